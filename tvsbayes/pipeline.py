@@ -74,14 +74,7 @@ def unusable(summary: FitSummary, causes: Sequence[Finding] = ()) -> TvsError | 
 
     `causes` are what explains a fit that explains nothing, as `misfit_causes` finds them.
     """
-    if not summary.converged and summary.sampling is not None and not summary.sampling.converged:
-        chain = summary.sampling.steps is not None
-        return NotConverged(
-            "unconverged",
-            "UNCONVERGED: " + "; ".join(summary.sampling.missing) + ". The table is the Laplace approximation",
-            remedy="run again with --resume and more --max-minutes" if chain else "run again without --quick",
-        )
-    if not summary.converged:
+    if not summary.explained:
         return NotConverged.of(summary.problems, "; ".join(c.sentence for c in causes) or MISFIT_REMEDY)
     if not summary.headline_informed:
         return NothingToEstimate(

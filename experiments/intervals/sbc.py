@@ -52,8 +52,8 @@ from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.parameter_space import coordinates_of, parameter_space
 from tvsbayes.posterior.draws import Posterior, derived_of
-from tvsbayes.posterior.ridges import transport
 from tvsbayes.posterior.sampling import TIERS, sample
+from tvsbayes.posterior.transport import transport
 from tvsbayes.report.drawing import BLUE
 from tvsbayes.twin.physics import effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import simulate

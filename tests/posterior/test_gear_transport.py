@@ -14,13 +14,13 @@ import pytest
 from support.dense_likelihood import angle_covariances, residual_covariance
 from support.small_posterior import ROUNDING
 from support.varying_gears import PERIODS_DEG, coordinates_with, varying_gears
+from tvsbayes.posterior.ridges import unbent
 
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.linear_spots import linear_spots, linearise, stop_information
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, names_of
 from tvsbayes.model.parameter_space import coordinates_of, free_mask, parameter_space, physical_at
-from tvsbayes.posterior.ridges import unbent
 from tvsbayes.posterior.transport import GEAR_SCALES, Transport
 
 VALUES = {

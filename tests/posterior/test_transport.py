@@ -12,12 +12,12 @@ import pytest
 from scipy import stats
 from support.small_posterior import ROUNDING, small_fit, small_path
 from support.two_parameters import BACKLASH, RATIO, no_places, route
+from tvsbayes.posterior.ridges import by_width, stop_states
 
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
 from tvsbayes.posterior.proposal import Target
-from tvsbayes.posterior.ridges import by_width, stop_states
 from tvsbayes.posterior.transport import STRETCH_NODES
 
 STOP_NAMES = (("stop_sd_deg.right", "stop_sd_deg.left"), ("stop_sd_deg.down", "stop_sd_deg.up"))

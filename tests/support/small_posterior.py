@@ -13,8 +13,7 @@ from support.varying_gears import perfect_rig
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
-from tvsbayes.posterior.ridges import transport
-from tvsbayes.posterior.transport import Transport
+from tvsbayes.posterior.transport import Transport, transport
 from tvsbayes.twin.simulated_campaign import simulate
 
 SIGMAS = 5.0

@@ -290,7 +290,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
 
     Args:
         fit: a joint fit, converged or not.
-        posterior: its sample. One that has not converged lends no number: what is returned is then the Laplace
+        posterior: its sample. One without an answer lends no number: what is returned is then the Laplace
             approximation, labelled so, and not converged.
 
     Returns:
@@ -312,10 +312,13 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     (a, b), (c, d) = np.asarray(source.centre.jacobian).tolist()
     problems = fit.problems
     if posterior is not None:
-        problems += tuple(f"UNCONVERGED: {sentence}" for sentence in posterior.convergence.missing)
+        lacks = {"accepted": "", "rough": "ROUGH", "laplace": "LAPLACE"}[posterior.convergence.answer]
+        problems += tuple(f"{lacks}: {sentence}" for sentence in posterior.convergence.missing)
     parameters = {**_parameters(source), **_derived(source)}
     return FitSummary(
         converged=fit.converged and (posterior is None or posterior.converged),
+        answer="laplace" if posterior is None else posterior.convergence.answer,
+        monte_carlo_error={} if posterior is None else posterior.convergence.monte_carlo_error,
         problems=problems,
         effective=effective,
         contrasts=contrasts,

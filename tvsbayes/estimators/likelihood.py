@@ -447,8 +447,9 @@ def residuals(
 
         def through(number, so_far):
             start = jnp.asarray(number) * size
-            found = standing(model, arrays.of_spots(start, size), angles=angles).terms.residual
-            return jax.lax.dynamic_update_slice_in_dim(so_far, jnp.stack(found, axis=1), start, 0)
+            found = standing(model, arrays.of_spots(start, size), angles=angles)
+            seen = found.to_states.in_place(found.terms.residual)
+            return jax.lax.dynamic_update_slice_in_dim(so_far, jnp.stack(seen, axis=1), start, 0)
 
         return jax.lax.fori_loop(0, blocks, through, jnp.zeros((len(arrays.spots.valid), 4)))
 

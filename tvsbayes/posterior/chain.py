@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -22,10 +22,10 @@ from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.posterior.importance import ImportanceRun, Pool, Weighing
 from tvsbayes.posterior.proposal import Independence
 from tvsbayes.posterior.tables import Followers, Tables
-from tvsbayes.posterior.transport import Transport
+from tvsbayes.posterior.transport import Transport, transport
 
 CHAIN_KIND = "tvsbayes-chain/"
-CHAIN_FORMAT = f"{CHAIN_KIND}6"
+CHAIN_FORMAT = f"{CHAIN_KIND}7"
 CHAIN_BYTES_MAX = 2**32
 """A chain is the user's own file: what was in memory when it was written fits there again."""
 
@@ -106,14 +106,13 @@ def write_chain(path: Path, fit: JointFit, start: ImportanceRun, chain: Chain) -
     """Keep a chain and what it started from, whole or not at all."""
     buffer = io.BytesIO()
     kind, keys, position, has_gauss, gauss = chain.random_state
-    kept = {f"transport_{f.name}": getattr(start.path, f.name) for f in fields(Transport)} | _pool_arrays(start.pool)
     np.savez(
         buffer,
         allow_pickle=False,
         format=CHAIN_FORMAT,
         fingerprint=fingerprint(fit),
         seed=start.posterior.seed,
-        **kept,
+        **_pool_arrays(start.pool),
         start_seconds=start.posterior.seconds,
         w=chain.w,
         log_density=chain.log_density,
@@ -147,7 +146,7 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun, C
         if found != CHAIN_FORMAT:
             raise ValueError(f"format {found!r}")
         same = str(stored["fingerprint"]) == fingerprint(fit) and int(stored["seed"]) == seed
-        route = Transport(**{f.name: stored[f"transport_{f.name}"] for f in fields(Transport)})
+        route = transport(fit)
         pool, chain, spent = _pool_of(stored, route), _chain_of(stored), float(stored["start_seconds"])
         if not pool.w.shape[1] == chain.w.shape[2] == len(pool.next_proposal.mean):
             raise ValueError(f"weighted draws of {pool.w.shape[1]} coordinates, walkers of {chain.w.shape[2]}")

@@ -6,7 +6,6 @@ Judged on the stored draws, so that what ArviZ computes from `posterior.nc` is w
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import emcee
@@ -18,19 +17,28 @@ from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior.chain import Chain
-from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names, propagated
-from tvsbayes.posterior.importance import ImportanceRun
+from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names, monte_carlo_errors, propagated
+from tvsbayes.posterior.importance import ImportanceRun, uncertain
 from tvsbayes.posterior.proposal import Target, place_normals
-from tvsbayes.results.convergence import Agreement, Convergence, extreme
+from tvsbayes.results.convergence import (
+    ROUGH_END_ERROR_MAX,
+    ROUGH_MEAN_ERROR_MAX,
+    Agreement,
+    Convergence,
+    MonteCarloError,
+    extreme,
+)
 
 GROUPS = 4
 """Of walkers that share no partners: chains that know nothing of each other, for R-hat."""
 RHAT_LIMIT = 1.01
-ESS_LIMIT, ESS_LIMIT_OTHERS = 1000, 400
+ESS_LIMIT = 400
 TAU_LIMIT = 50
-"""Limits of formulation 4.3: rank R-hat by group; bulk and tail effective draws of headlines, and of all else, where
-they only have to make R-hat and the sds sound (Vehtari et al., Bayesian Analysis 16 (2021) 667); steps in
-autocorrelation times."""
+"""Limits of formulation 4.3: rank R-hat by group; bulk and tail effective draws, which make R-hat and the errors sound
+(Vehtari et al., Bayesian Analysis 16 (2021) 667); steps in autocorrelation times. How well headlines are known is asked
+of their Monte Carlo errors, as of importance sampling."""
+ROUGH_RHAT = 1.05
+"""From which groups of walkers do not say the same, not even roughly."""
 AGREEMENT_LIMIT = 4.0
 """Monte Carlo errors by which a headline's mean or interval end may differ from importance sampling's. Of some thirty
 comparisons one lies farther out in two of a thousand fits."""
@@ -50,7 +58,6 @@ class ChainQuality:
     """Numbers behind the verdict: of the columns `names`, of which some are headlines, and of the walkers."""
 
     names: tuple[str, ...]
-    wanted_ess: np.ndarray
     rhat: np.ndarray
     ess_bulk: np.ndarray
     ess_tail: np.ndarray
@@ -66,10 +73,9 @@ class ChainQuality:
             worst = self.names[int(np.nanargmax(self.rhat))]
             missing.append(f"R-hat of {worst} is {np.max(self.rhat):.4f}, wanted {RHAT_LIMIT}")
         for kind, ess in (("bulk", self.ess_bulk), ("tail", self.ess_tail)):
-            if not np.all(ess >= self.wanted_ess):
-                least = int(np.nanargmin(ess - self.wanted_ess))
-                wanted = f"wanted {self.wanted_ess[least]:.0f}"
-                missing.append(f"{self.names[least]} has {ess[least]:.0f} {kind} effective draws, {wanted}")
+            if not np.all(ess >= ESS_LIMIT):
+                least = int(np.nanargmin(ess))
+                missing.append(f"{self.names[least]} has {ess[least]:.0f} {kind} effective draws, wanted {ESS_LIMIT}")
         if not self.kept >= TAU_LIMIT * self.tau_steps:
             times = f"{self.kept / self.tau_steps:.0f} autocorrelation times"
             missing.append(f"{self.kept} steps are {times}, wanted {TAU_LIMIT}")
@@ -139,12 +145,6 @@ def agreement(first: Posterior, chain_draws: Derived, names: tuple[str, ...]) ->
     return Agreement(worst.value < AGREEMENT_LIMIT, AGREEMENT_LIMIT, worst)
 
 
-def wanted_ess(fit: JointFit, names: Iterable[str]) -> np.ndarray:
-    """Effective draws that each of these quantities needs."""
-    headlines = headline_names(fit)
-    return np.array([float(ESS_LIMIT if name in headlines else ESS_LIMIT_OTHERS) for name in names])
-
-
 @dataclass(frozen=True)
 class Stored:
     """What is kept of a chain: thinned draws (walker, draw, ...), after `discarded` steps, every `thin`-th."""
@@ -181,7 +181,6 @@ class Stored:
         axes = {"chain_axis": 0, "draw_axis": 1}
         return ChainQuality(
             names,
-            wanted_ess(fit, names),
             rhat=array_stats.rhat(grouped(values), method="rank", **axes),
             ess_bulk=array_stats.ess(values, method="bulk", **axes),
             ess_tail=array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes),
@@ -189,6 +188,15 @@ class Stored:
             tau_steps=tau_steps,
             stuck=stuck_walkers(self.chain, self.discarded),
         )
+
+
+def chain_errors(fit: JointFit, derived: Derived, shape: tuple[int, int]) -> dict[str, MonteCarloError]:
+    """Of the headlines that vary, by draws (walker, draw) of a chain."""
+    columns = Draws(derived)
+    names = [name for name in headline_names(fit) if np.ptp(columns[name]) > 0]
+    if not names:
+        return {}
+    return monte_carlo_errors(names, propagated(np.stack([columns[name].reshape(shape) for name in names], axis=-1)))
 
 
 def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
@@ -207,7 +215,9 @@ def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
     derived = derived_of(fit, stored.z, errors_rad.reshape(walkers, draws, -1))
     quality = stored.quality(fit, derived, tau_steps)
     missing, same = quality.missing, None
-    if not missing and first.converged:
+    errors = chain_errors(fit, derived, stored.log_density.shape)
+    missing.extend(uncertain(errors))
+    if not missing and first.convergence.answer == "accepted":
         same = agreement(first, derived, headline_names(fit))
     if same is not None and not same.agrees:
         gap = f"by {same.worst.value:.1f} Monte Carlo errors, wanted below {AGREEMENT_LIMIT:g}"
@@ -226,6 +236,12 @@ def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
         missing=tuple(missing),
         importance=first.convergence.importance,
         agreement=same,
+        monte_carlo_error=errors,
+        rough=bool(
+            np.max(quality.rhat) <= ROUGH_RHAT
+            and not quality.stuck.any()
+            and all(error.within(ROUGH_MEAN_ERROR_MAX, ROUGH_END_ERROR_MAX) for error in errors.values())
+        ),
     )
     weights = np.full((walkers, draws), 1 / (walkers * draws))
     return Posterior(fit, stored.z, stored.log_density, derived, weights, convergence, first.seed, chain.seconds)

@@ -6,7 +6,7 @@ of a chain weigh the same; chains are walkers of the ensemble.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -21,8 +21,14 @@ from tvsbayes.instrument.parameters import BLOCKS, NAMES
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import Derived, derived_quantities
-from tvsbayes.results.convergence import Convergence, Reweighted
-from tvsbayes.statistics.weighted_draws import TAILS, systematic, weighted_mean, weighted_summary
+from tvsbayes.results.convergence import Convergence, MonteCarloError, Reweighted
+from tvsbayes.statistics.weighted_draws import (
+    TAILS,
+    WeightedSummary,
+    systematic,
+    weighted_mean,
+    weighted_summary,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -160,7 +166,7 @@ class Posterior(Shown):
 
     @property
     def converged(self) -> bool:
-        """All limits of formulation 4.3 are met."""
+        """There is a sampled answer, accepted or rough (formulation 4.3)."""
         return self.convergence.converged
 
     @property
@@ -312,6 +318,14 @@ def propagated(values: np.ndarray) -> Propagated:
         draws=values,
         weights=weights,
     )
+
+
+def monte_carlo_errors(names: Sequence[str], found: Propagated | WeightedSummary) -> dict[str, MonteCarloError]:
+    """Of quantities, the last axis of a summary, in their posterior sds; a quantity that no draw changes has none."""
+    sd = np.where(found.sd > 0, found.sd, 1.0)
+    parts = found.mcse_mean / sd, *(found.mcse_interval95 / sd)
+    rows = zip(*(np.reshape(part, len(names)).tolist() for part in parts), strict=True)
+    return {name: MonteCarloError(mean, (low, high)) for name, (mean, low, high) in zip(names, rows, strict=True)}
 
 
 def derived_of(fit: JointFit, z: np.ndarray, place_errors_rad: np.ndarray) -> Derived:

@@ -15,7 +15,7 @@ import numpy as np
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.chain import Chain, write_chain
-from tvsbayes.posterior.diagnosis import GROUPS, TAU_LIMIT, diagnose, steps_wanted, wanted_ess
+from tvsbayes.posterior.diagnosis import ESS_LIMIT, GROUPS, TAU_LIMIT, diagnose, steps_wanted
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.importance import ImportanceRun
 from tvsbayes.posterior.proposal import Independence, Target
@@ -77,17 +77,17 @@ def walkers_for(dimension: int) -> int:
     return max(WALKERS, 2 * BATCH * -(-dimension // (4 * BATCH)))
 
 
-def lengthening(fit: JointFit, found: Convergence) -> float:
+def lengthening(found: Convergence) -> float:
     """How many times longer a chain must be to have the autocorrelation times and effective draws that are wanted."""
     wanted = TAU_LIMIT * found.tau_steps / (found.steps - found.discarded)
     for ess in (found.ess_bulk, found.ess_tail):
-        wanted = max(wanted, float(np.max(wanted_ess(fit, ess) / np.array(list(ess.values())))))
-    return wanted
+        wanted = max(wanted, ESS_LIMIT / min(ess.values()))
+    return max(wanted, *(error.rounds_factor for error in found.monte_carlo_error.values()), 0.0)
 
 
-def next_look(fit: JointFit, chain: Chain, found: Convergence) -> int:
+def next_look(chain: Chain, found: Convergence) -> int:
     """Steps at which a chain that has not converged is worth another look; depends on the chain alone."""
-    wanted = lengthening(fit, found)
+    wanted = lengthening(found)
     # Where length is not what it lacks, a little more will not help either.
     growth = np.clip(MARGIN * wanted if 1 < wanted < np.inf else np.inf, *GROWTH_RANGE)
     return int(np.ceil(len(chain.w) * growth))
@@ -162,10 +162,10 @@ class Run:
         posterior = diagnose(self.fit, self.start, chain)
         found = posterior.convergence
         assert isinstance(found, Convergence)
-        if posterior.converged or hopeless(self.fit, found):
+        if not found.missing or hopeless(found):
             return posterior, True
         if len(chain.w) >= self.goal:
-            self.goal = next_look(self.fit, chain, found)
+            self.goal = next_look(chain, found)
         return posterior, False
 
     def too_short(self) -> bool:
@@ -205,7 +205,7 @@ class Run:
             raise
 
 
-def hopeless(fit: JointFit, found: Convergence) -> bool:
+def hopeless(found: Convergence) -> bool:
     """Whether nothing but the agreement with importance sampling is missing of a chain far longer than wanted."""
     disagrees = found.agreement is not None and not found.agreement.agrees
-    return disagrees and len(found.missing) == 1 and SETTLED * lengthening(fit, found) <= 1
+    return disagrees and len(found.missing) == 1 and SETTLED * lengthening(found) <= 1

@@ -4,13 +4,14 @@ Pilot rounds of draws in the coordinates w of `posterior.transport` teach the pr
 the target over the mixture of all proposals that made them, the balance heuristic (Veach and Guibas, SIGGRAPH 95, 419;
 Owen and Zhou, J. Am. Stat. Assoc. 95 (2000) 135), so that a poor first round costs little. They take no part in the
 posterior: a proposal fitted to a draw is high where that draw is, whose weight would come out too small (Marin, Pudlo
-and Sedki, Bernoulli 25 (2019) 1977).
+and Sedki, Bernoulli 25 (2019) 1977). Where the draws of a proposal would take too long to be accepted, they in turn are
+the pilot of the next one.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,12 +26,20 @@ from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.homing import prior_chance
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.headlines import Derived
-from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names
+from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names, monte_carlo_errors
 from tvsbayes.posterior.proposal import Independence, Target, first_proposal, place_normals
-from tvsbayes.posterior.transport import transport
-from tvsbayes.posterior.transport import Mapped, Transport
+from tvsbayes.posterior.transport import Mapped, Transport, transport
 from tvsbayes.progress import Advance, OpenEnded, unshown
-from tvsbayes.results.convergence import Importance, Reweighted, extreme
+from tvsbayes.results.convergence import (
+    END_ERROR_MAX,
+    MEAN_ERROR_MAX,
+    ROUGH_END_ERROR_MAX,
+    ROUGH_MEAN_ERROR_MAX,
+    Importance,
+    MonteCarloError,
+    Reweighted,
+    extreme,
+)
 from tvsbayes.statistics.weighted_draws import (
     SmoothedWeights,
     WeightedSummary,
@@ -43,19 +52,19 @@ from tvsbayes.statistics.weighted_draws import (
 ROUND = 1024
 PILOT_ROUNDS = 2
 """Rounds after each of which the proposal is fitted to all draws so far."""
-ROUNDS_MAX = 32
-"""Drawn from the last proposal, at most."""
+ROUNDS_MAX = 64
+"""All rounds of all proposals: the budget."""
 ROUNDS_LEAST = 4
 """Of fewer rounds nobody knows how many effective draws they have."""
-ESS_WANTED = 1000
-"""Effective draws of the worst statistic of the worst headline at which no further round is drawn ..."""
-ESS_LIMIT = 400
-"""... and fewer than which are not accepted."""
-K_LIMIT = 0.7
-"""Tail index from which weighted means cannot be trusted (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72)."""
+PATIENCE = 3
+"""A proposal is fitted anew if it would take more than this many times the rounds that it has had."""
+K_MAX = 0.7
+"""Tail index from which weighted means cannot be trusted, however many the draws ..."""
+ROUGH_K_MAX = 1.0
+"""... and from which they do not exist (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72)."""
 MAPPED_SHARE = 0.25
-"""Of the time, for the map to nearly normal coordinates: what progress foretells with."""
-HEAVIEST_LIMIT = 0.02
+"""Of the time, for the map to nearly normal coordinates: what progress predicts with."""
+HEAVIEST_MAX, ROUGH_HEAVIEST_MAX = 0.05, 0.2
 """Share of the weight that one draw may have."""
 
 
@@ -89,6 +98,11 @@ class Pool:
         share = np.log(np.array(self.counts) / len(self.w))
         return self.log_target - np.logaddexp.reduce(each + share[:, None], axis=0)
 
+    @property
+    def refitted(self) -> Independence:
+        """The next proposal fitted to all draws."""
+        return self.next_proposal.fitted(self.w, self.log_target, self.log_weights)
+
     def extended(self, target: Target, generator: np.random.RandomState, fitted: bool) -> Pool:
         """With another round; the proposal is fitted again if `fitted`."""
         proposal, before = self.next_proposal, target.invalid
@@ -114,7 +128,7 @@ class Pool:
         if not np.isfinite(found.log_target).sum() > 8 * w.shape[1]:
             raise FloatingPointError("the posterior density is not finite around the mode")
         if fitted:
-            found = replace(found, next_proposal=proposal.fitted(found.w, found.log_target, found.log_weights))
+            found = replace(found, next_proposal=found.refitted)
         return found
 
 
@@ -204,30 +218,51 @@ class Weighing:
         return weighted_summary(np.stack([self.columns[name] for name in names], axis=1), self.smoothed.weights)
 
     @cached_property
+    def headlines(self) -> tuple[str, ...]:
+        """What the draws are judged by; all quantities where no headline is left open."""
+        return tuple(name for name in headline_names(self.fit) if name in self.columns) or tuple(self.columns)
+
+    @cached_property
+    def monte_carlo_error(self) -> dict[str, MonteCarloError]:
+        """Of every headline."""
+        return monte_carlo_errors(self.headlines, self.summary(self.headlines))
+
+    @cached_property
     def importance(self) -> Importance:
-        """What the headlines say of the weights."""
-        # Where nothing that a fit is for is left open, everything else stands for it.
-        headlines = [name for name in headline_names(self.fit) if name in self.columns] or list(self.columns)
-        told = self.summary(headlines)
+        """The weights judged by the headlines."""
+        summary = self.summary(self.headlines)
         raw = np.exp(self.log_weights - np.max(self.log_weights))
         kish, count = effective_draws(raw), len(self.log_weights)
-        deviations = {name: self.columns[name] - mean for name, mean in zip(headlines, told.mean, strict=True)}
-        found = Importance(
-            accepted=True,
-            missing=(),
+        deviations = {n: self.columns[n] - mean for n, mean in zip(self.headlines, summary.mean, strict=True)}
+        pareto, heaviest = self.smoothed.pareto_k, float(np.max(self.smoothed.weights))
+        missing = lacking(pareto, heaviest, count, self.monte_carlo_error)
+        rough = (
+            pareto < ROUGH_K_MAX
+            and heaviest <= ROUGH_HEAVIEST_MAX
+            and all(e.within(ROUGH_MEAN_ERROR_MAX, ROUGH_END_ERROR_MAX) for e in self.monte_carlo_error.values())
+        )
+        return Importance(
+            accepted=not missing,
+            missing=missing,
             rounds=count // ROUND,
             draws=count,
             effective_share=kish / count,
-            least_ess=extreme(dict(zip(headlines, told.ess_least.tolist(), strict=True)), min),
-            pareto_k=self.smoothed.pareto_k,
+            least_ess=extreme(dict(zip(self.headlines, summary.ess_least.tolist(), strict=True)), min),
+            pareto_k=pareto,
             worst_pareto_k=extreme({name: pareto_k(raw[self.finite] * x**2) for name, x in deviations.items()}, max),
-            heaviest_share=float(np.max(self.smoothed.weights)),
+            heaviest_share=heaviest,
             log_evidence=log_evidence(self.fit, self.path, self.log_weights),
             log_evidence_mcse=float(np.sqrt(max(1 / kish - 1 / count, 0.0))),
             invalid_evaluations=self.pool.invalid,
+            answer="accepted" if not missing else "rough" if rough else "laplace",
         )
-        missing = lacking(found)
-        return replace(found, accepted=not missing, missing=missing)
+
+    @property
+    def rounds_wanted(self) -> float:
+        """How many rounds of the same proposal an accepted answer takes, as far as the draws say."""
+        found = self.importance
+        factor = max(e.rounds_factor for e in self.monte_carlo_error.values())
+        return found.rounds * max(factor, found.heaviest_share / HEAVIEST_MAX)
 
     def posterior(self, seed: int, seconds: float) -> Posterior:
         """All of them; `seed` of their generator, `seconds` spent on them."""
@@ -236,26 +271,43 @@ class Weighing:
             self.importance,
             dict(zip(self.columns, every.ess_mean.tolist(), strict=True)),
             dict(zip(self.columns, every.ess_interval95.min(axis=0).tolist(), strict=True)),
+            self.monte_carlo_error,
         )
         z, weights = self.pool.mapped.z[self.finite][None], self.smoothed.weights[None]
         return Posterior(self.fit, z, self.log_density[None], self.derived, weights, convergence, seed, seconds)
 
 
-def lacking(found: Importance) -> tuple[str, ...]:
-    """What is not reached, in sentences."""
-    missing = []
-    if not found.pareto_k < K_LIMIT:
-        missing.append(f"the weights of importance sampling have Pareto k {found.pareto_k:.2f}, wanted below {K_LIMIT}")
-    if not found.worst_pareto_k.value < K_LIMIT:
-        worst = found.worst_pareto_k
-        missing.append(f"those of {worst.quantity} have Pareto k {worst.value:.2f}, wanted below {K_LIMIT}")
-    if not found.heaviest_share <= HEAVIEST_LIMIT:
-        share = f"{100 * found.heaviest_share:.1f} %"
-        missing.append(f"one draw holds {share} of the weight, wanted at most {100 * HEAVIEST_LIMIT:.0f} %")
-    if not found.least_ess.value >= ESS_LIMIT:
-        least = found.least_ess
-        missing.append(f"{least.quantity} has {least.value:.0f} effective draws, wanted {ESS_LIMIT}")
-    return tuple(missing)
+def k_max(draws: int) -> float:
+    """Largest tail index with which the smoothed weights of so many draws can be trusted (Vehtari et al. 2024, 3.2)."""
+    return min(1 - 1 / np.log10(draws), K_MAX)
+
+
+def lacking(pareto: float, heaviest: float, draws: int, errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
+    """What an accepted answer lacks, in sentences.
+
+    Args:
+        pareto: tail index of the weights.
+        heaviest: share of the weight in one draw.
+        draws: their number.
+        errors: Monte Carlo errors of every headline.
+    """
+    missing, limit = [], k_max(draws)
+    if not pareto < limit:
+        missing.append(f"the weights of importance sampling have Pareto k {pareto:.2f}, wanted below {limit:.2f}")
+    if not heaviest <= HEAVIEST_MAX:
+        missing.append(f"one draw holds {100 * heaviest:.1f} % of the weight, wanted at most {100 * HEAVIEST_MAX:.0f} %")
+    return (*missing, *uncertain(errors))
+
+
+def uncertain(errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
+    """The headline that sampling knows worst, in a sentence; none where all are known well enough."""
+    bad = {name: e for name, e in errors.items() if not e.within(MEAN_ERROR_MAX, END_ERROR_MAX)}
+    if not bad:
+        return ()
+    name = max(bad, key=lambda each: bad[each].rounds_factor)
+    mean, ends = bad[name].mean, max(bad[name].interval95)
+    wanted = f"wanted at most {MEAN_ERROR_MAX:g} and {END_ERROR_MAX:g}"
+    return (f"sampling knows the mean of {name} to {mean:.2f} sd and its interval's ends to {ends:.2f} sd, {wanted}",)
 
 
 @dataclass(frozen=True)
@@ -269,8 +321,7 @@ class ImportanceRun:
     @cached_property
     def proposal(self) -> Independence:
         """Fitted to all draws: a chain that starts from them is right whatever it is proposed."""
-        pool = self.pool
-        return pool.next_proposal.fitted(pool.w, pool.log_target, pool.log_weights)
+        return self.pool.refitted
 
     def starts(self, count: int) -> np.ndarray:
         """Weighted draws of w without replacement, shape (count, d)."""
@@ -281,37 +332,46 @@ class ImportanceRun:
         return self.pool.w[np.argsort(-keys)[:count]]
 
 
-def importance_run(fit: JointFit, seed: int, advance: Advance = unshown) -> ImportanceRun:
-    """Draw rounds until every headline is known by `ESS_WANTED` draws and the weights are sound, at most `ROUNDS_MAX`.
+def importance_run(
+    fit: JointFit, seed: int, advance: Advance = unshown, rounds_max: int = ROUNDS_MAX
+) -> ImportanceRun:
+    """Draw rounds until the answer is accepted; where that would take too long, from a proposal fitted anew.
 
     Args:
         fit: a converged fit.
         seed: of the draws.
         advance: told how far it is.
+        rounds_max: of all proposals together.
 
     Raises:
         NotConverged: the density is not finite around the mode.
     """
     began = time.monotonic()
     generator = np.random.RandomState(seed)
-    wanted, rounds, drawn = ROUNDS_LEAST, 0, OpenEnded()
+    drawn = OpenEnded()
     path = transport(fit)
     advance(MAPPED_SHARE)
     target = Target(fit, path)
     try:
         pool = piloted(target, generator)
+        total, rounds, wanted, patience = PILOT_ROUNDS, 0, ROUNDS_LEAST, PATIENCE * ROUNDS_LEAST
         while True:
             while rounds < wanted:
-                rounds += 1
+                rounds, total = rounds + 1, total + 1
                 pool = pool.extended(target, generator, fitted=False)
-                advance(MAPPED_SHARE + (1 - MAPPED_SHARE) * drawn.share(rounds, wanted))
+                advance(MAPPED_SHARE + (1 - MAPPED_SHARE) * drawn.share(total, total + wanted - rounds))
             weighed = Weighing(fit, path, pool)
-            ess = weighed.importance.least_ess.value
-            if rounds >= ROUNDS_MAX or (weighed.importance.accepted and ess >= ESS_WANTED):
+            left = rounds_max - total
+            if weighed.importance.accepted or left <= 0:
                 return ImportanceRun(path, pool, weighed.posterior(seed, time.monotonic() - began))
-            # Effective draws of few rounds are known badly: never more than half as many again.
-            enough = min(np.ceil(rounds * ESS_WANTED / max(ess, 1.0)), np.ceil(1.5 * rounds))
-            wanted = min(ROUNDS_MAX, max(rounds + 1, int(enough)))
+            needed = weighed.rounds_wanted
+            if needed > patience and left >= 2 * rounds:
+                # These draws teach the next proposal, which is allowed twice as many.
+                pool = replace(empty_pool(target, pool.refitted), invalid=pool.invalid)
+                rounds, wanted, patience = 0, min(2 * rounds, left), 2 * patience
+            else:
+                # Few draws do not say well how many more it takes.
+                wanted = min(rounds + left, max(rounds + 1, int(min(np.ceil(1.1 * needed), 2 * rounds))))
     except FloatingPointError as error:
         raise NotConverged("no-density", str(error), remedy="see the weak directions of --no-sample") from error
 

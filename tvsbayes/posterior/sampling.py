@@ -14,11 +14,12 @@ from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.importance import importance_run, mixed
 from tvsbayes.progress import Job, Show
+from tvsbayes.results.convergence import Convergence
 
 TIERS = ("importance", "emcee")
 DRAWING, WALKING = "drawing weighted samples", "sampling with emcee"
 DRAWN_SECONDS, WALKED_SECONDS = 3.0, 8.0
-"""What progress foretells with."""
+"""What progress predicts with."""
 
 
 def sampling_stages(tier: str) -> dict[str, float]:
@@ -52,8 +53,9 @@ def sample(
         first: called with the posterior of importance sampling before the chain starts.
 
     Returns:
-        The posterior: `.propagate` for any quantity, `.by_name` for the draws; with `converged` False its intervals
-        must not be used. `write_posterior` makes a file for ArviZ of it.
+        The posterior: `.propagate` for any quantity, `.by_name` for the draws. `convergence.answer` says whether its
+        intervals are accepted or rough; with `converged` False they must not be used. `write_posterior` makes a file
+        for ArviZ of it.
 
     Raises:
         TypeError: an argument of another kind.
@@ -90,5 +92,19 @@ def sample(
 
         job.begin(WALKING)
         walked = Run(fit, start, chain, checkpoint, job.at, began).until_converged(60 * max_minutes)
-        # A chain knows one way of homing; where others count, the weighted draws of all have the last word.
-        return early if len(fit.mixture) > 1 and walked.converged else walked
+        return _better(early, walked)
+
+
+def _better(early: Posterior, walked: Posterior) -> Posterior:
+    """The posterior with the better answer, a chain's of two that are as good.
+
+    A chain that contradicts the weighted draws leaves neither accepted. It knows one way of homing; where others count,
+    the weighted draws of all have the last word.
+    """
+    chain, order = walked.convergence, ("accepted", "rough", "laplace")
+    assert isinstance(chain, Convergence)
+    if chain.agreement is not None and not chain.agreement.agrees:
+        return walked
+    several = len(early.fit.mixture) > 1 and walked.converged
+    better = order.index(early.convergence.answer) < order.index(chain.answer)
+    return early if several or better else walked

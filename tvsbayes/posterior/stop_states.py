@@ -3,7 +3,7 @@
 With G the columns, T the standard deviations of the states and unit noise, the covariance of the residuals is
 C = 1 + G T^2 G'. A state is coupled only to those alive at the same looks, so the Cholesky factor of 1 + T G'G T is
 sparse when states are eliminated in the order in which they end: the information form of the filter of
-`estimators.likelihood`, with a cost linear in the number of states. NumPy; leading axes are points of many noise scales.
+`estimators.likelihood`, with a cost linear in the number of states. NumPy; leading axes are points of other scales.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots
+from tvsbayes.instrument.parameters import INDEX, names_of
 from tvsbayes.model.parameter_space import STOP_COLUMNS
+
+SCATTER_COLUMNS = np.array([INDEX[name] for name in names_of("look_scatter_deg")])
 
 
 @dataclass(frozen=True)
@@ -26,11 +29,14 @@ class StopStates:
         load: d(predicted)/d(state) of the spots' components, shape (4 n, m).
         variance: at the fit's noise scales, by direction (right, left, down, up), shape (m, 4).
         constant: of states of another kind, shape (m,).
+        scatter: what the scatter of looks (pan, tilt) adds to the variance with which the looks of a state know it, at
+            the fit's noise scales, shape (m, 2); it is in the noise of the looks already.
     """
 
     load: np.ndarray
     variance: np.ndarray
     constant: np.ndarray
+    scatter: np.ndarray
 
     @cached_property
     def gram(self) -> np.ndarray:
@@ -52,7 +58,9 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
     """Unroll the filter's six states: a column for each time that one is drawn anew."""
     spots, states = linear.load.shape[0], linear.load.shape[2]
     mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
-    variance_of = np.radians(np.asarray(fit.mode.physical)[STOP_COLUMNS]) ** 2
+    physical = np.asarray(fit.mode.physical)
+    variance_of = np.radians(physical[STOP_COLUMNS]) ** 2
+    scatter_of = np.radians(physical[SCATTER_COLUMNS]) ** 2
     found = []
     for state in range(states):
         drawn = np.flatnonzero(linear.renewed[:, state])
@@ -62,13 +70,18 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
                 by_direction[state] = mix[begin, state] * variance_of[state]
             rest = 0.0 if state < 2 else linear.variance[begin, state]
             if linear.load[begin:end, :, state].any() and by_direction.sum() + rest > 0:
-                found.append((end, begin, state, by_direction.ravel(), rest))
+                scatter = scatter_of * (np.arange(2) == state % 2) / (end - begin)
+                found.append((end, begin, state, by_direction.ravel(), rest, scatter))
     found.sort(key=lambda each: each[:3])
     load = np.zeros((spots, 4, len(found)))
     for column, (end, begin, state, *_) in enumerate(found):
         load[begin:end, :, column] = linear.load[begin:end, :, state]
-    variance = np.array([each[3] for each in found]).reshape(len(found), 4)
-    return StopStates(load.reshape(4 * spots, len(found)), variance, np.array([each[4] for each in found], dtype=float))
+    return StopStates(
+        load.reshape(4 * spots, len(found)),
+        np.array([each[3] for each in found]).reshape(len(found), 4),
+        np.array([each[4] for each in found], dtype=float),
+        np.array([each[5] for each in found]).reshape(len(found), 2),
+    )
 
 
 @dataclass(frozen=True)

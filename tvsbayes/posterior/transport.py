@@ -22,12 +22,13 @@ from scipy.linalg import lapack
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import residuals
 from tvsbayes.estimators.linear_spots import linear_spots
+from tvsbayes.instrument.axes import AXES, SENSES
 from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import place_root
 from tvsbayes.model.parameter_space import FARTHEST_SD, STOP_COLUMNS, half_normal, half_normal_slope
-from tvsbayes.posterior.stop_states import Elimination, StopStates, stop_states
+from tvsbayes.posterior.stop_states import SCATTER_COLUMNS, Elimination, StopStates, stop_states
 
 GEAR_SCALES = np.array(
     [
@@ -81,8 +82,8 @@ class LinearCampaign:
         residual: shape (4 n,).
         along: d(predicted)/dy of the coordinates that are no noise scales, shape (4 n, g).
         states: stop errors and their like.
-        by_noise: variance of every state at the mode by the noise coordinate that scales it, shape (m, q).
-        constant: variance that scales with none, shape (m,).
+        by_noise: variance of every state at the mode by the noise coordinates that scale it, shape (m, q).
+        constant: variance that scales with none, less what the noise of the looks has already, shape (m,).
         places: d(predicted)/d(errors at places), shape (4 n, e).
         prior: precision of y without data, shape (g, g).
     """
@@ -261,9 +262,13 @@ class Transport:
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Leader and follower of scales that explain the same scatter: play's variation, then transmission error."""
+        """Leader and follower of scales that explain the same scatter.
+
+        Play's variation, then transmission error; the scatter of looks, then that of the stops of its axis.
+        """
         names = [NAMES[column] for column in self.free]
-        wanted = zip(names_of("play_variation_deg"), names_of("transmission_error_deg"), strict=True)
+        wanted = [*zip(names_of("play_variation_deg"), names_of("transmission_error_deg"), strict=True)]
+        wanted += [(f"look_scatter_deg.{axis}", f"stop_sd_deg.{side}") for axis in AXES for side in SENSES[axis]]
         return [(names.index(one), names.index(other)) for one, other in wanted if {one, other} <= set(names)]
 
     @cached_property
@@ -328,6 +333,8 @@ class Transport:
         weight = np.exp(-2 * log_scale @ self.pixels)
         places, count = linear.places.shape[1], len(linear.gram)
         variance = linear.constant + np.exp(2 * log_scale) @ linear.by_noise.T
+        # Less scatter of looks than at the mode leaves less than the stops' own variance: never none.
+        variance = np.maximum(variance, LEAST_SCALE * (linear.constant + linear.by_noise.sum(axis=1)))
         elimination = Elimination.of(linear.states, np.sqrt(weight[:, None] * variance))
         white = elimination.whitened(linear.by_states)
         whole = weight[:, None, None] * (linear.gram - np.swapaxes(white, 1, 2) @ white)
@@ -433,7 +440,7 @@ def transport(fit: JointFit) -> Transport:
     of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
     wide = np.linalg.cholesky(covariance[np.ix_(order, order)])
     stops = stop_states(fit, linear)
-    by_noise = STOP_COLUMNS.reshape(4, 1) == noise
+    by_noise, by_scatter = STOP_COLUMNS.reshape(4, 1) == noise, SCATTER_COLUMNS.reshape(2, 1) == noise
     places = jax.tree.map(np.asarray, fit.arrays.gears.places)
     seen = np.flatnonzero(places.valid)
     columns = np.asarray(fit.linearised.place_columns).reshape(-1, 2 * len(places.steps))
@@ -460,9 +467,9 @@ def transport(fit: JointFit) -> Transport:
             residual=linear.residual.ravel(),
             along=(linear.jacobian[..., others] @ wide).reshape(4 * spots, -1),
             states=stops,
-            by_noise=stops.variance @ by_noise,
+            by_noise=stops.variance @ by_noise + stops.scatter @ by_scatter,
             # Stop errors whose sd is not estimated keep their variance.
-            constant=stops.constant + stops.variance @ ~by_noise.any(axis=1),
+            constant=stops.constant + stops.variance @ ~by_noise.any(axis=1) - stops.scatter @ by_scatter.any(axis=1),
             places=columns[:, np.concatenate([seen, len(places.steps) + seen])],
             prior=wide.T @ wide,
         ),

@@ -47,6 +47,11 @@ def factor_told(validation: Validation) -> str:
     return "no factor on u covers it"
 
 
+LAPLACE_WORTH = "the table is the Laplace approximation, whose intervals are up to a quarter too short"
+"""On 900 simulated campaigns its 95 % intervals of play hold the truth in 89 %, all others in 92 to 96 %
+(experiments/intervals): a normal interval of 89 % is 1.6 sd wide instead of 1.96."""
+
+
 def failed(summary: FitSummary) -> Validation | None:
     """The validation where it failed."""
     validation = summary.validation
@@ -55,15 +60,17 @@ def failed(summary: FitSummary) -> Validation | None:
 
 def verdict_line(summary: FitSummary) -> str:
     """Whether the numbers of a fit may be used, in one line."""
-    if not summary.converged:
+    if not summary.explained:
         return "verdict: NOT CONVERGED, use none of these numbers"
     if (validation := failed(summary)) is not None:
         by_spots = not validation.widens and validation.cause.startswith("single spots disagree")
         return f"verdict: VALIDATION FAILED, {factor_told(validation)}" + f": {SPOTS_REMEDY}" * by_spots
     unseen = [d for d in DIRECTIONS if (e := summary.effective[d]) is not None and not e.informed]
     validation = summary.validation
-    if summary.sampling is not None and not summary.sampling.converged:
-        told = "UNCONVERGED, the table is the Laplace approximation"
+    if not summary.converged:
+        told = f"usable with care: the posterior could not be sampled; {LAPLACE_WORTH}"
+    elif summary.answer == "rough":
+        told = "usable, but rough: see the Monte Carlo error"
     elif validation is None or not validation.tests:
         told = "usable; too few spots to look for model errors"
     else:
@@ -93,9 +100,9 @@ def steps_ahead(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()
     `causes` explain a fit that failed.
     """
     found = []
-    if not summary.converged and causes:
+    if not summary.explained and causes:
         return [f"Use none of the numbers: {finding.sentence}." for finding in causes]
-    if not summary.converged:
+    if not summary.explained:
         return [
             "Use none of the numbers. See what `tvsbayes check` warns of, look for swapped cameras, wrong counters "
             "and pictures of another size, then fit again.",

@@ -52,7 +52,7 @@ class Verdict:
 
 def verdict_of(summary: FitSummary, criteria: Sequence[Criterion]) -> Verdict:
     """What the page says first: whether its numbers may be used, and whether the limits are met."""
-    if not summary.converged:
+    if not summary.explained:
         return Verdict("NOT CONVERGED: the numbers below must not be used", "not-met")
     validation = summary.validation
     failed = "" if validation is None or validation.passed else validation_lines(validation)[0] + ". "

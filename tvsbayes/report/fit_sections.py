@@ -256,7 +256,7 @@ def validation_section(e: Evidence) -> Section:
     else:
         told = sampling_line(sampling), agreement_line(sampling)
         text += [f"{line}." for line in told if line is not None]
-        items += [f"UNCONVERGED: {sentence}" for sentence in sampling.missing]
+        items += [f"not reached: {sentence}" for sentence in sampling.missing]
     tables.append(_foretold(e))
     if e.held_out is None:
         text.append(

@@ -43,7 +43,7 @@ def fit_text(
         written: files that hold all of it.
         causes: what explains that a fit failed.
     """
-    if not summary.converged and summary.sampling is None:
+    if not summary.explained:
         return astray_text(summary, causes)
     lines = detail_lines(summary) if details else []
     validation = failed(summary)
@@ -51,8 +51,7 @@ def fit_text(
         # Above and below the table: who reads either end of the text must meet it.
         told = validation_lines(validation)
         lines = [told[0], *lines, *told[1:], f"what helps: {remedy(validation)}"]
-    if summary.sampling is not None and not summary.sampling.converged:
-        lines.append(sampling_line(summary.sampling))
+    lines += answer_lines(summary)
     if summary.few_stops:
         lines.append(few_stops_line(summary.few_stops, summary.estimator))
     lines += homing_lines(summary)
@@ -191,7 +190,23 @@ def sampling_line(sampling: Sampling) -> str:
         text = f"{sampling.walkers} walkers, {sampling.steps} steps ({sampling.discarded} left out); worst R-hat "
         text += f"{rhat.value:.3f} ({rhat.quantity}), least effective draws {ess.value:.0f} "
         text += f"({ess.quantity}) and {tail.value:.0f} in the tails ({tail.quantity})"
-    return text if sampling.converged else f"UNCONVERGED, the table is Laplace's: {text}"
+    return text
+
+
+def answer_lines(summary: FitSummary) -> list[str]:
+    """What an answer that is not accepted lacks, and what more time would do; none of an accepted one."""
+    if summary.sampling is None or not summary.sampling.missing:
+        return []
+    quick = summary.sampling.steps is None
+    lines = [f"{'rough' if summary.converged else 'not sampled'}: {text}" for text in summary.sampling.missing]
+    lines.append(sampling_line(summary.sampling))
+    if summary.converged:
+        worst = max(summary.monte_carlo_error.items(), key=lambda each: each[1].rounds_factor)
+        ends = " and ".join(f"{each:.2f}" for each in worst[1].interval95)
+        lines.append(
+            f"Monte Carlo error, largest: {worst[1].mean:.2f} sd of the mean, {ends} sd of the interval's ends ({worst[0]})"
+        )
+    return [*lines, f"what helps: {'fit without --quick' if quick else 'fit with --resume and more --max-minutes'}"]
 
 
 def importance_line(found: Importance) -> str:
@@ -219,7 +234,7 @@ def first_text(summary: FitSummary) -> str:
     if sampling is None or sampling.importance is None:
         return ""
     if not sampling.converged:
-        return f"importance sampling alone does not do: {'; '.join(sampling.missing)}; emcee goes on ..."
+        return f"importance sampling has no answer: {'; '.join(sampling.missing)}; emcee goes on ..."
     return f"{headline_table(summary).text()}\n{importance_line(sampling.importance)}; emcee goes on ..."
 
 

@@ -235,7 +235,7 @@ def _steps(e: Evidence) -> list[str]:
     """What to do next: what the fit asks for, then the best of a plan; the plan's own section has all of it."""
     folder = "CAMPAIGN" if e.campaign.path is None else typed(e.campaign.path.resolve().name)
     summary = e.fit.summary
-    failed = not summary.converged and summary.sampling is None
+    failed = not summary.explained
     causes = misfit_causes(e.campaign, summary.parameters["pixel_scale"].value) if failed else ()
     found = steps_ahead(summary, folder, causes)
     if e.planned is not None and not e.planned.stop.now and e.planned.next:

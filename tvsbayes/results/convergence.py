@@ -10,7 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.results.records import ClosedRecord, Count, FromOne, NotNegative
+from tvsbayes.results.records import AnswerKind, ClosedRecord, Count, FromOne, NotNegative
+
+MEAN_ERROR_MAX, END_ERROR_MAX = 0.1, 0.2
+"""Monte Carlo standard error of a headline's mean and of the ends of its 95 % interval, in its sd, with which an answer
+is accepted: the first widens the interval by 0.5 %, the second moves an end by a digit that is not printed."""
+ROUGH_MEAN_ERROR_MAX, ROUGH_END_ERROR_MAX = 0.3, 0.6
+"""The same of a rough answer: the first widens an interval by 4 %, the second misses an end by a third of its distance
+from the mean, but seldom."""
 
 
 class NamedValue(ClosedRecord, frozen=True):
@@ -18,6 +25,27 @@ class NamedValue(ClosedRecord, frozen=True):
 
     quantity: str
     value: float
+
+
+class MonteCarloError(ClosedRecord, frozen=True):
+    """How far sampling alone may have moved what is said of a quantity, standard errors in its posterior sd.
+
+    Attributes:
+        mean: of its mean.
+        interval95: of the ends of its 95 % interval, low and high.
+    """
+
+    mean: NotNegative
+    interval95: tuple[NotNegative, NotNegative]
+
+    def within(self, mean: float, end: float) -> bool:
+        """Whether neither the mean nor an end has a larger error; an error that is no number is too large."""
+        return self.mean <= mean and all(each <= end for each in self.interval95)
+
+    @property
+    def rounds_factor(self) -> float:
+        """How many times as many draws an accepted answer takes."""
+        return max(self.mean / MEAN_ERROR_MAX, *(each / END_ERROR_MAX for each in self.interval95)) ** 2
 
 
 class Importance(ClosedRecord, frozen=True):
@@ -36,6 +64,7 @@ class Importance(ClosedRecord, frozen=True):
             `estimators.campaign_arrays.spot_constants`, and ranges are flat in image displacement.
         log_evidence_mcse: its Monte Carlo standard error.
         invalid_evaluations: draws whose density has no value.
+        answer: what the draws are good for.
     """
 
     accepted: bool
@@ -50,6 +79,7 @@ class Importance(ClosedRecord, frozen=True):
     log_evidence: float
     log_evidence_mcse: NotNegative
     invalid_evaluations: Count
+    answer: AnswerKind | None = None
 
 
 class Agreement(ClosedRecord, frozen=True):
@@ -108,11 +138,18 @@ class Reweighted:
     Attributes:
         importance: their diagnosis.
         ess_bulk, ess_tail: effective draws of the mean and of the worse end of the interval, by contract name.
+        monte_carlo_error: of every headline.
     """
 
     importance: Importance
     ess_bulk: dict[str, float]
     ess_tail: dict[str, float]
+    monte_carlo_error: dict[str, MonteCarloError]
+
+    @property
+    def answer(self) -> AnswerKind:
+        """What the draws are good for: their intervals, these roughly, or nothing."""
+        return self.importance.answer or "laplace"
 
     @property
     def rhat(self) -> dict[str, float]:
@@ -126,8 +163,8 @@ class Reweighted:
 
     @property
     def converged(self) -> bool:
-        """All limits of formulation 4.3 are met."""
-        return self.importance.accepted
+        """There is a sampled answer, accepted or rough."""
+        return self.answer != "laplace"
 
     @property
     def sampling(self) -> Sampling:
@@ -164,9 +201,11 @@ class Convergence:
         acceptance: share of accepted moves by walker.
         stuck_walkers: walkers that hardly moved or live at another density.
         invalid: evaluations that gave no number.
-        missing: sentences on what is not reached; empty when converged.
+        missing: sentences on what is not reached; empty when accepted.
         importance: diagnosis of the draws that the chain started from.
         agreement: with them; None where they were not accepted.
+        monte_carlo_error: of every headline.
+        rough: what is missing leaves a rough answer.
     """
 
     steps: int
@@ -182,11 +221,18 @@ class Convergence:
     missing: tuple[str, ...]
     importance: Importance
     agreement: Agreement | None
+    monte_carlo_error: dict[str, MonteCarloError]
+    rough: bool
+
+    @property
+    def answer(self) -> AnswerKind:
+        """What the draws are good for: their intervals, these roughly, or nothing."""
+        return "accepted" if not self.missing else "rough" if self.rough else "laplace"
 
     @property
     def converged(self) -> bool:
-        """All limits of formulation 4.3 are met."""
-        return not self.missing
+        """There is a sampled answer, accepted or rough."""
+        return self.answer != "laplace"
 
     @property
     def sampling(self) -> Sampling:

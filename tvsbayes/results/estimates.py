@@ -16,9 +16,10 @@ from msgspec import UNSET, Meta, UnsetType
 from tvsbayes.display import Shown, View
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.homing import ANYWHERE
-from tvsbayes.results.convergence import Sampling
+from tvsbayes.results.convergence import MonteCarloError, Sampling
 from tvsbayes.results.records import (
     AllDirections,
+    AnswerKind,
     AxisName,
     BothAxes,
     ByAxis,
@@ -257,7 +258,10 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
     Attributes:
         estimator: "posterior" if a converged sample stands behind the numbers, else "laplace".
         tier: what made a posterior's draws, "importance" or "emcee"; None of a Laplace approximation.
-        converged: whether the mode was reached.
+        converged: the mode was reached and explains the data, and what was sampled has an answer.
+        answer: "accepted" or "rough" of a posterior, "laplace" of the approximation at the mode; None in results of
+            0.2.0 and before.
+        monte_carlo_error: of every headline of a sampled posterior.
         problems: sentences on what failed.
         effective: left, right, up, down in deg/step, slopes of the lines through the looks used; None for a direction
             that was never moved.
@@ -285,6 +289,8 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
     estimator: EstimatorName
     tier: Tier | None = None
     converged: bool
+    answer: AnswerKind | None = None
+    monte_carlo_error: dict[str, MonteCarloError] = msgspec.field(default_factory=dict)
     problems: tuple[str, ...]
     effective: AllDirections[Estimate | None]
     contrasts: BothAxes[Estimate | None]
@@ -321,6 +327,11 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
             if e is not None and not name.startswith("stereo.")
         ]
         return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "told by the data, %"), rows)
+
+    @property
+    def explained(self) -> bool:
+        """There is a mode that explains the data: only then is anything sampled."""
+        return self.converged or self.sampling is not None
 
     @property
     def headline_informed(self) -> bool:

@@ -44,6 +44,7 @@ type BothAxes[T] = Annotated[dict[AxisName, T], Meta(extra_json_schema={"require
 type AllDirections[T] = Annotated[dict[Direction, T], Meta(extra_json_schema={"required": DIRECTIONS})]
 type EstimatorName = Annotated[str, Meta(extra_json_schema={"enum": ("laplace", "posterior")})]
 type Tier = Annotated[str, Meta(extra_json_schema={"enum": ("importance", "emcee")})]
+type AnswerKind = Annotated[str, Meta(extra_json_schema={"enum": ("accepted", "rough", "laplace")})]
 
 TEXT_CHARS_MAX = 20_000
 """Of one text in a document that tvsbayes wrote."""
