@@ -413,7 +413,7 @@ def _calibrated(rng: np.random.Generator, rig: Rig, board: tuple[int, int, float
     together = cv2.CALIB_FIX_INTRINSIC if rng.random() < 0.5 else cv2.CALIB_USE_INTRINSIC_GUESS
     ends = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 100, 1e-6)
     threads = cv2.getNumThreads()
-    # Sums of several threads differ in their last digits from run to run.
+    # Sums of several threads differ from run to run, and with them where a descent ends.
     cv2.setNumThreads(1)
     try:
         alone = [cv2.calibrateCamera(shown, one, rig.left.size, None, None, flags=flags)[1:3] for one in seen]

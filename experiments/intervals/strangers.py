@@ -187,7 +187,7 @@ def answer_of(document: dict) -> Row:
         "effective": None if not importance else importance["effective_share"] * importance["draws"],
         "least_ess": (importance.get("least_ess") or {}).get("value"),
         "heaviest_share": importance.get("heaviest_share"),
-        "problems": importance.get("missing") or document.get("problems") or [error["message"]] * bool(error),
+        "problems": importance.get("missing") or document.get("problems") or ([error["message"]] if error else []),
     }
 
 
