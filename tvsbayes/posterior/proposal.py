@@ -88,7 +88,10 @@ class Target:
 
     def valued(self, w: np.ndarray, normal: np.ndarray) -> Valued:
         """The same, with draws of the errors at places from standard normal numbers (n, e)."""
-        found = self.path.mapped(w)
+        return self.at(self.path.mapped(w), normal)
+
+    def at(self, found: Mapped, normal: np.ndarray) -> Valued:
+        """The same of points that are mapped already."""
 
         def value_and_errors(z: np.ndarray, normal: np.ndarray) -> tuple[jax.Array, jax.Array]:
             seen = evaluate(z, normal, self.fit.space, self.fit.arrays)
