@@ -25,7 +25,7 @@ from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_
 from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, held_by, search_stages
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
-from tvsbayes.instrument.homing import ANYWHERE, Sides, homed, prior_chance, unrecorded
+from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
 from tvsbayes.instrument.places import PLACES_MAX, line_share, seen_places

@@ -296,7 +296,8 @@ def lacking(pareto: float, heaviest: float, draws: int, errors: Mapping[str, Mon
     if not pareto < limit:
         missing.append(f"the weights of importance sampling have Pareto k {pareto:.2f}, wanted below {limit:.2f}")
     if not heaviest <= HEAVIEST_MAX:
-        missing.append(f"one draw holds {100 * heaviest:.1f} % of the weight, wanted at most {100 * HEAVIEST_MAX:.0f} %")
+        wanted = f"wanted at most {100 * HEAVIEST_MAX:.0f} %"
+        missing.append(f"one draw holds {100 * heaviest:.1f} % of the weight, {wanted}")
     return (*missing, *uncertain(errors))
 
 
@@ -333,9 +334,7 @@ class ImportanceRun:
         return self.pool.w[np.argsort(-keys)[:count]]
 
 
-def importance_run(
-    fit: JointFit, seed: int, advance: Advance = unshown, rounds_max: int = ROUNDS_MAX
-) -> ImportanceRun:
+def importance_run(fit: JointFit, seed: int, advance: Advance = unshown, rounds_max: int = ROUNDS_MAX) -> ImportanceRun:
     """Draw rounds until the answer is accepted; where that would take too long, from a proposal fitted anew.
 
     Args:

@@ -203,9 +203,7 @@ def answer_lines(summary: FitSummary) -> list[str]:
     if summary.converged:
         worst = max(summary.monte_carlo_error.items(), key=lambda each: each[1].rounds_factor)
         ends = " and ".join(f"{each:.2f}" for each in worst[1].interval95)
-        lines.append(
-            f"Monte Carlo error, largest: {worst[1].mean:.2f} sd of the mean, {ends} sd of the interval's ends ({worst[0]})"
-        )
+        lines.append(f"largest Monte Carlo error: {worst[1].mean:.2f} sd of the mean, {ends} of the ends ({worst[0]})")
     return [*lines, f"what helps: {'fit without --quick' if quick else 'fit with --resume and more --max-minutes'}"]
 
 

@@ -134,8 +134,8 @@ def levenberg_marquardt(
 
 
 NEIGHBOUR_STEPS, NEIGHBOUR_SETTLED = 8, 0.01
-"""Newton steps to a mode beside a known one, and the squared length of one, in posterior sds, after which the next would
-change the log density by less than a thousandth."""
+"""Newton steps to a mode beside a known one, and the squared length of one, in posterior sds, after which the next
+would change the log density by less than a thousandth."""
 
 
 @dataclass(frozen=True)
