@@ -98,6 +98,7 @@ class Stereo:
 
     `D1`, `D2` are k1 k2 p1 p2 k3. `parameter_covariance` orders the 24 parameters as
     `STEREO_PARAMETER_NAMES` (rotation as Rodrigues vector, rad; translation in mm).
+    Where it is `assumed`, `assumed_from` says from what.
     """
 
     image_width: int
@@ -111,6 +112,7 @@ class Stereo:
     parameter_covariance: np.ndarray
     rms_px: float
     assumed: bool = False
+    assumed_from: str = ""
 
     @property
     def vector(self) -> np.ndarray:
@@ -174,8 +176,9 @@ def rotation_vector(matrix: np.ndarray) -> np.ndarray:
 
 _STEREO_KEYS = (
     *("format", "image_width", "image_height", "M1", "D1", "M2", "D2", "R", "T"),
-    *("parameter_covariance", "rms_px", "assumed"),
+    *("parameter_covariance", "rms_px", "assumed", "assumed_from"),
 )
+_ORIGIN_CHARS_MAX = 400
 _ENTRY_MAX = 1e12
 _ROTATION_TOLERANCE = 1e-6
 _EIGENVALUE_TOLERANCE = 1e-8
@@ -275,6 +278,7 @@ def parse_stereo(data: bytes, file: str) -> Stereo:
         parameter_covariance=covariance,
         rms_px=keys.number("rms_px", 0.0, 1e4),
         assumed="assumed" in keys and keys.flag("assumed"),
+        assumed_from=keys.text_value("assumed_from", _ORIGIN_CHARS_MAX) if "assumed_from" in keys else "",
     )
 
 
@@ -300,6 +304,8 @@ def stereo_bytes(stereo: Stereo) -> bytes:
     lines = []
     for key in _STEREO_KEYS:
         value = "tvsbayes-stereo/1" if key == "format" else getattr(stereo, key)
+        if key == "assumed_from" and not value:
+            continue
         if isinstance(value, np.ndarray) and value.ndim == 2:
             rows = ",\n  ".join(json.dumps(row) for row in value.tolist())
             lines.append(f' "{key}": [\n  {rows}]')
