@@ -2,8 +2,9 @@
 
 A calibration's covariance is sigma^2 times the inverse of the information of its views. The cameras are those of the
 file; the boards stand as people place them (`data/reference/board_poses.csv`, measured on public sets). The information
-of a view is the average over those poses, board poses being nuisances (Schur complement). Frames of `bundle_adjustment`:
-board to left camera in OpenCV's axes, x_right = R x_left + T; mm, rad, px; the order of `STEREO_PARAMETER_NAMES`.
+of a view is the average over the poses of a set, poses being nuisances (Schur complement). Frames of
+`bundle_adjustment`: board to left camera in OpenCV's axes, x_right = R x_left + T; mm, rad, px; the parameters in the
+order of `STEREO_PARAMETER_NAMES`.
 """
 
 from __future__ import annotations
@@ -20,14 +21,15 @@ from tvsbayes.errors import InputError, refusal
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, rotation_vector
 
-CORRELATED = 1.3
-"""Factor on every sd that independent corners give. Perfect boards with independent errors need 1, the two public sets
-1.3 and 2.5 (experiments/cameras/assumed_covariance.md)."""
-GUESS_FACTOR = 1.6
-"""How well all sds together are known, as a factor: between perfect boards and those sets."""
-USUAL_RMS_PX, USUAL_VIEWS, USUAL_BOARD = 0.3, 15, (9, 6)
-"""Where nothing is stated. The public sets have 0.09 and 0.20 px of 11 and 13 views; simulated corners of 0.05 to 0.3 px
-give 0.07 to 0.42 px."""
+CORRELATED = 1.1
+"""Factor on every sd that independent corners give."""
+GUESS_FACTOR = 2.0
+"""How well all sds together are known, as a factor: errors of simulated calibrations are 0.5 to 1.3 of what is made up
+from RMS, views and board, halves of two public sets differ by 1.0 to 1.7 of it, focal lengths to T
+(experiments/cameras/assumed_covariance.md)."""
+USUAL_RMS_PX, USUAL_VIEWS, USUAL_BOARD = 0.3, 12, (9, 6)
+"""Where nothing is stated. The public sets have 0.09 and 0.20 px of 11 and 13 views; corners that scatter by 0.05 to
+0.3 px give 0.07 to 0.42 px. Errors are then 0.2 to 0.9 of what is made up, halves 0.3 to 0.9."""
 USUAL_PITCH_MM, USUAL_PITCH_SHARE = 25.0, 1e-3
 """Side of a square, and its relative standard uncertainty: bumblebee2's baseline differs from its other calibration by
 0.13 %."""
@@ -80,7 +82,7 @@ class Known:
     u_baseline_mm: float | None = None
 
 
-_USUAL = Known(USUAL_RMS_PX, USUAL_VIEWS, USUAL_BOARD, USUAL_PITCH_MM)
+_SOURCES = ("stated", "of the file", "usual")
 _ADJUSTED = {False: "all in one adjustment", True: "each camera by itself", None: "in one adjustment or one by one"}
 
 
@@ -89,37 +91,34 @@ def with_assumed_covariance(stereo: Stereo, stated: Known, of_file: Known) -> St
 
     Args:
         stereo: any covariance of it is ignored.
-        stated: by the user; it goes before
-        of_file: what the file says; and that before what is usual.
+        stated: by the user.
+        of_file: what the file says, used where nothing is stated; what it does not say either is as usual.
 
     Raises:
         InputError: values that no board or calibration has, or cameras that see no board together.
     """
-    used, words = {}, []
-    for name, text in (
-        ("rms_px", "RMS {:g} px"),
-        ("views", "{} views"),
-        ("board", "a board of {0[0]}x{0[1]} corners"),
-        ("pitch_mm", "squares of {:g} mm"),
-    ):
-        sources = ((stated, "stated"), (of_file, "of the file"), (_USUAL, "usual"))
-        value, source = next((v, said) for known, said in sources if (v := getattr(known, name)) is not None)
-        used[name] = value
+    words = []
+
+    def of[T](text: str, *values: T | None) -> T:
+        value, source = next((v, said) for v, said in zip(values, _SOURCES, strict=True) if v is not None)
         words.append(f"{text.format(value)} ({source})")
+        return value
+
+    rms_px = of("RMS {:.3g} px", stated.rms_px, of_file.rms_px, USUAL_RMS_PX)
+    views = of("{} views", stated.views, of_file.views, USUAL_VIEWS)
+    columns, rows = of("a board of {0[0]}x{0[1]} corners", stated.board, of_file.board, USUAL_BOARD)
+    pitch_mm = of("squares of {:g} mm", stated.pitch_mm, None, USUAL_PITCH_MM)
     # A stated pitch is exact unless its uncertainty is stated too, as for pictures.
-    usual_u_mm = 0.0 if stated.pitch_mm is not None else USUAL_PITCH_SHARE * used["pitch_mm"]
-    pitch_u_mm = usual_u_mm if stated.pitch_u_mm is None else stated.pitch_u_mm
-    board = Board(*used["board"], used["pitch_mm"], pitch_u_mm)
+    usual_u_mm = 0.0 if stated.pitch_mm is not None else USUAL_PITCH_SHARE * pitch_mm
+    board = Board(columns, rows, pitch_mm, usual_u_mm if stated.pitch_u_mm is None else stated.pitch_u_mm)
     fixed = of_file.fixed_intrinsics if stated.fixed_intrinsics is None else stated.fixed_intrinsics
     words.append(_ADJUSTED[fixed])
-    covariance = calibration_covariance(stereo, board, used["views"], used["rms_px"], fixed)
+    covariance = calibration_covariance(stereo, board, views, rms_px, fixed)
     for name, group, sds in _stated_sds(stereo, stated):
         covariance = with_marginal(covariance, group, sds)
         words.append(f"u of {name} (stated)")
     origin = ", ".join(words)
-    return replace(
-        stereo, parameter_covariance=covariance, rms_px=used["rms_px"], assumed=True, assumed_from=origin
-    )
+    return replace(stereo, parameter_covariance=covariance, rms_px=rms_px, assumed=True, assumed_from=origin)
 
 
 def calibration_covariance(
@@ -151,8 +150,10 @@ def calibration_covariance(
 
 
 def with_marginal(covariance: np.ndarray, group: list[int], sds: np.ndarray) -> np.ndarray:
-    """The covariance in which the parameters of a group have these sds; their correlations stay, and so does the
-    conditional distribution of all others given them (Jeffrey's rule)."""
+    """The covariance in which the parameters of a group have these sds.
+
+    Their correlations stay, and so does the conditional distribution of all others given them (Jeffrey 1965).
+    """
     others = np.setdiff1d(np.arange(len(covariance)), group)
     own = covariance[np.ix_(group, group)]
     factor = sds / np.sqrt(np.diag(own))
@@ -182,13 +183,16 @@ def _stated_sds(stereo: Stereo, stated: Known) -> list[tuple[str, list[int], np.
 
 
 def _of_one_view(stereo: Stereo, board: Board, fixed_intrinsics: bool | None) -> np.ndarray:
-    """Covariance (24, 24) of one view, corners of 1 px: the mean over the people of the table and over the ways in
-    which they may have adjusted, the covariance of a mixture whose members have one mean."""
+    """Covariance (24, 24) of one view, corners of 1 px.
+
+    The mean over the sets of the table and over the ways in which people may have adjusted: the covariance of a mixture
+    whose members have one mean.
+    """
     made = []
     for poses in placed_boards(stereo, board).values():
         views = [view_information(stereo, board, pose) for pose in poses]
         if len(views) >= PLACED_MIN:
-            together, alone = (sum(parts) / len(views) for parts in zip(*views, strict=True))
+            together, alone = (np.mean(parts, axis=0) for parts in zip(*views, strict=True))
             if fixed_intrinsics is not True:
                 made.append(_inverse(together))
             if fixed_intrinsics is not False:
@@ -223,7 +227,7 @@ def _unseen() -> InputError:
         file="the imported calibration",
         found="two cameras that do not see one board together",
         allowed="cameras whose pictures overlap",
-        remedy="look at R, T and the image size: is R from right to left, T in another unit, the size of other pictures?",
+        remedy="look at R, T and the image size: is R that of right to left, is the size that of other pictures?",
     )
 
 
@@ -291,13 +295,15 @@ def placed_boards(stereo: Stereo, board: Board) -> dict[str, list[np.ndarray]]:
     centre = -stereo.R.T @ stereo.T / 2
     size = np.array([stereo.image_width, stereo.image_height], float)
     focal = float(np.mean([m[k, k] for m in (stereo.M1, stereo.M2) for k in (0, 1)]))
+    # From the optical axis to the middle of the pictures, px.
+    middle = (size - 1) / 2 - (stereo.M1[:2, 2] + stereo.M2[:2, 2]) / 2
     diagonal = np.hypot(board.columns - 1, board.rows - 1) * board.pitch_mm
     found: dict[str, list[np.ndarray]] = {name: [] for name in names.tolist()}
     for name, row in zip(names.tolist(), table, strict=True):
         turn = rotation_vector(half.T @ rotation_matrix(row[3:]))
         depth = focal * diagonal / (row[2] * np.hypot(*size))
         for pull in TOWARDS_MIDDLE:
-            along = np.append(pull * row[:2] * size / focal, 1.0)
+            along = np.append((pull * row[:2] * size + (1 - pull) * middle) / focal, 1.0)
             shifts = (half.T @ (factor * depth * along) + centre for factor in NEARER_OR_FARTHER)
             seen = next((shift for shift in shifts if _sees_whole(stereo, board, turn, shift)), None)
             if seen is not None:

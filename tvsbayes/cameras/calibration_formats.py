@@ -1,6 +1,7 @@
 """Stereo calibrations of other tools: OpenCV's YAML and JSON, ROS camera_info, Kalibr camchains; and `stereo.json`.
 
-None of these formats carries an uncertainty. An import therefore gets `assumed_covariance` and `assumed = true`.
+None of these formats carries an uncertainty. An import therefore gets the covariance of `assumed_covariance` and
+`assumed = true`.
 Lengths in `Stereo` are mm; ROS and Kalibr write metres, OpenCV whatever unit the squares had.
 """
 
@@ -8,17 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from tvsbayes.cameras.assumed_covariance import GUESS_FACTOR, Known, with_assumed_covariance
 from tvsbayes.cameras.calibration_yaml import MATRIX_TAG, YAML_BYTES_MAX, parse_yaml
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import Keys, parse_json
 from tvsbayes.instrument.stereo_pair import (
+    ASSUMED_REMEDY,
     Stereo,
     pair_doubts,
     parse_stereo,
@@ -31,16 +34,17 @@ ROTATION_TOLERANCE = 1e-3
 """R from a file of few digits may miss a rotation by this much; the nearest rotation is taken."""
 SHORTEST_MM = 1.0
 M_TO_MM = 1000.0
-ASSUMED_FOCAL = 0.01
-"""Standard uncertainty of fx, fy, cx, cy over the focal length."""
-ASSUMED_RADIAL = (0.04, 0.15, 0.15)
-"""Standard uncertainty of the share of k1, k2, k3 in a corner's distance from the image centre."""
-ASSUMED_TANGENTIAL = 0.003
-"""Standard uncertainty of p1 and p2, as a share of that distance."""
-ASSUMED_ROTATION_RAD = 0.01
-ASSUMED_TRANSLATION = 0.02
-"""Standard uncertainty of each component of T over |T|."""
-ASSUMED_RMS_PX = 0.5
+RMS_PX_MAX, VIEWS_MAX = 20.0, 100_000
+NOTHING_KNOWN = Known()
+_MADE_BY = {
+    **dict.fromkeys(("rms", "rms_px", "rms_error", "stereo_rms", "reprojection_error"), "rms_px"),
+    **dict.fromkeys(("avg_reprojection_error", "reprojectionerror", "reprojection_rms", "ret", "retval"), "rms_px"),
+    **dict.fromkeys(("views", "n_views", "num_views", "nframes", "nr_of_frames", "num_images"), "views"),
+    **dict.fromkeys(("board_width", "board_columns", "board_cols"), "columns"),
+    **dict.fromkeys(("board_height", "board_rows"), "rows"),
+}
+"""Keys, in small letters, under which files say how they were made, and what each is in `Known`. The pitch is left out:
+its unit is not known."""
 Format = Literal["opencv", "ros"]
 _OPENCV_KEYS = ("M1", "M2", "R", "T")
 EXPORT_NAMES: dict[Format, tuple[str, str]] = {
@@ -67,13 +71,16 @@ class Imported:
     warnings: tuple[str, ...]
 
 
-def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None, *, unit_mm: float = 1.0) -> Imported:
+def read_calibration(
+    paths: Sequence[Path], size: tuple[int, int] | None = None, *, unit_mm: float = 1.0, stated: Known = NOTHING_KNOWN
+) -> Imported:
     """A stereo calibration from the files of another tool, or from `stereo.json`.
 
     Args:
         paths: OpenCV: one file or two; ROS: both cameras' camera_info; Kalibr: one camchain; `stereo.json`.
         size: image width and height, px, where the files do not tell (OpenCV).
         unit_mm: unit of OpenCV's T, mm.
+        stated: how it was made, and how uncertain it is: for the covariance that no such file has.
 
     Raises:
         InputError: unreadable, unknown or contradictory.
@@ -83,6 +90,11 @@ def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None,
     files = [_keys(path, data, name) for path, data, name in zip(paths, contents, names, strict=True)]
     if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json" and not _by_opencv(files[0]):
         stereo = parse_stereo(contents[0], names[0])
+        if stated != NOTHING_KNOWN:
+            if not stereo.assumed:
+                remedy = "leave out --rms-px, --views, --board, --pitch-mm, --u-...: they are for files without one"
+                raise refusal("usage", file=names[0], found="its own covariance", allowed="no other", remedy=remedy)
+            stereo = with_assumed_covariance(stereo, stated, NOTHING_KNOWN)
         return Imported(stereo, "tvsbayes", (), pair_doubts(stereo))
     if any("cam0" in keys for keys in files):
         if len(files) != 1:
@@ -99,8 +111,30 @@ def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None,
         allowed = "OpenCV's M1 D1 M2 D2 R T, ROS camera_info of both cameras, a Kalibr camchain, stereo.json"
         remedy = "a pair needs R and T between its cameras: calibrate both together"
         raise refusal("format", file=names[0], found=found, allowed=allowed, remedy=remedy)
-    notes.append("its uncertainty is assumed, and pessimistic: calibrate from pictures for a true one")
+    way = {"ros": True, "kalibr": False}.get(source)
+    stereo = with_assumed_covariance(stereo, stated, _made_by(files, way))
+    good_to = f"all its sds together are good to a factor of {GUESS_FACTOR:g}"
+    notes.append(f"the file has no covariance: assumed from {stereo.assumed_from}; {good_to}")
+    notes.append(f"for a better one {ASSUMED_REMEDY}")
     return Imported(stereo, source, tuple(notes), pair_doubts(stereo))
+
+
+def _made_by(files: Sequence[Keys], fixed_intrinsics: bool | None) -> Known:
+    """What files say of how they were made."""
+    values: dict[str, float] = {}
+    for keys in files:
+        for key, value in keys.values.items():
+            name = _MADE_BY.get(key.lower())
+            if name is not None and isinstance(value, int | float) and not isinstance(value, bool) and value > 0:
+                values.setdefault(name, value)
+    columns, rows = values.get("columns", 0), values.get("rows", 0)
+    views = values.get("views", 0.0)
+    return Known(
+        rms_px=values["rms_px"] if values.get("rms_px", math.inf) <= RMS_PX_MAX else None,
+        views=int(views) if 3 <= views <= VIEWS_MAX else None,
+        board=(int(columns), int(rows)) if 3 <= columns <= 100 and 3 <= rows <= 100 else None,
+        fixed_intrinsics=fixed_intrinsics,
+    )
 
 
 def _keys(path: Path, data: bytes, name: str) -> Keys:
@@ -144,25 +178,6 @@ def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
         }
         files[file] = _ros_text(name, size, matrices)
     return files
-
-
-def assumed_covariance(stereo: Stereo) -> np.ndarray:
-    """A pessimistic covariance (24, 24) for a calibration that came without one: independent parameters.
-
-    Standard uncertainties: 1 % of the focal length for fx, fy, cx, cy; for k1, k2, k3 what moves an image corner by
-    4, 15 and 15 % of its distance from the centre, for p1 and p2 by 0.3 %; 10 mrad for each component of R, 2 % of
-    |T| for each component of T. In every direction of parameter space this is more than the covariance of 13 views
-    at 640 x 480 (OpenCV's own pairs), errors shared by the corners of a picture included.
-    """
-    sds = []
-    for matrix in (stereo.M1, stereo.M2):
-        focal = matrix[[0, 1], [0, 1]]
-        corner = math.hypot(stereo.image_width / 2 / focal[0], stereo.image_height / 2 / focal[1])
-        k1, k2, k3 = (share / corner**power for share, power in zip(ASSUMED_RADIAL, (2, 4, 6), strict=True))
-        p = ASSUMED_TANGENTIAL / corner
-        sds += [*(ASSUMED_FOCAL * focal), *(ASSUMED_FOCAL * focal), k1, k2, p, p, k3]
-    sds += [ASSUMED_ROTATION_RAD] * 3 + [ASSUMED_TRANSLATION * float(np.linalg.norm(stereo.T))] * 3
-    return np.diag(np.square(sds))
 
 
 @dataclass(frozen=True)
@@ -304,11 +319,10 @@ def _kalibr(files: Sequence[Keys]) -> tuple[Stereo, list[str]]:
 def _stereo(
     size: tuple[int, int], left: _Camera, right: _Camera, rotation: np.ndarray, translation_mm: np.ndarray
 ) -> Stereo:
-    """Checked as `stereo.json` is, with the assumed covariance."""
+    """Checked as `stereo.json` is; without a covariance."""
     inner = left.matrix, left.distortion, right.matrix, right.distortion
-    bare = Stereo(*size, *inner, rotation, translation_mm, np.zeros((24, 24)), ASSUMED_RMS_PX, assumed=True)
-    checked = parse_stereo(stereo_bytes(bare), "the imported calibration")
-    return replace(checked, parameter_covariance=assumed_covariance(checked))
+    bare = Stereo(*size, *inner, rotation, translation_mm, np.zeros((24, 24)), 0.0, assumed=True)
+    return parse_stereo(stereo_bytes(bare), "the imported calibration")
 
 
 def _opencv_text(matrices: Mapping[str, np.ndarray], numbers: Mapping[str, int]) -> bytes:

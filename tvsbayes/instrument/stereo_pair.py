@@ -179,6 +179,11 @@ _STEREO_KEYS = (
     *("parameter_covariance", "rms_px", "assumed", "assumed_from"),
 )
 _ORIGIN_CHARS_MAX = 400
+ASSUMED_REMEDY = (
+    "calibrate from pictures (`tvsbayes stereo FOLDER`), or import again with --rms-px, --views, --board, --pitch-mm, "
+    "--joint or --fixed-intrinsics, or with --u-focal-percent, --u-principal-px, --u-rotation-mrad, --u-baseline-mm"
+)
+"""What gives a pair whose covariance is assumed a better one."""
 _ENTRY_MAX = 1e12
 _ROTATION_TOLERANCE = 1e-6
 _EIGENVALUE_TOLERANCE = 1e-8
