@@ -54,7 +54,10 @@ def stereo(
     robust: Annotated[bool, typer.Option("--robust", help="Leave out outlying views, by name.")] = False,
     image_size: Annotated[str | None, typer.Option("--image-size", help="1280x720, where imports lack it.")] = None,
     import_unit: Annotated[
-        str | None, typer.Option("--import-unit", help="mm (default) or m: unit of an imported OpenCV T.")
+        str | None, typer.Option("--import-unit", help="mm, cm or m: unit of an imported T.")
+    ] = None,
+    key: Annotated[
+        list[str] | None, typer.Option("--key", help="M1=NAME: what holds M1, D1, M2, D2, R or T; repeatable.")
     ] = None,
     rms_px: Annotated[
         float | None, typer.Option("--rms-px", help="RMS of an imported calibration, as OpenCV gives it.")
@@ -73,9 +76,9 @@ def stereo(
     as_json: Json = False,
 ) -> None:
     """Calibrate the camera pair from checkerboard pictures. With the covariance of all 24 parameters; or import one."""
-    words = (export, ("opencv", "ros")), (finder, ("classic", "sector")), (import_unit, ("mm", "m"))
+    words = (export, ("opencv", "ros")), (finder, ("classic", "sector")), (import_unit, ("mm", "cm", "m"))
     if odd := [escaped(str(value)) for value, allowed in words if value not in (None, *allowed)]:
-        remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm or m"
+        remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm, cm or m"
         raise InputError("usage", f"{', '.join(odd)}: no option of stereo takes this value", remedy=remedy)
     if (folder is None) == (not imports):
         found = "stereo needs pictures of a board, or a calibration to import"
@@ -92,9 +95,10 @@ def stereo(
         refuse_options("for pictures of a board", "leave out --import", **options)
         _positive(rms_px=rms_px, **uncertainties)
         known = _known(board, pitch_mm, pitch_u_mm, made_by)
-        made = _imported(imports or [], image_size, import_unit, known)
+        made = _imported(imports or [], image_size, import_unit, known, _named_keys(key))
     else:
         given = {"image_size": image_size, "import_unit": import_unit, "joint": fixed_intrinsics is False}
+        given |= {"key": key or None}
         refuse_options("for --import", "leave it out: pictures tell it", **given, **made_by)
         pattern = _board(board, pitch_mm, pitch_u_mm or 0.0)
         from tvsbayes.cameras.stereo_calibration import calibrate_folder
@@ -170,17 +174,31 @@ def _known(
     return Known(board=size, pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, **made_by)  # type: ignore[arg-type]
 
 
-def _imported(paths: list[Path], image_size: str | None, import_unit: str | None, known: Known) -> MadePair:
+def _named_keys(keys: list[str] | None) -> dict[str, str]:
+    """Fields with the names that hold them, of --key."""
+    found = {}
+    for text in keys or []:
+        field, _, name = text.partition("=")
+        if field not in ("M1", "D1", "M2", "D2", "R", "T") or not name:
+            remedy = "write --key M1=NAME, with M1, D1, M2, D2, R or T"
+            raise InputError("usage", f"--key {escaped(text, 80)}: no such name", remedy=remedy)
+        found[field] = name
+    return found
+
+
+def _imported(
+    paths: list[Path], image_size: str | None, import_unit: str | None, known: Known, keys: Mapping[str, str]
+) -> MadePair:
     """A calibration of another tool, or of ours."""
-    from tvsbayes.cameras.calibration_formats import read_calibration
+    from tvsbayes.cameras.calibration_formats import UNITS_MM, read_calibration
     from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
     from tvsbayes.report.command_text import stereo_text
 
-    unit_mm = {"mm": 1.0, "m": 1000.0}[import_unit or "mm"]
-    found = read_calibration(paths, _image_size(image_size), unit_mm=unit_mm, stated=known)
-    if found.source != "opencv":
-        reason, remedy = f"for files of OpenCV, and this is one of {found.source}", "leave it out: this file tells it"
-        refuse_options(reason, remedy, image_size=image_size, import_unit=import_unit)
+    unit_mm = None if import_unit is None else UNITS_MM[import_unit]
+    found = read_calibration(paths, _image_size(image_size), unit_mm=unit_mm, stated=known, keys=keys)
+    if found.source == "tvsbayes":
+        options = {"image_size": image_size, "import_unit": import_unit, "key": keys or None}
+        refuse_options("for files of other programs", "leave it out: this file tells it", **options)
     remarks = [*(f"note: {note}" for note in found.notes), *(f"warning: {warning}" for warning in found.warnings)]
     pair = found.stereo
     sds = [float(variance) ** 0.5 for variance in pair.parameter_covariance.diagonal()]
