@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from tvsbayes.cameras.assumed_covariance import Known, with_assumed_covariance
-from tvsbayes.cameras.calibration_formats import exported, read_calibration
 from tvsbayes.cameras.calibration_containers import read_container
+from tvsbayes.cameras.calibration_export import exported
+from tvsbayes.cameras.calibration_formats import read_calibration
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.stereo_pair import Stereo, pair_doubts, read_stereo, rotation_matrix, stereo_bytes

@@ -51,10 +51,10 @@ def read_container(data: bytes, file: str) -> Keys:
                 raise bad(file, None, "a damaged file", "write it again with its program") from e
             return Keys(_plain(values, file), file, "")
     text = decode(data, file)
-    begin = text.lstrip()[:1]
-    if begin == "<":
+    first = text.lstrip()[:1]
+    if first == "<":
         return Keys(_plain(_xml(text, file), file), file, "")
-    if begin == "{":
+    if first == "{":
         return parse_json(data, file)
     if re.search(r"^\s*\[[\w.\"-]+\]\s*(#.*)?$|^\s*[\w.-]+\s*=", text, re.MULTILINE) and not text.startswith("%YAML"):
         return parse_toml(data, file)

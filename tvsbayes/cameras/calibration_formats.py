@@ -12,12 +12,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from tvsbayes.cameras.assumed_covariance import GUESS_FACTOR, Known, with_assumed_covariance
-from tvsbayes.cameras.calibration_containers import CONTAINER_BYTES_MAX, MATRIX_TAG, read_container
+from tvsbayes.cameras.calibration_containers import CONTAINER_BYTES_MAX, read_container
 from tvsbayes.cameras.calibration_names import Entry, Found
 from tvsbayes.cameras.lens_models import ERROR_MAX_PX, FISHEYE, FIVE, RATIONAL, fitted_to_five
 from tvsbayes.errors import InputError, escaped, refusal
@@ -50,12 +49,6 @@ _MADE_BY = {
 }
 """Keys, in small letters, under which files say how they were made, and what each is in `Known`. The pitch is left out:
 its unit is not known."""
-Format = Literal["opencv", "ros"]
-EXPORT_NAMES: dict[Format, tuple[str, str]] = {
-    "opencv": ("intrinsics.yml", "extrinsics.yml"),
-    "ros": ("left.yaml", "right.yaml"),
-}
-"""The files of an export."""
 SIDE_NAMES = ("left", "right")
 
 
@@ -148,7 +141,8 @@ class _Reader:
 
     def __init__(self, found: Found, size: tuple[int, int] | None, unit_mm: float | None):
         self.found, self.stated_size, self.unit_mm = found, size, unit_mm
-        self.source, self.notes = "opencv", []
+        self.source = "opencv"
+        self.notes: list[str] = []
         self.places: dict[str, str] = {}
 
     def pair(self) -> Stereo:
@@ -210,47 +204,45 @@ class _Reader:
     def _distortion(self, side: int, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """k1 k2 p1 p2 k3, fitted where the file has another model."""
         camera, model = self.found.cameras[side], self.found.model(side)
-        entry = camera.get("D") or camera.get("radial")
-        if "D" not in camera and "radial" in camera:
-            radial = camera["radial"].numbers
-            tangential = camera["tangential"].numbers if "tangential" in camera else np.zeros(2)
-            values = np.array([*radial[:2], *tangential, *(radial[2:] if radial.size == 3 else [0.0])])
-        elif entry is not None:
-            values = entry.numbers
-        else:
-            single = {k: camera.get(f"coefficient_{k}") for k in ("k1", "k2", "p1", "p2", "k3")}
-            values = np.array([0.0 if one is None else float(one.numbers[0]) for one in single.values()])
-            entry = next((one for one in single.values() if one is not None), None)
-            if entry is None:
-                rectified = "M" not in camera and "fx" not in camera
-                if not rectified and f"D{side + 1}" not in self.places:
-                    raise self.found.missing([f"D{side + 1}"])
-                return np.zeros(5)
+        found = self._coefficients(camera)
+        if found is None:
+            if {"M", "fx"} & set(camera):
+                raise self.found.missing([f"D{side + 1}"])
+            return np.zeros(5)
+        values, entry = found
         self.places[f"D{side + 1}"] = entry.place
         fisheye = model in FISHEYE
         if not fisheye and model not in (*FIVE, *RATIONAL, ""):
-            allowed, remedy = "five coefficients (plumb_bob, radtan)", "calibrate the pair again with that model"
-            raise entry.refuse(
-                "lens-model", allowed, f"{remedy}; renaming it makes wrong rays", f"the model {escaped(model, 40)}"
-            )
-        if values.size <= 5 or not values[5:].any():
-            if not fisheye:
-                return np.append(values[:5], np.zeros(max(0, 5 - values.size)))
+            remedy = "calibrate the pair again with five coefficients; renaming the model makes wrong rays"
+            raise entry.refuse("lens-model", "plumb_bob, radtan or rational", remedy, f"the model {escaped(model, 40)}")
+        if not fisheye and not values[5:].any():
+            return np.append(values[:5], np.zeros(max(0, 5 - values.size)))
         if fisheye and values.size != 4:
-            raise entry.refuse(
-                "lens-model", "four coefficients", "take the file as it was", f"{values.size} of a fisheye"
-            )
+            found_here = f"{values.size} of a fisheye"
+            raise entry.refuse("lens-model", "four coefficients", "take the file as it was", found_here)
         fitted = fitted_to_five(matrix, values, size, fisheye)
         what = "a fisheye lens" if fisheye else f"a lens of {values.size} coefficients"
         if not fitted.error_px <= ERROR_MAX_PX:
-            off = (
-                f"by up to {fitted.error_px:.2g} px" if math.isfinite(fitted.error_px) else "by more than any fit tells"
-            )
+            off = f"up to {fitted.error_px:.2g} px" if math.isfinite(fitted.error_px) else "more than any fit tells"
             allowed = f"what k1 k2 p1 p2 k3 describe to {ERROR_MAX_PX:g} px over the picture"
             remedy = "do not rename the model: calibrate again with five coefficients, or crop the pictures"
-            raise entry.refuse("lens-model", allowed, remedy, f"{what}, which five coefficients miss {off}")
+            raise entry.refuse("lens-model", allowed, remedy, f"{what}, which five coefficients miss by {off}")
         self.notes.append(f"{entry.place}: {what}, fitted to five coefficients within {fitted.error_px:.2g} px")
         return fitted.distortion
+
+    @staticmethod
+    def _coefficients(camera: Mapping[str, Entry]) -> tuple[np.ndarray, Entry] | None:
+        """Coefficients in OpenCV's order and where they stand: of one entry, of MATLAB's two, of single numbers."""
+        if "D" in camera:
+            return camera["D"].numbers, camera["D"]
+        if "radial" in camera:
+            radial = camera["radial"].numbers
+            tangential = camera["tangential"].numbers if "tangential" in camera else np.zeros(2)
+            return np.array([*radial[:2], *tangential, *radial[2:]]), camera["radial"]
+        single = [camera.get(f"coefficient_{name}") for name in ("k1", "k2", "p1", "p2", "k3")]
+        some = [entry for entry in single if entry is not None]
+        values = np.array([0.0 if entry is None else float(entry.numbers[0]) for entry in single])
+        return (values, some[0]) if some else None
 
     def _size(self, matrices: Sequence[np.ndarray]) -> tuple[int, int]:
         """The size of the pictures, the same for both cameras."""
@@ -356,8 +348,8 @@ class _Reader:
             cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
             def by_essential(r: np.ndarray) -> float:
-                found, norm = cross @ r, np.linalg.norm
-                return 1 - abs(float(np.sum(essential * found))) / float(norm(essential) * norm(found))
+                one, two = (e / np.linalg.norm(e) for e in (essential, cross @ r))
+                return float(min(np.abs(one - two).max(), np.abs(one + two).max()))
 
             others.append(by_essential)
         for off in others:
@@ -454,57 +446,3 @@ def _made_by(files: Sequence[Keys], fixed_intrinsics: bool | None) -> Known:
         board=(int(columns), int(rows)) if 3 <= columns <= 100 and 3 <= rows <= 100 else None,
         fixed_intrinsics=fixed_intrinsics,
     )
-
-
-def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
-    """Files by name for another tool; none of them keeps the covariance.
-
-    `opencv`: `intrinsics.yml` (M1 D1 M2 D2, image size) and `extrinsics.yml` (R T R1 R2 P1 P2 Q) of the stereo
-    sample, mm. `ros`: `left.yaml` and `right.yaml`, camera_info, metres.
-    """
-    import cv2
-
-    size = (stereo.image_width, stereo.image_height)
-    # alpha = 0: only pixels that both cameras have, as ROS' calibrator and OpenCV's sample do by default.
-    R1, R2, P1, P2, Q, *_ = cv2.stereoRectify(
-        stereo.M1, stereo.D1, stereo.M2, stereo.D2, size, stereo.R, stereo.T.reshape(3, 1), alpha=0
-    )
-    if form == "opencv":
-        inner = {"M1": stereo.M1, "D1": stereo.D1[None], "M2": stereo.M2, "D2": stereo.D2[None]}
-        outer = {"R": stereo.R, "T": stereo.T[:, None], "R1": R1, "R2": R2, "P1": P1, "P2": P2, "Q": Q}
-        sizes = {"image_width": size[0], "image_height": size[1]}
-        return dict(zip(EXPORT_NAMES[form], (_opencv_text(inner, sizes), _opencv_text(outer, {})), strict=True))
-    files = {}
-    cameras = (("left", stereo.M1, stereo.D1, R1, P1), ("right", stereo.M2, stereo.D2, R2, P2))
-    for file, (name, matrix, distortion, turn, projection) in zip(EXPORT_NAMES[form], cameras, strict=True):
-        in_metres = np.array(projection, float)
-        in_metres[:, 3] /= UNITS_MM["m"]
-        matrices = {
-            "camera_matrix": matrix,
-            "distortion_coefficients": distortion[None],
-            "rectification_matrix": turn,
-            "projection_matrix": in_metres,
-        }
-        files[file] = _ros_text(name, size, matrices)
-    return files
-
-
-def _opencv_text(matrices: Mapping[str, np.ndarray], numbers: Mapping[str, int]) -> bytes:
-    """OpenCV's YAML 1.0 of 2-D matrices: 4.x and 5.x read it alike."""
-    lines = ["%YAML:1.0", "---", *(f"{key}: {value}" for key, value in numbers.items())]
-    for key, matrix in matrices.items():
-        rows, cols = matrix.shape
-        data = ", ".join(map(repr, map(float, matrix.ravel())))
-        lines += [f"{key}: {MATRIX_TAG}", f"   rows: {rows}", f"   cols: {cols}", "   dt: d", f"   data: [ {data} ]"]
-    return ("\n".join(lines) + "\n").encode()
-
-
-def _ros_text(name: str, size: tuple[int, int], matrices: Mapping[str, np.ndarray]) -> bytes:
-    lines = [f"image_width: {size[0]}", f"image_height: {size[1]}", f"camera_name: {name}"]
-    for key, matrix in matrices.items():
-        if key == "distortion_coefficients":
-            lines.append("distortion_model: plumb_bob")
-        rows, cols = matrix.shape
-        data = ", ".join(map(repr, map(float, matrix.ravel())))
-        lines += [f"{key}:", f"  rows: {rows}", f"  cols: {cols}", f"  data: [{data}]"]
-    return ("\n".join(lines) + "\n").encode()

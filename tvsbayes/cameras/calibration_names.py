@@ -83,7 +83,7 @@ def _table() -> dict[tuple[str, int], list[tuple[str, str]]]:
     """Field and side by name and count; the side "" is none."""
     found: dict[tuple[str, int], list[tuple[str, str]]] = {}
     for field, (counts, words) in FIELDS.items():
-        names = {(word, "") for word in words.split()}
+        names = {(f"{mark}{word}", "") for word in words.split() for mark in _MARKS}
         if field in OF_CAMERA:
             for word in words.split():
                 for side in (*SIDES, "0", "1", "2"):
@@ -137,6 +137,8 @@ def numbers_of(value: Any) -> tuple[np.ndarray, tuple[int, ...]] | None:
     if isinstance(value, Mapping):
         rows, cols = value.get("rows", value.get("Rows")), value.get("cols", value.get("Cols"))
         inner = numbers_of(value.get("data", value.get("Data")))
+        if inner is not None and "sizes" in value:
+            return inner[0], (inner[0].size,)
         if inner is None or not isinstance(rows, int) or not isinstance(cols, int) or rows * cols != inner[0].size:
             if set(value) == {"x", "y", "z"}:
                 return numbers_of([value["x"], value["y"], value["z"]])
@@ -205,9 +207,7 @@ class Found:
         self.cameras: tuple[dict[str, Entry], dict[str, Entry]] = ({}, {})
         self.twice: list[tuple[Entry, Entry]] = []
         sided = [(entry, *meaning) for entry in self.entries for meaning in meanings(entry)]
-        numbers = {
-            side for entry, field, side in sided if side.isdigit() and field in ("M", "D", "size", "fx", "to_body")
-        }
+        numbers = {side for _, _, side in sided if side.isdigit()}
         first = 0 if "0" in numbers or not numbers else 1
         # Files of one camera each hold entries without a side: the first named is the left one.
         alone = len(files) == 2 and all(self._whole(sided, k) for k in range(2))
@@ -253,7 +253,7 @@ class Found:
                 "usage",
                 file=self.files[0].file,
                 found=f"--key {field}={escaped(name, 60)}: {found}",
-                allowed=f"one of {listed(map(escaped, paths[:NAMES_LISTED]), NAMES_LISTED)}",
+                allowed=f"one of {listed([escaped(path, 40) for path in paths], NAMES_LISTED)}",
                 remedy=closest(name[:80], paths) if paths else "name a file that holds numbers",
             )
         return some[0]
@@ -269,16 +269,10 @@ class Found:
                 remedy="name the other camera's file too: --import LEFT --import RIGHT; R and T need pictures of both",
             )
         unknown = [entry.path for entry in self.entries if not meanings(entry) and entry.numbers.size > 1]
-        there = (
-            listed([escaped(path, 40) for path in unknown[:NAMES_LISTED]], NAMES_LISTED)
-            if unknown
-            else "no other numbers"
-        )
-        remedy = (
-            f"name what holds it: --key {wanted[0]}=NAME"
-            if unknown
-            else "a pair needs M D of both cameras and R T between them: name the other file too, or calibrate both together"
-        )
+        there = listed([escaped(path, 40) for path in unknown], NAMES_LISTED) if unknown else "no other numbers"
+        remedy = "a pair needs M D of both cameras and R T between them: name the other file too"
+        if unknown:
+            remedy = f"name what holds it: --key {wanted[0]}=NAME"
         return refusal(
             "missing-key",
             file=", ".join(keys.file for keys in self.files),

@@ -13,17 +13,11 @@ import numpy as np
 
 from tvsbayes.instrument.stereo_pair import distort
 
-FIVE = (
-    "plumb_bob",
-    "plumb bob",
-    "radtan",
-    "radial-tangential",
-    "radial_tangential",
-    "radialtangential",
-    "brown_conrady",
+FIVE: tuple[str, ...] = (
+    *("plumb_bob", "plumb bob", "radtan", "radial-tangential", "radial_tangential", "radialtangential", "standard"),
+    *("brown", "brown_conrady", "brown-conrady", "brown conrady", "distortion.brown_conrady", "opencv", "none"),
+    *("inverse_brown_conrady", "modified_brown_conrady", "pinhole", "perspective"),
 )
-FIVE += ("brown", "brown-conrady", "brown conrady", "opencv", "distortion.brown_conrady", "inverse_brown_conrady")
-FIVE += ("modified_brown_conrady", "none", "standard", "pinhole", "perspective")
 RATIONAL = ("rational_polynomial", "rational", "rational polynomial", "thin_prism", "tilted")
 FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "kannalabrandt8", "kannala_brandt8", "equi")
 GRID = 25

@@ -23,7 +23,7 @@ from tvsbayes.pipeline import compile_for
 if TYPE_CHECKING:
     from tvsbayes.cameras.assumed_covariance import Known
     from tvsbayes.cameras.boards import Board, Finder
-    from tvsbayes.cameras.calibration_formats import Format
+    from tvsbayes.cameras.calibration_export import Format
     from tvsbayes.instrument.stereo_pair import Stereo
 
 IMAGE_SIDE_MAX = 65_535
@@ -40,7 +40,7 @@ def stereo(
     imports: Annotated[
         list[Path] | None,
         typer.Option(
-            "--import", help="File of OpenCV, ROS or Kalibr, or stereo.json, instead of pictures; repeatable."
+            "--import", help="Calibration of another program, or stereo.json, instead of pictures; repeatable."
         ),
     ] = None,
     export: Annotated[str | None, typer.Option("--export", help="opencv or ros: also for these, beside -o.")] = None,
@@ -97,8 +97,12 @@ def stereo(
         known = _known(board, pitch_mm, pitch_u_mm, made_by)
         made = _imported(imports or [], image_size, import_unit, known, _named_keys(key))
     else:
-        given = {"image_size": image_size, "import_unit": import_unit, "joint": fixed_intrinsics is False}
-        given |= {"key": key or None}
+        given = {
+            "image_size": image_size,
+            "import_unit": import_unit,
+            "joint": fixed_intrinsics is False,
+            "key": bool(key),
+        }
         refuse_options("for --import", "leave it out: pictures tell it", **given, **made_by)
         pattern = _board(board, pitch_mm, pitch_u_mm or 0.0)
         from tvsbayes.cameras.stereo_calibration import calibrate_folder
@@ -126,7 +130,7 @@ class MadePair:
 
 def _new_files(out: Path | None, export: Format | None) -> dict[str, Path]:
     """Where the pair is to be written, by kind; refused before pictures are read, which takes minutes."""
-    from tvsbayes.cameras.calibration_formats import EXPORT_NAMES
+    from tvsbayes.cameras.calibration_export import EXPORT_NAMES
 
     beside = Path() if out is None else out.parent
     places = {} if out is None else {"stereo": out}
@@ -214,7 +218,7 @@ def _imported(
 
 def _write_pair(made: MadePair, places: dict[str, Path], export: Format | None, as_json: bool) -> None:
     """Write a pair where it was asked for, and say so."""
-    from tvsbayes.cameras.calibration_formats import exported
+    from tvsbayes.cameras.calibration_export import exported
     from tvsbayes.instrument.stereo_pair import write_stereo
 
     contents = {} if export is None else exported(made.stereo, export)

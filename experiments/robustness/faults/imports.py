@@ -99,14 +99,6 @@ FAULTS = (
         ("files/foreign_table",),
     ),
     Fault(
-        "OpenCV's JSON taken for our own",
-        "cameras/calibration_formats.py",
-        'return "format" not in keys and any(isinstance(keys.values.get(key), dict) for key in _OPENCV_KEYS)',
-        "return False",
-        "a calibration of OpenCV is refused for missing keys of ours",
-        ("cameras/calibration_formats::test_what_opencv_writes_as_json_is_read",),
-    ),
-    Fault(
         "millimetres taken for metres",
         "instrument/stereo_pair.py",
         "if baseline_mm > LONGEST_BASELINE_MM:",
