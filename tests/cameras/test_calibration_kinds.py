@@ -203,6 +203,84 @@ def test_tables_of_cameras_and_other_extrinsics(mounted, tmp_path):
         same(read_calibration([path], unit_mm=unit_mm).stereo, mounted)
 
 
+ROS2 = """header:
+  stamp:
+    sec: 1
+    nanosec: 5
+  frame_id: {side}
+height: {height}
+width: {width}
+distortion_model: {model}
+d:
+{d}
+k:
+{k}
+r:
+{r}
+p:
+{p}
+binning_x: 0
+roi:
+  x_offset: 0
+  height: 0
+  width: 0
+  do_rectify: false
+---
+"""
+
+
+def test_messages_of_ros_2_and_old_orb_slam_settings(mounted, tmp_path):
+    """`ros2 topic echo`: small letters, lists in lines, a separator at the end; LEFT.K ... with P in metres."""
+    size = mounted.image_width, mounted.image_height
+    pair = mounted.M1, mounted.D1, mounted.M2, mounted.D2
+    r1, r2, p1, p2, *_ = map(
+        np.array, cv2.stereoRectify(*pair, size, mounted.R, mounted.T[:, None] / 1000, alpha=0)[:4]
+    )
+    paths, slam = [], ["%YAML:1.0"]
+    for side, (k, d, r, p) in {"left": (*pair[:2], r1, p1), "right": (*pair[2:], r2, p2)}.items():
+        # As drivers of five coefficients publish it: the rational model's name, a tail of zeros.
+        lines = {
+            name: "\n".join(f"- {value!r}" for value in map(float, a.ravel()))
+            for name, a in {"d": np.append(d, [0, 0, 0]), "k": k, "r": r, "p": p}.items()
+        }
+        text = ROS2.format(side=side, width=size[0], height=size[1], model="rational_polynomial", **lines)
+        (tmp_path / f"{side}.yaml").write_text(text)
+        paths.append(tmp_path / f"{side}.yaml")
+        slam += [f"{side.upper()}.width: {size[0]}", f"{side.upper()}.height: {size[1]}"]
+        for name, value in {"K": k, "D": d[None], "R": r, "P": p}.items():
+            data = ", ".join(map(repr, map(float, value.ravel())))
+            slam += [
+                f"{side.upper()}.{name}: !!opencv-matrix",
+                f"   rows: {len(value)}",
+                f"   cols: {value.shape[1]}",
+                "   dt: d",
+                f"   data: [{data}]",
+            ]
+    found = read_calibration(paths)
+    same(found.stereo, mounted)
+    assert found.source == "ros" and "each camera by itself" in found.stereo.assumed_from
+    (tmp_path / "EuRoC.yaml").write_text("\n".join([*slam, "Camera.fx: 435.2", "Camera.bf: 47.9"]))
+    with pytest.raises(InputError, match="--import-unit m "):
+        read_calibration([tmp_path / "EuRoC.yaml"])
+    same(read_calibration([tmp_path / "EuRoC.yaml"], unit_mm=1000.0).stereo, mounted)
+
+
+def test_bouguets_toolbox_and_caliscope(mounted, tmp_path):
+    """KK_left, kc_left, om beside R; a TOML of cameras with their poses in the world, metres."""
+    turn = rotation_vector(mounted.R)
+    document = {"KK_left": mounted.M1, "kc_left": mounted.D1[:, None], "KK_right": mounted.M2, "kc_right": mounted.D2}
+    document |= {"om": turn, "R": mounted.R, "T": mounted.T, "nx": mounted.image_width, "ny": mounted.image_height}
+    scipy.io.savemat(tmp_path / "Calib_Results_stereo.mat", document)
+    same(read_calibration([tmp_path / "Calib_Results_stereo.mat"]).stereo, mounted)
+    lines = []
+    for k, (m, d) in enumerate(((mounted.M1, mounted.D1), (mounted.M2, mounted.D2))):
+        lines += [f"[cam_{k}]", f"port = {k}", f"size = [{mounted.image_width}, {mounted.image_height}]", "error = 0.2"]
+        lines += [f"matrix = {m.tolist()}", f"distortions = {d.tolist()}"]
+        lines += [f"rotation = {(k * turn).tolist()}", f"translation = {(k * mounted.T / 1000).tolist()}"]
+    (tmp_path / "config.toml").write_text("\n".join(lines))
+    same(read_calibration([tmp_path / "config.toml"], unit_mm=1000.0).stereo, mounted)
+
+
 def test_matlab_structures(mounted, tmp_path):
     """Transposed intrinsics and rotation, rows before columns in the image size, RMS as usual."""
     cameras = [

@@ -43,8 +43,8 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
     "camera_R": ((9, 3), "rotation rvec rotationvector"),
     "camera_T": ((3,), "translation tvec translationvector"),
     "size": ((2,), "size resolution imagesize imgsize imagesizewh imageshape"),
-    "width": ((1,), "width imagewidth imgwidth w sizex"),
-    "height": ((1,), "height imageheight imgheight h sizey"),
+    "width": ((1,), "width imagewidth imgwidth w sizex nx"),
+    "height": ((1,), "height imageheight imgheight h sizey ny"),
     "fx": ((1,), "fx intrinsicsfx"),
     "fy": ((1,), "fy intrinsicsfy"),
     "cx": ((1,), "cx ppx intrinsicscx intrinsicsppx"),
@@ -76,6 +76,8 @@ SIDES = {"left": 0, "right": 1, "l": 0, "r": 1, "first": 0, "second": 1}
 """Words for the camera; numbers count from 0 where one is 0, else from 1."""
 _MARKS = ("cam", "camera", "cameraparameters", "sensor", "")
 _SIDED = re.compile(r"left|right|first|second|[0-9]|l|r")
+_OTHER_TABLES = {"roi", "region_of_interest", "header"}
+"""Tables whose sizes and numbers are of other things."""
 MODEL_NAMES = ("distortionmodel", "distmodel", "cameratype", "cameramodel", "model", "lensmodel", "distortiontype")
 
 
@@ -179,6 +181,8 @@ def _bare(name: str) -> str:
 def meanings(entry: Entry) -> list[tuple[str, str]]:
     """Fields and sides that an entry may be, by the longest part of its path that is a name."""
     parts = (*entry.keys.path, entry.key)
+    if _OTHER_TABLES & set(parts):
+        return []
     for count in range(min(4, len(parts)), 0, -1):
         found = _NAMES.get((_bare("".join(parts[-count:])), entry.numbers.size))
         if found:
@@ -239,9 +243,12 @@ class Found:
         return any(e.file == file and field in ("M", "fx") and not side for e, field, side in sided)
 
     def _keep(self, into: dict[str, Entry], field: str, entry: Entry) -> None:
-        if field in into and not np.array_equal(into[field].numbers, entry.numbers):
-            self.twice.append((into[field], entry))
-        into.setdefault(field, entry)
+        there = into.get(field)
+        if there is None or (there.numbers.size == 3 and entry.numbers.size == 9):
+            # Of a rotation's vector and its matrix, the matrix.
+            into[field] = entry
+        elif there.numbers.size == entry.numbers.size and not np.array_equal(there.numbers, entry.numbers):
+            self.twice.append((there, entry))
 
     def _named(self, field: str, name: str) -> Entry:
         """The entry that a user named."""
