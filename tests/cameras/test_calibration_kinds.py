@@ -299,6 +299,22 @@ def test_matlab_structures(mounted, tmp_path):
     assert found.source == "matlab" and any("rows, columns" in note for note in found.notes)
 
 
+def test_one_file_each_and_one_between_them(mounted, tmp_path):
+    """In any order: names of files tell the cameras, R and T stand in the third or in the right one's."""
+    size = {"image_width": mounted.image_width, "image_height": mounted.image_height}
+    between = {"R": mounted.R.tolist(), "T": mounted.T.tolist()}
+    cameras = (("left", mounted.M1, mounted.D1), ("right", mounted.M2, mounted.D2))
+    for name, m, d in cameras:
+        own = {"camera_matrix": m.tolist(), "distortion_coefficients": d.tolist(), **size}
+        (tmp_path / f"{name}.json").write_text(json.dumps(own))
+    (tmp_path / "between.json").write_text(json.dumps(between))
+    for order in (("left", "right", "between"), ("between", "right", "left")):
+        same(read_calibration([tmp_path / f"{name}.json" for name in order]).stereo, mounted)
+    right = json.loads((tmp_path / "right.json").read_text())
+    (tmp_path / "right.json").write_text(json.dumps(right | between))
+    same(read_calibration([tmp_path / "right.json", tmp_path / "left.json"]).stereo, mounted)
+
+
 def test_a_rectified_pair_alone(mounted, tmp_path):
     """P of both without anything else: the rectified pair triangulates to what the raw one does."""
     size = mounted.image_width, mounted.image_height
@@ -376,6 +392,8 @@ def mistaken(mounted: Stereo) -> dict[str, tuple[dict[str, object], str]]:
             "another rotation",
         ),
         "R no rotation": ({**good, "R": (2 * mounted.R).tolist()}, "misses it by"),
+        "R in degrees": ({**good, "R": [0.0, 5.0, 1.0]}, "is it in degrees?"),
+        "omnidirectional": ({**good, "camera_model": "omni"}, "the model omni"),
         "T missing": (without_t, "no T under a name that is known"),
         "T zero": ({**good, "T": [0, 0, 0]}, "cameras in one place"),
         "T in metres": ({**good, "T": (mounted.T / 1000).tolist()}, "--import-unit m "),

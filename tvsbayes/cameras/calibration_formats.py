@@ -17,7 +17,7 @@ import numpy as np
 
 from tvsbayes.cameras.assumed_covariance import GUESS_FACTOR, Known, with_assumed_covariance
 from tvsbayes.cameras.calibration_containers import CONTAINER_BYTES_MAX, read_container
-from tvsbayes.cameras.calibration_names import Entry, Found
+from tvsbayes.cameras.calibration_names import ROTATION_TOLERANCE, Entry, Found
 from tvsbayes.cameras.lens_models import ERROR_MAX_PX, FISHEYE, FIVE, RATIONAL, fitted_to_five
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import read_bytes
@@ -28,13 +28,9 @@ from tvsbayes.instrument.stereo_pair import (
     Stereo,
     pair_doubts,
     parse_stereo,
-    rotation_matrix,
-    rotation_vector,
     stereo_bytes,
 )
 
-ROTATION_TOLERANCE = 1e-3
-"""R from a file of few digits may miss a rotation by this much; the nearest rotation is taken."""
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 BASELINES_MM = (20.0, 3000.0)
 """Cameras of one bench stand so far apart; what is outside is asked, not taken."""
@@ -80,7 +76,7 @@ def read_calibration(
     """A stereo calibration from the files of another program, or from `stereo.json`.
 
     Args:
-        paths: one file of a pair, or two: of both cameras, or of what is inside and between them.
+        paths: one file of a pair, or two or three: of each camera, of what is inside and between them.
         size: image width and height, px, where the files do not tell.
         unit_mm: unit of lengths, mm; None: as the format has it, and asked for where the baseline is implausible.
         stated: how it was made, and how uncertain it is: for the covariance that no such file has.
@@ -100,9 +96,9 @@ def read_calibration(
                 raise refusal("usage", file=names[0], found="its own covariance", allowed="no other", remedy=remedy)
             stereo = with_assumed_covariance(stereo, stated, NOTHING_KNOWN)
         return Imported(stereo, "tvsbayes", (), pair_doubts(stereo))
-    if len(files) > 2:
-        found = f"{len(files)} files"
-        raise refusal("usage", file=names[0], found=found, allowed="one or two", remedy="name those of one pair")
+    if len(files) > 3:
+        found, allowed = f"{len(files)} files", "one, two or three"
+        raise refusal("usage", file=names[0], found=found, allowed=allowed, remedy="name those of one pair")
     reader = _Reader(Found(files, keys or {}), size, unit_mm)
     bare = reader.pair()
     doubts = pair_doubts(bare, reader.places)
@@ -152,6 +148,8 @@ class _Reader:
                 "twice", "every quantity once", "name it: --key M1=NAME", f"another under {second.place}"
             )
         self._exchange()
+        for side in (0, 1):
+            self._check_model(side)
         matrices = [self._matrix(side) for side in (0, 1)]
         size = self._size(matrices)
         left, right = (_Camera(m, self._distortion(side, m, size)) for side, m in enumerate(matrices))
@@ -160,6 +158,18 @@ class _Reader:
         inner = left.matrix, left.distortion, right.matrix, right.distortion
         bare = Stereo(*size, *inner, rotation, translation, np.zeros((24, 24)), 0.0, assumed=True)
         return parse_stereo(stereo_bytes(bare), "the imported calibration")
+
+    def _check_model(self, side: int) -> None:
+        """Refuses a lens model that nothing here converts."""
+        model = self.found.model(side)
+        if model not in (*FIVE, *RATIONAL, *FISHEYE, ""):
+            raise refusal(
+                "lens-model",
+                file=", ".join(keys.file for keys in self.found.files),
+                found=f"the model {escaped(model, 40)} of the {SIDE_NAMES[side]} camera",
+                allowed="plumb_bob, radtan, rational or equidistant",
+                remedy="calibrate the pair again with five coefficients; renaming the model makes wrong rays",
+            )
 
     def _exchange(self) -> None:
         """Files of one camera in the other order: the left projection alone has no shift."""
@@ -212,9 +222,6 @@ class _Reader:
         values, entry = found
         self.places[f"D{side + 1}"] = entry.place
         fisheye = model in FISHEYE
-        if not fisheye and model not in (*FIVE, *RATIONAL, ""):
-            remedy = "calibrate the pair again with five coefficients; renaming the model makes wrong rays"
-            raise entry.refuse("lens-model", "plumb_bob, radtan or rational", remedy, f"the model {escaped(model, 40)}")
         if not fisheye and not values[5:].any():
             return np.append(values[:5], np.zeros(max(0, 5 - values.size)))
         if fisheye and values.size != 4:
@@ -287,14 +294,14 @@ class _Reader:
         turn = pair.get("R") or pair.get("R_transposed")
         if turn is not None and "T" in pair:
             self.places |= {"R": turn.place, "T": pair["T"].place}
-            rotation = _rotation(turn)
+            rotation = turn.rotation()
             by_columns = turn.numbers.size == 9 and turn.shape == (9,) and _named(left.get("cx"), "ppx")
             if "R" not in pair or by_columns:
                 rotation, self.source = rotation.T, "matlab" if "R" not in pair else "realsense"
             return self._consistent(rotation, turn), pair["T"].numbers
         if (entry := pair.get("pose") or pair.get("pose_backwards")) is not None:
             self.places |= {"R": entry.place, "T": entry.place}
-            pose = _pose(entry)
+            pose = entry.pose()
             if _named(entry, "tcncnm1"):
                 self.source = "kalibr"
             if "pose" not in pair:
@@ -304,12 +311,12 @@ class _Reader:
             if field in left and field in right:
                 self.source = source
                 self.places |= dict.fromkeys(("R", "T"), right[field].place)
-                one, two = (_pose(camera[field]) for camera in (left, right))
+                one, two = (camera[field].pose() for camera in (left, right))
                 pose = two @ np.linalg.inv(one) if field == "from_body" else np.linalg.inv(two) @ one
                 return pose[:3, :3], pose[:3, 3]
         if all("camera_R" in camera and "camera_T" in camera for camera in (left, right)):
             self.places |= {"R": right["camera_R"].place, "T": right["camera_T"].place}
-            one, two = (_rotation(camera["camera_R"]) for camera in (left, right))
+            one, two = (camera["camera_R"].rotation() for camera in (left, right))
             rotation = two @ one.T
             return rotation, right["camera_T"].numbers - rotation @ left["camera_T"].numbers
         if "P" in left and "P" in right:
@@ -328,7 +335,7 @@ class _Reader:
             allowed = "P[0][3] = 0 in the left camera, -fx baseline in the right one"
             remedy = "take both files from one stereo calibration"
             raise right["P"].refuse("projection", allowed, remedy, "files that are no stereo pair")
-        turns = [_rotation(c["rectification"]) if "rectification" in c else np.eye(3) for c in (left, right)]
+        turns = [c["rectification"].rotation() if "rectification" in c else np.eye(3) for c in (left, right)]
         if "M" not in left and "fx" not in left:
             # The rectified pair itself is what is there.
             turns = [np.eye(3), np.eye(3)]
@@ -340,7 +347,7 @@ class _Reader:
         pair, cameras = self.found.pair, self.found.cameras
         others = []
         if all("rectification" in c for c in cameras) and turn not in (c["rectification"] for c in cameras):
-            one, two = (_rotation(c["rectification"]) for c in cameras)
+            one, two = (c["rectification"].rotation() for c in cameras)
             others.append(lambda r: float(np.abs(two.T @ one - r).max()))
         if "E" in pair:
             essential = pair["E"].numbers.reshape(3, 3)
@@ -404,30 +411,6 @@ def _off(matrix: np.ndarray, size: tuple[int, int]) -> bool:
 def _named(entry: Entry | None, word: str) -> bool:
     """Whether an entry's own key is a word, marks aside."""
     return entry is not None and entry.key.lower().replace("_", "") == word
-
-
-def _pose(entry: Entry) -> np.ndarray:
-    """A homogeneous transformation (4, 4) of 12 or 16 numbers."""
-    pose = np.vstack([entry.numbers[:12].reshape(3, 4), [0, 0, 0, 1.0]])
-    pose[:3, :3] = _nearest(pose[:3, :3], entry)
-    return pose
-
-
-def _rotation(entry: Entry) -> np.ndarray:
-    """A rotation of nine numbers, or of Rodrigues' three."""
-    if entry.numbers.size == 3:
-        return rotation_matrix(entry.numbers)
-    return _nearest(entry.numbers.reshape(3, 3), entry)
-
-
-def _nearest(matrix: np.ndarray, entry: Entry) -> np.ndarray:
-    """The nearest rotation, where the file's digits allow."""
-    deviation = max(np.abs(matrix @ matrix.T - np.eye(3)).max(), abs(np.linalg.det(matrix) - 1.0))
-    if not deviation <= ROTATION_TOLERANCE:
-        allowed = f"R R^T = 1 and det R = +1 to {ROTATION_TOLERANCE:g}"
-        remedy = "take the file as its tool wrote it, or name the right entry: --key R=NAME"
-        raise entry.refuse("rotation", allowed, remedy, f"a matrix that misses it by {deviation:.3g}")
-    return rotation_matrix(rotation_vector(matrix))
 
 
 def _made_by(files: Sequence[Keys], fixed_intrinsics: bool | None) -> Known:

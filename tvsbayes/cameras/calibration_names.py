@@ -8,6 +8,7 @@ coefficient of a lens.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,9 +18,12 @@ import numpy as np
 
 from tvsbayes.errors import InputError, closest, escaped, listed, refusal
 from tvsbayes.files.documents import Keys
+from tvsbayes.instrument.stereo_pair import rotation_matrix, rotation_vector
 
 NAMES_LISTED = 12
 NUMBER_MAX = 1e12
+ROTATION_TOLERANCE = 1e-3
+"""R from a file of few digits may miss a rotation by this much; the nearest rotation is taken."""
 FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
     # Of each camera.
     "M": (
@@ -133,6 +137,29 @@ class Entry:
         """The refusal of these numbers."""
         return self.keys.refuse(self.key, code, allowed, remedy, found)
 
+    def rotation(self) -> np.ndarray:
+        """The rotation (3, 3) of nine numbers, the nearest where the file's digits allow, or of Rodrigues' three."""
+        if self.numbers.size == 3:
+            if np.linalg.norm(self.numbers) > math.pi:
+                found = escaped(str(self.numbers.tolist()), 60)
+                raise self.refuse("rotation", "Rodrigues' vector, rad", "is it in degrees? give R as a matrix", found)
+            return rotation_matrix(self.numbers)
+        return self._nearest(self.numbers.reshape(3, 3))
+
+    def pose(self) -> np.ndarray:
+        """The homogeneous transformation (4, 4) of 12 or 16 numbers."""
+        pose = np.vstack([self.numbers[:12].reshape(3, 4), [0, 0, 0, 1.0]])
+        pose[:3, :3] = self._nearest(pose[:3, :3])
+        return pose
+
+    def _nearest(self, matrix: np.ndarray) -> np.ndarray:
+        deviation = max(np.abs(matrix @ matrix.T - np.eye(3)).max(), abs(np.linalg.det(matrix) - 1.0))
+        if not deviation <= ROTATION_TOLERANCE:
+            allowed = f"R R^T = 1 and det R = +1 to {ROTATION_TOLERANCE:g}"
+            remedy = "take the file as its tool wrote it, or name the right entry: --key R=NAME"
+            raise self.refuse("rotation", allowed, remedy, f"a matrix that misses it by {deviation:.3g}")
+        return rotation_matrix(rotation_vector(matrix))
+
 
 def numbers_of(value: Any) -> tuple[np.ndarray, tuple[int, ...]] | None:
     """Finite numbers and their shape: of a number, of nested lists, of OpenCV's or ROS' rows, cols, data; else None."""
@@ -200,6 +227,14 @@ def _side_of(part: str) -> str:
     return bare if bare in (*SIDES, "0", "1", "2") else ""
 
 
+def _side_in_name(file: str) -> int | None:
+    """The camera that a file's name tells."""
+    for number, pattern in enumerate((r"left|cam(era)?[ _-]?0", r"right|cam(era)?[ _-]?1")):
+        if re.search(pattern, file.lower()):
+            return number
+    return None
+
+
 class Found:
     """Entries of all files by field, those of cameras by field and number (0 left, 1 right)."""
 
@@ -213,19 +248,22 @@ class Found:
         sided = [(entry, *meaning) for entry in self.entries for meaning in meanings(entry)]
         numbers = {side for _, _, side in sided if side.isdigit()}
         first = 0 if "0" in numbers or not numbers else 1
-        # Files of one camera each hold entries without a side: the first named is the left one.
-        alone = len(files) == 2 and all(self._whole(sided, k) for k in range(2))
+        # Files of one camera each hold entries without a side: the first named is the left one, unless names say.
+        whole = [k for k in range(len(files)) if self._whole(sided, k)]
+        alone = len(whole) == 2
+        if alone and [_side_in_name(files[k].file) for k in whole] == [1, 0]:
+            whole.reverse()
         self.by_file = alone
         for entry, field, side in sided:
             if field not in OF_CAMERA:
-                if not (alone and field == "R"):
+                if not (alone and field == "R" and entry.file in whole):
                     self._keep(self.pair, field, entry)
             elif side:
                 number = SIDES[side] if side in SIDES else int(side) - first
                 if number in (0, 1):
                     self._keep(self.cameras[number], field, entry)
-            elif alone:
-                self._keep(self.cameras[entry.file], field, entry)
+            elif alone and entry.file in whole:
+                self._keep(self.cameras[whole.index(entry.file)], field, entry)
             elif field in ("size", "width", "height"):
                 for camera in self.cameras:
                     camera.setdefault(field, entry)
