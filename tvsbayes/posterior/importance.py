@@ -137,7 +137,7 @@ def empty_pool(target: Target, proposal: Independence | None = None) -> Pool:
     """Before the first round: from a proposal, or from the first."""
     path = target.path
     dimension = path.dimension
-    first = proposal or first_proposal(target, dimension, path.heavy, path.coupled, path.pairs)
+    first = proposal or first_proposal(target, dimension, path.heavy, path.coupled)
     errors, nowhere = no_draw(0, target.fit.arrays), Mapped(np.zeros((0, len(path.mode))), np.zeros(0))
     return Pool(np.zeros((0, dimension)), np.zeros(0), errors, nowhere, (), (), first)
 
