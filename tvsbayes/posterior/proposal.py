@@ -447,7 +447,8 @@ def first_proposal(
     leaders = np.setdiff1d(np.arange(len(places)), [follower for _, follower in pairs])
     lines[leaders] = alone[leaders] + gains[leaders]
     conditional = np.reshape([Tables.normalised(each).log_density for each in rows], rows.shape)
-    followers = Followers(*np.reshape(np.array(pairs, dtype=int), (-1, 2)).T, conditional)
+    leader_rows, follower_rows = np.reshape(np.array(pairs, dtype=int), (-1, 2)).T
+    followers = Followers(leader_rows, follower_rows, conditional)
     tables = Tables.normalised(lines)
     mean, sd = np.zeros(dimension), np.full(dimension, INFLATION)
     together, zero = np.flatnonzero(coupled), np.zeros(dimension)
