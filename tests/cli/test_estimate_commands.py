@@ -143,7 +143,7 @@ def test_fit_samples_writes_for_arviz_and_refuses_what_has_not_converged(ask, gr
 
     for module, loose in (
         (ensemble, {"FIRST_CHECK": 40, "BLOCK": 20, "TAU_LIMIT": 1}),
-        (diagnosis, {"ESS_LIMIT": 50, "ESS_LIMIT_OTHERS": 10, "RHAT_LIMIT": 3.0, "TAU_LIMIT": 1}),
+        (diagnosis, {"ESS_LIMIT": 50, "RHAT_LIMIT": 3.0, "TAU_LIMIT": 1}),
         (diagnosis, {"AGREEMENT_LIMIT": 100.0, "STUCK_ACCEPTANCE": 0.0, "STUCK_DEVIATION": 1e9}),
     ):
         for name, value in loose.items():

@@ -14,7 +14,6 @@ from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.posterior.chain import Chain
 from tvsbayes.posterior.diagnosis import AGREEMENT_LIMIT, GROUPS, autocorrelation_steps, diagnose, grouped
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.transport import STRETCH_NODES
 from tvsbayes.results.convergence import Importance, NamedValue, Reweighted
 
 WALKERS, STEPS = 64, 400
@@ -27,7 +26,7 @@ def log_normal_density(z: np.ndarray) -> np.ndarray:
 
 def chain_of(z: np.ndarray) -> Chain:
     """A chain (steps, walkers, 2) of z as the sampler would hold it: w, and the density that `Target` gives it."""
-    log_factor = STRETCH * np.maximum(z[..., 0], STRETCH_NODES[0])
+    log_factor = STRETCH * z[..., 0]
     w = np.stack([z[..., 0], z[..., 1] * np.exp(-log_factor)], axis=-1)
     log_density = -0.5 * np.sum(z**2, axis=-1) + log_factor
     accepted = np.full(z.shape[1], 0.4 * len(z))
