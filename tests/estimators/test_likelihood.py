@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.dense_likelihood import dense_log_density, physical, play_band_deg, stop_labels
+from support.dense_likelihood import dense_log_density, drawn_at_every_move, physical, play_band_deg, stop_labels
 from support.sloped_density import value_and_gradient
 
 from tvsbayes.estimators import likelihood as density
@@ -127,22 +127,7 @@ def test_log_density_adds_the_prior(dozen, evaluate):
 
 def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
     """The mistake formulation 3.1 names: both axes drawn anew at every move."""
-    spots = ordered_spots(dozen.campaign)
-    same_move = np.array([i > 0 and s.move == spots[i - 1].move for i, s in enumerate(spots)])
-    redraw, mix = np.array(dozen.arrays.spots.redraw), np.array(dozen.arrays.spots.redraw_mix)
-    for axis, name in enumerate(("pan", "tilt")):
-        labels = stop_labels(dozen.campaign.moves, name)
-        for i, spot in enumerate(spots):
-            redraw[i, axis] = not same_move[i]
-            directions = labels[spot.move][1]
-            mix[i, axis] = [
-                ("right" in directions) or ("down" in directions),
-                "left" in directions or "up" in directions,
-            ]
-            mix[i, axis] /= mix[i, axis].sum()
-    mistaken = eqx.tree_at(
-        lambda a: (a.spots.redraw, a.spots.redraw_mix), dozen.arrays, (jnp.asarray(redraw), jnp.asarray(mix))
-    )
+    mistaken = drawn_at_every_move(dozen.campaign, dozen.arrays)
     right, wrong = (evaluate(dozen.z, dozen.space, arrays) for arrays in (dozen.arrays, mistaken))
     dense = dense_log_density(dozen.campaign, right, persistent=False)
     assert wrong.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.dense_likelihood import angle_covariances, residual_covariance
+from support.dense_likelihood import angle_covariances, drawn_at_every_move, residual_covariance
 from support.small_posterior import ROUNDING
 from support.varying_gears import PERIODS_DEG, coordinates_with, varying_gears
 
@@ -46,8 +46,7 @@ def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str,
         space = jax.tree.map(jnp.asarray, parameter_space(table, campaign.stereo))
         arrays = jax.tree.map(jnp.asarray, campaign_arrays(campaign, table))
         if redraw:
-            spots = replace(arrays.spots, redraw=jnp.ones_like(arrays.spots.redraw))
-            arrays = replace(arrays, spots=spots)
+            arrays = drawn_at_every_move(campaign, arrays)
         z = coordinates_of(space, physical_at(dozen.z, dozen.space).value)
         z = coordinates_with(space, z, values)
         lin = jax.jit(linearise)(jnp.asarray(z), space, arrays).of_spots(count)
