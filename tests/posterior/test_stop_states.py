@@ -23,7 +23,8 @@ def drawn_states(seed: int) -> StopStates:
     load = np.zeros((SPOTS, 4, len(spans)))
     for column, (end, begin) in enumerate(spans):
         # Some spots see nothing of a state: else those alive together are all coupled, and nothing is filled in.
-        load[begin:end, :, column] = generator.normal(size=(end - begin, 4)) * generator.integers(2, size=(end - begin, 1))
+        sees = generator.uniform(size=(end - begin, 1)) < 0.4
+        load[begin:end, :, column] = sees * generator.normal(size=(end - begin, 4))
     none = np.zeros((len(spans), 4)), np.zeros(len(spans)), np.zeros((len(spans), 2))
     return StopStates(load.reshape(4 * SPOTS, -1), *none)
 

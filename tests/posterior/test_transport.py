@@ -110,7 +110,7 @@ def test_centring_makes_a_curved_ridge_normal():
     # Of z_1 alone: the map keeps the wide coordinate.
     np.testing.assert_array_equal(seen.z[:, path.free[0]], w[:, 0])
     along = ridge_density(seen.z) + seen.log_jacobian - (ridge_density(centre.z) + centre.log_jacobian)
-    # The prior's pull on the narrow one is taken at the mode's slope: it is off by z_2 sd / slope^2 standard deviations.
+    # The prior's pull on the narrow one is taken at the mode's slope: off by z_2 sd / slope^2 standard deviations.
     pull = CURVE * wide**2 * NARROW_SD / (1 - TURN * wide) ** 2
     np.testing.assert_array_less(np.abs(along + 0.5 * w[:, 1] ** 2), (1 + np.abs(w[:, 1])) * pull + 1e-3)
     apart = uncentred(path).mapped(w)
@@ -151,8 +151,7 @@ def test_the_precision_at_other_noise_scales_is_the_smoothers():
         scaled = replace(linear, load=linear.load / pixels, jacobian=linear.jacobian / pixels, variance=variance)
         expected = wide.T @ (np.eye(len(others)) + stop_information(scaled).fisher[np.ix_(others, others)]) @ wide
         factor = path.conditional(held[None]).own[0]
-        # Rows of the map's factor stand in the order of narrowest first. The information spans ten decades in z; in y
-        # it is of order 1.
+        # The map has the narrowest coordinate first. The information spans ten decades in z; in y it is of order 1.
         found = (factor @ factor.T)[::-1, ::-1]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
         assert np.abs(expected - np.eye(len(others))).max() > 0.1, "the scales are those of the mode"

@@ -295,7 +295,8 @@ def lacking(pareto: float, heaviest: float, draws: int, errors: Mapping[str, Mon
     if not pareto < limit:
         missing.append(f"the weights of importance sampling have Pareto k {pareto:.2f}, wanted below {limit:.2f}")
     if not heaviest <= HEAVIEST_MAX:
-        missing.append(f"one draw holds {100 * heaviest:.1f} % of the weight, wanted at most {100 * HEAVIEST_MAX:.0f} %")
+        share = f"one draw holds {100 * heaviest:.1f} % of the weight"
+        missing.append(f"{share}, wanted at most {100 * HEAVIEST_MAX:.0f} %")
     return (*missing, *uncertain(errors))
 
 
