@@ -135,7 +135,7 @@ def test_fit_for_people_names_value_interval_and_origin(say, grid_folder, tmp_pa
 
 
 @pytest.mark.slow
-def test_fit_samples_writes_for_arviz_and_refuses_what_has_not_converged(ask, grid_folder, monkeypatch):
+def test_fit_samples_writes_for_arviz_and_gives_the_better_answer(ask, grid_folder, monkeypatch):
     """The limits are loosened: what is tested is the way from options to files, not convergence."""
     import arviz
 
@@ -166,9 +166,9 @@ def test_fit_samples_writes_for_arviz_and_refuses_what_has_not_converged(ask, gr
 
     monkeypatch.setattr(diagnosis, "ESS_LIMIT", 10**9)
     code, document = ask("fit", grid_folder, "--seed", 2, "--resume", "--max-minutes", "0.01")
-    assert (code, document["estimator"], document["converged"]) == (4, "laplace", False)
-    assert document["error"]["code"] == "unconverged"
-    assert document["sampling"]["steps"] > 40
+    # A chain that ends too soon is a worse answer than that of the weighted draws.
+    assert (code, document["answer"], document["tier"]) == (0, "accepted", "importance")
+    assert document["monte_carlo_error"]["effective_deg_per_step.left"]["mean"] <= 0.1
     code, document = ask("fit", grid_folder, "--seed", 3, "--resume")
     assert (code, document["error"]["code"]) == (2, "other-chain")
 

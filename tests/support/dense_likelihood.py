@@ -71,9 +71,7 @@ def drawn_at_every_move(campaign: Campaign, arrays: CampaignArrays) -> CampaignA
             redraw[i, axis] = i == 0 or spot.move != spots[i - 1].move
             directions = labels[spot.move][1]
             mix[i, axis] = np.array([negative in directions, positive in directions]) / len(directions)
-    return eqx.tree_at(
-        lambda a: (a.spots.redraw, a.spots.redraw_mix), arrays, (jnp.asarray(redraw), jnp.asarray(mix))
-    )
+    return eqx.tree_at(lambda a: (a.spots.redraw, a.spots.redraw_mix), arrays, (jnp.asarray(redraw), jnp.asarray(mix)))
 
 
 def play_band_deg(moves: Sequence[Move], axis: str, values: dict[str, float]) -> np.ndarray:

@@ -333,9 +333,7 @@ class ImportanceRun:
         return self.pool.w[np.argsort(-keys)[:count]]
 
 
-def importance_run(
-    fit: JointFit, seed: int, advance: Advance = unshown, rounds_max: int = ROUNDS_MAX
-) -> ImportanceRun:
+def importance_run(fit: JointFit, seed: int, advance: Advance = unshown, rounds_max: int = ROUNDS_MAX) -> ImportanceRun:
     """Draw rounds until the answer is accepted; where that would take too long, from a proposal fitted anew.
 
     Args:
