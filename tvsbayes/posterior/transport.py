@@ -482,7 +482,7 @@ def transport(fit: JointFit) -> Transport:
     by_noise, by_scatter = STOP_COLUMNS.reshape(4, 1) == noise, SCATTER_COLUMNS.reshape(2, 1) == noise
     places = jax.tree.map(np.asarray, fit.arrays.gears.places)
     seen = np.flatnonzero(places.valid)
-    columns = np.asarray(fit.linearised.place_columns).reshape(-1, 2 * len(places.steps))
+    columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, 2 * len(places.steps))
     half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
     ratio = np.radians([fit.mode.physical[INDEX[name]] for name in names_of("degrees_per_step")])
     spots = len(linear.residual)
