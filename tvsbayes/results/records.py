@@ -69,14 +69,16 @@ class _RecordType(StructMeta, ABCMeta):
 class Record(Struct, frozen=True, metaclass=_RecordType):
     """Base of records; keys that it does not know are passed over.
 
-    `always` names fields that every document holds though the class has defaults for them.
+    `always` names fields that every document holds though the class has defaults for them, `beside` fields that are no
+    part of the document.
     """
 
     always: ClassVar[tuple[str, ...]] = ()
+    beside: ClassVar[tuple[str, ...]] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The document, of plain types."""
-        return plain(self)
+        return {key: value for key, value in plain(self).items() if key not in self.beside}
 
 
 class ClosedRecord(Record, frozen=True, forbid_unknown_fields=True):
@@ -123,7 +125,8 @@ def _meanings(kind: type) -> tuple[str, dict[str, str]]:
     found = {}
     for entry in re.split(r"\n(?! )", inspect.cleandoc(attributes)):
         names, _, meaning = entry.partition(": ")
-        found.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
+        # What is None in Python is null in JSON.
+        found.update(dict.fromkeys(names.split(", "), re.sub(r"\bNone\b", "null", " ".join(meaning.split()))))
     return " ".join(text.split()), found
 
 
@@ -177,8 +180,8 @@ def schema_of(*kinds: type[Record], closed: bool = False, **keys: Any) -> dict[s
     required = list(keys)
     for kind in kinds:
         component = components.pop(kind.__name__)
-        properties |= component["properties"]
-        required += (key for key in component.get("required", ()) if key not in keys)
+        properties |= {key: value for key, value in component["properties"].items() if key not in kind.beside}
+        required += (key for key in component["required"] if key not in (*keys, *kind.beside))
     properties |= keys | dict(zip(named, references[len(kinds) :], strict=True))
     body = {"type": "object", "properties": properties, "required": required, "$defs": components}
     return _alike(_lists(body | ({"additionalProperties": False} if closed else {})))

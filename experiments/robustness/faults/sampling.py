@@ -38,8 +38,8 @@ FAULTS = (
     Fault(
         "degrees of freedom: n for n - p",
         "assessment/summary.py",
-        "dof=observations - determined,",
-        "dof=observations,",
+        "fit_noise(fit.chi2, observations - determined, parameters)",
+        "fit_noise(fit.chi2, observations, parameters)",
         "chi2 over dof looks too good",
         ("assessment/summary::test_dof_counts_spots_less_what_they_determine",),
     ),
