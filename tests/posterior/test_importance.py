@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from msgspec import structs
 from scipy import stats
 from scipy.special import gamma
 from support.small_posterior import SIGMAS, small_fit, small_path
@@ -202,11 +201,11 @@ def test_a_proposal_made_too_narrow_is_not_accepted(sampled, monkeypatch):
 def test_every_limit_is_said(sampled):
     sound = sampled[1].posterior.convergence.importance
     assert lacking(sound) == ()
-    few = structs.replace(sound.least_ess, quantity="backlash_deg.tilt", value=importance.ESS_LIMIT - 0.6)
+    few = replace(sound.least_ess, quantity="backlash_deg.tilt", value=importance.ESS_LIMIT - 0.6)
     for changed, words in (
         ({"pareto_k": 0.71}, "the weights of importance sampling have Pareto k 0.71, wanted below 0.7"),
         (
-            {"worst_pareto_k": structs.replace(few, value=0.9)},
+            {"worst_pareto_k": replace(few, value=0.9)},
             "those of backlash_deg.tilt have Pareto k 0.90, wanted below 0.7",
         ),
         ({"heaviest_share": 0.031}, "one draw holds 3.1 % of the weight, wanted at most 2 %"),
@@ -216,7 +215,7 @@ def test_every_limit_is_said(sampled):
         ),
         ({"pareto_k": np.nan}, "Pareto k nan"),
     ):
-        (sentence,) = lacking(structs.replace(sound, **changed))
+        (sentence,) = lacking(replace(sound, **changed))
         assert words in sentence
 
 

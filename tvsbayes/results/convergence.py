@@ -10,17 +10,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.results.records import ClosedRecord, Count, FromOne, NotNegative
+from tvsbayes.results.records import Count, FromOne, NotNegative
 
 
-class NamedValue(ClosedRecord, frozen=True):
+@dataclass(frozen=True)
+class NamedValue:
     """The extreme of a diagnosis, and the quantity that has it."""
 
     quantity: str
     value: float
 
 
-class Importance(ClosedRecord, frozen=True):
+@dataclass(frozen=True)
+class Importance:
     """Importance sampling: draws and what their weights are worth.
 
     Attributes:
@@ -52,7 +54,8 @@ class Importance(ClosedRecord, frozen=True):
     invalid_evaluations: Count
 
 
-class Agreement(ClosedRecord, frozen=True):
+@dataclass(frozen=True)
+class Agreement:
     """Whether a chain and importance sampling say the same of every headline.
 
     Attributes:
@@ -66,7 +69,8 @@ class Agreement(ClosedRecord, frozen=True):
     worst: NamedValue
 
 
-class Sampling(ClosedRecord, frozen=True):
+@dataclass(frozen=True)
+class Sampling:
     """The diagnosis of a posterior in brief; fields of a chain as in `Convergence`, None where there is no chain.
 
     Attributes:

@@ -119,9 +119,9 @@ def _array_schema(kind: type) -> dict[str, object]:
     return {"type": ["number", "array"]}
 
 
-def _meanings(kind: type) -> tuple[str, dict[str, str]]:
+def _meanings(docstring: str) -> tuple[str, dict[str, str]]:
     """What a docstring says of a class, and what its section "Attributes" says of each field."""
-    text, _, attributes = (inspect.getdoc(kind) or "").partition("\n\nAttributes:\n")
+    text, _, attributes = docstring.partition("\n\nAttributes:\n")
     found = {}
     for entry in re.split(r"\n(?! )", inspect.cleandoc(attributes)):
         names, _, meaning = entry.partition(": ")
@@ -153,14 +153,15 @@ def _alike(schema: Any) -> Any:
     return found | {"items": items[0]}
 
 
-def _described(kind: type[Record], component: dict[str, Any]) -> dict[str, Any]:
-    """What the declaration says of a record besides the types of its fields."""
-    text, meanings = _meanings(kind)
-    properties = component["properties"]
-    for field in msgspec.structs.fields(kind):
-        if field.name in meanings:
-            properties[field.encode_name] |= {"description": meanings[field.name]}
-    return {"description": text, "required": [*component["required"], *kind.always]}
+def _described(component: dict[str, Any], kind: type[Record] | None) -> dict[str, Any]:
+    """A schema with what the declaration says besides the types of the fields; `kind` is None of a dataclass."""
+    text, meanings = _meanings(component.get("description", ""))
+    keys = {} if kind is None else {field.name: field.encode_name for field in msgspec.structs.fields(kind)}
+    for name, meaning in meanings.items():
+        if (key := keys.get(name, name)) in component["properties"]:
+            component["properties"][key] |= {"description": meaning}
+    always = () if kind is None else kind.always
+    return component | {"description": text, "required": [*component["required"], *always]}
 
 
 def schema_of(*kinds: type[Record], closed: bool = False, **keys: Any) -> dict[str, Any]:
@@ -168,14 +169,16 @@ def schema_of(*kinds: type[Record], closed: bool = False, **keys: Any) -> dict[s
 
     Args:
         kinds: records whose fields stand side by side in the document.
-        closed: whether it holds no other key.
+        closed: whether it, and every record in it, holds no other key.
         keys: further keys of the document, or what a field of `kinds` is in this one: a record, or a schema.
     """
     named = {key: kind for key, kind in keys.items() if isinstance(kind, type)}
     references, components = msgspec.json.schema_components((*kinds, *named.values()), schema_hook=_array_schema)
-    for name, kind in _records().items():
-        if name in components:
-            components[name] |= _described(kind, components[name])
+    known = _records()
+    for name, component in components.items():
+        components[name] = _described(component, known.get(name))
+        if closed:
+            components[name]["additionalProperties"] = False
     properties: dict[str, Any] = {}
     required = list(keys)
     for kind in kinds:
