@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import jax
-import msgspec
 import numpy as np
 
 from tvsbayes.errors import NotConverged
@@ -463,5 +462,5 @@ def _joined(parts: Sequence[Posterior], chance: np.ndarray) -> Reweighted:
     errors = monte_carlo_errors(names, weighted_summary(np.concatenate(rows), np.concatenate(weights)))
     unknown, known = uncertain(errors), diagnosis.importance
     if unknown and known.accepted:
-        known = msgspec.structs.replace(known, accepted=False, missing=unknown, answer="rough")
+        known = replace(known, accepted=False, missing=unknown, answer="rough")
     return replace(diagnosis, importance=known, monte_carlo_error=errors)
