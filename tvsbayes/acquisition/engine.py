@@ -103,6 +103,8 @@ class Acquisition:
         self._log = RunLog(journal, rig, bench.utc)
         self._live = live or LiveRun()
         self._control = Control(self._live.requests, bench.positioner, self._stop, self._write_asked, self._publish)
+        if estimate is not None:
+            estimate.meanwhile = self._control.meanwhile
         self.bench = replace(bench, positioner=HeedingPositioner(bench.positioner, self._control))
         self._spot = self._log.next_spot()
 

@@ -148,6 +148,8 @@ class AskedDevice(TypedDict):
 class Asked(TypedDict):
     """What somebody asked of a run while it went on (pause, resume, stop, laser off), once the device had answered.
 
+    `control passed on`: another browser controls, because the one before had not asked for a while.
+
     `number` counts the requests of a run from 1; `time_s` since the campaign was created, when the device had answered.
     """
 

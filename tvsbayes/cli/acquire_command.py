@@ -138,9 +138,6 @@ def _live_page(port: int | None, no_browser: bool) -> Iterator[LiveRun | None]:
     if port is None:
         yield None
         return
-    from tvsbayes.view.contents import LIVE_FILES, Contents, page_files
-
-    files = page_files(LIVE_FILES)
     from tvsbayes.acquisition.live_run import LiveRun
     from tvsbayes.view.live_server import LivePage
 
@@ -153,7 +150,7 @@ def _live_page(port: int | None, no_browser: bool) -> Iterator[LiveRun | None]:
             threading.Thread(target=webbrowser.open, args=(page.link,), daemon=True).start()
 
     run = LiveRun(begun)
-    with LivePage(Contents(files=files), run, port) as page:
+    with LivePage(run, port) as page:
         yield run
 
 
