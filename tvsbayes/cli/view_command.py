@@ -24,9 +24,9 @@ def view(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """One HTML file to look at a campaign: rig in 3D, every look with pictures and residuals.
+    """One HTML file to look at a campaign: rig in 3D, all looks.
 
-    It opens in a browser by a double click, without a network.
+    Every look has its pictures and residuals. A double click opens the file in a browser, without a network.
     """
     folders = [folder for folder in (campaign, beside) if folder is not None]
     for folder in folders:
