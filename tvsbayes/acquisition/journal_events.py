@@ -1,9 +1,9 @@
 """The events of a run's journal, as their JSON objects stand in `log.jsonl`.
 
 `created` opens a journal. Every motion of the plan is an `intent` before, and an order has an event of its own once it
-is done: `homed`, `placed`, `moved`, `looked`. `place_command` is a program that was to place the sheet. `adapted` changes
-the plan, `confirmed` says whether the posterior meets the target, `asked` is what somebody asked for on the live page,
-`verified` closes a segment, `start` and `stop` enclose a run, `gap` stands where a repair lost lines.
+is done: `homed`, `placed`, `moved`, `looked`. `place_command` is a program that was to place the sheet. `adapted`
+changes the plan, `confirmed` says whether the posterior meets the target, `asked` is what somebody asked for on the
+live page, `verified` closes a segment, `start` and `stop` enclose a run, `gap` stands where a repair lost lines.
 Counters in motor steps, raw px, degrees and seconds by suffix; `utc` and `created` are ISO 8601.
 
 A checksum finds accidents, not forgery: who reads an event converts what its entries hold, and refuses what does not
