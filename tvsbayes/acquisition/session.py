@@ -128,7 +128,13 @@ def _running(
 
 def _before(folder: Path) -> Recorded:
     """What an interrupted run has left."""
-    require_journal(folder, "leave --resume out to begin, or name the folder of the interrupted run")
+    remedy = "leave --resume out to begin, or name the folder of the interrupted run"
+    if folder.is_dir() and any(folder.iterdir()):
+        remedy = (
+            f"bring {LOG} back from a backup, or begin in another folder without --resume; what this folder holds can "
+            "still be calibrated"
+        )
+    require_journal(folder, remedy)
     return recorded(read_journal(folder).records)
 
 

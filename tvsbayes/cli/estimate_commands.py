@@ -28,8 +28,12 @@ HOLDING_OUT = "hold-out"
 
 def _warn_of(campaign: Campaign) -> None:
     """What `check` says of data that no rig can have measured, for whoever did not ask it first."""
+    from tvsbayes.acquisition.campaign_files import behind_journal
     from tvsbayes.estimators.plausibility import implausible
 
+    unwritten = "" if campaign.path is None else behind_journal(campaign.path, campaign)
+    if unwritten:
+        report_line(f"warning: {unwritten}")
     for sentence in implausible(campaign):
         report_line(f"warning: {sentence}")
 
