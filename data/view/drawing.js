@@ -23,7 +23,7 @@ function digits(value, sd) {
   if (!Number.isFinite(value)) return "";
   if (!(sd > 0)) return String(Number(value.toPrecision(6)));
   const places = 1 - Math.floor(Math.log10(sd));
-  const text = places > 7
+  const text = places > 6
     ? value.toExponential(Math.max(0, places + Math.floor(Math.log10(Math.abs(value) || sd))))
     : value.toFixed(Math.max(0, places));
   return Number(text) === 0 ? text.replace("-", "") : text;

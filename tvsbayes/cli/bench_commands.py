@@ -187,8 +187,9 @@ def doctor(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Is the instrument fit for a campaign? Nothing moves but with --contract.
+    """Is the instrument fit for a campaign?
 
+    Nothing moves but with --contract.
     Checks ports, firmware, cameras, exposure, focus, laser, timing, disk and the compilation cache.
     """
     if contract and not laser:
