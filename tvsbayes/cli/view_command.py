@@ -40,9 +40,10 @@ def view(
     from tvsbayes.view.pictures import PICTURES_BYTES_MAX, look_pictures
 
     pictures, share = [], PICTURES_BYTES_MAX // len(folders)
-    with waiting() as progress, Job({f"pictures of {folder}": 1.0 for folder in folders}, progress) as job:
-        for folder, one in zip(folders, looked.scenes, strict=True):
-            job.begin(f"pictures of {folder}")
+    stages = ("pictures", "pictures of the second campaign")[: len(folders)]
+    with waiting() as progress, Job(dict.fromkeys(stages, 1.0), progress) as job:
+        for folder, one, stage in zip(folders, looked.scenes, stages, strict=True):
+            job.begin(stage)
             pictures.append(look_pictures(folder, one.looks, share, job.at))
     html = page_html(document(looked, pictures))
     path = out or output_place(campaign, "results") / "view.html"
