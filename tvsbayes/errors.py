@@ -163,7 +163,7 @@ def typed(word: object, limit: int = 200) -> str:
     return shlex.quote(escaped(str(word), limit))
 
 
-def listed(numbers: Sequence[int], most: int) -> str:
+def listed(numbers: Sequence[object], most: int) -> str:
     """The first of them, and how many more there are."""
     more = f" and {len(numbers) - most} more" if len(numbers) > most else ""
     return ", ".join(map(str, numbers[:most])) + more

@@ -5,11 +5,12 @@
     python -m experiments.robustness.mutations table > experiments/robustness/mutations.md
 
 A module is a path such as tvsbayes/statistics/weighted_draws.py; its tests are tests/PACKAGE/test_MODULE.py where no
-others are named. `run` unpacks HEAD into a temporary folder, writes mutmut's settings there, and appends a row. All of
-`PACKAGES` is hours of processor time: modules that JAX compiles are traced and compiled for every mutant anew.
+others are named. `run` unpacks HEAD into a temporary folder, writes mutmut's settings there, and appends a row.
 
 mutmut runs pytest several times in one process, which jaxtyping's import hook refuses: the project's options of pytest
-are left out, and shapes are not checked.
+are left out, and shapes are not checked. It forks for every mutant: a module that JAX compiles is traced and
+compiled anew each time, and a fork that hangs counts as seen by mutmut's time limit (5 of the first 37 mutants of
+`model/laser_path.py` on a busy machine). It reads the syntax of Python 3.13.
 """
 
 from __future__ import annotations
@@ -29,8 +30,6 @@ from experiments.common.rows import ROOT, append_row, commit, output, read_rows
 from experiments.robustness.planted_faults import unpack
 
 ROWS = output(__file__, "mutations.jsonl")
-PACKAGES = ("estimators", "model", "posterior", "single_axis", "statistics")
-"""Those that hold the mathematics."""
 SETTINGS = """[mutmut]
 source_paths=
     tvsbayes
@@ -119,7 +118,15 @@ operator, number, argument or word at a time, and runs the tests that reach the 
 {remarks}
 | module | tests | mutants | seen | survive | reached by none | CPU s | of |
 |---|---|---|---|---|---|---|---|"""
-REMARKS = ""
+REMARKS = """
+The mathematics are `model` (2202 mutants), `estimators` (5653), `posterior` (5269), `single_axis` (6993) and
+`statistics` (1440), counted on 25 November 2026. A mutant of a module without JAX costs 0.1 to 0.2 CPU seconds where
+its tests are fast: `statistics` and `single_axis` are 20 to 140 CPU minutes, by how many of their mutants need a fit. A
+mutant that JAX has to compile costs 3 to 30 CPU seconds: some 2000 CPU minutes for the other three, an estimate.
+
+Survivors of these sorts are left: an order of equal numbers (`kind="stable"`), a bound met with probability zero
+(`>` for `>=`), a type or a default that NumPy has anyway, a constant that cancels, a guard against rounding.
+"""
 
 
 def table(arguments: argparse.Namespace) -> int:

@@ -163,7 +163,7 @@ def table(arguments: argparse.Namespace) -> int:
     print(f", {len(done) - seen} survive, {len(FAULTS) - len(done)} not run;", end=" ")
     minutes = sum(row["seconds"] for row in done) / 60
     print(f"{minutes:.0f} minutes of one process. A fault is planted by name: what", end=" ")
-    print(" a definition returns, takes, reads or checks is changed in its syntax tree.")
+    print("a definition returns, takes, reads or checks is changed in its syntax tree.")
     print("\n| fault | place | change | test that fails | s |\n|---|---|---|---|---|")
     for fault in FAULTS:
         verdict, seconds = "not run", ""

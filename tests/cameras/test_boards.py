@@ -42,6 +42,17 @@ def test_pairs_of_png_and_jpeg_are_found_where_they_are(six_views):
         assert min(misses) < FOUND_PX
 
 
+def test_cameras_of_two_picture_sizes_are_named(tmp_path):
+    """Each camera agrees with itself: the smaller pictures are no odd ones out."""
+    for k, pose in enumerate(POSES[:3]):
+        left, right = pictures(pose)
+        cv2.imwrite(str(tmp_path / f"left{k}.png"), left)
+        cv2.imwrite(str(tmp_path / f"right{k}.png"), right[::2, ::2])
+    width, height = SIZE
+    with pytest.raises(InputError, match=f"two sizes: {width} x {height} and {width // 2} x {height // 2}"):
+        find_views(tmp_path, BOARD)
+
+
 def test_other_files_are_ignored_and_lonely_pictures_named(tmp_path):
     write_pair(tmp_path, "1", pictures(POSES[0]))
     cv2.imwrite(str(tmp_path / "left2.png"), pictures(POSES[1])[0])

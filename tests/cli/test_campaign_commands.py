@@ -51,6 +51,7 @@ def test_check_reads_campaign_rig_and_plan(ask, say):
         "refused": {},
         "aperture_readings": 0,
         "experiments": 96,
+        "findings": [],
         "warnings": [],
     }
     code, document = ask("check", MOUNTED / "rig.toml")

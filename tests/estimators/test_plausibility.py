@@ -171,6 +171,14 @@ def test_mismatched_pictures_are_not_called_swapped(paper_twin):
     assert not any(f.certain for f in implausible(replace(paper_twin, spots=mixed)))
 
 
+def test_swapped_pictures_that_contradict_each_other_are_a_doubt(paper_twin):
+    """Rows 30 px apart fit no pair, exchanged or not."""
+    swapped = corrected(None, paper_twin.spots, Correction(swapped=True)).spots
+    apart = tuple(replace(s, v_right_px=s.v_right_px + 30) for s in swapped)
+    (found,) = implausible(replace(paper_twin, spots=apart))
+    assert (found.code, found.certain) == ("cameras-swapped", False)
+
+
 def test_pixels_that_count_from_one_show_at_the_edge(paper_twin):
     """(0.5, size + 0.5) is where they lie: one beyond the picture may be a spot that the edge cuts, two are none."""
     edge = paper_twin.stereo.image_width - 0.5

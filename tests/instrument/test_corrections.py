@@ -30,12 +30,13 @@ def test_steps_of_moves_are_summed_up_again(twin):
     steps = relative(twin, None)
     assert corrected(steps.moves, steps.spots, Correction(relative=True)).moves == twin.moves
     second = replace(twin.moves[1], segment=1, pan_steps=7)
-    assert corrected((twin.moves[0], second), (), Correction(relative=True)).moves[1].pan_steps == 7
+    first = replace(twin.moves[0], pan_steps=5)
+    assert corrected((first, second), (), Correction(relative=True)).moves[1].pan_steps == 7
 
 
 def test_looks_are_shifted_from_a_spot_on_and_none_is_lost(twin):
-    found = corrected(twin.moves, twin.spots, Correction(shifts=(Shift(1, twin.spots[60].spot),)))
-    assert [b.move - a.move for a, b in zip(twin.spots, found.spots, strict=True)] == [0] * 60 + [1] * 83 + [0]
+    found = corrected(twin.moves, twin.spots, Correction(shifts=(Shift(1, twin.spots[62].spot),)))
+    assert [b.move - a.move for a, b in zip(twin.spots, found.spots, strict=True)] == [0] * 62 + [1] * 81 + [0]
     # Nobody listed a move after the last one.
     last = found.spots[-1]
     assert last.status == f"refused: move {len(twin.moves)} is not listed" and last.u_left_px is not None

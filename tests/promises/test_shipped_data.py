@@ -9,12 +9,12 @@ import tomllib
 import numpy as np
 import pytest
 
-from experiments.inputs import make_twins
+from experiments.inputs import make_schemas, make_twins
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import classic, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import Campaign, read_campaign
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, REGISTRY
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, LOOK_SCATTER_NAMES, REGISTRY
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.instrument.protocols import PROTOCOLS
 from tvsbayes.instrument.rig import Rig, RigTable, read_rig
@@ -119,7 +119,8 @@ def test_twins_state_the_mounted_rig_and_hold_another(name: str):
     stated = {"ratio_contrast_deg_per_step.pan", "ratio_contrast_deg_per_step.tilt", "pixel_scale"}
     allowed_equal = stated if name == "paper_twin" else set()
     equal = {parameter for parameter, z in distances.items() if z == 0}
-    assert equal - set(GEAR_ERROR_NAMES) == allowed_equal, "gears are perfect"
+    perfect = {*GEAR_ERROR_NAMES, *LOOK_SCATTER_NAMES}
+    assert equal - perfect == allowed_equal, "gears are perfect, looks stand still"
     offset = truth.stereo.vector - campaign.stereo.vector
     chi2 = offset @ np.linalg.solve(campaign.stereo.parameter_covariance, offset)
     # Chi-square with 24 degrees of freedom: 99.9 % between 6 and 54.
@@ -216,6 +217,12 @@ def test_make_twins_writes_what_is_shipped():
             # Solved parameters are rounded to seven digits; pixels follow to rounding times 10^6.
             assert one.u_left_px == pytest.approx(other.u_left_px, abs=1e-6)
             assert one.v_right_px == pytest.approx(other.v_right_px, abs=1e-6)
+
+
+def test_schemas_are_those_of_the_records():
+    """Whoever changes a record runs `python -m experiments.inputs.make_schemas`."""
+    shipped = {path.name: path.read_text(encoding="utf-8") for path in (DATA / "schemas").iterdir()}
+    assert shipped == make_schemas.files()
 
 
 def test_truth_file_that_is_none(tmp_path):

@@ -197,7 +197,7 @@ def test_a_schema_has_only_rules_that_are_checked(version):
     """A keyword that JSON Schema does not know would be passed over in silence."""
     schema = schema_of({"format": version})
     Draft202012Validator.check_schema(schema)
-    known = {*Draft202012Validator.VALIDATORS, "$schema", "$id", "$defs", "title", "description"}
+    known = {*Draft202012Validator.VALIDATORS, "$schema", "$id", "$defs", "title", "description", "default"}
 
     def unknown(rules: object) -> set[str]:
         if not isinstance(rules, dict):

@@ -10,9 +10,10 @@ import datetime
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import cast
 
-from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, read_journal, require_journal
+from msgspec import UNSET
+
+from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, event_of, read_journal, require_journal
 from tvsbayes.acquisition.journal_check import repair, verify
 from tvsbayes.acquisition.journal_events import Created
 from tvsbayes.acquisition.recorder import LOST_STEPS, Recorded, Recorder, recorded
@@ -90,10 +91,12 @@ class CampaignFiles:
 
     def _campaign(self) -> Campaign:
         """What the journal holds so far; there has been a homing."""
-        created = cast("Created", self._journal.records[0].data)
-        start = datetime.datetime.fromisoformat(str(created["created"])).astimezone(datetime.UTC)
-        header: dict[str, object] = {"name": str(created.get("name", NAME_ACQUIRED)), "created": start}
-        header |= {name: value for name, value in created.items() if name in ("synthetic", "seed")}
+        created = event_of(self._journal.records[0], Created)
+        assert created is not None
+        start = datetime.datetime.fromisoformat(created.created).astimezone(datetime.UTC)
+        header: dict[str, object] = {"name": NAME_ACQUIRED if created.name is UNSET else created.name, "created": start}
+        stated = {"synthetic": created.synthetic, "seed": created.seed}
+        header |= {name: value for name, value in stated.items() if value is not UNSET}
         return _campaign_of(self._recorder.result(), Campaign((), (), self._rig.stereo, self._rig.table, header))
 
 

@@ -98,14 +98,8 @@ class Control:
 
 def asked_entries(request: Request, state: DeviceState) -> Asked:
     """The event of a request that the device has answered."""
-    device: AskedDevice = {
-        "status": state.status,
-        "laser_on": state.laser_on,
-        "boot": state.boot,
-        "pan_steps": state.pan_steps,
-        "tilt_steps": state.tilt_steps,
-    }
-    return {"number": request.number, "what": request.what, "device": device}
+    device = AskedDevice(state.status, state.laser_on, state.boot, state.pan_steps, state.tilt_steps)
+    return Asked(number=request.number, what=request.what, device=device)
 
 
 def device_text(state: DeviceState) -> str:

@@ -14,9 +14,10 @@ import numpy as np
 from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR, Causes, causes_of
 from tvsbayes.assessment.gear_tables import DrawnGears, drawn_gears
 from tvsbayes.assessment.summary import equal_laplace_draws, seen_range
+from tvsbayes.calibration.drawn_looks import noise_of_a_look
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
-from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration, noise_of_a_look
+from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes

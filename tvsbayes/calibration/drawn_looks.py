@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from tvsbayes.calibration.optics import Number
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, NOISES, Calibration, Counters
 from tvsbayes.errors import InputError
+from tvsbayes.instrument.axes import SIDES
 
 
 @dataclass(frozen=True)
@@ -52,3 +54,16 @@ def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
     normal = generator.standard_normal((draws, NOISES))
     noise = np.column_stack([normal[:, :2], generator.uniform(-0.5, 0.5, (draws, 2)), normal[:, 4]])
     return Drawn(np.concatenate([own, calibration.noise[chosen]], axis=1), gears, noise)
+
+
+def noise_of_a_look(values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Sds by `NOISE_NAMES`, last axis, from parameters by name: a robot looks once at a stop, and meets both errors.
+
+    Without a scatter of looks among them, as in results before 0.3.0, there is none.
+    """
+    found = [values[name] for name in NOISE_NAMES]
+    for axis, sides in SIDES.items():
+        for side in sides:
+            place = NOISE_NAMES.index(f"stop_sd_deg.{side}")
+            found[place] = np.hypot(found[place], values.get(f"look_scatter_deg.{axis}", 0.0))
+    return np.stack(found, axis=-1)

@@ -47,7 +47,7 @@ INPUT_NAMES: tuple[str, ...] = names_of(
 )
 """What a coordinate depends on. Contrasts do not enter: after homing a counter stands for its mean ratio."""
 NOISE_NAMES = names_of("stop_sd_deg", "aperture_sd_deg")
-"""Noises of a look; those of stops hold the scatter of the look, see `noise_of_a_look`."""
+"""Noises of a look; those of stops hold the scatter of the look, see `drawn_looks.noise_of_a_look`."""
 UNIT_NOISES: dict[str, float] = {
     **{f"stop error {axis}": 1.0 for axis in AXES},
     **{f"place in the play, {axis}": 1 / 12 for axis in AXES},
@@ -55,21 +55,6 @@ UNIT_NOISES: dict[str, float] = {
 }
 """Noises of a look in units of their own scale, with their variances: a place in the play is uniform."""
 NOISES = len(UNIT_NOISES)
-
-
-def noise_of_a_look(values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Sds by `NOISE_NAMES`, last axis, from parameters by name: a robot looks once at a stop, and meets both errors.
-
-    Without a scatter of looks among them, as in results before 0.3.0, there is none.
-    """
-    found = [values[name] for name in NOISE_NAMES]
-    for axis, sides in SIDES.items():
-        for side in sides:
-            place = NOISE_NAMES.index(f"stop_sd_deg.{side}")
-            found[place] = np.hypot(found[place], values.get(f"look_scatter_deg.{axis}", 0.0))
-    return np.stack(found, axis=-1)
-
-
 COMPLEX_STEP = 1e-30
 """Imaginary step of derivatives: nothing is subtracted, so it may be as small as it likes (Squire and Trapp, SIAM
 Review 40 (1998) 110)."""

@@ -272,6 +272,7 @@ def find_views(
     """
     folder = Path(folder)
     sizes = _sizes(folder, swap)
+    _refuse_two_sizes(sizes, folder)
     counted = Counter(sizes.values())
     size = max(counted, key=lambda s: (counted[s], s))
     used = [picture for picture, own in sizes.items() if own == size]
@@ -311,6 +312,23 @@ def find_views(
         by_fallback=tuple(fallback),
         reordered=tuple(reordered),
     )
+
+
+def _refuse_two_sizes(sizes: dict[Picture, tuple[int, int]], folder: Path) -> None:
+    """Refuses two cameras of two picture sizes: one of them would pass for a camera without boards."""
+    usual = []
+    for side in CAMERAS:
+        own = Counter(size for picture, size in sizes.items() if picture.sides == (side,))
+        usual += [size for size, count in own.most_common(1) if 2 * count > own.total()]
+    if len(set(usual)) > 1:
+        (left, right) = (f"{width} x {height}" for width, height in usual)
+        raise refusal(
+            "image-size",
+            file=escaped(folder.resolve().name),
+            found=f"left and right have two sizes: {left} and {right}",
+            allowed="pictures of one size",
+            remedy="take the pictures of both cameras at one size, for the board and for the spots",
+        )
 
 
 def _sizes(folder: Path, swap: bool) -> dict[Picture, tuple[int, int]]:

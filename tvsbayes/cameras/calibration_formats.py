@@ -1,53 +1,51 @@
-"""Stereo calibrations of other tools: OpenCV's YAML and JSON, ROS camera_info, Kalibr camchains; and `stereo.json`.
+"""Stereo calibrations of other programs, by content, and `stereo.json`; and the files of an export.
 
-None of these formats carries an uncertainty. An import therefore gets `assumed_covariance` and `assumed = true`.
-Lengths in `Stereo` are mm; ROS and Kalibr write metres, OpenCV whatever unit the squares had.
+`calibration_names` says what a number is; here numbers become a pair: M and D of both cameras, R and T of
+x_right = R x_left + T. None of these files carries an uncertainty: an import gets the covariance of
+`assumed_covariance` and `assumed = true`. Lengths in `Stereo` are mm; Kalibr, ROS and EuRoC write metres, others
+whatever unit the squares of their board had.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from tvsbayes.cameras.calibration_yaml import MATRIX_TAG, YAML_BYTES_MAX, parse_yaml
-from tvsbayes.errors import escaped, refusal
+from tvsbayes.cameras.assumed_covariance import GUESS_FACTOR, Known, with_assumed_covariance
+from tvsbayes.cameras.calibration_containers import CONTAINER_BYTES_MAX, read_container
+from tvsbayes.cameras.calibration_names import ROTATION_TOLERANCE, Entry, Found
+from tvsbayes.cameras.lens_models import ERROR_MAX_PX, FISHEYE, FIVE, RATIONAL, fitted_to_five
+from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import read_bytes
-from tvsbayes.files.documents import Keys, parse_json
+from tvsbayes.files.documents import Keys
 from tvsbayes.instrument.stereo_pair import (
+    ASSUMED_REMEDY,
+    PRINCIPAL_SHARE_MAX,
     Stereo,
     pair_doubts,
     parse_stereo,
-    rotation_matrix,
-    rotation_vector,
     stereo_bytes,
 )
 
-ROTATION_TOLERANCE = 1e-3
-"""R from a file of few digits may miss a rotation by this much; the nearest rotation is taken."""
-SHORTEST_MM = 1.0
-M_TO_MM = 1000.0
-ASSUMED_FOCAL = 0.01
-"""Standard uncertainty of fx, fy, cx, cy over the focal length."""
-ASSUMED_RADIAL = (0.04, 0.15, 0.15)
-"""Standard uncertainty of the share of k1, k2, k3 in a corner's distance from the image centre."""
-ASSUMED_TANGENTIAL = 0.003
-"""Standard uncertainty of p1 and p2, as a share of that distance."""
-ASSUMED_ROTATION_RAD = 0.01
-ASSUMED_TRANSLATION = 0.02
-"""Standard uncertainty of each component of T over |T|."""
-ASSUMED_RMS_PX = 0.5
-Format = Literal["opencv", "ros"]
-_OPENCV_KEYS = ("M1", "M2", "R", "T")
-EXPORT_NAMES: dict[Format, tuple[str, str]] = {
-    "opencv": ("intrinsics.yml", "extrinsics.yml"),
-    "ros": ("left.yaml", "right.yaml"),
+UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+BASELINES_MM = (20.0, 3000.0)
+"""Cameras of one bench stand so far apart; what is outside is asked, not taken."""
+RMS_PX_MAX, VIEWS_MAX = 20.0, 100_000
+NOTHING_KNOWN = Known()
+_MADE_BY = {
+    **dict.fromkeys(("rms", "rms_px", "rms_error", "stereo_rms", "reprojection_error", "rmse"), "rms_px"),
+    **dict.fromkeys(("avg_reprojection_error", "reprojectionerror", "reprojection_rms", "ret", "retval"), "rms_px"),
+    **dict.fromkeys(("views", "n_views", "num_views", "nframes", "nr_of_frames", "num_images"), "views"),
+    **dict.fromkeys(("board_width", "board_columns", "board_cols"), "columns"),
+    **dict.fromkeys(("board_height", "board_rows"), "rows"),
 }
-"""The files of an export."""
+"""Keys, in small letters, under which files say how they were made, and what each is in `Known`. The pitch is left out:
+its unit is not known."""
+SIDE_NAMES = ("left", "right")
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ class Imported:
 
     Attributes:
         stereo: the pair, mm and px.
-        source: opencv, ros, kalibr or tvsbayes.
+        source: opencv (also any other program whose names are known), ros, kalibr, euroc, matlab or tvsbayes.
         notes: what was assumed.
         warnings: what makes it implausible (`pair_doubts`).
     """
@@ -67,102 +65,57 @@ class Imported:
     warnings: tuple[str, ...]
 
 
-def read_calibration(paths: Sequence[Path], size: tuple[int, int] | None = None, *, unit_mm: float = 1.0) -> Imported:
-    """A stereo calibration from the files of another tool, or from `stereo.json`.
+def read_calibration(
+    paths: Sequence[Path],
+    size: tuple[int, int] | None = None,
+    *,
+    unit_mm: float | None = None,
+    stated: Known = NOTHING_KNOWN,
+    keys: Mapping[str, str] | None = None,
+) -> Imported:
+    """A stereo calibration from the files of another program, or from `stereo.json`.
 
     Args:
-        paths: OpenCV: one file or two; ROS: both cameras' camera_info; Kalibr: one camchain; `stereo.json`.
-        size: image width and height, px, where the files do not tell (OpenCV).
-        unit_mm: unit of OpenCV's T, mm.
+        paths: one file of a pair, or two or three: of each camera, of what is inside and between them.
+        size: image width and height, px, where the files do not tell.
+        unit_mm: unit of lengths, mm; None: as the format has it, and asked for where the baseline is implausible.
+        stated: how it was made, and how uncertain it is: for the covariance that no such file has.
+        keys: what holds M1, D1, M2, D2, R, T, where no name that is known does.
 
     Raises:
-        InputError: unreadable, unknown or contradictory.
+        InputError: unreadable, unknown, contradictory, or of lenses that five coefficients do not describe.
     """
     names = [escaped(Path(path).name) for path in paths]
-    contents = [read_bytes(path, YAML_BYTES_MAX) for path in paths]
-    files = [_keys(path, data, name) for path, data, name in zip(paths, contents, names, strict=True)]
-    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json" and not _by_opencv(files[0]):
+    contents = [read_bytes(path, CONTAINER_BYTES_MAX) for path in paths]
+    files = [read_container(data, name) for data, name in zip(contents, names, strict=True)]
+    if len(paths) == 1 and str(files[0].values.get("format", "")).startswith("tvsbayes"):
         stereo = parse_stereo(contents[0], names[0])
+        if stated != NOTHING_KNOWN:
+            if not stereo.assumed:
+                remedy = "leave out --rms-px, --views, --board, --pitch-mm, --u-...: they are for files without one"
+                raise refusal("usage", file=names[0], found="its own covariance", allowed="no other", remedy=remedy)
+            stereo = with_assumed_covariance(stereo, stated, NOTHING_KNOWN)
         return Imported(stereo, "tvsbayes", (), pair_doubts(stereo))
-    if any("cam0" in keys for keys in files):
-        if len(files) != 1:
-            remedy = "name one camchain"
-            raise refusal("usage", file=names[0], found=f"{len(files)} files", allowed="one file", remedy=remedy)
-        source, (stereo, notes) = "kalibr", _kalibr(files)
-    elif any("projection_matrix" in keys for keys in files):
-        source, (stereo, notes) = "ros", _ros(files)
-    elif any(key in keys for keys in files for key in _OPENCV_KEYS):
-        source, (stereo, notes) = "opencv", _opencv(files, size, unit_mm)
-    else:
-        one = any("camera_matrix" in keys or "Camera_Matrix" in keys for keys in files)
-        found = "the calibration of one camera" if one else "no calibration that is known here"
-        allowed = "OpenCV's M1 D1 M2 D2 R T, ROS camera_info of both cameras, a Kalibr camchain, stereo.json"
-        remedy = "a pair needs R and T between its cameras: calibrate both together"
-        raise refusal("format", file=names[0], found=found, allowed=allowed, remedy=remedy)
-    notes.append("its uncertainty is assumed, and pessimistic: calibrate from pictures for a true one")
-    return Imported(stereo, source, tuple(notes), pair_doubts(stereo))
-
-
-def _keys(path: Path, data: bytes, name: str) -> Keys:
-    """The top map of a file: JSON by its suffix, else YAML."""
-    return (parse_json if Path(path).suffix.lower() == ".json" else parse_yaml)(data, name)
-
-
-def _by_opencv(keys: Keys) -> bool:
-    """Whether a JSON file is OpenCV's (FileStorage): its matrices are maps, those of `stereo.json` lists."""
-    return "format" not in keys and any(isinstance(keys.values.get(key), dict) for key in _OPENCV_KEYS)
-
-
-def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
-    """Files by name for another tool; none of them keeps the covariance.
-
-    `opencv`: `intrinsics.yml` (M1 D1 M2 D2, image size) and `extrinsics.yml` (R T R1 R2 P1 P2 Q) of the stereo
-    sample, mm. `ros`: `left.yaml` and `right.yaml`, camera_info, metres.
-    """
-    import cv2
-
-    size = (stereo.image_width, stereo.image_height)
-    # alpha = 0: only pixels that both cameras have, as ROS' calibrator and OpenCV's sample do by default.
-    R1, R2, P1, P2, Q, *_ = cv2.stereoRectify(
-        stereo.M1, stereo.D1, stereo.M2, stereo.D2, size, stereo.R, stereo.T.reshape(3, 1), alpha=0
-    )
-    if form == "opencv":
-        inner = {"M1": stereo.M1, "D1": stereo.D1[None], "M2": stereo.M2, "D2": stereo.D2[None]}
-        outer = {"R": stereo.R, "T": stereo.T[:, None], "R1": R1, "R2": R2, "P1": P1, "P2": P2, "Q": Q}
-        sizes = {"image_width": size[0], "image_height": size[1]}
-        return dict(zip(EXPORT_NAMES[form], (_opencv_text(inner, sizes), _opencv_text(outer, {})), strict=True))
-    files = {}
-    cameras = (("left", stereo.M1, stereo.D1, R1, P1), ("right", stereo.M2, stereo.D2, R2, P2))
-    for file, (name, matrix, distortion, turn, projection) in zip(EXPORT_NAMES[form], cameras, strict=True):
-        in_metres = np.array(projection, float)
-        in_metres[:, 3] /= M_TO_MM
-        matrices = {
-            "camera_matrix": matrix,
-            "distortion_coefficients": distortion[None],
-            "rectification_matrix": turn,
-            "projection_matrix": in_metres,
-        }
-        files[file] = _ros_text(name, size, matrices)
-    return files
-
-
-def assumed_covariance(stereo: Stereo) -> np.ndarray:
-    """A pessimistic covariance (24, 24) for a calibration that came without one: independent parameters.
-
-    Standard uncertainties: 1 % of the focal length for fx, fy, cx, cy; for k1, k2, k3 what moves an image corner by
-    4, 15 and 15 % of its distance from the centre, for p1 and p2 by 0.3 %; 10 mrad for each component of R, 2 % of
-    |T| for each component of T. In every direction of parameter space this is more than the covariance of 13 views
-    at 640 x 480 (OpenCV's own pairs), errors shared by the corners of a picture included.
-    """
-    sds = []
-    for matrix in (stereo.M1, stereo.M2):
-        focal = matrix[[0, 1], [0, 1]]
-        corner = math.hypot(stereo.image_width / 2 / focal[0], stereo.image_height / 2 / focal[1])
-        k1, k2, k3 = (share / corner**power for share, power in zip(ASSUMED_RADIAL, (2, 4, 6), strict=True))
-        p = ASSUMED_TANGENTIAL / corner
-        sds += [*(ASSUMED_FOCAL * focal), *(ASSUMED_FOCAL * focal), k1, k2, p, p, k3]
-    sds += [ASSUMED_ROTATION_RAD] * 3 + [ASSUMED_TRANSLATION * float(np.linalg.norm(stereo.T))] * 3
-    return np.diag(np.square(sds))
+    if len(files) > 3:
+        found, allowed = f"{len(files)} files", "one, two or three"
+        raise refusal("usage", file=names[0], found=found, allowed=allowed, remedy="name those of one pair")
+    reader = _Reader(Found(files, keys or {}), size, unit_mm)
+    bare = reader.pair()
+    doubts = pair_doubts(bare, reader.places)
+    try:
+        stereo = with_assumed_covariance(
+            bare, stated, _made_by(files, {"ros": True, "kalibr": False}.get(reader.source))
+        )
+    except InputError as error:
+        if error.code != "no-common-view":
+            raise
+        told = "; ".join(doubts) or "look at R, T and the image size"
+        found = "two cameras that do not see one board together"
+        raise refusal("no-common-view", file=", ".join(names), found=found, allowed="a pair", remedy=told) from error
+    good_to = f"all its sds together are good to a factor of {GUESS_FACTOR:g}"
+    reader.notes.append(f"the file has no covariance: assumed from {stereo.assumed_from}; {good_to}")
+    reader.notes.append(f"for a better one {ASSUMED_REMEDY}")
+    return Imported(stereo, reader.source, tuple(reader.notes), doubts)
 
 
 @dataclass(frozen=True)
@@ -173,160 +126,306 @@ class _Camera:
     distortion: np.ndarray
 
 
-def _matrix(keys: Keys, key: str, *shapes: tuple[int, int]) -> np.ndarray:
-    """A matrix of rows, cols, data (OpenCV, ROS) or of nested lists (Kalibr), in one of `shapes`."""
-    allowed = "finite numbers, " + " or ".join("x".join(map(str, shape)) for shape in shapes)
-    remedy = "take the file as its tool wrote it"
-    value = keys.values.get(key)
-    if isinstance(value, dict):
-        table = keys.table(key)
-        shape = table.integer("rows", 1, 1000), table.integer("cols", 1, 1000)
-        entries = value.get("data")
-    else:
-        rows = value if isinstance(value, list) else []
-        nested = bool(rows) and all(isinstance(row, list) for row in rows)
-        widths = {len(row) for row in rows} if nested else {len(rows)}
-        shape = (len(rows) if nested else 1, min(widths))
-        entries = [x for row in rows for x in row] if nested else rows
-        if len(widths) > 1:
-            entries = None
-    numbers = entries if isinstance(entries, list) else []
-    good = all(isinstance(x, int | float) and abs(x) <= 1e12 for x in numbers)
-    if not good or shape not in shapes or len(numbers) != shape[0] * shape[1]:
-        found = "x".join(map(str, shape)) if value is not None and shape not in shapes else None
-        raise keys.refuse(key, "matrix", allowed, remedy, found)
-    return np.array(numbers, float).reshape(shape)
+class _Reader:
+    """From entries by field to a pair.
 
+    Attributes:
+        source: whose file it seems to be.
+        notes: what was assumed.
+        places: key and file of M1, M2, D1, D2, R, T, in words.
+    """
 
-def _distortion(keys: Keys, key: str) -> np.ndarray:
-    """k1 k2 p1 p2 k3; further coefficients must be zero."""
-    shapes = [shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1))]
-    values = _matrix(keys, key, *shapes).ravel()
-    if values[5:].any():
-        allowed, remedy = "k1 k2 p1 p2 k3 (plumb bob)", "calibrate again without the rational or thin prism model"
-        raise keys.refuse(key, "distortion", allowed, remedy, f"{values.size} coefficients, not all beyond k3 zero")
-    return np.append(values, 0.0)[:5] if values.size == 4 else values[:5]
+    def __init__(self, found: Found, size: tuple[int, int] | None, unit_mm: float | None):
+        self.found, self.stated_size, self.unit_mm = found, size, unit_mm
+        self.source = "opencv"
+        self.notes: list[str] = []
+        self.places: dict[str, str] = {}
 
+    def pair(self) -> Stereo:
+        """The pair, without a covariance, checked as `stereo.json` is."""
+        for first, second in self.found.twice:
+            raise first.refuse(
+                "twice", "every quantity once", "name it: --key M1=NAME", f"another under {second.place}"
+            )
+        self._exchange()
+        for side in (0, 1):
+            self._check_model(side)
+        matrices = [self._matrix(side) for side in (0, 1)]
+        size = self._size(matrices)
+        left, right = (_Camera(m, self._distortion(side, m, size)) for side, m in enumerate(matrices))
+        rotation, translation = self._extrinsics()
+        translation = translation * self._unit(float(np.linalg.norm(translation)))
+        inner = left.matrix, left.distortion, right.matrix, right.distortion
+        bare = Stereo(*size, *inner, rotation, translation, np.zeros((24, 24)), 0.0, assumed=True)
+        return parse_stereo(stereo_bytes(bare), "the imported calibration")
 
-def _rotation(keys: Keys, key: str, matrix: np.ndarray) -> np.ndarray:
-    """The nearest rotation, where the file's digits allow."""
-    deviation = max(np.abs(matrix @ matrix.T - np.eye(3)).max(), abs(np.linalg.det(matrix) - 1.0))
-    if not deviation <= ROTATION_TOLERANCE:
-        allowed = f"R R^T = 1 and det R = +1 to {ROTATION_TOLERANCE:g}"
-        remedy = "take the file as its tool wrote it"
-        raise keys.refuse(key, "rotation", allowed, remedy, f"a matrix that misses it by {deviation:.3g}")
-    return rotation_matrix(rotation_vector(matrix))
+    def _check_model(self, side: int) -> None:
+        """Refuses a lens model that nothing here converts."""
+        model = self.found.model(side)
+        if model not in (*FIVE, *RATIONAL, *FISHEYE, ""):
+            raise refusal(
+                "lens-model",
+                file=", ".join(keys.file for keys in self.found.files),
+                found=f"the model {escaped(model, 40)} of the {SIDE_NAMES[side]} camera",
+                allowed="plumb_bob, radtan, rational or equidistant",
+                remedy="calibrate the pair again with five coefficients; renaming the model makes wrong rays",
+            )
 
+    def _exchange(self) -> None:
+        """Files of one camera in the other order: the left projection alone has no shift."""
+        cameras = self.found.cameras
+        if self.found.by_file and all("P" in camera for camera in cameras):
+            shifts = [np.abs(camera["P"].numbers[[3, 7]]).max() for camera in cameras]
+            if shifts[1] == 0 and shifts[0] > 0:
+                self.found.cameras = cameras[::-1]
 
-def _size(keys: Sequence[Keys], size: tuple[int, int] | None) -> tuple[int, int]:
-    """Image size from the files, else as given."""
-    for table in keys:
-        if "image_width" in table:
-            return table.integer("image_width", 1, 65_535), table.integer("image_height", 1, 65_535)
-    if size is None:
+    def _matrix(self, side: int) -> np.ndarray:
+        """The camera matrix, of nine numbers, of four, of single ones, or of a projection alone."""
+        camera, name = self.found.cameras[side], f"M{side + 1}"
+        single = [camera.get(key) for key in ("fx", "fy", "cx", "cy")]
+        entry = camera.get("M")
+        if entry is not None and entry.numbers.size == 9:
+            matrix = entry.numbers.reshape(3, 3)
+            if matrix[0, 2] == matrix[1, 2] == 0 and matrix[2, :2].all():
+                matrix, self.source = matrix.T, "matlab"
+        elif entry is not None or all(one is not None for one in single):
+            fx, fy, cx, cy = entry.numbers if entry is not None else (float(one.numbers[0]) for one in single if one)
+            matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+            entry = entry or single[0]
+        elif "P" in camera and not any({"M", "fx"} & set(one) for one in self.found.cameras):
+            entry = camera["P"]
+            matrix = entry.numbers.reshape(3, 4)[:, :3]
+            self.notes.append(f"{entry.place} alone: the rectified {SIDE_NAMES[side]} camera, without distortion")
+        else:
+            cameras = self.found.cameras
+            raise self.found.missing([f"M{k + 1}" for k in (0, 1) if not {"M", "fx"} & set(cameras[k])])
+        assert entry is not None
+        self.places[name] = entry.place
+        skew = abs(matrix[0, 1]) <= 1e-9 * abs(matrix[0, 0])
+        if not (
+            matrix[0, 0] > 0 and matrix[1, 1] > 0 and skew and np.allclose(matrix[2], [0, 0, 1]) and matrix[1, 0] == 0
+        ):
+            allowed = "fx 0 cx, 0 fy cy, 0 0 1 with fx, fy > 0, px"
+            raise entry.refuse(
+                "camera-matrix", allowed, "is it another matrix? name it: --key M1=NAME", "no camera matrix"
+            )
+        return np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1.0]])
+
+    def _distortion(self, side: int, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """k1 k2 p1 p2 k3, fitted where the file has another model."""
+        camera, model = self.found.cameras[side], self.found.model(side)
+        found = self._coefficients(camera)
+        if found is None:
+            if {"M", "fx"} & set(camera):
+                raise self.found.missing([f"D{side + 1}"])
+            return np.zeros(5)
+        values, entry = found
+        self.places[f"D{side + 1}"] = entry.place
+        fisheye = model in FISHEYE
+        if not fisheye and not values[5:].any():
+            return np.append(values[:5], np.zeros(max(0, 5 - values.size)))
+        if fisheye and values.size != 4:
+            found_here = f"{values.size} of a fisheye"
+            raise entry.refuse("lens-model", "four coefficients", "take the file as it was", found_here)
+        fitted = fitted_to_five(matrix, values, size, fisheye)
+        what = "a fisheye lens" if fisheye else f"a lens of {values.size} coefficients"
+        if not fitted.error_px <= ERROR_MAX_PX:
+            off = f"up to {fitted.error_px:.2g} px" if math.isfinite(fitted.error_px) else "more than any fit tells"
+            allowed = f"what k1 k2 p1 p2 k3 describe to {ERROR_MAX_PX:g} px over the picture"
+            remedy = "do not rename the model: calibrate again with five coefficients, or crop the pictures"
+            raise entry.refuse("lens-model", allowed, remedy, f"{what}, which five coefficients miss by {off}")
+        self.notes.append(f"{entry.place}: {what}, fitted to five coefficients within {fitted.error_px:.2g} px")
+        return fitted.distortion
+
+    @staticmethod
+    def _coefficients(camera: Mapping[str, Entry]) -> tuple[np.ndarray, Entry] | None:
+        """Coefficients in OpenCV's order and where they stand: of one entry, of MATLAB's two, of single numbers."""
+        if "D" in camera:
+            return camera["D"].numbers, camera["D"]
+        if "radial" in camera:
+            radial = camera["radial"].numbers
+            tangential = camera["tangential"].numbers if "tangential" in camera else np.zeros(2)
+            return np.array([*radial[:2], *tangential, *radial[2:]]), camera["radial"]
+        single = [camera.get(f"coefficient_{name}") for name in ("k1", "k2", "p1", "p2", "k3")]
+        some = [entry for entry in single if entry is not None]
+        values = np.array([0.0 if entry is None else float(entry.numbers[0]) for entry in single])
+        return (values, some[0]) if some else None
+
+    def _size(self, matrices: Sequence[np.ndarray]) -> tuple[int, int]:
+        """The size of the pictures, the same for both cameras."""
+        sizes = []
+        for side, camera in enumerate(self.found.cameras):
+            if "size" in camera:
+                entry = camera["size"]
+                one = entry.numbers
+            elif "width" in camera and "height" in camera:
+                entry = camera["width"]
+                one = np.array([camera["width"].numbers[0], camera["height"].numbers[0]])
+            else:
+                continue
+            if not all(n == int(n) and 1 <= n <= 65_535 for n in one):
+                raise entry.refuse(
+                    "image-size", "whole numbers of pixels", "correct it", escaped(str(one.tolist()), 60)
+                )
+            width, height = int(one[0]), int(one[1])
+            if "size" in camera and _off(matrices[side], (width, height)) and not _off(matrices[side], (height, width)):
+                width, height = height, width
+                self.notes.append(f"{entry.place} is taken as rows, columns: {width} x {height} px")
+            sizes.append(((width, height), entry))
+        if len({size for size, _ in sizes}) > 1:
+            (one_size, entry), (other, _) = sizes
+            found = f"left and right have two sizes: {one_size[0]} x {one_size[1]} and {other[0]} x {other[1]}"
+            raise entry.refuse("image-size", "two images of one size", "calibrate them at one size", found)
+        if sizes and self.stated_size not in (None, sizes[0][0]):
+            found = f"{sizes[0][0][0]} x {sizes[0][0][1]} px"
+            raise sizes[0][1].refuse("image-size", "the size of the pictures", "leave out --image-size", found)
+        if sizes or self.stated_size is not None:
+            return sizes[0][0] if sizes else self.stated_size  # type: ignore[return-value]
         remedy = "give it with --image-size, for example 1280x720"
-        raise refusal("missing-key", file=keys[0].file, found="no image size", allowed="image_width", remedy=remedy)
-    return size
+        file = self.found.files[0].file
+        raise refusal("missing-key", file=file, found="no image size", allowed="image_width", remedy=remedy)
+
+    def _extrinsics(self) -> tuple[np.ndarray, np.ndarray]:
+        """R and T of x_right = R x_left + T, T in the file's unit."""
+        pair, (left, right) = self.found.pair, self.found.cameras
+        if "R" not in pair and "T" in pair and ("rectification" in left) != ("rectification" in right):
+            # R in the file or table of one camera, beside T: no rectification, which both would have.
+            pair["R"] = left.get("rectification") or right["rectification"]
+        turn = pair.get("R") or pair.get("R_transposed")
+        if turn is not None and "T" in pair:
+            self.places |= {"R": turn.place, "T": pair["T"].place}
+            rotation = turn.rotation()
+            by_columns = turn.numbers.size == 9 and turn.shape == (9,) and _named(left.get("cx"), "ppx")
+            if "R" not in pair or by_columns:
+                rotation, self.source = rotation.T, "matlab" if "R" not in pair else "realsense"
+            return self._consistent(rotation, turn), pair["T"].numbers
+        if (entry := pair.get("pose") or pair.get("pose_backwards")) is not None:
+            self.places |= {"R": entry.place, "T": entry.place}
+            pose = entry.pose()
+            if _named(entry, "tcncnm1"):
+                self.source = "kalibr"
+            if "pose" not in pair:
+                pose = np.linalg.inv(pose)
+            return pose[:3, :3], pose[:3, 3]
+        for field, source in (("from_body", "kalibr"), ("to_body", "euroc")):
+            if field in left and field in right:
+                self.source = source
+                self.places |= dict.fromkeys(("R", "T"), right[field].place)
+                one, two = (camera[field].pose() for camera in (left, right))
+                pose = two @ np.linalg.inv(one) if field == "from_body" else np.linalg.inv(two) @ one
+                return pose[:3, :3], pose[:3, 3]
+        if all("camera_R" in camera and "camera_T" in camera for camera in (left, right)):
+            self.places |= {"R": right["camera_R"].place, "T": right["camera_T"].place}
+            one, two = (camera["camera_R"].rotation() for camera in (left, right))
+            rotation = two @ one.T
+            return rotation, right["camera_T"].numbers - rotation @ left["camera_T"].numbers
+        if "P" in left and "P" in right:
+            return self._from_projections()
+        if self.found.by_file or "M" in left or "fx" in left:
+            raise self.found.missing([name for name in ("R", "T") if name not in pair])
+        raise self.found.missing(["M1", "M2", "R", "T"])
+
+    def _from_projections(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rectified, the right camera sees x' = x + (P03 / P00, P13 / P11, 0): R = R2^T R1, T = R2^T of that."""
+        left, right = self.found.cameras
+        self.source = "ros" if self.found.by_file else "opencv"
+        self.places |= {"R": right["P"].place, "T": right["P"].place}
+        one, two = (camera["P"].numbers.reshape(3, 4) for camera in (left, right))
+        if np.any(one[:2, 3] != 0) or not np.any(two[:2, 3]) or not (two[0, 0] > 0 and two[1, 1] > 0):
+            allowed = "P[0][3] = 0 in the left camera, -fx baseline in the right one"
+            remedy = "take both files from one stereo calibration"
+            raise right["P"].refuse("projection", allowed, remedy, "files that are no stereo pair")
+        turns = [c["rectification"].rotation() if "rectification" in c else np.eye(3) for c in (left, right)]
+        if "M" not in left and "fx" not in left:
+            # The rectified pair itself is what is there.
+            turns = [np.eye(3), np.eye(3)]
+        shift = np.array([two[0, 3] / two[0, 0], two[1, 3] / two[1, 1], 0.0])
+        return turns[1].T @ turns[0], turns[1].T @ shift
+
+    def _consistent(self, rotation: np.ndarray, turn: Entry) -> np.ndarray:
+        """R held against what else the file says of it: the essential matrix, both rectifications."""
+        pair, cameras = self.found.pair, self.found.cameras
+        others = []
+        if all("rectification" in c for c in cameras) and turn not in (c["rectification"] for c in cameras):
+            one, two = (c["rectification"].rotation() for c in cameras)
+            others.append(lambda r: float(np.abs(two.T @ one - r).max()))
+        if "E" in pair:
+            essential = pair["E"].numbers.reshape(3, 3)
+            x, y, z = pair["T"].numbers
+            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+            def by_essential(r: np.ndarray) -> float:
+                one, two = (e / np.linalg.norm(e) for e in (essential, cross @ r))
+                return float(min(np.abs(one - two).max(), np.abs(one + two).max()))
+
+            others.append(by_essential)
+        for off in others:
+            if off(rotation) > ROTATION_TOLERANCE:
+                if off(rotation.T) <= ROTATION_TOLERANCE:
+                    found, remedy = "R transposed, by what else the file says", "store R of x_right = R x_left + T"
+                    raise turn.refuse("rotation", "R from left to right", remedy, found)
+                found = "another rotation than the rest of the file says"
+                raise turn.refuse("rotation", "files of one calibration", "take the files as they were written", found)
+        return rotation
+
+    def _unit(self, length: float) -> float:
+        """Millimetres of the file's unit: as stated, as the format has it, asked where that is implausible."""
+        if not 0 < length < math.inf:
+            raise refusal(
+                "translation",
+                file=self.places["T"],
+                found="cameras in one place",
+                allowed="a baseline",
+                remedy="T is 0: name the right one, --key T=NAME",
+            )
+        metric = self.source in ("kalibr", "ros", "euroc", "realsense")
+        if self.unit_mm is not None:
+            return self.unit_mm
+        unit = "m" if metric else "mm"
+        low, high = BASELINES_MM
+        if not low <= length * UNITS_MM[unit] <= high:
+            fits = [
+                f"--import-unit {name} ({length * mm:.4g} mm)"
+                for name, mm in UNITS_MM.items()
+                if low <= length * mm <= high
+            ]
+            remedy = f"give {' or '.join(fits) or '--import-unit'}, or --import-unit {unit} if it is so"
+            found = f"cameras {length * UNITS_MM[unit]:.4g} mm apart, taken in {unit}"
+            raise refusal(
+                "unit",
+                file=self.places["T"],
+                found=found,
+                allowed=f"{low:g} to {high:g} mm without a word",
+                remedy=remedy,
+            )
+        if not metric:
+            self.notes.append("T is taken in mm: the file does not state a unit")
+        return UNITS_MM[unit]
 
 
-def _opencv(files: Sequence[Keys], size: tuple[int, int] | None, unit_mm: float) -> tuple[Stereo, list[str]]:
-    """M1 D1 M2 D2 and R T of the stereo sample, in one file or two."""
-    home = {}
-    for key in ("M1", "D1", "M2", "D2", "R", "T"):
-        holders = [keys for keys in files if key in keys]
-        if len(holders) != 1:
-            found = f"{key} in {len(holders)} of the files"
-            remedy = "name both files: --import intrinsics.yml --import extrinsics.yml"
-            raise refusal("missing-key", file=files[0].file, found=found, allowed="M1 D1 M2 D2 R T once", remedy=remedy)
-        home[key] = holders[0]
-    translation = _matrix(home["T"], "T", (3, 1), (1, 3)).ravel() * unit_mm
-    if np.linalg.norm(translation) < SHORTEST_MM:
-        found = f"cameras {np.linalg.norm(translation):.3g} mm apart"
-        remedy = "OpenCV keeps the unit of the squares: give --import-unit m if they were in metres"
-        raise home["T"].refuse("T", "unit", f"at least {SHORTEST_MM:g} mm", remedy, found)
-    left, right = (
-        _Camera(_matrix(home[f"M{n}"], f"M{n}", (3, 3)), _distortion(home[f"D{n}"], f"D{n}")) for n in (1, 2)
-    )
-    rotation = _rotation(home["R"], "R", _matrix(home["R"], "R", (3, 3)))
-    stereo = _stereo(_size(files, size), left, right, rotation, translation)
-    return stereo, [f"T is taken in {'mm' if unit_mm == 1 else 'm'}: OpenCV's files do not state a unit"]
+def _off(matrix: np.ndarray, size: tuple[int, int]) -> bool:
+    """Whether a principal point is far from the middle of pictures of a size."""
+    return any(abs(c - (n - 1) / 2) > PRINCIPAL_SHARE_MAX * n for c, n in zip(matrix[:2, 2], size, strict=True))
 
 
-def _ros(files: Sequence[Keys]) -> tuple[Stereo, list[str]]:
-    """Two camera_info files. Rectified, the right camera sees x' = x + (P03 / P00, 0, 0): R = R2^T R1, T = R2^T t."""
-    if len(files) != 2:
-        remedy = "name both cameras' files: --import left.yaml --import right.yaml"
-        found = f"{len(files)} file{'s' * (len(files) != 1)}"
-        raise refusal("missing-file", file=files[0].file, found=found, allowed="two camera_info files", remedy=remedy)
-    projections = [_matrix(keys, "projection_matrix", (3, 4)) for keys in files]
-    if projections[1][0, 3] == 0 and projections[0][0, 3] != 0:
-        files, projections = files[::-1], projections[::-1]
-    cameras, turns = [], []
+def _named(entry: Entry | None, word: str) -> bool:
+    """Whether an entry's own key is a word, marks aside."""
+    return entry is not None and entry.key.lower().replace("_", "") == word
+
+
+def _made_by(files: Sequence[Keys], fixed_intrinsics: bool | None) -> Known:
+    """What files say of how they were made."""
+    values: dict[str, float] = {}
     for keys in files:
-        keys.word("distortion_model", ("plumb_bob",))
-        matrix = _matrix(keys, "camera_matrix", (3, 3))
-        cameras.append(_Camera(matrix, _distortion(keys, "distortion_coefficients")))
-        turn = _matrix(keys, "rectification_matrix", (3, 3))
-        turns.append(_rotation(keys, "rectification_matrix", turn))
-    sizes = [_size([keys], None) for keys in files]
-    left, right = projections
-    if sizes[0] != sizes[1] or left[0, 3] != 0 or right[0, 3] == 0 or not right[0, 0] > 0:
-        allowed = "P[0][3] = 0 in the left file, -fx baseline (m) in the right one; images of one size"
-        remedy = "take both files from one stereo calibration"
-        raise files[1].refuse("projection_matrix", "projection", allowed, remedy, "files that are no stereo pair")
-    shift = np.array([right[0, 3] / right[0, 0], right[1, 3] / right[1, 1] if right[1, 1] else 0.0, 0.0])
-    stereo = _stereo(sizes[0], cameras[0], cameras[1], turns[1].T @ turns[0], M_TO_MM * turns[1].T @ shift)
-    return stereo, []
-
-
-def _kalibr(files: Sequence[Keys]) -> tuple[Stereo, list[str]]:
-    """cam0 and cam1 of a camchain; T_cn_cnm1 maps points of cam0 into cam1."""
-    keys = files[0]
-    cameras, sizes = [], []
-    for name in ("cam0", "cam1"):
-        camera = keys.table(name)
-        camera.word("camera_model", ("pinhole",))
-        camera.word("distortion_model", ("radtan",))
-        fu, fv, pu, pv = _matrix(camera, "intrinsics", (1, 4)).ravel()
-        matrix = np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
-        cameras.append(_Camera(matrix, _distortion(camera, "distortion_coeffs")))
-        width, height = _matrix(camera, "resolution", (1, 2)).ravel()
-        sizes.append((int(width), int(height)))
-    camera = keys.table("cam1")
-    if sizes[0] != sizes[1]:
-        raise camera.refuse("resolution", "image-size", "two images of one size", "calibrate them at one size")
-    pose = _matrix(camera, "T_cn_cnm1", (4, 4))
-    turn = _rotation(camera, "T_cn_cnm1", pose[:3, :3])
-    stereo = _stereo(sizes[0], cameras[0], cameras[1], turn, M_TO_MM * pose[:3, 3])
-    return stereo, ["radtan has no k3: it is 0 and as uncertain"]
-
-
-def _stereo(
-    size: tuple[int, int], left: _Camera, right: _Camera, rotation: np.ndarray, translation_mm: np.ndarray
-) -> Stereo:
-    """Checked as `stereo.json` is, with the assumed covariance."""
-    inner = left.matrix, left.distortion, right.matrix, right.distortion
-    bare = Stereo(*size, *inner, rotation, translation_mm, np.zeros((24, 24)), ASSUMED_RMS_PX, assumed=True)
-    checked = parse_stereo(stereo_bytes(bare), "the imported calibration")
-    return replace(checked, parameter_covariance=assumed_covariance(checked))
-
-
-def _opencv_text(matrices: Mapping[str, np.ndarray], numbers: Mapping[str, int]) -> bytes:
-    """OpenCV's YAML 1.0 of 2-D matrices: 4.x and 5.x read it alike."""
-    lines = ["%YAML:1.0", "---", *(f"{key}: {value}" for key, value in numbers.items())]
-    for key, matrix in matrices.items():
-        rows, cols = matrix.shape
-        data = ", ".join(map(repr, map(float, matrix.ravel())))
-        lines += [f"{key}: {MATRIX_TAG}", f"   rows: {rows}", f"   cols: {cols}", "   dt: d", f"   data: [ {data} ]"]
-    return ("\n".join(lines) + "\n").encode()
-
-
-def _ros_text(name: str, size: tuple[int, int], matrices: Mapping[str, np.ndarray]) -> bytes:
-    lines = [f"image_width: {size[0]}", f"image_height: {size[1]}", f"camera_name: {name}"]
-    for key, matrix in matrices.items():
-        if key == "distortion_coefficients":
-            lines.append("distortion_model: plumb_bob")
-        rows, cols = matrix.shape
-        data = ", ".join(map(repr, map(float, matrix.ravel())))
-        lines += [f"{key}:", f"  rows: {rows}", f"  cols: {cols}", f"  data: [{data}]"]
-    return ("\n".join(lines) + "\n").encode()
+        for key, value in keys.values.items():
+            name = _MADE_BY.get(key.lower())
+            if name is not None and isinstance(value, int | float) and not isinstance(value, bool) and value > 0:
+                values.setdefault(name, value)
+    columns, rows = values.get("columns", 0), values.get("rows", 0)
+    views = values.get("views", 0.0)
+    return Known(
+        rms_px=values["rms_px"] if values.get("rms_px", math.inf) <= RMS_PX_MAX else None,
+        views=int(views) if 3 <= views <= VIEWS_MAX else None,
+        board=(int(columns), int(rows)) if 3 <= columns <= 100 and 3 <= rows <= 100 else None,
+        fixed_intrinsics=fixed_intrinsics,
+    )

@@ -6,6 +6,7 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,8 +21,9 @@ from tvsbayes.files.disk import write_atomically
 from tvsbayes.pipeline import compile_for
 
 if TYPE_CHECKING:
+    from tvsbayes.cameras.assumed_covariance import Known
     from tvsbayes.cameras.boards import Board, Finder
-    from tvsbayes.cameras.calibration_formats import Format
+    from tvsbayes.cameras.calibration_export import Format
     from tvsbayes.instrument.stereo_pair import Stereo
 
 IMAGE_SIDE_MAX = 65_535
@@ -38,7 +40,7 @@ def stereo(
     imports: Annotated[
         list[Path] | None,
         typer.Option(
-            "--import", help="File of OpenCV, ROS or Kalibr, or stereo.json, instead of pictures; repeatable."
+            "--import", help="Calibration of another program, or stereo.json, instead of pictures; repeatable."
         ),
     ] = None,
     export: Annotated[str | None, typer.Option("--export", help="opencv or ros: also for these, beside -o.")] = None,
@@ -52,29 +54,56 @@ def stereo(
     robust: Annotated[bool, typer.Option("--robust", help="Leave out outlying views, by name.")] = False,
     image_size: Annotated[str | None, typer.Option("--image-size", help="1280x720, where imports lack it.")] = None,
     import_unit: Annotated[
-        str | None, typer.Option("--import-unit", help="mm (default) or m: unit of an imported OpenCV T.")
+        str | None, typer.Option("--import-unit", help="mm, cm or m: unit of an imported T.")
     ] = None,
+    key: Annotated[
+        list[str] | None, typer.Option("--key", help="M1=NAME: what holds M1, D1, M2, D2, R or T; repeatable.")
+    ] = None,
+    rms_px: Annotated[
+        float | None, typer.Option("--rms-px", help="RMS of an imported calibration, as OpenCV gives it.")
+    ] = None,
+    views: Annotated[int | None, typer.Option("--views", min=1, help="Views that it was made of.")] = None,
+    fixed_intrinsics: Annotated[
+        bool | None,
+        typer.Option("--fixed-intrinsics/--joint", help="Each camera by itself, then R and T; or all at once."),
+    ] = None,
+    u_focal_percent: Annotated[
+        float | None, typer.Option("--u-focal-percent", help="Standard uncertainty of fx, fy of an import.")
+    ] = None,
+    u_principal_px: Annotated[float | None, typer.Option("--u-principal-px", help="Of its cx, cy.")] = None,
+    u_rotation_mrad: Annotated[float | None, typer.Option("--u-rotation-mrad", help="Of each turn in its R.")] = None,
+    u_baseline_mm: Annotated[float | None, typer.Option("--u-baseline-mm", help="Of each component of its T.")] = None,
     as_json: Json = False,
 ) -> None:
     """Calibrate the camera pair from checkerboard pictures. With the covariance of all 24 parameters; or import one."""
-    known = (export, ("opencv", "ros")), (finder, ("classic", "sector")), (import_unit, ("mm", "m"))
-    if odd := [escaped(str(value)) for value, allowed in known if value not in (None, *allowed)]:
-        remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm or m"
+    words = (export, ("opencv", "ros")), (finder, ("classic", "sector")), (import_unit, ("mm", "cm", "m"))
+    if odd := [escaped(str(value)) for value, allowed in words if value not in (None, *allowed)]:
+        remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm, cm or m"
         raise InputError("usage", f"{', '.join(odd)}: no option of stereo takes this value", remedy=remedy)
     if (folder is None) == (not imports):
         found = "stereo needs pictures of a board, or a calibration to import"
         found = found if folder is None else "stereo takes pictures or a calibration to import, not both"
         raise InputError("usage", found, remedy="give FOLDER with --board and --pitch-mm, or --import FILE")
-    finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm)
+    uncertainties = {"u_focal_percent": u_focal_percent, "u_principal_px": u_principal_px}
+    uncertainties |= {"u_rotation_mrad": u_rotation_mrad, "u_baseline_mm": u_baseline_mm}
+    finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, rms_px=rms_px, **uncertainties)
+    made_by = {"rms_px": rms_px, "views": views, "fixed_intrinsics": fixed_intrinsics, **uncertainties}
     form: Format | None = None if export is None else "ros" if export == "ros" else "opencv"
     places = _new_files(out, form)
     if folder is None:
-        options = {"board": board, "pitch_mm": pitch_mm, "pitch_u_mm": pitch_u_mm, "finder": finder, "swap": swap}
-        refuse_options("for pictures of a board", "leave out --import", **options, fix_k3=fix_k3, robust=robust)
-        made = _imported(imports or [], image_size, import_unit)
+        options = {"finder": finder, "swap": swap, "fix_k3": fix_k3, "robust": robust}
+        refuse_options("for pictures of a board", "leave out --import", **options)
+        _positive(rms_px=rms_px, **uncertainties)
+        known = _known(board, pitch_mm, pitch_u_mm, made_by)
+        made = _imported(imports or [], image_size, import_unit, known, _named_keys(key))
     else:
-        options = {"image_size": image_size, "import_unit": import_unit}
-        refuse_options("for --import", "leave it out: pictures tell it", **options)
+        given = {
+            "image_size": image_size,
+            "import_unit": import_unit,
+            "joint": fixed_intrinsics is False,
+            "key": bool(key),
+        }
+        refuse_options("for --import", "leave it out: pictures tell it", **given, **made_by)
         pattern = _board(board, pitch_mm, pitch_u_mm or 0.0)
         from tvsbayes.cameras.stereo_calibration import calibrate_folder
         from tvsbayes.report.command_text import stereo_calibration_text
@@ -101,7 +130,7 @@ class MadePair:
 
 def _new_files(out: Path | None, export: Format | None) -> dict[str, Path]:
     """Where the pair is to be written, by kind; refused before pictures are read, which takes minutes."""
-    from tvsbayes.cameras.calibration_formats import EXPORT_NAMES
+    from tvsbayes.cameras.calibration_export import EXPORT_NAMES
 
     beside = Path() if out is None else out.parent
     places = {} if out is None else {"stereo": out}
@@ -128,16 +157,52 @@ def _board(board: str | None, pitch_mm: float | None, pitch_u_mm: float) -> Boar
     return Board.named(board, pitch_mm, pitch_u_mm)
 
 
-def _imported(paths: list[Path], image_size: str | None, import_unit: str | None) -> MadePair:
+def _positive(**values: float | None) -> None:
+    """Refuse options that are 0 or less."""
+    for name, value in values.items():
+        if value is not None and not value > 0:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError("usage", f"{option} {value:g}: allowed are numbers above 0", remedy="correct it")
+
+
+def _known(
+    board: str | None, pitch_mm: float | None, pitch_u_mm: float | None, made_by: Mapping[str, float | None]
+) -> Known:
+    """What the options say of an imported calibration."""
+    from tvsbayes.cameras.assumed_covariance import USUAL_PITCH_MM, Known
+    from tvsbayes.cameras.boards import Board
+
+    # Checked as that of pictures is.
+    pattern = Board.named(board or "9x6", USUAL_PITCH_MM if pitch_mm is None else pitch_mm, pitch_u_mm or 0.0)
+    size = None if board is None else (pattern.columns, pattern.rows)
+    return Known(board=size, pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, **made_by)  # type: ignore[arg-type]
+
+
+def _named_keys(keys: list[str] | None) -> dict[str, str]:
+    """Fields with the names that hold them, of --key."""
+    found = {}
+    for text in keys or []:
+        field, _, name = text.partition("=")
+        if field not in ("M1", "D1", "M2", "D2", "R", "T") or not name:
+            remedy = "write --key M1=NAME, with M1, D1, M2, D2, R or T"
+            raise InputError("usage", f"--key {escaped(text, 80)}: no such name", remedy=remedy)
+        found[field] = name
+    return found
+
+
+def _imported(
+    paths: list[Path], image_size: str | None, import_unit: str | None, known: Known, keys: Mapping[str, str]
+) -> MadePair:
     """A calibration of another tool, or of ours."""
-    from tvsbayes.cameras.calibration_formats import read_calibration
+    from tvsbayes.cameras.calibration_formats import UNITS_MM, read_calibration
     from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
     from tvsbayes.report.command_text import stereo_text
 
-    found = read_calibration(paths, _image_size(image_size), unit_mm={"mm": 1.0, "m": 1000.0}[import_unit or "mm"])
-    if found.source != "opencv":
-        reason, remedy = f"for files of OpenCV, and this is one of {found.source}", "leave it out: this file tells it"
-        refuse_options(reason, remedy, image_size=image_size, import_unit=import_unit)
+    unit_mm = None if import_unit is None else UNITS_MM[import_unit]
+    found = read_calibration(paths, _image_size(image_size), unit_mm=unit_mm, stated=known, keys=keys)
+    if found.source == "tvsbayes":
+        options = {"image_size": image_size, "import_unit": import_unit, "key": keys or None}
+        refuse_options("for files of other programs", "leave it out: this file tells it", **options)
     remarks = [*(f"note: {note}" for note in found.notes), *(f"warning: {warning}" for warning in found.warnings)]
     pair = found.stereo
     sds = [float(variance) ** 0.5 for variance in pair.parameter_covariance.diagonal()]
@@ -145,14 +210,15 @@ def _imported(paths: list[Path], image_size: str | None, import_unit: str | None
     document: dict[str, object] = {
         **{"source": found.source, "image_width": pair.image_width, "image_height": pair.image_height},
         "parameters": {name: {"value": value, "sd": sd} for name, value, sd in values},
-        **{"rms_px": pair.rms_px, "assumed": pair.assumed, "warnings": [*found.notes, *found.warnings]},
+        **{"rms_px": pair.rms_px, "assumed": pair.assumed, "assumed_from": pair.assumed_from},
+        **{"warnings": [*found.notes, *found.warnings]},
     }
     return MadePair(pair, "\n".join([stereo_text(pair), *remarks]), document)
 
 
 def _write_pair(made: MadePair, places: dict[str, Path], export: Format | None, as_json: bool) -> None:
     """Write a pair where it was asked for, and say so."""
-    from tvsbayes.cameras.calibration_formats import exported
+    from tvsbayes.cameras.calibration_export import exported
     from tvsbayes.instrument.stereo_pair import write_stereo
 
     contents = {} if export is None else exported(made.stereo, export)

@@ -121,6 +121,7 @@ def fit(
     data = read_campaign(campaign)
     _warn_of(data, stops=not anyway)
     from tvsbayes.instrument.model_choice import ModelChoice
+    from tvsbayes.report.advice import assumed_stereo
     from tvsbayes.report.fit_text import fit_text
 
     compile_for(report_line)
@@ -147,6 +148,9 @@ def fit(
     summary, files = results.record.summary, results.files
     document = {**summary.as_json(), "seed": seed, "files": files}
     text = fit_text(summary, details, list(files.values()), results.causes)
+    budgets = () if results.record.evidence is None else results.record.evidence.budgets
+    if budgets and (told := assumed_stereo(data.stereo, budgets)) is not None:
+        text = f"{told}\n{text}"
     if results.error is None and out is None:
         text += f"\nnext: {command_line('report', campaign)}"
     finish(document, text, as_json, results.error)

@@ -35,8 +35,9 @@ LEAST_SLOPE = 0.3
 BETTER = 3.0
 """Times less of the motion that the right counters leave than those of the table: sums of cells that are steps, or the
 counters of the row before or after."""
-STOPS_FREE_MIN, STOPS_CERTAIN = 4, 8
-"""Stops beyond the coefficients of a line, from which it is a pattern, and from which it is certain."""
+STOPS_FREE_MIN, STOPS_CERTAIN, STOPS_MANY = 4, 8, 30
+"""Stops beyond the coefficients of a line, from which it is a pattern, from which it is certain, from which it is no
+chance even within play and scatter."""
 CERTAIN = 9.0
 """`BETTER` where rows are shifted for certain."""
 LOOKS_TRIED, BEGINS_TRIED = 2000, 64
@@ -183,7 +184,7 @@ def counter_findings(pattern: SpotPattern) -> list[Finding]:
         return [Finding("columns-exchanged", message, file="moves.csv")]
     steps = [axis for axis in enough if _are_steps(seen, axis, own[axis], added[axis])]
     if steps:
-        return [_steps_finding(seen, steps, added)]
+        return [_steps_finding(seen, steps, own)]
     if enough and (shifted := _row_finding(seen)) is not None:
         return [shifted]
     signs = [axis for axis in expected if _runs_back(seen, axis, own[axis])]
@@ -208,18 +209,22 @@ def _runs_back(seen: _Seen, axis: Axis, own: _Followed) -> bool:
 
 def _are_steps(seen: _Seen, axis: Axis, own: _Followed, added: _Followed) -> bool:
     """Whether the cells of a counter are the steps of each move."""
-    better = added.follows and own.left_deg**2 > BETTER * added.left_deg**2
-    return better and own.left_deg > UNEXPLAINED * seen.hidden_deg[axis]
+    # What play and scatter may hide, sums of a few counters explain by chance.
+    told = own.stops_free >= STOPS_MANY or own.left_deg > UNEXPLAINED * seen.hidden_deg[axis]
+    return told and added.follows and own.left_deg**2 > BETTER * added.left_deg**2
 
 
-def _steps_finding(seen: _Seen, axes: list[Axis], added: Mapping[Axis, _Followed]) -> Finding:
+def _steps_finding(seen: _Seen, axes: list[Axis], own: Mapping[Axis, _Followed]) -> Finding:
     names = " and ".join(f"{axis}_steps" for axis in axes)
     remedy = f"moves.csv holds absolute counters AFTER the move: {mending_command(seen.campaign, '--relative')}"
     return Finding(
         "relative-counters",
         f"spots follow the sum of {names}, not {names}: are these the steps of each move?",
         remedy,
-        certain=min(added[axis].stops_free for axis in axes) >= STOPS_CERTAIN,
+        certain=any(
+            own[axis].stops_free >= STOPS_CERTAIN and own[axis].left_deg > UNEXPLAINED * seen.hidden_deg[axis]
+            for axis in axes
+        ),
         file="moves.csv",
     )
 

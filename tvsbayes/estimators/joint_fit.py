@@ -25,7 +25,7 @@ from tvsbayes.estimators.linear_spots import Linearised, StopInformation, leave_
 from tvsbayes.estimators.mode_search import GATE_PROBABILITY, Problem, held_by, search_stages
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
-from tvsbayes.instrument.homing import ANYWHERE, Sides, homed, prior_chance, unrecorded
+from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
 from tvsbayes.instrument.places import PLACES_MAX, line_share, seen_places
@@ -170,12 +170,10 @@ class JointFit(Shown):
     def laplace_evidence(self) -> float:
         """Log of the integral of the density over the estimated coordinates and of its way of homing.
 
-        By the Laplace approximation, without `campaign_arrays.spot_constants`. The coordinates have N(0, 1) priors,
-        whose (2 pi)^(-p/2) the Gaussian integral cancels.
+        By the Laplace approximation, without `campaign_arrays.spot_constants`.
         """
-        free = np.flatnonzero(self.free)
-        own = 0.5 * float(np.linalg.slogdet(self.covariance[np.ix_(free, free)])[1])
-        return self.log_density + own + float(np.log(prior_chance(self.sides)))
+        mode = Mode(self.z, self.covariance, -self.log_density, ())
+        return laplace_evidence(mode, self.free) + float(np.log(prior_chance(self.sides)))
 
     @property
     def log_evidence(self) -> float:
@@ -277,33 +275,49 @@ def _by_homing(found: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
         seed: of the Laplace draws.
         advance: told how far it is.
     """
-    open_sides = dict.fromkeys(axes, ANYWHERE)
-    known = {tuple(sorted(open_sides.items())): replace(found, sides=open_sides)}
+    start = Mode(found.z, found.covariance, -found.log_density, ())
+    modes: dict[tuple[tuple[str, str], ...], tuple[Problem, Mode]] = {}
 
-    def under(sides: Sides) -> JointFit:
+    def mode_under(sides: Sides) -> tuple[Problem, Mode]:
         key = tuple(sorted(sides.items()))
-        if key not in known:
-            known[key] = _fit_under(found, problem, sides, seed)
-            advance(len(known) / most_fits(axes))
-        return known[key]
+        if key not in modes:
+            own = _problem_under(found, problem, sides)
+            modes[key] = own, own.mode_beside(start)
+            advance(len(modes) / most_fits(axes))
+        return modes[key]
 
-    told = weighed(axes, lambda sides: under(sides).laplace_evidence)
+    def evidence(sides: Sides) -> float:
+        mode = mode_under(sides)[1]
+        return laplace_evidence(mode, problem.free) + float(np.log(prior_chance(sides)))
+
+    def fit_under(sides: Sides) -> JointFit:
+        return replace(fit_at(found.campaign, *mode_under(sides), seed), sides=dict(sides))
+
+    weighed_ways = weighed(axes, evidence)
     alternatives = tuple(
-        Alternative(way.sides, way.probability, under(way.sides) if way.probability > WORTH_A_FIT else None)
-        for way in told
+        Alternative(way.sides, way.probability, fit_under(way.sides) if way.probability > WORTH_A_FIT else None)
+        for way in weighed_ways
     )
-    return replace(under(told[0].sides), alternatives=alternatives)
+    best = alternatives[0].fit
+    assert best is not None
+    return replace(best, alternatives=alternatives)
 
 
-def _fit_under(found: JointFit, problem: Problem, sides: Sides, seed: int) -> JointFit:
-    """The fit if the axes came home in these ways, from the mode of another."""
-    own = Problem(
-        homed(found.campaign, sides), problem.table, np.asarray(found.arrays.spots.valid)[: len(problem.spots)] > 0
-    )
+def _problem_under(found: JointFit, problem: Problem, sides: Sides) -> Problem:
+    """The problem of a fit if the axes came home in these ways."""
+    used = np.asarray(found.arrays.spots.valid)[: len(problem.spots)] > 0
+    own = Problem(homed(found.campaign, sides), problem.table, used)
     own.arrays = eqx.tree_at(lambda a: a.spots.weight, own.arrays, problem.arrays.spots.weight)
-    z = own.alternate(found.z.copy())
-    mode = own.mode(z)
-    return replace(fit_at(found.campaign, own, mode, seed), sides=dict(sides))
+    return own
+
+
+def laplace_evidence(mode: Mode, free: Bool[np.ndarray, " parameters"]) -> float:
+    """Log of the integral of a density over the estimated coordinates by its Laplace approximation.
+
+    The coordinates have N(0, 1) priors, whose (2 pi)^(-p/2) the Gaussian integral cancels.
+    """
+    rows = np.flatnonzero(free)
+    return 0.5 * float(np.linalg.slogdet(mode.covariance[np.ix_(rows, rows)])[1]) - mode.negative_log_density
 
 
 def _usable(campaign: Campaign, without: Collection[int]) -> Bool[np.ndarray, " spots"]:

@@ -34,7 +34,7 @@ from tvsbayes.model.gear_processes import Places, place_root
 from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space, physical_at
 from tvsbayes.progress import Job
 from tvsbayes.statistics.chances import chi2_quantile
-from tvsbayes.statistics.least_squares import Mode, newton_mode
+from tvsbayes.statistics.least_squares import Mode, neighbouring_mode, newton_mode
 
 RATIO_COLUMNS = np.array([INDEX[name] for name in names_of("degrees_per_step")])
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
@@ -249,6 +249,11 @@ class Problem:
         covariance = found.covariance.copy()
         covariance[own, own] = 1 / np.clip((both - 2 * centre) / SCALE_STEP**2, 1.0, None)
         return replace(found, covariance=covariance)
+
+    def mode_beside(self, known: Mode) -> Mode:
+        """The mode from that of another way of homing, which is seldom far away; scales of repeating errors held."""
+        found = neighbouring_mode(self.negative_log_density, known, self.free & ~self.repeated)
+        return self.mode(self.alternate(known.z.copy())) if found is None else found
 
     def curvature(self, z: np.ndarray) -> np.ndarray:
         """Expected information of the coordinates: Fisher's of geometry and stereo, measured for the noise."""

@@ -34,9 +34,11 @@ GAP_MM, GAP_SHARE = 10.0, 0.1
 """Least gap between the depths of two sheets, absolute and of the depth."""
 PLANE_MIN = 16
 """Looks at a sheet, below which the spread about its plane, which three of them determine, is not known."""
-LEVERAGE_MAX = 0.5
-"""Variance of the plane of all others at a look, over that of one look, from which they do not judge it."""
-STRAY_PLANE, STRAY_FEW, STRAY_NEIGHBOUR, NEIGHBOUR_FLOOR = 5.0, 6.0, 8.0, 0.4
+SHEET_SLOPE = 0.026
+"""Slope, 1.5 deg, by which a sheet that is put there anew may differ from how it stood."""
+ALONE = 3.0
+"""Times farther from the plane that a look must lie which is the only one of its placement."""
+STRAY_PLANE, STRAY_FEW, STRAY_NEIGHBOUR, NEIGHBOUR_FLOOR = 3.5, 12.0, 8.0, 0.4
 """Deviations from the plane of its sheet (in standard deviations of all placements, more of them by that many over the
 number of looks), and from both neighbours in its placement (in theirs, at least that share of the former), that make a
 spot stray: a sheet put there anew is seen by all looks of its placement."""
@@ -223,13 +225,15 @@ def _stray_doubts(pattern: SpotPattern) -> tuple[str, ...]:
         rows = np.array([k for k, s in enumerate(pattern.spots) if s.target == name and not apart[k]], int)
         if len(rows) < PLANE_MIN:
             continue
-        away, known = _off_plane_mm(pattern.points_mm[rows])
+        away, unsure = _off_plane_mm(pattern.points_mm[rows])
         # Of its own placement: rows follow each other where no other sheet was put there in between.
-        spread, apart_mm = _spread(away), _from_neighbours(away, np.cumsum(np.diff(rows, prepend=rows[0]) > 1))
+        placement = np.cumsum(np.diff(rows, prepend=rows[0]) > 1)
+        spread, apart_mm = _spread(away), _from_neighbours(away[:, None], placement, np.abs(away) / ALONE)
         usual = max(_spread(np.concatenate((apart_mm, -apart_mm))), NEIGHBOUR_FLOOR * spread)
-        least = STRAY_PLANE * (1 + STRAY_FEW / len(rows)) * spread
-        limit = np.maximum(least, MISMATCH_PX * _mm_per_pixel(pattern, rows))
-        for k in np.flatnonzero(known & (np.abs(away) > limit) & (apart_mm > STRAY_NEIGHBOUR * usual)):
+        least = STRAY_PLANE * (1 + STRAY_FEW / len(rows)) * spread * unsure
+        slope_mm = SHEET_SLOPE * _from_neighbours(pattern.points_mm[rows, 1:], placement, np.zeros(len(rows)))
+        limit = np.maximum.reduce([least, MISMATCH_PX * _mm_per_pixel(pattern, rows), slope_mm])
+        for k in np.flatnonzero((np.abs(away) > limit) & (apart_mm > STRAY_NEIGHBOUR * usual)):
             found[int(rows[k])] = f"{abs(away[k]):.1f} mm off the plane of its sheet, others {spread:.1g} mm"
     if not found:
         return ()
@@ -246,10 +250,11 @@ def _mm_per_pixel(pattern: SpotPattern, rows: np.ndarray) -> np.ndarray:
 
 
 def _off_plane_mm(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depths of points (n, 3) above the plane that most of them lie on, and whether the others know the plane there.
+    """Depths of points (n, 3) above the plane that most of them lie on, and how unsure that of the others is there.
 
     Returns:
-        (n,) mm, and (n,) bool: a look far from all others lies off their plane by their error of its slope.
+        (n,) mm, and (n,) variance of such a depth over that where the plane is known: a look far from all others lies
+        off their plane by their error of its slope.
     """
     design = np.column_stack((np.ones(len(points_mm)), points_mm[:, 1:] - points_mm[:, 1:].mean(axis=0)))
     weights = np.ones(len(points_mm))
@@ -261,17 +266,17 @@ def _off_plane_mm(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     weighted = design * weights[:, None]
     leverage = np.einsum("ij,jk,ik->i", design, np.linalg.pinv(weighted.T @ weighted), design)
     others = leverage / np.maximum(1 - weights**2 * leverage, 1e-9)
-    return away, others < LEVERAGE_MAX
+    return away, 1 + others
 
 
-def _from_neighbours(values: np.ndarray, placement: np.ndarray) -> np.ndarray:
-    """Distance from the nearer of the values before and after in the same placement, (n,); 0 where it has no other.
+def _from_neighbours(values: np.ndarray, placement: np.ndarray, alone: np.ndarray) -> np.ndarray:
+    """Distance of values (n, k) from the nearer of those before and after in the same placement, (n,).
 
-    A sheet put there anew for a single look stands apart as a mistyped cell does.
+    A sheet put there anew for a single look stands apart as a mistyped cell does: such a look gets that of `alone`.
     """
-    steps = np.where(np.diff(placement) == 0, np.abs(np.diff(values)), math.inf)
+    steps = np.where(np.diff(placement) == 0, np.linalg.norm(np.diff(values, axis=0), axis=1), math.inf)
     nearer = np.minimum(np.append(math.inf, steps), np.append(steps, math.inf))
-    return np.where(np.isfinite(nearer), nearer, 0.0)
+    return np.where(np.isfinite(nearer), nearer, alone)
 
 
 def _spread(values: np.ndarray) -> float:

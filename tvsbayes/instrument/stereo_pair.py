@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -98,6 +99,7 @@ class Stereo:
 
     `D1`, `D2` are k1 k2 p1 p2 k3. `parameter_covariance` orders the 24 parameters as
     `STEREO_PARAMETER_NAMES` (rotation as Rodrigues vector, rad; translation in mm).
+    Where it is `assumed`, `assumed_from` says from what.
     """
 
     image_width: int
@@ -111,6 +113,7 @@ class Stereo:
     parameter_covariance: np.ndarray
     rms_px: float
     assumed: bool = False
+    assumed_from: str = ""
 
     @property
     def vector(self) -> np.ndarray:
@@ -174,8 +177,14 @@ def rotation_vector(matrix: np.ndarray) -> np.ndarray:
 
 _STEREO_KEYS = (
     *("format", "image_width", "image_height", "M1", "D1", "M2", "D2", "R", "T"),
-    *("parameter_covariance", "rms_px", "assumed"),
+    *("parameter_covariance", "rms_px", "assumed", "assumed_from"),
 )
+_ORIGIN_CHARS_MAX = 400
+ASSUMED_REMEDY = (
+    "calibrate from pictures (`tvsbayes stereo FOLDER`), or import again with --rms-px, --views, --board, --pitch-mm, "
+    "--joint or --fixed-intrinsics, or with --u-focal-percent, --u-principal-px, --u-rotation-mrad, --u-baseline-mm"
+)
+"""What gives a pair whose covariance is assumed a better one."""
 _ENTRY_MAX = 1e12
 _ROTATION_TOLERANCE = 1e-6
 _EIGENVALUE_TOLERANCE = 1e-8
@@ -183,6 +192,10 @@ PRINCIPAL_SHARE_MAX = 0.25
 """Share of the image's width or height by which a principal point may miss its middle before it is worth a word."""
 ASPECT_SHARE_MAX = 0.05
 """The same of fx / fy from 1: pixels of today's sensors are square."""
+VIEW_DEG_MAX, TURN_DEG_MAX = 150.0, 45.0
+"""Of a lens that five coefficients describe, across the picture; of two cameras that look at one scene."""
+TANGENTIAL_MAX = 0.01
+"""Of p1 and p2: decentring of real lenses is some 1e-3."""
 SHORTEST_BASELINE_MM, LONGEST_BASELINE_MM = 2.0, 10_000.0
 """Two lenses cannot stand closer, and the longest baseline in metres that anybody calls a stereo pair is shorter; no
 cameras on one rig stand farther apart, and the shortest baseline in mm, taken for metres, is longer."""
@@ -275,6 +288,7 @@ def parse_stereo(data: bytes, file: str) -> Stereo:
         parameter_covariance=covariance,
         rms_px=keys.number("rms_px", 0.0, 1e4),
         assumed="assumed" in keys and keys.flag("assumed"),
+        assumed_from=keys.text_value("assumed_from", _ORIGIN_CHARS_MAX) if "assumed_from" in keys else "",
     )
 
 
@@ -300,6 +314,8 @@ def stereo_bytes(stereo: Stereo) -> bytes:
     lines = []
     for key in _STEREO_KEYS:
         value = "tvsbayes-stereo/1" if key == "format" else getattr(stereo, key)
+        if key == "assumed_from" and not value:
+            continue
         if isinstance(value, np.ndarray) and value.ndim == 2:
             rows = ",\n  ".join(json.dumps(row) for row in value.tolist())
             lines.append(f' "{key}": [\n  {rows}]')
@@ -316,24 +332,70 @@ def write_stereo(stereo: Stereo, path: Path) -> None:
     write_atomically(path, stereo_bytes(stereo))
 
 
-def baseline_doubt(stereo: Stereo) -> str | None:
-    """That T is in another unit, in words; None where its length in mm can be that of a pair."""
+def baseline_doubt(stereo: Stereo, place: str = "T of stereo.json") -> str | None:
+    """That T, from a place in words, is in another unit; None where its length in mm can be that of a pair."""
     baseline_mm = float(np.linalg.norm(stereo.T))
     if baseline_mm < SHORTEST_BASELINE_MM:
-        return f"T of stereo.json is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm"
+        return f"{place} is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm"
     if baseline_mm > LONGEST_BASELINE_MM:
-        length = f"T of stereo.json is {baseline_mm / 1000:.3g} m long"
+        length = f"{place} is {baseline_mm / 1000:.3g} m long"
         return f"{length}: was it in mm before it was taken for metres? Lengths are mm"
     return None
 
 
-def pair_doubts(stereo: Stereo) -> tuple[str, ...]:
+def fold_radius(distortion: np.ndarray) -> float:
+    """Tangent of the angle off the axis at which the radial distortion turns back; infinite where it never does.
+
+    Smallest positive root of d/dr of r (1 + k1 r^2 + k2 r^4 + k3 r^6).
+    """
+    k1, k2, _, _, k3 = np.asarray(distortion, float).ravel()
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    real = [root.real for root in roots if abs(root.imag) < 1e-9 * abs(root) and root.real > 0]
+    return math.sqrt(min(real)) if real else math.inf
+
+
+def _lens_doubts(
+    matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[int, int], matrix_place: str, distortion_place: str
+) -> list[str]:
+    """What no lens does."""
+    doubts = []
+    widest = 2 * math.degrees(math.atan(size_px[0] / 2 / matrix[0, 0]))
+    if widest > VIEW_DEG_MAX:
+        doubts.append(
+            f"fx in {matrix_place} is {matrix[0, 0]:.4g} px: a view of {widest:.0f} deg, which no such lens has"
+        )
+    corners = np.array([[x, y] for x in (0, size_px[0] - 1) for y in (0, size_px[1] - 1)], float)
+    corner = float(np.linalg.norm((corners - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], axis=1).max())
+    fold = fold_radius(distortion)
+    k1, k2, p1, p2, k3 = np.asarray(distortion, float).ravel()
+    if fold < math.inf and fold * (1 + k1 * fold**2 + k2 * fold**4 + k3 * fold**6) < corner:
+        doubts.append(
+            f"{distortion_place} (k1 {k1:.3g}, k2 {k2:.3g}, k3 {k3:.3g}) folds inside the picture, at r = "
+            f"{fold:.2f} ({math.degrees(math.atan(fold)):.0f} deg off the axis; the corner is at r = {corner:.2f}): "
+            "pixels beyond belong to no ray or to two; calibrate again with boards up to the corners, or with --fix-k3"
+        )
+    if max(abs(p1), abs(p2)) > TANGENTIAL_MAX:
+        doubts.append(
+            f"{distortion_place} has p1 {p1:.3g}, p2 {p2:.3g}: is it a fisheye (equidistant) model under another name?"
+        )
+    return doubts
+
+
+def pair_doubts(stereo: Stereo, places: Mapping[str, str] | None = None) -> tuple[str, ...]:
     """What contradicts two cameras beside each other that look at one scene, in words; empty where nothing does.
 
     No refusal: mirrors, cropped images and lenses off their axes exist. Seen are cameras exchanged, an image size that
-    belongs to other pictures, pixels far from square, T in another unit.
+    belongs to other pictures, pixels far from square, views near 180 deg, distortion that folds, T in another unit.
+
+    Args:
+        stereo: the pair.
+        places: which key of which file M1, D1, M2, D2, R, T came from, in words; those of `stereo.json` where absent.
     """
-    doubts = [text] if (text := baseline_doubt(stereo)) is not None else []
+    place = {name: f"{name} of stereo.json" for name in ("M1", "D1", "M2", "D2", "R", "T")} | dict(places or {})
+    doubts = [text] if (text := baseline_doubt(stereo, place["T"])) is not None else []
+    turned = math.degrees(float(np.linalg.norm(rotation_vector(stereo.R))))
+    if turned > TURN_DEG_MAX:
+        doubts.append(f"{place['R']} turns by {turned:.0f} deg: do both cameras look at one scene?")
     # Where the second camera stands, in axes of the first: x to the right, as columns of a picture grow.
     right_mm = -float(stereo.R[:, 0] @ stereo.T)
     if right_mm < 0:
@@ -355,4 +417,6 @@ def pair_doubts(stereo: Stereo) -> tuple[str, ...]:
         fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
         if abs(fx / fy - 1) > ASPECT_SHARE_MAX:
             doubts.append(f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are seldom so oblong")
+        number, own = ("1", stereo.D1) if side == "left" else ("2", stereo.D2)
+        doubts += _lens_doubts(matrix, own, size_px, place[f"M{number}"], place[f"D{number}"])
     return tuple(doubts)

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration, noise_of_a_look
+from tvsbayes.calibration.drawn_looks import noise_of_a_look
+from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.calibration.pointing import NOISE_NAMES as CALIBRATION_NOISE
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.axes import APPROACH_SIGN, DIRECTIONS

@@ -136,7 +136,7 @@ def empty_pool(target: Target, proposal: Independence | None = None) -> Pool:
     """Before the first round: from a proposal, or from the first."""
     path = target.path
     dimension = path.dimension
-    first = proposal or first_proposal(target, dimension, path.heavy, path.coupled, path.pairs)
+    first = proposal or first_proposal(target, dimension, path.heavy, path.coupled)
     errors, nowhere = no_draw(0, target.fit.arrays), Mapped(np.zeros((0, len(path.mode))), np.zeros(0))
     return Pool(np.zeros((0, dimension)), np.zeros(0), errors, nowhere, (), (), first)
 
@@ -295,8 +295,8 @@ def lacking(pareto: float, heaviest: float, draws: int, errors: Mapping[str, Mon
     if not pareto < limit:
         missing.append(f"the weights of importance sampling have Pareto k {pareto:.2f}, wanted below {limit:.2f}")
     if not heaviest <= HEAVIEST_MAX:
-        share = f"one draw holds {100 * heaviest:.1f} % of the weight"
-        missing.append(f"{share}, wanted at most {100 * HEAVIEST_MAX:.0f} %")
+        wanted = f"wanted at most {100 * HEAVIEST_MAX:.0f} %"
+        missing.append(f"one draw holds {100 * heaviest:.1f} % of the weight, {wanted}")
     return (*missing, *uncertain(errors))
 
 
@@ -375,6 +375,45 @@ def importance_run(fit: JointFit, seed: int, advance: Advance = unshown, rounds_
         raise NotConverged("no-density", str(error), remedy="see the weak directions of --no-sample") from error
 
 
+SHARED_DRAWS_LEAST = 2 * ROUND
+"""Draws of one way of homing, at least, by which another one is known."""
+SHARED_MARGIN = 2.0
+"""A way of homing takes so many times the draws that its share of the posterior asks for."""
+
+
+def run_beside(fit: JointFit, run: ImportanceRun, seed: int) -> Posterior:
+    """The posterior under another way of homing, from the draws of the most probable one weighted anew.
+
+    Both posteriors mostly lie over each other. Where they do not, the other one is sampled by itself.
+
+    Args:
+        fit: under the other way.
+        run: of the most probable way.
+        seed: of draws of the errors at places.
+    """
+    began, first = time.monotonic(), run.posterior.fit.mixture[0].probability
+    share = next(way.probability for way in run.posterior.fit.mixture if way.sides == fit.sides) / first
+    count = int(np.clip(SHARED_MARGIN * share * len(run.pool.w), SHARED_DRAWS_LEAST, len(run.pool.w)))
+    target, pool = Target(fit, run.path), run.pool
+    mapped = Mapped(pool.mapped.z[:count], pool.mapped.log_jacobian[:count])
+    valued = target.at(mapped, place_normals(count, fit, np.random.default_rng([seed, 6])))
+    own = replace(
+        pool,
+        w=pool.w[:count],
+        log_target=valued.log_target,
+        place_errors_rad=valued.place_errors_rad,
+        mapped=mapped,
+        counts=(count,),
+        invalid=target.invalid,
+    )
+    weighed = Weighing(fit, run.path, own)
+    error = max(e.rounds_factor for e in weighed.monte_carlo_error.values())
+    # An error of a part is as large in the whole as the part.
+    if weighed.importance.pareto_k < K_MAX and error * share**2 <= 1:
+        return weighed.posterior(seed, time.monotonic() - began)
+    return importance_run(fit, seed).posterior
+
+
 def mixed(parts: Sequence[Posterior]) -> Posterior:
     """One posterior of the fits under several ways of homing, by their evidence and prior probabilities.
 
@@ -386,7 +425,6 @@ def mixed(parts: Sequence[Posterior]) -> Posterior:
     evidence += np.log([prior_chance(part.fit.sides) for part in parts])
     chance = np.exp(evidence - evidence.max())
     chance /= chance.sum()
-    worst = min(parts, key=lambda part: (part.converged, part.convergence.importance.least_ess.value))
     ways = tuple(
         replace(way, probability=float(p))
         for way, p in zip([way for way in first.fit.mixture if way.fit is not None], chance, strict=True)
@@ -398,7 +436,31 @@ def mixed(parts: Sequence[Posterior]) -> Posterior:
         log_density=np.concatenate([part.log_density for part in parts], axis=1),
         draws=jax.tree.map(lambda *each: np.concatenate(each, axis=1), *(part.draws for part in parts)),
         weights=np.concatenate([p * part.weights for p, part in zip(chance, parts, strict=True)], axis=1),
-        convergence=worst.convergence,
+        convergence=_joined(parts, chance),
         way=np.concatenate([np.full(part.weights.shape, k) for k, part in enumerate(parts)], axis=1),
         seconds=sum(part.seconds for part in parts),
     )
+
+
+def _joined(parts: Sequence[Posterior], chance: np.ndarray) -> Reweighted:
+    """The diagnosis of a mixture: that of its first part, with the Monte Carlo errors of all.
+
+    Parts share draws; one that several have weighs what all of them give it.
+    """
+    first = parts[0]
+    diagnosis = first.convergence
+    assert isinstance(diagnosis, Reweighted)
+    names = list(diagnosis.monte_carlo_error)
+    weights, rows = [chance[0] * first.weights[0]], [np.stack([first.by_name[name] for name in names], axis=1)]
+    for p, part in zip(chance[1:], parts[1:], strict=True):
+        count = part.weights.size
+        if np.array_equal(part.z[0], first.z[0, :count]):
+            weights[0][:count] += p * part.weights[0]
+        else:
+            weights.append(p * part.weights[0])
+            rows.append(np.stack([part.by_name[name] for name in names], axis=1))
+    errors = monte_carlo_errors(names, weighted_summary(np.concatenate(rows), np.concatenate(weights)))
+    unknown, known = uncertain(errors), diagnosis.importance
+    if unknown and known.accepted:
+        known = replace(known, accepted=False, missing=unknown, answer="rough")
+    return replace(diagnosis, importance=known, monte_carlo_error=errors)

@@ -12,7 +12,7 @@ from tvsbayes.errors import NotConverged, require_kind
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.importance import importance_run, mixed
+from tvsbayes.posterior.importance import importance_run, mixed, run_beside
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.convergence import Convergence
 
@@ -83,7 +83,7 @@ def sample(
             start, chain = importance_run(fit, seed, job.at), None
         early = start.posterior
         if len(fit.mixture) > 1:
-            early = mixed([early, *(importance_run(way.fit, seed).posterior for way in fit.mixture[1:] if way.fit)])
+            early = mixed([early, *(run_beside(way.fit, start, seed) for way in fit.mixture[1:] if way.fit)])
         if tier == "importance":
             return early
         if first is not None:

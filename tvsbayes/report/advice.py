@@ -10,7 +10,10 @@ from collections.abc import Sequence
 from tvsbayes.errors import listed
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import REGISTRY, STEREO_PARAMETER_NAMES
+from tvsbayes.instrument.stereo_pair import ASSUMED_REMEDY, Stereo
 from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
+from tvsbayes.results.metrology_tables import BudgetTable
 
 SPOTS_REMEDY = "look at those spots, or fit with --robust"
 """Where single spots disagree; a factor on u covers nothing of that."""
@@ -30,6 +33,8 @@ REMEDIES = {
 ANY_REMEDY = "find the cause in the section Validation of the report, mend it and measure again"
 SPOTS_LISTED = 20
 """Of those that disagree, by their ids."""
+SHARE_TOLD = 0.05
+"""Of a variance, from which on its cause is named."""
 USUAL_SCALE = (0.5, 2.0)
 """Pixel noise over the stated one that needs no word."""
 
@@ -92,6 +97,26 @@ def noise_line(summary: FitSummary) -> str | None:
         f"the spots scatter {scale:.2g} times as much as su and sv of spots.csv say; the fit allows for it: "
         f"state {worse} ones if you know them"
     )
+
+
+def assumed_stereo(stereo: Stereo, budgets: Sequence[BudgetTable]) -> str | None:
+    """How much of each result's variance an assumed stereo covariance makes, and what lowers it; None of a real one."""
+    if not stereo.assumed:
+        return None
+    cause = REGISTRY[STEREO_PARAMETER_NAMES[0]].cause
+    shares = [
+        f"{100 * row.share:.0f} % of the variance of {table.quantity}"
+        for table in budgets
+        for row in table.rows
+        if row.quantity == cause and row.share >= SHARE_TOLD
+    ]
+    begin = "the stereo covariance is assumed, not estimated"
+    origin = f" (from {stereo.assumed_from})" if stereo.assumed_from else ""
+    if not budgets:
+        return f"{begin}{origin}"
+    if not shares:
+        return f"{begin}{origin}: less than {100 * SHARE_TOLD:.0f} % of the variance of every result comes from it"
+    return f"{begin}{origin}: it makes {', '.join(shares)}; what lowers it: {ASSUMED_REMEDY}"
 
 
 def steps_ahead(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()) -> list[str]:

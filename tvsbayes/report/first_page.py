@@ -14,7 +14,7 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.traceability import NOT_STATED, performed
 from tvsbayes.report import figures
-from tvsbayes.report.advice import verdict_line
+from tvsbayes.report.advice import assumed_stereo, verdict_line
 from tvsbayes.report.drawing import OF_ESTIMATOR
 from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
 from tvsbayes.report.fit_text import validation_lines
@@ -182,7 +182,7 @@ def warnings_of(e: Evidence) -> list[str]:
         found.append("Intervals are those of the Laplace approximation: too short for a backlash seen at few stops.")
     if e.campaign.header.get("synthetic"):
         found.append("The campaign is synthetic: made by the digital twin, not measured.")
-    if e.campaign.stereo.assumed:
-        found.append("The stereo calibration's covariance is assumed, not estimated.")
+    if (told := assumed_stereo(e.campaign.stereo, e.shown.budgets)) is not None:
+        found.append(f"{told[0].upper()}{told[1:]}.")
     found += [f"Prior conflict: {text}" for text in summary.prior_conflicts]
     return found

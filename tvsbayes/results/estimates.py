@@ -239,7 +239,7 @@ class FitNoise(ClosedRecord, frozen=True):
 def fit_noise(chi2: float, dof: float, parameters: Mapping[str, Estimate]) -> FitNoise:
     """Of a fit with these estimates."""
     stops = {direction: parameters[f"stop_sd_deg.{direction}"].value for direction in DIRECTIONS}
-    looks = {axis: parameters[f"look_scatter_deg.{axis}"].value for axis in AXES}
+    looks: dict[str, float] = {axis: parameters[f"look_scatter_deg.{axis}"].value for axis in AXES}
     return FitNoise(chi2, dof, parameters["pixel_scale"].value, stops, looks)
 
 

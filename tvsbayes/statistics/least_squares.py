@@ -133,6 +133,11 @@ def levenberg_marquardt(
     return descend(partial(linear_residual, residual), damped_solver(tolerance), start, args, max_steps).value
 
 
+NEIGHBOUR_STEPS, NEIGHBOUR_SETTLED = 8, 0.01
+"""Newton steps to a mode beside a known one, and the squared length of one, in posterior sds, after which the next
+would change the log density by less than a thousandth."""
+
+
 @dataclass(frozen=True)
 class Mode:
     """Outcome of the Newton steps: `covariance` is the inverse Hessian over all coordinates."""
@@ -251,6 +256,29 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
     whitened = (vectors / np.maximum(eigenvalues, 1e-3)) @ vectors.T
     covariance[np.ix_(rows, rows)] = (here.ways @ whitened @ here.ways.T)[np.ix_(rows, rows)]
     return Mode(here.z, covariance, float(objective(here.z[None])[0]), tuple(problems))
+
+
+def neighbouring_mode(objective: Objective, known: Mode, free: np.ndarray) -> Mode | None:
+    """The mode of a density that differs little from one whose mode is known: Newton steps with the known covariance.
+
+    Args:
+        objective: negative log density of many points.
+        known: mode and covariance of the other density.
+        free: coordinates that move.
+
+    Returns:
+        The mode with the known covariance; None where the steps did not settle.
+    """
+    rows = np.flatnonzero(free)
+    ways = np.zeros((len(free), len(rows)))
+    ways[rows] = np.linalg.cholesky(known.covariance[np.ix_(rows, rows)])
+    here = _Surroundings(objective, known.z, ways)
+    for _ in range(NEIGHBOUR_STEPS):
+        step = -here.slope()
+        here = replace(here, z=here.z + ways @ step)
+        if step @ step < NEIGHBOUR_SETTLED:
+            return Mode(here.z, known.covariance, float(objective(here.z[None])[0]), ())
+    return None
 
 
 def laplace_draws(z: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarray:

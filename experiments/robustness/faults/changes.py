@@ -165,19 +165,6 @@ class Argument(Change):
             node.body.insert(int(ast.get_docstring(node) is not None), self.changed(new))
 
 
-class Body(Change):
-    """A function does nothing but return an expression of its arguments."""
-
-    def __init__(self, expression: str):
-        super().__init__()
-        self.expression = expression
-
-    def change(self, place: Definition) -> None:
-        """Replace the body."""
-        if isinstance(place.node, ast.FunctionDef):
-            place.node.body = [self.changed(ast.Return(_expression(self.expression)))]
-
-
 class Returns(Change):
     """A function returns something else: an expression of `value`, its arguments and its variables."""
 

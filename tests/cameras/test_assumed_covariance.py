@@ -1,0 +1,258 @@
+"""The covariance of a calibration that came without one: one adjustment's information, and OpenCV's actual errors."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import chain
+
+import cv2
+import numpy as np
+import pytest
+
+from tvsbayes.cameras.assumed_covariance import (
+    CORRELATED,
+    GROUPS,
+    USUAL_PITCH_SHARE,
+    Known,
+    calibration_covariance,
+    placed_boards,
+    view_information,
+    with_assumed_covariance,
+    with_marginal,
+)
+from tvsbayes.cameras.boards import Board, View
+from tvsbayes.cameras.bundle_adjustment import bundle_adjustment
+from tvsbayes.cameras.calibration_export import exported
+from tvsbayes.cameras.calibration_formats import read_calibration
+from tvsbayes.cli.main import run
+from tvsbayes.errors import InputError
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.stereo_pair import Stereo, read_stereo, rotation_matrix, rotation_vector, stereo_bytes
+from tvsbayes.report.advice import assumed_stereo
+from tvsbayes.results.metrology_tables import BudgetRow, BudgetTable
+
+BOARD = Board(9, 6, 25.0)
+BENCHES, NOISE_PX, VIEWS = 12, 0.15, 18
+
+
+@pytest.fixture(scope="module")
+def mounted() -> Stereo:
+    return read_stereo(shipped_data() / "rigs" / "mounted" / "stereo.json")
+
+
+def corners(stereo: Stereo, pose: np.ndarray, board: Board = BOARD) -> tuple[np.ndarray, np.ndarray]:
+    """Where both cameras see the corners, by OpenCV."""
+    left = board.points_mm @ rotation_matrix(pose[:3]).T + pose[3:]
+    still = np.zeros(3)
+    own = (left, stereo.M1, stereo.D1), (left @ stereo.R.T + stereo.T, stereo.M2, stereo.D2)
+    one, two = (cv2.projectPoints(points, still, still, m, d)[0].reshape(-1, 2) for points, m, d in own)
+    return one, two
+
+
+def test_information_is_that_of_the_bundle_adjustment(mounted):
+    """Of the same views, to the curvature that noise of 1e-3 px leaves in the adjustment's own linearisation."""
+    poses = placed_boards(mounted, BOARD)["opencv"]
+    rng = np.random.default_rng(3)
+    views = []
+    for k, pose in enumerate(poses):
+        left, right = (seen + 1e-3 * rng.standard_normal(seen.shape) for seen in corners(mounted, pose))
+        views.append(View(f"{k}", left, right))
+    done = bundle_adjustment(views, BOARD, mounted.vector, np.array(poses), np.ones(24, bool))
+    whole = np.sum([view_information(mounted, BOARD, pose).together for pose in poses], axis=0)
+    made, own = np.linalg.inv(whole), done.covariance / done.noise_sd_px**2
+    sds = np.sqrt(np.diag(own))
+    np.testing.assert_allclose(made / np.outer(sds, sds), own / np.outer(sds, sds), atol=1e-4)
+
+
+def test_boards_are_seen_whole_by_both_cameras(mounted):
+    found = placed_boards(mounted, BOARD)
+    assert {name: len(poses) for name, poses in found.items()} == {"bumblebee2": 11, "opencv": 13}
+    size = np.array([mounted.image_width, mounted.image_height])
+    for pose in chain(*found.values()):
+        for pixels in corners(mounted, pose):
+            assert (pixels > -0.5).all() and (pixels < size - 0.5).all()
+
+
+def test_covariance_scales_as_a_calibration(mounted):
+    """With the RMS, with one over the root of the views (degrees of freedom aside), T with the pitch."""
+    made = calibration_covariance(mounted, BOARD, 20, 0.2)
+    np.testing.assert_allclose(calibration_covariance(mounted, BOARD, 20, 0.4), 4 * made, rtol=1e-12)
+    coordinates = 4 * BOARD.corners
+    share = [1 - (24 / views + 6) / coordinates for views in (20, 80)]
+    fewer = calibration_covariance(mounted, BOARD, 80, 0.2) * 4 * share[1] / share[0]
+    np.testing.assert_allclose(fewer, made, rtol=1e-9)
+    sd = np.sqrt(np.diag(calibration_covariance(mounted, replace(BOARD, pitch_u_mm=0.25), 20, 0.2) - made))[21:]
+    # Differences of variances: their digits are those of the larger one.
+    np.testing.assert_allclose(sd, 0.01 * np.abs(mounted.T), rtol=1e-6, atol=1e-6)
+    joint, fixed, either = (calibration_covariance(mounted, BOARD, 20, 0.2, way) for way in (False, True, None))
+    np.testing.assert_allclose(either, (joint + fixed) / 2, rtol=1e-9)
+    assert (np.diag(fixed) > np.diag(joint)).all(), "each camera by itself knows less"
+
+
+def drawn(seed: int) -> tuple[Stereo, list[np.ndarray]]:
+    """A pair, and poses of boards by depth and tilt anywhere in both pictures: not those of the table."""
+    rng = np.random.default_rng([seed, 45])
+    size, focal, baseline = np.array([1280, 960]), rng.uniform(700, 1600), rng.uniform(80, 300)
+    inner = []
+    for _ in range(2):
+        middle = size / 2 - 0.5 + 15 * rng.standard_normal(2)
+        inner += [focal, focal, *middle, rng.uniform(-0.3, 0.1), 0.03, *rng.normal(0, 5e-4, 2), 0.0]
+    turn = rotation_matrix(np.array([0, rng.uniform(0, 0.5) * baseline / 700, 0]))
+    vector = np.array([*inner, *rotation_vector(turn), *(turn @ [-baseline, 0, 0])])
+    true = Stereo(*size.tolist(), *(np.zeros(1),) * 6, np.zeros((24, 24)), 0.0).with_vector(vector)
+    poses: list[np.ndarray] = []
+    while len(poses) < VIEWS:
+        depth = focal * 8 * BOARD.pitch_mm / (size[0] * rng.uniform(0.25, 0.55))
+        across = rng.uniform(-0.45, 0.45, 2) * size / focal
+        shift = depth * np.append(across, 1.0) + [baseline / 2, 0, 0]
+        pose = np.array([*rng.uniform(-0.5, 0.5, 2), rng.normal(0, 0.3), *shift])
+        if all(((seen > 0) & (seen < size - 1)).all() for seen in corners(true, pose)):
+            poses.append(pose)
+    return true, poses
+
+
+def by_opencv(true: Stereo, poses: list[np.ndarray], seed: int, fixed: bool) -> tuple[Stereo, float]:
+    """What cv2.stereoCalibrate makes of noisy corners, all free from each camera's own calibration or R and T alone."""
+    rng = np.random.default_rng([seed, 46])
+    seen = [corners(true, pose) for pose in poses]
+    sides = [
+        [(view[k] + NOISE_PX * rng.standard_normal(view[k].shape)).astype(np.float32) for view in seen] for k in (0, 1)
+    ]
+    points, size = [BOARD.points_mm.astype(np.float32)] * len(poses), (true.image_width, true.image_height)
+    alone = [cv2.calibrateCamera(points, side, size, None, None)[1:3] for side in sides]
+    flags = cv2.CALIB_FIX_INTRINSIC if fixed else cv2.CALIB_USE_INTRINSIC_GUESS
+    ends = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-9
+    rms, m1, d1, m2, d2, r, t, *_ = cv2.stereoCalibrate(
+        points, *sides, *alone[0], *alone[1], size, flags=flags, criteria=ends
+    )
+    inner = [np.r_[m[[0, 1, 0, 1], [0, 1, 2, 2]], np.ravel(d)[:5]] for m, d in ((m1, d1), (m2, d2))]
+    return true.with_vector(np.concatenate([*inner, rotation_vector(r), np.ravel(t)])), float(rms)
+
+
+@pytest.mark.parametrize("fixed", (False, True))
+def test_opencvs_errors_are_as_large_as_assumed(fixed):
+    """RMS of whitened errors by group: 0.5 to 1.5 where all is stated, 0.2 to 1.5 where nothing is.
+
+    Of 12 benches with 3 or 4 parameters a group the RMS itself scatters by a tenth: the bounds are widened by two of
+    that; a wrong sign in a slope or a wrong power of the noise is off by more than a factor of 2.
+    """
+    squares: dict[tuple[str, str], list[float]] = {}
+    for seed in range(BENCHES):
+        true, poses = drawn(seed)
+        found, rms = by_opencv(true, poses, seed, fixed)
+        difference = found.vector - true.vector
+        stated = Known(rms, VIEWS, (9, 6), 25.0, fixed_intrinsics=fixed)
+        for kind, known in (("all", stated), ("nothing", Known())):
+            covariance = with_assumed_covariance(found, known, Known()).parameter_covariance
+            for name in ("focal length", "principal point", "rotation", "translation"):
+                own = covariance[np.ix_(GROUPS[name], GROUPS[name])]
+                error = difference[GROUPS[name]]
+                squares.setdefault((kind, name), []).append(float(error @ np.linalg.solve(own, error)) / len(error))
+    for (kind, name), values in squares.items():
+        low = {"all": 0.5, "nothing": 0.2}[kind]
+        assert 0.8 * low < np.sqrt(np.mean(values)) < 1.2 * 1.5, (kind, name)
+
+
+def test_a_stated_uncertainty_replaces_that_of_its_group(mounted):
+    """Exactly, with the group's correlations; the others follow as they depend on it."""
+    plain = with_assumed_covariance(mounted, Known(), Known())
+    stated = Known(u_focal_percent=0.5, u_principal_px=3.0, u_rotation_mrad=0.7, u_baseline_mm=0.2)
+    for name, values in (
+        ("u_focal_percent", 0.005 * mounted.vector[GROUPS["focal length"]]),
+        ("u_principal_px", np.full(4, 3.0)),
+        ("u_rotation_mrad", np.full(3, 0.7e-3)),
+        ("u_baseline_mm", np.full(3, 0.2)),
+    ):
+        group = GROUPS[
+            {"focal": "focal length", "princ": "principal point", "rotat": "rotation"}.get(name[2:7], "translation")
+        ]
+        found = with_assumed_covariance(mounted, Known(**{name: getattr(stated, name)}), Known())
+        np.testing.assert_allclose(np.sqrt(np.diag(found.parameter_covariance))[group], values, rtol=1e-9)
+        assert "(stated)" in found.assumed_from and found.assumed
+        stereo_bytes(found)
+    own = plain.parameter_covariance
+    sds = np.sqrt(np.diag(own))[GROUPS["rotation"]]
+    # The sds that it has change nothing; units span ten powers of ten.
+    scale = np.sqrt(np.outer(np.diag(own), np.diag(own)))
+    np.testing.assert_allclose(with_marginal(own, GROUPS["rotation"], sds) / scale, own / scale, atol=1e-9)
+    # A group that is known exactly leaves the conditional covariance of the others.
+    tiny = with_marginal(own, GROUPS["rotation"], 1e-6 * sds)
+    rest = [k for k in range(24) if k not in GROUPS["rotation"]]
+    expected = np.linalg.inv(np.linalg.inv(own / scale)[np.ix_(rest, rest)])
+    np.testing.assert_allclose(tiny[np.ix_(rest, rest)] / scale[np.ix_(rest, rest)], expected, atol=1e-6)
+
+
+def test_what_was_stated_goes_before_the_file_and_that_before_what_is_usual(mounted, tmp_path):
+    files = exported(mounted, "opencv")
+    files["intrinsics.yml"] += b"avg_reprojection_error: 0.41\nnr_of_frames: 17\nboard_width: 8\nboard_height: 5\n"
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    paths = [tmp_path / name for name in files]
+    of_file = read_calibration(paths).stereo
+    expected = Known(0.41, 17, (8, 5))
+    assert of_file.assumed_from == with_assumed_covariance(of_file, Known(), expected).assumed_from
+    assert (
+        "RMS 0.41 px (of the file), 17 views (of the file), a board of 8x5 corners (of the file)"
+        in of_file.assumed_from
+    )
+    assert of_file.rms_px == 0.41 and "squares of 25 mm (usual)" in of_file.assumed_from
+    stated = read_calibration(paths, stated=Known(0.21, 20, pitch_mm=30.0)).stereo
+    assert "RMS 0.21 px (stated), 20 views (stated), a board of 8x5 corners (of the file)" in stated.assumed_from
+    board = Board(8, 5, 30.0)
+    np.testing.assert_allclose(stated.parameter_covariance, calibration_covariance(stated, board, 20, 0.21), rtol=1e-12)
+    board = Board(8, 5, 25.0, 25.0 * USUAL_PITCH_SHARE)
+    np.testing.assert_allclose(
+        of_file.parameter_covariance, calibration_covariance(of_file, board, 17, 0.41), rtol=1e-12
+    )
+    assert CORRELATED >= 1
+
+
+def test_cameras_that_share_no_view_are_refused(mounted):
+    away = replace(mounted, R=rotation_matrix(np.array([0, 2.8, 0])))
+    with pytest.raises(InputError, match="do not see one board together"):
+        with_assumed_covariance(away, Known(), Known())
+    with pytest.raises(InputError, match="calibrate no pair"):
+        calibration_covariance(mounted, Board(3, 3, 25.0), 0, 0.2)
+
+
+def test_command_takes_what_is_known(mounted, tmp_path, capsys):
+    for name, data in exported(mounted, "opencv").items():
+        (tmp_path / name).write_bytes(data)
+    named = [part for name in ("intrinsics.yml", "extrinsics.yml") for part in ("--import", str(tmp_path / name))]
+    made = ["--rms-px", "0.21", "--views", "20", "--board", "9x6", "--pitch-mm", "25", "--joint"]
+    assert run(["stereo", *named, *made, "-o", str(tmp_path / "stereo.json"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["assumed"] and document["assumed_from"] == (
+        "RMS 0.21 px (stated), 20 views (stated), a board of 9x6 corners (stated), squares of 25 mm (stated), "
+        "all in one adjustment"
+    )
+    found = read_stereo(tmp_path / "stereo.json")
+    assert found.assumed_from == document["assumed_from"] and found.rms_px == 0.21
+    # The shipped pair's own sds, of 20 views at another noise, within the factor that is stated of a guess twice.
+    assert run(["stereo", "--import", str(tmp_path / "stereo.json"), "--u-rotation-mrad", "1", "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert abs(again["parameters"]["stereo.rotation_rad.y"]["sd"] - 1e-3) < 1e-12
+    for options in (["--rms-px", "0"], ["--views", "0"], ["--u-baseline-mm", "-1"], ["--board", "9"]):
+        assert run(["stereo", *named, *options, "--json"]) == 2
+        assert json.loads(capsys.readouterr().out)["error"]["remedy"]
+    own = shipped_data() / "rigs" / "mounted" / "stereo.json"
+    assert run(["stereo", "--import", str(own), "--rms-px", "0.2", "--json"]) == 2
+    assert "its own covariance" in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert run(["stereo", str(tmp_path), "--board", "9x6", "--pitch-mm", "25", "--rms-px", "0.2", "--json"]) == 2
+
+
+def test_a_fit_says_how_much_comes_from_it(mounted):
+    row = BudgetRow("stereo calibration", "deg", None, 0.1, "B", "normal", None, 1.0, 0.1, 0.62)
+    other = replace(row, share=0.01)
+    tables = [
+        BudgetTable(name, "deg", 1.0, (entry,), 0.1, None, 2.0, 0.95, 0.2, ())
+        for name, entry in (("effective_deg_per_step.left", row), ("backlash_deg.pan", other))
+    ]
+    assert assumed_stereo(mounted, tables) is None
+    assumed = replace(mounted, assumed=True, assumed_from="RMS 0.21 px (stated)")
+    told = assumed_stereo(assumed, tables)
+    assert told is not None and "(from RMS 0.21 px (stated))" in told and "backlash" not in told
+    assert "62 % of the variance of effective_deg_per_step.left" in told and "--rms-px" in told
+    told = assumed_stereo(assumed, tables[1:])
+    assert told is not None and "less than 5 %" in told and "--rms-px" not in told

@@ -1,0 +1,486 @@
+"""One pair in every kind of file that people have, written by the libraries of the formats: the same numbers come out.
+
+`tests/data/foreign` holds files of the layouts that were met in public repositories, own numbers: T = -118.6, 0.4,
+1.9 mm, 640 x 480 px. Files of many digits come back to 1e-9, which is rounding of a few products.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import scipy.io
+
+from tvsbayes.cameras.calibration_containers import read_container
+from tvsbayes.cameras.calibration_export import exported
+from tvsbayes.cameras.calibration_formats import read_calibration
+from tvsbayes.cameras.lens_models import fitted_to_five
+from tvsbayes.errors import InputError
+from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.stereo_pair import (
+    Stereo,
+    fold_radius,
+    pair_doubts,
+    project_pair,
+    read_stereo,
+    rotation_matrix,
+    rotation_vector,
+    triangulate,
+)
+
+FOREIGN = Path(__file__).parents[1] / "data" / "foreign"
+T_MM = np.array([-118.6, 0.4, 1.9])
+
+
+@pytest.fixture(scope="module")
+def mounted() -> Stereo:
+    return read_stereo(shipped_data() / "rigs" / "mounted" / "stereo.json")
+
+
+def same(found: Stereo, stereo: Stereo) -> None:
+    np.testing.assert_allclose(found.vector, stereo.vector, rtol=1e-9, atol=1e-9)
+    assert (found.image_width, found.image_height) == (stereo.image_width, stereo.image_height)
+    assert found.assumed and found.assumed_from
+
+
+@pytest.mark.parametrize(
+    "names, source",
+    (
+        (("opencv_other_names/pair.yml",), "opencv"),
+        (("opencv_other_names/pair2.yml",), "opencv"),
+        (("opencv_other_names/pair3.yml",), "opencv"),
+        (("opencv_xml/pair.xml",), "opencv"),
+        (("opencv_xml/pair.yml",), "opencv"),
+        (("plain_json/pair.json",), "opencv"),
+        (("ros_message_dump/left.yaml", "ros_message_dump/right.yaml"), "ros"),
+        (("ros_message_dump/right.yaml", "ros_message_dump/left.yaml"), "ros"),
+        (("euroc_sensor_pair/cam0.yaml", "euroc_sensor_pair/cam1.yaml"), "euroc"),
+        (("fisheye_advice/fisheye.yaml",), "kalibr"),
+    ),
+)
+def test_foreign_files_are_read_as_they_are(names, source):
+    found = read_calibration([FOREIGN / name for name in names])
+    assert found.source == source
+    np.testing.assert_allclose(found.stereo.T, T_MM, atol=1e-9)
+    assert (found.stereo.image_width, found.stereo.image_height) == (640, 480)
+    np.testing.assert_allclose(found.stereo.M2[[0, 1, 0, 1], [0, 1, 2, 2]], [809.1, 808.8, 325.6, 239.4], atol=1e-9)
+
+
+def test_centimetres_are_asked_for():
+    path = FOREIGN / "T_in_cm" / "pair.yml"
+    with pytest.raises(
+        InputError, match=r"T of pair\.yml: found cameras 11\.86 mm apart.*--import-unit cm \(118\.6 mm\)"
+    ):
+        read_calibration([path])
+    np.testing.assert_allclose(read_calibration([path], unit_mm=10.0).stereo.T, T_MM, atol=1e-9)
+    assert np.linalg.norm(read_calibration([path], unit_mm=1.0).stereo.T) < 12, "stated, it is believed"
+
+
+def test_a_fold_is_named_with_its_radius():
+    """1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 = 0 at r = 0.53, as the page of that file says."""
+    warnings = read_calibration([FOREIGN / "distortion_folds" / "pair.yml"]).warnings
+    assert any("D1 of pair.yml" in told and "r = 0.53" in told for told in warnings)
+    for k1, expected in ((-0.3, 1 / np.sqrt(0.9)), (0.3, np.inf), (0.0, np.inf)):
+        assert fold_radius(np.array([k1, 0, 0, 0, 0])) == pytest.approx(expected)
+
+
+def test_a_fisheye_is_fitted_or_refused_and_its_renaming_doubted(mounted):
+    found = read_calibration([FOREIGN / "fisheye_advice" / "fisheye.yaml"])
+    (note,) = (n for n in found.notes if "cam0.distortion_coeffs of fisheye.yaml" in n)
+    assert "a fisheye lens, fitted to five coefficients within" in note
+    followed = read_calibration([FOREIGN / "fisheye_advice" / "followed.yaml"])
+    assert sum("fisheye (equidistant) model under another name" in w for w in followed.warnings) == 2
+    # OpenCV's own projections agree within what is stated, plus the grid's coarseness.
+    stereo, coefficients = found.stereo, np.array([0.03, -0.02, 0.03, -0.01])
+    rays = np.random.default_rng(1).uniform(-0.35, 0.35, (50, 2))
+    points = np.column_stack([rays, np.ones(50)]).reshape(-1, 1, 3)
+    still = np.zeros(3)
+    theirs = cv2.fisheye.projectPoints(points, still, still, stereo.M1, coefficients)[0].reshape(-1, 2)
+    ours = cv2.projectPoints(points, still, still, stereo.M1, stereo.D1)[0].reshape(-1, 2)
+    assert np.abs(theirs - ours).max() < 0.01
+    wide = np.array([[240.0, 0, 320], [0, 240, 240], [0, 0, 1]])
+    assert fitted_to_five(wide, coefficients, (640, 480), True).error_px > 0.1
+
+
+def plain(stereo: Stereo, names: str) -> dict[str, np.ndarray]:
+    """The six matrices under names."""
+    values = stereo.M1, stereo.D1, stereo.M2, stereo.D2, stereo.R, stereo.T
+    return dict(zip(names.split(), values, strict=True))
+
+
+@pytest.mark.parametrize(
+    "names",
+    (
+        "M1 D1 M2 D2 R T",
+        "K1 D1 K2 D2 R T",
+        "mtxL distL mtxR distR R T",
+        "cameraMatrixL distCoeffsL cameraMatrixR distCoeffsR Rot Trans",
+        "left_camera_matrix left_distortion right_camera_matrix right_distortion rotation translation",
+        "camera_matrix_0 dist_coeffs_0 camera_matrix_1 dist_coeffs_1 rotation_matrix translation_vector",
+        "K_l d_l K_r d_r stereo_R stereo_T",
+    ),
+)
+def test_names_in_every_container(mounted, tmp_path, names):
+    """JSON, YAML of nested lists, .npz, .mat and TOML by their own writers, OpenCV's XML and JSON by its own."""
+    values = plain(mounted, names)
+    size = [mounted.image_width, mounted.image_height]
+    lists = {name: value.tolist() for name, value in values.items()} | {"image_size": size}
+    (tmp_path / "a.json").write_text(json.dumps(lists))
+    (tmp_path / "a.yaml").write_text("\n".join(f"{name}: {value}" for name, value in lists.items()))
+    (tmp_path / "a.toml").write_text("\n".join(f"{name} = {value}" for name, value in lists.items()))
+    assert tomllib.loads((tmp_path / "a.toml").read_text()) == lists
+    np.savez_compressed(tmp_path / "a.npz", image_size=size, **values)
+    scipy.io.savemat(tmp_path / "a.mat", {**values, "image_size": size}, do_compression=True)
+    for suffix in ("xml", "yml", "json"):
+        path = tmp_path / f"cv.{suffix}"
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        for name, value in values.items():
+            storage.write(name, value)
+        storage.write("image_width", size[0])
+        storage.write("image_height", size[1])
+        storage.release()
+    for file in ("a.json", "a.yaml", "a.toml", "a.npz", "a.mat", "cv.xml", "cv.yml", "cv.json"):
+        same(read_calibration([tmp_path / file]).stereo, mounted)
+
+
+def test_tables_of_cameras_and_other_extrinsics(mounted, tmp_path):
+    """Nested tables, Rodrigues vectors, poses of both cameras, T_cam_imu, a projection in place of R and T."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = mounted.R, mounted.T / 1000
+    body = np.eye(4)
+    body[:3, :3], body[:3, 3] = rotation_matrix(np.array([0.3, -0.2, 1.1])), [0.1, 0.2, -0.3]
+    world = rotation_matrix(np.array([0.1, 0.5, -0.2])), np.array([100.0, -40.0, 900.0])
+    size = [mounted.image_width, mounted.image_height]
+
+    def inner(matrix: np.ndarray, distortion: np.ndarray) -> dict[str, object]:
+        return {"camera_matrix": matrix.tolist(), "dist_coeffs": distortion.tolist(), "resolution": size}
+
+    left, right = inner(mounted.M1, mounted.D1), inner(mounted.M2, mounted.D2)
+    four = {"intrinsics": mounted.M2[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), "distortion_coeffs": mounted.D2.tolist()}
+    second = mounted.R @ world[0], mounted.R @ world[1] + mounted.T
+    posed = [
+        {**camera, "rotation": rotation_vector(turn).tolist(), "translation": shift.tolist()}
+        for camera, (turn, shift) in zip((left, right), (world, second), strict=True)
+    ]
+    turn, shift = rotation_vector(mounted.R).tolist(), mounted.T.tolist()
+    files: dict[str, tuple[dict[str, object], float | None]] = {
+        "nested": ({"left": left, "right": right, "extrinsics": {"R": mounted.R.tolist(), "T": shift}}, None),
+        "rodrigues": ({"cam1": left, "cam2": right, "rvec": turn, "tvec": [[x] for x in shift]}, None),
+        "posed": ({"cam_0": posed[0], "cam_1": posed[1]}, None),
+        "kalibr": ({"cam0": left, "cam1": {**four, "resolution": size, "T_cn_cnm1": pose.tolist()}}, None),
+        "imu": (
+            {"cam0": {**left, "T_cam_imu": body.tolist()}, "cam1": {**right, "T_cam_imu": (pose @ body).tolist()}},
+            None,
+        ),
+        "orb": (
+            {
+                **{
+                    f"Camera{n}.{k}": float(v)
+                    for n, m in ((1, mounted.M1), (2, mounted.M2))
+                    for k, v in zip(("fx", "fy", "cx", "cy"), m[[0, 1, 0, 1], [0, 1, 2, 2]], strict=True)
+                },
+                **{
+                    f"Camera{n}.{k}": float(v)
+                    for n, d in ((1, mounted.D1), (2, mounted.D2))
+                    for k, v in zip(("k1", "k2", "p1", "p2", "k3"), d, strict=True)
+                },
+                "Camera.type": "PinHole",
+                "Camera.width": size[0],
+                "Camera.height": size[1],
+                "Stereo.T_c1_c2": np.linalg.inv(pose).tolist(),
+            },
+            1000.0,
+        ),
+    }
+    for name, (document, unit_mm) in files.items():
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps(document))
+        same(read_calibration([path], unit_mm=unit_mm).stereo, mounted)
+
+
+ROS2 = """header:
+  stamp:
+    sec: 1
+    nanosec: 5
+  frame_id: {side}
+height: {height}
+width: {width}
+distortion_model: {model}
+d:
+{d}
+k:
+{k}
+r:
+{r}
+p:
+{p}
+binning_x: 0
+roi:
+  x_offset: 0
+  height: 0
+  width: 0
+  do_rectify: false
+---
+"""
+
+
+def test_messages_of_ros_2_and_old_orb_slam_settings(mounted, tmp_path):
+    """`ros2 topic echo`: small letters, lists in lines, a separator at the end; LEFT.K ... with P in metres."""
+    size = mounted.image_width, mounted.image_height
+    pair = mounted.M1, mounted.D1, mounted.M2, mounted.D2
+    r1, r2, p1, p2, *_ = map(
+        np.array, cv2.stereoRectify(*pair, size, mounted.R, mounted.T[:, None] / 1000, alpha=0)[:4]
+    )
+    paths, slam = [], ["%YAML:1.0"]
+    for side, (k, d, r, p) in {"left": (*pair[:2], r1, p1), "right": (*pair[2:], r2, p2)}.items():
+        # As drivers of five coefficients publish it: the rational model's name, a tail of zeros.
+        lines = {
+            name: "\n".join(f"- {value!r}" for value in map(float, a.ravel()))
+            for name, a in {"d": np.append(d, [0, 0, 0]), "k": k, "r": r, "p": p}.items()
+        }
+        text = ROS2.format(side=side, width=size[0], height=size[1], model="rational_polynomial", **lines)
+        (tmp_path / f"{side}.yaml").write_text(text)
+        paths.append(tmp_path / f"{side}.yaml")
+        slam += [f"{side.upper()}.width: {size[0]}", f"{side.upper()}.height: {size[1]}"]
+        for name, value in {"K": k, "D": d[None], "R": r, "P": p}.items():
+            data = ", ".join(map(repr, map(float, value.ravel())))
+            slam += [
+                f"{side.upper()}.{name}: !!opencv-matrix",
+                f"   rows: {len(value)}",
+                f"   cols: {value.shape[1]}",
+                "   dt: d",
+                f"   data: [{data}]",
+            ]
+    found = read_calibration(paths)
+    same(found.stereo, mounted)
+    assert found.source == "ros" and "each camera by itself" in found.stereo.assumed_from
+    (tmp_path / "EuRoC.yaml").write_text("\n".join([*slam, "Camera.fx: 435.2", "Camera.bf: 47.9"]))
+    with pytest.raises(InputError, match="--import-unit m "):
+        read_calibration([tmp_path / "EuRoC.yaml"])
+    same(read_calibration([tmp_path / "EuRoC.yaml"], unit_mm=1000.0).stereo, mounted)
+
+
+def test_bouguets_toolbox_and_caliscope(mounted, tmp_path):
+    """KK_left, kc_left, om beside R; a TOML of cameras with their poses in the world, metres."""
+    turn = rotation_vector(mounted.R)
+    document = {"KK_left": mounted.M1, "kc_left": mounted.D1[:, None], "KK_right": mounted.M2, "kc_right": mounted.D2}
+    document |= {"om": turn, "R": mounted.R, "T": mounted.T, "nx": mounted.image_width, "ny": mounted.image_height}
+    scipy.io.savemat(tmp_path / "Calib_Results_stereo.mat", document)
+    same(read_calibration([tmp_path / "Calib_Results_stereo.mat"]).stereo, mounted)
+    lines = []
+    for k, (m, d) in enumerate(((mounted.M1, mounted.D1), (mounted.M2, mounted.D2))):
+        lines += [f"[cam_{k}]", f"port = {k}", f"size = [{mounted.image_width}, {mounted.image_height}]", "error = 0.2"]
+        lines += [f"matrix = {m.tolist()}", f"distortions = {d.tolist()}"]
+        lines += [f"rotation = {(k * turn).tolist()}", f"translation = {(k * mounted.T / 1000).tolist()}"]
+    (tmp_path / "config.toml").write_text("\n".join(lines))
+    same(read_calibration([tmp_path / "config.toml"], unit_mm=1000.0).stereo, mounted)
+
+
+def test_matlab_structures(mounted, tmp_path):
+    """Transposed intrinsics and rotation, rows before columns in the image size, RMS as usual."""
+    cameras = [
+        {
+            "IntrinsicMatrix": m.T,
+            "RadialDistortion": d[[0, 1, 4]],
+            "TangentialDistortion": d[2:4],
+            "ImageSize": [mounted.image_height, mounted.image_width],
+        }
+        for m, d in ((mounted.M1, mounted.D1), (mounted.M2, mounted.D2))
+    ]
+    document = {"CameraParameters1": cameras[0], "CameraParameters2": cameras[1], "RotationOfCamera2": mounted.R.T}
+    scipy.io.savemat(tmp_path / "s.mat", {"stereoParams": {**document, "TranslationOfCamera2": mounted.T}})
+    found = read_calibration([tmp_path / "s.mat"])
+    same(found.stereo, mounted)
+    assert found.source == "matlab" and any("rows, columns" in note for note in found.notes)
+
+
+def test_one_file_each_and_one_between_them(mounted, tmp_path):
+    """In any order: names of files tell the cameras, R and T stand in the third or in the right one's."""
+    size = {"image_width": mounted.image_width, "image_height": mounted.image_height}
+    between = {"R": mounted.R.tolist(), "T": mounted.T.tolist()}
+    cameras = (("left", mounted.M1, mounted.D1), ("right", mounted.M2, mounted.D2))
+    for name, m, d in cameras:
+        own = {"camera_matrix": m.tolist(), "distortion_coefficients": d.tolist(), **size}
+        (tmp_path / f"{name}.json").write_text(json.dumps(own))
+    (tmp_path / "between.json").write_text(json.dumps(between))
+    for order in (("left", "right", "between"), ("between", "right", "left")):
+        same(read_calibration([tmp_path / f"{name}.json" for name in order]).stereo, mounted)
+    right = json.loads((tmp_path / "right.json").read_text())
+    (tmp_path / "right.json").write_text(json.dumps(right | between))
+    same(read_calibration([tmp_path / "right.json", tmp_path / "left.json"]).stereo, mounted)
+
+
+def test_a_rectified_pair_alone(mounted, tmp_path):
+    """P of both without anything else: the rectified pair triangulates to what the raw one does."""
+    size = mounted.image_width, mounted.image_height
+    r1, _, p1, p2, *_ = cv2.stereoRectify(
+        mounted.M1, mounted.D1, mounted.M2, mounted.D2, size, mounted.R, mounted.T[:, None], alpha=0
+    )
+    path = tmp_path / "p.json"
+    path.write_text(json.dumps({"P1": np.array(p1).tolist(), "P2": np.array(p2).tolist(), "image_size": size}))
+    found = read_calibration([path]).stereo
+    points = np.array([[250.0, 40.0, 10.0], [400.0, -20.0, -30.0], [600.0, 5.0, 60.0]])
+    left = np.column_stack((-points[:, 1], -points[:, 2], points[:, 0])) @ np.array(r1).T
+    seen = [
+        (left + np.array([b, 0, 0]))[:, :2] / left[:, 2:] * p[0, 0] + p[:2, 2]
+        for p, b in ((p1, 0), (p2, p2[0, 3] / p2[0, 0]))
+    ]
+    again = triangulate(found, np.hstack(seen))
+    np.testing.assert_allclose(np.column_stack((-again[:, 1], -again[:, 2], again[:, 0])), left, atol=1e-6)
+    # R1, R2, P1, P2 beside M and D, without R and T, give R and T.
+    files = exported(mounted, "opencv")
+    files["extrinsics.yml"] = files["extrinsics.yml"].replace(b"\nR:", b"\nx:").replace(b"\nT:", b"\ny:")
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    found = read_calibration([tmp_path / name for name in files]).stereo
+    np.testing.assert_allclose(triangulate(found, project_pair(mounted, points)), points, atol=1e-6)
+
+
+def test_rational_models(mounted, tmp_path):
+    """A zero tail is plumb bob; a small one is fitted and said; a large one is refused by its error."""
+    document = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()}
+    document |= {"image_size": [1280, 720], "distortion_model": "rational_polynomial"}
+    for tail, word in (
+        ([0.0] * 3, None),
+        ([1e-4, 0, 0], "fitted to five coefficients within"),
+        ([0.5, 0.3, 0.2], "miss"),
+    ):
+        path = tmp_path / "r.json"
+        path.write_text(json.dumps({**document, "D1": [*mounted.D1.tolist(), *tail]}))
+        if word == "miss":
+            with pytest.raises(
+                InputError, match=r"D1: found a lens of 8 coefficients, which five coefficients miss by"
+            ):
+                read_calibration([path])
+            continue
+        found = read_calibration([path])
+        assert (word is None) != any(word in note for note in found.notes if word)
+        if word is None:
+            same(found.stereo, mounted)
+
+
+def test_what_no_name_tells_is_named_by_the_user(mounted, tmp_path):
+    path = tmp_path / "odd.json"
+    odd = plain(mounted, "alpha beta gamma delta epsilon zeta")
+    path.write_text(json.dumps({"cal": {k: v.tolist() for k, v in odd.items()}, "image_size": [1280, 720]}))
+    with pytest.raises(InputError, match=r"no M1 M2.*cal\.alpha.*--key M1=NAME"):
+        read_calibration([path])
+    keys = dict(zip(("M1", "D1", "M2", "D2", "R", "T"), odd, strict=True))
+    same(read_calibration([path], keys=keys).stereo, mounted)
+    for changed in ({"M1": "nothing"}, {"M1": "zeta"}):
+        with pytest.raises(InputError, match="--key M1="):
+            read_calibration([path], keys={**keys, **changed})
+
+
+def mistaken(mounted: Stereo) -> dict[str, tuple[dict[str, object], str]]:
+    """Mistakes in a plain JSON, and what names each."""
+    good = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()}
+    good["image_size"] = [1280, 720]
+    x, y, z = mounted.T
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ mounted.R
+    turned = {"R": mounted.R.T.tolist(), "E": essential.tolist()}
+    without_t = {key: value for key, value in good.items() if key != "T"}
+    return {
+        "R transposed": ({**good, **turned}, "R transposed, by what else the file says"),
+        "R of another file": (
+            {**good, **turned, "R": rotation_matrix(np.array([0, 0.3, 0])).tolist()},
+            "another rotation",
+        ),
+        "R no rotation": ({**good, "R": (2 * mounted.R).tolist()}, "misses it by"),
+        "R in degrees": ({**good, "R": [0.0, 5.0, 1.0]}, "is it in degrees?"),
+        "omnidirectional": ({**good, "camera_model": "omni"}, "the model omni"),
+        "T missing": (without_t, "no T under a name that is known"),
+        "T zero": ({**good, "T": [0, 0, 0]}, "cameras in one place"),
+        "T in metres": ({**good, "T": (mounted.T / 1000).tolist()}, "--import-unit m "),
+        "size missing": ({k: v for k, v in good.items() if k != "image_size"}, "--image-size"),
+        "size of no picture": ({**good, "image_size": [1280.5, 720]}, "whole numbers of pixels"),
+        "M with skew": ({**good, "M1": [[800, 5, 640], [0, 800, 360], [0, 0, 1]]}, "no camera matrix"),
+        "M not last row": ({**good, "M1": [[800, 0, 640], [0, 800, 360], [0, 0, 2]]}, "no camera matrix"),
+        "D missing": ({k: v for k, v in good.items() if k != "D2"}, "no D2"),
+        "unknown lens": ({**good, "distortion_model": "fov"}, "the model fov"),
+        "two left matrices": ({**good, "K1": (2 * mounted.M1).tolist()}, "another under K1"),
+        "wide fisheye": (
+            {
+                **good,
+                "D1": [0.1, 0, 0, 0],
+                "D2": [0.1, 0, 0, 0],
+                "distortion_model": "equidistant",
+                "M1": [[300, 0, 640], [0, 300, 360], [0, 0, 1]],
+            },
+            "do not rename the model",
+        ),
+        "one camera": ({"camera_matrix": good["M1"], "dist_coeffs": good["D1"]}, "calibration of one camera"),
+        "nothing": ({"a": 1}, "no other numbers"),
+    }
+
+
+@pytest.mark.parametrize("kind", mistaken(read_stereo(shipped_data() / "rigs" / "mounted" / "stereo.json")))
+def test_mistakes_are_refused_with_the_mend(mounted, tmp_path, kind):
+    document, word = mistaken(mounted)[kind]
+    (tmp_path / "m.json").write_text(json.dumps(document))
+    with pytest.raises(InputError) as caught:
+        read_calibration([tmp_path / "m.json"])
+    assert word in str(caught.value) and caught.value.remedy and "m.json" in str(caught.value)
+
+
+def test_absurd_pairs_are_named_by_file_and_key(mounted, tmp_path):
+    """A view near 180 deg, cameras that look elsewhere; one that is plausible has no doubt."""
+    assert pair_doubts(mounted) == ()
+    wide = replace(mounted, M1=np.array([[50.0, 0, 640], [0, 50, 360], [0, 0, 1]]), D1=np.zeros(5))
+    assert any(
+        told.startswith("fx in left.K of x.json is 50 px: a view of 171 deg")
+        for told in pair_doubts(wide, {"M1": "left.K of x.json"})
+    )
+    turned = replace(mounted, R=rotation_matrix(np.array([0, 1.0, 0])))
+    assert any("R of stereo.json turns by 57 deg" in told for told in pair_doubts(turned))
+
+
+HOSTILE = {
+    "entity.xml": b'<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><opencv_storage><M1>&b;</M1></opencv_storage>',
+    "open.xml": b"<opencv_storage><M1>",
+    "deep.xml": b"<opencv_storage>" + 2000 * b"<a>" + 2000 * b"</a>" + b"</opencv_storage>",
+    "laughs.yml": b"a: &a [1,1]\nb: [*a,*a]\n",
+    "h5.mat": b"\x89HDF\r\n\x1a\n" + 50 * b"\0",
+    "short.npz": b"PK\x03\x04 nothing",
+    "short.mat": b"MATLAB 5.0 MAT-file" + 150 * b"\0",
+    "text.txt": b"fx = 800\nfy",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_and_damaged_containers_are_refused(name):
+    with pytest.raises(InputError) as caught:
+        read_container(HOSTILE[name], name)
+    assert caught.value.remedy and name in str(caught.value)
+
+
+def test_pickles_and_bombs_are_refused(tmp_path):
+    np.savez(tmp_path / "p.npz", a=np.array([{}], object))
+    with pytest.raises(InputError, match=r"p\.npz"):
+        read_calibration([tmp_path / "p.npz"])
+    np.savez_compressed(tmp_path / "b.npz", a=np.zeros(1_000_000))
+    scipy.io.savemat(tmp_path / "b.mat", {"a": np.zeros(1_000_000)}, do_compression=True)
+    for name in ("b.npz", "b.mat"):
+        with pytest.raises(InputError, match="more than 4194304 bytes"):
+            read_calibration([tmp_path / name])
+
+
+@pytest.mark.parametrize("seed", (31, 5))
+def test_damaged_mat_files_end_in_a_refusal(seed, tmp_path):
+    """The first of these seeds ends scipy.io.loadmat 1.17 in a segmentation fault."""
+    structure = {"s": {"M1": np.eye(3), "D1": np.zeros(5), "T": np.arange(3.0)}}
+    scipy.io.savemat(tmp_path / "m.mat", structure)
+    data, rng = bytearray((tmp_path / "m.mat").read_bytes()), np.random.default_rng(seed)
+    for _ in range(3):
+        at = int(rng.integers(128, len(data)))
+        if rng.random() < 0.3:
+            del data[at : at + int(rng.integers(1, 40))]
+        else:
+            data[at] = int(rng.integers(256))
+    with pytest.raises(InputError, match=r"m\.mat"):
+        read_container(bytes(data), "m.mat")

@@ -1,0 +1,252 @@
+"""Files in which programs keep calibrations, by content: YAML, XML and JSON (OpenCV's too), TOML, .npz, MATLAB's .mat.
+
+Every container comes out as nested maps, lists and numbers, `Keys` that know file and line. OpenCV's matrices stay maps
+of rows, cols, data. OpenCV's FileStorage has had memory errors on hostile files (CVE-2019-5063, -5064; opencv #28619):
+libraries of the formats read instead, under caps: bytes, entries and depth; no aliases, entities or pickles.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import re
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from tvsbayes.errors import InputError, escaped, refusal, shown
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.files.disk import decode
+from tvsbayes.files.documents import Keys, parse_json, parse_toml
+
+MATRIX_TAG = "!!opencv-matrix"
+CONTAINER_BYTES_MAX = 4 * 1024 * 1024
+ENTRIES_MAX = 200_000
+DEPTH_MAX = 12
+_ALLOWED = "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, or .mat of MATLAB up to version 7"
+MAT_SECONDS_MAX = 60.0
+_MAT_HEADER_BYTES, _MAT_COMPRESSED = 128, 15
+"""Of MAT-file 5: the header, and the type of a compressed element (MATLAB MAT-File Format, 1-3, 1-6)."""
+
+
+def read_container(data: bytes, file: str) -> Keys:
+    """The top map of a calibration file.
+
+    Raises:
+        InputError: too large, unknown, damaged, or with more than such files hold; names file and line.
+    """
+    if len(data) > CONTAINER_BYTES_MAX:
+        found, allowed = f"{len(data)} bytes", f"at most {CONTAINER_BYTES_MAX} bytes"
+        raise refusal("size", file=file, found=found, allowed=allowed, remedy="remove what is not needed")
+    for begin, reader in _BINARY.items():
+        if data.startswith(begin):
+            try:
+                values = reader(data)
+            except (ValueError, TypeError, KeyError, OSError, zlib.error, zipfile.BadZipFile, NotImplementedError) as e:
+                raise bad(file, None, str(e), "write it again with its program") from e
+            except (MemoryError, RecursionError, struct.error, IndexError, AttributeError, OverflowError) as e:
+                raise bad(file, None, "a damaged file", "write it again with its program") from e
+            return Keys(_plain(values, file), file, "")
+    text = decode(data, file)
+    first = text.lstrip()[:1]
+    if first == "<":
+        return Keys(_plain(_xml(text, file), file), file, "")
+    if first == "{":
+        return parse_json(data, file)
+    if re.search(r"^\s*\[[\w.\"-]+\]\s*(#.*)?$|^\s*[\w.-]+\s*=", text, re.MULTILINE) and not text.startswith("%YAML"):
+        return parse_toml(data, file)
+    return Keys(_plain(_yaml(text, file), file), file, text)
+
+
+def bad(file: str, line: int | None, found: str, remedy: str = "write it as its own program does") -> InputError:
+    """The refusal of a container."""
+    return refusal("container", file=file, line=line, found=escaped(found, 120), allowed=_ALLOWED, remedy=remedy)
+
+
+def _plain(value: Any, file: str) -> Any:
+    """Maps, lists, numbers and text alone; capped."""
+    count = 0
+
+    def plain(value: Any, depth: int) -> Any:
+        nonlocal count
+        count += 1
+        if count > ENTRIES_MAX or depth > DEPTH_MAX:
+            raise bad(
+                file, None, f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
+            )
+        if isinstance(value, dict):
+            return {str(key): plain(each, depth + 1) for key, each in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(each, depth + 1) for each in value]
+        if isinstance(value, np.ndarray | np.generic):
+            if value.size > ENTRIES_MAX:
+                raise bad(file, None, f"an array of {value.size} numbers", "keep the calibration alone")
+            return plain(value.tolist(), depth)
+        if isinstance(value, float) and not math.isfinite(value):
+            return None
+        return value if isinstance(value, int | float | str | bool) else None
+
+    return plain(value, 0)
+
+
+def _npz(data: bytes) -> dict[str, Any]:
+    """Arrays of NumPy's archive, without pickles."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > CONTAINER_BYTES_MAX:
+            raise ValueError(f"an archive of more than {CONTAINER_BYTES_MAX} bytes")
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+_MAT_PROGRAM = """
+import io, json, sys
+import numpy as np
+from scipy.io import loadmat
+
+def plain(value):
+    if isinstance(value, dict):
+        return {str(key): plain(each) for key, each in value.items() if not str(key).startswith("__")}
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        return value.tolist()
+    if isinstance(value, np.ndarray | list):
+        return [plain(each) for each in (value if isinstance(value, list) else value.tolist())]
+    return value if isinstance(value, str | int | float) else None
+
+json.dump(plain(loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True)), sys.stdout)
+"""
+
+
+def _mat(data: bytes) -> dict[str, Any]:
+    """Variables of a MAT-file of version 5 (saved by -v6 or -v7); structures become maps.
+
+    `scipy.io.loadmat` ends in a segmentation fault on some damaged files: a process of its own reads them.
+    """
+    at, whole = _MAT_HEADER_BYTES, 0
+    order = "<" if data[126:128] == b"IM" else ">"
+    while at + 8 <= len(data):
+        kind, size = struct.unpack(f"{order}II", data[at : at + 8])
+        if kind == _MAT_COMPRESSED:
+            whole += len(zlib.decompressobj().decompress(data[at + 8 : at + 8 + size], CONTAINER_BYTES_MAX + 1))
+        if whole > CONTAINER_BYTES_MAX:
+            raise ValueError(f"variables of more than {CONTAINER_BYTES_MAX} bytes")
+        at += 8 + size
+    command = [sys.executable, "-I", "-c", _MAT_PROGRAM]
+    try:
+        done = subprocess.run(command, input=data, capture_output=True, timeout=MAT_SECONDS_MAX, check=True)
+    except subprocess.SubprocessError as error:
+        raise ValueError("a damaged file, or variables that are no plain matrices and structures") from error
+    found = json.loads(done.stdout)
+    return found if isinstance(found, dict) else {}
+
+
+def _hdf5(data: bytes) -> dict[str, Any]:
+    raise ValueError("an HDF5 file (MATLAB's -v7.3 is one): save it with save(..., '-v7')")
+
+
+_BINARY: dict[bytes, Callable[[bytes], dict[str, Any]]] = {
+    b"PK\x03\x04": _npz,
+    b"MATLAB 5.0": _mat,
+    b"\x89HDF": _hdf5,
+    b"MATLAB 7.3": _hdf5,
+}
+"""Readers by how a file begins."""
+
+
+def _xml(text: str, file: str) -> dict[str, Any]:
+    """OpenCV's XML: elements by name, matrices as maps of rows, cols, data."""
+    from xml.etree import ElementTree
+
+    if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
+        raise bad(file, None, "a document type or entity")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        line = getattr(error, "position", (None,))[0]
+        raise bad(file, line, str(error)) from error
+
+    def value(element: Any, depth: int) -> Any:
+        if depth > DEPTH_MAX:
+            raise bad(file, None, f"elements nested deeper than {DEPTH_MAX}")
+        if len(element):
+            listed = all(child.tag == "_" for child in element)
+            children = [value(child, depth + 1) for child in element]
+            return children if listed else dict(zip((child.tag for child in element), children, strict=True))
+        words = (element.text or "").split()
+        numbers = [_number(word) for word in words]
+        if not words or None in numbers:
+            return (element.text or "").strip().strip('"')
+        return numbers if len(numbers) > 1 or element.tag == "data" else numbers[0]
+
+    found = value(root, 0)
+    return found if isinstance(found, dict) else {root.tag: found}
+
+
+def _number(word: str) -> int | float | None:
+    """A finite number of text, else None."""
+    if not NUMBER.fullmatch(word) or not math.isfinite(float(word)):
+        return None
+    return int(word) if re.fullmatch(r"[+-]?[0-9]{1,15}", word) else float(word)
+
+
+def _yaml(text: str, file: str) -> dict[str, Any]:
+    """The first document of YAML, by PyYAML's safe loader; tags of OpenCV mean nothing to it."""
+    import yaml
+
+    class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+        """Maps with every key once; numbers as OpenCV, ROS and Kalibr write them (`1.`, `2e-05`)."""
+
+    def mapping(loader: Any, node: Any) -> dict[str, Any]:
+        keys = [str(key.value) for key, _ in node.value]
+        for k, key in enumerate(keys):
+            if key in keys[:k]:
+                line = node.value[k][0].start_mark.line + 1
+                raise bad(file, line, f"{shown(key)} twice", "remove one of them")
+        return {key: loader.construct_object(each, deep=True) for key, (_, each) in zip(keys, node.value, strict=True)}
+
+    def scalar(loader: Any, node: Any) -> Any:
+        number = None if node.style in ("'", '"', "|", ">") else _number(node.value)
+        return node.value if number is None else number
+
+    Loader.yaml_constructors = {"tag:yaml.org,2002:map": mapping, "tag:yaml.org,2002:str": scalar}
+    for kind in ("int", "float", "bool", "null", "timestamp", "merge", "value"):
+        Loader.yaml_constructors[f"tag:yaml.org,2002:{kind}"] = scalar
+    Loader.yaml_constructors["tag:yaml.org,2002:seq"] = yaml.SafeLoader.construct_yaml_seq
+    for kind in ("opencv-matrix", "opencv-nd-matrix"):
+        Loader.yaml_constructors[f"tag:yaml.org,2002:{kind}"] = mapping
+    Loader.yaml_constructors[None] = yaml.SafeLoader.construct_undefined
+    # OpenCV's header is no directive of YAML, and separators of ROS' dumps begin documents that are not wanted.
+    body = re.sub(r"\A%YAML[^\n]*\n", "\n", text)
+    try:
+        _counted(yaml.parse(body, Loader=Loader), file)
+        found = next(iter(yaml.load_all(body, Loader=Loader)), None)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        told = getattr(error, "problem", None) or str(error)
+        raise bad(file, None if mark is None else mark.line + 1, str(told)) from error
+    except (RecursionError, ValueError) as error:
+        raise bad(file, None, "YAML that is nested too deeply") from error
+    if not isinstance(found, dict):
+        raise bad(file, 1, "nothing" if found is None else shown(found), "name a calibration file")
+    return found
+
+
+def _counted(events: Iterable[Any], file: str) -> None:
+    """Refuse aliases, which multiply, depth and number of entries before anything is built."""
+    depth = count = 0
+    for event in events:
+        name, line = type(event).__name__, event.start_mark.line + 1
+        count += 1
+        depth += name.endswith("StartEvent") - name.endswith("EndEvent")
+        if name == "AliasEvent" or getattr(event, "anchor", None):
+            raise bad(file, line, "an anchor or alias", "write the values out")
+        if depth > DEPTH_MAX or count > ENTRIES_MAX:
+            raise bad(
+                file, line, f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
+            )

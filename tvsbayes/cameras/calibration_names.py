@@ -1,0 +1,345 @@
+"""Which number of somebody's calibration file is which: one table of names, asked for every entry with its path.
+
+A name says a field and often a camera: `M1`, `K_left`, `cameraMatrixL`, `cam0.intrinsics`, `Camera1.fx`. Small and
+capital letters, dots and underscores count for nothing; the innermost names of a path count, up to three of them. An
+entry fits a field by its name and by how many numbers it holds: `P1` of 12 numbers is a projection, `p1` of one a
+coefficient of a lens.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tvsbayes.errors import InputError, closest, escaped, listed, refusal
+from tvsbayes.files.documents import Keys
+from tvsbayes.instrument.stereo_pair import rotation_matrix, rotation_vector
+
+NAMES_LISTED = 12
+NUMBER_MAX = 1e12
+ROTATION_TOLERANCE = 1e-3
+"""R from a file of few digits may miss a rotation by this much; the nearest rotation is taken."""
+FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
+    # Of each camera.
+    "M": (
+        (9, 4),
+        "m k a mtx matrix cameramatrix cammatrix cameramtx intrinsic intrinsics intrinsicmatrix "
+        "intrinsicsmatrix intrinsicparameters cameraintrinsics kmatrix kk intrinsicsk "
+        "intrinsicsintrinsicmatrix",
+    ),
+    "D": (
+        (4, 5, 8, 12, 14),
+        "d dist distortion distortions distcoeff distcoeffs distcoefs distcoef coeffs distortioncoeff "
+        "distortioncoeffs distortioncoefs distortioncoefficients distortioncoefficient distortionparameters "
+        "kc distvec distortionvector intrinsicscoeffs",
+    ),
+    "radial": ((2, 3), "radialdistortion intrinsicsradialdistortion"),
+    "tangential": ((2,), "tangentialdistortion intrinsicstangentialdistortion"),
+    "rectification": ((9,), "r rect rectification rectificationmatrix rectificationtransform rectify"),
+    "P": ((12,), "p proj projection projectionmatrix projmatrix"),
+    "from_body": ((16,), "tcamimu tcimu tcambody"),
+    "to_body": ((16,), "tbs timucam tbc tbodycam"),
+    "camera_R": ((9, 3), "rotation rvec rotationvector"),
+    "camera_T": ((3,), "translation tvec translationvector"),
+    "size": ((2,), "size resolution imagesize imgsize imagesizewh imageshape"),
+    "width": ((1,), "width imagewidth imgwidth w sizex nx"),
+    "height": ((1,), "height imageheight imgheight h sizey ny"),
+    "fx": ((1,), "fx intrinsicsfx"),
+    "fy": ((1,), "fy intrinsicsfy"),
+    "cx": ((1,), "cx ppx intrinsicscx intrinsicsppx"),
+    "cy": ((1,), "cy ppy intrinsicscy intrinsicsppy"),
+    **{f"coefficient_{name}": ((1,), name) for name in ("k1", "k2", "p1", "p2", "k3")},
+    # Of the pair.
+    "R": (
+        (9, 3),
+        "r rot rotation rotationmatrix rmat rmatrix stereor rstereo rotationvector rvec om rotmatrix rlr "
+        "extrinsicsr extrinsicsrotation rotationlefttoright",
+    ),
+    "R_transposed": ((9,), "rotationofcamera2"),
+    "T": (
+        (3,),
+        "t trans translation translationvector tvec tmat stereot tstereo transvec tvector "
+        "translationofcamera2 extrinsicst extrinsicstranslation translationlefttoright tlr",
+    ),
+    "pose": (
+        (16, 12),
+        "tcncnm1 tc1c0 tcam1cam0 trightleft trl posecamera2a extrinsics extrinsic rt extrinsicmatrix "
+        "tlefttoright cam1tcncnm1",
+    ),
+    "pose_backwards": ((16, 12), "tc1c2 stereotc1c2 tcam0cam1 tleftright trighttoleft tc0c1"),
+    "E": ((9,), "e essential essentialmatrix"),
+}
+"""Numbers that a field may hold, and its names. Every name of a camera's field stands before or after a side."""
+OF_CAMERA = tuple(FIELDS)[: tuple(FIELDS).index("R")]
+SIDES = {"left": 0, "right": 1, "l": 0, "r": 1, "first": 0, "second": 1}
+"""Words for the camera; numbers count from 0 where one is 0, else from 1."""
+_MARKS = ("cam", "camera", "cameraparameters", "sensor", "")
+_SIDED = re.compile(r"left|right|first|second|[0-9]|l|r")
+_OTHER_TABLES = {"roi", "region_of_interest", "header"}
+"""Tables whose sizes and numbers are of other things."""
+MODEL_NAMES = ("distortionmodel", "distmodel", "cameratype", "cameramodel", "model", "lensmodel", "distortiontype")
+
+
+def _table() -> dict[tuple[str, int], list[tuple[str, str]]]:
+    """Field and side by name and count; the side "" is none."""
+    found: dict[tuple[str, int], list[tuple[str, str]]] = {}
+    for field, (counts, words) in FIELDS.items():
+        names = {(f"{mark}{word}", "") for word in words.split() for mark in _MARKS}
+        if field in OF_CAMERA:
+            for word in words.split():
+                for side in (*SIDES, "0", "1", "2"):
+                    for mark in _MARKS:
+                        names |= {(f"{mark}{side}{word}", side), (f"{side}{mark}{word}", side)}
+                        names |= {(f"{word}{mark}{side}", side), (f"{mark}{word}{side}", side)}
+        for name, side in names:
+            for count in counts:
+                found.setdefault((name, count), []).append((field, side))
+    return found
+
+
+_NAMES = _table()
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Numbers of a file.
+
+    Attributes:
+        keys: the table that holds them.
+        key: their name in it.
+        numbers: flat.
+        shape: as the file has them.
+        file: number of the file.
+    """
+
+    keys: Keys
+    key: str
+    numbers: np.ndarray
+    shape: tuple[int, ...]
+    file: int
+
+    @property
+    def path(self) -> str:
+        """Dotted, as users name it."""
+        return ".".join((*self.keys.path, self.key))
+
+    @property
+    def place(self) -> str:
+        """In words: which key of which file."""
+        return f"{escaped(self.path, 80)} of {self.keys.file}"
+
+    def refuse(self, code: str, allowed: str, remedy: str, found: str) -> InputError:
+        """The refusal of these numbers."""
+        return self.keys.refuse(self.key, code, allowed, remedy, found)
+
+    def rotation(self) -> np.ndarray:
+        """The rotation (3, 3) of nine numbers, the nearest where the file's digits allow, or of Rodrigues' three."""
+        if self.numbers.size == 3:
+            if np.linalg.norm(self.numbers) > math.pi:
+                found = escaped(str(self.numbers.tolist()), 60)
+                raise self.refuse("rotation", "Rodrigues' vector, rad", "is it in degrees? give R as a matrix", found)
+            return rotation_matrix(self.numbers)
+        return self._nearest(self.numbers.reshape(3, 3))
+
+    def pose(self) -> np.ndarray:
+        """The homogeneous transformation (4, 4) of 12 or 16 numbers."""
+        pose = np.vstack([self.numbers[:12].reshape(3, 4), [0, 0, 0, 1.0]])
+        pose[:3, :3] = self._nearest(pose[:3, :3])
+        return pose
+
+    def _nearest(self, matrix: np.ndarray) -> np.ndarray:
+        deviation = max(np.abs(matrix @ matrix.T - np.eye(3)).max(), abs(np.linalg.det(matrix) - 1.0))
+        if not deviation <= ROTATION_TOLERANCE:
+            allowed = f"R R^T = 1 and det R = +1 to {ROTATION_TOLERANCE:g}"
+            remedy = "take the file as its tool wrote it, or name the right entry: --key R=NAME"
+            raise self.refuse("rotation", allowed, remedy, f"a matrix that misses it by {deviation:.3g}")
+        return rotation_matrix(rotation_vector(matrix))
+
+
+def numbers_of(value: Any) -> tuple[np.ndarray, tuple[int, ...]] | None:
+    """Finite numbers and their shape: of a number, of nested lists, of OpenCV's or ROS' rows, cols, data; else None."""
+    if isinstance(value, Mapping):
+        rows, cols = value.get("rows", value.get("Rows")), value.get("cols", value.get("Cols"))
+        inner = numbers_of(value.get("data", value.get("Data")))
+        if inner is not None and "sizes" in value:
+            return inner[0], (inner[0].size,)
+        if inner is None or not isinstance(rows, int) or not isinstance(cols, int) or rows * cols != inner[0].size:
+            if set(value) == {"x", "y", "z"}:
+                return numbers_of([value["x"], value["y"], value["z"]])
+            return None
+        return inner[0], (rows, cols)
+    if isinstance(value, bool) or not isinstance(value, int | float | list):
+        return None
+    try:
+        found = np.array(value, dtype=float)
+    except (ValueError, TypeError, OverflowError):
+        return None
+    if not found.size or not (np.abs(found) <= NUMBER_MAX).all():
+        return None
+    return found.ravel(), found.shape
+
+
+def entries_of(keys: Keys, file: int) -> Iterator[Entry]:
+    """Every entry of numbers in a file, in its order."""
+    for key, value in keys.values.items():
+        found = numbers_of(value)
+        if found is None and isinstance(value, dict) and {"rows", "cols", "data"} <= {name.lower() for name in value}:
+            raise keys.refuse(key, "matrix", "rows times cols finite numbers", "take the file as its tool wrote it")
+        if isinstance(value, str) and _bare(key) in FIELDS["width"][1].split() + FIELDS["height"][1].split():
+            raise keys.refuse(key, "integer", "a whole number of px", "correct the value")
+        if found is not None:
+            yield Entry(keys, key, *found, file)
+        elif isinstance(value, dict):
+            yield from entries_of(keys.table(key), file)
+        elif isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
+            for number, one in enumerate(value):
+                yield from entries_of(Keys(one, keys.file, keys.text, (*keys.path, key, str(number))), file)
+
+
+def _bare(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def meanings(entry: Entry) -> list[tuple[str, str]]:
+    """Fields and sides that an entry may be, by the longest part of its path that is a name."""
+    parts = (*entry.keys.path, entry.key)
+    if _OTHER_TABLES & set(parts):
+        return []
+    for count in range(min(4, len(parts)), 0, -1):
+        found = _NAMES.get((_bare("".join(parts[-count:])), entry.numbers.size))
+        if found:
+            # A name without a side may stand in the table of one camera.
+            side = next((s for part in reversed(parts[:-count]) if (s := _side_of(part))), "")
+            return [(field, own or (side if field in OF_CAMERA else "")) for field, own in found]
+    return []
+
+
+def _side_of(part: str) -> str:
+    """The camera that a table's name tells, or ""."""
+    bare = _bare(part)
+    for mark in ("cameraparameters", "camera", "cam", "sensor"):
+        bare = bare.replace(mark, "", 1)
+    return bare if bare in (*SIDES, "0", "1", "2") else ""
+
+
+def _side_in_name(file: str) -> int | None:
+    """The camera that a file's name tells."""
+    for number, pattern in enumerate((r"left|cam(era)?[ _-]?0", r"right|cam(era)?[ _-]?1")):
+        if re.search(pattern, file.lower()):
+            return number
+    return None
+
+
+class Found:
+    """Entries of all files by field, those of cameras by field and number (0 left, 1 right)."""
+
+    def __init__(self, files: Sequence[Keys], stated: Mapping[str, str]):
+        """Entries by name, and by `stated`: field such as M1 to the path that holds it."""
+        self.files = files
+        self.entries = [entry for k, keys in enumerate(files) for entry in entries_of(keys, k)]
+        self.pair: dict[str, Entry] = {}
+        self.cameras: tuple[dict[str, Entry], dict[str, Entry]] = ({}, {})
+        self.twice: list[tuple[Entry, Entry]] = []
+        sided = [(entry, *meaning) for entry in self.entries for meaning in meanings(entry)]
+        numbers = {side for _, _, side in sided if side.isdigit()}
+        first = 0 if "0" in numbers or not numbers else 1
+        # Files of one camera each hold entries without a side: the first named is the left one, unless names say.
+        whole = [k for k in range(len(files)) if self._whole(sided, k)]
+        alone = len(whole) == 2
+        if alone and [_side_in_name(files[k].file) for k in whole] == [1, 0]:
+            whole.reverse()
+        self.by_file = alone
+        for entry, field, side in sided:
+            if field not in OF_CAMERA:
+                if not (alone and field == "R" and entry.file in whole):
+                    self._keep(self.pair, field, entry)
+            elif side:
+                number = SIDES[side] if side in SIDES else int(side) - first
+                if number in (0, 1):
+                    self._keep(self.cameras[number], field, entry)
+            elif alone and entry.file in whole:
+                self._keep(self.cameras[whole.index(entry.file)], field, entry)
+            elif field in ("size", "width", "height"):
+                for camera in self.cameras:
+                    camera.setdefault(field, entry)
+        for field, name in stated.items():
+            entry = self._named(field, name)
+            if field in ("R", "T"):
+                self.pair[field] = entry
+                self.pair.pop("pose", None)
+            else:
+                self.cameras[int(field[-1]) - 1][field[:-1]] = entry
+
+    @staticmethod
+    def _whole(sided: Sequence[tuple[Entry, str, str]], file: int) -> bool:
+        """Whether a file holds one camera's matrix without a side."""
+        return any(e.file == file and field in ("M", "fx") and not side for e, field, side in sided)
+
+    def _keep(self, into: dict[str, Entry], field: str, entry: Entry) -> None:
+        there = into.get(field)
+        if there is None or (there.numbers.size == 3 and entry.numbers.size == 9):
+            # Of a rotation's vector and its matrix, the matrix.
+            into[field] = entry
+        elif there.numbers.size == entry.numbers.size and not np.array_equal(there.numbers, entry.numbers):
+            self.twice.append((there, entry))
+
+    def _named(self, field: str, name: str) -> Entry:
+        """The entry that a user named."""
+        some = [entry for entry in self.entries if name in (entry.path, entry.key)]
+        if len(some) != 1 or some[0].numbers.size not in STATED_SIZES[field[0]]:
+            paths = [entry.path for entry in self.entries]
+            found = f"{len(some)} entries of that name" if len(some) != 1 else f"{some[0].numbers.size} numbers"
+            raise refusal(
+                "usage",
+                file=self.files[0].file,
+                found=f"--key {field}={escaped(name, 60)}: {found}",
+                allowed=f"one of {listed([escaped(path, 40) for path in paths], NAMES_LISTED)}",
+                remedy=closest(name[:80], paths) if paths else "name a file that holds numbers",
+            )
+        return some[0]
+
+    def missing(self, wanted: Sequence[str]) -> InputError:
+        """The refusal of files that lack something, with what there is."""
+        if len(self.files) == 1 and any(("M", "") in meanings(entry) for entry in self.entries):
+            return refusal(
+                "missing-file",
+                file=self.files[0].file,
+                found="the calibration of one camera",
+                allowed="a pair: both cameras, and R and T between them",
+                remedy="name the other camera's file too: --import LEFT --import RIGHT; R and T need pictures of both",
+            )
+        unknown = [entry.path for entry in self.entries if not meanings(entry) and entry.numbers.size > 1]
+        there = listed([escaped(path, 40) for path in unknown], NAMES_LISTED) if unknown else "no other numbers"
+        remedy = "a pair needs M D of both cameras and R T between them: name the other file too"
+        if unknown:
+            remedy = f"name what holds it: --key {wanted[0]}=NAME"
+        return refusal(
+            "missing-key",
+            file=", ".join(keys.file for keys in self.files),
+            found=f"no {' '.join(wanted)} under a name that is known, and {there}",
+            allowed="M1 D1 M2 D2 and R T, or what gives them",
+            remedy=remedy,
+        )
+
+    def model(self, camera: int) -> str:
+        """The name of the lens model that the files state for a camera, in small letters; "" where none is."""
+        place = next((self.cameras[camera][f] for f in ("D", "M", "fx") if f in self.cameras[camera]), None)
+        tables = [place.keys] if place is not None else []
+        tables += [self.files[place.file]] if place is not None else list(self.files)
+        for keys in tables:
+            for key, value in keys.values.items():
+                bare = _bare(key)
+                if isinstance(value, str) and any(bare.endswith(name) for name in MODEL_NAMES):
+                    if bare.endswith(("cameramodel", "cameratype")) and _bare(value) in ("pinhole", "perspective"):
+                        continue
+                    return value.strip().lower()
+        return ""
+
+
+STATED_SIZES = {"M": (4, 9), "D": (4, 5, 8, 12, 14), "R": (3, 9), "T": (3,)}
+"""How many numbers a field that is named by --key may hold."""

@@ -1,0 +1,69 @@
+"""Lens models of other programs, fitted to k1 k2 p1 p2 k3 over the picture; what the five cannot describe is refused.
+
+Normalised coordinates and pixels as in `stereo_pair`. The fit is linear: rays of a grid of pixels by the other model,
+then the five coefficients that bring them back to their pixels, the camera matrix as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from tvsbayes.instrument.stereo_pair import distort
+
+FIVE: tuple[str, ...] = (
+    *("plumb_bob", "plumb bob", "radtan", "radial-tangential", "radial_tangential", "radialtangential", "standard"),
+    *("brown", "brown_conrady", "brown-conrady", "brown conrady", "distortion.brown_conrady", "opencv", "none"),
+    *("inverse_brown_conrady", "modified_brown_conrady", "pinhole", "perspective"),
+)
+RATIONAL = ("rational_polynomial", "rational", "rational polynomial", "thin_prism", "tilted")
+FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "kannalabrandt8", "kannala_brandt8", "equi")
+GRID = 25
+"""Pixels each way over the picture."""
+ERROR_MAX_PX = 0.1
+"""What a fit may miss: a centroid's own error."""
+WIDEST_TAN = 4.0
+"""Tangent of the angle off the axis, 76 deg, beyond which five coefficients are not tried."""
+
+
+@dataclass(frozen=True)
+class FittedLens:
+    """Five coefficients, and by how much they miss the other model in the picture, px; infinite where it has no ray."""
+
+    distortion: np.ndarray
+    error_px: float
+
+
+def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, int], fisheye: bool) -> FittedLens:
+    """The five coefficients nearest to another model.
+
+    Args:
+        matrix: of the camera.
+        distortion: OpenCV's 8, 12 or 14, or the 4 of its fisheye model.
+        size: width and height of the picture, px.
+        fisheye: whether they are the latter.
+    """
+    grid = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 1, 2)
+    if fisheye:
+        rays = cv2.fisheye.undistortPoints(grid, matrix, distortion.reshape(4, 1)).reshape(-1, 2)
+        again = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), matrix, distortion.reshape(4, 1)).reshape(-1, 2)
+    else:
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+        if hasattr(cv2, "undistortPointsIter"):
+            rays = cv2.undistortPointsIter(grid, matrix, distortion, None, None, criteria).reshape(-1, 2)
+        else:
+            rays = cv2.undistortPoints(grid, matrix, distortion, criteria=criteria).reshape(-1, 2)
+        points = np.column_stack([rays, np.ones(len(rays))])
+        again = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
+    pixels = grid.reshape(-1, 2)
+    good = np.isfinite(rays).all(axis=1) & (np.linalg.norm(rays, axis=1) < WIDEST_TAN)
+    good[good] &= np.abs(again[good] - pixels[good]).max(axis=1) < ERROR_MAX_PX
+    if not good.all():
+        return FittedLens(np.zeros(5), np.inf)
+    wanted = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    columns = [(distort(rays, one) - rays).ravel() for one in np.eye(5)]
+    found = np.linalg.lstsq(np.stack(columns, axis=1), (wanted - rays).ravel())[0]
+    missed = (distort(rays, found) - wanted) * matrix[[0, 1], [0, 1]]
+    return FittedLens(found, float(np.linalg.norm(missed, axis=1).max()))
