@@ -276,8 +276,28 @@ def _compared(record: Recorded, present: Campaign, empty: bool) -> list[str]:
     return warnings
 
 
+def behind_journal(folder: Path, present: Campaign) -> str:
+    """Which looks the journal of a campaign holds and its table lacks, in words; "" for none or without a journal.
+
+    What is wrong with a damaged journal is left to `check_journal`.
+    """
+    try:
+        require_journal(folder, "")
+        record = recorded(read_journal(folder).records)
+    except InputError:
+        return ""
+    missing = sorted({spot.spot for spot in record.spots} - {spot.spot for spot in present.spots})
+    if not missing:
+        return ""
+    names = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
+    looks = f"look{'s' * (len(missing) > 1)} {names}"
+    return f"spots.csv lacks {looks}, which {LOG} holds: the run was killed; acquire --resume writes the tables again"
+
+
 def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
     """Copies what is whole of a journal, and writes the campaign that it holds, into a new folder.
+
+    Moves and looks that follow a gap without a new homing are kept in the journal, do not count, and are counted apart.
 
     Raises:
         InputError: no journal, nothing whole, a folder that holds something, or campaign files that are damaged too.
@@ -286,10 +306,18 @@ def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
     # Rig, stereo and header stand in files of their own, written once and not touched since.
     before = _settings_of(folder)
     done = repair(folder, to)
-    record = recorded(read_journal(to).records)
+    records = read_journal(to).records
+    record = recorded(records)
     if record.moves:
         write_derived(_campaign_of(record, before), to)
-    return {**asdict(done), "moves": len(record.moves), "looks": len(record.spots)}
+    ignored = set(record.ignored_lines)
+    return {
+        **asdict(done),
+        "moves": len(record.moves),
+        "looks": len(record.spots),
+        "moves_not_counted": sum(one.event == "moved" for one in records if one.line in ignored),
+        "looks_not_counted": sum(one.event == "looked" for one in records if one.line in ignored),
+    }
 
 
 def _settings_of(folder: Path) -> Campaign:

@@ -25,6 +25,7 @@ from tvsbayes.acquisition.live_run import LiveRun
 from tvsbayes.acquisition.live_snapshot import COMING_MAX, PAUSED, REMARKS_MAX, RUNNING, SeenLook
 from tvsbayes.acquisition.observation import Observation
 from tvsbayes.acquisition.operator import HAZARD, Progress, StopKey
+from tvsbayes.acquisition.place_command import PlaceCommand, require_placed
 from tvsbayes.acquisition.recorder import Recorded
 from tvsbayes.acquisition.replanning import Proposal, Replanning, adapted_entries, check_plan
 from tvsbayes.acquisition.run_identity import setup_entries
@@ -84,6 +85,7 @@ class Acquisition:
         show: told about progress.
         estimate: the running estimate; a run that meets its target ends.
         live: where the run is published, and what is asked of it; by default nobody looks.
+        place_command: a program that places the sheet before the operator is told; by default there is none.
     """
 
     def __init__(
@@ -97,14 +99,17 @@ class Acquisition:
         show: Callable[[Progress], None] = lambda progress: None,
         estimate: RunningEstimate | None = None,
         live: LiveRun | None = None,
+        place_command: PlaceCommand | None = None,
     ):
         self.rig, self.plan, self.journal = rig, tuple(plan), journal
         self._stop, self._show, self._estimate = stop or StopKey(), show, estimate
         self._settle_s = float(rig.positioner.get("settle_s", SETTLE_S))
-        self._retries, self._check_depth, self._placement = 0, False, -1
+        self._place_command, self._retries, self._check_depth, self._placement = place_command, 0, False, -1
         self._log = RunLog(journal, rig, bench.utc)
         self._live = live or LiveRun()
         self._control = Control(self._live.requests, bench.positioner, self._stop, self._write_asked, self._publish)
+        if estimate is not None:
+            estimate.meanwhile = self._control.meanwhile
         self.bench = replace(bench, positioner=HeedingPositioner(bench.positioner, self._control))
         self._spot = self._log.next_spot()
 
@@ -239,10 +244,15 @@ class Acquisition:
         self._log.write(event)
 
     def _place(self, target: str, placement: int, remark: str, step: int | None) -> None:
-        again = step is None
+        if self._place_command is not None:
+            self.bench.positioner.laser(False)
+            done = self._place_command.run(target, self.rig.sheets_mm[target], placement, self._control.meanwhile)
+            self._log.write(structs.replace(done, time_s=self._log.now_s()))
+            self._heed_stop()
+            require_placed(done)
         if not self.bench.operator.place(target, self.rig.sheets_mm[target], placement, remark):
             raise _Stopped
-        self._log.write(Placed(step=step, target=target, again=again, utc=self._log.utc_text()))
+        self._log.write(Placed(step=step, target=target, again=step is None, utc=self._log.utc_text()))
         self._placement, self._check_depth = placement, True
 
     def _move(self, pan: int, tilt: int, step: int | None, **more: Any) -> None:

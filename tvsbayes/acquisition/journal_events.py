@@ -1,9 +1,9 @@
 """The events of a run's journal, as their JSON objects stand in `log.jsonl`: structs, told apart by the key `event`.
 
 `created` opens a journal. Every motion of the plan is an `intent` before, and an order has an event of its own once it
-is done: `homed`, `placed`, `moved`, `looked`. `adapted` changes the plan, `confirmed` says whether the posterior meets
-the target, `asked` is what somebody asked for on the live page, `verified` closes a segment, `start` and `stop` enclose
-a run, `gap` stands where a repair lost lines.
+is done: `homed`, `placed`, `moved`, `looked`. `place_command` is a program that was to place the sheet. `adapted`
+changes the plan, `confirmed` says whether the posterior meets the target, `asked` is what somebody asked for on the
+live page, `verified` closes a segment, `start` and `stop` enclose a run, `gap` stands where a repair lost lines.
 Counters in motor steps, raw px, degrees and seconds by suffix; `utc` and `created` are ISO 8601. Fields stand in the
 order in which they are written; those that are UNSET by default may be missing.
 
@@ -65,6 +65,23 @@ class Placed(Event, frozen=True):
     target: str
     again: bool | UnsetType = UNSET
     utc: str = ""
+
+
+class PlaceCommanded(Event, frozen=True, kw_only=True, tag="place_command"):
+    """A program has placed the sheet (`exit_code` 0) or failed to; None where it had to be ended. `words`: its output.
+
+    `placement` counts the placements of the plan from 0. `placed` follows where it has worked.
+    """
+
+    time_s: float | UnsetType = UNSET
+    target: str
+    x_mm: float
+    placement: int
+    command: list[str]
+    exit_code: int | None
+    seconds: float
+    limit_s: float
+    words: str
 
 
 class TrueAngles(Struct, frozen=True):
@@ -184,6 +201,8 @@ class AskedDevice(Struct, frozen=True):
 
 class Asked(Event, frozen=True, kw_only=True):
     """What somebody asked of a run while it went on (pause, resume, stop, laser off), once the device had answered.
+
+    `control passed on`: another browser controls, because the one before had not asked for a while.
 
     `number` counts the requests of a run from 1; `time_s` since the campaign was created, when the device had answered.
     """
