@@ -46,7 +46,7 @@ def normal(mean: float, sd: float, dimension: int) -> Independence:
 class Skewed:
     """A target of mass e^1.7: Gumbel's density in the first coordinate, whom the second follows, the rest normal."""
 
-    path = SimpleNamespace(mode=np.zeros(5), dimension=5, heavy=np.arange(5) == 0, coupled=np.arange(5) >= 3, pairs=())
+    path = SimpleNamespace(mode=np.zeros(5), dimension=5, heavy=np.arange(5) == 0, coupled=np.arange(5) >= 3)
     fit = SimpleNamespace(arrays=no_places())
     invalid = 0
 

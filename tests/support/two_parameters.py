@@ -53,6 +53,9 @@ def route() -> Transport:
         bend=np.zeros((1, 0, 0)),
         place_angle_rad=np.zeros(0),
         place_on_tilt=np.zeros(0, bool),
+        walk=np.zeros((0, 2)),
+        drift_scale=np.zeros(2),
+        drift_noise=np.zeros((2, 1)),
         gear_scale=np.zeros(len(GEAR_SCALES)),
         gear_noise=np.zeros((len(GEAR_SCALES), 1)),
         period_deg=np.zeros((2, PERIODS_MAX)),
@@ -92,6 +95,7 @@ def ridge() -> Transport:
         linear=linear_campaign(np.array([0.0, sd / NARROW_SD]), np.diag([1.0, sd**2]), 0),
         residuals=ridge_residual,
         bend=np.zeros((2, 1, 1)),
+        drift_noise=np.zeros((2, 0)),
         gear_noise=np.zeros((len(GEAR_SCALES), 0)),
     )
     return replace(straight, bend=bends(straight))
