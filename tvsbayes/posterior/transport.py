@@ -472,7 +472,9 @@ def transport(fit: JointFit) -> Transport:
     names = np.array(NAMES)
     free = np.flatnonzero(fit.free)
     scales = np.isin(names[free], NOISE_NAMES)
+    # What several scales share comes first: given it, they have little to do with each other.
     noise, others = free[scales], free[~scales]
+    noise = noise[np.argsort(~np.isin(names[noise], names_of("look_scatter_deg")), kind="stable")]
     covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
     order = by_width(covariance)
     others = others[order]
