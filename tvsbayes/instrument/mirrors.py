@@ -48,9 +48,9 @@ class Vectors(NamedTuple):
         """Longer by a factor."""
         return Vectors(self.x * factor, self.y * factor, self.z * factor)
 
-    __rmul__ = __mul__
-    # An array to the left leaves the product to `__rmul__`: it would take a tuple for one more array.
-    __array_ufunc__ = None
+    def __rmul__(self, factor: Numbers) -> Vectors:
+        """The same from the other side: a tuple would be repeated."""
+        return self * factor
 
     def dot(self, other: Vectors) -> Numbers:
         """Scalar product."""
@@ -61,6 +61,10 @@ class Vectors(NamedTuple):
         x = self.y * other.z - self.z * other.y
         y = self.z * other.x - self.x * other.z
         return Vectors(x, y, self.x * other.y - self.y * other.x)
+
+
+# NumPy's arrays leave a product with vectors to these; they would take a tuple for one more array.
+Vectors.__array_ufunc__ = None  # type: ignore[attr-defined]
 
 
 class Turn(NamedTuple):
@@ -172,14 +176,12 @@ def mirrors_of(optics: Optics, tilt: Turn, functions: ModuleType) -> tuple[Mirro
     cos, sin = functions.cos, functions.sin
     first = functions.pi / 4 + optics.mirror1_error_rad
     second = functions.pi / 4 + optics.mirror2_error_rad
-    across, along = sin(second), cos(second)
     sin_skew, cos_skew = sin(optics.tilt_axis_skew_rad), cos(optics.tilt_axis_skew_rad)
     x_mm, z_mm = optics.tilt_axis_offset_mm
-    second_normal = Vectors(
-        across * tilt.cosine,
-        cos_skew * along - sin_skew * across * tilt.sine,
-        sin_skew * along + cos_skew * across * tilt.sine,
-    )
+    ahead = Vectors(sin(second), 0.0, 0.0)
+    above = Vectors(0.0, -sin_skew, cos_skew) * sin(second)
+    axial = Vectors(0.0, cos_skew, sin_skew) * cos(second)
+    second_normal = ahead * tilt.cosine + above * tilt.sine + axial
     return (
         Mirror(Vectors(0.0, 0.0, 0.0), Vectors(0.0, -sin(first), cos(first))),
         Mirror(Vectors(x_mm, -optics.mirror_offset_mm, z_mm), second_normal),
