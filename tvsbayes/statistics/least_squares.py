@@ -274,7 +274,10 @@ def neighbouring_mode(objective: Objective, known: Mode, free: np.ndarray) -> Mo
     ways[rows] = np.linalg.cholesky(known.covariance[np.ix_(rows, rows)])
     here = _Surroundings(objective, known.z, ways)
     for _ in range(NEIGHBOUR_STEPS):
-        step = -here.slope()
+        with np.errstate(invalid="ignore"):
+            step = -here.slope()
+        if not np.all(np.isfinite(step)):
+            return None
         here = replace(here, z=here.z + ways @ step)
         if step @ step < NEIGHBOUR_SETTLED:
             return Mode(here.z, known.covariance, float(objective(here.z[None])[0]), ())
