@@ -10,7 +10,7 @@ import pytest
 from support.waits import check_forward
 
 from tvsbayes import progress
-from tvsbayes.progress import FORESEEN_SECONDS, FORESEEN_SHARE, Job, OpenEnded, SessionLine
+from tvsbayes.progress import FORESEEN_SECONDS, FORESEEN_SHARE, DelayedDisplay, Job, OpenEnded, Progress
 
 ROUNDING = 2.0**-50
 """Of a sum of a few shares near 1, four units of float64's last place."""
@@ -158,13 +158,13 @@ def session(monkeypatch):
     """Somebody types; lines appear at once. What they say, and an event of the first."""
     lines, appeared = [], threading.Event()
 
-    def write(text: str) -> None:
-        lines.append(text)
+    def write(state: Progress | None) -> None:
+        lines.append("" if state is None else f"{100 * state.share:.0f} %, {state.doing}")
         appeared.set()
 
     monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
     monkeypatch.setattr(progress, "SHOWN_AFTER_SECONDS", 0.0)
-    monkeypatch.setattr(progress, "SessionLine", partial(SessionLine, writer=lambda: write))
+    monkeypatch.setattr(progress, "DelayedDisplay", partial(DelayedDisplay, writer=lambda: write))
     return lines, appeared
 
 

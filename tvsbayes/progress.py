@@ -56,7 +56,17 @@ def time_left(seconds: float | None) -> str:
     return f"{seconds:.0f} s left" if seconds < 100 else f"{seconds / 60:.0f} min left"
 
 
-def _line_writer() -> Callable[[str], None] | None:
+Write = Callable[[Progress | None], None]
+"""Replaces what a display shows of a wait; None takes it away."""
+
+
+def _in_words(state: Progress | None) -> str:
+    if state is None:
+        return ""
+    return ", ".join(filter(None, (f"{100 * state.share:.0f} %", state.doing, time_left(state.seconds_left))))
+
+
+def _line_writer() -> Write | None:
     """What replaces the one line of a session; None where nobody types, or nobody would see it."""
     if not hasattr(sys, "ps1"):
         return None
@@ -64,31 +74,31 @@ def _line_writer() -> Callable[[str], None] | None:
         from IPython.display import display
 
         handle = display({"text/plain": ""}, raw=True, display_id=True)
-        return lambda text: handle.update({"text/plain": text}, raw=True)
+        return lambda state: handle.update({"text/plain": _in_words(state)}, raw=True)
     if not sys.stderr.isatty():
         return None
 
-    def write(text: str) -> None:
-        sys.stderr.write(f"\r\x1b[K{text}")
+    def write(state: Progress | None) -> None:
+        sys.stderr.write(f"\r\x1b[K{_in_words(state)}")
         sys.stderr.flush()
 
     return write
 
 
-class SessionLine:
-    """The line of a wait in a session; it appears after `SHOWN_AFTER_SECONDS`, also while nothing is told yet.
+class DelayedDisplay:
+    """The display of a wait; it appears after `SHOWN_AFTER_SECONDS`, also while nothing is told yet.
 
     Args:
         doing: what is being done, until something is told.
-        writer: makes what writes the line, asked when the line appears.
+        writer: makes what writes, called when the display appears.
     """
 
     _shown = threading.Lock()
     """Of one wait at a time: jobs inside a job are its own affair."""
 
-    def __init__(self, doing: str, writer: Callable[[], Callable[[str], None] | None] = _line_writer):
+    def __init__(self, doing: str, writer: Callable[[], Write | None] = _line_writer):
         self._state, self._writer = Progress(doing, 0.0, 0.0, None), writer
-        self._write: Callable[[str], None] | None = None
+        self._write: Write | None = None
         self._lock = threading.RLock()
         self._mine = self._shown.acquire(blocking=False)
         self._timer = threading.Timer(SHOWN_AFTER_SECONDS, self._open)
@@ -103,11 +113,11 @@ class SessionLine:
             self._update()
 
     def close(self) -> None:
-        """Take the line away."""
+        """Take the display away."""
         self._timer.cancel()
         with self._lock:
             if self._write is not None:
-                self._write("")
+                self._write(None)
                 self._write = None
             if self._mine:
                 self._mine = False
@@ -122,9 +132,7 @@ class SessionLine:
 
     def _update(self) -> None:
         if self._write is not None:
-            state = self._state
-            parts = (f"{100 * state.share:.0f} %", state.doing, time_left(state.seconds_left))
-            self._write(", ".join(filter(None, parts)))
+            self._write(self._state)
 
 
 def unshown(share: float) -> None:
@@ -159,11 +167,11 @@ class Job:
         self._stage = next(iter(stages))
         self._told = Progress(self._stage, 0.0, 0.0, None)
         self._silent, self._skipped = True, 0.0
-        self._line: SessionLine | None = None
+        self._line: DelayedDisplay | None = None
 
     def __enter__(self) -> Job:
         if self._show is None and hasattr(sys, "ps1"):
-            self._line = SessionLine(self._stage)
+            self._line = DelayedDisplay(self._stage)
             self._show = self._line.show
         return self
 

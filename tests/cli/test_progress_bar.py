@@ -21,12 +21,13 @@ from tvsbayes.progress import Progress, time_left
 
 SCRIPT = """
 import sys, threading
+from tvsbayes import progress
 from tvsbayes.cli import progress_bar
 from tvsbayes.progress import Job
-progress_bar.SHOWN_AFTER_SECONDS = float(sys.argv[1])
+progress.SHOWN_AFTER_SECONDS = float(sys.argv[1])
 with progress_bar.waiting() as show, Job({"looking": 1.0, "thinking": 3.0}, show) as job:
     for thread in threading.enumerate():
-        if isinstance(thread, threading.Timer) and "silent" in sys.argv:
+        if isinstance(thread, threading.Timer) and sys.argv[1] == "0":
             thread.join()
     if "silent" not in sys.argv:
         job.begin("thinking")
@@ -36,9 +37,10 @@ print("result")
 """
 RENDERING = """
 import sys
-from tvsbayes.cli import main, progress_bar
+from tvsbayes import progress
+from tvsbayes.cli import main
 from tvsbayes.twin import frames
-progress_bar.SHOWN_AFTER_SECONDS = 0.0
+progress.SHOWN_AFTER_SECONDS = 0.0
 frames.BOARD_VIEWS = 1
 sys.exit(main.run(sys.argv[1:]))
 """

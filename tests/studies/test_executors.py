@@ -2,71 +2,110 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from concurrent.futures import CancelledError, Future
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
 
 from tvsbayes.errors import InputError, TvsError
-from tvsbayes.studies.executors import DaskExecutor, ProcessExecutor, executor
-
-
-def test_unknown_engines_are_refused(job):
-    with pytest.raises(InputError, match="no engine threads"), executor("threads"):
-        pass
+from tvsbayes.studies.executors import SINGLE_THREADED, made_rows
 
 
 class KilledWorker(Exception):
     """Dask's name for a row whose workers died again and again."""
 
 
-@pytest.mark.parametrize(
-    ("raised", "what"), [(KilledWorker("row 3"), "worker"), (CancelledError("row 3"), "scheduler is gone")]
-)
-def test_what_dask_lost_is_said_without_a_traceback(job, monkeypatch, raised, what):
-    """`distributed` is an extra: a module of its names stands in."""
+class CommClosedError(OSError):
+    """Dask's name for a connection to the scheduler that ended."""
+
+
+class Pool:
+    """Makes row 5 and loses every other; remembers what it was asked for."""
+
+    def __init__(self, lost: BaseException):
+        self.lost, self.threads, self.ended = lost, "", False
+
+    def submit(self, function, job, index):
+        self.threads = os.environ["NPROC"]
+        future: Future = Future()
+        if index == 5:
+            future.set_result({"index": index})
+        else:
+            future.set_exception(self.lost)
+        return future
+
+    def shutdown(self, **_):
+        self.ended = True
+
+
+def pool_of(engine: str, lost: BaseException, monkeypatch) -> Pool:
+    """What stands in for an engine; `distributed` is an extra."""
+    pool = Pool(lost)
+    if engine == "processes":
+        monkeypatch.setattr("concurrent.futures.ProcessPoolExecutor", lambda *_, **options: pool)
+        return pool
 
     class Client:
-        def submit(self, function, job, index, **options):
-            return index
+        def __init__(self, place):
+            assert place == "tcp://scheduler:8786"
 
-    def as_completed(ordered):
-        done = Future()
-        done.set_result({"index": ordered[0]})
-        yield done
-        lost = Future()
-        lost.set_exception(raised)
-        yield lost
+        def __enter__(self):
+            return self
 
-    stand_in = SimpleNamespace(KilledWorker=KilledWorker, as_completed=as_completed)
-    monkeypatch.setitem(sys.modules, "distributed", stand_in)
-    made = DaskExecutor(Client())
-    made.submit(job, 5)
-    rows = made.as_completed()
-    assert next(rows) == {"index": 5}
+        def __exit__(self, *_):
+            pool.shutdown()
+
+        def submit(self, *order, **options):
+            return pool.submit(*order)
+
+    given = {"Client": Client, "LocalCluster": nullcontext, "KilledWorker": KilledWorker, "as_completed": iter}
+    monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(**given))
+    monkeypatch.setitem(sys.modules, "distributed.comm", SimpleNamespace(CommClosedError=CommClosedError))
+    return pool
+
+
+def test_unknown_engines_are_refused(job):
+    with pytest.raises(InputError, match="no engine threads"):
+        next(made_rows(job, [0], "threads"))
+
+
+@pytest.mark.parametrize(
+    ("engine", "lost", "what"),
+    [
+        ("processes", BrokenProcessPool(), "a worker process"),
+        ("dask", KilledWorker("row 3"), "every Dask worker"),
+        ("dask", CancelledError("row 3"), "scheduler is gone"),
+        ("dask", CommClosedError("row 3"), "scheduler is gone"),
+    ],
+)
+def test_dead_workers_are_told_with_what_to_do(job, monkeypatch, engine, lost, what):
+    """Rows before are given out, workers have one thread, and what was started is ended."""
+    pool = pool_of(engine, lost, monkeypatch)
+    before = {name: os.environ.get(name) for name in SINGLE_THREADED}
+    assert next(made_rows(job, [5], engine, 1, "tcp://scheduler:8786")) == {"index": 5}
+    assert pool.threads == "1"
     with pytest.raises(TvsError, match=f"{what}.*finished rows are kept") as error:
-        next(rows)
-    assert error.value.code == "worker-died" and "goes on" in error.value.remedy
+        list(made_rows(job, [5, 3], engine, 1, "tcp://scheduler:8786"))
+    assert error.value.code == "worker-died" and "run the same command again" in error.value.remedy
+    assert pool.ended and {name: os.environ.get(name) for name in SINGLE_THREADED} == before
 
 
-def test_a_dead_worker_is_told_with_what_to_do(job):
-    """A pool whose process has died says so in our words."""
-    from concurrent.futures.process import BrokenProcessPool
+@pytest.mark.parametrize("engine", ["processes", "dask"])
+def test_rows_left_early_end_the_workers(job, monkeypatch, engine):
+    """As Ctrl-C does, and an error where the row is kept."""
+    pool = pool_of(engine, BrokenProcessPool(), monkeypatch)
+    rows = made_rows(job, [5, 5], engine, 1, "tcp://scheduler:8786")
+    next(rows)
+    assert not pool.ended
+    rows.close()
+    assert pool.ended
 
-    class Broken:
-        def submit(self, *_):
-            future = Future()
-            future.set_exception(BrokenProcessPool())
-            return future
 
-        def shutdown(self, **_):
-            pass
-
-    made = ProcessExecutor(1)
-    made.pool.shutdown()
-    made.pool = Broken()
-    made.submit(job, 0)
-    with pytest.raises(TvsError, match="finished rows are kept") as told:
-        list(made.as_completed())
-    assert "run the same command again" in told.value.remedy
+def test_dask_without_its_extra_is_refused(job, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match="needs the extra dask"):
+        next(made_rows(job, [0], "dask"))

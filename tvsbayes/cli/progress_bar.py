@@ -6,18 +6,12 @@ What an interrupted wait leaves behind is told too.
 from __future__ import annotations
 
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from tvsbayes.cli.app import report_line
 from tvsbayes.pipeline import SAMPLING
-from tvsbayes.progress import SHOWN_AFTER_SECONDS, Progress, Show, time_left
-
-if TYPE_CHECKING:
-    from rich.progress import Progress as Bar
+from tvsbayes.progress import DelayedDisplay, Progress, Show, Write, time_left
 
 
 @contextmanager
@@ -26,11 +20,11 @@ def waiting() -> Iterator[Show | None]:
     if not sys.stderr.isatty():
         yield None
         return
-    shown = _Shown()
+    display = DelayedDisplay("", _bar)
     try:
-        yield shown.show
+        yield display.show
     finally:
-        shown.close()
+        display.close()
 
 
 @contextmanager
@@ -56,56 +50,23 @@ def chain_kept(further: str) -> Iterator[Show]:
         raise
 
 
-class _Shown:
-    """A bar that appears when the wait is long enough, also while nothing is told, and leaves no trace."""
+def _bar() -> Write:
+    """A bar on stderr that leaves no trace."""
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn
+    from rich.progress import Progress as Bar
 
-    def __init__(self) -> None:
-        self._began = time.monotonic()
-        self._lock = threading.RLock()
-        self._state = Progress("", 0.0, 0.0, None)
-        self._bar: Bar | None = None
-        self._timer = threading.Timer(SHOWN_AFTER_SECONDS, self._open)
-        self._timer.daemon = True
-        self._timer.start()
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}"))
+    # Standard output is for the result alone.
+    bar = Bar(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False)
+    task = bar.add_task("", total=1.0, left="")
 
-    def show(self, state: Progress) -> None:
-        """Takes the news."""
-        with self._lock:
-            self._state = state
-            if self._bar is None and time.monotonic() - self._began >= SHOWN_AFTER_SECONDS:
-                self._open()
-            self._update()
+    def write(state: Progress | None) -> None:
+        if state is None:
+            bar.stop()
+            return
+        left = time_left(state.seconds_left)
+        bar.update(task, description=state.doing, completed=state.share, left=left)
+        bar.start()
 
-    def close(self) -> None:
-        """Take the bar away."""
-        self._timer.cancel()
-        with self._lock:
-            if self._bar is not None:
-                self._bar.stop()
-
-    def _open(self) -> None:
-        with self._lock:
-            # The timer may fire after a bar was opened, or while the wait ends.
-            if self._bar is not None or self._timer.finished.is_set():
-                return
-            from rich.console import Console
-            from rich.progress import BarColumn, TaskProgressColumn, TextColumn
-            from rich.progress import Progress as Bar
-
-            columns = (
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TaskProgressColumn(),
-                TextColumn("{task.fields[left]}"),
-            )
-            # Standard output is for the result alone.
-            self._bar = Bar(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False)
-            self._bar.add_task("", total=1.0, left="")
-            self._update()
-            self._bar.start()
-
-    def _update(self) -> None:
-        if self._bar is not None:
-            state = self._state
-            left = time_left(state.seconds_left)
-            self._bar.update(self._bar.task_ids[0], description=state.doing, completed=state.share, left=left)
+    return write

@@ -8,18 +8,15 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent import futures
-from concurrent.futures import BrokenExecutor
-from contextlib import contextmanager
-from typing import Protocol
+from contextlib import contextmanager, nullcontext
 
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.studies.rows import StudyRow
 from tvsbayes.studies.study_job import StudyJob, study_row
 
-ENGINES = ("serial", "processes", "dask")
 SINGLE_THREADED = {
     "NPROC": "1",
     "PJRT_NPROC": "1",
@@ -36,101 +33,22 @@ def _in_worker(job: StudyJob, index: int) -> StudyRow:
     return study_row(job, index)
 
 
-class Executor(Protocol):
-    """Where the rows of a study are made."""
+def made_rows(
+    job: StudyJob, indices: Sequence[int], engine: str = "serial", workers: int = 2, address: str | None = None
+) -> Generator[StudyRow, None, None]:
+    """Rows of a study in the order in which they are finished.
 
-    def submit(self, job: StudyJob, index: int) -> None:
-        """Order one row."""
-
-    def as_completed(self) -> Iterator[StudyRow]:
-        """Rows in the order in which they are finished."""
-
-
-class SerialExecutor:
-    """This process, one row after the other."""
-
-    def __init__(self) -> None:
-        self._ordered: list[tuple[StudyJob, int]] = []
-
-    def submit(self, job: StudyJob, index: int) -> None:
-        """Order one row."""
-        self._ordered.append((job, index))
-
-    def as_completed(self) -> Iterator[StudyRow]:
-        """Rows in order."""
-        for job, index in self._ordered:
-            yield study_row(job, index)
-
-
-def _worker_died(what: str) -> InputError:
-    remedy = "run the same command again: it goes on"
-    return InputError("worker-died", f"{what}; finished rows are kept", remedy=remedy)
-
-
-class ProcessExecutor:
-    """Spawned processes of this machine, one thread each; JAX must not be forked."""
-
-    def __init__(self, workers: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pool = futures.ProcessPoolExecutor(workers, mp_context=context)
-        self._ordered: list[futures.Future] = []
-
-    def submit(self, job: StudyJob, index: int) -> None:
-        """Order one row."""
-        self._ordered.append(self.pool.submit(_in_worker, job, index))
-
-    def as_completed(self) -> Iterator[StudyRow]:
-        """Rows as they come.
-
-        Raises:
-            TvsError: a worker died; the rows so far are kept.
-        """
-        try:
-            for future in futures.as_completed(self._ordered):
-                yield future.result()
-        except BrokenExecutor as error:
-            raise _worker_died("a worker process of the study died (out of memory, or killed)") from error
-
-
-class DaskExecutor:
-    """A Dask cluster; the rows of a worker that dies are made again by another."""
-
-    def __init__(self, client) -> None:
-        self.client = client
-        self._ordered: list = []
-
-    def submit(self, job: StudyJob, index: int) -> None:
-        """Order one row."""
-        self._ordered.append(self.client.submit(_in_worker, job, index, pure=False, retries=3))
-
-    def as_completed(self) -> Iterator[StudyRow]:
-        """Rows as they come.
-
-        Raises:
-            TvsError: every worker that took a row died, or the scheduler is gone; the rows so far are kept.
-        """
-        from distributed import KilledWorker, as_completed
-
-        try:
-            for future in as_completed(self._ordered):
-                yield future.result()
-        except KilledWorker as error:
-            raise _worker_died("every Dask worker that took a certain row died (out of memory, or killed)") from error
-        except futures.CancelledError as error:
-            raise _worker_died("the Dask scheduler is gone") from error
-
-
-@contextmanager
-def executor(engine: str, workers: int = 2, address: str | None = None) -> Iterator[Executor]:
-    """An executor by its name.
+    Close the iterator where it is left early: it ends the workers that it started.
 
     Args:
+        job: what is studied.
+        indices: of the rows.
         engine: one of `ENGINES`.
         workers: processes; of a Dask cluster only where it is started here.
         address: scheduler of a Dask cluster that runs already.
 
     Raises:
-        InputError: an engine that does not exist, or Dask without its extra.
+        InputError: an engine that does not exist, Dask without its extra, or a worker that died.
     """
     if engine not in ENGINES:
         allowed = ", ".join(ENGINES)
@@ -138,30 +56,52 @@ def executor(engine: str, workers: int = 2, address: str | None = None) -> Itera
             "engine", f"no engine {escaped(engine)}", column="--engine", allowed=allowed, remedy="name one"
         )
     if engine == "serial":
-        yield SerialExecutor()
+        for index in indices:
+            yield study_row(job, index)
         return
     with _environment(SINGLE_THREADED):
-        if engine == "processes":
-            made = ProcessExecutor(workers)
-            try:
-                yield made
-            finally:
-                made.pool.shutdown(wait=True, cancel_futures=True)
-            return
-        try:
-            from distributed import Client, LocalCluster
-        except ImportError as error:
-            remedy = "pip install 'tvsbayes[dask]', or use --engine processes"
-            raise InputError(
-                "no-dask", "the engine dask needs the extra dask", column="--engine", remedy=remedy
-            ) from error
-        if address is not None:
-            with Client(address) as client:
-                yield DaskExecutor(client)
-            return
-        local = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
-        with LocalCluster(**local) as cluster, Client(cluster) as client:
-            yield DaskExecutor(client)
+        yield from _WORKERS[engine](job, indices, workers, address)
+
+
+def _worker_died(what: str) -> InputError:
+    remedy = "run the same command again: it goes on"
+    return InputError("worker-died", f"{what}; finished rows are kept", remedy=remedy)
+
+
+def _by_processes(job: StudyJob, indices: Sequence[int], workers: int, address: str | None) -> Iterator[StudyRow]:
+    """Spawned processes of this machine, one thread each; JAX must not be forked."""
+    pool = futures.ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    try:
+        for future in futures.as_completed([pool.submit(_in_worker, job, index) for index in indices]):
+            yield future.result()
+    except futures.BrokenExecutor as error:
+        raise _worker_died("a worker process of the study died (out of memory, or killed)") from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _by_dask(job: StudyJob, indices: Sequence[int], workers: int, address: str | None) -> Iterator[StudyRow]:
+    """A Dask cluster; the rows of a worker that dies are made again by another."""
+    try:
+        from distributed import Client, KilledWorker, LocalCluster, as_completed
+        from distributed.comm import CommClosedError
+    except ImportError as error:
+        remedy = "pip install 'tvsbayes[dask]', or use --engine processes"
+        raise InputError("no-dask", "the engine dask needs the extra dask", column="--engine", remedy=remedy) from error
+    local = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    try:
+        with LocalCluster(**local) if address is None else nullcontext(address) as place, Client(place) as client:
+            # Not `Client.get_executor`: it waits without end for a row that is fetched while the scheduler dies.
+            for future in as_completed([client.submit(_in_worker, job, i, pure=False, retries=3) for i in indices]):
+                yield future.result()
+    except KilledWorker as error:
+        raise _worker_died("every Dask worker that took a certain row died (out of memory, or killed)") from error
+    except (futures.CancelledError, CommClosedError) as error:
+        raise _worker_died("the Dask scheduler is gone") from error
+
+
+_WORKERS = {"processes": _by_processes, "dask": _by_dask}
+ENGINES = ("serial", *_WORKERS)
 
 
 @contextmanager

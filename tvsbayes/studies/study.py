@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from tvsbayes.planning.target import Target
 from tvsbayes.progress import Job, Show
 from tvsbayes.statistics.chances import LEVELS, binomial_bounds, rms_bounds, share_interval95
 from tvsbayes.statistics.intervals import NORMAL_95
-from tvsbayes.studies.executors import executor
+from tvsbayes.studies.executors import made_rows
 from tvsbayes.studies.rows import StudyRow, StudyRows
 from tvsbayes.studies.study_job import StudyJob
 
@@ -186,11 +187,9 @@ def study(
     missing = [index for index in range(count) if index not in done]
     with Job({CAMPAIGNS: 1.0}, progress) as told:
         if missing:
-            with executor(engine, min(workers, len(missing)), address) as running:
-                told.at(0.0, f"{count - len(missing)} of {count}")
-                for index in missing:
-                    running.submit(job, index)
-                for made, row in enumerate(running.as_completed(), 1):
+            told.at(0.0, f"{count - len(missing)} of {count}")
+            with closing(made_rows(job, missing, engine, min(workers, len(missing)), address)) as running:
+                for made, row in enumerate(running, 1):
                     rows.append(row)
                     told.at(made / len(missing), f"{count - len(missing) + made} of {count}")
         every = rows.of(job.key)
