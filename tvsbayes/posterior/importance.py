@@ -333,7 +333,13 @@ class ImportanceRun:
         return self.pool.w[np.argsort(-keys)[:count]]
 
 
-def importance_run(fit: JointFit, seed: int, advance: Advance = unshown, rounds_max: int = ROUNDS_MAX) -> ImportanceRun:
+def importance_run(
+    fit: JointFit,
+    seed: int,
+    advance: Advance = unshown,
+    rounds_max: int = ROUNDS_MAX,
+    rounds_least: int = ROUNDS_LEAST,
+) -> ImportanceRun:
     """Draw rounds until the answer is accepted; where that would take too long, from a proposal fitted anew.
 
     Args:
@@ -341,6 +347,7 @@ def importance_run(fit: JointFit, seed: int, advance: Advance = unshown, rounds_
         seed: of the draws.
         advance: told how far it is.
         rounds_max: of all proposals together.
+        rounds_least: of the proposal that gives the answer.
 
     Raises:
         NotConverged: the density is not finite around the mode.
@@ -353,7 +360,7 @@ def importance_run(fit: JointFit, seed: int, advance: Advance = unshown, rounds_
     target = Target(fit, path)
     try:
         pool = piloted(target, generator)
-        total, rounds, wanted, patience = PILOT_ROUNDS, 0, ROUNDS_LEAST, PATIENCE * ROUNDS_LEAST
+        total, rounds, wanted, patience = PILOT_ROUNDS, 0, rounds_least, PATIENCE * rounds_least
         while True:
             while rounds < wanted:
                 rounds, total = rounds + 1, total + 1

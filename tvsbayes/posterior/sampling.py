@@ -12,11 +12,13 @@ from tvsbayes.errors import NotConverged, require_kind
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.importance import importance_run, mixed, run_beside
+from tvsbayes.posterior.importance import ROUNDS_LEAST, ImportanceRun, importance_run, mixed, run_beside
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.convergence import Convergence
 
 TIERS = ("importance", "emcee")
+MIXTURE_ROUNDS = 4 * ROUNDS_LEAST
+"""Of the most probable way of homing, where fewer leave the mixture of all rough."""
 DRAWING, WALKING = "drawing weighted samples", "sampling with emcee"
 DRAWN_SECONDS, WALKED_SECONDS = 3.0, 8.0
 """What progress predicts with."""
@@ -81,9 +83,11 @@ def sample(
         else:
             job.begin(DRAWING)
             start, chain = importance_run(fit, seed, job.at), None
-        early = start.posterior
-        if len(fit.mixture) > 1:
-            early = mixed([early, *(run_beside(way.fit, start, seed) for way in fit.mixture[1:] if way.fit)])
+        early = _mixture(start, seed)
+        if early.convergence.answer == "rough" and start.posterior.convergence.answer == "accepted" and chain is None:
+            # The share of a less probable way of homing asks for more draws than the most probable one needs.
+            start = importance_run(fit, seed, job.at, rounds_least=MIXTURE_ROUNDS)
+            early = _mixture(start, seed)
         if tier == "importance":
             return early
         if first is not None:
@@ -93,6 +97,13 @@ def sample(
         job.begin(WALKING)
         walked = Run(fit, start, chain, checkpoint, job.at, began).until_converged(60 * max_minutes)
         return _better(early, walked)
+
+
+def _mixture(start: ImportanceRun, seed: int) -> Posterior:
+    """The posterior of all ways of homing, from the draws of the most probable one."""
+    first = start.posterior
+    others = [run_beside(way.fit, start, seed) for way in first.fit.mixture[1:] if way.fit]
+    return mixed([first, *others]) if others else first
 
 
 def _better(early: Posterior, walked: Posterior) -> Posterior:
