@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Literal, cast
 
 from tvsbayes.acquisition.journal import LOG, Record
 from tvsbayes.acquisition.journal_events import Homed, Looked, Moved, Placed, Stop, Verified
 from tvsbayes.errors import refusal
 from tvsbayes.instrument.axes import PanApproach, TiltApproach
-from tvsbayes.instrument.campaign import NO_PIXELS, Move, Spot, with_pixels
+from tvsbayes.instrument.campaign import NO_PIXELS, Move, Spot, next_move, with_pixels
 
 HOME_TOLERANCE_STEPS = 2
 """Scatter of a home switch, as homing finds it again; more than that are lost steps."""
@@ -109,7 +109,7 @@ class Recorder:
         elif event == "homed":
             self._homed(cast("Homed", data))
         elif event == "moved":
-            self.moves.append(Move(len(self.moves), self.moves[-1].segment, *_head(cast("Moved", data))))
+            self._moved(cast("Moved", data), self.moves[-1].segment)
         elif event == "looked":
             self._looks(cast("Looked", data))
         if data.get("step") is not None and event in ("homed", "moved", "placed", "looked"):
@@ -131,10 +131,19 @@ class Recorder:
         pan, tilt = data["approach"]
         # What sides they are is checked where the tables are written.
         approach = cast("PanApproach", pan), cast("TiltApproach", tilt)
-        self.moves.append(Move(len(self.moves), segment, *_head(data), *approach))
+        self._moved(data, segment, approach)
         # Only a homing of the plan states counters; one of a resumed run repeats them.
         counters = int(data["pan_steps"]), int(data["tilt_steps"])
         self.state = replace(self.state, boot=int(data["boot"]), home_steps=counters)
+
+    def _moved(
+        self,
+        data: Moved,
+        segment: int,
+        approach: tuple[PanApproach | Literal[""], TiltApproach | Literal[""]] = ("", ""),
+    ) -> None:
+        steps = int(data["pan_steps"]), int(data["tilt_steps"])
+        self.moves.append(next_move(self.moves, segment, float(data["time_s"]), steps, approach))
 
     def _looks(self, data: Looked) -> None:
         self.spots.append(_spot(data, len(self.moves) - 1))
@@ -174,22 +183,16 @@ def recorded(records: Iterable[Record]) -> Recorded:
     return recorder.result()
 
 
-def _head(data: Moved) -> tuple[float, int, int]:
-    return float(data["time_s"]), int(data["pan_steps"]), int(data["tilt_steps"])
-
-
 def _spot(data: Looked, move: int) -> Spot:
     if move < 0:
         raise ValueError("a look before the first homing")
     row = Spot(
-        int(data["spot"]),
-        move,
-        str(data["target"]),
-        data["experiment"],
-        data["point"],
-        *NO_PIXELS,
-        *NO_PIXELS,
-        data.get("aperture_deg"),
+        spot=int(data["spot"]),
+        move=move,
+        target=str(data["target"]),
+        experiment=data["experiment"],
+        point=data["point"],
+        aperture_deg=data.get("aperture_deg"),
     )
     pixels, sds = data["pixels_px"] or NO_PIXELS, data["sds_px"] or NO_PIXELS
     left, right = map(float, data.get("correlations", (0.0, 0.0)))
