@@ -1,4 +1,4 @@
-// What the server sent, as arrays: columns of looks, and all looks of all campaigns by one number, their place.
+// The document's columns as arrays: looks of a campaign, and all looks of all campaigns by one number, their place.
 
 const KINDS = { "<f4": Float32Array, "<i4": Int32Array, u1: Uint8Array };
 
@@ -11,7 +11,7 @@ function unpacked(sent) {
 }
 
 /** The looks of one campaign. */
-export class Looks {
+class Looks {
   constructor(sent, first) {
     this.first = first;
     this.count = sent.spot.shape[0];
@@ -52,8 +52,8 @@ export class Looks {
   some(name, most, part = null) {
     const known = [];
     for (let row = 0; row < this.count; row++) {
-      const told = part === null ? this.row(name, row).every(Number.isFinite) : Number.isFinite(this.at(name, row, part));
-      if (told) known.push(row);
+      const finite = part === null ? this.row(name, row).every(Number.isFinite) : Number.isFinite(this.at(name, row, part));
+      if (finite) known.push(row);
     }
     if (known.length <= most) return known;
     return Array.from({ length: most }, (_, k) => known[Math.floor((k * known.length) / most)]);
@@ -61,11 +61,11 @@ export class Looks {
 }
 
 /** All campaigns of the document, and their looks by place. */
-export class Scenes {
-  constructor(told) {
-    this.told = told;
+class Scenes {
+  constructor(sent) {
+    this.sent = sent;
     let first = 0;
-    this.all = told.scenes.map((scene) => {
+    this.all = sent.scenes.map((scene) => {
       const looks = new Looks(scene.looks, first);
       first += looks.count;
       return { ...scene, looks };

@@ -1,22 +1,40 @@
-// The page of a run: what it tells twice a second, and what may be asked of it. Closing the page changes nothing.
+// The page of a run: what it says twice a second, and what may be asked of it. Closing the page changes nothing.
 
-import { asked, keyOf } from "./access.js";
-
+const KEY = "tvsbayes-key";
 const POLL_MS = 500;
 const LATE_MS = 3000;
 const GONE_AFTER = 4;
 const WINDOW_PX = 48;
-const COLOURS = { left: "#1f6fb2", right: "#c2410c", up: "#2f8f4e", down: "#8f4bb0" };
+const DIRECTIONS = ["left", "right", "up", "down"];
+/** What every browser may ask for, whichever controls: as in view/watched.py. */
+const SAFER = ["pause", "laser off"];
+const WAITS = "waits for the next exchange with the device: after a motion, or once the sheet is placed";
 const WORDS = { running: "the run goes on", paused: "PAUSED: laser off, nothing moves until resume or stop", ended: "the run has ended" };
 const NOISY = 2;
-const SVG = "http://www.w3.org/2000/svg";
-const by = (id) => document.getElementById(id);
 
-function element(name, attributes, text = "") {
-  const made = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.textContent = text;
-  return made;
+/** The key of this tab: kept over a reload, else given for the token behind the #. */
+async function keyOf() {
+  const token = location.hash.slice(1);
+  if (token) {
+    history.replaceState(null, "", "/");
+    const answer = await fetch("/key", { method: "POST", body: JSON.stringify({ token }) });
+    if (!answer.ok) throw new Error(await answer.text());
+    sessionStorage.setItem(KEY, (await answer.json()).key);
+  }
+  return sessionStorage.getItem(KEY) ?? "";
+}
+
+/** An answer of the page's own server; `how` as of fetch. */
+async function asked(path, key, how = {}) {
+  const answer = await fetch(path, { ...how, headers: { "X-Tvsbayes-Key": key } });
+  if (!answer.ok) throw new Error(await answer.text());
+  return answer;
+}
+
+/** A value with its standard uncertainty in units of the last digit: 0.0775(22). */
+function withU(value, u) {
+  const places = Math.max(0, 1 - Math.floor(Math.log10(u)));
+  return `${value.toFixed(places)}(${Math.round(u * 10 ** places)})`;
 }
 
 function time(seconds) {
@@ -55,9 +73,7 @@ class LivePage {
     for (const button of document.querySelectorAll("#buttons button")) {
       button.addEventListener("click", () => this.ask(button.dataset.what));
     }
-    for (const change of ["(prefers-color-scheme: dark)", "(max-width: 700px)"]) {
-      matchMedia(change).addEventListener("change", () => this.drawHistory(this.told));
-    }
+    this.panels = {};
   }
 
   /** Put a request; what became of it is told with the next snapshots. */
@@ -71,8 +87,8 @@ class LivePage {
   }
 
   async refresh() {
-    this.told = await (await asked("/live", this.key, { signal: AbortSignal.timeout(LATE_MS) })).json();
-    await this.show(this.told);
+    this.latest = await (await asked("/live", this.key, { signal: AbortSignal.timeout(LATE_MS) })).json();
+    await this.show(this.latest);
   }
 
   async watch() {
@@ -81,7 +97,7 @@ class LivePage {
       try {
         await this.refresh();
         missed = 0;
-        document.body.dataset.state = this.told.state;
+        document.body.dataset.state = this.latest.state;
       } catch (error) {
         missed += 1;
         if (missed >= GONE_AFTER) return this.gone();
@@ -126,9 +142,10 @@ class LivePage {
     const sensible = { pause: state === "running", resume: state === "paused", stop: state !== "ended", "laser off": state !== "ended" };
     for (const button of document.querySelectorAll("#buttons button")) {
       const what = button.dataset.what;
-      button.disabled = !controls || !sensible[what] || waits(what);
+      button.disabled = !(controls || SAFER.includes(what)) || !sensible[what] || waits(what);
     }
-    by("rights").textContent = controls ? "this browser controls" : "this browser only watches: the first one that opened the link controls";
+    by("rights").textContent = controls ? "this browser controls"
+      : "another browser controls; Pause and Laser off work here too, and control comes here once the other is silent for 10 s";
     document.body.dataset.controls = controls;
   }
 
@@ -154,14 +171,15 @@ class LivePage {
     if (!requests.length) return rows(by("requests"), [], [["nothing yet"]]);
     rows(by("requests"), ["", "asked for", "", "after", "answer"], requests.toReversed().map((request) => [
       String(request.number), request.what, [request.state, request.state],
-      request.waited_s === null ? "" : `${request.waited_s.toFixed(2)} s`, request.answer,
+      request.waited_s === null ? "" : `${request.waited_s.toFixed(2)} s`, request.state === "requested" ? WAITS : request.answer,
     ]));
   }
 
   showEstimates(told) {
     const { estimates, aim, temperature } = told;
     const target = aim.target_u_deg_per_step;
-    const wanted = target === null ? "" : `; wanted: u at most ${target.toPrecision(2)} in ${aim.directions.join(", ")}`;
+    const names = DIRECTIONS.filter((name) => aim.directions.includes(name));
+    const wanted = target === null ? "" : `; wanted: u at most ${target.toPrecision(2)} in ${names.join(", ")}`;
     if (!estimates.length) {
       by("estimate-remark").textContent = `no estimate yet${wanted}`;
       return;
@@ -173,44 +191,30 @@ class LivePage {
     by("estimate-remark").textContent = `of ${last.looks} looks${wanted}${drift}`;
     if (estimates.length === this.shown.estimates) return;
     this.shown.estimates = estimates.length;
-    const heads = ["direction", "deg/step", "u", "target", "moved, sd"];
+    const heads = ["direction", "deg/step (u)", "target", "moved, sd"];
     rows(by("estimates"), heads, Object.entries(last.deg_per_step).map(([name, value]) => {
       const u = last.u_deg_per_step[name];
       const moved = temperature?.moved[name] ?? null;
-      const met = target === null || !aim.directions.includes(name) ? "" : u <= target ? "met" : `u / target ${(u / target).toFixed(1)}`;
-      return [name, value.toFixed(6), u.toExponential(1), met, [moved === null ? "" : moved.toFixed(1), Math.abs(moved) > 3 ? "hot" : ""]];
+      const met = target === null || !aim.directions.includes(name) ? "" : u <= target ? "met" : `u is ${(u / target).toFixed(1)} times the target`;
+      return [name, withU(value, u), met, [moved === null ? "" : moved.toFixed(1), Math.abs(moved) > 3 ? "hot" : ""]];
     }));
     this.drawHistory(told);
   }
 
-  /** Every estimate with its 95 % bars over the looks it was made of. */
-  drawHistory(told) {
-    if (!told?.estimates.length) return;
-    by("history").hidden = false;
-    const style = getComputedStyle(document.documentElement);
-    const [ink, line] = ["--ink", "--line"].map((name) => style.getPropertyValue(name).trim());
-    const names = Object.keys(told.estimates.at(-1).deg_per_step);
-    const axes = Object.fromEntries(names.flatMap((name, k) => [
-      [`yaxis${k ? k + 1 : ""}`, { title: { text: name }, gridcolor: line, zeroline: false, tickformat: ".4f", automargin: true }],
-      [`xaxis${k ? k + 1 : ""}`, { title: { text: "looks" }, gridcolor: line, zeroline: false, rangemode: "tozero" }],
-    ]));
-    const traces = names.map((name, k) => {
-      const known = told.estimates.filter((one) => name in one.deg_per_step);
-      return {
-        name, mode: "lines+markers", xaxis: `x${k ? k + 1 : ""}`, yaxis: `y${k ? k + 1 : ""}`,
-        x: known.map((one) => one.looks), y: known.map((one) => one.deg_per_step[name]),
-        error_y: { type: "data", array: known.map((one) => 1.96 * one.u_deg_per_step[name]) },
-        marker: { color: COLOURS[name] ?? ink }, line: { color: COLOURS[name] ?? ink },
-      };
-    });
-    const columns = by("history").clientWidth < 700 ? 1 : Math.min(2, names.length);
-    const count = Math.ceil(names.length / columns);
-    by("history").style.height = `${Math.max(260, 210 * count)}px`;
-    const layout = {
-      ...axes, grid: { rows: count, columns, pattern: "independent" }, showlegend: false,
-      margin: { l: 70, r: 10, t: 10, b: 44 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: ink, size: 11 },
-    };
-    Plotly.react(by("history"), traces, layout, { responsive: true, displayModeBar: false });
+  /** Every estimate with its 95 % bars over the looks it was made of, a chart for each direction. */
+  drawHistory({ estimates }) {
+    for (const name of Object.keys(estimates.at(-1).deg_per_step)) {
+      const place = document.createElement("div");
+      this.panels[name] ??= new Panel(by("history").appendChild(place), { title: `${name}, deg/step`, x: { title: "looks", fromZero: true }, y: {} });
+      const known = estimates.filter((one) => name in one.deg_per_step)
+        .map((one) => [one.looks, one.deg_per_step[name], 1.96 * one.u_deg_per_step[name]]);
+      const look = { colour: `var(--${name})` };
+      this.panels[name].put(
+        lines("u", known.flatMap(([x, y, u]) => [[x, y - u], [x, y + u], null]), look),
+        lines("way", known.map(([x, y]) => [x, y]), { ...look, opacity: 0.5 }),
+        dots("estimates", known.map(([x, y]) => [x, y]), { ...look, glyph: name, texts: known.map(([x, y, u]) => `${x} looks: ${withU(y, u / 1.96)}`), places: known.map(([x]) => x) }),
+      );
+    }
   }
 
   /** Both pictures, small, and the surroundings of the spot with the centre that was found. */
@@ -225,11 +229,11 @@ class LivePage {
       const parts = [];
       if (look?.pictured.includes(camera)) {
         const href = await this.fetched(`/live/${look.spot}/${camera}/whole`);
-        if (href) parts.push(element("image", { href, x: -0.5, y: -0.5, width, height }));
+        if (href) parts.push(node("image", { href, x: -0.5, y: -0.5, width, height }));
       }
-      for (const past of trail) parts.push(element("circle", { cx: past[2 * k], cy: past[2 * k + 1], r: 5, class: "trail" }));
-      if (centre) parts.push(element("circle", { cx: centre[0], cy: centre[1], r: 24, class: "centre" }));
-      parts.push(element("text", { x: 16, y: 44 }, camera));
+      for (const past of trail) parts.push(node("circle", { cx: past[2 * k], cy: past[2 * k + 1], r: 5, class: "trail" }));
+      if (centre) parts.push(node("circle", { cx: centre[0], cy: centre[1], r: 24, class: "centre" }));
+      parts.push(node("text", { x: 16, y: 44 }, camera));
       whole.replaceChildren(...parts);
       await this.showSpot(spot, look, camera, centre);
     }
@@ -248,9 +252,9 @@ class LivePage {
     const parts = [];
     if (centre) {
       const href = look.pictured.includes(camera) ? await this.fetched(`/live/${look.spot}/${camera}/spot`) : null;
-      if (href) parts.push(element("image", { href, x: u - half - 0.5, y: v - half - 0.5, width: WINDOW_PX, height: WINDOW_PX }));
+      if (href) parts.push(node("image", { href, x: u - half - 0.5, y: v - half - 0.5, width: WINDOW_PX, height: WINDOW_PX }));
       const [x, y] = centre;
-      parts.push(element("path", { d: `M${x - 5} ${y}H${x + 5}M${x} ${y - 5}V${y + 5}`, class: "centre" }));
+      parts.push(node("path", { d: `M${x - 5} ${y}H${x + 5}M${x} ${y - 5}V${y + 5}`, class: "centre" }));
     }
     spot.replaceChildren(...parts);
   }
@@ -271,13 +275,17 @@ class LivePage {
   }
 }
 
-try {
-  const key = await keyOf();
-  await asked("/live", key);
-  await new LivePage(key).watch();
-} catch (error) {
-  by("notes").textContent = error.message;
-  by("notes").classList.add("refused");
-  document.body.dataset.state = "refused";
-  throw error;
+async function start() {
+  try {
+    const key = await keyOf();
+    await asked("/live", key);
+    await new LivePage(key).watch();
+  } catch (error) {
+    by("notes").textContent = error.message;
+    by("notes").classList.add("refused");
+    document.body.dataset.state = "refused";
+    throw error;
+  }
 }
+
+start();

@@ -1,24 +1,4 @@
-// The page: the key for the link's token, the document, the plots, and one selection that all of them share.
-
-import { asked, keyOf } from "./access.js";
-import { Scenes } from "./columns.js";
-import { Changes, Correlation, MARKS_MOST, Pictures, Residuals, Stops } from "./plots.js";
-import { Rig, VIEWS } from "./rig.js";
-
-const by = (id) => document.getElementById(id);
-
-function refuse(text) {
-  by("notes").textContent = text;
-  by("notes").classList.add("refused");
-  document.body.dataset.state = "refused";
-}
-
-function digits(value, sd) {
-  if (!Number.isFinite(value)) return "";
-  if (!(sd > 0)) return value.toPrecision(6);
-  const places = Math.min(12, Math.max(0, 1 - Math.floor(Math.log10(sd))));
-  return value.toFixed(places);
-}
+// The page of a campaign: its plots, and one selection that all of them share. The document stands in the page itself.
 
 function cells(row, texts, numbersFrom = Infinity) {
   texts.forEach((text, k) => {
@@ -43,45 +23,48 @@ function tableOf(heads, numbersFrom) {
 }
 
 class Page {
-  constructor(scenes, key) {
-    const fetched = async (path) => URL.createObjectURL(await (await asked(path, key)).blob());
+  constructor(scenes) {
     this.scenes = scenes;
-    this.rig = new Rig(by("rig"), scenes);
-    this.residuals = new Residuals(by("residuals"), scenes);
-    this.stops = new Stops(by("stops"), scenes);
-    this.pictures = new Pictures(by("pictures"), scenes, fetched);
-    this.correlation = new Correlation(by("correlation"), scenes);
+    this.plots = {
+      rig: new Rig(by("rig"), scenes), pictures: new Pictures(by("pictures"), scenes), residuals: new Residuals(by("residuals"), scenes),
+      stops: new Stops(by("stops"), scenes), correlation: new Correlation(by("correlation"), scenes), changes: new Changes(by("changes"), scenes),
+    };
+    for (const plot of Object.values(this.plots)) plot.choice = (places) => this.choose(places);
+    this.plots.correlation.choice = (names) => this.mark(names);
     this.places = [];
-    this.marked = [];
   }
 
-  async draw() {
-    const { all, told } = this.scenes;
+  draw() {
+    const { all, sent } = this.scenes;
     by("name").textContent = all.map((scene) => scene.name).join(" beside ");
     document.title = `${all[0].name} - tvsbayes view`;
     by("notes").textContent = all.flatMap((scene) => scene.notes.map((note) => `${scene.name}: ${note}`)).join("; ");
     for (const [k, scene] of all.entries()) by("campaign").add(new Option(scene.name, k));
     by("campaign").hidden = all.length < 2;
+    ["first-name", "second-name"].forEach((id, k) => { by(id).textContent = all[k]?.name ?? ""; });
+    for (const row of document.querySelectorAll(".second")) row.hidden = all.length < 2;
     if (all.length > 1) by("whose").textContent = ` of the first, ${all[0].name}`;
-    for (const plot of [this.rig, this.residuals, this.stops, this.pictures, this.correlation]) await plot.draw();
-    by("rig-remark").textContent = this.rig.remark();
-    by("residuals-remark").textContent = this.residuals.remark();
+    const { rig, pictures, residuals, stops, correlation } = this.plots;
+    for (const plot of [rig, pictures, residuals, stops]) plot.draw();
+    by("rig-remark").textContent = rig.remark();
+    by("residuals-remark").textContent = residuals.remark();
     by("correlation-figure").hidden = !all[0].correlation.names.length;
+    if (all[0].correlation.names.length) correlation.draw();
     this.listParameters();
-    if (told.changes !== null) await this.showChanges(told.changes);
+    if (sent.changes !== null) this.showChanges(sent.changes);
     this.wire();
-    if (this.scenes.count) await this.choose([0]);
+    if (this.scenes.count) this.choose([0]);
   }
 
-  async showChanges(changes) {
+  showChanges(changes) {
     by("changes-figure").hidden = false;
-    await new Changes(by("changes"), this.scenes).draw();
+    this.plots.changes.draw();
     by("verdict").textContent = changes.verdict;
-    const table = tableOf(["quantity", "unit", "A", "B", "B - A", "u", "(B - A) / u"], 2);
+    const table = tableOf(["quantity", "A", "B", "B - A", "u", "unit", "(B - A) / u"], 1);
     for (const c of changes.changes) {
-      const told = c.normalised === null ? "" : c.normalised.toFixed(2);
-      const numbers = [c.first, c.second, c.difference].map((value) => digits(value, c.u));
-      const row = cells(table.tBodies[0].insertRow(), [c.quantity, c.unit, ...numbers, c.u.toPrecision(2), told], 2);
+      const normalised = c.normalised === null ? "" : digits(c.normalised, 0.1);
+      const numbers = [c.first, c.second, c.difference, c.u].map((value) => digits(value, c.u));
+      const row = cells(table.tBodies[0].insertRow(), [c.quantity, ...numbers, c.unit, normalised], 1);
       row.classList.toggle("significant", c.significant);
     }
     by("changes-table").replaceChildren(table);
@@ -89,11 +72,11 @@ class Page {
 
   listParameters() {
     const { fitted, parameters } = this.scenes.all[0];
-    const table = tableOf(["parameter", "unit", fitted ? "value" : "stated", fitted ? "sd" : "u", "told by the data"], 2);
+    const table = tableOf(["parameter", fitted ? "value" : "stated", fitted ? "sd" : "u", "unit", "from the data"], 1);
     for (const p of parameters) {
       const share = p.contraction === null ? "" : `${(100 * p.contraction).toFixed(0)} %`;
-      const texts = [p.name, p.unit, digits(p.value, p.sd), p.sd.toPrecision(2), share];
-      const row = cells(table.tBodies[0].insertRow(), texts, 2);
+      const texts = [p.name, digits(p.value, p.sd), p.sd > 0 ? digits(p.sd, p.sd) : "0", p.unit, share];
+      const row = cells(table.tBodies[0].insertRow(), texts, 1);
       row.dataset.name = p.name;
       row.tabIndex = 0;
       row.addEventListener("click", () => this.mark([p.name]));
@@ -106,30 +89,30 @@ class Page {
     return [...by("parameters").querySelectorAll("tbody tr")];
   }
 
-  async mark(names) {
-    this.marked = names;
+  mark(names) {
     for (const row of this.rows()) row.classList.toggle("marked", names.includes(row.dataset.name));
     this.rows().find((row) => row.dataset.name === names[0])?.scrollIntoView({ block: "nearest" });
-    if (!by("correlation-figure").hidden) by("correlation-remark").textContent = await this.correlation.mark(names);
+    if (!by("correlation-figure").hidden) by("correlation-remark").textContent = this.plots.correlation.mark(names);
   }
 
-  async choose(places) {
+  choose(places) {
     this.places = places;
     const marked = places.length > MARKS_MOST ? `, ${MARKS_MOST} are marked` : "";
     by("chosen").textContent = places.length > 1 ? `${places.length} looks are selected${marked}` : "";
-    for (const plot of [this.rig, this.residuals, this.stops]) await plot.choose(places);
-    if (places.length) await this.showLook(places[0]);
+    const { rig, residuals, stops } = this.plots;
+    for (const plot of [rig, residuals, stops]) plot.choose(places);
+    if (places.length) this.showLook(places[0]);
     document.body.dataset.chosen = places.length;
   }
 
-  async showLook(place) {
+  showLook(place) {
     this.current = place;
     const { number, scene, row } = this.scenes.at(place);
     by("campaign").value = number;
     by("look").value = scene.looks.at("spot", row);
     this.listFacts(scene, row);
-    await this.pictures.show(place);
-    by("pictures-remark").textContent = this.pictures.remark();
+    this.plots.pictures.show(place);
+    by("pictures-remark").textContent = this.plots.pictures.remark();
   }
 
   listFacts({ looks, fitted }, row) {
@@ -138,7 +121,7 @@ class Page {
     const axes = looks.row("ellipsoid_mm", row);
     const halves = [0, 1, 2].map((a) => Math.hypot(...axes.subarray(3 * a, 3 * a + 3))).sort((a, b) => b - a);
     const facts = [
-      ["status", looks.texts.status[row] + (looks.at("suspect", row) ? "; the fit doubts it or left it out" : "")],
+      ["status", looks.texts.status[row] + (looks.at("suspect", row) ? "; the fit finds it unlikely or left it out" : "")],
       ["sheet", looks.texts.target[row]],
       ["after move", `${looks.at("move", row)}, to pan ${looks.at("steps", row, 0)}, tilt ${looks.at("steps", row, 1)} steps`],
       ["came", direction],
@@ -147,14 +130,14 @@ class Page {
       const [left, right] = [0, 2].map((k) => `${pair("pixels_px", k, 0.01)} (sd ${pair("sd_px", k, 0.01)})`);
       facts.push(["centre left, px", left], ["centre right, px", right]);
       facts.push(["point, mm", [0, 1, 2].map((k) => digits(looks.at("point_mm", row, k), 0.1)).join(", ")]);
-      facts.push(["half axes of 95 %, mm", halves.map((half) => half.toPrecision(2)).join(", ")]);
+      facts.push(["half axes of 95 %, mm", halves.map((half) => digits(half, half)).join(", ")]);
     }
     if (fitted && Number.isFinite(looks.at("residual_px", row))) {
       facts.push(["residual left, px", pair("residual_px", 0, 0.01)], ["residual right, px", pair("residual_px", 2, 0.01)]);
     }
     ["pan", "tilt"].forEach((axis, k) => {
       const [off, u] = [looks.at("deviation_deg", row, k), looks.at("u_deg", row, k)];
-      if (Number.isFinite(off)) facts.push([`${axis} stop off, deg`, `${digits(off, u)} (sd ${u.toPrecision(2)})`]);
+      if (Number.isFinite(off)) facts.push([`${axis} stop off, deg`, `${digits(off, u)} (sd ${digits(u, u)})`]);
     });
     const body = document.createElement("tbody");
     for (const [name, text] of facts) {
@@ -175,80 +158,68 @@ class Page {
       const place = (((from + k * step) % this.scenes.count) + this.scenes.count) % this.scenes.count;
       if (wanted(place)) return this.choose([place]);
     }
-    by("chosen").textContent = "the fit doubts no look";
+    by("chosen").textContent = "the fit finds no look unlikely";
     return null;
   }
 
   wire() {
-    by("previous").addEventListener("click", () => this.walk(-1));
-    by("next").addEventListener("click", () => this.walk(1));
-    by("none").addEventListener("click", () => this.choose([]));
-    const doubted = (place) => { const { scene, row } = this.scenes.at(place); return scene.looks.at("suspect", row) === 1; };
-    by("unlikely").addEventListener("click", () => this.walk(1, doubted));
-    const asksFor = () => {
-      const place = this.scenes.placeOf(Number(by("campaign").value || 0), Number(by("look").value));
+    const { rig, residuals, stops, pictures } = this.plots;
+    const on = (id, event, act) => by(id).addEventListener(event, ({ target }) => act(target));
+    on("previous", "click", () => this.walk(-1));
+    on("next", "click", () => this.walk(1));
+    on("none", "click", () => this.choose([]));
+    const unlikely = (place) => { const { scene, row } = this.scenes.at(place); return scene.looks.at("suspect", row) === 1; };
+    on("unlikely", "click", () => this.walk(1, unlikely));
+    const goTo = () => {
+      const wanted = Number(by("look").value);
+      by("look").value = wanted;
+      const place = this.scenes.placeOf(Number(by("campaign").value || 0), wanted);
       if (place >= 0) this.choose([place]);
-      else by("chosen").textContent = `there is no look ${by("look").value}`;
+      else by("chosen").textContent = `there is no look ${wanted}`;
     };
-    for (const id of ["look", "campaign"]) by(id).addEventListener("change", asksFor);
-    for (const [id, name] of Object.entries({ spots: "spots", ellipsoids: "ellipsoids", beams: "beams", mirrors: "mirrors",
-      cameras: "cameras", sheets: "sheets" })) {
-      by(`show-${id}`).addEventListener("change", (event) => this.rig.show(name, event.target.checked));
+    for (const id of ["look", "campaign"]) on(id, "change", goTo);
+    for (const name of ["spots", "ellipsoids", "beams", "mirrors", "cameras", "sheets"]) {
+      on(`show-${name}`, "change", ({ checked }) => rig.show(name, checked));
     }
-    by("ellipsoid-scale").addEventListener("change", (event) => this.rig.enlarge(Number(event.target.value)));
-    by("residual-scale").addEventListener("change", (event) => this.residuals.enlarge(Number(event.target.value)));
-    for (const view of Object.keys(VIEWS)) by(view).addEventListener("click", () => this.rig.look(view));
-    by("window-spot").addEventListener("change", () => this.pictures.widen(false));
-    by("window-all").addEventListener("change", () => this.pictures.widen(true));
-    by("show-gears").addEventListener("change", (event) => this.stops.show("gears", event.target.checked));
-    by("show-u").addEventListener("change", (event) => this.stops.show("u", event.target.checked));
-    by("filter").addEventListener("input", (event) => {
-      for (const row of this.rows()) row.hidden = !row.dataset.name.includes(event.target.value.trim());
+    on("ellipsoid-scale", "change", ({ value }) => rig.enlarge(Number(value)));
+    on("residual-scale", "change", ({ value }) => { residuals.enlarge(Number(value)); residuals.choose(this.places); });
+    for (const view of Object.keys(VIEWS)) on(view, "click", () => rig.look(view));
+    on("window-spot", "change", () => pictures.widen(false));
+    on("window-all", "change", () => pictures.widen(true));
+    on("show-gears", "change", ({ checked }) => stops.show(["gears", "gear means"], checked));
+    on("show-u", "change", ({ checked }) => stops.show(["u"], checked));
+    on("filter", "input", ({ value }) => {
+      for (const row of this.rows()) row.hidden = !row.dataset.name.includes(value.trim());
     });
-    this.link();
-    for (const place of document.querySelectorAll(".tools")) offerExports(place, this.scenes.all[0].name);
+    for (const place of document.querySelectorAll(".tools")) this.offer(place, place.dataset.plot);
   }
 
-  /** What is clicked or framed in one plot is selected in all. */
-  link() {
-    const placesOf = (event) => {
-      const found = event?.points.map((point) => point.customdata).filter((place) => place !== undefined) ?? [];
-      return [...new Set(found)].sort((a, b) => a - b);
+  /** Buttons of a plot: its size, what dragging does, and the plot as a file as it is seen. */
+  offer(place, name) {
+    const plot = this.plots[name];
+    const button = (id, text, title, act) => {
+      const made = document.createElement("button");
+      Object.assign(made, { type: "button", id: `${id}-${name}`, textContent: text, title });
+      made.addEventListener("click", act);
+      place.append(made);
     };
-    for (const id of ["rig", "residuals", "stops"]) {
-      by(id).on("plotly_click", (event) => { const places = placesOf(event); if (places.length) this.choose(places); });
+    if (plot instanceof Plane) {
+      const modes = document.createElement("select");
+      Object.assign(modes, { id: `mode-${name}`, title: "what dragging does" });
+      for (const [value, text] of [["frame", "select in a frame"], ["lasso", "select in a lasso"], ["move", "move the plot"]]) modes.add(new Option(text, value));
+      modes.addEventListener("change", () => plot.all((panel) => { panel.mode = modes.value; }));
+      place.append(modes);
     }
-    for (const id of ["residuals", "stops"]) {
-      by(id).on("plotly_selected", (event) => { const places = this[id].framed(event); if (places.length) this.choose(places); });
+    button("larger", "+", "larger; also Ctrl and the wheel", () => plot.all((panel) => panel.zoom(ZOOM)));
+    button("smaller", "\u2212", "smaller", () => plot.all((panel) => panel.zoom(1 / ZOOM)));
+    button("whole", "all", "all of it; also a double click", () => plot.all((panel) => panel.whole()));
+    const file = `${this.scenes.all[0].name.replace(/[^A-Za-z0-9]+/g, "-")}-${name}`;
+    for (const format of ["png", "svg"]) {
+      button(`save-${format}`, format.toUpperCase(), `save as ${format.toUpperCase()}`, () => save(plot.element, file, format));
     }
-    by("correlation").on("plotly_click", ({ points: [point] }) => this.mark([point.y, point.x]));
   }
 }
 
-/** Buttons that save a plot as it is seen. */
-function offerExports(place, name) {
-  for (const format of ["png", "svg"]) {
-    const button = document.createElement("button");
-    const plot = by(place.dataset.plot);
-    button.type = "button";
-    button.id = `save-${place.dataset.plot}-${format}`;
-    button.textContent = format.toUpperCase();
-    button.title = `save as ${format.toUpperCase()}`;
-    button.addEventListener("click", async () => {
-      const filename = `${name.replace(/[^A-Za-z0-9]+/g, "-")}-${place.dataset.plot}`;
-      const { clientWidth: width, clientHeight: height } = plot;
-      await Plotly.downloadImage(plot, { format, filename, width, height, scale: format === "png" ? 2 : 1 });
-    });
-    place.append(button);
-  }
-}
-
-try {
-  const key = await keyOf();
-  const told = await (await asked("/scene", key)).json();
-  await new Page(new Scenes(told), key).draw();
-  document.body.dataset.state = "ready";
-} catch (error) {
-  refuse(error.message);
-  throw error;
-}
+document.page = new Page(new Scenes(JSON.parse(by("document").textContent)));
+document.page.draw();
+document.body.dataset.state = "ready";

@@ -1,203 +1,224 @@
-// The rig in 3D: cameras, positioner, mirrors, beams, sheets, spots and their error ellipsoids.
-
-import { CHOSEN, COLOURS, CONFIG, DOTS_MOST, Lines, MARKS_MOST, some } from "./plots.js";
+// The rig in 3D, in parallel projection: cameras, positioner, mirrors, beams, sheets, spots and their error ellipsoids.
 
 const BEAMS_MOST = 300;
 const ELLIPSOIDS_MOST = 200;
 const CHOSEN_MOST = 300;
 const RING = 24;
 const MIRROR_HALF_MM = 8;
-export const VIEWS = {
-  "from-above": { eye: { x: 0, y: 0, z: 2.3 }, up: { x: 1, y: 0, z: 0 } },
-  "from-side": { eye: { x: 0, y: -1.7, z: 0.3 }, up: { x: 0, y: 0, z: 1 } },
-  "from-behind": { eye: { x: -1.6, y: -0.3, z: 0.5 }, up: { x: 0, y: 0, z: 1 } },
-};
+const DEG = Math.PI / 180;
+const DRAG_DEG = 0.4;
+/** Where the eye is, as azimuth from X (depth) towards Y (left) and elevation, degrees. */
+const VIEWS = { "from-above": [180, 90], "from-side": [-90, 10], "from-behind": [190, 17] };
 
-function addWay(lines, looks, row) {
-  lines.add([looks.row("first_mm", row), looks.row("second_mm", row), looks.row("end_mm", row)]);
-}
+const wayOf = (looks, row) => [looks.row("first_mm", row), looks.row("second_mm", row), looks.row("end_mm", row), null];
 
-function addEllipsoid(lines, looks, row, scale) {
-  const centre = looks.row("point_mm", row);
-  const axes = looks.row("ellipsoid_mm", row);
-  if (!axes.every(Number.isFinite)) return;
-  for (const [a, b] of [[0, 1], [1, 2], [2, 0]]) {
-    const ring = [];
-    for (let k = 0; k <= RING; k++) {
+function ellipsoidOf(looks, row, scale) {
+  const [centre, axes] = [looks.row("point_mm", row), looks.row("ellipsoid_mm", row)];
+  if (!axes.every(Number.isFinite)) return [];
+  return [[0, 1], [1, 2], [2, 0]].flatMap(([a, b]) => {
+    const ring = Array.from({ length: RING + 1 }, (_, k) => {
       const [c, s] = [Math.cos((2 * Math.PI * k) / RING), Math.sin((2 * Math.PI * k) / RING)];
-      ring.push([0, 1, 2].map((i) => centre[i] + scale * (c * axes[3 * a + i] + s * axes[3 * b + i])));
-    }
-    lines.add(ring);
-  }
+      return [0, 1, 2].map((i) => centre[i] + scale * (c * axes[3 * a + i] + s * axes[3 * b + i]));
+    });
+    return [...ring, null];
+  });
 }
 
-function addMirrors(lines, looks, row) {
-  for (const which of ["first", "second"]) {
-    const centre = looks.row(`${which}_mm`, row);
-    const normal = looks.row(`${which}_normal`, row);
-    if (!normal.every(Number.isFinite)) continue;
+function mirrorsOf(looks, row) {
+  return ["first", "second"].flatMap((which) => {
+    const [centre, normal] = [looks.row(`${which}_mm`, row), [...looks.row(`${which}_normal`, row)]];
+    if (!normal.every(Number.isFinite)) return [];
     // Any two directions in the plane of the mirror.
-    const least = normal.map(Math.abs).indexOf(Math.min(...normal.map(Math.abs)));
-    const along = cross(normal, [0, 1, 2].map((i) => Number(i === least)));
-    const length = Math.hypot(...along);
-    const one = along.map((x) => (x * MIRROR_HALF_MM) / length);
+    const sizes = normal.map(Math.abs);
+    const along = cross(normal, [0, 1, 2].map((i) => Number(i === sizes.indexOf(Math.min(...sizes)))));
+    const one = along.map((x) => (x * MIRROR_HALF_MM) / Math.hypot(...along));
     const two = cross(normal, one);
     const corners = [[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]];
-    lines.add(corners.map(([p, q]) => [0, 1, 2].map((i) => centre[i] + p * one[i] + q * two[i])));
-  }
+    return [...corners.map(([p, q]) => [0, 1, 2].map((i) => centre[i] + p * one[i] + q * two[i])), null];
+  });
 }
 
 function cross(a, b) {
   return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
 
-function lineTrace(name, lines, colour, width, more = {}) {
-  return {
-    type: "scatter3d", mode: "lines", name, hoverinfo: "skip", connectgaps: false,
-    x: lines.x, y: lines.y, z: lines.z, line: { color: colour, width }, ...more,
-  };
-}
+const pyramidOf = ([centre, a, b, c, d]) => [centre, a, b, c, d, a, null, centre, b, null, centre, c, null, centre, d, null];
 
-function cameraLines(cameras) {
-  const lines = new Lines(3);
-  for (const { corners_mm: [centre, a, b, c, d] } of cameras) {
-    lines.add([centre, a, b, c, d, a]);
-    for (const corner of [b, c, d]) lines.add([centre, corner]);
+/** Points in mm seen from an eye at infinity. */
+class Space extends Chart {
+  constructor(parent, title) {
+    super(parent, title);
+    Object.assign(this, { labels: [], eye: VIEWS["from-behind"], kept: null, shift: [0, 0] });
   }
-  return lines;
-}
 
-function sheetTrace(sheet, colour) {
-  const [a, b, c, d] = sheet.corners_mm;
-  const corners = [a, b, c, d];
-  return {
-    type: "mesh3d", name: "sheets", hoverinfo: "text", text: `sheet ${sheet.target}`, opacity: 0.15, color: colour,
-    x: corners.map((p) => p[0]), y: corners.map((p) => p[1]), z: corners.map((p) => p[2]), i: [0, 0], j: [1, 2], k: [2, 3],
-  };
-}
+  /** Right and upward unit vectors of the picture. */
+  base() {
+    const [azimuth, elevation] = this.eye.map((angle) => angle * DEG);
+    const [ca, sa, ce, se] = [Math.cos(azimuth), Math.sin(azimuth), Math.cos(elevation), Math.sin(elevation)];
+    return [[-sa, ca, 0], [-se * ca, -se * sa, ce]];
+  }
 
-/** Traces of one campaign; `names` of them are the switches of the page. */
-function sceneTraces(scene, number, scale) {
-  const { looks, rig } = scene;
-  const colour = COLOURS[number];
-  const beams = new Lines(3);
-  for (const row of looks.some("end_mm", BEAMS_MOST)) addWay(beams, looks, row);
-  const ellipsoids = new Lines(3);
-  for (const row of looks.some("ellipsoid_mm", ELLIPSOIDS_MOST)) addEllipsoid(ellipsoids, looks, row, scale);
-  const mirrors = new Lines(3);
-  const rows = looks.some("point_mm", DOTS_MOST);
-  const [first] = looks.some("second_normal", 1);
-  if (first !== undefined) addMirrors(mirrors, looks, first);
-  const traces = [
-    {
-      type: "scatter3d", mode: "markers", name: "spots", customdata: rows.map((row) => looks.first + row),
-      x: looks.column("point_mm", 0, rows), y: looks.column("point_mm", 1, rows), z: looks.column("point_mm", 2, rows),
-      marker: { size: looks.count > DOTS_MOST ? 1.5 : 3, color: colour },
-      hovertemplate: "look %{text}<br>%{x:.2f} %{y:.2f} %{z:.2f} mm<extra></extra>", text: looks.column("spot", 0, rows),
-    },
-    lineTrace("ellipsoids", ellipsoids, colour, 1),
-    lineTrace("beams", beams, colour, 1, { opacity: 0.35 }),
-    lineTrace("mirrors", mirrors, colour, 5),
-    lineTrace("cameras", cameraLines(rig.cameras), "#3b4754", 2),
-    ...rig.sheets.map((sheet) => sheetTrace(sheet, colour)),
-  ];
-  if (rig.origin_mm !== null) {
-    const [x, y, z] = rig.origin_mm;
-    traces.push({
-      type: "scatter3d", mode: "markers+text", name: "mirrors", x: [x], y: [y], z: [z], text: ["positioner"],
-      textposition: "bottom center", hoverinfo: "text", marker: { size: 4, symbol: "diamond", color: colour },
+  /** The box around all points that stay when sizes are drawn too large: lowest and highest corner. */
+  bounds() {
+    const corners = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
+    for (const layer of this.layers) {
+      if (layer.enlarged) continue;
+      for (const p of layer.points) {
+        if (p === null) continue;
+        for (let i = 0; i < 3; i++) {
+          if (!Number.isFinite(p[i])) continue;
+          corners[0][i] = Math.min(corners[0][i], p[i]);
+          corners[1][i] = Math.max(corners[1][i], p[i]);
+        }
+      }
+    }
+    return corners[0].every(Number.isFinite) ? corners : [[0, 0, 0], [1, 1, 1]];
+  }
+
+  parts(width, height) {
+    const [right, up] = this.base();
+    const [low, high] = this.bounds();
+    const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    const flat = (p) => [dot(p, right), -dot(p, up)];
+    const corners = Array.from({ length: 8 }, (_, k) => [0, 1, 2].map((i) => ((k >> i) & 1 ? high : low)[i]));
+    const ends = corners.map(flat);
+    const [xs, ys] = [0, 1].map((k) => [Math.min(...ends.map((p) => p[k])), Math.max(...ends.map((p) => p[k]))]);
+    const scale = this.kept ?? 0.82 * Math.min(width / (xs[1] - xs[0]), height / (ys[1] - ys[0]));
+    this.scale = scale;
+    const middle = [(xs[0] + xs[1]) / 2, (ys[0] + ys[1]) / 2];
+    const at = (p) => {
+      const q = flat(p);
+      return [width / 2 + this.shift[0] + scale * (q[0] - middle[0]), height / 2 + this.shift[1] + scale * (q[1] - middle[1])];
+    };
+    let box = "";
+    for (let k = 0; k < 8; k++) {
+      for (const bit of [1, 2, 4]) if (!(k & bit)) box += trail([at(corners[k]), at(corners[k | bit])]);
+    }
+    const words = this.labels.filter(({ point, of }) => point.every(Number.isFinite) && !this.layers.some((layer) => layer.name === of && layer.hidden))
+      .map(({ point, text, dy = 16 }) => {
+        const [x, y] = at(point);
+        return node("text", { x: px(x), y: px(y + dy), "text-anchor": "middle", class: "label" }, text);
+      });
+    return [node("path", { d: box, class: "grid" }), ...this.rulers(low, high, at), ...this.paths(at), ...words];
+  }
+
+  /** Values along the edges that begin in the lowest corner. */
+  rulers(low, high, at) {
+    return ["X depth", "Y left", "Z up"].flatMap((name, i) => {
+      const place = (value) => at(low.map((v, k) => (k === i ? value : v)));
+      const [a, b] = [place(low[i]), place(high[i])];
+      const length = Math.hypot(b[0] - a[0], b[1] - a[1]);
+      if (length < 30) return [];
+      const made = ticks([low[i], high[i]], length, 70).map(([value, text]) => {
+        const [x, y] = place(value);
+        return node("text", { x: px(x), y: px(y + 13), "text-anchor": "middle", class: "tick" }, text);
+      });
+      return [...made, node("text", { x: px(b[0]), y: px(b[1] - 6), "text-anchor": "middle", class: "title" }, name)];
     });
   }
-  return traces;
-}
 
-/** What is chosen, for the last three traces: marks, ways with mirrors, ellipsoids. */
-function chosenTraces(scenes, places, scale) {
-  const marks = { x: [], y: [], z: [] };
-  const ways = new Lines(3);
-  const ellipsoids = new Lines(3);
-  for (const place of some(places, MARKS_MOST)) {
-    const { scene: { looks }, row } = scenes.at(place);
-    const point = looks.row("point_mm", row);
-    marks.x.push(point[0]);
-    marks.y.push(point[1]);
-    marks.z.push(point[2]);
+  dragged([dx, dy], _, event) {
+    if (event.shiftKey || this.mode === "shift") {
+      this.shift = [this.shift[0] + dx, this.shift[1] + dy];
+    } else {
+      this.kept ??= this.scale;
+      this.eye = [this.eye[0] - DRAG_DEG * dx, Math.max(-90, Math.min(90, this.eye[1] + DRAG_DEG * dy))];
+    }
+    this.draw();
   }
-  for (const place of some(places, CHOSEN_MOST)) {
-    const { scene: { looks }, row } = scenes.at(place);
-    addWay(ways, looks, row);
-    addEllipsoid(ellipsoids, looks, row, scale);
-    if (places.length === 1) addMirrors(ways, looks, row);
+
+  released() {}
+
+  zoom(factor) {
+    this.kept = this.scale * factor;
+    this.draw();
   }
-  return [
-    { type: "scatter3d", mode: "markers", name: "chosen", hoverinfo: "skip", ...marks,
-      marker: { size: 5, color: CHOSEN, symbol: "circle-open" } },
-    lineTrace("chosen", ways, CHOSEN, 3),
-    lineTrace("chosen", ellipsoids, CHOSEN, 2),
-  ];
+
+  whole() { this.look(this.eye); }
+
+  look(eye) {
+    Object.assign(this, { eye, kept: null, shift: [0, 0] });
+    this.draw();
+  }
 }
 
-function layout(view) {
-  const axis = (title) => ({ title: { text: title }, backgroundcolor: "#fff", gridcolor: "#e3e8ec" });
-  return {
-    margin: { l: 0, r: 0, t: 0, b: 0 }, showlegend: false, uirevision: "kept",
-    scene: {
-      aspectmode: "data", camera: view,
-      xaxis: axis("X depth"), yaxis: axis("Y left"), zaxis: axis("Z up"), dragmode: "orbit",
-    },
-  };
-}
-
-/** The plot in its element: drawn once, then only what changes. */
-export class Rig {
+class Rig extends Plot {
   constructor(element, scenes) {
-    this.element = element;
-    this.scenes = scenes;
+    super(element, scenes);
     this.scale = 30;
-    this.places = [];
   }
 
-  async draw() {
-    this.traces = this.scenes.all.flatMap((scene, number) => sceneTraces(scene, number, this.scale));
-    const all = [...this.traces, ...chosenTraces(this.scenes, [], this.scale)];
-    await Plotly.newPlot(this.element, all, layout(VIEWS["from-behind"]), CONFIG);
+  draw() {
+    const space = new Space(this.element, "the rig in 3D");
+    this.panels = [space];
+    space.picked = (place) => this.choice([place]);
+    space.put(...this.scenes.all.flatMap((scene, number) => this.layers(scene, number)));
+  }
+
+  layers({ looks, rig }, number) {
+    const colour = COLOURS[number];
+    const rows = looks.some("point_mm", DOTS_MOST);
+    const points = rows.map((row) => looks.row("point_mm", row));
+    const places = rows.map((row) => looks.first + row);
+    const texts = rows.map((row, k) => `look ${looks.at("spot", row)}: ${[...points[k]].map((v) => v.toFixed(2)).join(", ")} mm`);
+    const [first] = looks.some("second_normal", 1);
+    const mirrors = first === undefined ? [] : mirrorsOf(looks, first);
+    const origin = rig.origin_mm === null ? [] : [rig.origin_mm];
+    const [space] = this.panels;
+    for (const { camera, corners_mm: [centre] } of number ? [] : rig.cameras) space.labels.push({ of: "cameras 0", point: centre, text: `${camera} camera`, dy: -8 });
+    for (const { target, corners_mm: [, , , corner] } of rig.sheets) space.labels.push({ of: `sheets ${number}`, point: corner, text: `sheet ${target}` });
+    for (const point of origin) space.labels.push({ of: `mirrors ${number}`, point, text: "positioner" });
+    return [
+      areas(`sheets ${number}`, rig.sheets.flatMap((sheet) => [...sheet.corners_mm, null]), { colour, opacity: 0.12 }),
+      lines(`cameras ${number}`, rig.cameras.flatMap((camera) => pyramidOf(camera.corners_mm)), { colour: "var(--ink)", width: 1.5, opacity: 0.8 }),
+      lines(`beams ${number}`, looks.some("end_mm", BEAMS_MOST).flatMap((row) => wayOf(looks, row)), { colour, width: 0.7, opacity: 0.35 }),
+      this.ellipsoids(number),
+      lines(`mirrors ${number}`, mirrors, { colour, width: 3 }),
+      dots(`positioner ${number}`, origin, { colour, size: 5, glyph: "diamond" }),
+      dots(`spots ${number}`, points, { colour, size: looks.count > DOTS_MOST ? 1 : 2, places, texts }),
+    ];
+  }
+
+  ellipsoids(number) {
+    const { looks } = this.scenes.all[number];
+    const points = looks.some("ellipsoid_mm", ELLIPSOIDS_MOST).flatMap((row) => ellipsoidOf(looks, row, this.scale));
+    return { ...lines(`ellipsoids ${number}`, points, { colour: COLOURS[number], width: 0.7 }), enlarged: true };
   }
 
   remark() {
     const counts = this.scenes.all.map(({ looks }) => [looks.some("end_mm", Infinity).length, looks.count]);
-    const shown = counts.map(([known]) => Math.min(known, BEAMS_MOST)).join(" and ");
-    const told = counts.map(([known, all]) => `${known} of ${all}`).join(" and ");
-    const dots = counts.map(([known]) => Math.min(known, DOTS_MOST)).join(" and ");
-    return `${told} looks have a spot; dots of ${dots}, beams of ${shown}, ellipsoids (95 %, pixel noise) of at most ${ELLIPSOIDS_MOST}, ` +
-      "and of what is selected. Click a spot to select its look.";
+    const of = (most) => counts.map(([known]) => Math.min(known, most)).join(" and ");
+    const known = counts.map(([seen, all]) => `${seen} of ${all}`).join(" and ");
+    return `${known} looks have a spot; dots of ${of(DOTS_MOST)}, beams of ${of(BEAMS_MOST)}, ellipsoids (95 %, pixel noise) of at most ` +
+      `${ELLIPSOIDS_MOST}, and of what is selected. Drag to turn, with Shift to move; click a spot to select its look.`;
   }
 
   show(name, wanted) {
-    const own = this.traces.flatMap((trace, k) => (trace.name === name ? [k] : []));
-    return Plotly.restyle(this.element, { visible: wanted }, own);
+    for (const [number] of this.scenes.all.entries()) {
+      this.panels[0].show(`${name} ${number}`, wanted);
+      if (name === "mirrors") this.panels[0].show(`positioner ${number}`, wanted);
+    }
   }
 
-  async enlarge(scale) {
+  enlarge(scale) {
     this.scale = scale;
-    for (const [number, scene] of this.scenes.all.entries()) {
-      const lines = new Lines(3);
-      for (const row of scene.looks.some("ellipsoid_mm", ELLIPSOIDS_MOST)) addEllipsoid(lines, scene.looks, row, scale);
-      const own = this.traces.flatMap((trace, k) =>
-        trace.name === "ellipsoids" && trace.line.color === COLOURS[number] ? [k] : []);
-      await Plotly.restyle(this.element, { x: [lines.x], y: [lines.y], z: [lines.z] }, own);
-    }
-    await this.choose(this.places);
+    this.panels[0].put(...this.scenes.all.map((_, number) => this.ellipsoids(number)));
+    this.choose(this.places ?? []);
   }
 
   choose(places) {
     this.places = places;
-    const traces = chosenTraces(this.scenes, places, this.scale);
-    const from = this.traces.length;
-    const data = { x: traces.map((t) => t.x), y: traces.map((t) => t.y), z: traces.map((t) => t.z) };
-    return Plotly.restyle(this.element, data, [from, from + 1, from + 2]);
+    const each = (most, of) => some(places, most).flatMap((place) => {
+      const { scene: { looks }, row } = this.scenes.at(place);
+      return of(looks, row);
+    });
+    const mirrors = places.length === 1 ? mirrorsOf : () => [];
+    this.panels[0].put(
+      dots("chosen", each(MARKS_MOST, (looks, row) => [looks.row("point_mm", row)]), { colour: CHOSEN, size: 4, hollow: true }),
+      lines("chosen ways", each(CHOSEN_MOST, (looks, row) => [...wayOf(looks, row), ...mirrors(looks, row)]), { colour: CHOSEN, width: 2 }),
+      { ...lines("chosen ellipsoids", each(CHOSEN_MOST, (looks, row) => ellipsoidOf(looks, row, this.scale)), { colour: CHOSEN, width: 1.5 }), enlarged: true },
+    );
   }
 
-  look(view) {
-    return Plotly.relayout(this.element, { "scene.camera": VIEWS[view] });
-  }
+  look(view) { this.panels[0].look(VIEWS[view]); }
 }

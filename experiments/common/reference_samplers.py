@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import emcee
 import jax
@@ -17,7 +17,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.likelihood import evaluate, no_draw
+from tvsbayes.estimators.likelihood import blocks_filled, innovations
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.posterior import transport
 from tvsbayes.posterior.proposal import Target
@@ -71,6 +71,18 @@ def pivoted(covariance: np.ndarray) -> np.ndarray:
     return np.array(order)
 
 
+@jax.jit
+def whitened(z, space, arrays):
+    """Standardised innovations and errors at places of many points, shape (n, residuals)."""
+    still, blocks = jnp.zeros(2 * len(arrays.gears.places.steps)), blocks_filled(arrays.spots)
+
+    def one(z):
+        seen = innovations(space.model(z), arrays, still, blocks)
+        return jnp.concatenate([seen.standardised.ravel(), seen.places])
+
+    return jax.vmap(one)(z)
+
+
 def build_transport(joint: JointFit) -> Transport:
     """Second differences of the standardised innovations give the shear that keeps them fixed to second order."""
     rows = np.flatnonzero(joint.free)
@@ -84,9 +96,7 @@ def build_transport(joint: JointFit) -> Transport:
             part = y[first : first + BATCH]
             z = np.repeat(joint.z[None], BATCH, axis=0)
             z[: len(part), index] += part @ root.T
-            seen = evaluate(jnp.asarray(z), no_draw(BATCH, joint.arrays), joint.space, joint.arrays)
-            both = np.concatenate([np.reshape(seen.standardised, (BATCH, -1)), seen.places], axis=1)
-            out.append(both[: len(part)])
+            out.append(np.asarray(whitened(jnp.asarray(z), joint.space, joint.arrays))[: len(part)])
         return np.concatenate(out)
 
     geometry = [k for k in range(size) if NAMES[index[k]] not in NOISE_NAMES]
@@ -232,18 +242,24 @@ class Stretched:
     wall_s: float
 
 
+def straight(path: transport.Transport) -> transport.Transport:
+    """The map without what noise scales and wide coordinates do to the others: by the covariance at the mode alone."""
+    still = {"slope": np.zeros_like(path.slope), "half": np.zeros_like(path.half)}
+    return replace(path, narrow=0, bend=path.bend[:, :0, :0], **still)
+
+
 def stretch(joint: JointFit, start: np.ndarray, path: transport.Transport) -> Stretched:
     """Emcee's default move in Laplace-whitened coordinates from draws that a map `path` has made."""
-    straight = path.straight()
-    whitened = straight.to_w(path.mapped(start).z)
-    walkers = 2 * len(whitened)
+    plain = straight(path)
+    began = plain.to_w(path.mapped(start).z)
+    walkers = 2 * len(began)
     generator = np.random.default_rng(3)
-    whitened = np.concatenate([whitened, whitened + 0.1 * generator.standard_normal(whitened.shape)])
-    sampler = emcee.EnsembleSampler(walkers, whitened.shape[1], Target(joint, straight), vectorize=True)
-    state = emcee.State(whitened, random_state=np.random.RandomState(1).get_state())
+    began = np.concatenate([began, began + 0.1 * generator.standard_normal(began.shape)])
+    sampler = emcee.EnsembleSampler(walkers, began.shape[1], Target(joint, plain), vectorize=True)
+    state = emcee.State(began, random_state=np.random.RandomState(1).get_state())
     wall, cpu = time.perf_counter(), time.process_time()
     sampler.run_mcmc(state, STRETCH_STEPS, skip_initial_state_check=True)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    kept = straight.mapped(sampler.get_chain()[STRETCH_STEPS // 4 :].reshape(-1, whitened.shape[1])).z
+    kept = plain.mapped(sampler.get_chain()[STRETCH_STEPS // 4 :].reshape(-1, began.shape[1])).z
     kept = kept.reshape(-1, walkers, kept.shape[1])[..., np.flatnonzero(joint.free)].transpose(1, 0, 2)
     return Stretched(worst_ess(kept), cpu, wall)

@@ -40,7 +40,7 @@ from tvsbayes.coordinates.location import locate
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.posterior import importance
-from tvsbayes.posterior.importance import K_LIMIT
+from tvsbayes.posterior.importance import K_MAX
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
@@ -115,7 +115,7 @@ def one_rig(task: tuple[str, float, str, int]) -> dict[str, object]:
             calibration = calibration_of(result, posterior if posterior.converged else None, seed=seed)
             row[name] = {
                 "converged": bool(result.converged),
-                "accepted": bool(told.pareto_k < K_LIMIT),
+                "accepted": bool(told.pareto_k < K_MAX),
                 "pareto_k": told.pareto_k,
                 "least_ess": told.least_ess.value,
                 "headlines": judged(posterior.draws, None, result.prior_draws, true, posterior.weights),

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from support.bench_runs import HEADER, Failing, Run, small_plan
 
+from tvsbayes.acquisition.campaign_files import behind_journal
 from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG
-from tvsbayes.acquisition.session import begin
+from tvsbayes.acquisition.session import acquire, begin
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import read_campaign
@@ -102,6 +103,45 @@ def test_a_journal_that_lost_its_end_is_told_from_tables_behind(mounted_rig, tmp
     assert sum("lost its end" in warning for warning in outcome.warnings) == 2
     copies = {name: (folder / name.replace(".csv", ".longer-1.csv")).read_bytes() for name in before}
     assert copies == before
+
+
+def test_tables_that_lack_a_look_of_the_journal_say_which(mounted_rig, tmp_path, capsys):
+    """As a killed run leaves them: `classic` and `fit` use the tables."""
+    folder = tmp_path / "c"
+    Run(mounted_rig, folder, small_plan(2)).engine.run()
+    assert behind_journal(folder, read_campaign(folder)) == ""
+    lines = (folder / "spots.csv").read_bytes().splitlines(keepends=True)
+    (folder / "spots.csv").write_bytes(b"".join(lines[:-1]))
+    assert run(["classic", str(folder)]) == 0
+    assert "warning: spots.csv lacks look 7, which log.jsonl holds" in " ".join(capsys.readouterr().err.split())
+    (folder / LOG).write_bytes(b"damaged\n")
+    assert behind_journal(folder, read_campaign(folder)) == "", "what is wrong with a journal is said by check"
+
+
+def test_a_deleted_journal_has_a_remedy_that_leads_somewhere(mounted_rig, tmp_path):
+    folder = tmp_path / "c"
+    Run(mounted_rig, folder, small_plan(2)).engine.run()
+    (folder / LOG).unlink()
+    with pytest.raises(InputError) as refused:
+        acquire(mounted_rig, small_plan(2), folder, simulate=True, resume=True)
+    assert "backup" in refused.value.remedy and "another folder" in refused.value.remedy
+    with pytest.raises(InputError) as refused:
+        acquire(mounted_rig, small_plan(2), tmp_path / "new", simulate=True, resume=True)
+    assert refused.value.remedy.startswith("leave --resume out")
+
+
+def test_a_repair_counts_what_follows_a_lost_event(mounted_rig, tmp_path, capsys):
+    """A motion of the first look is lost: until the next homing nobody knows where the mirrors stood."""
+    folder = tmp_path / "c"
+    Run(mounted_rig, folder, small_plan(2)).engine.run()
+    lines = (folder / LOG).read_bytes().splitlines(keepends=True)
+    lost = next(number for number, line in enumerate(lines) if b'"moved"' in line)
+    later = [sum(f'"{event}"'.encode() in line for line in lines[lost + 1 :]) for event in ("moved", "looked")]
+    (folder / LOG).write_bytes(b"".join(lines[:lost] + lines[lost + 1 :]))
+    assert run(["check", str(folder), "--repair-to", str(tmp_path / "new"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [document["moves_not_counted"], document["looks_not_counted"]] == later and later[1] > 0
+    assert document["looks"] + document["looks_not_counted"] == 8
 
 
 def test_what_a_killed_run_left_unfinished_is_removed_at_its_resume(mounted_rig, tmp_path):

@@ -6,12 +6,13 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.grbl_board import BoardLink, GrblBoard
 
-from tvsbayes.acquisition.doctor import examine
+from tvsbayes.acquisition.doctor import contract, examine
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.cameras.capture import CameraSettings, StereoImage
 from tvsbayes.errors import DeviceFault
@@ -207,3 +208,31 @@ def test_missing_hardware_is_told_once_and_by_us_alone(tmp_path):
         for name, remedy in (("cameras:", "check [cameras]"), ("firmware:", "check [positioner] port")):
             assert faults[name].count(remedy) == 1, faults[name]
         assert "tvsbayes doctor" not in done.stdout + done.stderr
+
+
+def test_contract_of_drivers_that_keep_it_and_of_one_that_does_not(small_rig):
+    """On the simulated bench; then with a positioner that tells other counters, and limits that nobody stated."""
+    simulated = {"driver": "simulated"}
+    limits = {"pan_min_steps": -50, "pan_max_steps": 150, "tilt_min_steps": -30, "tilt_max_steps": 40}
+    rig = replace(small_rig, positioner=simulated | limits, cameras={**simulated, "spot_sd_px": 0.08})
+    good = contract(rig)
+    assert [(check.name, check.status) for check in good] == [("contract positioner", "ok"), ("contract cameras", "ok")]
+
+    class Elsewhere(SerialPositioner):
+        def move_to(self, pan_steps, tilt_steps):
+            return replace(super().move_to(pan_steps, tilt_steps), pan_steps=pan_steps + 1)
+
+    device = SimulatedDevice(VirtualClock(), Mechanics(home_steps=(-60, -40)))
+    wrong = contract(rig, open_positioner=lambda: Elsewhere(lambda: ModelLink(device), {"hp": -60}, device.clock))
+    faults = [check for check in wrong if check.status == "fault"]
+    assert any("counters ordered" in check.found for check in faults) and all(check.remedy for check in faults)
+    assert not device.mechanics.laser_on
+    (missing,) = contract(replace(rig, positioner=simulated))
+    assert missing.status == "fault" and "pan_min_steps" in missing.found
+
+
+def test_contract_needs_the_word_that_the_laser_may_come_on(capsys):
+    from tvsbayes.cli.main import run
+
+    assert run(["doctor", "rig.toml", "--contract"]) == 2
+    assert "--laser" in capsys.readouterr().err

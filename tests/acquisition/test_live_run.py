@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from support.bench_runs import Failing, Run, raise_error
 
-from tvsbayes.acquisition.live_run import WHOLE_PX, WINDOW_PX, LiveRun, small_picture
+from tvsbayes.acquisition.live_run import LiveRun
 from tvsbayes.acquisition.live_snapshot import ESTIMATES_MAX, REMARKS_MAX, TRAIL_MAX, SeenLook, temperature
 from tvsbayes.acquisition.observation import Observation, Sighting, TwinObserver
 from tvsbayes.acquisition.running_estimate import Estimate
 from tvsbayes.errors import DeviceFault
-from tvsbayes.files.images import decode_image, png_bytes
+from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import frame_name
 
 PIXELS = (600.0, 300.25, 500.5, 310.0)
@@ -138,24 +138,6 @@ def test_only_the_last_look_has_pictures():
         assert live.picture(*wrong) is None
     live.looked(SeenLook(2, "no-spot", "d1", None, None, looked(2).pictures))
     assert live.picture(2, "right", "spot") is None and live.picture(2, "right", "whole")
-
-
-def test_pictures_are_small_and_the_window_stands_on_the_spot():
-    image = np.zeros((720, 1280), np.uint8)
-    image[300:303, 700:703] = 250
-    whole = decode_image(small_picture(png_bytes(image), None), "whole")
-    assert whole.shape == (270, WHOLE_PX, 3)
-    window = decode_image(small_picture(png_bytes(image), (701.3, 301.4)), "window")
-    assert window.shape == (WINDOW_PX, WINDOW_PX, 3)
-    row, column = np.argwhere(window[..., 0] > 125).mean(axis=0)
-    assert (row, column) == (WINDOW_PX / 2, WINDOW_PX / 2)
-    corner = decode_image(small_picture(png_bytes(image), (0.0, 719.0)), "corner")
-    assert corner.shape == window.shape
-
-
-def test_pictures_of_twelve_bits_are_shown():
-    image = np.full((40, 40), 4000, np.uint16)
-    assert decode_image(small_picture(png_bytes(image), None), "picture").mean() > 240
 
 
 def test_temperature_of_looks_that_agree_and_of_some_that_do_not():

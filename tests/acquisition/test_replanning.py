@@ -111,7 +111,7 @@ def test_a_proposal_of_many_looks_fits_into_the_journal(tmp_path):
     u = tuple(0.00012345678901234567 + n * 1e-17 for n in range(count))
     proposal = Proposal(steps, u, u[0], 100_000, "80 looks at d1, d2 lower u(worst) most per minute" + 80 * ".")
     with closing(Journal.create(tmp_path / "c", created="2026-01-01T00:00:00+00:00")) as journal:
-        assert journal.append("adapted", **adapted_entries(proposal, 99_999, steps)).event == "adapted"
+        assert journal.append("adapted", **adapted_entries(proposal, 99_999, steps).entries()).event == "adapted"
 
 
 def test_the_command_says_by_what_it_ended(tmp_path, monkeypatch, capsys):
@@ -179,10 +179,10 @@ def test_a_resumed_run_has_the_plan_of_the_interrupted_one(mounted_rig, tmp_path
 def test_a_damaged_change_of_plan_is_refused(mounted_rig, tmp_path):
     from types import SimpleNamespace
 
-    with pytest.raises(InputError, match="changed plan"):
-        adapted_plan(
-            small_plan(1), [SimpleNamespace(event="adapted", line=7, data={"row": 3, "steps": [{"action": "fly"}]})]
-        )
+    data = {"row": 3, "looks": 4, "why": "", "steps": [{"action": "fly"}]}
+    for entries, found in ((data, "fly"), ({**data, "row": "3"}, "row")):
+        with pytest.raises(InputError, match=f"line 7: .*{found}.*entries of the event adapted"):
+            adapted_plan(small_plan(1), [SimpleNamespace(event="adapted", line=7, data=entries)])
 
 
 def test_options_that_do_not_fit(capsys):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
 import pytest
 from support.bench_runs import Run, small_plan
+from support.live_runs import scripted_run
 
+from tvsbayes.acquisition import running_estimate
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import recorded
@@ -66,6 +69,41 @@ def test_running_estimate_does_not_hold_up_the_run_and_dies_with_it(mounted_rig,
         child = estimate._process
         assert child.poll() is None and estimate.latest is None
     assert child.poll() is not None
+
+
+FIT_THAT_WAITS = "import sys; open(sys.argv[1] + '/../go').read()"
+"""Ends once somebody opens the other end of a pipe."""
+
+
+@pytest.mark.usefixtures("ctrl_c_works")
+@pytest.mark.parametrize("asked", ["laser off", "stop"])
+def test_requests_are_heeded_while_a_fit_is_waited_for(mounted_rig, tmp_path, monkeypatch, asked):
+    """Laser off is acknowledged while the fit still works: only then is the fit let go. A stop ends the fit."""
+    monkeypatch.setattr(running_estimate, "FIT_MAX_S", 60.0)
+    os.mkfifo(tmp_path / "go")
+    live, states = scripted_run("resume"), []
+    settle = live.requests.settle
+
+    class Asking(RunningEstimate):
+        def _begin(self, looks):
+            super()._begin(looks)
+            if not states:
+                live.ask(asked)
+
+    def settled(request, state, answer):
+        states.append((request.what, state, estimate._process.poll() if estimate._process else None))
+        if request.what == "laser off":
+            (tmp_path / "go").write_text("go")
+            (tmp_path / "go").unlink()
+            (tmp_path / "go").write_text("later fits need not wait")
+        return settle(request, state, answer)
+
+    monkeypatch.setattr(live.requests, "settle", settled)
+    with Asking(tmp_path / "c", [sys.executable, "-c", FIT_THAT_WAITS], None, {"left"}, wait=True) as estimate:
+        outcome = Run(mounted_rig, tmp_path / "c", small_plan(4), estimate=estimate, live=live).engine.run()
+        assert estimate._process is None
+    assert states[0] == (asked, "acknowledged", None)
+    assert (outcome.reason, outcome.looks) == (("interrupted", 12) if asked == "stop" else ("done", 16))
 
 
 def test_estimate_that_cannot_start_does_not_end_the_run(tmp_path):

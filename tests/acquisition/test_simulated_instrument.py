@@ -92,13 +92,13 @@ def test_zero_drifts_with_the_clock_and_a_homing_finds_it(mounted_rig):
     positioner = instrument.positioner()
     positioner.home()
     positioner.move_to(0, 0)
-    changes, angle_deg = [], instrument.state_deg()["mirror_angles_deg"][0]
+    changes, angle_deg = [], instrument.state_deg().mirror_angles_deg[0]
     for number in range(200):
         instrument.clock.sleep(3600.0)
         instrument.light()
-        assert instrument.state_deg()["mirror_angles_deg"][0] == angle_deg
+        assert instrument.state_deg().mirror_angles_deg[0] == angle_deg
         positioner.move_to(0 if number % 2 else 1, 0)
-        now_deg = instrument.state_deg()["mirror_angles_deg"][0]
+        now_deg = instrument.state_deg().mirror_angles_deg[0]
         changes.append(now_deg - angle_deg)
         angle_deg = now_deg
     p = truth.parameters
@@ -108,7 +108,7 @@ def test_zero_drifts_with_the_clock_and_a_homing_finds_it(mounted_rig):
     positioner.home()
     positioner.move_to(0, 0)
     # What is left is the home offset.
-    assert abs(instrument.state_deg()["mirror_angles_deg"][0]) < 5 * HOME_SD_DEG
+    assert abs(instrument.state_deg().mirror_angles_deg[0]) < 5 * HOME_SD_DEG
 
 
 def test_camera_that_looks_on_does_not_change_the_motion(mounted_rig):

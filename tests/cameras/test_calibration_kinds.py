@@ -468,3 +468,19 @@ def test_pickles_and_bombs_are_refused(tmp_path):
     for name in ("b.npz", "b.mat"):
         with pytest.raises(InputError, match="more than 4194304 bytes"):
             read_calibration([tmp_path / name])
+
+
+@pytest.mark.parametrize("seed", (31, 5))
+def test_damaged_mat_files_end_in_a_refusal(seed, tmp_path):
+    """The first of these seeds ends scipy.io.loadmat 1.17 in a segmentation fault."""
+    structure = {"s": {"M1": np.eye(3), "D1": np.zeros(5), "T": np.arange(3.0)}}
+    scipy.io.savemat(tmp_path / "m.mat", structure)
+    data, rng = bytearray((tmp_path / "m.mat").read_bytes()), np.random.default_rng(seed)
+    for _ in range(3):
+        at = int(rng.integers(128, len(data)))
+        if rng.random() < 0.3:
+            del data[at : at + int(rng.integers(1, 40))]
+        else:
+            data[at] = int(rng.integers(256))
+    with pytest.raises(InputError, match=r"m\.mat"):
+        read_container(bytes(data), "m.mat")

@@ -350,11 +350,12 @@ def test_clouds_that_cannot_be_written_say_what_to_do(ask, folder, options, code
     assert exit_code == 2 and document["error"]["code"] == code and said in document["error"]["remedy"]
 
 
-@pytest.mark.parametrize("command", [("steps-for", "--export", "json"), ("report",)])
-@pytest.mark.parametrize("name", ["moves.csv", "campaign.toml"])
+@pytest.mark.parametrize("command", [("steps-for", "--export", "json"), ("report",), ("view",)])
+@pytest.mark.parametrize("name", ["moves.csv", "campaign.toml", "log.jsonl", "frames/000003_left.png"])
 def test_no_output_replaces_the_data_of_a_campaign(ask, tmp_path, command, name):
     """Before anything is fitted, and without a campaign of one's own the name is free."""
-    for part in ("campaign.toml", "moves.csv"):
+    (tmp_path / "frames").mkdir()
+    for part in ("campaign.toml", name):
         (tmp_path / part).write_bytes(b"mine")
     code, document = ask(command[0], tmp_path, *command[1:], "-o", tmp_path / name)
     assert code == 2 and "would replace data of the campaign" in document["error"]["message"]

@@ -1,65 +1,83 @@
-"""view: what it prints, what it hands to the server, what it refuses."""
+"""view: one file, whole or not at all, never in the place of data."""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
+import shutil
 
 import pytest
 
 from tvsbayes.cli.main import run
-
-LINK = "http://127.0.0.1:4711/#token"
+from tvsbayes.instrument.campaign import frame_name
 
 
 @pytest.fixture
-def handed(monkeypatch):
-    """What would have been served, and which links a browser would have been given; the extra need not be there."""
-    served, opened = [], []
-
-    def serve(contents, port, started):
-        served.append((contents, port))
-        started(LINK)
-
-    monkeypatch.setattr("tvsbayes.view.server.serve", serve)
-    monkeypatch.setattr("tvsbayes.view.contents.page_files", lambda: {"/": (b"", "text/html")})
-    monkeypatch.setattr("webbrowser.open", opened.append)
-    return served, opened
+def folder(viewed, tmp_path):
+    return shutil.copytree(viewed.bare, tmp_path / "campaign")
 
 
-def test_view_serves_what_it_shows_and_prints_the_link(viewed, handed, capsys):
-    served, opened = handed
-    assert run(["view", str(viewed.bare), "--port", "4711", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told == {"link": LINK, "looks": [384], "fitted": [False]} and opened == []
-    ((contents, port),) = served
-    assert port == 4711 and contents.folders == (viewed.bare,)
-    assert contents.picture(0, 3, "left").startswith(b"\x89PNG")
-    assert [contents.picture(*asked) for asked in ((0, 3, "right"), (0, 9999, "left"), (1, 3, "left"))] == [None] * 3
-    assert len(json.loads(contents.document)["scenes"]) == 1
+def document_of(html: str) -> dict:
+    return json.loads(re.search(r'<script type="application/json" id="document">(.*?)</script>', html, re.DOTALL)[1])
 
 
-def test_ctrl_c_ends_the_page_and_the_one_document_stays_the_only_one(viewed, handed, monkeypatch, capsys):
-    def served_until_ctrl_c(contents, port, started):
-        started(LINK)
-        raise KeyboardInterrupt
+def test_view_writes_one_file_that_holds_all_it_needs(folder, capsys):
+    assert run(["view", str(folder), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    page = folder / "results" / "view.html"
+    html = page.read_text(encoding="utf-8")
+    assert result == {
+        "view": str(page), "bytes": page.stat().st_size, "looks": [384], "pictures": [1], "fitted": [False],
+    }  # fmt: skip
+    (scene,) = document_of(html)["scenes"]
+    assert scene["pictures"]["3"]["left"]["whole"].startswith("data:image/jpeg;base64,")
+    assert not re.search(r'(?:src|href)="(?!data:)|url\((?!#)|@import|https?://(?!www\.w3\.org/2000/svg")', html)
 
-    monkeypatch.setattr("tvsbayes.view.server.serve", served_until_ctrl_c)
-    assert run(["view", str(viewed.bare), "--json"]) == 130
-    assert json.loads(capsys.readouterr().out)["link"] == LINK
+
+def test_page_runs_its_own_script_alone(folder):
+    """The policy names the hash of the one script that there is, and lets nothing be loaded."""
+    import base64
+
+    assert run(["view", str(folder)]) == 0
+    html = (folder / "results" / "view.html").read_text(encoding="utf-8")
+    (script,) = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', html)[1].replace("&#39;", "'")
+    assert f"script-src 'sha256-{digest}'" in policy and "default-src 'none'" in policy and "http" not in policy
 
 
-def test_view_opens_a_browser_unless_told_not_to(viewed, handed, capsys):
-    _, opened = handed
-    assert run(["view", str(viewed.bare)]) == 0
+def test_view_says_where_the_page_is_and_what_it_lacks(folder, tmp_path, capsys):
+    out = tmp_path / "page.html"
+    assert run(["view", str(folder), "--beside", str(folder), "-o", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert opened == [LINK] and LINK in printed and "note: no results" in printed
-    assert run(["view", str(viewed.bare), "--no-browser"]) == 0
-    assert opened == [LINK]
+    assert str(out) in printed and "note: no results" in printed and out.stat().st_size > 100_000
+    assert len(document_of(out.read_text(encoding="utf-8"))["scenes"]) == 2
+    assert not (folder / "results").exists()
 
 
-def test_view_refuses_an_axis_and_what_is_no_campaign(tmp_path, handed, capsys):
+def test_view_replaces_no_data_and_leaves_nothing_half_written(folder, tmp_path, capsys, monkeypatch):
+    for name in ("spots.csv", "campaign.toml", frame_name(3, "left")):
+        before = (folder / name).read_bytes()
+        assert run(["view", str(folder), "-o", str(folder / name)]) == 2
+        assert "would replace data" in capsys.readouterr().err and (folder / name).read_bytes() == before
+    out = tmp_path / "page.html"
+    out.write_text("an older page")
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    assert run(["view", str(folder), "-o", str(out)]) == 2
+    assert "No space left" in capsys.readouterr().err
+    assert out.read_text() == "an older page"
+    assert sorted(place.name for place in tmp_path.iterdir()) == ["campaign", "page.html"]
+    (folder / "results").symlink_to(tmp_path)
+    assert run(["view", str(folder)]) == 2
+
+
+def test_view_refuses_an_axis_and_what_is_no_campaign(tmp_path, capsys):
     assert run(["new", str(tmp_path / "stage"), "--axis"]) == 0
     assert run(["view", str(tmp_path / "stage")]) == 2
     assert "not an axis" in capsys.readouterr().err
     assert run(["view", str(tmp_path / "nothing")]) == 2
-    assert handed[0] == []

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.dense_likelihood import dense_log_density, physical, play_band_deg, stop_labels
+from support.dense_likelihood import dense_log_density, drawn_at_every_move, physical, play_band_deg, stop_labels
 from support.sloped_density import value_and_gradient
 
 from tvsbayes.estimators import likelihood as density
@@ -127,22 +127,7 @@ def test_log_density_adds_the_prior(dozen, evaluate):
 
 def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
     """The mistake formulation 3.1 names: both axes drawn anew at every move."""
-    spots = ordered_spots(dozen.campaign)
-    same_move = np.array([i > 0 and s.move == spots[i - 1].move for i, s in enumerate(spots)])
-    redraw, mix = np.array(dozen.arrays.spots.redraw), np.array(dozen.arrays.spots.redraw_mix)
-    for axis, name in enumerate(("pan", "tilt")):
-        labels = stop_labels(dozen.campaign.moves, name)
-        for i, spot in enumerate(spots):
-            redraw[i, axis] = not same_move[i]
-            directions = labels[spot.move][1]
-            mix[i, axis] = [
-                ("right" in directions) or ("down" in directions),
-                "left" in directions or "up" in directions,
-            ]
-            mix[i, axis] /= mix[i, axis].sum()
-    mistaken = eqx.tree_at(
-        lambda a: (a.spots.redraw, a.spots.redraw_mix), dozen.arrays, (jnp.asarray(redraw), jnp.asarray(mix))
-    )
+    mistaken = drawn_at_every_move(dozen.campaign, dozen.arrays)
     right, wrong = (evaluate(dozen.z, dozen.space, arrays) for arrays in (dozen.arrays, mistaken))
     dense = dense_log_density(dozen.campaign, right, persistent=False)
     assert wrong.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
@@ -159,11 +144,11 @@ def test_padding_changes_nothing(grid_campaign, monkeypatch):
     z = np.repeat(0.3 * np.random.default_rng(31).standard_normal((1, len(NAMES))), BATCH, axis=0)
     one, two = (density.evaluate(z, no_draw(BATCH, arrays), space, arrays) for arrays in (short, long))
     assert two.log_density[0] == pytest.approx(float(one.log_density[0]), abs=FINE_UNIT, rel=1e-12)
-    moves, count = len(grid_campaign.moves), len(grid_campaign.spots)
+    places = len(short.gears.places.steps)
+    assert places and len(long.gears.places.steps) == places
+    np.testing.assert_allclose(two.place_errors_rad, one.place_errors_rad, atol=FINE_UNIT * 1e-3)
+    moves = len(grid_campaign.moves)
     assert np.all(long.moves.steps[moves:] == long.moves.steps[moves - 1])
-    assert np.all(np.asarray(two.standardised)[0, count:] == 0)
-    scale = np.abs(np.asarray(one.standardised)[0]).max()
-    np.testing.assert_allclose(two.standardised[0, :count], one.standardised[0, :count], atol=FINE_UNIT * scale)
 
 
 def test_bucket_sizes():

@@ -8,11 +8,14 @@ import pytest
 from tvsbayes.errors import InputError
 from tvsbayes.files.images import (
     IMAGE_PIXELS_MAX,
+    WHOLE_PX,
+    WINDOW_PX,
     decode_image,
     image_size,
     in_grey_levels,
     png_bytes,
     read_image,
+    small_picture,
     white_level,
 )
 
@@ -124,3 +127,23 @@ def test_links_out_of_the_folder_are_refused(tmp_path):
     with pytest.raises(InputError) as caught:
         read_image(tmp_path / "in" / "a.png", tmp_path / "in")
     assert caught.value.code == "path"
+
+
+def test_pictures_are_small_and_the_window_stands_on_the_spot():
+    image = np.zeros((720, 1280, 3), np.uint8)
+    image[300:303, 700:703] = 250
+    whole = decode_image(small_picture(image), "whole")
+    assert whole.shape == (270, WHOLE_PX, 3)
+    window = decode_image(small_picture(image, (701.3, 301.4)), "window")
+    assert window.shape == (WINDOW_PX, WINDOW_PX, 3)
+    row, column = np.argwhere(window[..., 0] > 125).mean(axis=0)
+    assert (row, column) == (WINDOW_PX / 2, WINDOW_PX / 2)
+    corner = decode_image(small_picture(image, (0.0, 719.0)), "corner")
+    assert corner.shape == window.shape
+
+
+def test_pictures_of_twelve_bits_are_shown():
+    image = np.full((40, 40, 3), 4000, np.uint16)
+    assert decode_image(small_picture(image), "picture").mean() > 240
+    with pytest.raises(ValueError, match="no pixel"):
+        small_picture(image, (40.0, 3.0))

@@ -10,7 +10,7 @@ from scipy import stats
 from support.small_posterior import SIGMAS
 from support.tabulated import tabulated
 
-from tvsbayes.posterior.proposal import Independence, first_proposal
+from tvsbayes.posterior.proposal import Independence, first_proposal, forest
 from tvsbayes.posterior.tables import CUT_NODES, LEADER_NODES, NODES, Followers, Tables, between_cuts
 
 GRID = np.linspace(-12.0, 16.0, 561)
@@ -97,21 +97,43 @@ def test_between_two_nodes_the_tables_are_mixed():
         np.testing.assert_allclose(followers.at(w), expected, rtol=1e-12)
 
 
-def test_a_pair_that_explains_the_same_scatter_is_proposed_as_the_target_has_it():
+def effective_share(target, dimension: int) -> float:
+    """Of draws from the first proposal, all coordinates tabulated."""
+    proposal = first_proposal(target, dimension, np.ones(dimension, bool), np.zeros(dimension, bool))
+    w = proposal.draw(20_000, np.random.RandomState(5))
+    log_weights = target(w) - proposal.log_density(w)
+    weights = np.exp(log_weights - log_weights.max())
+    return float(weights.sum() ** 2 / np.sum(weights**2) / len(w))
+
+
+def test_a_pair_that_explains_the_same_scatter_is_proposed_as_the_target_has_it(monkeypatch):
     """Two scales of which one suffices: weights of independent draws have a long tail, of followed ones hardly."""
 
     def target(w: np.ndarray) -> np.ndarray:
         both = np.logaddexp(1.5 * w[:, 0], 1.5 * w[:, 1])
         return -0.5 * np.sum(w**2, axis=1) / 4 - 0.5 * (both - 3.0) ** 2 / 0.15
 
-    effective = {}
-    for pairs in ((), ((0, 1),)):
-        proposal = first_proposal(target, 2, np.ones(2, bool), np.zeros(2, bool), pairs)
-        w = proposal.draw(20_000, np.random.RandomState(5))
-        weights = np.exp(target(w) - proposal.log_density(w) - 3.0)
-        effective[len(pairs)] = weights.sum() ** 2 / np.sum(weights**2) / len(w)
-    # Between the leader's nodes, 1.5 apart, tables are mixed: that costs a part.
-    assert effective[1] > 0.2 > 20 * effective[0], effective
+    followed = effective_share(target, 2)
+    monkeypatch.setattr("tvsbayes.posterior.proposal.forest", lambda *_: [])
+    # Between the leader's nodes tables are mixed: that costs a part.
+    assert followed > 0.2 > 20 * effective_share(target, 2)
+
+
+def test_coordinates_follow_those_that_they_depend_on_most(monkeypatch):
+    """A chain of three, the middle one known by both others, and a fourth that depends on none."""
+
+    def target(w: np.ndarray) -> np.ndarray:
+        chained = (w[:, 0] - w[:, 1]) ** 2 + (w[:, 2] - w[:, 1]) ** 2
+        # Little between the ends: what the middle one leaves of their dependence.
+        return -0.5 * (w[:, 1] ** 2 + chained / 0.5**2 + w[:, 3] ** 2) + 0.1 * w[:, 0] * w[:, 2]
+
+    assert set(forest(target, np.arange(4), 4)) == {(1, 0), (1, 2)}
+    # Rows, not places: of other tabulated coordinates they are others.
+    assert {frozenset(pair) for pair in forest(target, np.array([3, 1, 2]), 4)} == {frozenset((1, 2))}
+    assert forest(target, np.array([3]), 4) == [] and forest(target, np.array([1, 3]), 4) == []
+    followed = effective_share(target, 4)
+    monkeypatch.setattr("tvsbayes.posterior.proposal.forest", lambda *_: [])
+    assert followed > 0.3 > 2 * effective_share(target, 4)
 
 
 def test_fitting_tilts_the_tables_of_followers():

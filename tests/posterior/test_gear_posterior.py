@@ -13,7 +13,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.posterior.draws import headline_names
-from tvsbayes.posterior.importance import K_LIMIT, importance_run
+from tvsbayes.posterior.importance import K_MAX, importance_run
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -58,7 +58,7 @@ def test_both_samplers_say_the_same(gear_fit):
     chain, weighted = sample(fitted, "emcee", seed=5, max_minutes=20.0), importance_run(fitted, 5).posterior
     assert chain.convergence.stuck_walkers == ()
     importance = weighted.convergence.importance
-    assert importance.pareto_k < K_LIMIT and importance.least_ess.value > 400, importance
+    assert importance.pareto_k < K_MAX and importance.least_ess.value > 400, importance
     for name in headline_names(fitted):
         one, other = (posterior.propagate(lambda p, name=name: p[name]) for posterior in (chain, weighted))
         mean_error, sd_error = (np.hypot(getattr(one, e), getattr(other, e)) for e in ("mcse_mean", "mcse_sd"))

@@ -5,23 +5,26 @@ A dozen spots linearised at their truth stand for a fit; the dense side is `supp
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.dense_likelihood import angle_covariances, residual_covariance
+from support.dense_likelihood import angle_covariances, drawn_at_every_move, residual_covariance
 from support.small_posterior import ROUNDING
 from support.varying_gears import PERIODS_DEG, coordinates_with, varying_gears
-from tvsbayes.posterior.ridges import unbent
 
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.linear_spots import linear_spots, linearise, stop_information
-from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, names_of
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, NOISE_NAMES, names_of
 from tvsbayes.model.parameter_space import coordinates_of, free_mask, parameter_space, physical_at
-from tvsbayes.posterior.transport import GEAR_SCALES, Transport
+from tvsbayes.posterior.transport import Transport, transport
+
+pytestmark = pytest.mark.usefixtures("x64")
 
 VALUES = {
     **{"transmission_error_deg.pan": 0.04, "transmission_error_deg.tilt": 0.02, "play_variation_deg.pan": 0.03},
@@ -30,29 +33,34 @@ VALUES = {
     **{"harmonic_amplitude_deg.tilt.1": 0.04, "drift_deg_per_root_hour.pan": 0.0, "drift_deg_per_root_hour.tilt": 0.0},
 }
 """Without drift: few coordinates see it, and the map leaves it out."""
+SCATTER = dict(zip(LOOK_SCATTER_NAMES, (0.01, 0.015), strict=True))
+"""Less than the stops' own errors: a variance that scatter of the mode leaves is never below none."""
+FLOOR = 1e-8
+"""Of a centred map, in y: Gauss and Newton take differences of residuals of 1e4 units of noise."""
 
 
-@pytest.fixture(scope="module")
-def fitted(dozen) -> SimpleNamespace:
-    """What the map reads of a fit."""
-    table = varying_gears(dozen.campaign.rig)
-    count = len(ordered_spots(dozen.campaign))
+def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str, ...], redraw: bool) -> SimpleNamespace:
+    """What the map reads of a fit, at values; `redraw`: every look has stop errors of its own."""
+    table = varying_gears(campaign.rig)
+    count = len(ordered_spots(campaign))
     with jax.enable_x64(True):
-        space = jax.tree.map(jnp.asarray, parameter_space(table, dozen.campaign.stereo))
-        arrays = jax.tree.map(jnp.asarray, campaign_arrays(dozen.campaign, table))
+        space = jax.tree.map(jnp.asarray, parameter_space(table, campaign.stereo))
+        arrays = jax.tree.map(jnp.asarray, campaign_arrays(campaign, table))
+        if redraw:
+            arrays = drawn_at_every_move(campaign, arrays)
         z = coordinates_of(space, physical_at(dozen.z, dozen.space).value)
-        z = coordinates_with(space, z, VALUES)
+        z = coordinates_with(space, z, values)
         lin = jax.jit(linearise)(jnp.asarray(z), space, arrays).of_spots(count)
         information = stop_information(linear_spots(lin, arrays, -lin.residual_jacobian))
     free = free_mask(space, has_aperture=True)
-    free[[INDEX[name] for name in names_of("drift_deg_per_root_hour")]] = False
+    free[[INDEX[name] for name in held]] = False
     covariance = np.linalg.inv(np.eye(len(NAMES)) + information.fisher)
     noise = np.isin(NAMES, NOISE_NAMES)
     # Noise scales as wide as a dozen spots leave them.
     covariance[noise], covariance[:, noise] = 0.0, 0.0
     covariance[noise, noise] = 0.3**2
     return SimpleNamespace(
-        campaign=dozen.campaign,
+        campaign=campaign,
         space=space,
         arrays=arrays,
         z=z,
@@ -61,19 +69,32 @@ def fitted(dozen) -> SimpleNamespace:
         information=information,
         covariance=covariance,
         mode=SimpleNamespace(physical=physical_at(z, space).value),
+        persistent=not redraw,
     )
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["whole", "table"])
-def path(request, fitted) -> Transport:
-    with pytest.MonkeyPatch.context() as patch:
-        if not request.param:
-            patch.setattr("tvsbayes.posterior.ridges.STATES_MAX", 0)
-        with jax.enable_x64(True):
-            found = unbent(fitted)
-    places = len(fitted.arrays.gears.places.steps)
-    assert (len(found.constant) > 0) == request.param and len(found.states) == len(found.constant) + 2 * places
+@pytest.fixture(scope="module")
+def fitted(dozen) -> SimpleNamespace:
+    """Of looks that do not scatter."""
+    values = VALUES | dict.fromkeys(LOOK_SCATTER_NAMES, 0.0)
+    held = (*names_of("drift_deg_per_root_hour"), *LOOK_SCATTER_NAMES)
+    return fit_of(dozen, dozen.campaign, values, held, redraw=False)
+
+
+@pytest.fixture(scope="module")
+def path(fitted) -> Transport:
+    found = transport(fitted)
+    assert found.noise > 10 and found.narrow and found.linear.places.shape[1] == 2 * len(found.place_on_tilt) > 0
     return found
+
+
+@pytest.fixture(scope="module")
+def scattered(dozen) -> SimpleNamespace:
+    """Of looks that scatter, each at a stop of its own; pixel noise held."""
+    first = {spot.move: spot for spot in reversed(dozen.campaign.spots)}
+    campaign = replace(dozen.campaign, spots=tuple(first[move] for move in sorted(first)))
+    held = (*names_of("drift_deg_per_root_hour"), "pixel_scale")
+    return fit_of(dozen, campaign, VALUES | SCATTER, held, redraw=True)
 
 
 def values_at(fitted: SimpleNamespace, z: np.ndarray) -> dict[str, float]:
@@ -89,43 +110,65 @@ def dense_density(fitted: SimpleNamespace, path: Transport, z: np.ndarray) -> tu
     """Precision and score of the coordinates y that are no noise scales, by the covariance of all residuals at z."""
     values, mode = values_at(fitted, z), values_at(fitted, fitted.z)
     pixels = values["pixel_scale"] / mode["pixel_scale"]
-    others = path.free[len(path.noise) :]
-    wide = path.root[len(path.noise) :, len(path.noise) :]
+    others = path.free[path.noise :]
+    wide = path.root[path.noise :, path.noise :]
     slope = fitted.linearised.slope / pixels
-    covariance = residual_covariance(angle_covariances(fitted.campaign, values), slope)
+    without = values | dict.fromkeys(LOOK_SCATTER_NAMES, 0.0)
+    angles = angle_covariances(fitted.campaign, without, persistent=fitted.persistent)
+    # Slopes are in units of a look's noise at the mode, its scatter included: what the scatter is more there comes on.
+    for axis, name in enumerate(LOOK_SCATTER_NAMES):
+        angles[axis] += np.radians(np.radians(values[name] ** 2 - mode[name] ** 2)) * np.eye(len(slope))
+    covariance = residual_covariance(angles, slope)
     jacobian = -fitted.linearised.residual_jacobian.reshape(len(covariance), -1)[:, others] @ wide / pixels
     solved = np.linalg.solve(covariance, jacobian)
     return wide.T @ wide + jacobian.T @ solved, solved.T @ fitted.linearised.residual.ravel() / pixels
 
 
-def test_the_map_has_mean_and_covariance_of_the_dense_campaign_at_any_scales(fitted, path):
-    """Of a map with a table only the gears' scales are followed: stop sds and pixels stay those of the mode."""
-    count = len(path.noise)
-    followed = np.isin(path.free[path.noise], GEAR_SCALES) | (len(path.constant) > 0)
+def check_dense(fitted: SimpleNamespace, path: Transport, least: float) -> None:
+    """Precision and mean of the map at drawn noise scales; they move the former by `least` of its largest entry."""
+    count = path.noise
     at_mode = dense_density(fitted, path, fitted.z)
-    for w in 1.5 * np.random.default_rng(13).standard_normal((4, count)) * followed:
+    for w in 1.5 * np.random.default_rng(13).standard_normal((4, count)):
         z = path.from_whitened(np.concatenate([w, np.zeros(path.dimension - count)])[None])[0]
         precision, score = dense_density(fitted, path, z)
         found = path.conditional(w[None])
-        factor = found.factor[0]
+        # From the narrowest on, in the map.
+        factor, shift = found.own[0], found.shift[0]
         largest = np.abs(precision).max()
         # Weights of spots span eight decades, and errors at places have a floor of 1e-10 of their variance.
-        np.testing.assert_allclose(factor @ factor.T, precision, rtol=0, atol=1e-5 * largest)
+        np.testing.assert_allclose((factor @ factor.T)[::-1, ::-1], precision, rtol=0, atol=1e-5 * largest)
         moved = score - at_mode[1]
-        np.testing.assert_allclose(factor @ found.shift[0], moved, rtol=0, atol=1e-5 * np.abs(moved).max())
-        assert np.abs(precision - at_mode[0]).max() > 0.01 * largest, "the scales are those of the mode"
+        np.testing.assert_allclose((factor @ shift)[::-1], moved, rtol=0, atol=1e-5 * np.abs(moved).max())
+        assert np.abs(precision - at_mode[0]).max() > least * largest, "the scales are those of the mode"
+
+
+def test_the_map_has_mean_and_covariance_of_the_dense_campaign_at_any_scales(fitted, path):
+    """Scales of pixels, stops, gears and play together."""
+    assert path.pixels.sum() == 1 and np.isin(LOOK_SCATTER_NAMES, np.array(NAMES)[path.free]).sum() == 0
+    check_dense(fitted, path, 0.01)
+
+
+def test_looks_that_scatter_more_or_less_than_at_the_mode(scattered):
+    """Where every look has a stop of its own the scatter adds to its error: the map is exact."""
+    path = transport(scattered)
+    names = np.array(NAMES)[path.free[: path.noise]]
+    assert set(LOOK_SCATTER_NAMES) <= set(names) and path.pixels.sum() == 0
+    check_dense(scattered, path, 0.01)
+    # Of scatter alone.
+    for axis, name in zip(AXES, LOOK_SCATTER_NAMES, strict=True):
+        w = np.where(names == name, 3.0, 0.0)[None]
+        one, other = (path.conditional(each).own[0] for each in (w, 0 * w))
+        assert np.abs(one @ one.T - other @ other.T).max() > 1e-3, axis
 
 
 def test_to_w_undoes_the_map(fitted, path):
     w = np.random.default_rng(14).standard_normal((40, path.dimension))
-    mapped = path.mapped(w)
-    back = path.to_w(mapped.z)
-    widest = np.abs(path.to_w(path.from_whitened(w))).max()
-    assert np.abs(back - w).max() < ROUNDING * np.linalg.cond(path.root) * widest * path.dimension
-    # At the mode two slopes cancel, each as large as the scores it is made of, by the root's units at most.
-    rounded = ROUNDING * path.dimension * np.abs(path.score).max()
+    z = path.mapped(w).z
+    widest = np.abs(path.to_whitened(z)).max()
+    bound = ROUNDING * np.linalg.cond(path.root) * widest * path.dimension + FLOOR
+    assert np.abs(path.to_w(z) - w).max() < bound
     at_mode = path.mapped(np.zeros((1, path.dimension))).z[0][path.free]
-    np.testing.assert_allclose(at_mode, fitted.z[path.free], rtol=0, atol=rounded)
+    np.testing.assert_allclose(at_mode, fitted.z[path.free], rtol=0, atol=bound)
 
 
 def test_the_jacobian_of_the_map_is_what_it_says(path):

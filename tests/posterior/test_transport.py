@@ -1,4 +1,4 @@
-"""The map of the posterior and the ridges it was measured from: coordinates are what they say, of known Jacobian."""
+"""The map of the posterior: coordinates are what they say, of known Jacobian, and nearly normal."""
 
 from __future__ import annotations
 
@@ -10,18 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from support.small_posterior import ROUNDING, small_fit, small_path
-from support.two_parameters import BACKLASH, RATIO, no_places, route
-from tvsbayes.posterior.ridges import by_width, stop_states
+from support.small_posterior import ROUNDING, small_fit
+from support.two_parameters import BACKLASH, CURVE, NARROW_SD, RATIO, TURN, no_places, ridge, ridge_density, route
 
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
 from tvsbayes.posterior.proposal import Target
-from tvsbayes.posterior.transport import STRETCH_NODES
+from tvsbayes.posterior.transport import BLOCK_ROWS, Transport, by_width
 
 STOP_NAMES = (("stop_sd_deg.right", "stop_sd_deg.left"), ("stop_sd_deg.down", "stop_sd_deg.up"))
 """By axis, in the order of `redraw_mix`."""
+FLOOR = 1e-9
+"""Of a centred map, in y: Gauss and Newton take differences of residuals of 1e4 units of noise."""
+
+
+def uncentred(path: Transport) -> Transport:
+    """The map whose narrow coordinates stay where the linearised campaign has them."""
+    return replace(path, narrow=0, bend=path.bend[:, :0, :0])
 
 
 @pytest.mark.parametrize("count", [1, BATCH - 1, BATCH, BATCH + 1, 2 * BATCH + 6])
@@ -52,57 +58,86 @@ def test_coordinates_are_ordered_by_the_variance_left_to_them():
         assert np.argmax(left) == 0, place
 
 
-@pytest.mark.parametrize("whole", [True, False])
-def test_to_w_undoes_the_map(whole):
-    fitted, path = small_fit()[0], small_path(whole)
-    assert path.dimension == fitted.free.sum() and len(path.narrow) > 0
-    w = np.random.default_rng(8).normal(size=(50, path.dimension))
-    back = path.to_w(path.mapped(w).z)
-    # A triangular solve amplifies rounding by the condition of the root; the shear adds terms as large as itself.
-    sheared = np.abs(path.to_w(path.from_whitened(w))).max()
-    assert np.abs(back - w).max() < ROUNDING * np.linalg.cond(path.root) * sheared * path.dimension
+def test_no_coordinates_have_an_order():
+    """Where only the noise is estimated, nothing is left to whiten."""
+    order = by_width(np.zeros((0, 0)))
+    assert order.shape == (0,) and np.zeros(3)[order].shape == (0,)
+
+
+def test_to_w_undoes_the_map():
+    """Points on both sides of a block's end; what is held stays; the origin is the mode."""
+    fitted, path = small_fit()
+    assert path.dimension == fitted.free.sum() and 0 < path.narrow < path.dimension - path.noise
+    w = np.random.default_rng(8).normal(size=(BLOCK_ROWS + 6, path.dimension))
+    with jax.enable_x64(True):
+        z = path.mapped(w).z
+        back, origin = path.to_w(z), path.mapped(np.zeros((1, path.dimension))).z[0]
+        widest = np.abs(path.to_whitened(z)).max()
+    # A triangular solve amplifies rounding by the condition of the root.
+    amplified = ROUNDING * np.linalg.cond(path.root) * widest * path.dimension
+    assert np.abs(back - w).max() < amplified + FLOOR
     fixed = ~fitted.free
-    np.testing.assert_array_equal(path.mapped(w).z[:, fixed], np.repeat(fitted.z[None, fixed], 50, axis=0))
-    # At the mode two slopes cancel, each as large as the scores it is made of, by the root's units at most.
-    rounded = ROUNDING * path.dimension * max(1.0, np.abs(path.score).max())
-    np.testing.assert_allclose(path.mapped(np.zeros((1, path.dimension))).z[0], fitted.z, rtol=0, atol=rounded)
+    np.testing.assert_array_equal(z[:, fixed], np.repeat(fitted.z[None, fixed], len(w), axis=0))
+    np.testing.assert_allclose(origin, fitted.z, rtol=0, atol=amplified + FLOOR)
 
 
-@pytest.mark.parametrize("whole", [True, False])
-def test_the_jacobian_of_the_map_is_what_it_says(whole):
-    path = small_path(whole)
+def test_the_jacobian_of_the_map_is_what_it_says():
+    """By central differences: also where coordinates are centred, which moves them by what was drawn before."""
+    path = small_fit()[1]
     step = 1e-3
     for w in np.random.default_rng(9).normal(size=(3, path.dimension)):
         steps = step * np.eye(path.dimension)
-        slopes = (path.mapped(w + steps).z - path.mapped(w - steps).z)[:, path.free].T / (2 * step)
+        with jax.enable_x64(True):
+            slopes = (path.mapped(w + steps).z - path.mapped(w - steps).z)[:, path.free].T / (2 * step)
+            found = path.mapped(w[None]).log_jacobian[0]
         straight = np.linalg.solve(path.root, slopes)
         assert np.abs(straight - np.eye(path.dimension)).max() > 0.1, "nothing is bent"
-        sign, log_volume = np.linalg.slogdet(slopes)
-        # Central differences of an exponential of at most 0.5 w, and rounding amplified by the solve.
+        sign, log_volume = np.linalg.slogdet(straight)
+        # Central differences are good to step^2 / 6 of third derivatives, and rounding amplified by the solve.
         error = (step**2 + ROUNDING / step * np.linalg.cond(path.root)) * np.abs(straight).sum()
         assert error < 1e-2
-        assert sign == 1
-        expected = np.sum(np.log(np.diag(path.root))) + path.mapped(w[None]).log_jacobian[0]
-        assert abs(log_volume - expected) < error
+        assert sign == 1 and abs(log_volume - found) < error
+        assert abs(found) > 10 * error, "nothing is wider than at the mode"
 
 
-def test_the_shear_straightens_the_posterior():
+def test_centring_makes_a_curved_ridge_normal():
+    """Where a narrow coordinate follows a wide one along a parabola, its conditional density is the normal one of w."""
+    path = ridge()
+    assert path.bend[0, 0, 0] == pytest.approx(TURN, rel=1e-3) and abs(path.bend[1, 0, 0]) < 1e-6
+    w = np.random.default_rng(10).normal(size=(400, 2))
+    seen, centre = path.mapped(w), path.mapped(w * [1.0, 0.0])
+    wide = np.abs(w[:, 0])
+    # Of z_1 alone: the map keeps the wide coordinate.
+    np.testing.assert_array_equal(seen.z[:, path.free[0]], w[:, 0])
+    along = ridge_density(seen.z) + seen.log_jacobian - (ridge_density(centre.z) + centre.log_jacobian)
+    # The prior's pull on the narrow one is taken at the mode's slope: off by z_2 sd / slope^2 standard deviations.
+    pull = CURVE * wide**2 * NARROW_SD / (1 - TURN * wide) ** 2
+    np.testing.assert_array_less(np.abs(along + 0.5 * w[:, 1] ** 2), (1 + np.abs(w[:, 1])) * pull + 1e-3)
+    apart = uncentred(path).mapped(w)
+    assert np.std(ridge_density(apart.z) + apart.log_jacobian) > 100, "the ridge would be none"
+    np.testing.assert_allclose(path.to_w(seen.z), w, atol=FLOOR)
+
+
+def test_centring_straightens_the_posterior_of_a_campaign():
     fitted, path = small_fit()
-    straight = replace(path, narrow=path.narrow[:0], bend=path.bend[:0])
-    w = np.random.default_rng(10).normal(size=(8 * BATCH, path.dimension))
+    w = np.random.default_rng(10).normal(size=(4 * BATCH, path.dimension))
     with jax.enable_x64(True):
-        spread = [np.std(Target(fitted, p)(w) + 0.5 * np.sum(w**2, axis=1)) for p in (path, straight)]
-    assert spread[0] < spread[1] / 3, spread
+        spread = [np.std(Target(fitted, p)(w) + 0.5 * np.sum(w**2, axis=1)) for p in (path, uncentred(path))]
+    assert spread[0] < spread[1] / 3 and spread[0] < 2, spread
 
 
 def test_the_precision_at_other_noise_scales_is_the_smoothers():
-    """Woodbury's identity over all stop errors against the Fisher information of the filter and smoother."""
+    """The eliminated states against the Fisher information of the filter and smoother, at other scales of stops."""
     fitted, path = small_fit()
-    count = len(path.slope)
-    others = path.free[count:]
-    wide = path.root[count:, count:]
-    for w in np.random.default_rng(12).normal(size=(4, count)):
-        z = path.from_whitened(np.concatenate([w, np.zeros(len(others))])[None])[0]
+    others = path.free[path.noise :]
+    wide = path.root[path.noise :, path.noise :]
+    scatter = np.isin(np.array(NAMES)[path.free[: path.noise]], ["look_scatter_deg.pan", "look_scatter_deg.tilt"])
+    for w in np.random.default_rng(12).normal(size=(4, path.noise)):
+        # How scatter of looks is followed is another question: it is held.
+        held = np.where(scatter, 0.0, w)
+        z = path.from_whitened(np.concatenate([held, np.zeros(len(others))])[None])[0]
+        z[path.free[: path.noise][scatter]] = fitted.z[path.free[: path.noise][scatter]]
+        held = path.to_whitened(z[None])[0, : path.noise]
         with jax.enable_x64(True):
             scales, mode = (np.asarray(fitted.space.physical(jnp.asarray(x))) for x in (z, fitted.z))
         pixels = scales[INDEX["pixel_scale"]] / mode[INDEX["pixel_scale"]]
@@ -115,77 +150,54 @@ def test_the_precision_at_other_noise_scales_is_the_smoothers():
         variance[:, :2] = np.sum(mix * stops**2, axis=2)
         scaled = replace(linear, load=linear.load / pixels, jacobian=linear.jacobian / pixels, variance=variance)
         expected = wide.T @ (np.eye(len(others)) + stop_information(scaled).fisher[np.ix_(others, others)]) @ wide
-        factor = path.conditional(w[None]).factor[0]
-        # The information spans ten decades in z; in y it is of order 1.
-        np.testing.assert_allclose(factor @ factor.T, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+        factor = path.conditional(held[None]).own[0]
+        # The map has the narrowest coordinate first. The information spans ten decades in z; in y it is of order 1.
+        found = (factor @ factor.T)[::-1, ::-1]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
         assert np.abs(expected - np.eye(len(others))).max() > 0.1, "the scales are those of the mode"
-
-
-def test_too_many_stop_errors_get_no_columns(monkeypatch):
-    """A campaign of ten thousand spots would need gigabytes for them."""
-    fitted, path = small_fit()
-    linear = linear_spots(fitted.linearised, fitted.arrays, -fitted.linearised.residual_jacobian)
-    count = len(path.constant)
-    assert stop_states(fitted, linear).load.shape == (4 * len(linear.residual), count)
-    monkeypatch.setattr("tvsbayes.posterior.ridges.STATES_MAX", count - 1)
-    found = stop_states(fitted, linear)
-    assert found.load.shape == (4 * len(linear.residual), 0)
-    assert found.variance.shape == (0, 4) and found.constant.shape == (0,)
 
 
 def test_w_keeps_the_curvature_far_from_the_mode():
     """Where a stop scatters by four of its posterior sds more than at the mode, ratios are far wider; not in w."""
     fitted, path = small_fit()
-    count = len(path.slope)
-    for which in np.flatnonzero(path.pixels == 0):
-        w = np.zeros((3, path.dimension))
+    names = np.array(NAMES)[path.free[: path.noise]]
+    plain, count = uncentred(path), path.noise
+    for which in np.flatnonzero(np.char.startswith(names, "stop_sd_deg")):
+        w = np.zeros((1, count))
         w[:, which] = 4.0
-        factor = path.conditional(w[:1, :count]).factor[0]
+        found = plain.conditional(w)
         # Along the direction of y that this stop sd widens most.
+        factor = found.own[0][::-1, ::-1]
         values, vectors = np.linalg.eigh(factor @ factor.T)
         assert values[0] < 0.3
         aside, curvature = 0.25 * vectors[:, 0], []
+        centre = found.solved(found.shift)[0][::-1]
+        y = np.concatenate([np.repeat(w, 3, axis=0), centre + np.outer([-1, 0, 1], aside)], axis=1)
         with jax.enable_x64(True):
-            for route, step in ((path, factor.T @ aside), (path.straight(), aside)):
-                moved = w.copy()
-                moved[:, count:] = np.outer([-1, 0, 1], step)
-                curvature.append(-(np.array([1, -2, 1]) @ Target(fitted, route)(moved)) / (step @ step))
+            inside = plain.to_w(plain.from_whitened(y))
+            step = np.diff(inside, axis=0)[0]
+            value = Target(fitted, plain)(inside)
+        curvature = -(np.array([1, -2, 1]) @ value)
         # Of the linearised campaign; the true one is bent.
-        assert 0.5 < curvature[0] < 2, (which, curvature)
-        assert curvature[1] < 0.5, (which, curvature)
-
-
-def test_the_table_keeps_the_curvature_far_from_the_mode():
-    """The same, coordinate by coordinate."""
-    fitted, path = small_fit()[0], small_path(False)
-    node = len(STRETCH_NODES) - 2
-    which, place = np.unravel_index(np.argmax(path.stretch[:, node]), path.stretch[:, node].shape)
-    step = 0.5 * np.eye(path.dimension)[place]
-    w = np.stack([-step, np.zeros(path.dimension), step])
-    w[:, path.noise[which]] = STRETCH_NODES[node]
-    with jax.enable_x64(True):
-        curvature = [-(np.array([1, -2, 1]) @ Target(fitted, p)(w)) / 0.5**2 for p in (path, path.straight())]
-    # The information at the node comes from one-sided steps as long: halves of their error are left.
-    assert curvature[0] == pytest.approx(1.0, abs=0.3) and curvature[1] < 0.5, curvature
+        assert 0.5 < curvature / (step @ step) < 2, (which, curvature)
+        assert curvature / (aside @ aside) < 0.5, (which, curvature)
 
 
 def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
-    dimension, count = 3, BATCH + 5
-    path = replace(small_fit()[1].straight(), mode=np.zeros(4), free=np.array([0, 1, 3]), root=np.eye(3))
-    path = replace(path, noise=np.zeros(0, int), stretch=np.zeros((0, len(STRETCH_NODES), 3)))
+    dimension, count = 2, BATCH + 5
+    path = route()
     w = np.random.default_rng(11).normal(size=(count, dimension))
     without = np.array([0, 7, count - 1])
-    w[without, 2] = 100.0
+    w[without, 1] = 1000.0
 
     def evaluate(z, normal, space, arrays):
-        value = jnp.where(z[:, 3] > 50, jnp.nan, 5.0 - z[:, 0])
+        value = jnp.where(z[:, RATIO] > 50, jnp.nan, 5.0 - z[:, BACKLASH])
         return SimpleNamespace(log_density=value, place_errors_rad=normal)
 
     monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
-    monkeypatch.setattr("tvsbayes.posterior.ridges.evaluate", evaluate)
     target = Target(SimpleNamespace(space=None, arrays=no_places(), log_density=2.0), path)
     value = target(w)
-    expected = (5.0 - w[:, 0]) - 2.0
+    expected = (5.0 - w[:, 0]) - 2.0 + path.mapped(w).log_jacobian
     expected[without] = -np.inf
     np.testing.assert_array_equal(value, expected)
     assert target.invalid == len(without), "the filling of the last batch is no evaluation"
@@ -198,9 +210,9 @@ def test_a_ratio_follows_the_degrees_of_a_backlash():
     at = 0.4
     mode = np.zeros(len(NAMES))
     mode[BACKLASH] = at
-    ridge = replace(route(), mode=mode, root=np.array([[1.2, 0.0], [-0.6, 0.05]]))
+    path = replace(route(), mode=mode, root=np.array([[1.2, 0.0], [-0.6, 0.05]]))
     y = np.column_stack([np.linspace(-3.0, 3.0, 13), np.zeros(13)])
-    z = ridge.from_whitened(y)
+    z = path.from_whitened(y)
 
     def play(z):
         return stats.halfnorm.ppf(stats.norm.cdf(z))
@@ -209,11 +221,5 @@ def test_a_ratio_follows_the_degrees_of_a_backlash():
     slope = (play(at + 1e-5) - play(at - 1e-5)) / 2e-5
     # A central difference of 1e-5 is good to 1e-10 of the slope, SciPy's two laws to 1e-12.
     np.testing.assert_allclose(z[:, RATIO], -0.5 * (play(z[:, BACKLASH]) - play(at)) / slope, atol=1e-8)
-    apart = ridge.from_whitened(y + np.array([0.0, 1.0])) - z
+    apart = path.from_whitened(y + np.array([0.0, 1.0])) - z
     np.testing.assert_allclose(apart[:, RATIO], 0.05, rtol=1e-9)
-
-
-def test_no_coordinates_have_an_order():
-    """Where only the noise is estimated, nothing is left to whiten."""
-    order = by_width(np.zeros((0, 0)))
-    assert order.shape == (0,) and np.zeros(3)[order].shape == (0,)

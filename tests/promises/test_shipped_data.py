@@ -9,7 +9,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from experiments.inputs import make_twins
+from experiments.inputs import make_schemas, make_twins
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import classic, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
@@ -217,6 +217,12 @@ def test_make_twins_writes_what_is_shipped():
             # Solved parameters are rounded to seven digits; pixels follow to rounding times 10^6.
             assert one.u_left_px == pytest.approx(other.u_left_px, abs=1e-6)
             assert one.v_right_px == pytest.approx(other.v_right_px, abs=1e-6)
+
+
+def test_schemas_are_those_of_the_records():
+    """Whoever changes a record runs `python -m experiments.inputs.make_schemas`."""
+    shipped = {path.name: path.read_text(encoding="utf-8") for path in (DATA / "schemas").iterdir()}
+    assert shipped == make_schemas.files()
 
 
 def test_truth_file_that_is_none(tmp_path):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
-from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.looks import aperture_angle
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.parameters import HARMONIC_NAMES, RIG_NAMES, Prior
@@ -204,7 +203,7 @@ def test_headlines(truths, values, poses_rad):
         assert abs(offset_mm[rig] - effective_mirror_offset_mm(truth.parameters, pose_deg)) < LENGTH_MM
 
 
-def test_errors_that_repeat_drift_and_scatter(mounted_rig):
+def test_errors_that_repeat_drift_and_scatter(mounted_rig, evaluate):
     """Chi-square of six campaigns at their truths: repeated errors, drifting zeros, scattered looks as the twin's.
 
     The estimators integrate them out; without their scales the same campaigns stand off by far more than chance.
@@ -227,8 +226,7 @@ def test_errors_that_repeat_drift_and_scatter(mounted_rig):
         with jax.enable_x64(True):
             space, arrays = parameter_space(table, rig.stereo), campaign_arrays(run.campaign)
             true = np.array([*(run.truth.parameters[name] for name in RIG_NAMES), *run.truth.stereo.vector])
-            z = coordinates_of(space, true)[None]
-            found = jax.tree.map(np.asarray, evaluate(z, no_draw(1, arrays), space, arrays))
+            found = evaluate(coordinates_of(space, true), space, arrays).innovations
         squares.append(np.sum(found.standardised**2) + np.sum(found.places**2))
         # Four pixels of a spot less its range.
         count += 3 * sum(spot.status == "ok" for spot in run.campaign.spots)

@@ -13,7 +13,8 @@ from tvsbayes.report.evidence import Criterion
 from tvsbayes.report.first_page import verdict_of
 from tvsbayes.report.fit_text import classic_text, demo_text, fit_text
 from tvsbayes.report.result_tables import KEY_PARAMETERS
-from tvsbayes.results.estimates import Validation, ValidationTest
+from tvsbayes.results.convergence import Importance, MonteCarloError, NamedValue, Sampling
+from tvsbayes.results.estimates import FitSummary, Validation, ValidationTest
 
 
 def test_a_fit_astray_shows_no_results():
@@ -65,6 +66,79 @@ def test_a_fit_ends_with_its_table_and_its_verdict():
     assert "--details and the report say more: 1 weak direction, 1 stop on which a result hangs" in lines[:blank]
     assert not [line for line in lines if line.startswith(("weak", "hangs"))]
     assert max(map(len, lines[blank:])) <= 80
+
+
+def sampled(answer: str, missing: tuple[str, ...], steps: int | None = None) -> FitSummary:
+    """The small summary with a diagnosis of its draws."""
+    least = NamedValue("effective left", 310.0)
+    importance = Importance(
+        not missing, missing, 64, 65536, 0.01, least, 0.8, NamedValue("backlash", 0.9), 0.08, -7.0, 0.1, 0, answer
+    )
+    diagnosis = Sampling(
+        converged=answer != "laplace",
+        missing=missing,
+        walkers=None if steps is None else 64,
+        steps=steps,
+        discarded=None if steps is None else steps // 10,
+        thin=None if steps is None else 1,
+        tau_steps=None,
+        worst_rhat=None if steps is None else NamedValue("effective left", 1.03),
+        least_ess_bulk=least,
+        least_ess_tail=least,
+        acceptance=None,
+        least_acceptance=None,
+        stuck_walkers=(),
+        invalid_evaluations=0,
+        proposal_pareto_k=0.8,
+        importance=importance,
+    )
+    errors = {"effective left": MonteCarloError(0.17, (0.31, 0.28)), "backlash": MonteCarloError(0.05, (0.1, 0.1))}
+    return structs.replace(
+        small_summary(),
+        estimator="laplace" if answer == "laplace" else "posterior",
+        tier=None if answer == "laplace" else "importance" if steps is None else "emcee",
+        converged=answer != "laplace",
+        answer=answer,
+        monte_carlo_error=errors,
+        sampling=diagnosis,
+        problems=missing,
+    )
+
+
+@pytest.mark.parametrize(("steps", "helps"), [(None, "fit without --quick"), (900, "--resume and more --max-minutes")])
+def test_a_rough_answer_says_how_rough_and_what_helps(steps, helps):
+    """The table stays; what is missing, the worst Monte Carlo error and the way to more stand before it."""
+    text = fit_text(sampled("rough", ("known to 0.17 sd, wanted 0.1",), steps))
+    lines = text.splitlines()
+    assert "rough: known to 0.17 sd, wanted 0.1" in lines
+    worst = "0.17 sd of the mean, 0.31 and 0.28 sd of the interval's ends (effective left)"
+    assert f"Monte Carlo error, largest: {worst}" in lines
+    assert any(line.startswith("what helps: ") and line.endswith(helps) for line in lines)
+    assert "0.06210(10)" in text and lines[-1] == "verdict: usable, but rough: see the Monte Carlo error"
+    assert "NOT" not in text
+
+
+@pytest.mark.parametrize("steps", [None, 900])
+def test_where_nothing_could_be_sampled_the_laplace_table_is_given_with_its_warning(steps):
+    summary = sampled("laplace", ("Pareto k 0.80, wanted below 0.70",), steps)
+    assert summary.explained
+    lines = fit_text(summary).splitlines()
+    assert "not sampled: Pareto k 0.80, wanted below 0.70" in lines
+    assert not [line for line in lines if line.startswith("Monte Carlo error")]
+    assert any("0.06210(10)" in line for line in lines)
+    assert lines[-1].startswith("verdict: usable with care: the posterior could not be sampled; the table is the Lap")
+    assert "too short" in lines[-1]
+
+
+def test_an_accepted_answer_needs_no_word():
+    text = fit_text(sampled("accepted", ()))
+    assert "rough" not in text and "what helps" not in text and "Monte Carlo" not in text
+
+
+def test_a_chain_without_headlines_has_no_largest_error():
+    """A rig whose geometry is stated as known: what may be rough are its scales alone."""
+    summary = structs.replace(sampled("rough", ("short",), 900), monte_carlo_error={})
+    assert "rough: short" in fit_text(summary) and "Monte Carlo error, largest" not in fit_text(summary)
 
 
 def direction(mean: float, u: float | None) -> DirectionResult:

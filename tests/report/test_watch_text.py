@@ -15,15 +15,15 @@ from tvsbayes.results.watch_record import MOVED, MovedPart, Watch
 def test_sizes_beyond_the_linear_are_called_rough(value, unit, rough):
     """Their u is that of the linear law: of a positioner that fell over it would be believed."""
     moved = (MovedPart("positioner: shift along y", value, 0.1, unit),)
-    text = watch_text(Watch(MOVED, 0.0, 0.01, 0.5, moved, (), 16, True), 0.8)
+    text = watch_text(Watch(MOVED, 0.0, 0.01, moved, 16, 0.5, (), True), 0.8)
     assert f"moved: {moved[0].what}" in text and ("are rough" in text) == rough
 
 
 def test_what_follows_the_best_explanation_is_not_called_a_motion_of_its_own():
     """Of cameras that moved far the linear law leaves something that the positioner explains."""
     parts = tuple(MovedPart(f"{what}: shift along y", 3.0, 0.1, "mm") for what in ("cameras", "positioner"))
-    text = watch_text(Watch(MOVED, 0.0, 0.01, 0.5, parts, (), 16, True), 0.8)
+    text = watch_text(Watch(MOVED, 0.0, 0.01, parts, 16, 0.5, (), True), 0.8)
     assert "what to do: calibrate the cameras anew" in text and "fasten it" not in text
     assert "what is told of positioner takes what the first leaves" in text
-    alone = watch_text(Watch(MOVED, 0.0, 0.01, 0.5, parts[1:], (), 16, True), 0.8)
+    alone = watch_text(Watch(MOVED, 0.0, 0.01, parts[1:], 16, 0.5, (), True), 0.8)
     assert "fasten it" in alone and "takes what" not in alone

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,14 @@ from support.fit_documents import OLD, changed, kept, problems, schema_of
 from support.small_results import small_record, whole_summary
 
 from tvsbayes.errors import InputError
-from tvsbayes.results.convergence import Agreement, Convergence, Importance, NamedValue, Reweighted
+from tvsbayes.results.convergence import (
+    Agreement,
+    Convergence,
+    Importance,
+    MonteCarloError,
+    NamedValue,
+    Reweighted,
+)
 from tvsbayes.results.fit_record import FIT_FORMAT, FIT_FORMATS, read_fit
 from tvsbayes.results.records import plain
 
@@ -34,10 +42,8 @@ def test_every_readable_version_has_a_schema_and_kept_documents():
 def test_old_documents_stay_valid_and_readable(path):
     document = json.loads(path.read_text())
     assert problems(document, schema_of(document)) == []
-    # Keys that came within the version, as they are where nothing is said.
-    if document["sampling"] is not None:
-        document["sampling"] |= {"importance": None, "agreement": None}
-    later = {"local_deg_per_step": {}, "range_steps": {}, "homing_side": {}}
+    # Keys that came within the version, as they are where nothing is said; those of a diagnosis stay away.
+    later = {"local_deg_per_step": {}, "range_steps": {}, "homing_side": {}, "answer": None, "monte_carlo_error": {}}
     assert read_fit(path).as_json() == {"validation": None, "few_stops": {}, "tier": None, **later, **document}
 
 
@@ -53,22 +59,53 @@ def test_a_new_document_obeys_the_schema(tmp_path):
 def test_both_tiers_obey_the_schema(tmp_path):
     """Weighted draws have no walkers and no R-hat; a chain says whether it agrees with them."""
     worst = NamedValue("backlash_deg.tilt", 0.41)
-    importance = Importance(True, (), 4, 4096, 0.7, worst, 0.33, worst, 0.003, -1189.2, 0.01, 0)
+    importance = Importance(True, (), 4, 4096, 0.7, worst, 0.33, worst, 0.003, -1189.2, 0.01, 0, "accepted")
     effective = {"backlash_deg.tilt": 2100.0}
-    weighted = Reweighted(importance, effective, effective)
+    errors = {"backlash_deg.tilt": MonteCarloError(0.02, (0.05, 0.11))}
+    weighted = Reweighted(importance, effective, effective, errors)
     chain = Convergence(
         *(200, 20, 2, 3.1, {"backlash_deg.tilt": 1.002}, effective, effective, np.array([0.5, 0.6]), (), 0, ()),
         importance=importance,
         agreement=Agreement(True, 4.0, worst),
+        monte_carlo_error=errors,
+        rough=True,
     )
+    assert weighted.answer == chain.answer == "accepted"
     for tier, found in (("importance", weighted), ("emcee", chain)):
-        summary = structs.replace(whole_summary(), estimator="posterior", tier=tier, sampling=found.sampling)
+        answer = {"answer": found.answer, "monte_carlo_error": found.monte_carlo_error}
+        summary = structs.replace(whole_summary(), estimator="posterior", tier=tier, sampling=found.sampling, **answer)
         (tmp_path / "fit.json").write_text(json.dumps(small_record(summary, seed=3).as_json()))
         document = json.loads((tmp_path / "fit.json").read_text())
         assert problems(document, schema_of(document)) == []
         assert read_fit(tmp_path / "fit.json").summary == summary
         assert document["sampling"]["importance"]["log_evidence"] == -1189.2
+        assert (document["answer"], document["sampling"]["importance"]["answer"]) == ("accepted", "accepted")
+        error = {"mean": 0.02, "interval95": [0.05, 0.11]}
+        assert document["monte_carlo_error"] == {"backlash_deg.tilt": error}
+        for path, value in (
+            ("answer", "good"),
+            ("monte_carlo_error/backlash_deg.tilt/mean", -0.1),
+            ("monte_carlo_error/backlash_deg.tilt/interval95", [0.1]),
+        ):
+            assert problems(changed(document, path, value), schema_of(document)), path
     assert weighted.sampling.worst_rhat is None and weighted.rhat == {}
+
+
+def test_what_a_chain_lacks_leaves_a_rough_answer_or_none():
+    """A chain has an answer while what it lacks is no more than a rough one may lack."""
+    worst = NamedValue("backlash_deg.tilt", 0.41)
+    importance = Importance(False, ("few",), 4, 4096, 0.7, worst, 0.33, worst, 0.003, -1189.2, 0.01, 0, "rough")
+    effective = {"backlash_deg.tilt": 210.0}
+    found = {}
+    for rough in (True, False):
+        chain = Convergence(
+            *(200, 20, 2, 3.1, {"backlash_deg.tilt": 1.02}, effective, effective, np.array([0.5]), (), 0, ("short",)),
+            *(importance, None, {}, rough),
+        )
+        found[rough] = chain.answer, chain.converged
+    assert found == {True: ("rough", True), False: ("laplace", False)}
+    # Documents of 0.2.0 do not say: their weights were accepted or not.
+    assert Reweighted(replace(importance, answer=None), effective, effective, {}).answer == "laplace"
 
 
 def test_what_reports_show_besides_obeys_the_schema():
@@ -159,7 +196,7 @@ def test_a_schema_has_only_rules_that_are_checked(version):
     """A keyword that JSON Schema does not know would be passed over in silence."""
     schema = schema_of({"format": version})
     Draft202012Validator.check_schema(schema)
-    known = {*Draft202012Validator.VALIDATORS, "$schema", "$id", "$defs", "title", "description"}
+    known = {*Draft202012Validator.VALIDATORS, "$schema", "$id", "$defs", "title", "description", "default"}
 
     def unknown(rules: object) -> set[str]:
         if not isinstance(rules, dict):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.documents import Keys
-from tvsbayes.results.records import Record, plain, read_record
+from tvsbayes.results.records import Record, plain, read_record, schema_of
 
 
 class Inner(Record, frozen=True):
@@ -73,3 +75,29 @@ def test_a_missing_key_is_named():
     with pytest.raises(InputError) as caught:
         read(values)
     assert caught.value.column == "count"
+
+
+class Kept(Record, frozen=True, rename={"short": "a_long_key"}):
+    """What a schema is made of.
+
+    Attributes:
+        short: a length, mm;
+            None where nobody knows.
+        known, hidden: two more.
+    """
+
+    short: float | None
+    known: str = ""
+    hidden: int = 0
+    always: ClassVar = ("known",)
+    beside: ClassVar = ("hidden",)
+
+
+def test_a_declaration_is_the_document_and_its_schema():
+    assert Kept(1.5).as_json() == {"a_long_key": 1.5, "known": ""}
+    schema = schema_of(Kept, closed=True, format={"const": "kept/1"}, inner=Inner)
+    assert set(schema["properties"]) == {"a_long_key", "known", "format", "inner"}
+    assert set(schema["required"]) == {"a_long_key", "known", "format", "inner"}
+    assert schema["properties"]["a_long_key"]["description"] == "a length, mm; null where nobody knows."
+    assert not schema["additionalProperties"] and not schema["$defs"]["Inner"]["additionalProperties"]
+    assert schema["$defs"]["Inner"]["description"] == "A number, whole or not, and a switch."

@@ -77,4 +77,4 @@ def test_a_damaged_seed_is_refused(kept, seed):
             results_for(read_axis(folder))
     finally:
         file.write_bytes(whole)
-    assert (caught.value.code, caught.value.column) == ("damaged", "seed") and caught.value.remedy
+    assert (caught.value.code, caught.value.column) == ("schema", "seed") and caught.value.remedy

@@ -51,22 +51,45 @@ class Browsed:
     def js(self, code: str, *given):
         return self.driver.execute_script(code, *given)
 
-    def traces(self, plot: str, name: str) -> list[dict]:
-        """Of a plot, those of one name: how many numbers each has, and whether it is seen."""
+    def layers(self, plot: str, name: str) -> list[int]:
+        """Of a plot, the layers whose name begins so that are seen: how many points each has."""
         code = (
-            "return document.getElementById(arguments[0]).data.filter((t) => t.name === arguments[1])"
-            ".map((t) => ({count: t.x.length, visible: t.visible ?? true, first: Array.from(t.x).slice(0, 9)}))"
+            "return [...document.querySelectorAll(`#${arguments[0]} path[data-name^='${arguments[1]}']`)]"
+            ".map((path) => Number(path.dataset.count))"
         )
         return self.js(code, plot, name)
 
     def marks(self, plot: str) -> list[int]:
         """Of a plane plot, marks on what is selected: left and right."""
-        shapes = self.js("return document.getElementById(arguments[0]).layout.shapes ?? []", plot)
-        marks = {shape["xref"]: shape["path"].count("Z") for shape in shapes if shape["name"] == "chosen"}
-        return [marks.get(axis, 0) for axis in ("x", "x2")]
+        code = (
+            "return [...document.querySelectorAll(`#${arguments[0]} path[data-name=chosen]`)]"
+            ".map((path) => Number(path.dataset.count))"
+        )
+        return self.js(code, plot)
 
     def chosen(self) -> int:
         return int(self.js("return document.body.dataset.chosen"))
+
+    @contextmanager
+    def shown(self, width: int, scheme: str) -> Iterator[None]:
+        """On a screen so wide, "light" or "dark"."""
+        metrics = {"width": width, "height": 1200, "deviceScaleFactor": 1, "mobile": False}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+        asked = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", asked)
+        try:
+            yield
+        finally:
+            self.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+            self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+    def brightness(self, place: str) -> list[float]:
+        """Of text and ground of the first element of a kind: sums of red, green and blue."""
+        code = (
+            "return arguments[0].map((name) => getComputedStyle(document.querySelector(arguments[1]))[name]"
+            ".match(/\\d+/g).slice(0, 3).reduce((sum, part) => sum + Number(part), 0))"
+        )
+        return self.js(code, ["color", "backgroundColor"], place)
 
     def complaints(self) -> list[str]:
         return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]

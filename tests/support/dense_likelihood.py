@@ -10,8 +10,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
+from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
 from tvsbayes.twin.physics import play
@@ -56,6 +59,19 @@ def stop_labels(moves: Sequence[Move], axis: str) -> list[tuple[int, tuple[str, 
             directions = (positive,) if steps > getattr(moves[k - 1], f"{axis}_steps") else (negative,)
         labels.append((number, directions))
     return labels
+
+
+def drawn_at_every_move(campaign: Campaign, arrays: CampaignArrays) -> CampaignArrays:
+    """A campaign whose stop errors both axes draw anew at every move, from where each of them came last."""
+    spots = ordered_spots(campaign)
+    redraw, mix = np.array(arrays.spots.redraw), np.array(arrays.spots.redraw_mix)
+    for axis, (name, (positive, negative)) in enumerate(SENSES.items()):
+        labels = stop_labels(campaign.moves, name)
+        for i, spot in enumerate(spots):
+            redraw[i, axis] = i == 0 or spot.move != spots[i - 1].move
+            directions = labels[spot.move][1]
+            mix[i, axis] = np.array([negative in directions, positive in directions]) / len(directions)
+    return eqx.tree_at(lambda a: (a.spots.redraw, a.spots.redraw_mix), arrays, (jnp.asarray(redraw), jnp.asarray(mix)))
 
 
 def play_band_deg(moves: Sequence[Move], axis: str, values: dict[str, float]) -> np.ndarray:

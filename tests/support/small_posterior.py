@@ -7,7 +7,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pytest
 from support.varying_gears import perfect_rig
 
 from tvsbayes.estimators.joint_fit import JointFit, fit
@@ -24,26 +23,9 @@ ROUNDING = 2.0**-52
 
 @cache
 def small_fit() -> tuple[JointFit, Transport]:
-    """64 spots seen by cameras that are known exactly: 29 free parameters; shared with test_posterior.
-
-    With the 21 of the cameras the pairs of second differences would be three times as many.
-    """
+    """64 spots seen by cameras that are known exactly, gears without errors: 31 free parameters."""
     rig = perfect_rig(read_rig(Path(__file__).resolve().parents[2] / "data" / "rigs" / "mounted" / "rig.toml"))
     rig = replace(rig, stereo=replace(rig.stereo, parameter_covariance=np.zeros((24, 24))))
     fitted = fit(simulate(rig, four_point_protocol(repeats=4, steps=(100, 200)), seed=21).campaign)
     assert fitted.converged, fitted.problems
     return fitted, transport(fitted)
-
-
-@cache
-def small_table() -> Transport:
-    """The map of the same fit as with too many stops to follow each."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tvsbayes.posterior.ridges.STATES_MAX", 0)
-        return transport(small_fit()[0])
-
-
-def small_path(whole: bool) -> Transport:
-    path = small_fit()[1] if whole else small_table()
-    assert (len(path.states) > 0) == whole == (not path.stretch.any())
-    return path

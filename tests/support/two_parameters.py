@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,35 +10,95 @@ from support.partial_arrays import no_gears, partial_arrays
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.instrument.parameters import INDEX, NAMES, PERIODS_MAX
-from tvsbayes.posterior.transport import GEAR_SCALES, STRETCH_NODES, Transport
+from tvsbayes.posterior.stop_states import StopStates
+from tvsbayes.posterior.transport import GEAR_SCALES, LinearCampaign, Transport, bends
 
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
 STRETCH = 0.3
-"""Log of the factor on the second coordinate per unit of the first, which counts from -2 on."""
+"""Log of the factor on the second coordinate per unit of the first."""
 AT_MODE = 7.0
+ROWS = 4
+"""Components of the one spot: the first alone sees anything."""
+
+
+def no_states() -> StopStates:
+    """Of axes that stop exactly."""
+    return StopStates(np.zeros((ROWS, 0)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 2)))
+
+
+def linear_campaign(along: np.ndarray, prior: np.ndarray, noise: int) -> LinearCampaign:
+    """Of one spot at its predicted place, whose first component sees coordinates y by `along` (g,)."""
+    seen = np.zeros((ROWS, len(along)))
+    seen[0] = along
+    nothing = np.zeros(0)
+    return LinearCampaign(np.zeros(ROWS), seen, no_states(), np.zeros((0, noise)), nothing, np.zeros((ROWS, 0)), prior)
 
 
 def route() -> Transport:
-    """The map z_1 = w_1, z_2 = w_2 exp(0.3 max(w_1, -2)) at two of the parameters."""
-    empty = {"variance": (0, 1), "constant": (0,), "load": (1, 0), "states": (0, 0), "state_score": (0,)}
-    empty |= {"place_angle_rad": (0,), "place_on_tilt": (0,), "place_valid": (0,), "period_deg": (2, PERIODS_MAX)}
-    empty |= {"gear_scale": (len(GEAR_SCALES),), "gear_noise": (len(GEAR_SCALES), 1)}
+    """The map z_1 = w_1, z_2 = w_2 exp(0.3 w_1) at two of the parameters.
+
+    The first scales the noise of the one datum that knows the second, which has no prior.
+    """
     return Transport(
         mode=np.zeros(len(NAMES)),
         free=np.array([BACKLASH, RATIO]),
         root=np.eye(2),
-        noise=np.array([0]),
-        narrow=np.zeros(0, int),
-        bend=np.zeros((0, 2, 2)),
-        slope=np.zeros((1, 1)),
+        noise=1,
+        narrow=0,
+        slope=np.array([[STRETCH]]),
         half=np.zeros(1, bool),
-        pixels=np.zeros(1),
-        prior=np.zeros((1, 1)),
-        known=np.ones((1, 1)),
-        score=np.zeros(1),
-        stretch=STRETCH * np.array([[[0.0, node] for node in STRETCH_NODES]]),
-        **{name: np.zeros(shape) for name, shape in empty.items()},
+        pixels=np.ones(1),
+        linear=linear_campaign(np.ones(1), np.zeros((1, 1)), 1),
+        residuals=lambda z: np.zeros((len(z), ROWS)),
+        bend=np.zeros((1, 0, 0)),
+        place_angle_rad=np.zeros(0),
+        place_on_tilt=np.zeros(0, bool),
+        walk=np.zeros((0, 2)),
+        drift_scale=np.zeros(2),
+        drift_noise=np.zeros((2, 1)),
+        gear_scale=np.zeros(len(GEAR_SCALES)),
+        gear_noise=np.zeros((len(GEAR_SCALES), 1)),
+        period_deg=np.zeros((2, PERIODS_MAX)),
     )
+
+
+NARROW_SD, CURVE, TURN = 0.02, 0.4, 0.15
+"""Of the ridge below: its width, how it bends, how its slope along the second coordinate changes with the first."""
+WIDE = INDEX["tilt_zero_deg"]
+
+
+def ridge_residual(z: np.ndarray) -> np.ndarray:
+    """Of one datum, in units of its noise: z_2 (1 + 0.15 z_1) = 0.4 z_1^2 +- 0.02; shape (n, 4)."""
+    wide, narrow = z[:, WIDE], z[:, RATIO]
+    found = np.zeros((len(z), ROWS))
+    found[:, 0] = -(narrow * (1 + TURN * wide) - CURVE * wide**2) / NARROW_SD
+    return found
+
+
+def ridge_density(z: np.ndarray) -> np.ndarray:
+    """Log posterior density, standard normal priors; 0 at the mode, the origin."""
+    return -0.5 * (np.sum(ridge_residual(z) ** 2, axis=1) + z[:, WIDE] ** 2 + z[:, RATIO] ** 2)
+
+
+def ridge() -> Transport:
+    """The map of a wide coordinate and a narrow one that follows it along a parabola; no noise scale."""
+    sd = 1 / np.hypot(1 / NARROW_SD, 1.0)
+    straight = replace(
+        route(),
+        free=np.array([WIDE, RATIO]),
+        root=np.diag([1.0, sd]),
+        noise=0,
+        narrow=1,
+        slope=np.zeros((0, 0)),
+        half=np.zeros(0, bool),
+        pixels=np.zeros(0),
+        linear=linear_campaign(np.array([0.0, sd / NARROW_SD]), np.diag([1.0, sd**2]), 0),
+        residuals=ridge_residual,
+        bend=np.zeros((2, 1, 1)),
+        drift_noise=np.zeros((2, 0)),
+        gear_noise=np.zeros((len(GEAR_SCALES), 0)),
+    )
+    return replace(straight, bend=bends(straight))
 
 
 def fit() -> SimpleNamespace:

@@ -12,8 +12,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-pytest.importorskip("tornado", reason="the extra view is not installed")
-pytest.importorskip("plotly", reason="the extra view is not installed")
+pytest.importorskip("tornado", reason="the extra live is not installed")
 pytest.importorskip("selenium", reason="selenium is not installed")
 from support.bench_runs import Run
 from support.browsers import CHROMIUM, DRIVER, SECONDS_MAX, Browsed, browser, foreign_page
@@ -27,7 +26,7 @@ from tvsbayes.acquisition.running_estimate import Estimate, RunningEstimate
 from tvsbayes.errors import DeviceFault
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import frame_name, read_campaign
-from tvsbayes.view.contents import LIVE_FILES, Contents, page_files
+from tvsbayes.view import access
 from tvsbayes.view.live_server import LivePage
 
 pytestmark = [
@@ -118,7 +117,7 @@ def going(mounted_rig, tmp_path) -> Iterator[Going]:
             ended.append(error)
 
     thread = threading.Thread(target=work)
-    with estimate, LivePage(Contents(files=page_files(LIVE_FILES)), live, 0) as page:
+    with estimate, LivePage(live, 0) as page:
         thread.start()
         assert gate.there.wait(SECONDS_MAX)
         going = Going(run, live, gate, page.link, page, thread, ended)
@@ -162,8 +161,8 @@ def test_page_shows_the_run_and_asks_nobody_else(going, browsed):
     centre = browsed.js("return Number(document.querySelector('#right .whole .centre').getAttribute('cx'))")
     assert centre == pytest.approx(going.live.latest.look.pixels_px[2])
     told(browsed, "estimate-remark", "of 3 looks; wanted: u at most 0.00010 in left, right")
-    assert "Temperature 0." in text(browsed, "estimate-remark") and "u / target" in text(browsed, "estimates")
-    browsed.until("document.querySelectorAll('#history .main-svg').length > 0")
+    assert "Temperature 0." in text(browsed, "estimate-remark") and "times the target" in text(browsed, "estimates")
+    browsed.until("document.querySelectorAll('#history path[data-name=estimates]').length === 2")
     assert browsed.complaints() == [] and browsed.asked() == {urlsplit(going.link).netloc}
 
 
@@ -199,13 +198,13 @@ def test_every_button_is_acknowledged_by_the_device(going, browsed, tmp_path):
     assert browsed.complaints() == []
 
 
-def test_second_browser_only_watches_and_says_so(going, browsed):
+def test_second_browser_watches_and_may_make_the_run_safer(going, browsed):
     assert browsed.opened(going.link) == "running"
     browsed.driver.switch_to.new_window("tab")
     try:
         assert browsed.opened(going.link) == "running"
-        told(browsed, "rights", "only watches")
-        assert browsed.js(f"return {ENABLED}") == ""
+        told(browsed, "rights", "another browser controls")
+        assert browsed.js(f"return {ENABLED}") == "pause,laser-off"
         # Nor past its own buttons.
         code = (
             "const done = arguments[0]; fetch('/ask', {method: 'POST', body: '{\"what\": \"stop\"}', headers:"
@@ -221,6 +220,22 @@ def test_second_browser_only_watches_and_says_so(going, browsed):
     browsed.driver.refresh()
     browsed.until("document.body?.dataset.controls === 'true'")
     assert going.live.requests.told() == () and going.finish().ok == 8
+
+
+def test_control_comes_to_who_is_there_once_the_other_browser_is_gone(going, browsed, tmp_path_factory, monkeypatch):
+    """The red button stays within reach; the silence that is waited for is shortened."""
+    monkeypatch.setattr(access, "SILENT_S", 1.5)
+    with browser(tmp_path_factory.mktemp("saved")) as doomed:
+        assert doomed.opened(going.link) == "running"
+        assert browsed.opened(going.link) == "running"
+        told(browsed, "rights", "another browser controls")
+        os.kill(doomed.driver.capabilities["goog:processID"], signal.SIGKILL)
+    browsed.until("document.body?.dataset.controls === 'true'")
+    told(browsed, "requests", "control passed on")
+    assert "Closing this page changes nothing" in browsed.js("return document.querySelector('header').textContent")
+    assert going.finish().ok == 8
+    asked = [r.data["what"] for r in read_journal(going.run.engine.journal.folder).records if r.event == "asked"]
+    assert asked == ["control passed on"]
 
 
 def test_another_origin_asks_for_nothing(going, browsed):
@@ -307,21 +322,10 @@ def test_faults_are_shown_in_words_and_lose_nothing(going, browsed, tmp_path, fa
 @pytest.mark.parametrize("width", [390, 1280])
 def test_nothing_is_cut_off(going, browsed, scheme, width):
     """On a telephone and a screen, by day and by night: no sideways scrolling, and text that stands out."""
-    metrics = {"width": width, "height": 1200, "deviceScaleFactor": 1, "mobile": False}
-    browsed.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-    scheme_asked = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-    browsed.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", scheme_asked)
-    try:
+    with browsed.shown(width, scheme):
         assert browsed.opened(going.link) == "running"
-        browsed.until("document.querySelectorAll('#history .main-svg').length > 0")
+        browsed.until("document.querySelectorAll('#history path[data-name=estimates]').length === 2")
         assert browsed.js("return document.documentElement.scrollWidth") <= width
-        light = (
-            "return arguments[0].map((name) => getComputedStyle(document.querySelector(arguments[1]))[name]"
-            ".match(/\\d+/g).slice(0, 3).reduce((sum, part) => sum + Number(part), 0))"
-        )
         for place in ("figure", "button:not(:disabled)"):
-            ink, ground = browsed.js(light, ["color", "backgroundColor"], place)
+            ink, ground = browsed.brightness(place)
             assert (ground > 600 > ink + 150) if scheme == "light" else (ink > 350 > ground + 150)
-    finally:
-        browsed.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-        browsed.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})

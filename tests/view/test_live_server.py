@@ -1,17 +1,19 @@
-"""The page of a run over a real socket: one browser controls, others watch, strangers get nothing; the run goes on."""
+"""The page of a run over a real socket: one browser controls, others may make it safer, strangers get nothing."""
 
 from __future__ import annotations
 
 import http.client
 import json
+import socket
+import sys
 import threading
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-pytest.importorskip("tornado", reason="the extra view is not installed")
-pytest.importorskip("plotly", reason="the extra view is not installed")
+pytest.importorskip("tornado", reason="the extra live is not installed")
 
 from support.bench_runs import Failing, Run
 
@@ -20,11 +22,9 @@ from tvsbayes.acquisition.live_snapshot import SeenLook
 from tvsbayes.errors import InputError
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import frame_name, read_campaign
+from tvsbayes.view import access, live_server
 from tvsbayes.view.access import KEY_HEADER, SECURITY_HEADERS
-from tvsbayes.view.contents import LIVE_FILES, Contents, page_files
-from tvsbayes.view.live_server import LivePage
-
-FILES = Contents(files=page_files(LIVE_FILES))
+from tvsbayes.view.live_server import PAGE_FILES, LivePage, connections_max, page_files
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Asker:
             sent = None if body is None else body if isinstance(body, bytes) else json.dumps(body).encode()
             connection.request(method, path, sent, {k.replace("_", "-"): v for k, v in headers.items()})
             got = connection.getresponse()
-            if got.status != 413:
-                assert {name: got.headers[name] for name in SECURITY_HEADERS} == SECURITY_HEADERS
+            assert {name: got.headers[name] for name in SECURITY_HEADERS} == SECURITY_HEADERS
+            assert "Server" not in got.headers and "Set-Cookie" not in got.headers
             return got.status, got.read()
         finally:
             connection.close()
@@ -70,20 +70,34 @@ def live():
 
 @pytest.fixture
 def asker(live):
-    with LivePage(FILES, live, 0) as page:
+    with LivePage(live, 0) as page:
         address, _, token = page.link.partition("/#")
         yield Asker(int(address.rpartition(":")[2]), token)
 
 
-def test_first_browser_controls_and_others_watch(asker, live):
+def test_first_browser_controls_and_others_make_it_safer(asker, live):
     first, second = asker.key(), asker.key()
-    assert first != second and asker.key() == second
     assert asker.now(first)["controls"] is True and asker.now(second)["controls"] is False
-    status, content = asker.answer("/ask", "POST", {"what": "stop"}, **second)
-    assert status == 403 and b"this browser only watches" in content and live.requests.told() == ()
+    for what in ("stop", "resume"):
+        status, content = asker.answer("/ask", "POST", {"what": what}, **second)
+        assert status == 403 and b"this browser only watches" in content and live.requests.told() == ()
+    for what in ("pause", "laser off"):
+        assert asker.answer("/ask", "POST", {"what": what}, **second)[0] == 202
     assert asker.answer("/ask", "POST", {"what": "stop"}, **first)[0] == 202
     for key in (first, second):
-        assert [(r["what"], r["state"]) for r in asker.now(key)["requests"]] == [("stop", "requested")]
+        assert [one["what"] for one in asker.now(key)["requests"]] == ["pause", "laser off", "stop"]
+
+
+def test_control_passes_on_and_is_written_down(asker, live, monkeypatch):
+    first, second = asker.key(), asker.key()
+    assert asker.now(first)["controls"] and live.requests.told() == ()
+    # From now on everybody who does not ask this very moment is silent.
+    monkeypatch.setattr(access, "SILENT_S", -1.0)
+    assert asker.now(second)["controls"] is True
+    monkeypatch.undo()
+    assert asker.now(first)["controls"] is False
+    assert [request.what for request in live.requests.told()] == ["control passed on"]
+    assert asker.answer("/ask", "POST", {"what": "stop"}, **second)[0] == 202
 
 
 def test_nobody_without_a_key_sees_or_asks_anything(asker, live):
@@ -106,7 +120,13 @@ def test_another_page_with_the_key_asks_for_nothing(asker, live, headers):
     assert live.requests.told() == ()
 
 
-@pytest.mark.parametrize("body", [b"", b"{}", b"[]", b"\xff", b'{"what": 1}', b'{"what": "laser on"}', b'{"what": []}'])
+@pytest.mark.parametrize(
+    "body",
+    [
+        *(b"", b"{}", b"[]", b"\xff", b"[" * 4000, b'{"what": 1}', b'{"what": []}', b'{"what": "laser on"}'),
+        b'{"what": "control passed on"}',
+    ],
+)
 def test_what_cannot_be_asked_for_is_refused(asker, live, body):
     assert asker.answer("/ask", "POST", body, **asker.key())[0] == 400
     assert live.requests.told() == ()
@@ -121,7 +141,10 @@ def test_requests_are_posted_only(asker, live):
 
 @pytest.mark.parametrize(
     "path",
-    ["/live/3/left/../right", "/live/3/left/raw", "/live/3/middle/whole", "/live/../etc/passwd", "/scene", "/page.js"],
+    [
+        *("/live/3/left/../right", "/live/3/left/raw", "/live/3/middle/whole", "/live/../etc/passwd", "/scene"),
+        *("/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/live/3/left/whole%00", "/live.html"),
+    ],
 )
 def test_no_path_leads_out_of_the_list(asker, path):
     key = asker.key()
@@ -138,20 +161,85 @@ def test_nothing_is_taken_once_the_run_has_ended(asker, live):
 
 
 def test_files_of_the_page(asker):
-    for path in (*LIVE_FILES, "/plotly.js"):
-        assert asker.answer(path)[0] == 200
+    for path, (content, _) in page_files().items():
+        assert asker.answer(path) == (200, content)
+    assert set(page_files()) == set(PAGE_FILES)
+
+
+@pytest.mark.parametrize("body", [b'{"token": "wrong"}', b'{"token": 1}', b"{}", b"[]", b"\xff", b"", b"[" * 4000])
+def test_wrong_token_gets_no_key(asker, body):
+    status, content = asker.answer("/key", "POST", body)
+    assert status == 403 and b"the link is wrong" in content
+
+
+def test_preflight_of_another_origin_is_refused(asker):
+    asked = {"Origin": "http://evil.example", "Access_Control_Request_Headers": KEY_HEADER}
+    assert asker.answer("/live", "OPTIONS", **asked)[0] == 403
+
+
+def test_large_request_is_cut_off(asker):
+    connection = http.client.HTTPConnection("127.0.0.1", asker.port, timeout=20)
+    try:
+        connection.request("POST", "/key", b"x" * 1_000_000)
+        status = connection.getresponse().status
+    except (ConnectionError, http.client.RemoteDisconnected):
+        return
+    finally:
+        connection.close()
+    assert status in (400, 413)
+
+
+def test_it_listens_on_this_machine_alone(asker):
+    with pytest.raises(OSError):
+        socket.create_connection(("127.0.0.2", asker.port), timeout=5)
+
+
+def test_idle_connections_neither_pile_up_nor_keep_a_browser_out(asker):
+    """Each new one closes the oldest: of twice as many as allowed the first half is closed, and the page answers."""
+    key, most = asker.key(), connections_max()
+    with ExitStack() as stack:
+        idle = []
+        for _ in range(2 * most):
+            idle.append(stack.enter_context(socket.create_connection(("127.0.0.1", asker.port), timeout=20)))
+        assert asker.now(key)["controls"]
+        assert [one.recv(1) for one in idle[:most]] == [b""] * most
+
+
+def test_connection_without_a_request_is_closed(live, monkeypatch):
+    monkeypatch.setattr(live_server, "IDLE_S", 0.05)
+    with LivePage(live, 0) as page:
+        port = int(page.link.partition("/#")[0].rpartition(":")[2])
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as idle:
+            assert idle.recv(1) == b""
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as slow:
+            slow.sendall(b"GET / HTTP/1.1\r\nHost: ")
+            assert slow.recv(1) == b""
+
+
+def test_connections_leave_most_descriptors_to_the_run(monkeypatch):
+    resource = pytest.importorskip("resource")
+    for soft, most in ((1024, 64), (96, 24), (4, 2), (resource.RLIM_INFINITY, 64)):
+        monkeypatch.setattr(resource, "getrlimit", lambda kind, soft=soft: (soft, soft))
+        assert connections_max() == most
+
+
+def test_without_the_extra_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "tornado", None)
+    with pytest.raises(InputError) as refused:
+        page_files()
+    assert refused.value.code == "no-live" and refused.value.remedy == "pip install 'tvsbayes[live]'"
 
 
 def test_taken_port_is_called_so(asker, live):
     with pytest.raises(InputError, match="cannot be used"):
-        with LivePage(FILES, live, asker.port):
+        with LivePage(live, asker.port):
             pass
 
 
 @pytest.mark.usefixtures("ctrl_c_works")
 def test_a_server_that_dies_does_not_disturb_the_run(mounted_rig, tmp_path):
     live = LiveRun()
-    with LivePage(FILES, live, 0) as page:
+    with LivePage(live, 0) as page:
 
         def dies(instrument):
             page.end()
@@ -174,7 +262,7 @@ def test_a_reader_that_never_reads_and_one_that_hangs_delay_nothing(mounted_rig,
         return told()
 
     live.told = hangs
-    with LivePage(FILES, live, 0) as page:
+    with LivePage(live, 0) as page:
         address, _, token = page.link.partition("/#")
         asker = Asker(int(address.rpartition(":")[2]), token)
         reader = threading.Thread(target=asker.now, args=(asker.key(),))

@@ -1,30 +1,26 @@
-"""The page in headless Chromium: every control, the linked selection, what is saved, and who is kept out."""
+"""The page in headless Chromium, opened as a file: every control, the linked selection, what is saved."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 from support.viewed_twin import PICTURED, UNDETECTED
 
-pytest.importorskip("tornado", reason="the extra view is not installed")
-pytest.importorskip("plotly", reason="the extra view is not installed")
 pytest.importorskip("selenium", reason="selenium is not installed")
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import Select, WebDriverWait
-from support.browsers import CHROMIUM, DRIVER, SECONDS_MAX, Browsed, browser, foreign_page
-from support.served_pages import page_served
+from support.browsers import CHROMIUM, DRIVER, SECONDS_MAX, Browsed, browser
 
 from tvsbayes.instrument.campaign import read_campaign, with_pixels
-from tvsbayes.view.contents import Contents, page_files
 from tvsbayes.view.document import document
 from tvsbayes.view.gathering import look_at
+from tvsbayes.view.page import page_html
+from tvsbayes.view.pictures import look_pictures
 from tvsbayes.view.scene import LookColumns, Looked, scene
 
 pytestmark = [
@@ -34,14 +30,11 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
 ]
 MANY = 50_000
-CLICK = (
-    "const [plot, places] = arguments; document.getElementById(plot).emit('plotly_click',"
-    " {points: places.map((place) => ({customdata: place}))})"
-)
-FRAME = "const [plot, range] = arguments; document.getElementById(plot).emit('plotly_selected', {range})"
-LASSO = "const [plot, lassoPoints] = arguments; document.getElementById(plot).emit('plotly_selected', {lassoPoints})"
-"""What Plotly tells the page when points are clicked or framed."""
 PLOTS = ("rig", "pictures", "residuals", "stops", "correlation", "changes")
+ASK = "const i = document.getElementById('look'); i.value = arguments[0]; i.dispatchEvent(new Event('change'))"
+PATH = "return document.querySelector(`#${arguments[0]} path[data-name='${arguments[1]}']`).getAttribute('d')"
+REACH = "((box) => box.xs[1] - box.xs[0])(document.page.plots.pictures.panels[0].box)"
+"""Pixels from the left to the right end of the left picture."""
 
 
 @pytest.fixture(scope="module")
@@ -50,62 +43,72 @@ def browsed(tmp_path_factory) -> Iterator[Browsed]:
         yield opened
 
 
-def contents_of(looked: Looked, *folders: Path) -> Contents:
-    kept = tuple(frozenset(one.looks.spot.tolist()) for one in looked.scenes)
-    return Contents(document(looked), folders, kept, page_files())
+def page_of(place: Path, looked: Looked, *folders: Path) -> str:
+    """The address of the page of scenes, with the pictures in their folders."""
+    pictures = [look_pictures(folder, one.looks) for folder, one in zip(folders, looked.scenes, strict=True)]
+    place.write_bytes(page_html(document(looked, pictures)))
+    return place.as_uri()
 
 
 @pytest.fixture(scope="module")
-def both(viewed) -> Contents:
+def both(viewed, tmp_path_factory) -> str:
     """The campaign beside itself, the last of its looks suspect."""
     looked = look_at(viewed.folder, viewed.folder)
     first = looked.scenes[0]
     suspect = first.looks.suspect.copy()
     suspect[-1] = True
     doubted = replace(first, looks=replace(first.looks, suspect=suspect))
-    return contents_of(replace(looked, scenes=(doubted, looked.scenes[1])), viewed.folder, viewed.folder)
+    place = tmp_path_factory.mktemp("page") / "both.html"
+    return page_of(place, replace(looked, scenes=(doubted, looked.scenes[1])), viewed.folder, viewed.folder)
 
 
 @pytest.fixture
 def page(both, browsed) -> Iterator[Browsed]:
     browsed.complaints(), browsed.asked()
-    with page_served(both) as link:
-        assert browsed.opened(link) == "ready"
-        yield browsed
-        assert browsed.complaints() == []
-        assert browsed.asked() <= {urlsplit(link).netloc}
+    assert browsed.opened(both) == "ready"
+    yield browsed
+    assert browsed.complaints() == []
+    assert browsed.asked() == set()
 
 
-def test_page_shows_everything_and_sends_nothing(page):
+def test_page_shows_everything_and_asks_nobody(page):
     assert page.one("name").text == "paper twin beside paper twin"
     for plot in PLOTS:
-        assert page.js("return document.getElementById(arguments[0]).querySelectorAll('.main-svg').length", plot) > 0
-    assert [trace["count"] for trace in page.traces("rig", "spots")] == [383, 383]
-    assert len(page.traces("rig", "sheets")) == 4 and len(page.traces("residuals", "looks")) == 4
+        assert page.js("return document.querySelectorAll(`#${arguments[0]} svg.chart *`).length", plot) > 10
+    assert page.layers("rig", "spots") == [383, 383] and page.layers("residuals", "looks") == [383] * 4
+    assert page.layers("rig", "sheets") == [8, 8]
+    written = page.one("rig").text
+    assert all(text in written for text in ("left camera", "right camera", "positioner", "sheet d1"))
     assert page.one("verdict").text == "no significant change"
     assert page.one("parameters-figure").text.startswith("Parameters of the first, paper twin")
-    rows = page.driver.find_elements(By.CSS_SELECTOR, "#changes-table tbody tr")
-    assert len(rows) == 6
-    titles = page.js("return [...document.querySelectorAll('.modebar-btn')].map((b) => b.dataset.title ?? '')")
-    assert titles and not [title for title in titles if "cloud" in title.lower() or "plotly" in title.lower()]
+    assert len(page.driver.find_elements(By.CSS_SELECTOR, "#changes-table tbody tr")) == 6
 
 
 def test_every_switch_of_the_rig(page):
     for name in ("spots", "ellipsoids", "beams", "mirrors", "cameras", "sheets"):
-        seen = page.traces("rig", name)
-        assert seen and all(trace["visible"] is True for trace in seen)
+        assert len(page.layers("rig", f"{name} ")) == 2
         page.click(f"show-{name}")
-        page.until(f"document.getElementById('rig').data.filter((t) => t.name === '{name}').every((t) => !t.visible)")
+        assert page.layers("rig", f"{name} ") == []
         page.click(f"show-{name}")
-        page.until(f"document.getElementById('rig').data.filter((t) => t.name === '{name}').every((t) => t.visible)")
-    eyes = []
+        assert len(page.layers("rig", f"{name} ")) == 2
+
+    def path(name: str) -> str:
+        return page.js(PATH, "rig", name)
+
+    seen = set()
     for view in ("from-above", "from-side", "from-behind"):
         page.click(view)
-        eyes.append(page.js("return document.getElementById('rig').layout.scene.camera.eye"))
-    assert len({json.dumps(eye) for eye in eyes}) == 3
-    before = page.traces("rig", "ellipsoids")[0]["first"]
+        seen.add(path("spots 0"))
+    before = path("ellipsoids 0")
     Select(page.one("ellipsoid-scale")).select_by_visible_text("100")
-    page.until(f"document.getElementById('rig').data.find((t) => t.name === 'ellipsoids').x[1] !== {before[1]}")
+    assert path("ellipsoids 0") != before
+    chart = page.driver.find_element(By.CSS_SELECTOR, "#rig svg")
+    webdriver.ActionChains(page.driver).drag_and_drop_by_offset(chart, 80, 30).perform()
+    seen.add(path("spots 0"))
+    for button in ("larger-rig", "smaller-rig"):
+        page.click(button)
+        seen.add(path("spots 0"))
+    assert len(seen) >= 5
 
 
 def test_looks_are_walked_by_number(page):
@@ -114,82 +117,90 @@ def test_looks_are_walked_by_number(page):
 
     first = look()
     page.click("next")
-    page.until(f"document.getElementById('look').value !== '{first}'")
+    assert look() != first
     page.click("previous")
-    page.until(f"document.getElementById('look').value === '{first}'")
+    assert look() == first
     page.click("unlikely")
-    page.until("document.getElementById('facts').textContent.includes('the fit doubts it')")
-    page.js("const i = document.getElementById('look'); i.value = '99999'; i.dispatchEvent(new Event('change'))")
-    assert "there is no look 99999" in page.one("chosen").text
-    asked = "const i = document.getElementById('look'); i.value = arguments[0]; i.dispatchEvent(new Event('change'))"
-    page.js(asked, str(UNDETECTED))
-    page.until("document.getElementById('facts').textContent.includes('undetected')")
+    assert "the fit finds it unlikely" in page.one("facts").text
+    page.js(ASK, "099999")
+    assert "there is no look 99999" in page.one("chosen").text and look() == "99999"
+    page.js(ASK, str(UNDETECTED))
+    assert "undetected" in page.one("facts").text
     assert "No picture of this look is kept (left, right)" in page.one("pictures-remark").text
     Select(page.one("campaign")).select_by_value("1")
-    page.until("document.getElementById('chosen').textContent === ''")
+    assert page.one("chosen").text == ""
     page.click("none")
-    page.until("document.body.dataset.chosen === '0'")
-    assert page.marks("stops") == page.marks("residuals") == [0, 0]
+    assert page.chosen() == 0 and page.marks("stops") == page.marks("residuals") == [0, 0]
 
 
 def test_picture_of_a_look_with_what_was_found(page):
-    asked = "const i = document.getElementById('look'); i.value = arguments[0]; i.dispatchEvent(new Event('change'))"
-    page.js(asked, str(PICTURED))
-    page.until("document.getElementById('pictures').layout.images.length === 1")
-    page.until("document.querySelectorAll('#pictures image').length === 1")
-    # Pixels stay square: an axis may reach further than asked.
-    reach = "((r) => r[1] - r[0])(document.getElementById('pictures').layout.xaxis.range)"
-    assert 50 <= page.js(f"return {reach}") < 100
+    page.js(ASK, str(PICTURED))
+    sources = page.js("return [...document.querySelectorAll('#pictures image')].map((i) => i.getAttribute('href'))")
+    assert len(sources) == 1 and sources[0].startswith("data:image/jpeg;base64,")
+    assert page.layers("pictures", "found") == page.layers("pictures", "fitted") == [1, 1]
+    assert page.js(f"return {REACH}") == 48
     page.click("window-all")
-    page.until(f"{reach} >= 1280")
+    assert page.js(f"return {REACH}") == 1280
     page.click("window-spot")
-    page.until(f"{reach} < 100")
+    assert page.js(f"return {REACH}") == 48
     assert "(right)" in page.one("pictures-remark").text
 
 
-def test_what_is_framed_in_one_plot_is_selected_in_all(page):
-    page.js(CLICK, "rig", [4, 5, 390])
-    page.until("document.body.dataset.chosen === '3'")
-    assert page.traces("rig", "chosen")[0]["count"] == 3
-    assert page.marks("stops") == page.marks("residuals") == [3, 3]
-    assert page.one("chosen").text == "3 looks are selected"
-    page.js(FRAME, "residuals", {"x2": [0, 1280], "y2": [720, 0]})
-    seen = 2 * 383
-    page.until(f"document.body.dataset.chosen === '{seen}'")
-    assert page.marks("stops") == [seen, seen]
-    # A triangle around the looks at the counter 200, whatever their deviation.
-    page.js(LASSO, "stops", {"x": [190, 210, 200], "y": [-50, -50, 50]})
-    page.until(f"document.body.dataset.chosen !== '{seen}'")
-    assert 0 < page.chosen() < seen and page.marks("residuals") == [page.chosen()] * 2
-    page.js(CLICK, "stops", [9])
-    page.until("document.body.dataset.chosen === '1'")
-    assert page.marks("residuals") == [1, 1]
-    page.js(FRAME, "stops", {"x": [1e6, 2e6], "y": [0, 1]})
-    assert page.chosen() == 1
-
-
-def test_a_frame_drawn_by_hand_selects(page):
-    page.js("document.getElementById('stops').scrollIntoView({block: 'center'})")
-    box = page.driver.find_element(By.CSS_SELECTOR, "#stops .nsewdrag")
+def dragged(page: Browsed, plot: str, *way: tuple[float, float]) -> None:
+    """Drag over the left chart of a plot, along places from (0, 0) at its upper left to (1, 1)."""
+    page.js("document.getElementById(arguments[0]).scrollIntoView({block: 'center'})", plot)
+    chart = page.driver.find_element(By.CSS_SELECTOR, f"#{plot} svg")
+    box = page.js(f"return document.page.plots.{plot}.panels[0].box")
+    width, height = chart.size["width"], chart.size["height"]
     mouse = webdriver.ActionChains(page.driver)
-    width, height = box.size["width"], box.size["height"]
-    mouse.move_to_element_with_offset(box, -width // 2 + 5, -height // 2 + 5).click_and_hold()
-    mouse.move_by_offset(width // 2, height // 2).move_by_offset(width // 2 - 12, height // 2 - 12).release().perform()
-    page.until("Number(document.body.dataset.chosen) > 100")
-    assert page.marks("stops") == [page.chosen()] * 2
+    left, top = box["left"] - width / 2, box["top"] - height / 2
+    at = [(round(left + x * box["w"]), round(top + y * box["h"])) for x, y in way]
+    mouse.move_to_element_with_offset(chart, *at[0]).click_and_hold()
+    for place in at[1:]:
+        mouse.move_to_element_with_offset(chart, *place)
+    mouse.release().perform()
+
+
+def test_what_is_framed_or_clicked_in_one_plot_is_selected_in_all(page):
+    seen = 2 * 383
+    dragged(page, "residuals", (0.01, 0.01), (0.5, 0.5), (0.99, 0.99))
+    assert page.chosen() == seen and page.marks("stops") == page.marks("residuals") == [seen, seen]
+    assert page.one("chosen").text == f"{seen} looks are selected"
+    assert page.layers("rig", "chosen")[0] == seen
+    # Nothing lies in this corner, so the selection stays.
+    dragged(page, "residuals", (0.01, 0.9), (0.02, 0.98))
+    assert page.chosen() == seen
+    # The left half: counters of one side.
+    Select(page.one("mode-stops")).select_by_value("lasso")
+    dragged(page, "stops", (0.01, 0.01), (0.01, 0.99), (0.55, 0.99), (0.55, 0.01))
+    half = page.chosen()
+    assert 0 < half < seen and page.marks("residuals") == [half, half]
+    Select(page.one("mode-stops")).select_by_value("move")
+    before = page.js("return document.page.plots.stops.panels[0].box.xs")
+    dragged(page, "stops", (0.4, 0.4), (0.5, 0.5))
+    assert page.js("return document.page.plots.stops.panels[0].box.xs")[0] < before[0] and page.chosen() == half
+    page.click("whole-stops")
+    assert page.js("return document.page.plots.stops.panels[0].box.xs") == before
+    at = page.js("const [p] = document.page.plots.rig.panels[0].picks; return p[0]")
+    chart = page.driver.find_element(By.CSS_SELECTOR, "#rig svg")
+    page.js("document.getElementById('rig').scrollIntoView({block: 'center'})")
+    offset = [round(at[0] - chart.size["width"] / 2), round(at[1] - chart.size["height"] / 2)]
+    webdriver.ActionChains(page.driver).move_to_element_with_offset(chart, *offset).click().perform()
+    assert page.chosen() == 1 and page.marks("residuals") == [1, 1]
+    assert page.driver.find_element(By.CSS_SELECTOR, ".hint").text.startswith("look ")
 
 
 def test_arrows_bars_and_bands(page):
-    def first() -> float:
-        return page.traces("residuals", "arrows")[0]["first"][1]
+    def arrows() -> str:
+        return page.js(PATH, "residuals", "arrows 0")
 
-    before = first()
+    before = arrows()
     Select(page.one("residual-scale")).select_by_visible_text("1000")
-    page.until(f"document.getElementById('residuals').data.find((t) => t.name === 'arrows').x[1] !== {before}")
-    for switch, name in (("show-gears", "gears"), ("show-u", "u")):
-        assert page.traces("stops", name)
+    assert arrows() != before
+    for switch, name in (("show-gears", "gear"), ("show-u", "u ")):
+        assert page.layers("stops", name)
         page.click(switch)
-        page.until(f"document.getElementById('stops').data.filter((t) => t.name === '{name}').every((t) => !t.visible)")
+        assert page.layers("stops", name) == []
         page.click(switch)
 
 
@@ -198,17 +209,10 @@ def test_parameters_and_correlations_are_linked(page):
     page.one("filter").send_keys("backlash_deg.pan")
     page.until("document.querySelectorAll('#parameters tbody tr:not([hidden])').length === 1")
     page.driver.find_element(By.CSS_SELECTOR, "#parameters tbody tr:not([hidden])").click()
-    page.until(
-        "document.getElementById('correlation-remark').textContent.startsWith('backlash_deg.pan goes most with')"
-    )
-    assert len(page.js("return document.getElementById('correlation').layout.shapes")) == 2
-    page.one("filter").clear()
-    page.one("filter").send_keys("d")
-    event = (
-        "document.getElementById('correlation').emit('plotly_click', {points: [{x: arguments[0], y: arguments[1]}]})"
-    )
-    page.js(event, "tilt_zero_deg", "mirror_offset_mm")
-    page.until("document.querySelectorAll('#parameters tr.marked').length === 2")
+    assert page.one("correlation-remark").text.startswith("backlash_deg.pan goes most with")
+    assert page.layers("correlation", "marked") == [10]
+    page.js("document.page.plots.correlation.panels[0].picked(['tilt_zero_deg', 'mirror_offset_mm'])")
+    assert page.js("return document.querySelectorAll('#parameters tr.marked').length") == 2
     assert len(rows) > 50
 
 
@@ -216,77 +220,53 @@ def test_parameters_and_correlations_are_linked(page):
 def test_plots_are_saved_as_they_are_seen(page, plot):
     begins = {"png": b"\x89PNG\r\n\x1a\n", "svg": b"<svg"}
     for kind, start in begins.items():
-        page.click(f"save-{plot}-{kind}")
+        page.click(f"save-{kind}-{plot}")
         place = Path(page.driver.saved) / f"paper-twin-{plot}.{kind}"
         WebDriverWait(page.driver, SECONDS_MAX).until(lambda _, place=place: place.exists() and place.stat().st_size)
         content = place.read_bytes()
         assert content.startswith(start) and len(content) > 2000
+        assert kind == "png" or (b"var(" not in content and b"rgb(" in content)
 
 
-def test_reload_goes_on_and_a_second_browser_is_refused(both, browsed):
-    with page_served(both) as link:
-        assert browsed.opened(link) == "ready"
-        assert browsed.js("return location.hash") == ""
-        browsed.driver.refresh()
-        assert browsed.until("document.body?.dataset.state") == "ready"
-        browsed.driver.switch_to.new_window("tab")
-        for wrong in (link, link + "x", link.partition("#")[0]):
-            assert browsed.opened(wrong) == "refused"
-            assert "403" in browsed.one("notes").text
-            assert browsed.js("return document.querySelectorAll('.main-svg').length") == 0
-        browsed.driver.close()
-        browsed.driver.switch_to.window(browsed.driver.window_handles[0])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_is_cut_off(page, scheme, width):
+    """On a telephone and a screen, by day and by night: no sideways scrolling, and text that stands out."""
+    with page.shown(width, scheme):
+        page.driver.refresh()
+        assert page.until("document.body?.dataset.state") == "ready"
+        assert page.js("return document.documentElement.scrollWidth") <= width
+        ink, ground = page.brightness("figure")
+        assert (ground > 600 > ink + 150) if scheme == "light" else (ink > 350 > ground + 150)
+
+
+def test_texts_of_a_campaign_are_texts(viewed, browsed, tmp_path):
+    """Names that would end the script or begin one."""
+    hostile = "</script><script>document.body.dataset.state = 'taken'</script><img src=x onerror=alert(1)>"
+    one = look_at(viewed.bare).scenes[0]
+    renamed = replace(one, name=hostile, looks=replace(one.looks, target=(hostile,) * len(one.looks.spot)))
     browsed.complaints()
+    assert browsed.opened(page_of(tmp_path / "page.html", Looked((renamed,)), viewed.bare)) == "ready"
+    assert browsed.one("name").text == hostile
+    assert browsed.complaints() == [] and browsed.asked() == set()
 
 
-def test_another_origin_reaches_nothing(both, browsed):
-    """Neither by reading, nor blindly, nor as a picture, a script or a frame."""
-    tried = """
-      const [own, done] = [arguments[0], arguments[1]];
-      const loads = (kind, path) => new Promise((tell) => {
-        const made = document.createElement(kind);
-        made.onload = () => tell(kind === "iframe" ? "frame" : "loaded");
-        made.onerror = () => tell("refused");
-        made.src = own + path;
-        document.body.append(made);
-      });
-      const asks = (path, how) => fetch(own + path, how).then((got) => got.type, () => "refused");
-      Promise.all([
-        asks("scene", {}), asks("scene", {headers: {"X-Tvsbayes-Key": "x"}}), asks("key", {method: "POST", body: "{}"}),
-        loads("img", "picture/0/3/left"), loads("script", "page.js"), loads("script", "scene"),
-      ]).then(done);
-    """
-    with page_served(both) as link, foreign_page() as foreign:
-        assert browsed.opened(foreign) == "foreign"
-        browsed.driver.set_script_timeout(SECONDS_MAX)
-        own = link.partition("#")[0]
-        assert browsed.driver.execute_async_script(tried, own) == ["refused"] * 6
-        # A name of somebody else's that leads here, as by DNS rebinding: localhost. with its dot is such a name.
-        browsed.driver.get(own.replace("127.0.0.1", "localhost."))
-        assert "403" in browsed.driver.page_source and "tvsbayes view" not in browsed.driver.page_source
-        # The link is still good for its own browser.
-        assert browsed.opened(link) == "ready"
-    browsed.complaints()
-
-
-def test_folder_without_results_and_one_without_spots(viewed, browsed):
+def test_folder_without_results_and_one_without_spots(viewed, browsed, tmp_path):
     """The stated rig without residuals; then cameras alone."""
     campaign = read_campaign(viewed.bare)
     blind = replace(campaign, spots=tuple(with_pixels(spot, "undetected") for spot in campaign.spots))
     browsed.complaints()
     for looked, seen in ((look_at(viewed.bare), 383), (Looked((scene(blind),)), 0)):
-        with page_served(contents_of(looked, viewed.bare)) as link:
-            assert browsed.opened(link) == "ready"
-            assert browsed.traces("rig", "spots")[0]["count"] == seen
-            assert len(browsed.traces("rig", "cameras")) == 1
-            assert browsed.one("residuals-remark").text.startswith("No residuals without a fit")
-            assert not browsed.one("correlation-figure").is_displayed()
-            assert not browsed.one("changes-figure").is_displayed()
-            browsed.click("next")
-            browsed.until("document.getElementById('look').value === '1'")
-            browsed.click("unlikely")
-            browsed.until("document.getElementById('chosen').textContent === 'the fit doubts no look'")
-            browsed.driver.find_element(By.CSS_SELECTOR, "#parameters tbody tr").click()
+        assert browsed.opened(page_of(tmp_path / f"{seen}.html", looked, viewed.bare)) == "ready"
+        assert browsed.layers("rig", "spots") == [seen] and len(browsed.layers("rig", "cameras")) == 1
+        assert browsed.one("residuals-remark").text.startswith("No residuals without a fit")
+        assert not browsed.one("correlation-figure").is_displayed()
+        assert not browsed.one("changes-figure").is_displayed()
+        browsed.click("next")
+        assert browsed.one("look").get_property("value") == "1"
+        browsed.click("unlikely")
+        assert browsed.one("chosen").text == "the fit finds no look unlikely"
+        browsed.driver.find_element(By.CSS_SELECTOR, "#parameters tbody tr").click()
     assert browsed.complaints() == []
 
 
@@ -305,21 +285,19 @@ def many(looks: LookColumns, count: int) -> LookColumns:
     return LookColumns(**again)
 
 
-def test_fifty_thousand_looks(viewed, browsed):
+def test_fifty_thousand_looks(viewed, browsed, tmp_path):
     one = look_at(viewed.folder).scenes[0]
-    contents = contents_of(Looked((replace(one, looks=many(one.looks, MANY)),)), viewed.folder)
+    looked = Looked((replace(one, looks=many(one.looks, MANY)),))
     browsed.complaints()
-    with page_served(contents) as link:
-        assert browsed.opened(link) == "ready"
-        assert browsed.traces("rig", "spots")[0]["count"] == 3000
-        browsed.click("next")
-        browsed.until("document.getElementById('look').value === '1'")
-        # All looks are selected, also those without a dot.
-        browsed.js(FRAME, "residuals", {"x": [-1e4, 1e4], "y": [-1e4, 1e4]})
-        known = MANY - MANY // 384 - 1
-        browsed.until(f"Number(document.body.dataset.chosen) >= {known - 1}")
-        assert browsed.chosen() < MANY
-        assert browsed.one("chosen").text.endswith("looks are selected, 3000 are marked")
-        assert browsed.marks("stops") == browsed.marks("residuals") != [0, 0]
-        assert f"of {MANY} looks have a spot; dots of 3000" in browsed.one("rig-remark").text
+    assert browsed.opened(page_of(tmp_path / "page.html", looked, viewed.folder)) == "ready"
+    assert browsed.layers("rig", "spots") == [3000]
+    browsed.click("next")
+    assert browsed.one("look").get_property("value") == "1"
+    # All looks are selected, also those without a dot.
+    dragged(browsed, "residuals", (0.001, 0.001), (0.999, 0.999))
+    known = MANY - MANY // 384 - 1
+    assert 0.9 * known < browsed.chosen() <= known
+    assert browsed.one("chosen").text.endswith("looks are selected, 3000 are marked")
+    assert browsed.marks("stops") == browsed.marks("residuals") != [0, 0]
+    assert f"of {MANY} looks have a spot; dots of 3000" in browsed.one("rig-remark").text
     assert browsed.complaints() == []

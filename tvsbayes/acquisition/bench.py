@@ -14,12 +14,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import cast
+from typing import Any
+
+from msgspec import UNSET
 
 from tvsbayes.acquisition.drivers import cameras_of, connect_trigger, positioner_of
 from tvsbayes.acquisition.emulated_instrument import EmulatedInstrument
-from tvsbayes.acquisition.journal import LOG, read_journal
-from tvsbayes.acquisition.journal_events import Moved
+from tvsbayes.acquisition.journal import LOG, event_of, read_journal
+from tvsbayes.acquisition.journal_events import Homed, Moved
 from tvsbayes.acquisition.observation import CameraObserver, Detector, Observer, TwinObserver, wait_for_detection
 from tvsbayes.acquisition.operator import Operator, SimulatedOperator
 from tvsbayes.acquisition.recorder import Recorded, recorded
@@ -71,8 +73,8 @@ class Bench:
     operator: Operator
     clock: Clock
     utc: Callable[[], datetime.datetime]
-    details: Mapping[str, object] = field(default_factory=dict)
-    annotate: Callable[[], Mapping[str, object]] = dict
+    details: Mapping[str, Any] = field(default_factory=dict)
+    annotate: Callable[[], Mapping[str, Any]] = dict
     conclude: Callable[[Path], None] = lambda folder: None
     warnings: tuple[str, ...] = ()
 
@@ -172,13 +174,13 @@ def write_truth(folder: Path, instrument: Instrument) -> None:
     record = recorded(reading.records)
     # As in `recorded`: motions after a gap are no rows of moves.csv.
     counted = [r for r in reading.records if r.line not in set(record.ignored_lines)]
-    events = [cast("Moved", r.data) for r in counted if r.event in ("homed", "moved")]
-    motions = [event["twin"] for event in events if "twin" in event]
+    events = [event_of(r, Homed) or event_of(r, Moved) for r in counted]
+    motions = [event.twin for event in events if event is not None and event.twin is not UNSET]
     seen = [motions[spot.move] for spot in record.spots if spot.status == "ok" and spot.move < len(motions)]
     truth = replace(
         instrument.truth,
-        mirror_angles_deg=pan_and_tilt(m["mirror_angles_deg"] for m in motions),
-        stop_errors_deg=pan_and_tilt(m["stop_errors_deg"] for m in motions),
+        mirror_angles_deg=pan_and_tilt(m.mirror_angles_deg for m in motions),
+        stop_errors_deg=pan_and_tilt(m.stop_errors_deg for m in motions),
         reference_pose_deg=reference_pose_deg(seen),
     )
     campaign = Campaign(record.moves, record.spots, instrument.rig.stereo, instrument.rig.table)

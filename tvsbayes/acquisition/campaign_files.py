@@ -10,9 +10,10 @@ import datetime
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import cast
 
-from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, read_journal, require_journal
+from msgspec import UNSET
+
+from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, event_of, read_journal, require_journal
 from tvsbayes.acquisition.journal_check import repair, verify
 from tvsbayes.acquisition.journal_events import Created
 from tvsbayes.acquisition.recorder import LOST_STEPS, Recorded, Recorder, recorded
@@ -90,10 +91,12 @@ class CampaignFiles:
 
     def _campaign(self) -> Campaign:
         """What the journal holds so far; there has been a homing."""
-        created = cast("Created", self._journal.records[0].data)
-        start = datetime.datetime.fromisoformat(str(created["created"])).astimezone(datetime.UTC)
-        header: dict[str, object] = {"name": str(created.get("name", NAME_ACQUIRED)), "created": start}
-        header |= {name: value for name, value in created.items() if name in ("synthetic", "seed")}
+        created = event_of(self._journal.records[0], Created)
+        assert created is not None
+        start = datetime.datetime.fromisoformat(created.created).astimezone(datetime.UTC)
+        header: dict[str, object] = {"name": NAME_ACQUIRED if created.name is UNSET else created.name, "created": start}
+        stated = {"synthetic": created.synthetic, "seed": created.seed}
+        header |= {name: value for name, value in stated.items() if value is not UNSET}
         return _campaign_of(self._recorder.result(), Campaign((), (), self._rig.stereo, self._rig.table, header))
 
 
@@ -273,8 +276,28 @@ def _compared(record: Recorded, present: Campaign, empty: bool) -> list[str]:
     return warnings
 
 
+def behind_journal(folder: Path, present: Campaign) -> str:
+    """Which looks the journal of a campaign holds and its table lacks, in words; "" for none or without a journal.
+
+    What is wrong with a damaged journal is left to `check_journal`.
+    """
+    try:
+        require_journal(folder, "")
+        record = recorded(read_journal(folder).records)
+    except InputError:
+        return ""
+    missing = sorted({spot.spot for spot in record.spots} - {spot.spot for spot in present.spots})
+    if not missing:
+        return ""
+    names = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
+    looks = f"look{'s' * (len(missing) > 1)} {names}"
+    return f"spots.csv lacks {looks}, which {LOG} holds: the run was killed; acquire --resume writes the tables again"
+
+
 def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
     """Copies what is whole of a journal, and writes the campaign that it holds, into a new folder.
+
+    Moves and looks that follow a gap without a new homing are kept in the journal, do not count, and are counted apart.
 
     Raises:
         InputError: no journal, nothing whole, a folder that holds something, or campaign files that are damaged too.
@@ -283,10 +306,18 @@ def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
     # Rig, stereo and header stand in files of their own, written once and not touched since.
     before = _settings_of(folder)
     done = repair(folder, to)
-    record = recorded(read_journal(to).records)
+    records = read_journal(to).records
+    record = recorded(records)
     if record.moves:
         write_derived(_campaign_of(record, before), to)
-    return {**asdict(done), "moves": len(record.moves), "looks": len(record.spots)}
+    ignored = set(record.ignored_lines)
+    return {
+        **asdict(done),
+        "moves": len(record.moves),
+        "looks": len(record.spots),
+        "moves_not_counted": sum(one.event == "moved" for one in records if one.line in ignored),
+        "looks_not_counted": sum(one.event == "looked" for one in records if one.line in ignored),
+    }
 
 
 def _settings_of(folder: Path) -> Campaign:

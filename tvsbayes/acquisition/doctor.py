@@ -1,7 +1,7 @@
 """Is the instrument fit for a campaign? One check after the other, each with what to do.
 
-Nothing moves. The laser stays off unless the caller asks for the laser check, and then is on for one picture; a
-positioner that is not homed refuses it. Seconds where a name says `_s`; grey levels 0 to 255.
+Nothing moves but in `contract`. The laser stays off unless the caller asks for the laser check, and then is on for one
+picture; a positioner that is not homed refuses it. Seconds where a name says `_s`; grey levels 0 to 255.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tvsbayes.acquisition.driver_contract import camera_violations, positioner_violations
 from tvsbayes.acquisition.drivers import cameras_of, connect_trigger, positioner_of
 from tvsbayes.acquisition.journal import Disk
 from tvsbayes.acquisition.observation import CHANGE_DN, rises_dn
@@ -103,6 +104,47 @@ def examine(
         if positioner is not None:
             positioner.close()
     return checks
+
+
+def contract(
+    rig: Rig,
+    *,
+    open_positioner: Callable[[], Positioner] | None = None,
+    open_camera: Callable[[], StereoCamera] | None = None,
+) -> list[Check]:
+    """Whether the drivers keep their promises: THE MOTORS MOVE AND THE LASER COMES ON; arguments as of `examine`.
+
+    It homes, moves to a quarter and to three quarters of the stated limits, and asks for one step beyond them.
+    """
+    if rig.limits.unstated:
+        found, remedy = f"{', '.join(rig.limits.unstated)} not stated", "state them in [positioner] of the rig file"
+        return [Check("contract", "fault", found, remedy)]
+    ranges = [(low or 0, high or 0) for low, high in (rig.limits.steps[axis] for axis in AXES)]
+    (a, b), (c, d) = ranges
+    quarter, three = ((a + k * (b - a) // 4, c + k * (d - c) // 4) for k in (1, 3))
+    beyond = b + 1, quarter[1]
+    stop = StopKey()
+    broken: dict[str, list[str]] = {}
+    # There is no look worth finishing: the first Ctrl-C interrupts, and the driver is closed by it.
+    stop.requested = True
+    size = rig.stereo.image_width, rig.stereo.image_height
+    try:
+        with stop:
+            positioner = positioner_of(rig) if open_positioner is None else open_positioner()
+            broken["positioner"] = positioner_violations(positioner, [quarter, three], beyond)
+            camera = cameras_of(rig) if open_camera is None else open_camera()
+            broken["cameras"] = camera_violations(camera, *size)
+    except TvsError as error:
+        return [_failed("contract", error)]
+    remedy = "the driver breaks a promise: see data/docs/instrument.md, Your own hardware"
+    return [
+        check
+        for name, sentences in broken.items()
+        for check in (
+            [Check(f"contract {name}", "fault", sentence, remedy) for sentence in sentences]
+            or [Check(f"contract {name}", "ok", "every promise is kept")]
+        )
+    ]
 
 
 def _rig(rig: Rig) -> Check:

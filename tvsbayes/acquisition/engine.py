@@ -12,19 +12,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from tvsbayes.acquisition.bench import Bench
 from tvsbayes.acquisition.journal import Journal
-from tvsbayes.acquisition.journal_events import Asked, Four
+from tvsbayes.acquisition.journal_events import Asked, Four, Homed, Looked, Moved, Placed, Start
 from tvsbayes.acquisition.live_control import Control, HeedingPositioner, LightRefused
 from tvsbayes.acquisition.live_run import LiveRun
 from tvsbayes.acquisition.live_snapshot import COMING_MAX, PAUSED, REMARKS_MAX, RUNNING, SeenLook
 from tvsbayes.acquisition.observation import Observation
 from tvsbayes.acquisition.operator import HAZARD, Progress, StopKey
+from tvsbayes.acquisition.place_command import PlaceCommand, require_placed
 from tvsbayes.acquisition.recorder import Recorded
-from tvsbayes.acquisition.replanning import ADAPTED, CONFIRMED, Proposal, Replanning, adapted_entries, check_plan
+from tvsbayes.acquisition.replanning import Proposal, Replanning, adapted_entries, check_plan
 from tvsbayes.acquisition.run_identity import setup_entries
 from tvsbayes.acquisition.run_log import Outcome, RunLog
 from tvsbayes.acquisition.running_estimate import Aim, RunningEstimate
@@ -82,6 +85,7 @@ class Acquisition:
         show: told about progress.
         estimate: the running estimate; a run that meets its target ends.
         live: where the run is published, and what is asked of it; by default nobody looks.
+        place_command: a program that places the sheet before the operator is told; by default there is none.
     """
 
     def __init__(
@@ -95,14 +99,17 @@ class Acquisition:
         show: Callable[[Progress], None] = lambda progress: None,
         estimate: RunningEstimate | None = None,
         live: LiveRun | None = None,
+        place_command: PlaceCommand | None = None,
     ):
         self.rig, self.plan, self.journal = rig, tuple(plan), journal
         self._stop, self._show, self._estimate = stop or StopKey(), show, estimate
         self._settle_s = float(rig.positioner.get("settle_s", SETTLE_S))
-        self._retries, self._check_depth, self._placement = 0, False, -1
+        self._place_command, self._retries, self._check_depth, self._placement = place_command, 0, False, -1
         self._log = RunLog(journal, rig, bench.utc)
         self._live = live or LiveRun()
         self._control = Control(self._live.requests, bench.positioner, self._stop, self._write_asked, self._publish)
+        if estimate is not None:
+            estimate.meanwhile = self._control.meanwhile
         self.bench = replace(bench, positioner=HeedingPositioner(bench.positioner, self._control))
         self._spot = self._log.next_spot()
 
@@ -146,7 +153,7 @@ class Acquisition:
         if not self.bench.operator.accept(HAZARD):
             return "declined"
         setup = setup_entries(self.rig, bool(self.journal.records[0].data.get("synthetic")))
-        self._log.write("start", utc=self._log.utc_text(), setup=setup, **self.bench.details)
+        self._log.write(Start(utc=self._log.utc_text(), setup=setup, **self.bench.details))
         resumed = self._log.recorder.result()
         # Before the first homing nothing counts, whatever was placed.
         next_row = resumed.next_step if resumed.moves else 0
@@ -184,7 +191,7 @@ class Acquisition:
         self._live.estimated(estimate.latest)
         confirmed = estimate.confirmed()
         if confirmed is not None:
-            self._log.write(CONFIRMED, **confirmed)
+            self._log.write(confirmed)
         if not met:
             self._adapt(row, estimate.proposal())
         return met
@@ -203,7 +210,7 @@ class Acquisition:
         except InputError as error:
             self._log.warnings.append(f"proposed looks were not followed: {error}")
             return
-        self._log.write(ADAPTED, **adapted_entries(proposal, row, steps))
+        self._log.write(adapted_entries(proposal, row, steps))
         self.plan = (*self.plan[:row], *steps)
 
     def _do(self, step: PlanStep) -> None:
@@ -224,25 +231,37 @@ class Acquisition:
         state = self.bench.positioner.move_to(*counters)
         self.bench.clock.sleep(self._settle_s)
         ways = zip(AXES, counters, switches, strict=True)
-        approach = [_approach(axis, to - start, report.ends_negative) for axis, to, start in ways]
-        reached = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps, "boot": state.boot}
-        self._log.write(
-            "homed", step=step, time_s=self._log.now_s(), **reached, approach=approach, **self.bench.annotate()
+        pan, tilt = (_approach(axis, to - start, report.ends_negative) for axis, to, start in ways)
+        event = Homed(
+            step=step,
+            time_s=self._log.now_s(),
+            pan_steps=state.pan_steps,
+            tilt_steps=state.tilt_steps,
+            boot=state.boot,
+            approach=(pan, tilt),
+            **self.bench.annotate(),
         )
+        self._log.write(event)
 
     def _place(self, target: str, placement: int, remark: str, step: int | None) -> None:
-        again = step is None
+        if self._place_command is not None:
+            self.bench.positioner.laser(False)
+            done = self._place_command.run(target, self.rig.sheets_mm[target], placement, self._control.meanwhile)
+            self._log.write(structs.replace(done, time_s=self._log.now_s()))
+            self._heed_stop()
+            require_placed(done)
         if not self.bench.operator.place(target, self.rig.sheets_mm[target], placement, remark):
             raise _Stopped
-        self._log.write("placed", step=step, target=target, again=again, utc=self._log.utc_text())
+        self._log.write(Placed(step=step, target=target, again=step is None, utc=self._log.utc_text()))
         self._placement, self._check_depth = placement, True
 
-    def _move(self, pan: int, tilt: int, step: int | None, **more: object) -> None:
+    def _move(self, pan: int, tilt: int, step: int | None, **more: Any) -> None:
         self.journal.append("intent", step=step, action="move", pan_steps=pan, tilt_steps=tilt)
         state = self.bench.positioner.move_to(pan, tilt)
         self.bench.clock.sleep(self._settle_s)
-        reached = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps}
-        self._log.write("moved", step=step, time_s=self._log.now_s(), **reached, **more, **self.bench.annotate())
+        reached: dict[str, Any] = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps}
+        more = {**more, **self.bench.annotate()}
+        self._log.write(Moved(step=step, time_s=self._log.now_s(), **reached, **more))
 
     def _look(self, step: int | None, experiment: int | None, point: int | None, reference: Spot | None = None) -> None:
         for _ in range(PLACEMENTS_MAX):
@@ -254,11 +273,10 @@ class Acquisition:
         else:
             remedy = "check the sheet and [sheets] of the rig file, then go on with --resume"
             raise DeviceFault("placement", f"the sheet is not where it should be: {wrong}; {remedy}", remedy=remedy)
-        frames = [self.journal.store(name, data).as_json() for name, data in observation.pictures.items()]
+        frames = tuple(self.journal.store(name, data) for name, data in observation.pictures.items())
         found = observation.sighting
         more = {} if reference is None else self._compared(reference, found.pixels_px)
-        self._log.write(
-            "looked",
+        event = Looked(
             step=step,
             spot=self._spot,
             target=self._log.recorder.state.target,
@@ -272,13 +290,14 @@ class Acquisition:
             time_s=self._log.now_s(),
             **more,
         )
+        self._log.write(event)
         pictures = {name: data for name, data in observation.pictures.items() if name.startswith("frames/")}
         sheet = self._log.recorder.state.target
         self._live.looked(SeenLook(self._spot, found.status, sheet, found.pixels_px, found.sds_px, pictures))
         self._spot += 1
         self._log.files.derive()
 
-    def _compared(self, reference: Spot, pixels_px: Four | None) -> dict[str, object]:
+    def _compared(self, reference: Spot, pixels_px: Four | None) -> dict[str, Any]:
         """What a look at a spot seen before says of it; a large change is worth a word."""
         shift_px = None if pixels_px is None else _shift_px(reference, pixels_px)
         if shift_px is None or shift_px > REFERENCE_SHIFT_MAX_PX:
@@ -400,7 +419,7 @@ class Acquisition:
         self._publish()
 
     def _write_asked(self, asked: Asked) -> None:
-        self._log.write("asked", time_s=self._log.now_s(), **asked)
+        self._log.write(structs.replace(asked, time_s=self._log.now_s()))
 
     def _begin_live(self) -> None:
         """What does not change while the run goes on."""

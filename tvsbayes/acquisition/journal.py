@@ -23,7 +23,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tvsbayes.acquisition.journal_events import Frame
+import msgspec
+
+from tvsbayes.acquisition.journal_events import FRAME_NAME, Event, Frame
 from tvsbayes.errors import DeviceFault, InputError, escaped, refusal
 from tvsbayes.files.disk import flush_folder, make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import parse_json
@@ -41,8 +43,6 @@ Source: `experiments/robustness/hostile.md`.
 FRAME_BYTES_MAX = 128 * 1024 * 1024
 FRAME_FOLDERS = ("frames", "dark")
 """Pictures with the laser on and, for the background, off."""
-FRAME_NAME = re.compile(r"(?:frames|dark)/[0-9]{6}_(?:left|right)\.png")
-"""As `instrument.campaign.frame_name` makes them."""
 LOG_LINE = re.compile(rb"([0-9a-f]{8}) (0|[1-9][0-9]{0,8}) ([0-9a-f]{8}) (\{[ -~]*\})")
 EMPTY_REMEDY = "nothing was written down: begin anew in another folder, without --resume"
 """For a run that was killed before its first event, or whose journal was emptied."""
@@ -83,17 +83,31 @@ class Record:
     line: int
 
 
-@dataclass(frozen=True, slots=True)
-class FrameFile:
-    """A stored picture: name relative to the folder, SHA-256 of the file, its size in bytes."""
+def refused(record: Record, found: object) -> InputError:
+    """The refusal of an event that states what it cannot, or contradicts those before it."""
+    allowed, remedy = f"the entries of the event {record.event}", "tvsbayes check FOLDER --repair-to NEW"
+    found = escaped(str(found), 80)
+    return refusal("event", file=LOG, line=record.line, found=found, allowed=allowed, remedy=remedy)
 
-    name: str
-    sha256: str
-    size: int
 
-    def as_json(self) -> Frame:
-        """As a look's event holds it."""
-        return {"name": self.name, "sha256": self.sha256, "bytes": self.size}
+def kind_of(event: type[Event]) -> str:
+    """How a journal names events of a class."""
+    return str(event.__struct_config__.tag)
+
+
+def event_of[E: Event](record: Record, *kinds: type[E]) -> E | None:
+    """An event of one of these kinds, its entries held to their types; None of every other kind.
+
+    Raises:
+        InputError: an entry is missing or of another type, with the line of the journal.
+    """
+    for kind in kinds:
+        if kind_of(kind) == record.event:
+            try:
+                return msgspec.convert({"event": record.event, **record.data}, kind)
+            except msgspec.ValidationError as error:
+                raise refused(record, error) from error
+    return None
 
 
 @dataclass(frozen=True)
@@ -315,7 +329,7 @@ class Journal:
             raise
         return cls(folder, descriptor, reading, disk)
 
-    def store(self, name: str, data: bytes) -> FrameFile:
+    def store(self, name: str, data: bytes) -> Frame:
         """Writes a frame; it counts once an event that names it is appended.
 
         Raises:
@@ -339,7 +353,7 @@ class Journal:
                 self._disk.close(descriptor)
             self._disk.replace(temporary, target)
         self._dirty.add(target.parent)
-        return FrameFile(name, hashlib.sha256(data).hexdigest(), len(data))
+        return Frame(name, hashlib.sha256(data).hexdigest(), len(data))
 
     def append(self, event: str, /, **data: object) -> Record:
         """Appends an event and returns once it is on the disk, behind the frames stored before it.

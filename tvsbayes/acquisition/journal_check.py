@@ -10,21 +10,23 @@ import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
+
 from tvsbayes.acquisition.journal import (
     EMPTY_REMEDY,
     FRAME_BYTES_MAX,
     FRAME_FOLDERS,
-    FRAME_NAME,
     LOG,
     REPAIR_REMEDY,
-    FrameFile,
     Journal,
     Line,
     Record,
+    event_of,
     parse_line,
     read_journal,
     read_log,
 )
+from tvsbayes.acquisition.journal_events import Frame, Stop
 from tvsbayes.errors import InputError, refusal
 from tvsbayes.files.disk import make_folder, read_bytes
 
@@ -63,32 +65,21 @@ class Verification:
         return warnings
 
 
-def frames_of(record: Record) -> list[FrameFile]:
+def frames_of(record: Record) -> list[Frame]:
     """The frames that an event names.
 
     Raises:
         InputError: entries that no journal of ours holds.
     """
-    entries = record.data.get("frames", [])
-    found = []
-    for entry in entries if isinstance(entries, list) else [None]:
-        frame = _frame(entry)
-        if frame is None:
-            allowed = "frames as { name, sha256, bytes }"
-            raise refusal("journal", file=LOG, line=record.line, found="another", allowed=allowed, remedy=REPAIR_REMEDY)
-        found.append(frame)
-    return found
+    try:
+        return msgspec.convert(record.data.get("frames", []), list[Frame])
+    except msgspec.ValidationError as error:
+        allowed, line = "frames as { name, sha256, bytes }", record.line
+        found = "another"
+        raise refusal("journal", file=LOG, line=line, found=found, allowed=allowed, remedy=REPAIR_REMEDY) from error
 
 
-def _frame(entry: object) -> FrameFile | None:
-    if not isinstance(entry, dict) or set(entry) != {"name", "sha256", "bytes"}:
-        return None
-    name = entry["name"]
-    good = isinstance(name, str) and FRAME_NAME.fullmatch(name)
-    return FrameFile(name, str(entry["sha256"]), entry["bytes"]) if good else None
-
-
-def _frame_problem(folder: Path, frame: FrameFile) -> str | None:
+def _frame_problem(folder: Path, frame: Frame) -> str | None:
     """What is wrong with a stored frame, None for nothing."""
     try:
         data = read_bytes(folder / frame.name, FRAME_BYTES_MAX, folder)
@@ -132,9 +123,9 @@ def verify(folder: Path) -> Verification:
                     remedy=REPAIR_REMEDY,
                 )
             count += 1
-    stops = [str(r.data.get("reason", "")) for r in reading.records[-1:] if r.event == "stop"]
+    end = event_of(reading.records[-1], Stop) if reading.records else None
     missing = tuple(orphans(folder, reading.records))
-    return Verification(len(reading.records), count, missing, len(reading.torn), stops[0] if stops else None)
+    return Verification(len(reading.records), count, missing, len(reading.torn), None if end is None else end.reason)
 
 
 @dataclass

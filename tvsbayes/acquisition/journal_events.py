@@ -1,24 +1,37 @@
-"""The events of a run's journal, as their JSON objects stand in `log.jsonl`.
+"""The events of a run's journal, as their JSON objects stand in `log.jsonl`: structs, told apart by the key `event`.
 
 `created` opens a journal. Every motion of the plan is an `intent` before, and an order has an event of its own once it
-is done: `homed`, `placed`, `moved`, `looked`. `adapted` changes the plan, `confirmed` says whether the posterior meets
-the target, `asked` is what somebody asked for on the live page, `verified` closes a segment, `start` and `stop` enclose
-a run, `gap` stands where a repair lost lines.
-Counters in motor steps, raw px, degrees and seconds by suffix; `utc` and `created` are ISO 8601.
+is done: `homed`, `placed`, `moved`, `looked`. `place_command` is a program that was to place the sheet. `adapted`
+changes the plan, `confirmed` says whether the posterior meets the target, `asked` is what somebody asked for on the
+live page, `verified` closes a segment, `start` and `stop` enclose a run, `gap` stands where a repair lost lines.
+Counters in motor steps, raw px, degrees and seconds by suffix; `utc` and `created` are ISO 8601. Fields stand in the
+order in which they are written; those that are UNSET by default may be missing.
 
-A checksum finds accidents, not forgery: who reads an event converts what its entries hold, and refuses what does not
-convert.
+A checksum finds accidents, not forgery: `journal.event_of` holds what an event states to its declaration.
 """
 
 from __future__ import annotations
 
-from typing import NotRequired, TypedDict
+import re
+from typing import Annotated, Any
+
+from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 
 Four = tuple[float, float, float, float]
 """u_left, v_left, u_right, v_right."""
 
 
-class Created(TypedDict):
+class Event(Struct, frozen=True, kw_only=True, tag_field="event", tag=str.lower):
+    """Base of the events; keys that one does not know are passed over."""
+
+    def entries(self) -> dict[str, Any]:
+        """The entries of its JSON object but for its kind."""
+        found = to_builtins(self, enc_hook=float)
+        del found["event"]
+        return found
+
+
+class Created(Event, frozen=True):
     """The first event: whose journal it is; a plan is known by its SHA-256, a rig by the entries that may not change.
 
     Earlier journals know the rig by a SHA-256 too.
@@ -26,68 +39,109 @@ class Created(TypedDict):
 
     format: str
     created: str
-    name: NotRequired[str]
-    synthetic: NotRequired[bool]
-    seed: NotRequired[int]
-    plan_sha256: NotRequired[str]
-    rig: NotRequired[dict[str, object]]
-    rig_sha256: NotRequired[str]
-    repaired: NotRequired[bool]
+    name: str | UnsetType = UNSET
+    synthetic: bool | UnsetType = UNSET
+    seed: int | UnsetType = UNSET
+    plan_sha256: str | UnsetType = UNSET
+    rig: dict[str, Any] | UnsetType = UNSET
+    rig_sha256: str | UnsetType = UNSET
+    repaired: bool | UnsetType = UNSET
 
 
-class Placed(TypedDict):
+class Start(Event, frozen=True):
+    """A run begins, for the first time or again: what may differ between runs, and who takes part."""
+
+    utc: str = ""
+    setup: dict[str, Any] | UnsetType = UNSET
+    device: dict[str, Any] | UnsetType = UNSET
+    cameras: dict[str, Any] | UnsetType = UNSET
+    simulated: bool | UnsetType = UNSET
+
+
+class Placed(Event, frozen=True):
     """The sheet stands at a target; `again` where the plan did not ask for it."""
 
     step: int | None
     target: str
-    again: NotRequired[bool]
-    utc: str
+    again: bool | UnsetType = UNSET
+    utc: str = ""
 
 
-class Moved(TypedDict):
-    """A motion has ended at these counters, since the campaign was created `time_s` ago.
+class PlaceCommanded(Event, frozen=True, kw_only=True, tag="place_command"):
+    """A program has placed the sheet (`exit_code` 0) or failed to; None where it had to be ended. `words`: its output.
 
-    `step` is that of the plan, None for motions of a resumed run; `twin` is what a simulation knows of the mirrors.
+    `placement` counts the placements of the plan from 0. `placed` follows where it has worked.
     """
 
-    step: int | None
-    time_s: float
-    pan_steps: int
-    tilt_steps: int
-    reference: NotRequired[bool]
-    twin: NotRequired[TrueAngles]
+    time_s: float | UnsetType = UNSET
+    target: str
+    x_mm: float
+    placement: int
+    command: list[str]
+    exit_code: int | None
+    seconds: float
+    limit_s: float
+    words: str
 
 
-class Homed(Moved):
-    """A homing and the way to its counters: boot id of the device, the side of arrival of pan and tilt."""
-
-    boot: int
-    approach: list[str]
-
-
-class TrueAngles(TypedDict):
+class TrueAngles(Struct, frozen=True):
     """Mirror angles (psi, beta) of a simulated rig at rest, and the stop errors (pan, tilt) in them, degrees."""
 
     mirror_angles_deg: tuple[float, float]
     stop_errors_deg: tuple[float, float]
 
 
-class Verified(TypedDict):
+class Motion(Event, frozen=True):
+    """A motion has ended at these counters, since the campaign was created `time_s` ago.
+
+    `step` is that of the plan, None for motions of a resumed run.
+    """
+
+    step: int | None
+    time_s: float
+    pan_steps: int
+    tilt_steps: int
+
+
+class Moved(Motion, frozen=True):
+    """An order to move is done; `twin` is what a simulation knows of the mirrors."""
+
+    reference: bool | UnsetType = UNSET
+    twin: TrueAngles | UnsetType = UNSET
+
+
+class Homed(Motion, frozen=True):
+    """A homing and the way to its counters: boot id of the device, the side of arrival of pan and tilt."""
+
+    boot: int
+    approach: tuple[str, str]
+    twin: TrueAngles | UnsetType = UNSET
+
+
+class Verified(Event, frozen=True):
     """What a homing found of the segment before: (pan, tilt) switches minus counters; None where it cannot tell."""
 
     segment: int
-    deviation_steps: list[int] | None
+    deviation_steps: tuple[int, int] | None
 
 
-class Frame(TypedDict):
-    """A stored picture: name relative to the folder, SHA-256 and size of the file."""
+FRAME_NAME = re.compile(r"(?:frames|dark)/[0-9]{6}_(?:left|right)\.png")
+"""As `instrument.campaign.frame_name` makes them."""
 
-    name: str
+
+class Frame(Struct, frozen=True, forbid_unknown_fields=True, rename={"size": "bytes"}):
+    """A stored picture: name relative to the folder, SHA-256 of the file, its size in bytes."""
+
+    name: Annotated[str, Meta(pattern=rf"\A{FRAME_NAME.pattern}\Z")]
     sha256: str
-    bytes: int
+    size: int
+
+    def as_json(self) -> dict[str, Any]:
+        """As a look's event holds it."""
+        return to_builtins(self)
 
 
-class Looked(TypedDict):
+class Looked(Event, frozen=True):
     """A look and what a detector found in it.
 
     `reference_of` names the spot that a look of a resumed run compares itself with, `shift_px` the largest change.
@@ -101,15 +155,15 @@ class Looked(TypedDict):
     status: str
     pixels_px: Four | None
     sds_px: Four | None
-    correlations: NotRequired[tuple[float, float]]
-    frames: list[Frame]
-    time_s: float
-    aperture_deg: NotRequired[float | None]
-    reference_of: NotRequired[int]
-    shift_px: NotRequired[float | None]
+    correlations: tuple[float, float] = (0.0, 0.0)
+    frames: tuple[Frame, ...] = ()
+    time_s: float | UnsetType = UNSET
+    reference_of: int | UnsetType = UNSET
+    shift_px: float | UnsetType | None = UNSET
+    aperture_deg: float | UnsetType | None = UNSET
 
 
-class Adapted(TypedDict):
+class Adapted(Event, frozen=True):
     """A change of plan: the steps that stand from row `row` on, and why they were chosen.
 
     Each look says what the target was expected to be before it and after; `looks` are those of the estimate behind it.
@@ -118,10 +172,10 @@ class Adapted(TypedDict):
     row: int
     looks: int
     why: str
-    steps: list[dict[str, object]]
+    steps: tuple[dict[str, Any], ...]
 
 
-class Confirmed(TypedDict):
+class Confirmed(Event, frozen=True):
     """Whether the posterior, sampled where the Laplace approximation met the target, meets it too.
 
     Of so many `looks`; worst u of the directions by both, deg/step; `accepted`: whether the weighted draws may be used.
@@ -135,7 +189,7 @@ class Confirmed(TypedDict):
     reached: bool
 
 
-class AskedDevice(TypedDict):
+class AskedDevice(Struct, frozen=True):
     """What the device answered: status, laser, boot id and counters."""
 
     status: str
@@ -145,21 +199,29 @@ class AskedDevice(TypedDict):
     tilt_steps: int
 
 
-class Asked(TypedDict):
+class Asked(Event, frozen=True, kw_only=True):
     """What somebody asked of a run while it went on (pause, resume, stop, laser off), once the device had answered.
+
+    `control passed on`: another browser controls, because the one before had not asked for a while.
 
     `number` counts the requests of a run from 1; `time_s` since the campaign was created, when the device had answered.
     """
 
-    time_s: NotRequired[float]
+    time_s: float | UnsetType = UNSET
     number: int
     what: str
     device: AskedDevice
 
 
-class Stop(TypedDict):
+class Stop(Event, frozen=True):
     """The end of a run."""
 
     reason: str
-    exit_code: int
-    utc: str
+    exit_code: int | UnsetType = UNSET
+    utc: str = ""
+
+
+class Gap(Event, frozen=True):
+    """Lines were lost before a line of the journal that was repaired."""
+
+    before_line: int

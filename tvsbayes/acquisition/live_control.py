@@ -12,7 +12,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from tvsbayes.acquisition.journal_events import Asked, AskedDevice
-from tvsbayes.acquisition.live_requests import ACKNOWLEDGED, FAILED, LASER_OFF, RESUME, STOP, Request, Requests
+from tvsbayes.acquisition.live_requests import (
+    ACKNOWLEDGED,
+    CONTROL_PASSED,
+    FAILED,
+    LASER_OFF,
+    RESUME,
+    STOP,
+    Request,
+    Requests,
+)
 from tvsbayes.acquisition.operator import StopKey
 from tvsbayes.positioner.interface import HomeReport, Positioner
 from tvsbayes.positioner.protocol import DeviceState
@@ -64,6 +73,15 @@ class Control:
             self._requests.wait(PAUSE_POLL_S)
             self._carry_out_all()
 
+    def meanwhile(self) -> bool:
+        """While the run waits for a computation: does what was asked for; whether the run is to go on afterwards.
+
+        Raises:
+            DeviceFault: as `heed`.
+        """
+        self._carry_out_all()
+        return not self._stop.requested
+
     def darken(self) -> bool:
         """Within a step: carries out a request for laser off; whether light is refused now."""
         request = self._requests.next(LASER_OFF)
@@ -83,9 +101,10 @@ class Control:
 
     def _carry_out(self, request: Request) -> None:
         try:
-            resumes = request.what == RESUME
-            state = self._positioner.state() if resumes else self._positioner.laser(False)
-            self.paused = not resumes
+            only_asks = request.what in (RESUME, CONTROL_PASSED)
+            state = self._positioner.state() if only_asks else self._positioner.laser(False)
+            if request.what != CONTROL_PASSED:
+                self.paused = request.what != RESUME
             if request.what == STOP:
                 self._stop.requested = True
             self._write(asked_entries(request, state))
@@ -98,14 +117,8 @@ class Control:
 
 def asked_entries(request: Request, state: DeviceState) -> Asked:
     """The event of a request that the device has answered."""
-    device: AskedDevice = {
-        "status": state.status,
-        "laser_on": state.laser_on,
-        "boot": state.boot,
-        "pan_steps": state.pan_steps,
-        "tilt_steps": state.tilt_steps,
-    }
-    return {"number": request.number, "what": request.what, "device": device}
+    device = AskedDevice(state.status, state.laser_on, state.boot, state.pan_steps, state.tilt_steps)
+    return Asked(number=request.number, what=request.what, device=device)
 
 
 def device_text(state: DeviceState) -> str:

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 
 PAUSE, RESUME, STOP, LASER_OFF = "pause", "resume", "stop", "laser off"
 REQUESTS = (PAUSE, RESUME, STOP, LASER_OFF)
+CONTROL_PASSED = "control passed on"
+"""No request of a page but news for the journal: another browser controls."""
 KEPT_MAX = 20
 """Settled requests that are still told of."""
 REQUESTED, ACKNOWLEDGED, FAILED = "requested", "acknowledged", "failed"
@@ -23,7 +25,7 @@ class Request:
 
     Attributes:
         number: from 1, in the order in which they came.
-        what: one of `REQUESTS`.
+        what: one of `REQUESTS`, or `CONTROL_PASSED`.
         asked_s: when, by this computer's steady clock.
         state: requested, acknowledged (the device has answered and the journal holds it), or failed.
         waited_s: from asking to the answer, None while it waits.
@@ -54,12 +56,12 @@ class Requests:
         goes before all others.
 
         Raises:
-            ValueError: none of `REQUESTS`.
+            ValueError: neither one of `REQUESTS` nor `CONTROL_PASSED`.
         """
-        if what not in REQUESTS:
+        if what not in (*REQUESTS, CONTROL_PASSED):
             raise ValueError(what)
         with self._changed:
-            if what != RESUME:
+            if what not in (RESUME, CONTROL_PASSED):
                 for request in self._waiting():
                     if request.what == RESUME:
                         self.settle(request, FAILED, f"withdrawn: {what} was asked for after it")

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
 
-from tvsbayes.acquisition.live_requests import Requests
+from tvsbayes.acquisition.live_requests import CONTROL_PASSED, REQUESTS, Requests
 from tvsbayes.acquisition.live_snapshot import (
     ENDED,
     ESTIMATES_MAX,
@@ -22,15 +22,9 @@ from tvsbayes.acquisition.live_snapshot import (
     temperature,
 )
 from tvsbayes.acquisition.running_estimate import Estimate
-from tvsbayes.errors import DeviceFault
-from tvsbayes.files.images import decode_image, in_grey_levels
+from tvsbayes.files.images import decode_image, small_picture
 from tvsbayes.instrument.campaign import CAMERAS, frame_name
 
-WHOLE_PX = 480
-"""Width of a whole picture as it is shown."""
-WINDOW_PX = 48
-"""Side of the cut-out around a spot, pixels of the camera."""
-JPEG_QUALITY = 80
 KINDS = ("whole", "spot")
 """Of pictures: all of it, small; the surroundings of the spot as they are."""
 
@@ -88,7 +82,13 @@ class LiveRun:
         Raises:
             ValueError: nothing that can be asked for.
         """
+        if what not in REQUESTS:
+            raise ValueError(what)
         return self.requests.ask(what) is not None
+
+    def control_passed(self) -> None:
+        """Another browser controls from now on: written down by the engine, as what was asked for is."""
+        self.requests.ask(CONTROL_PASSED)
 
     def told(self) -> dict[str, Any]:
         """The newest snapshot and the requests, as JSON holds them."""
@@ -116,29 +116,10 @@ class LiveRun:
         if png is None or (kind == "spot" and look.pixels_px is None):
             return None
         first = 2 * CAMERAS.index(camera)
-        centre = None if look.pixels_px is None or kind == "whole" else look.pixels_px[first : first + 2]
-        return small_picture(png, centre)
-
-
-def small_picture(png: bytes, centre_px: tuple[float, ...] | None) -> bytes:
-    """A picture for a page: all of it, at most `WHOLE_PX` wide, or a window around a centre; JPEG.
-
-    The window has `WINDOW_PX` pixels a side, the pixel of the centre at WINDOW_PX / 2; black beyond the picture.
-    """
-    import cv2
-    import numpy as np
-
-    image = np.clip(in_grey_levels(decode_image(png, "picture")), 0, 255).astype(np.uint8)
-    if centre_px is None:
-        height, width = image.shape[:2]
-        if width > WHOLE_PX:
-            image = cv2.resize(image, (WHOLE_PX, round(height * WHOLE_PX / width)), interpolation=cv2.INTER_AREA)
-    else:
-        half = WINDOW_PX // 2
-        u, v = (round(value) for value in centre_px)
-        padded = np.pad(image, ((half, half), (half, half), (0, 0)))
-        image = padded[v : v + WINDOW_PX, u : u + WINDOW_PX]
-    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not done:
-        raise DeviceFault("picture", f"no JPEG of shape {image.shape}")
-    return data.tobytes()
+        centre = None
+        if look.pixels_px is not None and kind == "spot":
+            centre = look.pixels_px[first], look.pixels_px[first + 1]
+        try:
+            return small_picture(decode_image(png, "picture"), centre)
+        except ValueError:
+            return None

@@ -17,11 +17,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
-from tvsbayes.acquisition.journal import LOG, LOG_BYTES_MAX, Record, read_journal
+from tvsbayes.acquisition.journal import LOG, LOG_BYTES_MAX, Record, event_of, read_journal
 from tvsbayes.acquisition.journal_check import frames_of
 from tvsbayes.acquisition.journal_events import Looked, Stop
 from tvsbayes.errors import escaped, refusal
@@ -125,7 +126,7 @@ def _entry(entry: Any, campaign: Campaign, records: Sequence[Record]) -> None:
     created = header.get("created")
     if created is not None:
         _put(entry, "start_time", created.isoformat() if hasattr(created, "isoformat") else str(created))
-    ends = [str(cast("Stop", record.data).get("utc", "")) for record in records if record.event == "stop"]
+    ends = [end.utc for record in records if (end := event_of(record, Stop)) is not None]
     if ends and ends[-1]:
         _put(entry, "end_time", ends[-1])
     if header.get("synthetic"):
@@ -202,8 +203,8 @@ def _numbers(values: Sequence[float | None]) -> np.ndarray:
 
 def _look_times(records: Sequence[Record]) -> Mapping[int, float]:
     """When looks were taken, by spot."""
-    looks = [cast("Looked", record.data) for record in records if record.event == "looked"]
-    return {int(look["spot"]): float(look["time_s"]) for look in looks if "time_s" in look}
+    looks = [look for record in records if (look := event_of(record, Looked)) is not None]
+    return {look.spot: look.time_s for look in looks if look.time_s is not UNSET}
 
 
 def _pictures(group: Any, records: Sequence[Record]) -> int:

@@ -124,11 +124,13 @@ class TerminalOperator:
         stop: the stop key, which may interrupt a question.
         terminal: where.
         laser_class: stated on the command line: the hazard is shown, nobody is asked.
+        places: whether a person places the sheet; else a program has placed it, and nobody is asked.
     """
 
     stop: StopKey
     terminal: Terminal
     laser_class: str | None = None
+    places: bool = True
 
     def accept(self, hazard: str) -> bool:
         """See `Operator.accept`."""
@@ -143,6 +145,8 @@ class TerminalOperator:
         """See `Operator.place`."""
         if remark:
             self.terminal.say(f"note: {remark}")
+        if not self.places:
+            return True
         answer = self._answer(f"Put the sheet at {target} (X = {x_mm:g} mm), then press Enter; q stops: ")
         return answer != "q"
 

@@ -11,9 +11,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal, cast
 
-from tvsbayes.acquisition.journal import LOG, Record
-from tvsbayes.acquisition.journal_events import Homed, Looked, Moved, Placed, Stop, Verified
-from tvsbayes.errors import refusal
+from msgspec import UNSET
+
+from tvsbayes.acquisition.journal import Record, event_of, refused
+from tvsbayes.acquisition.journal_events import Gap, Homed, Looked, Moved, Placed, Start, Stop, Verified
 from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import NO_PIXELS, Move, Spot, next_move, with_pixels
 
@@ -83,72 +84,64 @@ class Recorder:
         Raises:
             InputError: one that contradicts those before, with its line.
         """
-        try:
-            self._add(record)
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            found, allowed = f"{error!r}"[:80], f"the entries of the event {record.event}"
-            remedy = "tvsbayes check FOLDER --repair-to NEW"
-            raise refusal("event", file=LOG, line=record.line, found=found, allowed=allowed, remedy=remedy) from error
+        event = event_of(record, Gap, Start, Stop, Placed, Verified, Homed, Moved, Looked)
+        if isinstance(event, Moved | Looked):
+            if not self._trusted:
+                self._ignored.append(record.line)
+                return
+            if not self.moves:
+                raise refused(record, "it stands before the first homing")
+        match event:
+            case Gap():
+                self._trusted = False
+            case Start():
+                self.state = replace(self.state, starts=self.state.starts + 1, ended=None)
+            case Stop():
+                self.state = replace(self.state, ended=event.reason)
+            case Placed():
+                self.state = replace(self.state, target=event.target)
+            case Verified():
+                self._verified(event)
+            case Homed():
+                self._homed(event)
+            case Moved():
+                self._moved(event, self.moves[-1].segment)
+            case Looked():
+                self._looks(event)
+        if isinstance(event, Homed | Moved | Placed | Looked) and event.step is not None:
+            self.state = replace(self.state, next_step=max(self.state.next_step, event.step + 1))
 
-    def _add(self, record: Record) -> None:
-        """Takes an event; the casts say which it is, the conversions behind them whether it holds what it should."""
-        data, event, state = record.data, record.event, self.state
-        if event in ("moved", "looked") and not self._trusted:
-            self._ignored.append(record.line)
-            return
-        if event == "gap":
-            self._trusted = False
-        elif event == "start":
-            self.state = replace(state, starts=state.starts + 1, ended=None)
-        elif event == "stop":
-            self.state = replace(state, ended=str(cast("Stop", data)["reason"]))
-        elif event == "placed":
-            self.state = replace(state, target=str(cast("Placed", data)["target"]))
-        elif event == "verified":
-            self._verified(cast("Verified", data))
-        elif event == "homed":
-            self._homed(cast("Homed", data))
-        elif event == "moved":
-            self._moved(cast("Moved", data), self.moves[-1].segment)
-        elif event == "looked":
-            self._looks(cast("Looked", data))
-        if data.get("step") is not None and event in ("homed", "moved", "placed", "looked"):
-            step = int(cast("Moved | Placed | Looked", data)["step"] or 0)
-            self.state = replace(self.state, next_step=max(self.state.next_step, step + 1))
-
-    def _verified(self, data: Verified) -> None:
-        segment, deviation = int(data["segment"]), data["deviation_steps"]
-        if deviation is None:
+    def _verified(self, event: Verified) -> None:
+        if event.deviation_steps is None:
             # A device that was restarted meanwhile has no counters to compare with.
             return
-        self._closed.add(segment)
-        if max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
-            self._lost[segment] = (int(deviation[0]), int(deviation[1]))
+        self._closed.add(event.segment)
+        if max(map(abs, event.deviation_steps)) > HOME_TOLERANCE_STEPS:
+            self._lost[event.segment] = event.deviation_steps
 
-    def _homed(self, data: Homed) -> None:
+    def _homed(self, event: Homed) -> None:
         self._trusted = True
         segment = self.moves[-1].segment + 1 if self.moves else 0
-        pan, tilt = data["approach"]
+        pan, tilt = event.approach
         # What sides they are is checked where the tables are written.
         approach = cast("PanApproach", pan), cast("TiltApproach", tilt)
-        self._moved(data, segment, approach)
+        self._moved(event, segment, approach)
         # Only a homing of the plan states counters; one of a resumed run repeats them.
-        counters = int(data["pan_steps"]), int(data["tilt_steps"])
-        self.state = replace(self.state, boot=int(data["boot"]), home_steps=counters)
+        self.state = replace(self.state, boot=event.boot, home_steps=(event.pan_steps, event.tilt_steps))
 
     def _moved(
         self,
-        data: Moved,
+        event: Moved | Homed,
         segment: int,
         approach: tuple[PanApproach | Literal[""], TiltApproach | Literal[""]] = ("", ""),
     ) -> None:
-        steps = int(data["pan_steps"]), int(data["tilt_steps"])
-        self.moves.append(next_move(self.moves, segment, float(data["time_s"]), steps, approach))
+        steps = event.pan_steps, event.tilt_steps
+        self.moves.append(next_move(self.moves, segment, event.time_s, steps, approach))
 
-    def _looks(self, data: Looked) -> None:
-        self.spots.append(_spot(data, len(self.moves) - 1))
-        if data.get("step") is not None:
-            self._looked.add(int(data["step"] or 0))
+    def _looks(self, event: Looked) -> None:
+        self.spots.append(_spot(event, len(self.moves) - 1))
+        if event.step is not None:
+            self._looked.add(event.step)
         else:
             self.state = replace(self.state, references=self.state.references + 1)
 
@@ -183,17 +176,14 @@ def recorded(records: Iterable[Record]) -> Recorded:
     return recorder.result()
 
 
-def _spot(data: Looked, move: int) -> Spot:
-    if move < 0:
-        raise ValueError("a look before the first homing")
+def _spot(event: Looked, move: int) -> Spot:
     row = Spot(
-        spot=int(data["spot"]),
+        spot=event.spot,
         move=move,
-        target=str(data["target"]),
-        experiment=data["experiment"],
-        point=data["point"],
-        aperture_deg=data.get("aperture_deg"),
+        target=event.target,
+        experiment=event.experiment,
+        point=event.point,
+        aperture_deg=None if event.aperture_deg is UNSET else event.aperture_deg,
     )
-    pixels, sds = data["pixels_px"] or NO_PIXELS, data["sds_px"] or NO_PIXELS
-    left, right = map(float, data.get("correlations", (0.0, 0.0)))
-    return with_pixels(row, str(data["status"]), pixels, sds, (left, right))
+    pixels, sds = event.pixels_px or NO_PIXELS, event.sds_px or NO_PIXELS
+    return with_pixels(row, event.status, pixels, sds, event.correlations)

@@ -13,9 +13,9 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from tvsbayes.acquisition.journal import LOG, Record
+from tvsbayes.acquisition.journal import Record, event_of, refused
 from tvsbayes.acquisition.journal_events import Adapted, Confirmed
 from tvsbayes.acquisition.running_estimate import Estimate, RunningEstimate
 from tvsbayes.errors import escaped, refusal
@@ -25,9 +25,6 @@ from tvsbayes.instrument.plan import PlanStep, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
 
-ADAPTED = "adapted"
-CONFIRMED = "confirmed"
-"""Events of the journal."""
 NEXT_SHARE, NEXT_LEAST, NEXT_MOST = 0.3, 8, 80
 """Looks of a proposal: this share of those that are there, more than come before the next one, at least so many.
 
@@ -155,14 +152,14 @@ class Replanning(RunningEstimate):
         before, after = (max(each.u_deg_per_step.values()) for each in (laplace, sampled))
         if accepted:
             self._ratio = max(1.0, after / before)
-        self._confirmed = {
-            "looks": self._looks,
-            "target_u_deg_per_step": float(self.target or 0.0),
-            "laplace_u_deg_per_step": before,
-            "importance_u_deg_per_step": after,
-            "accepted": accepted,
-            "reached": accepted and after <= float(self.target or 0.0),
-        }
+        self._confirmed = Confirmed(
+            looks=self._looks,
+            target_u_deg_per_step=float(self.target or 0.0),
+            laplace_u_deg_per_step=before,
+            importance_u_deg_per_step=after,
+            accepted=accepted,
+            reached=accepted and after <= float(self.target or 0.0),
+        )
         return sampled if accepted else laplace
 
     def proposal(self) -> Proposal | None:
@@ -208,7 +205,7 @@ def adapted_entries(proposal: Proposal, row: int, steps: Sequence[PlanStep]) -> 
             entry |= {"u_before_deg_per_step": before, "u_after_deg_per_step": after}
             before = after
         told.append(entry)
-    return {"row": row, "looks": proposal.looks, "why": proposal.why, "steps": told}
+    return Adapted(row=row, looks=proposal.looks, why=proposal.why, steps=tuple(told))
 
 
 def adapted_plan(plan: Sequence[PlanStep], records: Iterable[Record]) -> tuple[PlanStep, ...]:
@@ -219,15 +216,11 @@ def adapted_plan(plan: Sequence[PlanStep], records: Iterable[Record]) -> tuple[P
     """
     now = tuple(plan)
     for record in records:
-        if record.event != ADAPTED:
+        event = event_of(record, Adapted)
+        if event is None:
             continue
         try:
-            data = cast("Adapted", record.data)
-            row = int(data["row"])
-            now = (*now[:row], *(_step(row + n, entry) for n, entry in enumerate(data["steps"])))
+            now = (*now[: event.row], *(_step(event.row + n, entry) for n, entry in enumerate(event.steps)))
         except (KeyError, TypeError, ValueError) as error:
-            allowed, remedy = "row and steps of a changed plan", "tvsbayes check FOLDER --repair-to NEW"
-            found = escaped(repr(error), 80)
-            line = record.line
-            raise refusal("event", file=LOG, line=line, found=found, allowed=allowed, remedy=remedy) from error
+            raise refused(record, repr(error)) from error
     return now

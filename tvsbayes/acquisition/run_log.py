@@ -10,8 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tvsbayes.acquisition.campaign_files import CampaignFiles
-from tvsbayes.acquisition.journal import FRAME_NAME, Journal
+from tvsbayes.acquisition.journal import Journal, kind_of
 from tvsbayes.acquisition.journal_check import orphans
+from tvsbayes.acquisition.journal_events import FRAME_NAME, Event, Homed, Stop, Verified
 from tvsbayes.acquisition.recorder import HOME_TOLERANCE_STEPS, Recorder
 from tvsbayes.acquisition.running_estimate import Estimate
 from tvsbayes.errors import DeviceFault
@@ -90,14 +91,14 @@ class RunLog:
         """How many looks count, as far as is known."""
         return sum(spot.status == "ok" for spot in self.recorder.spots)
 
-    def write(self, event: str, **data: object) -> None:
+    def write(self, event: Event) -> None:
         """Appends an event; after a homing the campaign files are written anew.
 
         Raises:
             DeviceFault: the disk refuses.
         """
-        self.recorder.add(self._journal.append(event, **data))
-        if event in ("homed", "verified"):
+        self.recorder.add(self._journal.append(kind_of(type(event)), **event.entries()))
+        if isinstance(event, Homed | Verified):
             self.files.derive(always=True)
 
     def now_s(self) -> float:
@@ -123,8 +124,8 @@ class RunLog:
         if not self.recorder.moves:
             return
         known = report.known or (report.compared and report.state.boot == self.recorder.state.boot)
-        segment, deviation = self.recorder.moves[-1].segment, list(report.deviation_steps) if known else None
-        self.write("verified", segment=segment, deviation_steps=deviation)
+        segment, deviation = self.recorder.moves[-1].segment, report.deviation_steps if known else None
+        self.write(Verified(segment=segment, deviation_steps=deviation))
         if deviation is not None and max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
             self.warnings.append(
                 f"segment {segment}: the home switches were found {deviation[0]} and {deviation[1]} steps off: steps "
@@ -134,7 +135,7 @@ class RunLog:
     def end(self, reason: str, exit_code: int) -> None:
         """Writes down how it ended, as well as the disk allows, and closes the journal."""
         try:
-            self.write("stop", reason=reason, exit_code=exit_code, utc=self.utc_text())
+            self.write(Stop(reason=reason, exit_code=exit_code, utc=self.utc_text()))
         except DeviceFault:
             # A broken disk was the reason, and is on its way to the user already.
             pass

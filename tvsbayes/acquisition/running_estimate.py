@@ -11,7 +11,8 @@ from __future__ import annotations
 import json
 import subprocess
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ GROWTH = 1.2
 """The next fit begins when there are so many times more looks than at the last: their sum costs a few fits."""
 FIT_MAX_S = 3600.0
 """Longest wait for a fit; one takes a minute or less."""
+FIT_POLL_S = 0.1
+"""While a fit is waited for: how often what is asked of the run is heeded."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,10 @@ class RunningEstimate:
         target_u_deg_per_step: the uncertainty wanted of every direction; None wants nothing and is never met.
         directions: those that must meet it.
         wait: whether to wait for every fit: in a simulation time stands still meanwhile.
+
+    Attributes:
+        latest: the newest estimate.
+        meanwhile: called again and again while a fit is waited for; False ends wait and fit.
     """
 
     def __init__(
@@ -99,6 +106,7 @@ class RunningEstimate:
     ):
         self.folder, self.target, self.directions = Path(folder), target_u_deg_per_step, set(directions)
         self.latest: Estimate | None = None
+        self.meanwhile: Callable[[], bool] = lambda: True
         self._wait = wait
         self._command = tuple(command)
         self._scratch = tempfile.TemporaryDirectory(prefix="tvsbayes-estimate-")
@@ -109,10 +117,15 @@ class RunningEstimate:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._end()
+        self._scratch.cleanup()
+
+    def _end(self) -> None:
+        """Kills a fit that goes on."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
-        self._scratch.cleanup()
+            self._process = None
 
     @property
     def aim(self) -> Aim:
@@ -156,13 +169,20 @@ class RunningEstimate:
             self._process = None
 
     def _wait_for_fit(self) -> None:
+        """A fit that takes too long is killed, as is that of a run that is to end."""
         if self._process is None:
             return
-        try:
-            self._process.wait(FIT_MAX_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        until = time.monotonic() + FIT_MAX_S
+        while self.meanwhile():
+            try:
+                self._process.wait(FIT_POLL_S)
+                break
+            except subprocess.TimeoutExpired:
+                if time.monotonic() > until:
+                    self._process.kill()
+        else:
+            self._end()
+            return
         self._take()
 
     def _take(self) -> None:

@@ -15,6 +15,7 @@ from tvsbayes.acquisition.engine import Acquisition, Outcome
 from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, read_journal, require_journal
 from tvsbayes.acquisition.live_run import LiveRun
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator, check_hazard
+from tvsbayes.acquisition.place_command import PlaceCommand
 from tvsbayes.acquisition.recorder import Recorded, recorded
 from tvsbayes.acquisition.replanning import AdaptWish, Replanning, adapted_plan, check_plan
 from tvsbayes.acquisition.run_identity import check_same, identity, setup_changes
@@ -42,6 +43,7 @@ def acquire(
     vision: Vision | None = None,
     terminal: Terminal | None = None,
     live: LiveRun | None = None,
+    place_command: PlaceCommand | None = None,
 ) -> Outcome:
     """Runs a plan on the instrument of a rig file, or on its twin, into a campaign folder.
 
@@ -59,6 +61,7 @@ def acquire(
         vision: how pictures are made and seen; by default they wait for `detect`, and a simulation states centroids.
         terminal: where to speak and to ask; by default nothing is shown.
         live: where the run is published for whoever looks on, and what is asked of it.
+        place_command: a program that places the sheet instead of a person.
 
     Raises:
         InputError: a plan this rig cannot run, another plan than before, nobody to ask, no emulator.
@@ -75,7 +78,7 @@ def acquire(
             board = stack.enter_context(EmulatedBoard()) if emulate else None
             bench = stack.enter_context(simulated(rig, seed, before, vision, board))
         else:
-            operator = TerminalOperator(stop, terminal, laser_class)
+            operator = TerminalOperator(stop, terminal, laser_class, place_command is None)
             bench = stack.enter_context(hardware(rig, vision.detector, operator))
         for warning in bench.warnings:
             terminal.say(f"warning: {warning}")
@@ -90,7 +93,18 @@ def acquire(
             stack.enter_context(running)
         stack.callback(bench.conclude, folder)
         now = adapted_plan(plan, journal.records)
-        return Acquisition(rig, now, journal, bench, stop=stop, show=terminal.show, estimate=running, live=live).run()
+        run = Acquisition(
+            rig,
+            now,
+            journal,
+            bench,
+            stop=stop,
+            show=terminal.show,
+            estimate=running,
+            live=live,
+            place_command=place_command,
+        )
+        return run.run()
 
 
 def _running(
@@ -114,7 +128,13 @@ def _running(
 
 def _before(folder: Path) -> Recorded:
     """What an interrupted run has left."""
-    require_journal(folder, "leave --resume out to begin, or name the folder of the interrupted run")
+    remedy = "leave --resume out to begin, or name the folder of the interrupted run"
+    if folder.is_dir() and any(folder.iterdir()):
+        remedy = (
+            f"bring {LOG} back from a backup, or begin in another folder without --resume; what this folder holds can "
+            "still be calibrated"
+        )
+    require_journal(folder, remedy)
     return recorded(read_journal(folder).records)
 
 

@@ -256,7 +256,7 @@ class Instrument:
         Ends the way from the home switch: to be called once per motion, by who drives it.
         """
         self._from_switch = [False, False]
-        return {"mirror_angles_deg": self._mirror_angles_deg(), "stop_errors_deg": (self._eta[0], self._eta[1])}
+        return TrueAngles(self._mirror_angles_deg(), (self._eta[0], self._eta[1]))
 
     def _mirror_angles_deg(self) -> tuple[float, float]:
         psi, beta = (
@@ -289,6 +289,6 @@ def reference_pose_deg(looks: Sequence[TrueAngles]) -> tuple[float, float] | Non
     """Mean mirror angles without stop errors over `state_deg` of the looks used (formulation 3.2); None for none."""
     if not looks:
         return None
-    resting = np.array([np.subtract(look["mirror_angles_deg"], look["stop_errors_deg"]) for look in looks])
+    resting = np.array([np.subtract(look.mirror_angles_deg, look.stop_errors_deg) for look in looks])
     pan, tilt = resting.mean(axis=0)
     return float(pan), float(tilt)

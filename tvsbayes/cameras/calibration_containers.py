@@ -8,9 +8,12 @@ libraries of the formats read instead, under caps: bytes, entries and depth; no 
 from __future__ import annotations
 
 import io
+import json
 import math
 import re
 import struct
+import subprocess
+import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
@@ -28,6 +31,7 @@ CONTAINER_BYTES_MAX = 4 * 1024 * 1024
 ENTRIES_MAX = 200_000
 DEPTH_MAX = 12
 _ALLOWED = "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, or .mat of MATLAB up to version 7"
+MAT_SECONDS_MAX = 60.0
 _MAT_HEADER_BYTES, _MAT_COMPRESSED = 128, 15
 """Of MAT-file 5: the header, and the type of a compressed element (MATLAB MAT-File Format, 1-3, 1-6)."""
 
@@ -101,10 +105,29 @@ def _npz(data: bytes) -> dict[str, Any]:
         return {name: arrays[name] for name in arrays.files}
 
 
-def _mat(data: bytes) -> dict[str, Any]:
-    """Variables of a MAT-file of version 5 (saved by -v6 or -v7); structures become maps."""
-    from scipy.io import loadmat
+_MAT_PROGRAM = """
+import io, json, sys
+import numpy as np
+from scipy.io import loadmat
 
+def plain(value):
+    if isinstance(value, dict):
+        return {str(key): plain(each) for key, each in value.items() if not str(key).startswith("__")}
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        return value.tolist()
+    if isinstance(value, np.ndarray | list):
+        return [plain(each) for each in (value if isinstance(value, list) else value.tolist())]
+    return value if isinstance(value, str | int | float) else None
+
+json.dump(plain(loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True)), sys.stdout)
+"""
+
+
+def _mat(data: bytes) -> dict[str, Any]:
+    """Variables of a MAT-file of version 5 (saved by -v6 or -v7); structures become maps.
+
+    `scipy.io.loadmat` ends in a segmentation fault on some damaged files: a process of its own reads them.
+    """
     at, whole = _MAT_HEADER_BYTES, 0
     order = "<" if data[126:128] == b"IM" else ">"
     while at + 8 <= len(data):
@@ -114,8 +137,13 @@ def _mat(data: bytes) -> dict[str, Any]:
         if whole > CONTAINER_BYTES_MAX:
             raise ValueError(f"variables of more than {CONTAINER_BYTES_MAX} bytes")
         at += 8 + size
-    found = loadmat(io.BytesIO(data), simplify_cells=True)
-    return {name: value for name, value in found.items() if not name.startswith("__")}
+    command = [sys.executable, "-I", "-c", _MAT_PROGRAM]
+    try:
+        done = subprocess.run(command, input=data, capture_output=True, timeout=MAT_SECONDS_MAX, check=True)
+    except subprocess.SubprocessError as error:
+        raise ValueError("a damaged file, or variables that are no plain matrices and structures") from error
+    found = json.loads(done.stdout)
+    return found if isinstance(found, dict) else {}
 
 
 def _hdf5(data: bytes) -> dict[str, Any]:

@@ -68,6 +68,13 @@ def acquire(
     adapt: Annotated[bool, typer.Option("--adapt", help="With --target-u: looks chosen from the fits.")] = False,
     minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="With --adapt: longest run.")] = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of a simulation (default 0).")] = None,
+    place_command: Annotated[
+        str | None,
+        typer.Option("--place-command", metavar="CMD", help="Program that places the sheet: CMD TARGET X_MM NUMBER."),
+    ] = None,
+    place_seconds: Annotated[
+        float | None, typer.Option("--place-seconds", min=1.0, help="With --place-command: longest time (default 600).")
+    ] = None,
     live: Annotated[bool, typer.Option("--live", help="A page on this machine to watch and stop the run.")] = False,
     port: Annotated[
         int | None, typer.Option("--port", min=0, max=65535, help="With --live: to listen on; 0 takes a free one.")
@@ -82,7 +89,9 @@ def acquire(
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
 
-    finite(target_u=target_u, minutes=minutes)
+    finite(target_u=target_u, minutes=minutes, place_seconds=place_seconds)
+    if place_command is None:
+        refuse_options("for --place-command", "add it, or leave it out", place_seconds=place_seconds)
     if simulate:
         refuse_options("for a laser, and --simulate has none", "leave out one of them", laser_class=laser_class)
     else:
@@ -100,16 +109,19 @@ def acquire(
     in_order(rig, plan)
     instrument, steps = read_rig(rig), read_plan(plan)
     if dry_run:
-        refuse_options("for a run, and --dry-run makes none", "leave out one of them", live=live)
+        unfit = {"live": live, "place_command": place_command}
+        refuse_options("for a run, and --dry-run makes none", "leave out one of them", **unfit)
         _rehearse(instrument, steps, as_json)
         return
     from tvsbayes.acquisition.bench import Vision
     from tvsbayes.acquisition.observation import live_detector, twin_renderer
     from tvsbayes.acquisition.operator import LiveLine, Terminal
+    from tvsbayes.acquisition.place_command import PlaceCommand
     from tvsbayes.acquisition.replanning import AdaptWish
     from tvsbayes.acquisition.running_estimate import EstimateWish
     from tvsbayes.acquisition.session import acquire as run_plan
 
+    placing = None if place_command is None else PlaceCommand.parsed(place_command, place_seconds)
     vision = Vision()
     if not centroids:
         vision = Vision(live_detector(instrument.stereo), twin_renderer(instrument, seed or 0) if simulate else None)
@@ -128,6 +140,7 @@ def acquire(
             vision=vision,
             terminal=Terminal(report_line, line.show, line.ask),
             live=watched,
+            place_command=placing,
         )
     _end(outcome, out, target_u, as_json)
 
@@ -138,9 +151,6 @@ def _live_page(port: int | None, no_browser: bool) -> Iterator[LiveRun | None]:
     if port is None:
         yield None
         return
-    from tvsbayes.view.contents import LIVE_FILES, Contents, page_files
-
-    files = page_files(LIVE_FILES)
     from tvsbayes.acquisition.live_run import LiveRun
     from tvsbayes.view.live_server import LivePage
 
@@ -153,7 +163,7 @@ def _live_page(port: int | None, no_browser: bool) -> Iterator[LiveRun | None]:
             threading.Thread(target=webbrowser.open, args=(page.link,), daemon=True).start()
 
     run = LiveRun(begun)
-    with LivePage(Contents(files=files), run, port) as page:
+    with LivePage(run, port) as page:
         yield run
 
 

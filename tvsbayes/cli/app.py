@@ -154,13 +154,15 @@ def keep(document: Mapping[str, Any], path: Path) -> bool:
     return True
 
 
-PARTS = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "readings.csv")
-"""Of a campaign, of a scanner or an axis."""
+PARTS = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "readings.csv", "log.jsonl")
+"""Of a campaign, of a scanner or an axis, and its journal."""
 
 
 def is_part(path: Path) -> bool:
-    """Whether a file is one of those that make a campaign of the folder it lies in."""
-    return path.name in PARTS and path.is_file() and (path.parent / PARTS[0]).is_file()
+    """Whether a file is one of those that make a campaign of the folder it lies in, or one of its pictures."""
+    pictured = path.parent.name == "frames"
+    folder = path.parent.parent if pictured else path.parent
+    return (pictured or path.name in PARTS) and path.is_file() and (folder / PARTS[0]).is_file()
 
 
 def refuse_options(reason: str, remedy: str, **given: object) -> None:

@@ -248,18 +248,31 @@ def doctor(
     laser: Annotated[
         bool, typer.Option("--laser", help="LASER ON for one picture, invisible and likely class 3B: goggles on.")
     ] = False,
+    contract: Annotated[
+        bool, typer.Option("--contract", help="With --laser: MOTORS MOVE, LASER ON; do drivers keep their promises?")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Is the instrument fit for a campaign? Nothing moves.
+    """Is the instrument fit for a campaign?
 
+    Nothing moves but with --contract.
     Checks ports, firmware, cameras, exposure, focus, laser, timing, disk and the compilation cache.
     """
+    if contract and not laser:
+        message = "--contract moves the motors and switches the laser on"
+        raise InputError("usage", message, remedy="goggles on, nothing in the way, then add --laser")
     from tvsbayes.acquisition.doctor import Check, examine
+    from tvsbayes.acquisition.doctor import contract as contract_checks
     from tvsbayes.errors import DeviceFault
     from tvsbayes.instrument.rig import read_rig
     from tvsbayes.model.compilation_cache import cache_state
 
-    checks = examine(read_rig(rig), Path.cwd(), laser=laser)
+    instrument = read_rig(rig)
+    checks = examine(instrument, Path.cwd(), laser=laser)
+    if contract and any(check.status == "fault" for check in checks):
+        checks.append(Check("contract", "skipped", "needs a bench without faults", "cure the faults above first"))
+    elif contract:
+        checks += contract_checks(instrument)
     cache = cache_state()
     status = "ok" if cache.used else "warning"
     checks.append(Check("compilation cache", status, escaped(cache.found, 400), escaped(cache.remedy, 400)))

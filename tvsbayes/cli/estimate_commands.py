@@ -45,9 +45,13 @@ def _warn_of(campaign: Campaign, *, stops: bool = False) -> None:
     Raises:
         InputError: `stops`, and it is certain of something.
     """
+    from tvsbayes.acquisition.campaign_files import behind_journal
     from tvsbayes.estimators.findings import stop_at
     from tvsbayes.estimators.plausibility import implausible
 
+    unwritten = "" if campaign.path is None else behind_journal(campaign.path, campaign)
+    if unwritten:
+        report_line(f"warning: {unwritten}")
     findings = implausible(campaign)
     for finding in findings:
         if not (stops and finding.certain):

@@ -1,4 +1,4 @@
-"""view: a campaign looked at in a browser of this machine."""
+"""view: a campaign as one HTML file to look at."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import Annotated
 import typer
 
 from tvsbayes.cli import axis_commands
-from tvsbayes.cli.app import INTERRUPTED, CampaignFolder, Ended, Json, finish, report_line
+from tvsbayes.cli.app import CampaignFolder, Json, finish, report_line, spared
+from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.files.disk import make_folder, output_place, write_atomically
+from tvsbayes.progress import Job
 
 
 def view(
@@ -16,41 +19,39 @@ def view(
     beside: Annotated[
         Path | None, typer.Option("--beside", metavar="CAMPAIGN", help="A later campaign of the same instrument.")
     ] = None,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="To listen on; 0 takes a free one.")] = 0,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the link.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="HTML file (default CAMPAIGN/results/view.html).")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """A page to look at a campaign: rig in 3D, looks, residuals.
+    """One HTML file to look at a campaign: rig in 3D, all looks.
 
-    On 127.0.0.1 alone, by a link for one browser, until Ctrl-C. Needs the extra `view`.
+    Every look has its pictures and residuals. A double click opens the file in a browser, without a network.
     """
-    for folder in (campaign, beside):
-        if folder is not None:
-            axis_commands.refuse_axis(folder, "view", "`tvsbayes report` makes the page of an axis")
-    from tvsbayes.view.contents import Contents, page_files
-    from tvsbayes.view.server import serve
-
-    files = page_files()
-    from tvsbayes.view.document import document
+    folders = [folder for folder in (campaign, beside) if folder is not None]
+    for folder in folders:
+        axis_commands.refuse_axis(folder, "view", "`tvsbayes report` makes the page of an axis")
+    spared(out)
     from tvsbayes.view.gathering import look_at
 
     looked = look_at(campaign, beside, report_line)
-    folders = tuple(folder for folder in (campaign, beside) if folder is not None)
-    kept = tuple(frozenset(one.looks.spot.tolist()) for one in looked.scenes)
-    contents = Contents(document(looked), folders, kept, files)
+    from tvsbayes.view.document import document
+    from tvsbayes.view.page import page_html
+    from tvsbayes.view.pictures import PICTURES_BYTES_MAX, look_pictures
 
-    def started(link: str) -> None:
-        counts = [len(one.looks.spot) for one in looked.scenes]
-        fitted = [one.fitted for one in looked.scenes]
-        notes = "".join(f"note: {note}\n" for one in looked.scenes for note in one.notes)
-        finish({"link": link, "looks": counts, "fitted": fitted}, f"{notes}open {link}\nCtrl-C ends it", as_json)
-        if not (no_browser or as_json):
-            import webbrowser
-
-            webbrowser.open(link)
-
-    try:
-        serve(contents, port, started)
-    except KeyboardInterrupt:
-        # Its usual end, and the one document of --json is out.
-        raise Ended(INTERRUPTED) from None
+    pictures, share = [], PICTURES_BYTES_MAX // len(folders)
+    stages = ("pictures", "pictures of the second campaign")[: len(folders)]
+    with waiting() as progress, Job(dict.fromkeys(stages, 1.0), progress) as job:
+        for folder, one, stage in zip(folders, looked.scenes, stages, strict=True):
+            job.begin(stage)
+            pictures.append(look_pictures(folder, one.looks, share, job.at))
+    html = page_html(document(looked, pictures))
+    path = out or output_place(campaign, "results") / "view.html"
+    if out is None:
+        make_folder(path.parent)
+    write_atomically(path, html)
+    counts = [len(one.looks.spot) for one in looked.scenes]
+    pictured, fitted = [len(own) for own in pictures], [one.fitted for one in looked.scenes]
+    result = {"view": str(path), "bytes": len(html), "looks": counts, "pictures": pictured, "fitted": fitted}
+    notes = "".join(f"note: {note}\n" for one in looked.scenes for note in one.notes)
+    finish(result, f"{notes}written: {path} ({len(html) / 1e6:.1f} MB); open it in a browser", as_json)

@@ -87,6 +87,8 @@ def plan_watch(
         seed: of the search.
         as_json: print the document.
     """
+    from msgspec import structs
+
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.instrument.plan import write_plan
     from tvsbayes.instrument.rig import read_rig
@@ -108,9 +110,9 @@ def plan_watch(
         found = watch_plan(fitted, rig, minutes=MINUTES if minutes is None else minutes, seed=seed)
     from tvsbayes.report.watch_text import watch_plan_text
 
-    text, document = watch_plan_text(found), found.as_json()
+    text = watch_plan_text(found)
     if out is not None:
         write_plan(found.steps, out)
-        document["plan"] = str(out)
+        found = structs.replace(found, plan=str(out))
         text += f"\nwritten: {escaped(str(out), 200)}"
-    finish(document, text, as_json)
+    finish(found.as_json(), text, as_json)

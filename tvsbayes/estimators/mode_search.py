@@ -46,6 +46,8 @@ SCALE_STEP = 0.3
 """Of second differences along scales of repeating errors, whose density is no parabola, in prior sds."""
 NOISE_SETTLED = 0.05
 """Change of every noise coordinate (prior sds) below which the alternation stops: half a posterior sd."""
+HOPELESS = 20.0
+"""Loss of log density with which a way of homing has no evidence worth a better mode."""
 GATE_PROBABILITY = 1e-6
 """A clean spot is excluded by the robust option with this probability."""
 HUBER_CORE = 0.8214
@@ -253,7 +255,14 @@ class Problem:
     def mode_beside(self, known: Mode) -> Mode:
         """The mode from that of another way of homing, which is seldom far away; scales of repeating errors held."""
         found = neighbouring_mode(self.negative_log_density, known, self.free & ~self.repeated)
-        return self.mode(self.alternate(known.z.copy())) if found is None else found
+        if found is not None:
+            return found
+        z = self.alternate(known.z.copy())
+        value = float(self.negative_log_density(z[None])[0])
+        # So far below, the last Newton steps change nothing: the way is as good as impossible.
+        if not value < known.negative_log_density + HOPELESS:
+            return Mode(z, known.covariance, value, ())
+        return self.mode(z)
 
     def curvature(self, z: np.ndarray) -> np.ndarray:
         """Expected information of the coordinates: Fisher's of geometry and stereo, measured for the noise."""

@@ -36,6 +36,11 @@ IMAGES_ALLOWED = (
     f"PNG of 8 or 16 bits, or JPEG of 8 bits per channel; at most {IMAGE_PIXELS_MAX // 1_000_000} million pixels, "
     "half as many of 16 bits"
 )
+WHOLE_PX = 480
+"""Width of a whole picture on a page."""
+WINDOW_PX = 48
+"""Side of the cut-out around a spot on a page, pixels of the camera."""
+JPEG_QUALITY = 80
 WHITE_BITS = (8, 10, 12, 14, 16)
 """Bits of cameras' converters; a file of 16 bits holds the values of any of them."""
 
@@ -160,3 +165,33 @@ def in_grey_levels(image: np.ndarray, white: int | None = None) -> np.ndarray:
     if image.dtype == np.uint8:
         return image
     return image.astype(np.float32) * np.float32(255 / (white or white_level(int(image.max()))))
+
+
+def small_picture(image: np.ndarray, centre_px: tuple[float, float] | None = None, width_px: int = WHOLE_PX) -> bytes:
+    """A picture for a page: all of it, at most so wide, or a window around a centre; JPEG.
+
+    The window has `WINDOW_PX` pixels a side, the pixel of the centre at WINDOW_PX / 2; black beyond the picture.
+
+    Args:
+        image: from `decode_image`.
+        centre_px: (u, v) of a spot in it.
+        width_px: of a whole picture.
+
+    Raises:
+        ValueError: the centre lies outside the picture.
+    """
+    import cv2
+    import numpy as np
+
+    image = np.clip(in_grey_levels(image), 0, 255).astype(np.uint8)
+    height, width = image.shape[:2]
+    if centre_px is not None:
+        half = WINDOW_PX // 2
+        u, v = (round(value) for value in centre_px)
+        if not (0 <= u < width and 0 <= v < height):
+            raise ValueError(f"no pixel {u}, {v} in a picture of {width} x {height}")
+        padded = np.pad(image, ((half, half), (half, half), (0, 0)))
+        image = padded[v : v + WINDOW_PX, u : u + WINDOW_PX]
+    elif width > width_px:
+        image = cv2.resize(image, (width_px, max(1, round(height * width_px / width))), interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()

@@ -159,6 +159,7 @@ def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTE
     need = (_fewest(designs, every, wanted, minutes) if wanted.any() else None) or _fullest(every, minutes)
     homings, judged = _corrected(designs, need, wanted, minutes)
     pattern = need.tried.pattern
+    changes = _changes(designs, every, judged)
     return WatchPlan(
         steps=designs.steps(pattern, homings),
         looks=need.tried.looks(homings),
@@ -167,7 +168,8 @@ def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTE
         minutes_allowed=minutes,
         power_wanted=POWER_MIN,
         false_alarm_rate=FALSE_ALARM_RATE,
-        changes=_changes(designs, every, judged),
+        met=all(change.power >= POWER_MIN for change in changes),
+        changes=changes,
     )
 
 

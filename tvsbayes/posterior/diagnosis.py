@@ -124,8 +124,38 @@ def stuck_walkers(chain: Chain, discarded: int) -> np.ndarray:
     return stuck | (deviation > max(STUCK_DEVIATION * float(np.median(deviation)), single_draw))
 
 
-def agreement(first: Posterior, chain_draws: Derived, names: tuple[str, ...]) -> Agreement:
-    """Of draws (chain, draw) with the weighted ones, by the columns of those names that vary; by all if none does."""
+@dataclass(frozen=True)
+class Comparison:
+    """Of a chain with the weighted draws: mean, lower and upper end of the columns `names`, shape (3, n).
+
+    Attributes:
+        names: of quantities.
+        gap: difference.
+        error: its Monte Carlo standard error.
+        sd: of the posterior, shape (n,).
+    """
+
+    names: tuple[str, ...]
+    gap: np.ndarray
+    error: np.ndarray
+    sd: np.ndarray
+
+    @property
+    def agreement(self) -> Agreement:
+        """By the largest difference in its errors."""
+        labels = [f"{name}, {what}" for what in ("mean", "lower end", "upper end") for name in self.names]
+        worst = extreme(dict(zip(labels, (self.gap / self.error).ravel().tolist(), strict=True)), max)
+        return Agreement(worst.value < AGREEMENT_LIMIT, AGREEMENT_LIMIT, worst)
+
+    @property
+    def gaps(self) -> dict[str, MonteCarloError]:
+        """Differences in posterior sds: where they are no chance, what sampling may have moved."""
+        rows = zip(*(self.gap / self.sd).tolist(), strict=True)
+        return {name: MonteCarloError(mean, (*ends,)) for name, (mean, *ends) in zip(self.names, rows, strict=True)}
+
+
+def compared(first: Posterior, chain_draws: Derived, names: tuple[str, ...]) -> Comparison:
+    """Draws (chain, draw) with the weighted ones, by the columns of those names that vary; by all if none does."""
     own, theirs = Draws(chain_draws), first.by_name
     shape = np.shape(chain_draws.effective_mirror_offset_mm)
     varying = [name for name in own if np.ptp(own[name]) > 0 and np.ptp(theirs[name]) > 0]
@@ -133,16 +163,9 @@ def agreement(first: Posterior, chain_draws: Derived, names: tuple[str, ...]) ->
     names = tuple(name for name in names if name in varying) or tuple(varying)
     ours = propagated(np.stack([own[name].reshape(shape) for name in names], axis=-1))
     weighted = first.summarised(np.stack([theirs[name].reshape(first.weights.shape) for name in names], axis=-1))
-    gaps: dict[str, float] = {}
-    for label, one, other, error_one, error_other in (
-        ("mean", ours.mean, weighted.mean, ours.mcse_mean, weighted.mcse_mean),
-        ("lower end", ours.interval95[0], weighted.interval95[0], ours.mcse_interval95[0], weighted.mcse_interval95[0]),
-        ("upper end", ours.interval95[1], weighted.interval95[1], ours.mcse_interval95[1], weighted.mcse_interval95[1]),
-    ):
-        gap = np.abs(one - other) / np.hypot(error_one, error_other)
-        gaps |= {f"{name}, {label}": float(each) for name, each in zip(names, gap, strict=True)}
-    worst = extreme(gaps, max)
-    return Agreement(worst.value < AGREEMENT_LIMIT, AGREEMENT_LIMIT, worst)
+    one, other = (np.stack([each.mean, *each.interval95]) for each in (ours, weighted))
+    errors = (np.stack([each.mcse_mean, *each.mcse_interval95]) for each in (ours, weighted))
+    return Comparison(names, np.abs(one - other), np.hypot(*errors), ours.sd)
 
 
 @dataclass(frozen=True)
@@ -218,7 +241,10 @@ def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
     errors = chain_errors(fit, derived, stored.log_density.shape)
     missing.extend(uncertain(errors))
     if not missing and first.convergence.answer == "accepted":
-        same = agreement(first, derived, headline_names(fit))
+        beside = compared(first, derived, headline_names(fit))
+        same = beside.agreement
+        # What two samplers do not agree on is known no better than they agree.
+        errors = errors if same.agrees else errors | beside.gaps
     if same is not None and not same.agrees:
         gap = f"by {same.worst.value:.1f} Monte Carlo errors, wanted below {AGREEMENT_LIMIT:g}"
         missing.append(f"emcee and importance sampling differ on {same.worst.quantity} {gap}")

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import jax
-import msgspec
 import numpy as np
 
 from tvsbayes.errors import NotConverged
@@ -137,7 +136,7 @@ def empty_pool(target: Target, proposal: Independence | None = None) -> Pool:
     """Before the first round: from a proposal, or from the first."""
     path = target.path
     dimension = path.dimension
-    first = proposal or first_proposal(target, dimension, path.heavy, path.coupled, path.pairs)
+    first = proposal or first_proposal(target, dimension, path.heavy, path.coupled)
     errors, nowhere = no_draw(0, target.fit.arrays), Mapped(np.zeros((0, len(path.mode))), np.zeros(0))
     return Pool(np.zeros((0, dimension)), np.zeros(0), errors, nowhere, (), (), first)
 
@@ -380,6 +379,8 @@ SHARED_DRAWS_LEAST = 2 * ROUND
 """Draws of one way of homing, at least, by which another one is known."""
 SHARED_MARGIN = 2.0
 """A way of homing takes so many times the draws that its share of the posterior asks for."""
+BESIDE_ROUNDS_MAX = 12
+"""Of a way of homing that is sampled by itself."""
 
 
 def run_beside(fit: JointFit, run: ImportanceRun, seed: int) -> Posterior:
@@ -394,7 +395,18 @@ def run_beside(fit: JointFit, run: ImportanceRun, seed: int) -> Posterior:
     """
     began, first = time.monotonic(), run.posterior.fit.mixture[0].probability
     share = next(way.probability for way in run.posterior.fit.mixture if way.sides == fit.sides) / first
-    count = int(np.clip(SHARED_MARGIN * share * len(run.pool.w), SHARED_DRAWS_LEAST, len(run.pool.w)))
+    count, every = int(max(SHARED_MARGIN * share * len(run.pool.w), SHARED_DRAWS_LEAST)), len(run.pool.w)
+    for some in dict.fromkeys((min(count, every), every)):
+        weighed = _weighed_anew(fit, run, some, seed)
+        error = max(e.rounds_factor for e in weighed.monte_carlo_error.values())
+        # An error of a part is as large in the whole as the part.
+        if weighed.importance.pareto_k < K_MAX and error * share**2 <= 1:
+            return weighed.posterior(seed, time.monotonic() - began)
+    return importance_run(fit, seed, rounds_max=BESIDE_ROUNDS_MAX).posterior
+
+
+def _weighed_anew(fit: JointFit, run: ImportanceRun, count: int, seed: int) -> Weighing:
+    """The first draws of a run, weighted by the density under another way of homing."""
     target, pool = Target(fit, run.path), run.pool
     mapped = Mapped(pool.mapped.z[:count], pool.mapped.log_jacobian[:count])
     valued = target.at(mapped, place_normals(count, fit, np.random.default_rng([seed, 6])))
@@ -407,12 +419,7 @@ def run_beside(fit: JointFit, run: ImportanceRun, seed: int) -> Posterior:
         counts=(count,),
         invalid=target.invalid,
     )
-    weighed = Weighing(fit, run.path, own)
-    error = max(e.rounds_factor for e in weighed.monte_carlo_error.values())
-    # An error of a part is as large in the whole as the part.
-    if weighed.importance.pareto_k < K_MAX and error * share**2 <= 1:
-        return weighed.posterior(seed, time.monotonic() - began)
-    return importance_run(fit, seed).posterior
+    return Weighing(fit, run.path, own)
 
 
 def mixed(parts: Sequence[Posterior]) -> Posterior:
@@ -463,5 +470,5 @@ def _joined(parts: Sequence[Posterior], chance: np.ndarray) -> Reweighted:
     errors = monte_carlo_errors(names, weighted_summary(np.concatenate(rows), np.concatenate(weights)))
     unknown, known = uncertain(errors), diagnosis.importance
     if unknown and known.accepted:
-        known = msgspec.structs.replace(known, accepted=False, missing=unknown, answer="rough")
+        known = replace(known, accepted=False, missing=unknown, answer="rough")
     return replace(diagnosis, importance=known, monte_carlo_error=errors)

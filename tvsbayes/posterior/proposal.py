@@ -5,7 +5,7 @@ Coordinates w of `posterior.transport`, nearly standard normal; log densities ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -51,6 +51,9 @@ TILT_LIMITS = 0.5, 0.2
 """Largest slope and curvature by which one fit changes a tabulated log density, per sd and its square."""
 REACH = 4.0
 """Sds within which a fit's tilt of a table grows; beyond, it stays."""
+CORNER, INTERPLAY_LEAST, EDGES_MAX = 1.5, 1.0, 10
+"""Place of the corners, in w, at which two coordinates are asked how they depend on each other; the sum of what the log
+density says beyond each of them from which one follows the other; and how many do, at most."""
 MATTERS = 12.0
 """Draws whose log weight lies farther below the largest tell nothing of the target's shape."""
 
@@ -296,7 +299,7 @@ class Independence:
         led = np.where(alone, single, self.tables.draw(share))
         led = np.where(stays, found[:, self.places], led)
         # A follower follows its leader, however that was drawn.
-        found[:, self.places] = np.where(alone | stays, led, self.followers.drawn(led, share, chances))
+        found[:, self.places] = self.followers.drawn(led, share, chances, alone | stays)
         return found
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
@@ -351,49 +354,103 @@ class Independence:
         return straight.turned(found.cross * np.sqrt(np.outer(variance, variance)))
 
 
+def forest(target: Callable[[np.ndarray], np.ndarray], places: np.ndarray, dimension: int) -> list[tuple[int, int]]:
+    """Pairs of tabulated coordinates that depend on each other most, as a forest, leaders before their followers.
+
+    What a log density says of two coordinates beyond what it says of each is asked at the corners of a square. The
+    forest is the one of the largest sum (as Chow and Liu, IEEE Trans. Inf. Theory 14 (1968) 462, choose a tree).
+
+    Args:
+        target: log density of points (n, d).
+        places: of the tabulated coordinates, shape (h,).
+        dimension: d.
+
+    Returns:
+        Rows of leader and follower among the tabulated coordinates.
+    """
+    count = len(places)
+    first, second = np.triu_indices(count, 1)
+    if not len(first):
+        return []
+    steps = CORNER * np.eye(dimension)[places]
+    alone = target(np.concatenate([np.zeros((1, dimension)), steps, -steps]))
+    centre, (ahead, behind) = alone[0], np.reshape(alone[1:], (2, count))
+    strength = np.zeros(len(first))
+    for one, own in ((1, ahead), (-1, behind)):
+        for other, its in ((1, ahead), (-1, behind)):
+            both = target(one * steps[first] + other * steps[second])
+            with np.errstate(invalid="ignore"):
+                beyond = both - own[first] - its[second] + centre
+            strength += np.abs(np.where(np.isfinite(beyond), beyond, 0.0))
+    tree = np.arange(count)
+    edges: dict[int, list[int]] = {row: [] for row in range(count)}
+    for edge in np.argsort(-strength)[:count]:
+        a, b = int(first[edge]), int(second[edge])
+        if strength[edge] < INTERPLAY_LEAST or sum(map(len, edges.values())) >= 2 * EDGES_MAX:
+            break
+        if tree[a] != tree[b]:
+            tree[tree == tree[b]] = tree[a]
+            edges[a].append(b)
+            edges[b].append(a)
+    pairs: list[tuple[int, int]] = []
+    reached: set[int] = set()
+    for root in sorted(edges, key=lambda row: -len(edges[row])):
+        waiting = [] if root in reached else [root]
+        reached.add(root)
+        while waiting:
+            leader = waiting.pop(0)
+            for follower in (row for row in edges[leader] if row not in reached):
+                reached.add(follower)
+                pairs.append((leader, follower))
+                waiting.append(follower)
+    return pairs
+
+
 def first_proposal(
-    target: Callable[[np.ndarray], np.ndarray],
-    dimension: int,
-    heavy: np.ndarray,
-    coupled: np.ndarray,
-    pairs: Sequence[tuple[int, int]] = (),
+    target: Callable[[np.ndarray], np.ndarray], dimension: int, heavy: np.ndarray, coupled: np.ndarray
 ) -> Independence:
     """Standard normal but for the heavy coordinates, whose densities are the target's along each of them.
 
     In w, where everything else is measured from its mean at a coordinate's value and by its width there, a cut through
-    the mode is the marginal density but for what the others' curvature does.
+    the mode is the marginal density but for what the others' curvature does. Of those that depend on each other most,
+    a cut through the plane of both makes one follow the other (`forest`).
 
     Args:
         target: log density of points (n, d).
         dimension: d.
         heavy: coordinates to be tabulated, shape (d,), boolean.
         coupled: those of which a share is drawn together, likewise.
-        pairs: of heavy coordinates, leader and follower: a cut through the plane of both.
     """
     places = np.flatnonzero(heavy)
+    pairs = forest(target, places, dimension)
     along = np.zeros((len(places), len(CUT_NODES), dimension))
     along[np.arange(len(places)), :, places] = CUT_NODES
     planes = np.zeros((len(pairs), len(LEADER_NODES), len(CUT_NODES), dimension))
-    for k, (leading, following) in enumerate(pairs):
-        planes[k, :, :, leading] = LEADER_NODES[:, None]
-        planes[k, :, :, following] = CUT_NODES
+    for k, (leader, follower) in enumerate(pairs):
+        planes[k, :, :, places[leader]] = LEADER_NODES[:, None]
+        planes[k, :, :, places[follower]] = CUT_NODES
     points = np.concatenate([along.reshape(-1, dimension), planes.reshape(-1, dimension)])
     cuts = target(points) if len(points) else np.zeros(0)
     lines, rows = np.split(cuts, [along.shape[0] * along.shape[1]])
     lines, rows = between_cuts(lines.reshape(along.shape[:2])), between_cuts(rows.reshape(planes.shape[:3]))
-    row_of = {int(place): row for row, place in enumerate(places)}
-    leader, follower = (np.array([row_of[pair[k]] for pair in pairs], dtype=int) for k in range(2))
-    for k in range(len(pairs)):
-        # What both say together, as the leader's own density and the follower's whatever the leader is.
-        seen = np.where(np.isfinite(rows[k]), rows[k], -np.inf)
+    alone = lines.copy()
+    gains = np.zeros_like(lines)
+    for k in reversed(range(len(pairs))):
+        leader, follower = pairs[k]
+        # What both say together, as the leader's own density and the follower's whatever the leader is; what the
+        # follower leads in turn belongs to it.
+        rows[k] = np.where(np.isfinite(rows[k]), rows[k], -np.inf) + gains[follower]
         with np.errstate(invalid="ignore"):
-            gain = special.logsumexp(seen, axis=1) - np.interp(LEADER_NODES, NODES, lines[leader[k]])
-        lines[leader[k]] += np.interp(NODES, LEADER_NODES, np.where(np.isfinite(gain), gain, 0.0))
-        lines[follower[k]] = special.logsumexp(seen, axis=0)
+            gain = special.logsumexp(rows[k], axis=1) - np.interp(LEADER_NODES, NODES, alone[leader])
+        gains[leader] += np.interp(NODES, LEADER_NODES, np.where(np.isfinite(gain), gain, 0.0))
+        lines[follower] = special.logsumexp(rows[k], axis=0)
+    leaders = np.setdiff1d(np.arange(len(places)), [follower for _, follower in pairs])
+    lines[leaders] = alone[leaders] + gains[leaders]
     conditional = np.reshape([Tables.normalised(each).log_density for each in rows], rows.shape)
-    followers = Followers(leader, follower, conditional)
+    leader_rows, follower_rows = np.reshape(np.array(pairs, dtype=int), (-1, 2)).T
+    followers = Followers(leader_rows, follower_rows, conditional)
     tables = Tables.normalised(lines)
     mean, sd = np.zeros(dimension), np.full(dimension, INFLATION)
-    together, nought = np.flatnonzero(coupled), np.zeros(dimension)
-    first = Independence(mean, sd, places, tables, together, followers, nought, np.eye(dimension))
+    together, zero = np.flatnonzero(coupled), np.zeros(dimension)
+    first = Independence(mean, sd, places, tables, together, followers, zero, np.eye(dimension))
     return first.moved(mean, sd, tables, followers)

@@ -29,8 +29,8 @@ class StopStates:
         load: d(predicted)/d(state) of the spots' components, shape (4 n, m).
         variance: at the fit's noise scales, by direction (right, left, down, up), shape (m, 4).
         constant: of states of another kind, shape (m,).
-        scatter: what the scatter of looks (pan, tilt) adds to the variance with which the looks of a state know it, at
-            the fit's noise scales, shape (m, 2); it is in the noise of the looks already.
+        scatter: what the scatter of looks (pan, tilt) adds to the variance with which the looks of a stop error know
+            it, at the fit's noise scales, shape (m, 2); it is in the noise of the looks already.
     """
 
     load: np.ndarray
@@ -65,12 +65,12 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
     for state in range(states):
         drawn = np.flatnonzero(linear.renewed[:, state])
         for begin, end in zip(drawn, [*drawn[1:], spots], strict=True):
-            by_direction = np.zeros((2, 2))
+            by_direction, scatter = np.zeros((2, 2)), np.zeros(2)
             if state < 2:
                 by_direction[state] = mix[begin, state] * variance_of[state]
+                scatter[state] = scatter_of[state] / (end - begin)
             rest = 0.0 if state < 2 else linear.variance[begin, state]
-            if linear.load[begin:end, :, state].any() and by_direction.sum() + rest > 0:
-                scatter = scatter_of * (np.arange(2) == state % 2) / (end - begin)
+            if linear.load[begin:end, :, state].any() and by_direction.sum() + scatter.sum() + rest > 0:
                 found.append((end, begin, state, by_direction.ravel(), rest, scatter))
     found.sort(key=lambda each: each[:3])
     load = np.zeros((spots, 4, len(found)))

@@ -111,10 +111,10 @@ LEADER_NODES = np.linspace(-4.0, 4.0, 11)
 class Followers:
     """Coordinates whose density depends on another: of two scales that explain the same scatter one may be large.
 
-    Between a leader's nodes the two tables are mixed.
+    Between a leader's nodes the two tables are mixed. A follower has one leader and may lead others: a forest.
 
     Attributes:
-        leader, follower: their rows among the tabulated coordinates, shape (f,) each.
+        leader, follower: their rows among the tabulated coordinates, leaders before their followers, shape (f,) each.
         log_density: of the follower at `NODES`, by the leader's node, shape (f, leader nodes, nodes).
     """
 
@@ -143,12 +143,20 @@ class Followers:
                 found[:, k] = np.logaddexp(np.log1p(-above) + low, np.log(above) + high)
         return found
 
-    def drawn(self, w: np.ndarray, share: np.ndarray, chance: np.ndarray) -> np.ndarray:
-        """Tabulated coordinates (n, h) with their followers drawn anew: shares (n, h) of densities, chances (n, f)."""
+    def drawn(self, w: np.ndarray, share: np.ndarray, chance: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Tabulated coordinates (n, h) with their followers drawn anew but those kept.
+
+        Args:
+            w: leaders are as they are here.
+            share: uniform numbers of the densities, shape (n, h).
+            chance: uniform numbers of the mixtures, shape (n, f).
+            kept: shape (n, h), boolean.
+        """
         found = w.copy()
         for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
-            node, above = self.share(w[:, leader])
+            node, above = self.share(found[:, leader])
             chosen = node + (chance[:, k] < above)
             table = self.tables[k]
-            found[:, follower] = _point_below(share[:, follower], table.log_density[chosen], table.reached[chosen])
+            new = _point_below(share[:, follower], table.log_density[chosen], table.reached[chosen])
+            found[:, follower] = np.where(kept[:, follower], w[:, follower], new)
         return found

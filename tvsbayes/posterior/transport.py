@@ -22,7 +22,6 @@ from scipy.linalg import lapack
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import residuals
 from tvsbayes.estimators.linear_spots import linear_spots
-from tvsbayes.instrument.axes import AXES, SENSES
 from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
@@ -39,6 +38,9 @@ GEAR_SCALES = np.array(
     ]
 )
 """Coordinates of what the covariance of the errors at places depends on."""
+DRIFT_COLUMNS = np.array([INDEX[name] for name in names_of("drift_deg_per_root_hour")])
+WALK_TERMS = 3
+"""Terms of the Karhunen-Loeve series of a drift between two homings: 93 % of its variance."""
 LEAST_SCALE = 1e-6
 """Of a noise scale over that at the mode: what is smaller moves nothing."""
 FAR_ABOVE = 1e200
@@ -76,7 +78,8 @@ class Mapped:
 class LinearCampaign:
     """The campaign linearised at the mode: observed - predicted is residual - along y - states s - places e + noise.
 
-    Rows are the components of the spots in units of their noise at the mode, states s and errors at places e rad.
+    Rows are the components of the spots in units of their noise at the mode, states s and errors e rad. Errors repeat
+    by position, or are drifts: what stays for many looks.
 
     Attributes:
         residual: shape (4 n,).
@@ -84,7 +87,7 @@ class LinearCampaign:
         states: stop errors and their like.
         by_noise: variance of every state at the mode by the noise coordinates that scale it, shape (m, q).
         constant: variance that scales with none, less what the noise of the looks has already, shape (m,).
-        places: d(predicted)/d(errors at places), shape (4 n, e).
+        places: d(predicted)/d(errors at places, then terms of the drifts), shape (4 n, e).
         prior: precision of y without data, shape (g, g).
     """
 
@@ -219,7 +222,11 @@ class Transport:
         residuals: of the model, for centring.
         bend: how the slopes of the narrow coordinates change with all others, as these move away from the mode: by
             bend' y their parts along each other grow, shape (g, narrow, narrow).
-        place_angle_rad, place_on_tilt: of the e / 2 places, as `gear_processes.place_root` takes them.
+        place_angle_rad, place_on_tilt: of places, as `gear_processes.place_root` takes them; their transmission errors
+            and plays are the first of the e errors, terms of the drifts the others.
+        walk: sds of those terms, in units of the drift of their axis (pan, tilt), h^(1/2), shape (terms, 2).
+        drift_scale: of the drifts at the mode, rad h^(-1/2), shape (2,).
+        drift_noise: which noise coordinate each of them is, shape (2, q).
         gear_scale: values of `GEAR_SCALES` at the mode, in the units of their names, shape (12,).
         gear_noise: which noise coordinate each of them is, shape (12, q).
         period_deg: of the gears, shape (2, 3).
@@ -238,6 +245,9 @@ class Transport:
     bend: np.ndarray
     place_angle_rad: np.ndarray
     place_on_tilt: np.ndarray
+    walk: np.ndarray
+    drift_scale: np.ndarray
+    drift_noise: np.ndarray
     gear_scale: np.ndarray
     gear_noise: np.ndarray
     period_deg: np.ndarray
@@ -259,17 +269,6 @@ class Transport:
         They are wide: where several of them are far out together the target lies beside the proposal.
         """
         return np.isin(np.array(NAMES)[self.free], OPTICS_NAMES)
-
-    @property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Leader and follower of scales that explain the same scatter.
-
-        Play's variation, then transmission error; the scatter of looks, then that of the stops of its axis.
-        """
-        names = [NAMES[column] for column in self.free]
-        wanted = [*zip(names_of("play_variation_deg"), names_of("transmission_error_deg"), strict=True)]
-        wanted += [(f"look_scatter_deg.{axis}", f"stop_sd_deg.{side}") for axis in AXES for side in SENSES[axis]]
-        return [(names.index(one), names.index(other)) for one, other in wanted if {one, other} <= set(names)]
 
     @cached_property
     def curved(self) -> np.ndarray:
@@ -321,7 +320,13 @@ class Transport:
         values = np.zeros((len(log_scale), len(NAMES)))
         values[:, GEAR_SCALES] = self.gear_scale * np.exp(log_scale @ self.gear_noise.T)
         scales, valid = scales_at(values, self.period_deg), np.ones(len(self.place_on_tilt), dtype=bool)
-        return np.asarray(place_root(scales, self.place_angle_rad, self.place_on_tilt, valid, np))
+        errors, terms = 2 * len(valid), len(self.walk)
+        root = np.zeros((len(log_scale), errors + terms, errors + terms))
+        if errors:
+            root[:, :errors, :errors] = place_root(scales, self.place_angle_rad, self.place_on_tilt, valid, np)
+        drift = self.drift_scale * np.exp(log_scale @ self.drift_noise.T)
+        root[:, errors + np.arange(terms), errors + np.arange(terms)] = drift @ self.walk.T
+        return root
 
     def _conditional(self, noise: np.ndarray, score_at_mode: np.ndarray) -> Conditional:
         """What the linearised campaign and the prior say of y at noise coordinates (n, q), slopes from one at the mode.
@@ -338,7 +343,7 @@ class Transport:
         elimination = Elimination.of(linear.states, np.sqrt(weight[:, None] * variance))
         white = elimination.whitened(linear.by_states)
         whole = weight[:, None, None] * (linear.gram - np.swapaxes(white, 1, 2) @ white)
-        root = self._place_roots(log_scale) if places else np.zeros((len(noise), 0, 0))
+        root = self._place_roots(log_scale)
         # Errors at places in units of their prior sds: their covariance may be as good as singular.
         whole[:, :places] = np.swapaxes(root, 1, 2) @ whole[:, :places]
         whole[:, places:, :places] = np.swapaxes(whole[:, :places, places:], 1, 2)
@@ -427,23 +432,59 @@ def bends(path: Transport) -> np.ndarray:
     return bend
 
 
+@dataclass(frozen=True)
+class Walks:
+    """Drifts of the zeros as a few terms of their Karhunen-Loeve series, anew after every homing.
+
+    Attributes:
+        columns: d(predicted)/d(term), shape (4 n, terms).
+        walk: as in `Transport`.
+    """
+
+    columns: np.ndarray
+    walk: np.ndarray
+
+
+def walks(fit: JointFit) -> Walks:
+    """Of the axes whose drift is estimated (Ghanem and Spanos, Stochastic Finite Elements, Springer 1991, 2.3.3)."""
+    slope = np.asarray(fit.linearised.slope)
+    spots = jax.tree.map(lambda x: np.asarray(x)[: len(slope)], fit.arrays.spots)
+    begins = np.flatnonzero(spots.new_segment)
+    columns, walk = [], []
+    for axis in np.flatnonzero(fit.free[DRIFT_COLUMNS]):
+        for begin, end in zip(begins, [*begins[1:], len(slope)], strict=True):
+            hours = np.cumsum(spots.hours[begin:end])
+            if not hours[-1] > 0:
+                continue
+            for frequency in (np.arange(WALK_TERMS) + 0.5) * np.pi:
+                column = np.zeros(slope.shape[:2])
+                shape = np.sqrt(2) * np.sin(frequency * hours / hours[-1])
+                column[begin:end] = slope[begin:end, :, axis] * shape[:, None]
+                columns.append(column.ravel())
+                walk.append(np.sqrt(hours[-1]) / frequency * (np.arange(2) == axis))
+    rows = slope.shape[0] * slope.shape[1]
+    return Walks(np.reshape(columns, (len(columns), rows)).T, np.reshape(walk, (len(walk), 2)))
+
+
 def transport(fit: JointFit) -> Transport:
     """The map at the mode of a converged fit."""
     linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
     names = np.array(NAMES)
     free = np.flatnonzero(fit.free)
     scales = np.isin(names[free], NOISE_NAMES)
+    # What several scales share comes first: given it, they have little to do with each other.
     noise, others = free[scales], free[~scales]
+    noise = noise[np.argsort(~np.isin(names[noise], names_of("look_scatter_deg")), kind="stable")]
     covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
     order = by_width(covariance)
     others = others[order]
     of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
     wide = np.linalg.cholesky(covariance[np.ix_(order, order)])
-    stops = stop_states(fit, linear)
+    stops, drifts = stop_states(fit, linear), walks(fit)
     by_noise, by_scatter = STOP_COLUMNS.reshape(4, 1) == noise, SCATTER_COLUMNS.reshape(2, 1) == noise
     places = jax.tree.map(np.asarray, fit.arrays.gears.places)
     seen = np.flatnonzero(places.valid)
-    columns = np.asarray(fit.linearised.place_columns).reshape(-1, 2 * len(places.steps))
+    columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, 2 * len(places.steps))
     half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
     ratio = np.radians([fit.mode.physical[INDEX[name]] for name in names_of("degrees_per_step")])
     spots = len(linear.residual)
@@ -470,13 +511,16 @@ def transport(fit: JointFit) -> Transport:
             by_noise=stops.variance @ by_noise + stops.scatter @ by_scatter,
             # Stop errors whose sd is not estimated keep their variance.
             constant=stops.constant + stops.variance @ ~by_noise.any(axis=1) - stops.scatter @ by_scatter.any(axis=1),
-            places=columns[:, np.concatenate([seen, len(places.steps) + seen])],
+            places=np.column_stack([columns[:, np.concatenate([seen, len(places.steps) + seen])], drifts.columns]),
             prior=wide.T @ wide,
         ),
         residuals=misfit,
         bend=np.zeros((len(others), narrow, narrow)),
         place_angle_rad=(places.steps * ratio[places.on_tilt.astype(int)])[seen],
         place_on_tilt=places.on_tilt[seen],
+        walk=drifts.walk,
+        drift_scale=np.radians(np.asarray(fit.mode.physical)[DRIFT_COLUMNS]),
+        drift_noise=(DRIFT_COLUMNS[:, None] == noise).astype(float),
         gear_scale=np.asarray(fit.mode.physical)[GEAR_SCALES],
         gear_noise=(GEAR_SCALES[:, None] == noise).astype(float),
         period_deg=np.asarray(fit.space.harmonic_period_deg),

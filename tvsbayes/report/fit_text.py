@@ -200,10 +200,11 @@ def answer_lines(summary: FitSummary) -> list[str]:
     quick = summary.sampling.steps is None
     lines = [f"{'rough' if summary.converged else 'not sampled'}: {text}" for text in summary.sampling.missing]
     lines.append(sampling_line(summary.sampling))
-    if summary.converged:
+    if summary.converged and summary.monte_carlo_error:
         worst = max(summary.monte_carlo_error.items(), key=lambda each: each[1].rounds_factor)
         ends = " and ".join(f"{each:.2f}" for each in worst[1].interval95)
-        lines.append(f"largest Monte Carlo error: {worst[1].mean:.2f} sd of the mean, {ends} of the ends ({worst[0]})")
+        told = f"{worst[1].mean:.2f} sd of the mean, {ends} sd of the interval's ends ({worst[0]})"
+        lines.append(f"Monte Carlo error, largest: {told}")
     return [*lines, f"what helps: {'fit without --quick' if quick else 'fit with --resume and more --max-minutes'}"]
 
 

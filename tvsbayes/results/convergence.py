@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.results.records import AnswerKind, ClosedRecord, Count, FromOne, NotNegative
+from tvsbayes.results.records import AnswerKind, Count, FromOne, NotNegative
 
 MEAN_ERROR_MAX, END_ERROR_MAX = 0.1, 0.2
 """Monte Carlo standard error of a headline's mean and of the ends of its 95 % interval, in its sd, with which an answer
@@ -20,14 +20,16 @@ ROUGH_MEAN_ERROR_MAX, ROUGH_END_ERROR_MAX = 0.3, 0.6
 from the mean, but seldom."""
 
 
-class NamedValue(ClosedRecord, frozen=True):
+@dataclass(frozen=True)
+class NamedValue:
     """The extreme of a diagnosis, and the quantity that has it."""
 
     quantity: str
     value: float
 
 
-class MonteCarloError(ClosedRecord, frozen=True):
+@dataclass(frozen=True)
+class MonteCarloError:
     """How far sampling alone may have moved what is said of a quantity, standard errors in its posterior sd.
 
     Attributes:
@@ -48,7 +50,8 @@ class MonteCarloError(ClosedRecord, frozen=True):
         return max(self.mean / MEAN_ERROR_MAX, *(each / END_ERROR_MAX for each in self.interval95)) ** 2
 
 
-class Importance(ClosedRecord, frozen=True):
+@dataclass(frozen=True)
+class Importance:
     """Importance sampling: draws and what their weights are worth.
 
     Attributes:
@@ -82,7 +85,8 @@ class Importance(ClosedRecord, frozen=True):
     answer: AnswerKind | None = None
 
 
-class Agreement(ClosedRecord, frozen=True):
+@dataclass(frozen=True)
+class Agreement:
     """Whether a chain and importance sampling say the same of every headline.
 
     Attributes:
@@ -96,7 +100,8 @@ class Agreement(ClosedRecord, frozen=True):
     worst: NamedValue
 
 
-class Sampling(ClosedRecord, frozen=True):
+@dataclass(frozen=True)
+class Sampling:
     """The diagnosis of a posterior in brief; fields of a chain as in `Convergence`, None where there is no chain.
 
     Attributes:

@@ -6,6 +6,7 @@ Values and gains in the unit of the target, times in minutes.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from tvsbayes.files.documents import Keys
 from tvsbayes.instrument.campaign import Campaign
@@ -15,7 +16,8 @@ from tvsbayes.results.records import Record, read_record, stored_document
 PLAN_FORMAT = "tvsbayes-plan/1"
 
 
-class Batch(Record, frozen=True):
+@dataclass(frozen=True)
+class Batch:
     """A possible next experiment: four looks at one sheet and what they bring; read back without its actions."""
 
     actions: tuple[PlanStep, ...]
@@ -25,7 +27,8 @@ class Batch(Record, frozen=True):
     text: str
 
 
-class Advice(Record, frozen=True):
+@dataclass(frozen=True)
+class Advice:
     """Whether to stop measuring, and the rule."""
 
     now: bool

@@ -70,14 +70,16 @@ class _RecordType(StructMeta, ABCMeta):
 class Record(Struct, frozen=True, metaclass=_RecordType):
     """Base of records; keys that it does not know are passed over.
 
-    `always` names fields that every document holds though the class has defaults for them.
+    `always` names fields that every document holds though the class has defaults for them, `beside` fields that are no
+    part of the document.
     """
 
     always: ClassVar[tuple[str, ...]] = ()
+    beside: ClassVar[tuple[str, ...]] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The document, of plain types."""
-        return plain(self)
+        return {key: value for key, value in plain(self).items() if key not in self.beside}
 
 
 class ClosedRecord(Record, frozen=True, forbid_unknown_fields=True):
@@ -118,13 +120,14 @@ def _array_schema(kind: type) -> dict[str, object]:
     return {"type": ["number", "array"]}
 
 
-def _meanings(kind: type) -> tuple[str, dict[str, str]]:
+def _meanings(docstring: str) -> tuple[str, dict[str, str]]:
     """What a docstring says of a class, and what its section "Attributes" says of each field."""
-    text, _, attributes = (inspect.getdoc(kind) or "").partition("\n\nAttributes:\n")
+    text, _, attributes = docstring.partition("\n\nAttributes:\n")
     found = {}
     for entry in re.split(r"\n(?! )", inspect.cleandoc(attributes)):
         names, _, meaning = entry.partition(": ")
-        found.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
+        # What is None in Python is null in JSON.
+        found.update(dict.fromkeys(names.split(", "), re.sub(r"\bNone\b", "null", " ".join(meaning.split()))))
     return " ".join(text.split()), found
 
 
@@ -151,14 +154,15 @@ def _alike(schema: Any) -> Any:
     return found | {"items": items[0]}
 
 
-def _described(kind: type[Record], component: dict[str, Any]) -> dict[str, Any]:
-    """What the declaration says of a record besides the types of its fields."""
-    text, meanings = _meanings(kind)
-    properties = component["properties"]
-    for field in msgspec.structs.fields(kind):
-        if field.name in meanings:
-            properties[field.encode_name] |= {"description": meanings[field.name]}
-    return {"description": text, "required": [*component["required"], *kind.always]}
+def _described(component: dict[str, Any], kind: type[Record] | None) -> dict[str, Any]:
+    """A schema with what the declaration says besides the types of the fields; `kind` is None of a dataclass."""
+    text, meanings = _meanings(component.get("description", ""))
+    keys = {} if kind is None else {field.name: field.encode_name for field in msgspec.structs.fields(kind)}
+    for name, meaning in meanings.items():
+        if (key := keys.get(name, name)) in component["properties"]:
+            component["properties"][key] |= {"description": meaning}
+    always = () if kind is None else kind.always
+    return component | {"description": text, "required": [*component["required"], *always]}
 
 
 def schema_of(*kinds: type[Record], closed: bool = False, **keys: Any) -> dict[str, Any]:
@@ -166,20 +170,22 @@ def schema_of(*kinds: type[Record], closed: bool = False, **keys: Any) -> dict[s
 
     Args:
         kinds: records whose fields stand side by side in the document.
-        closed: whether it holds no other key.
+        closed: whether it, and every record in it, holds no other key.
         keys: further keys of the document, or what a field of `kinds` is in this one: a record, or a schema.
     """
     named = {key: kind for key, kind in keys.items() if isinstance(kind, type)}
     references, components = msgspec.json.schema_components((*kinds, *named.values()), schema_hook=_array_schema)
-    for name, kind in _records().items():
-        if name in components:
-            components[name] |= _described(kind, components[name])
+    known = _records()
+    for name, component in components.items():
+        components[name] = _described(component, known.get(name))
+        if closed:
+            components[name]["additionalProperties"] = False
     properties: dict[str, Any] = {}
     required = list(keys)
     for kind in kinds:
         component = components.pop(kind.__name__)
-        properties |= component["properties"]
-        required += (key for key in component.get("required", ()) if key not in keys)
+        properties |= {key: value for key, value in component["properties"].items() if key not in kind.beside}
+        required += (key for key in component["required"] if key not in (*keys, *kind.beside))
     properties |= keys | dict(zip(named, references[len(kinds) :], strict=True))
     body = {"type": "object", "properties": properties, "required": required, "$defs": components}
     return _alike(_lists(body | ({"additionalProperties": False} if closed else {})))

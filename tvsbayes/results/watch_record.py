@@ -5,32 +5,34 @@ Lengths in mm, angles in deg, ratios in % of themselves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, ClassVar, Literal
+
+from msgspec import UNSET, Meta, UnsetType
 
 from tvsbayes.display import Shown, View
 from tvsbayes.instrument.plan import PlanStep
+from tvsbayes.results.records import FromOne, Positive, Probability, Record
 
 Verdict = Literal["OK", "MOVED", "CANNOT TELL"]
 OK: Verdict = "OK"
 MOVED: Verdict = "MOVED"
 CANNOT_TELL: Verdict = "CANNOT TELL"
+type Unit = Annotated[str, Meta(extra_json_schema={"enum": ("deg", "mm", "%")})]
+type Looks = Annotated[int, Meta(ge=4)]
 LOOKS_MAX = 384
 """Of a plan for `watch`; a need beyond is told, not planned."""
 
 
-@dataclass(frozen=True)
-class MovedPart:
+class MovedPart(Record, frozen=True):
     """Something that moved: what, by how much, standard uncertainty and unit of both."""
 
     what: str
     value: float
-    u: float
-    unit: str
+    u: Positive
+    unit: Unit
 
 
-@dataclass(frozen=True)
-class SeenChange:
+class SeenChange(Record, frozen=True):
     """What the looks can see of one change.
 
     Attributes:
@@ -41,34 +43,33 @@ class SeenChange:
     """
 
     what: str
-    size: float
-    unit: str
-    power: float
-    p: float
+    size: Positive
+    unit: Unit
+    power: Probability
+    p: Probability
 
 
-@dataclass(frozen=True, repr=False)
-class Watch(Shown):
+class Watch(Shown, Record, frozen=True):
     """New looks against a stored calibration.
 
     Attributes:
         verdict: `OK`, `MOVED` or `CANNOT_TELL`.
         p: probability of a departure like the largest one if nothing has moved, all changes together.
         false_alarm_rate: probability of `MOVED` if nothing has moved.
-        p_all: probability of residuals this large at the fitted noise; it raises no alarm.
-        moved: what moved, the best explanation first.
-        changes: every change that is asked about.
+        moved: what moved, the best explanation first; empty unless `MOVED`.
         looks: usable new looks.
+        p_all: probability of residuals this large at the fitted noise; it raises no alarm.
+        changes: every change that is asked about.
         same_cameras: the new looks state the stereo calibration of the campaign.
     """
 
     verdict: Verdict
-    p: float
-    false_alarm_rate: float
-    p_all: float
+    p: Probability
+    false_alarm_rate: Probability
     moved: tuple[MovedPart, ...]
-    changes: tuple[SeenChange, ...]
-    looks: int
+    looks: Looks
+    p_all: Probability
+    changes: Annotated[tuple[SeenChange, ...], Meta(min_length=1)]
     same_cameras: bool
 
     def unseen(self, power: float) -> tuple[SeenChange, ...]:
@@ -80,24 +81,8 @@ class Watch(Shown):
         rows = [(c.what, c.size, c.unit, c.power, c.p) for c in self.changes]
         return View(f"Watch: {self.verdict}, p = {self.p:.3g}", ("change", "size", "unit", "power", "p"), rows)
 
-    def as_json(self) -> dict[str, Any]:
-        """The document of `watch --json`."""
-        return {
-            "verdict": self.verdict,
-            "p": self.p,
-            "false_alarm_rate": self.false_alarm_rate,
-            "moved": [{"what": m.what, "value": m.value, "u": m.u, "unit": m.unit} for m in self.moved],
-            "looks": self.looks,
-            "p_all": self.p_all,
-            "changes": [
-                {"what": c.what, "size": c.size, "unit": c.unit, "power": c.power, "p": c.p} for c in self.changes
-            ],
-            "same_cameras": self.same_cameras,
-        }
 
-
-@dataclass(frozen=True)
-class PlannedChange:
+class PlannedChange(Record, frozen=True):
     """What planned looks will see of one change.
 
     Attributes:
@@ -111,49 +96,43 @@ class PlannedChange:
     """
 
     what: str
-    size: float
-    unit: str
-    power: float
-    looks_needed: int | None
-    homings_needed: int | None
+    size: Positive
+    unit: Unit
+    power: Probability
+    looks_needed: FromOne | None
+    homings_needed: FromOne | None
     minutes_needed: float | None
-    looks_to_add: int | None
+    looks_to_add: FromOne | None
 
 
-@dataclass(frozen=True, repr=False)
-class WatchPlan(Shown):
+class WatchPlan(Shown, Record, frozen=True, kw_only=True):
     """The fewest looks that watch a calibration.
 
     Attributes:
-        steps: the plan.
-        looks, homings, minutes: its size.
+        looks, homings, minutes: size of the plan.
         minutes_allowed: what it may take.
         power_wanted: of every change.
         false_alarm_rate: of all tests together.
+        met: whether every change is noticed as often as wanted.
         changes: what it will notice.
+        plan: where its steps were written.
+        steps: the plan; no part of the document.
     """
 
-    steps: tuple[PlanStep, ...]
-    looks: int
-    homings: int
+    looks: Looks
+    homings: FromOne
     minutes: float
     minutes_allowed: float
-    power_wanted: float
-    false_alarm_rate: float
-    changes: tuple[PlannedChange, ...]
-
-    @property
-    def met(self) -> bool:
-        """Whether every change is noticed as often as wanted."""
-        return all(change.power >= self.power_wanted for change in self.changes)
+    power_wanted: Probability
+    false_alarm_rate: Probability
+    met: bool
+    changes: Annotated[tuple[PlannedChange, ...], Meta(min_length=1)]
+    plan: str | UnsetType = UNSET
+    steps: tuple[PlanStep, ...]
+    beside: ClassVar = ("steps",)
 
     def shown(self) -> View:
         """What will be noticed."""
         rows = [(c.what, c.size, c.unit, c.power, c.looks_needed) for c in self.changes]
         title = f"WatchPlan: {self.looks} looks, {self.homings} homings, {self.minutes:.1f} minutes"
         return View(title, ("change", "size", "unit", "power", "looks needed"), rows)
-
-    def as_json(self) -> dict[str, Any]:
-        """The document of `plan --watch --json`."""
-        keys = ("looks", "homings", "minutes", "minutes_allowed", "power_wanted", "false_alarm_rate", "met")
-        return {**{key: getattr(self, key) for key in keys}, "changes": [vars(change) for change in self.changes]}

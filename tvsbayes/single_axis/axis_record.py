@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +23,7 @@ from tvsbayes.results.records import (
     NotNegative,
     Record,
     Tier,
+    hold_to_schema,
     plain,
     read_record,
     schema_of,
@@ -122,6 +124,7 @@ class AxisInputs(Record, frozen=True):
     axis: Sha256
 
 
+@cache
 def axis_fit_schema() -> dict[str, Any]:
     """The JSON schema of `results/fit.json` in an axis folder."""
     return schema_of(AxisSummary, Provenance, format={"const": AXIS_FIT_FORMAT}, inputs=AxisInputs)
@@ -383,13 +386,12 @@ def results_for(
     document = stored_document(campaign, "fit.json", (AXIS_FIT_FORMAT,), axis_hashes(campaign))
     if document is not None and document.values.get("converged") is True and campaign.path is not None:
         again = "run `tvsbayes fit` again"
-        summary = read_record(AxisSummary, document, again)
+        hold_to_schema(document, axis_fit_schema(), again)
+        summary = read_record(AxisSummary, document, again, held=True)
+        made = read_record(Provenance, document, again, held=True)
         model = model_of(campaign, more)
-        stored_seed = document.values.get("seed")
-        if not isinstance(stored_seed, int) or isinstance(stored_seed, bool) or stored_seed < 0:
-            raise document.refuse("seed", "damaged", "a whole number from 0", again)
         w = _stored_w(campaign.path, len(model.coordinates.names), again)
-        return AxisResults(summary, AxisFit.of_draws(campaign, model, w, stored_seed), True)
+        return AxisResults(summary, AxisFit.of_draws(campaign, model, w, made.seed), True)
     fit = fit_axis(campaign, tier="importance", seed=seed, more=more, progress=progress)
     if fit.error is not None:
         raise fit.error

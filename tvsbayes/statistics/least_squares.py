@@ -133,9 +133,9 @@ def levenberg_marquardt(
     return descend(partial(linear_residual, residual), damped_solver(tolerance), start, args, max_steps).value
 
 
-NEIGHBOUR_STEPS, NEIGHBOUR_SETTLED = 8, 0.01
-"""Newton steps to a mode beside a known one, and the squared length of one, in posterior sds, after which the next
-would change the log density by less than a thousandth."""
+NEIGHBOUR_STEPS, NEIGHBOUR_SETTLED = 20, 0.01
+"""Newton steps to a mode beside a known one, and the gain of log density of one after which they end: steps get
+shorter slowly where a scale is poorly known."""
 
 
 @dataclass(frozen=True)
@@ -273,11 +273,19 @@ def neighbouring_mode(objective: Objective, known: Mode, free: np.ndarray) -> Mo
     ways = np.zeros((len(free), len(rows)))
     ways[rows] = np.linalg.cholesky(known.covariance[np.ix_(rows, rows)])
     here = _Surroundings(objective, known.z, ways)
+    value, shortened = float(objective(known.z[None])[0]), 0.5 ** np.arange(6)[:, None]
     for _ in range(NEIGHBOUR_STEPS):
-        step = -here.slope()
-        here = replace(here, z=here.z + ways @ step)
-        if step @ step < NEIGHBOUR_SETTLED:
-            return Mode(here.z, known.covariance, float(objective(here.z[None])[0]), ())
+        with np.errstate(invalid="ignore"):
+            step = -here.slope()
+        if not np.all(np.isfinite(step)):
+            return None
+        trials = here.at(shortened * step)
+        chosen = int(np.argmin(trials))
+        gain = value - float(trials[chosen])
+        if gain > 0:
+            here, value = replace(here, z=here.z + ways @ (shortened[chosen] * step)), float(trials[chosen])
+        if gain < NEIGHBOUR_SETTLED:
+            return Mode(here.z, known.covariance, value, ())
     return None
 
 

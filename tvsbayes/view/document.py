@@ -1,4 +1,4 @@
-"""What the page is sent: scenes as one JSON document, its columns of numbers as little-endian arrays in base64.
+"""The document of a page: scenes as JSON, its columns of numbers as little-endian arrays in base64.
 
 Single precision, enough to draw by: 1e-4 px of 2000 px. Not a number stays what it is.
 """
@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from tvsbayes.instrument.campaign import CAMERAS, PIXELS
 from tvsbayes.results.records import plain
+from tvsbayes.view.pictures import PagePicture
 from tvsbayes.view.scene import LookColumns, Looked, Scene, numbers_of
 from tvsbayes.view.shapes import PROBABILITY
 
@@ -38,7 +40,11 @@ def _bare(values: np.ndarray) -> list[float] | None:
     return values.tolist() if np.isfinite(values).all() else None
 
 
-def _scene(shown: Scene) -> dict[str, object]:
+Pictures = Mapping[int, Mapping[str, PagePicture]]
+"""By look and camera."""
+
+
+def _scene(shown: Scene, pictures: Pictures) -> dict[str, object]:
     """One campaign."""
     gears = [{**plain(band), "seen_steps": list(band.seen_steps)} for band in shown.gears]
     return {
@@ -47,6 +53,8 @@ def _scene(shown: Scene) -> dict[str, object]:
         "notes": list(shown.notes),
         "image_px": list(shown.image_px),
         "looks": _looks(shown.looks),
+        "pictures": {str(spot): plain(own) for spot, own in pictures.items()},
+        "pictured": len(pictures),
         "rig": {"cameras": plain(shown.cameras), "sheets": plain(shown.sheets), "origin_mm": _bare(shown.origin_mm)},
         "gears": gears,
         "parameters": plain(shown.parameters),
@@ -54,14 +62,19 @@ def _scene(shown: Scene) -> dict[str, object]:
     }
 
 
-def document(looked: Looked) -> bytes:
-    """The document of everything that a page shows."""
-    changes = None if looked.changes is None else plain(looked.changes)
-    told = {
-        "scenes": [_scene(one) for one in looked.scenes],
-        "changes": changes,
+def document(looked: Looked, pictures: Sequence[Pictures] = ()) -> bytes:
+    """The document of everything that a page shows.
+
+    Args:
+        looked: the scenes.
+        pictures: of each of them; none by default.
+    """
+    held = pictures or [{}] * len(looked.scenes)
+    content = {
+        "scenes": [_scene(one, own) for one, own in zip(looked.scenes, held, strict=True)],
+        "changes": None if looked.changes is None else plain(looked.changes),
         "cameras": list(CAMERAS),
         "pixels": list(PIXELS),
         "probability": PROBABILITY,
     }
-    return json.dumps(told, allow_nan=False).encode()
+    return json.dumps(content, allow_nan=False).encode()

@@ -1,53 +1,122 @@
-"""Answers of a run's page: what there is to see, and requests by the one browser that controls. Tornado."""
+"""Answers to a browser that looks at a run: every one, also to what does not exist, passes `Access` first. Tornado.
+
+No path of a request is ever a path on the disk, and nothing can be written.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 from tornado import web
 
 from tvsbayes.instrument.campaign import CAMERAS
-from tvsbayes.view.access import Access
-from tvsbayes.view.contents import Contents
-from tvsbayes.view.guard import Guarded
-from tvsbayes.view.watched import Watched
+from tvsbayes.view.access import SECURITY_HEADERS, Access
+from tvsbayes.view.watched import SAFER, Watched
+
+Files = Mapping[str, tuple[bytes, str]]
+"""Content and type of the page's own files, by path."""
 
 
-class OfRun(Guarded):
-    """An answer about a run.
+class Guarded(web.RequestHandler):
+    """What all answers share.
 
     Attributes:
+        access: who may ask.
+        files: of the page.
         live: the run.
+        open_to_all: whether the page's own browser is answered without the key.
     """
 
-    def initialize(self, access: Access, contents: Contents, live: Watched | None = None) -> None:
+    open_to_all = False
+
+    def initialize(self, access: Access, files: Files, live: Watched) -> None:
         """Called by Tornado for every request."""
-        super().initialize(access, contents)
-        assert live is not None
-        self.live = live
+        self.access, self.files, self.live = access, files, live
+
+    def set_default_headers(self) -> None:
+        """Those of `SECURITY_HEADERS`, and nothing of the server's make."""
+        self.clear_header("Server")
+        for name, value in SECURITY_HEADERS.items():
+            self.set_header(name, value)
+
+    def prepare(self) -> None:
+        """Refuse strangers before anything else; control passes on where who had it is silent."""
+        reason = self.access.stranger(self.request.headers)
+        if reason is None and not self.open_to_all and not self.access.knows(self.request.headers):
+            reason = "this browser has no key: open the link that the terminal shows"
+        if reason is not None:
+            raise web.HTTPError(403, reason=reason)
+        if self.access.takes_over(self.request.headers):
+            self.live.control_passed()
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        """In words, without a traceback."""
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.finish(f"{status_code}: {self._reason}\n")
 
 
-class Now(OfRun):
+class Unknown(Guarded):
+    """Any other path."""
+
+    def prepare(self) -> None:
+        """Not found, for those who may ask."""
+        super().prepare()
+        raise web.HTTPError(404)
+
+
+class File(Guarded):
+    """A file of the page: holds nothing of a run, and browsers cannot send our header for a script."""
+
+    open_to_all = True
+
+    def get(self) -> None:
+        """The file of this very path."""
+        content, kind = self.files[self.request.path]
+        self.set_header("Content-Type", kind)
+        self.finish(content)
+
+
+class Key(Guarded):
+    """A key for the token of the link."""
+
+    open_to_all = True
+
+    def post(self) -> None:
+        """`{"token": ...}` to `{"key": ...}`."""
+        try:
+            token = json.loads(self.request.body)["token"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            token = None
+        key = self.access.key_for(token) if isinstance(token, str) else None
+        if key is None:
+            raise web.HTTPError(403, reason="the link is wrong: open the one that the terminal shows")
+        self.finish({"key": key})
+
+
+class Now(Guarded):
     """The newest snapshot."""
 
     def get(self) -> None:
-        """As JSON; `controls` says whether this browser may ask for something."""
+        """As JSON; `controls` says whether this browser may ask for everything."""
         self.set_header("Content-Type", "application/json")
         told = {**self.live.told(), "controls": self.access.controls(self.request.headers)}
         self.finish(json.dumps(told, allow_nan=False))
 
 
-class Ask(OfRun):
+class Ask(Guarded):
     """A request to the run."""
 
     def post(self) -> None:
         """`{"what": ...}`, put in the queue; what becomes of it stands in the snapshots."""
-        if not self.access.controls(self.request.headers):
-            raise web.HTTPError(403, reason="this browser only watches: the first one that opened the link controls")
         try:
-            taken = self.live.ask(json.loads(self.request.body)["what"])
-        except (ValueError, KeyError, TypeError) as error:
+            what = json.loads(self.request.body)["what"]
+            if not self.access.controls(self.request.headers) and what not in SAFER:
+                reason = f"this browser only watches: another one controls; here only {' and '.join(SAFER)}"
+                raise web.HTTPError(403, reason=reason)
+            taken = self.live.ask(what)
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise web.HTTPError(400, reason="nothing that can be asked of a run") from error
         if not taken:
             raise web.HTTPError(409, reason="the run has ended")
@@ -55,7 +124,7 @@ class Ask(OfRun):
         self.finish()
 
 
-class LivePicture(OfRun):
+class LivePicture(Guarded):
     """A picture of the last look."""
 
     def get(self, spot: str, camera: str, kind: str) -> None:
@@ -70,7 +139,12 @@ class LivePicture(OfRun):
         self.finish(found)
 
 
-def live_routes(given: dict[str, Any]) -> list[Any]:
-    """Those of a run by path."""
+def application(files: Files, access: Access, live: Watched) -> web.Application:
+    """All of them by path."""
+    given: dict[str, Any] = {"access": access, "files": files, "live": live}
     pictures = rf"/live/([0-9]{{1,10}})/({'|'.join(CAMERAS)})/(whole|spot)"
-    return [("/live", Now, given), ("/ask", Ask, given), (pictures, LivePicture, given)]
+    routes: list[Any] = [(path.replace(".", r"\."), File, given) for path in files]
+    routes += [("/key", Key, given), ("/live", Now, given), ("/ask", Ask, given), (pictures, LivePicture, given)]
+    return web.Application(
+        routes, default_handler_class=Unknown, default_handler_args=given, log_function=lambda handler: None
+    )

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+SAFER = ("pause", "laser off")
+"""What every browser with the link may ask for: it only makes a run safer."""
+
 
 class Watched(Protocol):
     """What a page reads of a run and asks of it; called by the server's thread, so no call may wait for the run."""
@@ -20,3 +23,6 @@ class Watched(Protocol):
         Raises:
             ValueError: nothing that can be asked for.
         """
+
+    def control_passed(self) -> None:
+        """Another browser controls the run from now on."""

@@ -1,0 +1,106 @@
+"""Placements by a program: in the journal before they count, with the laser off, ended where they take too long."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from support.bench_runs import Run, small_plan
+
+from tvsbayes.acquisition.journal import read_journal
+from tvsbayes.acquisition.journal_check import verify
+from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator
+from tvsbayes.acquisition.place_command import WORDS_MAX, PlaceCommand
+from tvsbayes.cli.main import run
+from tvsbayes.errors import DeviceFault, InputError
+from tvsbayes.instrument.campaign import read_campaign
+
+pytestmark = pytest.mark.usefixtures("ctrl_c_works")
+SAYS = "import sys; print('moved to', *sys.argv[1:])"
+WAITS = "import threading; print('on my way', flush=True); threading.Event().wait()"
+
+
+def program(code: str, limit_s: float = 60.0) -> PlaceCommand:
+    return PlaceCommand((sys.executable, "-c", code), limit_s)
+
+
+def events(folder, name: str) -> list[dict]:
+    return [record.data for record in read_journal(folder).records if record.event == name]
+
+
+def test_every_placement_is_made_by_the_program_in_the_dark(mounted_rig, tmp_path, monkeypatch):
+    ordinary, light = PlaceCommand.run, []
+    run_ = Run(mounted_rig, tmp_path / "c", place_command=program(SAYS))
+
+    def seen(self, *given):
+        light.append(run_.instrument.mechanics.laser_on)
+        return ordinary(self, *given)
+
+    monkeypatch.setattr(PlaceCommand, "run", seen)
+    outcome = run_.engine.run()
+    assert (outcome.reason, outcome.ok) == ("done", 8) and run_.dark()
+    done, placed = events(tmp_path / "c", "place_command"), events(tmp_path / "c", "placed")
+    assert [one["target"] for one in done] == [one["target"] for one in placed] and light == [False] * len(done)
+    for number, one in enumerate(done):
+        x_mm = mounted_rig.sheets_mm[one["target"]]
+        assert one["words"].strip() == f"moved to {one['target']} {x_mm:.3f} {number}"
+        assert (one["exit_code"], one["placement"], one["x_mm"], one["limit_s"]) == (0, number, x_mm, 60.0)
+    assert verify(tmp_path / "c").stopped == "done" and len(read_campaign(tmp_path / "c").spots) == 8
+
+
+def test_a_program_that_fails_ends_the_run_and_resume_goes_on(mounted_rig, tmp_path):
+    fails = program("import sys; print('no air pressure'); sys.exit(3)")
+    with pytest.raises(DeviceFault) as fault:
+        Run(mounted_rig, tmp_path / "c", place_command=fails).engine.run()
+    assert fault.value.code == "place-command" and "code 3" in str(fault.value)
+    assert "no air pressure" in str(fault.value) and "--resume" in fault.value.remedy
+    (event,) = events(tmp_path / "c", "place_command")
+    assert event["exit_code"] == 3 and events(tmp_path / "c", "placed") == []
+    again = Run(mounted_rig, tmp_path / "c", resume=True, start=1, place_command=program(SAYS))
+    assert again.engine.run().reason == "done" and len(events(tmp_path / "c", "place_command")) >= 2
+
+
+def test_a_program_that_takes_too_long_is_ended(mounted_rig, tmp_path):
+    with pytest.raises(DeviceFault, match="was ended after"):
+        Run(mounted_rig, tmp_path / "c", place_command=program(WAITS, 0.5)).engine.run()
+    (event,) = events(tmp_path / "c", "place_command")
+    assert event["exit_code"] is None and event["limit_s"] == 0.5
+
+
+def test_stop_ends_the_program_too(mounted_rig, tmp_path, monkeypatch):
+    run_ = Run(mounted_rig, tmp_path / "c", small_plan(), place_command=program(WAITS))
+    monkeypatch.setattr(run_.stop, "requested", False)
+    control = run_.engine._control
+    heeds = control.meanwhile
+
+    def stopped() -> bool:
+        run_.stop.requested = True
+        return heeds()
+
+    monkeypatch.setattr(control, "meanwhile", stopped)
+    assert run_.engine.run().reason == "interrupted"
+    assert [one["exit_code"] for one in events(tmp_path / "c", "place_command")] == [None]
+
+
+def test_much_that_is_said_is_kept_short():
+    done = program("print('x' * 10**6 + 'end')").run("d1", 175.0, 0, lambda: True)
+    assert len(done["words"]) == WORDS_MAX and done["words"].strip().endswith("end")
+
+
+@pytest.mark.parametrize("line", ["", "'", "no-such-program-anywhere --fast"])
+def test_no_program_is_refused_before_the_run(line):
+    with pytest.raises(InputError) as refused:
+        PlaceCommand.parsed(line, None)
+    assert refused.value.column == "--place-command"
+
+
+def test_nobody_is_asked_for_the_sheet():
+    def ask(question: str) -> str:
+        raise AssertionError(question)
+
+    assert TerminalOperator(StopKey(), Terminal(ask=ask), "2", places=False).place("d1", 175.0, 0, "")
+
+
+def test_options_of_the_command(tmp_path, capsys):
+    assert run(["acquire", "rig.toml", "plan.csv", str(tmp_path / "c"), "--simulate", "--place-seconds", "3"]) == 2
+    assert "--place-command" in capsys.readouterr().err

@@ -1,0 +1,97 @@
+"""States that a campaign drew, eliminated in time order, against dense algebra."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.small_posterior import ROUNDING, small_fit
+
+from tvsbayes.estimators.linear_spots import linear_spots
+from tvsbayes.posterior.stop_states import Elimination, StopStates, stop_states
+
+SPOTS, STATES, POINTS = 30, 16, 5
+SEEN_BY = 3
+
+
+def drawn_states(seed: int) -> StopStates:
+    """States that few spots see, here and there: eliminating one couples others that no spot sees together."""
+    generator = np.random.default_rng(seed)
+    load = np.zeros((SPOTS, 4, STATES))
+    for state in range(STATES):
+        load[generator.choice(SPOTS, SEEN_BY, replace=False), :, state] = generator.normal(size=(SEEN_BY, 4))
+    none = np.zeros((STATES, 4)), np.zeros(STATES), np.zeros((STATES, 2))
+    return StopStates(load.reshape(4 * SPOTS, STATES), *none)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_elimination_is_the_dense_cholesky_factor(seed):
+    """At points of many scales, decades apart, fill included."""
+    states = drawn_states(seed)
+    count = len(states.constant)
+    generator = np.random.default_rng([seed, 1])
+    sd = np.exp(generator.normal(size=(POINTS, count), scale=2.0))
+    filled = sum(states.gram[i, j] == 0 for i, later in enumerate(states.later) for j in later)
+    assert filled > 0, "nothing is filled in"
+    assert sum(map(len, states.later)) < count * (count - 1) / 2, "nothing is left out"
+    products = states.load.T @ generator.normal(size=(4 * SPOTS, 3))
+    found = Elimination.of(states, sd)
+    for point in range(POINTS):
+        scaled = states.load * sd[point]
+        dense = np.linalg.cholesky(np.eye(count) + scaled.T @ scaled)
+        rounding = 4 * SPOTS * count * ROUNDING * np.linalg.cond(dense)
+        mine = np.diag(found.pivot[point])
+        for i, later in enumerate(states.later):
+            mine[list(later), i] = found.below[i][point]
+        np.testing.assert_allclose(mine, dense, rtol=0, atol=rounding * np.abs(dense).max())
+        whitened = np.linalg.solve(dense, sd[point][:, None] * products)
+        atol = rounding * np.abs(whitened).max()
+        np.testing.assert_allclose(found.whitened(products)[point], whitened, rtol=0, atol=atol)
+        own = found.whitened(np.repeat(products[None], POINTS, axis=0))[point]
+        np.testing.assert_allclose(own, whitened, rtol=0, atol=atol)
+
+
+def test_what_states_leave_of_residuals_is_woodburys():
+    """X' C^-1 X with C = 1 + G T^2 G' written out."""
+    states = drawn_states(7)
+    generator = np.random.default_rng(8)
+    sd = np.exp(generator.normal(size=(1, len(states.constant))))
+    columns = generator.normal(size=(4 * SPOTS, 4))
+    white = Elimination.of(states, sd).whitened(states.load.T @ columns)[0]
+    scaled = states.load * sd[0]
+    covariance = np.eye(4 * SPOTS) + scaled @ scaled.T
+    dense = columns.T @ np.linalg.solve(covariance, columns)
+    found = columns.T @ columns - white.T @ white
+    rounding = 4 * SPOTS * ROUNDING * np.linalg.cond(covariance)
+    np.testing.assert_allclose(found, dense, rtol=0, atol=rounding * np.abs(columns.T @ columns).max())
+
+
+def test_no_states_take_nothing():
+    nothing = StopStates(np.zeros((8, 0)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 2)))
+    found = Elimination.of(nothing, np.zeros((3, 0)))
+    assert found.whitened(np.zeros((0, 2))).shape == (3, 0, 2)
+
+
+def test_states_of_a_campaign_give_the_covariance_of_its_filter():
+    """Columns times their variances at the mode, against the filter's six states followed spot by spot."""
+    fitted = small_fit()[0]
+    linear = linear_spots(fitted.linearised, fitted.arrays, -fitted.linearised.residual_jacobian)
+    states = stop_states(fitted, linear)
+    spots = len(linear.residual)
+    variance = states.variance.sum(axis=1) + states.constant
+    found = (states.load * variance) @ states.load.T
+    expected = np.zeros((spots, 4, spots, 4))
+    covariance = np.zeros((6, 6))
+    for spot in range(spots):
+        keep = ~linear.renewed[spot]
+        covariance = covariance * np.outer(keep, keep) + np.diag(linear.variance[spot])
+        # A state that lives on is the same at later spots; what drifts has no column.
+        alive = np.ones(6, bool)
+        for later in range(spot, spots):
+            if later > spot:
+                alive &= ~linear.renewed[later]
+            shared = linear.load[spot] @ (np.diag(covariance) * alive * np.eye(6)) @ linear.load[later].T
+            expected[spot, :, later], expected[later, :, spot] = shared, shared.T
+    expected = expected.reshape(4 * spots, 4 * spots)
+    assert not linear.variance[:, 2:4][~linear.renewed[:, 2:4]].any(), "a drift has no column"
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert np.all(np.diff([np.flatnonzero(column)[-1] // 4 for column in states.load.T]) >= 0), "in order of their ends"

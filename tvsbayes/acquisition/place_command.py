@@ -1,0 +1,128 @@
+"""Placements by a program: a robot that drives the rig to the wall, a linear stage under the sheet.
+
+The program is started with three more arguments: the target, its nominal X in mm in frame S, and the number of the
+placement in the plan, from 0. Exit code 0 says that the sheet stands there. Seconds where a name says `_s`.
+"""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import IO
+
+from tvsbayes.acquisition.journal_events import PlaceCommanded
+from tvsbayes.errors import DeviceFault, InputError, escaped
+
+LIMIT_S = 600.0
+"""Default longest time of one placement."""
+POLL_S = 0.1
+"""How often what is asked of the run is heeded meanwhile."""
+GRACE_S = 5.0
+"""For a program that is asked to end (SIGTERM) to stop its motion, before it is killed."""
+WORDS_MAX = 2000
+"""Characters of its output that are kept: the last ones."""
+
+
+@dataclass(frozen=True)
+class PlaceCommand:
+    """A program that places the sheet.
+
+    Attributes:
+        command: program and its own arguments.
+        limit_s: longest time of one placement.
+    """
+
+    command: tuple[str, ...]
+    limit_s: float = LIMIT_S
+
+    @classmethod
+    def parsed(cls, line: str, limit_s: float | None) -> PlaceCommand:
+        """Of a line as a shell splits it; no shell runs it.
+
+        Raises:
+            InputError: no such program.
+        """
+        try:
+            command = tuple(shlex.split(line))
+        except ValueError:
+            command = ()
+        if not command or shutil.which(command[0]) is None:
+            found, remedy = f"--place-command {escaped(line, 200)}", "name a program that can be started"
+            raise InputError("usage", found, column="--place-command", allowed="a program", remedy=remedy)
+        return cls(command, LIMIT_S if limit_s is None else limit_s)
+
+    def run(self, target: str, x_mm: float, placement: int, meanwhile: Callable[[], bool]) -> PlaceCommanded:
+        """Run it; what it did, also where it failed.
+
+        Args:
+            target: where the sheet shall stand.
+            x_mm: nominal X of the target in frame S.
+            placement: its number in the plan, from 0.
+            meanwhile: called again and again; False ends the program.
+        """
+        begun, exit_code = time.monotonic(), None
+        with tempfile.TemporaryFile() as output:
+            arguments = [*self.command, target, f"{x_mm:.3f}", str(placement)]
+            try:
+                # A session of its own: the Ctrl-C that asks for the end of the run does not reach it.
+                with subprocess.Popen(
+                    arguments, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
+                ) as process:
+                    exit_code = self._waited(process, begun, meanwhile)
+                words = _last_words(output)
+            except OSError as error:
+                words = error.strerror or str(error)
+        return PlaceCommanded(
+            target=target,
+            x_mm=x_mm,
+            placement=placement,
+            command=list(self.command),
+            exit_code=exit_code,
+            seconds=round(time.monotonic() - begun, 1),
+            limit_s=self.limit_s,
+            words=words,
+        )
+
+    def _waited(self, process: subprocess.Popen[bytes], begun: float, meanwhile: Callable[[], bool]) -> int | None:
+        """The exit code; None of a program that had to be ended."""
+        try:
+            while meanwhile() and time.monotonic() - begun < self.limit_s:
+                try:
+                    return process.wait(POLL_S)
+                except subprocess.TimeoutExpired:
+                    pass
+            process.terminate()
+            try:
+                process.wait(GRACE_S)
+            except subprocess.TimeoutExpired:
+                pass
+            return None
+        finally:
+            process.kill()
+
+
+def require_placed(done: PlaceCommanded) -> None:
+    """Refuses to go on without a sheet.
+
+    Raises:
+        DeviceFault: the program has failed.
+    """
+    if done.exit_code == 0:
+        return
+    code, limit_s = done.exit_code, done.limit_s
+    how = f"was ended after {done.seconds:g} s (limit {limit_s:g} s)" if code is None else f"ended with code {code}"
+    said = escaped(done.words.strip()[-200:], 300) or "nothing"
+    remedy = "bring the sheet into reach, then go on with --resume"
+    message = f"the place command for {escaped(done.target)} {how} and said: {said}; {remedy}"
+    raise DeviceFault("place-command", message, remedy=remedy)
+
+
+def _last_words(output: IO[bytes]) -> str:
+    size = output.seek(0, 2)
+    output.seek(max(0, size - WORDS_MAX))
+    return output.read().decode("utf-8", errors="replace")

@@ -1,0 +1,96 @@
+"""The pictures that the page of a campaign carries: every look's, reduced, as data URIs within a limit for all of them.
+
+px of the sensor with the integer at the centre of a pixel.
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.errors import InputError
+from tvsbayes.files.images import WINDOW_PX, read_image, small_picture
+from tvsbayes.instrument.campaign import CAMERAS, frame_name
+from tvsbayes.progress import Advance
+from tvsbayes.view.scene import LookColumns
+
+WIDTH_PX = 320
+"""Of a whole picture."""
+PICTURES_BYTES_MAX = 24_000_000
+"""Of all pictures of a page: 600 looks by two cameras in a lit room, 3800 in the dark."""
+GOLDEN = (5**0.5 - 1) / 2
+
+
+@dataclass(frozen=True)
+class PagePicture:
+    """One picture of a look.
+
+    Attributes:
+        whole: data URI of all of it, reduced.
+        spot: data URI of the surroundings of the spot as they were taken; None without a spot in the picture.
+        corner_px: (u, v) of the outer corner of these surroundings.
+        side_px: their side.
+    """
+
+    whole: str
+    spot: str | None
+    corner_px: tuple[float, float] | None
+    side_px: int = WINDOW_PX
+
+    @property
+    def size(self) -> int:
+        """Bytes in the page."""
+        return len(self.whole) + len(self.spot or "")
+
+
+def look_pictures(
+    folder: Path | None, looks: LookColumns, bytes_max: int = PICTURES_BYTES_MAX, advance: Advance = lambda share: None
+) -> dict[int, dict[str, PagePicture]]:
+    """Pictures by look and camera: of unlikely looks first, then of looks evenly chosen until the limit is reached.
+
+    Args:
+        folder: of the campaign; a link that leads out of it is not followed.
+        looks: which have pictures, and where their spots are.
+        bytes_max: of all data URIs.
+        advance: told the share that is done.
+    """
+    found: dict[int, dict[str, PagePicture]] = {}
+    kept = np.flatnonzero(looks.pictures.any(axis=1))
+    # Multiples of the golden ratio lie evenly however few of them there are (Weyl).
+    order = sorted(kept.tolist(), key=lambda row: (not looks.suspect[row], row * GOLDEN % 1.0))
+    size = 0
+    for count, row in enumerate(order if folder is not None else ()):
+        own = _pictures(Path(folder or ""), looks, row)
+        size += sum(picture.size for picture in own.values())
+        if size > bytes_max:
+            break
+        if own:
+            found[int(looks.spot[row])] = own
+        advance((count + 1) / len(order))
+    return found
+
+
+def _pictures(folder: Path, looks: LookColumns, row: int) -> dict[str, PagePicture]:
+    """Those of one look; what is damaged or leads out of the folder is left out."""
+    found = {}
+    for k, camera in enumerate(CAMERAS):
+        if not looks.pictures[row, k]:
+            continue
+        try:
+            image = read_image(folder / frame_name(int(looks.spot[row]), camera), folder)
+        except InputError:
+            continue
+        u, v = looks.pixels_px[row, 2 * k : 2 * k + 2].tolist()
+        spot, corner = None, None
+        if 0 <= u <= image.shape[1] - 1 and 0 <= v <= image.shape[0] - 1:
+            spot = _uri(small_picture(image, (u, v)))
+            corner = (round(u) - WINDOW_PX / 2 - 0.5, round(v) - WINDOW_PX / 2 - 0.5)
+        found[camera] = PagePicture(_uri(small_picture(image, width_px=WIDTH_PX)), spot, corner)
+    return found
+
+
+def _uri(jpeg: bytes) -> str:
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}"
