@@ -32,8 +32,6 @@ from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.acquisition import session
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.replanning import (
-    ADAPTED,
-    CONFIRMED,
     AdaptWish,
     Replanning,
     adapted_plan,
@@ -129,8 +127,8 @@ def adapted(seed: int, folder: Path) -> dict[str, object]:
     if last.fit is None or len(last.fit.campaign.spots) < len(campaign.spots):
         last = Last(fit(campaign))
     told = ended(campaign, last.fit, last.sampled, truth, plan_seconds(rig, steps[: row + 1]) / 60)
-    asked = [dict(record.data) for record in journal.records if record.event == CONFIRMED]
-    return {**told, "met": outcome.reason == "target met", "changes": events.count(ADAPTED), "confirmed": asked}
+    asked = [dict(record.data) for record in journal.records if record.event == "confirmed"]
+    return {**told, "met": outcome.reason == "target met", "changes": events.count("adapted"), "confirmed": asked}
 
 
 def first_looks(campaign: Campaign, count: int) -> Campaign:

@@ -29,8 +29,8 @@ from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.likelihood import stop_variances
 from tvsbayes.estimators.looks import nearest_range, observe
 from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.mirrors import Vectors
 from tvsbayes.instrument.parameters import NAMES, Prior
-from tvsbayes.model.geometry import Vectors
 from tvsbayes.model.laser_path import mirror_angles, trace
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.posterior.sampling import sample

@@ -84,7 +84,7 @@ def test_stop_ends_the_program_too(mounted_rig, tmp_path, monkeypatch):
 
 def test_much_that_is_said_is_kept_short():
     done = program("print('x' * 10**6 + 'end')").run("d1", 175.0, 0, lambda: True)
-    assert len(done["words"]) == WORDS_MAX and done["words"].strip().endswith("end")
+    assert len(done.words) == WORDS_MAX and done.words.strip().endswith("end")
 
 
 @pytest.mark.parametrize("line", ["", "'", "no-such-program-anywhere --fast"])

@@ -7,6 +7,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 import pytest
+from msgspec.structs import replace as renewed
 from scipy import stats
 from support.drawn_residuals import drawn_residual
 from support.imagined_stops import STOPS, linearised, stops_of
@@ -111,11 +112,11 @@ def stops(generator: np.random.Generator, count: int = 60) -> list[StopResidual]
 
 
 PLANTED = {
-    "depth": lambda r: replace(r, within=tuple(w and w + s for w, s in zip(r.within, (-1.0, 1.0), strict=True))),
-    "direction": lambda r: replace(r, deviation_deg=r.deviation_deg + (0.03 if r.direction == "left" else -0.03)),
-    "N": lambda r: replace(r, deviation_deg=r.deviation_deg + (0.06 if r.leg_steps == 200 else 0.0)),
-    "step phase": lambda r: replace(r, deviation_deg=r.deviation_deg + 0.045 * np.cos(np.pi * r.steps / 2)),
-    "time": lambda r: replace(r, deviation_deg=r.deviation_deg + 2e-4 * (r.time_s - 300)),
+    "depth": lambda r: renewed(r, within=tuple(w and w + s for w, s in zip(r.within, (-1.0, 1.0), strict=True))),
+    "direction": lambda r: renewed(r, deviation_deg=r.deviation_deg + (0.03 if r.direction == "left" else -0.03)),
+    "N": lambda r: renewed(r, deviation_deg=r.deviation_deg + (0.06 if r.leg_steps == 200 else 0.0)),
+    "step phase": lambda r: renewed(r, deviation_deg=r.deviation_deg + 0.045 * np.cos(np.pi * r.steps / 2)),
+    "time": lambda r: renewed(r, deviation_deg=r.deviation_deg + 2e-4 * (r.time_s - 300)),
 }
 
 
@@ -156,6 +157,6 @@ def test_depths_are_not_sorted_by_the_noise_that_they_share():
     # One placement is not tested; an oblique sheet that reaches far is, in bins far wider than the noise.
     (near,) = (c for c in residual_causes(rows[:40]) if (c.name, c.axis) == ("depth", "pan"))
     assert len(near.groups) == 1 and near.p is None
-    oblique = [replace(r, depth_mm=(200.0 + r.steps,)) for r in rows]
+    oblique = [renewed(r, depth_mm=(200.0 + r.steps,)) for r in rows]
     (far,) = (c for c in residual_causes(oblique) if (c.name, c.axis) == ("depth", "pan"))
     assert len(far.groups) == 6 and far.p is not None

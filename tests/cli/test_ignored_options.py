@@ -47,13 +47,13 @@ def test_what_would_be_ignored_is_refused(ask, line, said):
 
 
 def test_a_unit_is_for_files_that_state_none(ask, tmp_path):
-    """Only OpenCV's files leave the unit of T open; that of ours is stated."""
+    """Files of other programs leave the unit of T open; that of ours is stated."""
     from tvsbayes.files.disk import shipped_data
 
     pair = shipped_data() / "rigs" / "mounted" / "stereo.json"
     for option in (("--import-unit", "m"), ("--image-size", "1280x720")):
         code, document = ask("stereo", "--import", pair, *option)
-        assert (code, document["error"]["code"]) == (2, "usage") and "OpenCV" in document["error"]["message"]
+        assert (code, document["error"]["code"]) == (2, "usage") and "other programs" in document["error"]["message"]
     assert ask("stereo", "--import", pair)[0] == 0
 
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from msgspec import structs
 from support.varying_gears import perfect_rig
 
 from tvsbayes.comparison.changes import compare
@@ -29,8 +30,8 @@ def test_a_calibration_has_not_changed_from_itself(mixed_fit):
     assert [c.quantity for c in same.changes[:2]] == ["effective_deg_per_step.left", "effective_deg_per_step.right"]
     assert "local_deg_per_step.left" in changes_text(same) and "effective" not in changes_text(same)
     # What is least known may hide most: here the second ratio, made ten times less sure.
-    worst = replace(same.changes[1], u=10 * same.changes[1].u)
-    less = replace(same, changes=(same.changes[0], worst, *same.changes[2:]))
+    worst = structs.replace(same.changes[1], u=10 * same.changes[1].u)
+    less = structs.replace(same, changes=(same.changes[0], worst, *same.changes[2:]))
     assert f"may have changed by {100 * same.limit * worst.u / worst.first:.2g} % unseen" in changes_text(less)
     for change in same.changes:
         assert change.difference == 0.0 and change.normalised == 0.0 and change.u > 0

@@ -1,4 +1,4 @@
-"""Rotations, mirrors and rays against scipy and the laws they obey; projection against OpenCV's own."""
+"""Rotations against scipy and the laws they obey; projection against OpenCV's own."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tvsbayes.instrument.mirrors import Vectors
 from tvsbayes.model.geometry import (
     CV_FROM_S,
     NEAREST_MM,
     StereoCameras,
-    Turn,
-    Vectors,
-    intersect_plane,
     project,
-    reflect,
     rotation_matrix,
     transform,
 )
@@ -99,56 +96,11 @@ def test_second_derivative_at_zero_is_the_known_one(compiled):
             np.testing.assert_allclose(second[:, :, i, j], expected, atol=ROUNDING)
 
 
-def test_a_turn_is_the_rotation_about_z():
-    vectors = np.random.default_rng(2).standard_normal((3, 20))
-    angles = np.linspace(-np.pi, np.pi, 20)
-    turn = Turn.by(jnp.asarray(angles))
-    turned = turn.forward(Vectors.of(jnp.asarray(vectors)))
-    expected = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).apply(vectors.T).T
-    np.testing.assert_allclose(turned.stacked(), expected, atol=4 * ROUNDING)
-    np.testing.assert_allclose(turn.back(turned).stacked(), vectors, atol=4 * ROUNDING)
-
-
-def test_vectors_know_their_products():
+def test_matrix_times_vectors():
     rng = np.random.default_rng(3)
-    matrix, vectors, others = rng.standard_normal((3, 3)), *rng.standard_normal((2, 3, 5, 7))
-    first, second = (Vectors.of(jnp.asarray(v)) for v in (vectors, others))
-    product = transform(jnp.asarray(matrix), first).stacked()
+    matrix, vectors = rng.standard_normal((3, 3)), rng.standard_normal((3, 5, 7))
+    product = transform(jnp.asarray(matrix), Vectors.of(jnp.asarray(vectors))).stacked()
     np.testing.assert_allclose(product, np.einsum("ij,jab->iab", matrix, vectors), atol=10 * ROUNDING)
-    np.testing.assert_allclose(first.dot(second), np.sum(vectors * others, axis=0), atol=10 * ROUNDING)
-    np.testing.assert_allclose(first.cross(second).stacked(), np.cross(vectors, others, axis=0), atol=10 * ROUNDING)
-
-
-def test_one_vector_goes_with_many():
-    many = Vectors.of(jnp.asarray(np.random.default_rng(5).standard_normal((3, 4))))
-    both = (many + Vectors.of(np.array([0.0, 2.0, 0.0])) - many) * 0.5
-    np.testing.assert_allclose(both.stacked(), np.repeat([[0.0], [1.0], [0.0]], 4, axis=1), atol=4 * ROUNDING)
-
-
-def rays_and_planes():
-    rng = np.random.default_rng(4)
-    origin, direction, point, normal = rng.standard_normal((4, 3, 50))
-    unit = direction / np.linalg.norm(direction, axis=0), normal / np.linalg.norm(normal, axis=0)
-    return tuple(Vectors.of(jnp.asarray(v)) for v in (origin, unit[0], point, unit[1]))
-
-
-def test_reflection_keeps_what_lies_in_the_mirror_and_turns_the_rest():
-    _, direction, _, normal = rays_and_planes()
-    out = reflect(direction, normal)
-    incoming, outgoing = direction.dot(normal), out.dot(normal)
-    np.testing.assert_allclose(outgoing, -incoming, atol=4 * ROUNDING)
-    tangential = direction - normal * incoming
-    np.testing.assert_allclose((out - normal * outgoing).stacked(), tangential.stacked(), atol=4 * ROUNDING)
-    np.testing.assert_allclose(reflect(out, normal).stacked(), direction.stacked(), atol=4 * ROUNDING)
-
-
-def test_intersection_lies_on_line_and_plane():
-    origin, direction, point, normal = rays_and_planes()
-    hit = intersect_plane(origin, direction, point, normal)
-    size = np.maximum(1.0, np.linalg.norm(hit.stacked(), axis=0))
-    assert np.max(np.abs((hit - point).dot(normal)) / size) < 10 * ROUNDING
-    across = np.cross((hit - origin).stacked(), direction.stacked(), axis=0)
-    assert np.max(np.linalg.norm(across, axis=0) / size) < 10 * ROUNDING
 
 
 def cameras(focal_scale: float = 1.0) -> StereoCameras:

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tvsbayes.instrument.mirrors import Optics
 from tvsbayes.model.laser_path import (
     UNIFORM_SD,
     Harmonics,
     MoveArrays,
-    Optics,
     Transmission,
     beam_angles,
     mirror_angles,

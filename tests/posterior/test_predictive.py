@@ -152,7 +152,7 @@ def posterior_of_two_ways() -> Posterior:
     )
     ways = tuple(Alternative(each.sides, 0.5, each) for each in (one, other))
     worst = NamedValue("none", 500.0)
-    found = Reweighted(Importance(True, (), 1, count, 1.0, worst, 0.1, worst, 0.02, 0.0, 0.0, 0), {}, {})
+    found = Reweighted(Importance(True, (), 1, count, 1.0, worst, 0.1, worst, 0.02, 0.0, 0.0, 0), {}, {}, {})
     parts = []
     for number, fit in enumerate((replace(one, alternatives=ways), other)):
         z = np.full((1, count, 1), float(number))

@@ -11,9 +11,10 @@ import pytest
 from support.printed_vector import LAST_6, LAST_7, LAST_9, LAST_12, VECTOR
 
 from tvsbayes.estimators.looks import aperture_angle, observe
+from tvsbayes.instrument.mirrors import Turn, Vectors
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.geometry import Turn, Vectors, project, rotation_matrix
+from tvsbayes.model.geometry import project, rotation_matrix
 from tvsbayes.model.laser_path import MoveArrays, Transmission, beam_angles, mirror_angles, trace
 from tvsbayes.model.parameter_space import Receiver, model_of, parameter_space
 from tvsbayes.statistics.intervals import NORMAL_95, coverage_factor
@@ -82,7 +83,7 @@ def test_tvs_point_and_aperture_of_the_test_vector(nominal, looks, azimuth, prin
     """250 mm along the beam: p_T = Rz(C0 - 90 deg) p_P + (0, a/2, 0), and B as either convention reads it."""
     origin, direction, _ = looks(with_values(nominal, **VECTOR), [[PAN_RAD, TILT_RAD, RANGE_MM]])
     point_p = Vectors.of(jnp.asarray(origin[0] + RANGE_MM * direction[0]))
-    point_t = Turn.by(jnp.asarray(C0_RAD - np.pi / 2)).forward(point_p) + Vectors.of(
+    point_t = Turn.by(jnp.asarray(C0_RAD - np.pi / 2), jnp).forward(point_p) + Vectors.of(
         np.array([0.0, BASELINE_MM / 2, 0.0])
     )
     assert np.abs(point_t.stacked() - np.array([250.365237, 119.492704, 18.238043])).max() <= LAST_6 * 1.01
@@ -118,7 +119,7 @@ def test_pan_positive_is_left_and_tilt_positive_is_up(nominal, looks):
     # With P parallel to S, left in the room is left in both images, up is up (v falls).
     assert np.all(pixels[1, [0, 2]] < pixels[0, [0, 2]] - 1.0)
     assert np.all(pixels[2, [1, 3]] < pixels[0, [1, 3]] - 1.0)
-    in_t = Turn.by(jnp.asarray(C0_RAD - np.pi / 2)).forward(Vectors.of(jnp.asarray(direction[1])))
+    in_t = Turn.by(jnp.asarray(C0_RAD - np.pi / 2), jnp).forward(Vectors.of(jnp.asarray(direction[1])))
     emission = np.pi / 2 + np.arctan2(in_t.y, in_t.x)
     assert emission == pytest.approx(C0_RAD + 0.1, abs=ROUNDING)
 

@@ -440,7 +440,7 @@ def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeyp
         ("verdict", 5, "held_out.verdict"),
         ("classic", None, "held_out.classic"),
         ("joint", {"rms_deg": "0.1"}, "held_out.joint.rms_deg"),
-        ("unseen", {"<b>": 1.0}, "held_out.unseen"),
+        ("unseen", {"<b>": 1.0}, "held_out.unseen.<b>"),
         ("unseen", [], "held_out.unseen"),
     ],
 )

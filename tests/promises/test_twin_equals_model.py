@@ -15,11 +15,12 @@ import pytest
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.looks import aperture_angle
 from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.mirrors import Vectors
 from tvsbayes.instrument.parameters import HARMONIC_NAMES, RIG_NAMES, Prior
 from tvsbayes.instrument.places import line_share, seen_places
 from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.model.gear_processes import Places
-from tvsbayes.model.geometry import Vectors, project
+from tvsbayes.model.geometry import project
 from tvsbayes.model.headlines import SeenLine, derived_quantities
 from tvsbayes.model.headlines import effective_deg_per_step as effective_of_model
 from tvsbayes.model.laser_path import MoveArrays, beam_angles, mirror_angles, trace

@@ -34,6 +34,8 @@ def test_evidence_is_that_of_a_conjugate_gaussian():
         mode = reading / (1 + sd**2)
         density = -0.5 * mode**2 + stats.norm.logpdf(reading, mode, sd)
         covariance = np.array([[sd**2 / (1 + sd**2)]])
-        result = SimpleNamespace(log_density=density, covariance=covariance, free=np.array([True]), sides={})
+        result = SimpleNamespace(
+            z=np.array([mode]), log_density=density, covariance=covariance, free=np.array([True]), sides={}
+        )
         exact = stats.norm.logpdf(reading, 0.0, np.sqrt(1 + sd**2))
         assert JointFit.laplace_evidence.fget(result) == pytest.approx(exact, abs=1e-12)

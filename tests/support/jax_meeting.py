@@ -20,9 +20,10 @@ from tvsbayes.calibration.optics import ROUNDING
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, NOISES, Calibration
 from tvsbayes.coordinates.location import Settings
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
+from tvsbayes.instrument.mirrors import Ray, Turn, Vectors
 from tvsbayes.instrument.parameters import INDEX, NAMES
-from tvsbayes.model.geometry import Scalar, Turn, Vectors
-from tvsbayes.model.laser_path import Ray, trace
+from tvsbayes.model.geometry import Scalar
+from tvsbayes.model.laser_path import trace
 from tvsbayes.model.parameter_space import Model, model_of
 
 
@@ -144,7 +145,7 @@ def beams_at(model: Model, steps: Array, side: Array, noise: Float[Array, "noise
 
 def _in_frame_t(model: Model, pan_rad: Array, tilt_rad: Array) -> Ray:
     ray = trace(model.optics, pan_rad, tilt_rad)
-    turn = Turn.by(model.receiver.pan_zero_emission_rad - jnp.pi / 2)
+    turn = Turn.by(model.receiver.pan_zero_emission_rad - jnp.pi / 2, jnp)
     return Ray(turn.forward(ray.origin_mm) + half_baseline(model.receiver.baseline_mm), turn.forward(ray.direction))
 
 

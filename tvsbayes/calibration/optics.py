@@ -1,4 +1,4 @@
-"""The optics written out in components: counters to mirror angles, beams, ranges and aperture readings, in NumPy.
+"""The optics in components: counters to mirror angles, beams, ranges and aperture readings, in NumPy.
 
 The same lines serve one pose in Python floats (`m` = `math`) and many parameter sets in arrays (`m` = `numpy`, also
 complex, for derivatives). Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2,
@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
-from tvsbayes.instrument.parameters import HARMONIC_ORDERS
+from tvsbayes.instrument.mirrors import Optics, Turn, laser_way
+from tvsbayes.instrument.parameters import BLOCKS, HARMONIC_ORDERS
 
 ERROR_AT, PLAY_AT = "transmission_error_at_deg", "play_variation_at_deg"
 GEAR_INPUTS: tuple[str, ...] = tuple(f"{kind}.{axis}" for kind in (ERROR_AT, PLAY_AT) for axis in AXES)
@@ -101,42 +102,24 @@ class Components(NamedTuple):
         return np.where(ahead(points[0]), points, complex(np.nan, np.nan) if np.iscomplexobj(points) else np.nan)
 
 
+def _optics(values: Values) -> Optics:
+    """Laser and mirrors of parameters by name."""
+
+    def block(name: str) -> Number | list[Number]:
+        found = [values[entry] * TO_RAD if name.endswith("_deg") else values[entry] for entry in BLOCKS[name]]
+        return found if len(found) > 1 else found[0]
+
+    return Optics.of(block)
+
+
 def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: ModuleType = np) -> Components:
-    """Origin and unit direction of the beam in frame T for mirror angles (formulation 3.2 and 2).
-
-    The laser is reflected in the turned pan stage and everything turned back at the end. Arguments as in
-    `output_deg`.
-    """
-    sin, cos, tan, sqrt = m.sin, m.cos, m.tan, m.sqrt
-    psi, beta = pan_deg * TO_RAD, tilt_deg * TO_RAD
-    sin_psi, cos_psi = sin(psi), cos(psi)
-    tx, ty = tan(values["laser_tilt_deg.x"] * TO_RAD), tan(values["laser_tilt_deg.y"] * TO_RAD)
-    length = sqrt(1.0 + tx * tx + ty * ty)
-    ox, oy = values["laser_offset_mm.x"], values["laser_offset_mm.y"]
-    x, y, z = cos_psi * ox + sin_psi * oy, cos_psi * oy - sin_psi * ox, 0.0
-    u, v, w = (cos_psi * tx + sin_psi * ty) / length, (cos_psi * ty - sin_psi * tx) / length, -1.0 / length
-
-    first = (45.0 + values["mirror1_error_deg"]) * TO_RAD
-    ny, nz = -sin(first), cos(first)
-    along = v * ny + w * nz
-    reach = -(y * ny) / along
-    x, y, z = x + reach * u, y + reach * v, reach * w
-    v, w = v - 2 * along * ny, w - 2 * along * nz
-
-    second, skew = (45.0 + values["mirror2_error_deg"]) * TO_RAD, values["tilt_axis_skew_deg"] * TO_RAD
-    sin_m, cos_m, sin_s, cos_s = sin(second), cos(second), sin(skew), cos(skew)
-    nx, up = sin_m * cos(beta), sin_m * sin(beta)
-    ny, nz = cos_m * cos_s - up * sin_s, cos_m * sin_s + up * cos_s
-    along = u * nx + v * ny + w * nz
-    cx, cy, cz = values["tilt_axis_offset_mm.x"], -values["mirror_offset_mm"], values["tilt_axis_offset_mm.z"]
-    reach = ((cx - x) * nx + (cy - y) * ny + (cz - z) * nz) / along
-    x, y, z = x + reach * u, y + reach * v, z + reach * w
-    u, v, w = u - 2 * along * nx, v - 2 * along * ny, w - 2 * along * nz
-
-    turn = psi + (values["pan_zero_emission_deg"] - 90.0) * TO_RAD
-    sin_t, cos_t = sin(turn), cos(turn)
-    origin = cos_t * x - sin_t * y, sin_t * x + cos_t * y + 0.5 * values["baseline_mm"], z
-    return Components(origin, (cos_t * u - sin_t * v, sin_t * u + cos_t * v, w))
+    """Origin and unit direction of the beam in frame T for mirror angles (formulation 3.2 and 2); see `output_deg`."""
+    psi = pan_deg * TO_RAD
+    beam = laser_way(_optics(values), psi, tilt_deg * TO_RAD, m).rays[-1]
+    # From Q to P and on to T in one turn.
+    turn = Turn.by(psi + (values["pan_zero_emission_deg"] - 90.0) * TO_RAD, m)
+    x, y, z = turn.forward(beam.origin_mm)
+    return Components((x, y + 0.5 * values["baseline_mm"], z), turn.forward(beam.direction))
 
 
 def range_components(

@@ -36,14 +36,13 @@ from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, HOME_APPROACH, SIDES, Axis, sides_of
 from tvsbayes.instrument.counter_limits import unseen
-from tvsbayes.instrument.parameters import names_of
+from tvsbayes.instrument.parameters import OPTICS_NAMES, names_of
 from tvsbayes.statistics.intervals import NORMAL_95
 
-INPUT_NAMES: tuple[str, ...] = names_of(
-    *("degrees_per_step", "backlash_deg", "harmonic_deg"),
-    *("tilt_zero_deg", "mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg"),
-    *("laser_tilt_deg", "laser_offset_mm", "tilt_axis_skew_deg", "tilt_axis_offset_mm"),
-    *("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
+INPUT_NAMES: tuple[str, ...] = (
+    *names_of("degrees_per_step", "backlash_deg", "harmonic_deg", "tilt_zero_deg"),
+    *OPTICS_NAMES,
+    *names_of("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
 )
 """What a coordinate depends on. Contrasts do not enter: after homing a counter stands for its mean ratio."""
 NOISE_NAMES = names_of("stop_sd_deg", "aperture_sd_deg")

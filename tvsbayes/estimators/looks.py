@@ -1,7 +1,7 @@
 """Ideal looks: what a spot's pixels and aperture angle are, and how they move with mirror angles, range and parameters.
 
 Angles rad, lengths mm, px. The range of a look is where its beam passes closest to the spot that the cameras
-triangulated (formulation 4.1). Components of looks are separate arrays, as vectors are (`model.geometry.Vectors`).
+triangulated (formulation 4.1). Components of looks are separate arrays, as vectors are (`instrument.mirrors.Vectors`).
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
+from tvsbayes.instrument.mirrors import Ray, Turn, Vectors
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.geometry import Turn, Vectors, image, materialise, rotation_matrix, transform
-from tvsbayes.model.laser_path import Ray, mirror_angles, trace
+from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
+from tvsbayes.model.laser_path import mirror_angles, trace
 from tvsbayes.model.parameter_space import Extrinsics, Model, ParameterSpace, Receiver
 
 Numbers = tuple[Float[Array, "..."], ...]
@@ -25,7 +26,7 @@ def aperture_angle(
     receiver: Receiver, points_p_mm: Vectors, azimuth_convention: Bool[Array, ""]
 ) -> Float[Array, "*batch"]:
     """Angle B at the aperture between +y of frame T and the spot, or its projection on x-y (formulation 5)."""
-    turned = Turn.by(receiver.pan_zero_emission_rad - jnp.pi / 2).forward(points_p_mm)
+    turned = Turn.by(receiver.pan_zero_emission_rad - jnp.pi / 2, jnp).forward(points_p_mm)
     lateral2 = turned.x**2 + jnp.where(azimuth_convention, 0.0, 1.0) * turned.z**2
     # A spot on the baseline itself has no direction; the floor keeps the derivative finite there.
     return jnp.arctan2(jnp.sqrt(jnp.maximum(lateral2, 1e-12)), turned.y + receiver.baseline_mm)

@@ -1,8 +1,8 @@
-"""Vectors, rotations, reflections and cameras in JAX: what the laser's path and the pixels are made of.
+"""Rotations and cameras in JAX: what the pixels are made of.
 
-Many vectors are three arrays, one for each of x, y, z (`Vectors`): XLA's loops over one wide array run several times
-faster than over an axis of three. Where one array is handed over its first axis is x, y, z. mm, rad. Frame S: origin in
-the left camera's centre, X depth, Y left, Z up; OpenCV's camera axes are x = -Y, y = -Z, z = X. Pinhole with
+Many vectors are three arrays (`instrument.mirrors.Vectors`). Where one array is handed over its first axis is x, y, z.
+mm, rad. Frame S: origin in the left camera's centre, X depth, Y left, Z up; OpenCV's camera axes are x = -Y, y = -Z,
+z = X. Pinhole with
 Brown-Conrady distortion; the right camera sees x_right = R x_left + T. Image px with the integer at the centre of a
 pixel, ordered (u_left, v_left, u_right, v_right).
 """
@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from tvsbayes.instrument.mirrors import Vectors
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, "3"]
@@ -61,79 +63,9 @@ def rotation_matrix(rotation_rad: Vector) -> Float[Array, "3 3"]:
     return jnp.eye(3) + sinc * cross + versine * (cross @ cross)
 
 
-class Vectors(eqx.Module):
-    """Many vectors by their components; a single one broadcasts against them."""
-
-    x: Float[Array, "..."]
-    y: Float[Array, "..."]
-    z: Float[Array, "..."]
-
-    @classmethod
-    def of(cls, stacked: Float[Array | np.ndarray, "3 *batch"]) -> Vectors:
-        """From one array whose first axis is x, y, z."""
-        array = jnp.asarray(stacked)
-        return cls(array[0], array[1], array[2])
-
-    def stacked(self) -> Float[Array, "3 ..."]:
-        """One array whose first axis is x, y, z."""
-        return jnp.stack(jnp.broadcast_arrays(self.x, self.y, self.z))
-
-    def __add__(self, other: Vectors) -> Vectors:
-        """Componentwise."""
-        return Vectors(self.x + other.x, self.y + other.y, self.z + other.z)
-
-    def __sub__(self, other: Vectors) -> Vectors:
-        """Componentwise."""
-        return Vectors(self.x - other.x, self.y - other.y, self.z - other.z)
-
-    def __mul__(self, factor: Float[Array, "..."] | float) -> Vectors:
-        """Longer by a factor."""
-        return Vectors(self.x * factor, self.y * factor, self.z * factor)
-
-    def dot(self, other: Vectors) -> Float[Array, "..."]:
-        """Scalar product."""
-        return self.x * other.x + self.y * other.y + self.z * other.z
-
-    def cross(self, other: Vectors) -> Vectors:
-        """Vector product."""
-        x = self.y * other.z - self.z * other.y
-        y = self.z * other.x - self.x * other.z
-        return Vectors(x, y, self.x * other.y - self.y * other.x)
-
-
 def transform(matrix: Float[Array | np.ndarray, "3 3"], vectors: Vectors) -> Vectors:
     """Matrix times vectors."""
     return Vectors(*(row[0] * vectors.x + row[1] * vectors.y + row[2] * vectors.z for row in matrix))
-
-
-class Turn(eqx.Module):
-    """Turns about z, counter-clockwise seen from +z, by the cosine and sine of their angles."""
-
-    cosine: Float[Array, "..."]
-    sine: Float[Array, "..."]
-
-    @classmethod
-    def by(cls, angle_rad: Float[Array, "..."]) -> Turn:
-        """The turn by an angle."""
-        return cls(jnp.cos(angle_rad), jnp.sin(angle_rad))
-
-    def forward(self, v: Vectors) -> Vectors:
-        """Turned vectors."""
-        return Vectors(self.cosine * v.x - self.sine * v.y, self.sine * v.x + self.cosine * v.y, v.z)
-
-    def back(self, v: Vectors) -> Vectors:
-        """Vectors turned the other way."""
-        return Vectors(self.cosine * v.x + self.sine * v.y, self.cosine * v.y - self.sine * v.x, v.z)
-
-
-def reflect(direction: Vectors, normal: Vectors) -> Vectors:
-    """Mirror directions at a plane with unit normal: d - 2 (d.n) n (formulation 3.2)."""
-    return direction - normal * (2 * direction.dot(normal))
-
-
-def intersect_plane(origin: Vectors, direction: Vectors, point: Vectors, normal: Vectors) -> Vectors:
-    """Points where lines meet the plane through `point`; not finite where they are parallel."""
-    return origin + direction * ((point - origin).dot(normal) / direction.dot(normal))
 
 
 class StereoCameras(eqx.Module):

@@ -1,10 +1,7 @@
 """The way of the laser: counters -> gears, play -> mirror angles -> beam. Differentiable (formulation 3.1 and 3.2).
 
-Lengths in mm, angles in rad. Vectors by their components (`geometry.Vectors`).
-
-Frame P: z along the pan axis, up; x along the nominal beam at pan angle 0; y left; origin where the nominal laser
-meets mirror 1. Frame Q is P turned by the pan angle. Pan positive = left, tilt positive = up; arrays over axes are
-ordered (pan, tilt).
+Lengths in mm, angles in rad. Pan positive = left, tilt positive = up; arrays over axes are ordered (pan, tilt). Frame P
+and vectors by their components are those of `instrument.mirrors`.
 """
 
 from __future__ import annotations
@@ -15,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from tvsbayes.instrument.mirrors import Optics, Ray, Vectors, laser_way
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
-from tvsbayes.model.geometry import Scalar, Turn, Vectors, intersect_plane, materialise, reflect
+from tvsbayes.model.geometry import Scalar, materialise
 
 UNIFORM_SD = 1 / 12**0.5
 """Standard deviation of a uniform distribution of unit width."""
@@ -122,29 +120,6 @@ def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: Move
     return MirrorAngles(output + jnp.stack([jnp.zeros(()), tilt_zero_rad]), play_sd_rad)
 
 
-class Optics(eqx.Module):
-    """Laser and the two mirrors, with every deviation from the nominal 45-degree chain (formulation 3.2)."""
-
-    mirror_offset_mm: Scalar
-    mirror1_error_rad: Scalar
-    mirror2_error_rad: Scalar
-    laser_tilt_rad: Float[Array, "2"]
-    laser_offset_mm: Float[Array, "2"]
-    tilt_axis_skew_rad: Scalar
-    tilt_axis_offset_mm: Float[Array, "2"]
-
-
-class Ray(eqx.Module):
-    """Rays, in frame P unless said otherwise: they leave mirror 2 at `origin_mm` along the unit vectors `direction`."""
-
-    origin_mm: Vectors
-    direction: Vectors
-
-    def at(self, range_mm: Float[Array, "..."]) -> Vectors:
-        """Points along the rays."""
-        return self.origin_mm + self.direction * range_mm
-
-
 class Reflections(eqx.Module):
     """Where the laser meets both mirrors, mm, the mirrors' unit normals, and the direction in which it leaves."""
 
@@ -166,46 +141,16 @@ def trace(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array
     Returns:
         The rays in frame P.
     """
-    pan, found = _reflections(optics, pan_rad, tilt_rad)
-    return Ray(pan.forward(found.second_mm), pan.forward(found.outgoing))
+    way = laser_way(optics, pan_rad, tilt_rad, jnp, materialise)
+    return Ray(*map(way.pan.forward, way.rays[-1]))
 
 
 def reflections(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Reflections:
     """What `trace` meets on its way, in frame P; arguments as there."""
-    pan, found = _reflections(optics, pan_rad, tilt_rad)
-    parts = (found.first_mm, found.first_normal, found.second_mm, found.second_normal, found.outgoing)
-    return Reflections(*map(pan.forward, parts))
-
-
-def _reflections(
-    optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]
-) -> tuple[Turn, Reflections]:
-    """The turn of the pan stage, and the reflections in its frame Q."""
-    none = jnp.zeros(())
-    tangent_x, tangent_y = jnp.tan(optics.laser_tilt_rad)
-    shorter = 1 / jnp.sqrt(1 + tangent_x**2 + tangent_y**2)
-    laser = Vectors(tangent_x * shorter, tangent_y * shorter, -shorter)
-    laser_origin = Vectors(optics.laser_offset_mm[0], optics.laser_offset_mm[1], none)
-    pan, tilt = materialise((Turn.by(pan_rad), Turn.by(tilt_rad)))
-    # The laser stands still in P; in the pan stage's frame Q it turns backwards.
-    laser, laser_origin = pan.back(laser), pan.back(laser_origin)
-
-    mirror1 = jnp.pi / 4 + optics.mirror1_error_rad
-    normal1 = Vectors(none, -jnp.sin(mirror1), jnp.cos(mirror1))
-    hit1 = intersect_plane(laser_origin, laser, Vectors(none, none, none), normal1)
-    hit1, between = materialise((hit1, reflect(laser, normal1)))
-
-    ax, az = optics.tilt_axis_offset_mm
-    centre = Vectors(ax, -optics.mirror_offset_mm, az)
-    sin_skew, cos_skew = jnp.sin(optics.tilt_axis_skew_rad), jnp.cos(optics.tilt_axis_skew_rad)
-    mirror2 = jnp.pi / 4 + optics.mirror2_error_rad
-    ahead = Vectors(jnp.sin(mirror2), none, none)
-    above = Vectors(none, -sin_skew, cos_skew) * jnp.sin(mirror2)
-    axial = Vectors(none, cos_skew, sin_skew) * jnp.cos(mirror2)
-    normal2 = ahead * tilt.cosine + above * tilt.sine + axial
-    hit2 = intersect_plane(hit1, between, centre, normal2)
-    hit2, outgoing = materialise((hit2, reflect(between, normal2)))
-    return pan, Reflections(hit1, normal1, hit2, normal2, outgoing)
+    way = laser_way(optics, pan_rad, tilt_rad, jnp, materialise)
+    (first, second), (first_mm, second_mm) = way.mirrors, (ray.origin_mm for ray in way.rays)
+    parts = (first_mm, first.normal, second_mm, second.normal, way.rays[-1].direction)
+    return Reflections(*map(way.pan.forward, parts))
 
 
 class BeamAngles(eqx.Module):

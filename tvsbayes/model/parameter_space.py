@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import special
 
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
+from tvsbayes.instrument.mirrors import Optics
 from tvsbayes.instrument.parameters import (
     BLOCKS,
     INDEX,
@@ -37,7 +38,7 @@ from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_processes import GearScales
 from tvsbayes.model.geometry import Scalar, StereoCameras, Vector, materialise
-from tvsbayes.model.laser_path import Harmonics, Optics, Transmission
+from tvsbayes.model.laser_path import Harmonics, Transmission
 
 NO_PERIOD_DEG = np.full((2, PERIODS_MAX), FULL_TURN_DEG)
 """Stands for the periods of transmission errors that nobody stated; harmless, since those errors are 0."""
@@ -236,15 +237,7 @@ def model_of(
                 on_wheel=period_deg[:, 0] == FULL_TURN_DEG,
             ),
         ),
-        optics=Optics(
-            mirror_offset_mm=block("mirror_offset_mm"),
-            mirror1_error_rad=block("mirror1_error_deg"),
-            mirror2_error_rad=block("mirror2_error_deg"),
-            laser_tilt_rad=block("laser_tilt_deg"),
-            laser_offset_mm=block("laser_offset_mm"),
-            tilt_axis_skew_rad=block("tilt_axis_skew_deg"),
-            tilt_axis_offset_mm=block("tilt_axis_offset_mm"),
-        ),
+        optics=Optics.of(block),
         tilt_zero_rad=block("tilt_zero_deg"),
         extrinsics=Extrinsics(block("extrinsics.rotation_rad"), block("extrinsics.translation_mm")),
         cameras=StereoCameras(

@@ -35,6 +35,7 @@ from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.looks import in_frame_s
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
+from tvsbayes.instrument.mirrors import Ray
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
 from tvsbayes.instrument.places import gears_vary, seen_places
 from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
@@ -42,7 +43,7 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
-from tvsbayes.model.laser_path import MoveArrays, Ray, mirror_angles, trace
+from tvsbayes.model.laser_path import MoveArrays, mirror_angles, trace
 from tvsbayes.model.parameter_space import Model, ParameterSpace, parameter_space, physical_at
 from tvsbayes.planning.gear_places import (
     NO_PLACES,

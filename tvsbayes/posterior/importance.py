@@ -459,6 +459,8 @@ def _joined(parts: Sequence[Posterior], chance: np.ndarray) -> Reweighted:
     diagnosis = first.convergence
     assert isinstance(diagnosis, Reweighted)
     names = list(diagnosis.monte_carlo_error)
+    if not names:
+        return diagnosis
     weights, rows = [chance[0] * first.weights[0]], [np.stack([first.by_name[name] for name in names], axis=1)]
     for p, part in zip(chance[1:], parts[1:], strict=True):
         count = part.weights.size

@@ -11,9 +11,10 @@ from jaxtyping import Array, Float
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.looks import in_frame_s, nearest_range
+from tvsbayes.instrument.mirrors import Ray, Vectors
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.geometry import Vectors, image, rotation_matrix, transform
-from tvsbayes.model.laser_path import Ray, mirror_angles, reflections
+from tvsbayes.model.geometry import image, rotation_matrix, transform
+from tvsbayes.model.laser_path import mirror_angles, reflections
 from tvsbayes.model.parameter_space import ParameterSpace
 
 

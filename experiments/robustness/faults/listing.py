@@ -96,7 +96,7 @@ FAULTS = (
     Fault("U95 is taken with k = 1.64", "NORMAL_95", Constant("1.6448536269514722"),
           "test_95_percent_are_two_sided_and_normal"),
     # Sampling, weights, convergence.
-    Fault("the Jacobian of the map is dropped", "Target.valued", Reads("found.log_jacobian", "0 * value"),
+    Fault("the Jacobian of the map is dropped", "Target.at", Reads("found.log_jacobian", "0 * value"),
           "test_the_density_of_walkers_is_the_models_times_the_jacobian"),
     Fault("the acceptance of independent proposals is upside down", "Independence.__call__",
           Returns("(value[0], -value[1])"), "test_the_proposal_density_and_draws_agree_in_many_dimensions"),

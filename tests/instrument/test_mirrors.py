@@ -1,0 +1,162 @@
+"""Vectors, turns and mirrors: the laws they obey, in Python floats, NumPy and JAX; the chain against the twin's."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.printed_vector import VECTOR
+
+from tvsbayes.instrument.mirrors import (
+    Mirror,
+    Optics,
+    Ray,
+    Turn,
+    Vectors,
+    intersect_plane,
+    laser_way,
+    reflect,
+    reflected,
+)
+from tvsbayes.instrument.parameters import BLOCKS, OPTICS_NAMES
+from tvsbayes.twin.physics import mirror_chain
+
+ROUNDING = 1e-15
+"""Half a dozen operations on numbers of order one."""
+CHAIN_ROUNDING = 1e-12
+"""A hundred operations on lengths up to 30 mm, and on numbers of order one."""
+PAN_RAD, TILT_RAD = np.radians([10.0, -25.0, 3.0]), np.radians([5.0, -12.0, 20.0])
+
+
+def optics() -> Optics:
+    """Of the printed test vector; the registry names what each field is made of."""
+
+    def block(name: str) -> float | list[float]:
+        found = [math.radians(VECTOR[n]) if name.endswith("_deg") else VECTOR[n] for n in BLOCKS[name]]
+        return found if len(found) > 1 else found[0]
+
+    return Optics.of(block)
+
+
+def vectors(seed: int, count: int = 50) -> Vectors:
+    return Vectors.of(np.random.default_rng(seed).standard_normal((3, count)))
+
+
+def unit_vectors(seed: int, count: int = 50) -> Vectors:
+    found = vectors(seed, count)
+    return found * (1 / np.sqrt(found.dot(found)))
+
+
+@pytest.mark.parametrize("functions", [np, jnp])
+@pytest.mark.usefixtures("x64")
+def test_a_turn_is_the_rotation_about_z(functions):
+    many, angles = vectors(2, 20), np.linspace(-np.pi, np.pi, 20)
+    turn = Turn.by(functions.asarray(angles), functions)
+    turned = turn.forward(many)
+    expected = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).apply(many.stacked().T).T
+    np.testing.assert_allclose(Vectors(*map(np.asarray, turned)).stacked(), expected, atol=4 * ROUNDING)
+    np.testing.assert_allclose(turn.back(turned), many, atol=4 * ROUNDING)
+
+
+def test_vectors_know_their_products():
+    first, second = np.random.default_rng(3).standard_normal((2, 3, 5, 7))
+    one, other = Vectors.of(first), Vectors.of(second)
+    np.testing.assert_allclose(one.dot(other), np.sum(first * second, axis=0), atol=10 * ROUNDING)
+    np.testing.assert_allclose(one.cross(other).stacked(), np.cross(first, second, axis=0), atol=10 * ROUNDING)
+
+
+@pytest.mark.parametrize("factor", [2.0, 2, np.float64(2.0), np.full(50, 2.0), jnp.full(50, 2.0)])
+@pytest.mark.usefixtures("x64")
+def test_a_factor_stands_on_either_side(factor):
+    """A tuple would be repeated, and an array would take it for an array of three rows."""
+    many = vectors(4)
+    for product in (many * factor, factor * many):
+        assert isinstance(product, Vectors)
+        np.testing.assert_array_equal(product, 2.0 * np.array(many))
+
+
+def test_one_vector_goes_with_many():
+    many = vectors(5, 4)
+    both = (many + Vectors(0.0, 2.0, 0.0) - many) * 0.5
+    np.testing.assert_allclose(both.stacked(), np.repeat([[0.0], [1.0], [0.0]], 4, axis=1), atol=4 * ROUNDING)
+
+
+@pytest.mark.usefixtures("x64")
+def test_vectors_are_stacked_by_the_functions_of_their_kind():
+    assert isinstance(vectors(6).stacked(), np.ndarray)
+    traced = jax.jit(lambda v: v.stacked())(jax.tree.map(jnp.asarray, vectors(6)))
+    np.testing.assert_array_equal(traced, vectors(6).stacked())
+
+
+def test_reflection_keeps_what_lies_in_the_mirror_and_turns_the_rest():
+    direction, normal = unit_vectors(7), unit_vectors(8)
+    out = reflect(direction, normal)
+    incoming, outgoing = direction.dot(normal), out.dot(normal)
+    np.testing.assert_allclose(outgoing, -incoming, atol=4 * ROUNDING)
+    np.testing.assert_allclose(out - normal * outgoing, direction - normal * incoming, atol=4 * ROUNDING)
+    np.testing.assert_allclose(reflect(out, normal), direction, atol=4 * ROUNDING)
+
+
+def test_intersection_lies_on_line_and_plane():
+    origin, direction, point, normal = vectors(9), unit_vectors(10), vectors(11), unit_vectors(12)
+    hit = intersect_plane(origin, direction, point, normal)
+    size = np.maximum(1.0, np.sqrt(hit.dot(hit)))
+    assert np.max(np.abs((hit - point).dot(normal)) / size) < 10 * ROUNDING
+    across = (hit - origin).cross(direction)
+    assert np.max(np.sqrt(across.dot(across)) / size) < 10 * ROUNDING
+
+
+def test_any_number_of_mirrors_follow_each_other():
+    """Three at right angles send every ray back along its direction, and each ray starts in its mirror's plane."""
+    axes = np.eye(3)
+    corner = [Mirror(Vectors(0.0, 0.0, 0.0), Vectors(*axis)) for axis in axes]
+    ray = Ray(vectors(13), unit_vectors(14))
+    rays = reflected(ray, corner)
+    assert len(rays) == 3
+    for mirror, left in zip(corner, rays, strict=True):
+        np.testing.assert_allclose(left.origin_mm.dot(mirror.normal), 0.0, atol=1e3 * ROUNDING)
+    np.testing.assert_allclose(rays[-1].direction, ray.direction * -1.0, atol=ROUNDING)
+    assert reflected(ray, []) == ()
+
+
+def test_the_chain_is_the_twins():
+    """In frame P."""
+    values = {name: VECTOR[name] for name in OPTICS_NAMES}
+    for pan, tilt in zip(PAN_RAD.tolist(), TILT_RAD.tolist(), strict=True):
+        way = laser_way(optics(), pan, tilt, math)
+        found = [np.array(way.pan.forward(part)) for part in way.rays[-1]]
+        for part, expected in zip(found, mirror_chain(pan, tilt, values), strict=True):
+            np.testing.assert_allclose(part, expected, atol=CHAIN_ROUNDING)
+
+
+@pytest.mark.usefixtures("x64")
+def test_floats_numpy_and_jax_take_the_same_way():
+    """Derivatives too: NumPy's by a complex step (Squire and Trapp, SIAM Review 40 (1998) 110), JAX's own."""
+
+    def ends(pan, functions):
+        return laser_way(optics(), pan, TILT_RAD, functions).rays[-1]
+
+    step = 1e-30
+    expected, slopes = jax.jvp(lambda pan: ends(pan, jnp), (jnp.asarray(PAN_RAD),), (jnp.ones(3),))
+    moved = ends(PAN_RAD + 1j * step, np)
+    for k in range(2):
+        np.testing.assert_allclose(ends(PAN_RAD, np)[k], expected[k], atol=CHAIN_ROUNDING)
+        np.testing.assert_allclose(np.array(moved[k]).imag / step, slopes[k], atol=10 * CHAIN_ROUNDING)
+        singles = [laser_way(optics(), p, t, math).rays[-1][k] for p, t in zip(PAN_RAD, TILT_RAD, strict=True)]
+        np.testing.assert_allclose(np.transpose(singles), expected[k], atol=CHAIN_ROUNDING)
+
+
+def test_a_compiler_may_be_told_to_compute_each_part_once():
+    """The turns of the stages and the ray that leaves each mirror pass through it, and what it returns is used."""
+    seen = []
+
+    def materialise(tree):
+        seen.append(tree)
+        return tree
+
+    way = laser_way(optics(), 0.1, 0.2, math, materialise)
+    assert seen[0][0] is way.pan and [tuple(ray) for ray in way.rays] == seen[1:]

@@ -1,0 +1,211 @@
+"""The laser over the plane mirrors of the positioner, once for Python floats, NumPy and JAX (formulation 3.2).
+
+Lengths in mm, angles in rad. Frame P: z along the pan axis, up; x along the nominal beam at pan angle 0; y left; origin
+where the nominal laser meets mirror 1. Frame Q is P turned by the pan angle: the mirrors stand there. Many vectors are
+three arrays, one for each of x, y, z (`Vectors`): XLA's loops over one wide array run several times faster than over an
+axis of three. Named tuples are trees of arrays for JAX without importing it. `functions` is `math` for floats, `numpy`
+for arrays (also complex, for derivatives) or `jax.numpy`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from types import ModuleType
+from typing import Any, NamedTuple
+
+type Numbers = Any
+"""A float, or an array of NumPy or JAX; all of a call broadcast."""
+type Materialise = Callable[[Any], Any]
+"""Has a compiler compute a tree of arrays once, see `model.geometry.materialise`."""
+
+
+class Vectors(NamedTuple):
+    """Many vectors by their components; a single one broadcasts against them."""
+
+    x: Numbers
+    y: Numbers
+    z: Numbers
+
+    @classmethod
+    def of(cls, stacked: Numbers) -> Vectors:
+        """From one array of shape (3, ...) whose first axis is x, y, z."""
+        return cls(stacked[0], stacked[1], stacked[2])
+
+    def stacked(self) -> Numbers:
+        """One array of shape (3, ...) whose first axis is x, y, z, by the functions of the components' own kind."""
+        functions = self.x.__array_namespace__()
+        return functions.stack(functions.broadcast_arrays(*self))
+
+    def __add__(self, other: Vectors) -> Vectors:  # type: ignore[override]
+        """Componentwise."""
+        return Vectors(self.x + other.x, self.y + other.y, self.z + other.z)
+
+    def __sub__(self, other: Vectors) -> Vectors:
+        """Componentwise."""
+        return Vectors(self.x - other.x, self.y - other.y, self.z - other.z)
+
+    def __mul__(self, factor: Numbers) -> Vectors:
+        """Longer by a factor."""
+        return Vectors(self.x * factor, self.y * factor, self.z * factor)
+
+    def __rmul__(self, factor: Numbers) -> Vectors:
+        """The same from the other side: a tuple would be repeated."""
+        return self * factor
+
+    def dot(self, other: Vectors) -> Numbers:
+        """Scalar product."""
+        return self.x * other.x + self.y * other.y + self.z * other.z
+
+    def cross(self, other: Vectors) -> Vectors:
+        """Vector product."""
+        x = self.y * other.z - self.z * other.y
+        y = self.z * other.x - self.x * other.z
+        return Vectors(x, y, self.x * other.y - self.y * other.x)
+
+
+# NumPy's arrays leave a product with vectors to these; they would take a tuple for one more array.
+Vectors.__array_ufunc__ = None  # type: ignore[attr-defined]
+
+
+class Turn(NamedTuple):
+    """Turns about z, counter-clockwise seen from +z, by the cosine and sine of their angles."""
+
+    cosine: Numbers
+    sine: Numbers
+
+    @classmethod
+    def by(cls, angle_rad: Numbers, functions: ModuleType) -> Turn:
+        """The turn by an angle."""
+        return cls(functions.cos(angle_rad), functions.sin(angle_rad))
+
+    def forward(self, v: Vectors) -> Vectors:
+        """Turned vectors."""
+        return Vectors(self.cosine * v.x - self.sine * v.y, self.sine * v.x + self.cosine * v.y, v.z)
+
+    def back(self, v: Vectors) -> Vectors:
+        """Vectors turned the other way."""
+        return Vectors(self.cosine * v.x + self.sine * v.y, self.cosine * v.y - self.sine * v.x, v.z)
+
+
+class Ray(NamedTuple):
+    """Rays that leave `origin_mm` along the unit vectors `direction`."""
+
+    origin_mm: Vectors
+    direction: Vectors
+
+    def at(self, range_mm: Numbers) -> Vectors:
+        """Points along the rays."""
+        return self.origin_mm + self.direction * range_mm
+
+
+class Mirror(NamedTuple):
+    """A plane mirror by a point of its plane and its unit normal."""
+
+    point_mm: Vectors
+    normal: Vectors
+
+
+class Optics(NamedTuple):
+    """Laser and mirrors, with every deviation from the nominal 45-degree chain.
+
+    Fields are the blocks of parameters of these names; those of two parts are arrays of shape (2,), or pairs.
+    """
+
+    mirror_offset_mm: Numbers
+    mirror1_error_rad: Numbers
+    mirror2_error_rad: Numbers
+    laser_tilt_rad: Numbers
+    laser_offset_mm: Numbers
+    tilt_axis_skew_rad: Numbers
+    tilt_axis_offset_mm: Numbers
+
+    @classmethod
+    def of(cls, block: Callable[[str], Numbers]) -> Optics:
+        """From the values, in mm and rad, of a block of `instrument.parameters` by its name."""
+        return cls(*(block(field.replace("_rad", "_deg")) for field in cls._fields))
+
+
+class Way(NamedTuple):
+    """The laser's way in frame Q: the turn from Q to P, the mirrors in order, and the rays that leave each of them."""
+
+    pan: Turn
+    mirrors: tuple[Mirror, ...]
+    rays: tuple[Ray, ...]
+
+
+def reflect(direction: Vectors, normal: Vectors) -> Vectors:
+    """Mirror directions at a plane with unit normal: d - 2 (d.n) n."""
+    return direction - normal * (2 * direction.dot(normal))
+
+
+def intersect_plane(origin: Vectors, direction: Vectors, point: Vectors, normal: Vectors) -> Vectors:
+    """Points where lines meet the plane through `point`; not finite where they are parallel."""
+    return origin + direction * ((point - origin).dot(normal) / direction.dot(normal))
+
+
+def _unchanged(tree: Any) -> Any:
+    return tree
+
+
+def reflected(ray: Ray, mirrors: Iterable[Mirror], materialise: Materialise = _unchanged) -> tuple[Ray, ...]:
+    """Rays that leave one mirror after the other: each starts where the one before it meets the mirror."""
+    rays = []
+    for mirror in mirrors:
+        hit_mm = intersect_plane(*ray, *mirror)
+        ray = Ray(*materialise((hit_mm, reflect(ray.direction, mirror.normal))))
+        rays.append(ray)
+    return tuple(rays)
+
+
+def laser_of(optics: Optics, functions: ModuleType) -> Ray:
+    """The laser, at rest in P."""
+    tangent_x, tangent_y = (functions.tan(tilt) for tilt in optics.laser_tilt_rad)
+    shorter = 1 / functions.sqrt(1 + tangent_x**2 + tangent_y**2)
+    x_mm, y_mm = optics.laser_offset_mm
+    return Ray(Vectors(x_mm, y_mm, 0.0), Vectors(tangent_x * shorter, tangent_y * shorter, -shorter))
+
+
+def mirrors_of(optics: Optics, tilt: Turn, functions: ModuleType) -> tuple[Mirror, ...]:
+    """The mirrors of the positioner in Q, in the order in which the laser meets them.
+
+    Args:
+        optics: laser and mirrors.
+        tilt: of the tilt stage by beta, from its zero about the tilt axis.
+        functions: see the module.
+    """
+    cos, sin = functions.cos, functions.sin
+    first = functions.pi / 4 + optics.mirror1_error_rad
+    second = functions.pi / 4 + optics.mirror2_error_rad
+    sin_skew, cos_skew = sin(optics.tilt_axis_skew_rad), cos(optics.tilt_axis_skew_rad)
+    x_mm, z_mm = optics.tilt_axis_offset_mm
+    ahead = Vectors(sin(second), 0.0, 0.0)
+    above = Vectors(0.0, -sin_skew, cos_skew) * sin(second)
+    axial = Vectors(0.0, cos_skew, sin_skew) * cos(second)
+    second_normal = ahead * tilt.cosine + above * tilt.sine + axial
+    return (
+        Mirror(Vectors(0.0, 0.0, 0.0), Vectors(0.0, -sin(first), cos(first))),
+        Mirror(Vectors(x_mm, -optics.mirror_offset_mm, z_mm), second_normal),
+    )
+
+
+def laser_way(
+    optics: Optics,
+    pan_rad: Numbers,
+    tilt_rad: Numbers,
+    functions: ModuleType,
+    materialise: Materialise = _unchanged,
+) -> Way:
+    """Follow the laser over all mirrors; the signs are part of the contract.
+
+    Args:
+        optics: laser and mirrors.
+        pan_rad: angles psi of the pan stage.
+        tilt_rad: angles beta of the tilt stage.
+        functions: see the module.
+        materialise: applied to the turns of the stages and to every ray.
+    """
+    pan, tilt = materialise((Turn.by(pan_rad, functions), Turn.by(tilt_rad, functions)))
+    # The laser stands still in P; in the pan stage's frame Q it turns backwards.
+    still = laser_of(optics, functions)
+    met = mirrors_of(optics, tilt, functions)
+    return Way(pan, met, reflected(Ray(*map(pan.back, still)), met, materialise))
