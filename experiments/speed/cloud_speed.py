@@ -20,7 +20,7 @@ import numpy as np
 
 from experiments.common.command_line import print_only
 from tvsbayes.calibration.calibration_file import load_calibration
-from tvsbayes.coordinates.looks_file import LOOK_COLUMNS
+from tvsbayes.coordinates.looks_file import LOOKS
 from tvsbayes.files.disk import shipped_data
 
 SIZES = 1_000, 100_000, 1_000_000
@@ -38,7 +38,7 @@ def write_looks(place: Path, calibration, count: int) -> None:
     generator = np.random.default_rng(count)
     low, high = calibration.range_steps.T
     with open(place, "w") as stream:
-        stream.write(",".join(LOOK_COLUMNS) + "\n")
+        stream.write(",".join(LOOKS.required) + "\n")
         for begin in range(0, count, 100_000):
             size = min(100_000, count - begin)
             pan, tilt = np.round(low + generator.uniform(size=(size, 2)) * (high - low)).T

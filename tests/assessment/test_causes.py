@@ -12,9 +12,9 @@ import equinox as eqx
 import numpy as np
 import pytest
 from support.linear_fit import ROWS, fit_of, linear_problem, refitted, slope_of
+from support.written_rows import move_row
 
 from tvsbayes.assessment.causes import causes_of, headline_budget
-from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.metrology.budget_tables import CORRELATIONS
@@ -41,7 +41,8 @@ def linear_fit(mounted_rig):
     physical[:, INDEX["backlash_deg.pan"]], physical[:, INDEX["backlash_deg.tilt"]] = values[:, 4], values[:, 5]
     for k, name in enumerate(("stop_sd_deg.left", "stop_sd_deg.right", "pixel_scale")):
         physical[:, INDEX[name]] = np.exp((0.1, 0.2, 0.05)[k] * rng.standard_normal(len(draws_z)))
-    moves = (Move(0, 0, 0.0, 0, 0, "left", "up"), Move(1, 0, 1.0, 9, 0), Move(2, 0, 2.0, 0, 0), Move(3, 0, 3.0, 0, 9))
+    rows = ((0, 0, 0.0, 0, 0, "left", "up"), (1, 0, 1.0, 9, 0), (2, 0, 2.0, 0, 0), (3, 0, 3.0, 0, 9))
+    moves = tuple(move_row(*row) for row in rows)
     draws = SimpleNamespace(physical=physical, effective_deg_per_step=values[:, :4])
     for name, value in (("draws_z", draws_z), ("covariance", covariance), ("draws", draws)):
         object.__setattr__(fit, name, value)

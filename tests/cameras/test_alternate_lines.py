@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.drawn_spots import oval, picture, small_pair
+from support.written_rows import move_row, spot_row
 
 from tvsbayes.cameras.alternate_lines import EXCESS_MIN, widening
 from tvsbayes.cameras.detection import detect
@@ -12,7 +13,7 @@ from tvsbayes.cameras.spot_fit import Centre, centre_of, find_spot, widened
 from tvsbayes.cameras.spot_noise import SpotNoise
 from tvsbayes.cameras.spot_window import patch_around
 from tvsbayes.files.images import in_grey_levels, png_bytes
-from tvsbayes.instrument.campaign import Campaign, Move, Spot, read_campaign, write_campaign
+from tvsbayes.instrument.campaign import Campaign, read_campaign, write_campaign
 from tvsbayes.report.command_text import detection_text
 from tvsbayes.twin.spot_pictures import Footprint, Scene
 
@@ -102,8 +103,8 @@ def test_one_look_alone_is_widened_alone():
 def test_detect_says_which_camera_reads_in_fields(tmp_path):
     """Six looks; the left camera's odd rows come later, the beam has moved by 0.4 px."""
     rng = np.random.default_rng(11)
-    spots = [Spot(k, 0, "d1", k // 4, k % 4 + 1, *[None] * 8, 50.0 + k, "undetected") for k in range(6)]
-    moves = (Move(0, 0, 0.0, 0, 0, "left", "up"),)
+    spots = [spot_row(k, 0, "d1", k // 4, k % 4 + 1, *[None] * 8, 50.0 + k, "undetected") for k in range(6)]
+    moves = (move_row(0, 0, 0.0, 0, 0, "left", "up"),)
     write_campaign(Campaign(moves, tuple(spots), small_pair(), header={"name": "fields"}), tmp_path / "c")
     (tmp_path / "c" / "frames").mkdir()
     places = PLACE + rng.uniform(-1, 1, (6, 2))

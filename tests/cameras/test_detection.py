@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from support.drawn_spots import HEIGHT, WIDTH, oval, picture, small_pair
 from support.waits import check_forward, doings
+from support.written_rows import move_row, spot_row
 
 from tvsbayes.cameras.contour import epipolar_refused
 from tvsbayes.cameras.detection import DETECTING, LEARNING, LEVELLING, detect
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.images import png_bytes
-from tvsbayes.instrument.campaign import Campaign, Move, Spot, read_campaign, write_campaign
+from tvsbayes.instrument.campaign import Campaign, read_campaign, write_campaign
 from tvsbayes.report.command_text import detection_text
 from tvsbayes.twin.physics import cameras_of
 from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, render_spot
@@ -35,8 +36,9 @@ class Folder:
             (rng.uniform(-20, 90, looks), rng.uniform(-60, 60, looks), rng.uniform(200, 275, looks))
         )
         self.true_px = np.hstack([camera.project(points) for camera in (cameras.left, cameras.right)])
-        spots = [Spot(10 * k, 0, "d1", k // 4, k % 4 + 1, *[None] * 8, 50.0 + k, "undetected") for k in range(looks)]
-        moves = (Move(0, 0, 0.0, 0, 0, "left", "up"),)
+        cells = [(10 * k, 0, "d1", k // 4, k % 4 + 1, *[None] * 8, 50.0 + k, "undetected") for k in range(looks)]
+        spots = [spot_row(*row) for row in cells]
+        moves = (move_row(0, 0, 0.0, 0, 0, "left", "up"),)
         write_campaign(Campaign(moves, tuple(spots[::-1]), self.stereo, header={"name": "rendered"}), path)
         (path / "frames").mkdir()
         scene = Scene(speckle_contrast=contrast)

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from support.drawn_pictures import SIZE, drawn, pairs
+from support.written_rows import spot_row
 
 from tvsbayes.cameras.look_pictures import copy_frames, pair_looks, views_of
 from tvsbayes.errors import InputError
 from tvsbayes.files.images import png_bytes, read_image
-from tvsbayes.instrument.campaign import Spot
 
 
 def test_the_number_in_the_name_is_the_move(tmp_path):
@@ -60,10 +60,10 @@ def test_rows_that_wait_take_their_own_pictures(tmp_path):
     drawn(tmp_path, *pairs("3", "5"))
     numbers = (0.1,) * 4
     rows = [
-        Spot(3, 0, "near", 1, 1, *(None,) * 8, status="undetected"),
-        Spot(4, 0, "far", 1, 2, *(9.0,) * 4, *numbers),
-        Spot(5, 1, "far", 1, 3, *(None,) * 8, status="undetected"),
-        Spot(6, 1, "near", 1, 4, *(None,) * 8, status="undetected"),
+        spot_row(3, 0, "near", 1, 1, *(None,) * 8, status="undetected"),
+        spot_row(4, 0, "far", 1, 2, *(9.0,) * 4, *numbers),
+        spot_row(5, 1, "far", 1, 3, *(None,) * 8, status="undetected"),
+        spot_row(6, 1, "near", 1, 4, *(None,) * 8, status="undetected"),
     ]
     found = pair_looks(views_of(tmp_path).views, range(2), rows)
     assert found.spots == tuple(rows)

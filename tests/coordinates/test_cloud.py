@@ -17,7 +17,7 @@ from tvsbayes.coordinates import cloud_files
 from tvsbayes.coordinates.cloud import CHECKED_MAX, EvenSample, checked, cloud
 from tvsbayes.coordinates.cloud_files import cloud_place, columns_of, write_cloud
 from tvsbayes.coordinates.location import locate_linear
-from tvsbayes.coordinates.looks_file import BLOCK_ROWS, LOOK_COLUMNS, LookRows, look_blocks
+from tvsbayes.coordinates.looks_file import BLOCK_ROWS, LOOKS, LookRows, look_blocks
 from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_rays
 from tvsbayes.errors import InputError
 
@@ -204,16 +204,16 @@ def test_files_are_read_in_blocks_with_the_lines_of_the_file(tmp_path):
     """A bad cell behind the first block is named by its own line; shares of the file rise to one."""
     file, shares = tmp_path / "looks.csv", []
     rows = ["10,20,left,up,70"] * (BLOCK_ROWS + 5)
-    file.write_text("\n".join([",".join(LOOK_COLUMNS), *rows]) + "\n")
+    file.write_text("\n".join([",".join(LOOKS.required), *rows]) + "\n")
     found = list(look_blocks(file, shares.append))
     assert [len(block.lines) for block in found] == [BLOCK_ROWS, 5]
     assert (found[0].lines[0], found[1].lines[0], found[1].lines[-1]) == (2, BLOCK_ROWS + 2, BLOCK_ROWS + 6)
     assert shares == sorted(shares) and shares[-1] == 1.0
     rows[BLOCK_ROWS + 1] = "10,20,left,up,7O"
-    file.write_text("\n".join([",".join(LOOK_COLUMNS), *rows]) + "\n")
+    file.write_text("\n".join([",".join(LOOKS.required), *rows]) + "\n")
     with pytest.raises(InputError) as refused:
         list(look_blocks(file))
     assert (refused.value.line, refused.value.column) == (BLOCK_ROWS + 3, "aperture_deg")
-    file.write_text(",".join(LOOK_COLUMNS) + "\n")
+    file.write_text(",".join(LOOKS.required) + "\n")
     with pytest.raises(InputError, match="no points"):
         list(look_blocks(file))

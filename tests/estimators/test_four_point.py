@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.written_rows import move_row, spot_row
 
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.four_point import (
@@ -22,7 +23,7 @@ from tvsbayes.estimators.four_point import (
     select_experiments,
     stereo_variance,
 )
-from tvsbayes.instrument.campaign import Campaign, Move, Spot
+from tvsbayes.instrument.campaign import Campaign, Spot
 from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, distort, rotation_matrix, triangulate, undistort
@@ -80,18 +81,18 @@ def make_campaign(
 ) -> Campaign:
     """Noise-free campaign of (axis, steps, theta_i, theta_f); each starts at counters 0, 0."""
     stereo = make_stereo(covariance)
-    moves = [Move(0, 0, 0.0, 0, 0, "left", "up")]
+    moves = [move_row(0, 0, 0.0, 0, 0, "left", "up")]
     spots: list[Spot] = []
     for number, (axis, steps, theta_i, theta_f) in enumerate(experiments):
         start = len(moves) - 1
         counters = (steps, 0) if axis == "pan" else (0, steps)
-        moves.append(Move(start + 1, 0, float(start), *counters))
-        moves.append(Move(start + 2, 0, float(start), 0, 0))
+        moves.append(move_row(start + 1, 0, float(start), *counters))
+        moves.append(move_row(start + 2, 0, float(start), 0, 0))
         pixels = project(four_points(theta_i, theta_f, axis), stereo)
         assert np.isfinite(pixels).all()
         for point, row in enumerate(pixels, 1):
             move, target = start + (point > 2), "d1" if point in (1, 4) else "d2"
-            spots.append(Spot(len(spots), move, target, number, point, *map(float, row), *(0.08,) * 4))
+            spots.append(spot_row(len(spots), move, target, number, point, *map(float, row), *(0.08,) * 4))
     priors = {**RIG_PRIORS, "focal_scale": Prior(1.0, focal_u)}
     return Campaign(tuple(moves), tuple(spots), stereo, RigTable(priors))
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.small_campaign import small_campaign
+from support.written_rows import move_row
 
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import (
     Campaign,
-    Move,
     Spot,
     input_hashes,
     parse_spots,
@@ -90,7 +90,7 @@ def test_write_refuses_what_read_would(tmp_path):
     campaign = small_campaign()
     wrong = {
         "nan": {"spots": (dataclasses.replace(campaign.spots[0], u_left_px=float("nan")),)},
-        "move": {"moves": (Move(1, 0, 0.0, 0, 0, "left", "up"),)},
+        "move": {"moves": (move_row(1, 0, 0.0, 0, 0, "left", "up"),)},
         "header": {"header": {"color": "red"}},
         "stereo": {"stereo": dataclasses.replace(campaign.stereo, R=2 * np.eye(3))},
         "rig": {"rig": RigTable({**campaign.rig.priors, "backlash_deg.pan": Prior(0.2, 0.1, "half-normal")})},

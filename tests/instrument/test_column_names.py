@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.campaign import PIXEL_SDS, PIXELS, SPOT_COLUMNS
+from tvsbayes.instrument.campaign import PIXEL_SDS, PIXELS, SPOTS
 from tvsbayes.instrument.column_names import (
     COUNTERS,
     DEGREES,
@@ -74,7 +74,7 @@ def test_other_fields_in_four_languages():
 
 
 def test_our_own_names_and_other_words():
-    assert understand(SPOT_COLUMNS).columns == {name: name for name in SPOT_COLUMNS}
+    assert understand(SPOTS.columns).columns == {name: name for name in SPOTS.columns}
     found = understand(["steps pan", "TiltCount", "t (ms)", "Blatt", "B (rad)", "pan_approach", "remark"])
     assert found.columns == {
         "pan_steps": "steps pan",

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 from support.small_campaign import small_campaign
+from support.written_rows import move_row
 
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.homing import ANYWHERE, every_way, homed, prior_chance, unrecorded, ways
@@ -13,8 +14,8 @@ def moves(*first: tuple[str, str]) -> tuple[Move, ...]:
     """A segment of two moves for every pair of approaches."""
     found = []
     for segment, (pan, tilt) in enumerate(first):
-        found.append(Move(2 * segment, segment, 0.0, 0, 0, pan, tilt))
-        found.append(Move(2 * segment + 1, segment, 0.0, 100, 0))
+        found.append(move_row(2 * segment, segment, 0.0, 0, 0, pan, tilt))
+        found.append(move_row(2 * segment + 1, segment, 0.0, 100, 0))
     return tuple(found)
 
 

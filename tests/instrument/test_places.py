@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.varying_gears import perfect_gears, varying_gears
+from support.written_rows import move_row
 
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.parameters import Prior
@@ -89,7 +90,7 @@ def test_regular_places_meet_an_error_that_changes_over_eight_degrees():
 def moves() -> list[Move]:
     """Both axes; the first side of pan is known, of tilt not."""
     counters = [(0, 0), (60, 0), (60, 40), (20, 40), (20, -40), (60, -40)]
-    first, *others = [Move(k, 0, 10.0 * k, *steps) for k, steps in enumerate(counters)]
+    first, *others = [move_row(k, 0, 10.0 * k, *steps) for k, steps in enumerate(counters)]
     return [replace(first, pan_approach="right", tilt_approach="unknown"), *others]
 
 

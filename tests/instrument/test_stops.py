@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import pytest
+from support.written_rows import move_row
 
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
@@ -14,7 +15,7 @@ from tvsbayes.instrument.stops import Stop, few_stops, legs_of, observed_stops, 
 
 def pan_moves(*counters: int, approach: str = "left") -> tuple[Move, ...]:
     """One segment that visits these pan counters; the tilt axis rests."""
-    return tuple(Move(i, 0, float(i), n, 0, *((approach, "up") if i == 0 else ())) for i, n in enumerate(counters))
+    return tuple(move_row(i, 0, float(i), n, 0, *((approach, "up") if i == 0 else ())) for i, n in enumerate(counters))
 
 
 def pan_separation(*counters: int) -> str | None:
@@ -36,7 +37,7 @@ def test_stops_have_the_sense_of_the_last_move_of_their_axis():
 
 def test_two_looks_at_one_rest_are_one_stop():
     """Moves that order the same counters again, or move the other axis, end no rest."""
-    moves = (*pan_moves(0, 200, 200), Move(3, 0, 3.0, 200, 50), Move(4, 0, 4.0, 0, 50))
+    moves = (*pan_moves(0, 200, 200), move_row(3, 0, 3.0, 200, 50), move_row(4, 0, 4.0, 0, 50))
     assert observed_stops(moves, {1, 2, 3, 4}, "pan") == (Stop(0, 200, 1), Stop(0, 0, -1))
     assert observed_stops(moves, {1, 2, 3, 4}, "tilt") == (Stop(0, 0, 1), Stop(0, 50, 1))
 
@@ -46,7 +47,7 @@ def test_unobserved_stops_are_left_out_but_set_the_sense():
 
 
 def test_a_homing_begins_a_new_stop_at_the_same_counter():
-    moves = (*pan_moves(0, 200), Move(2, 1, 2.0, 200, 0, "right", "unknown"), Move(3, 1, 3.0, 0, 0))
+    moves = (*pan_moves(0, 200), move_row(2, 1, 2.0, 200, 0, "right", "unknown"), move_row(3, 1, 3.0, 0, 0))
     assert observed_stops(moves, range(4), "pan") == (
         Stop(0, 0, 1),
         Stop(0, 200, 1),
@@ -82,11 +83,11 @@ def test_cleared_starts_separate():
 def test_homing_is_no_leg():
     """A second segment homed at counter 40 says no more of a leg's length than the first did."""
     one = pan_moves(*[0, 200] * 12)
-    homed = Move(len(one), 1, 100.0, 40, 0, "left", "up")
+    homed = move_row(len(one), 1, 100.0, 40, 0, "left", "up")
     both = (*one, homed)
     assert "only one |N| = 200" in separation(observed_stops(both, range(len(both)), "pan"), "pan")
     # Two homings from either side, and nothing driven.
-    alone = (Move(0, 0, 0.0, 0, 0, "left", "up"), Move(1, 1, 1.0, 40, 0, "right", "up"))
+    alone = (move_row(0, 0, 0.0, 0, 0, "left", "up"), move_row(1, 1, 1.0, 40, 0, "right", "up"))
     assert "no leg of the pan axis" in separation(observed_stops(alone, range(2), "pan"), "pan")
 
 
@@ -109,7 +110,7 @@ def test_every_segment_has_its_own_zero():
 
 def test_a_rest_knows_how_it_was_reached():
     """Distance of the last move, the way since the last reversal, and the homing that the counter counts from."""
-    moves = (*pan_moves(0, 200, 260, 260, 100), Move(5, 1, 5.0, 30, 0, "right", "up"))
+    moves = (*pan_moves(0, 200, 260, 260, 100), move_row(5, 1, 5.0, 30, 0, "right", "up"))
     found = [(rest.move, rest.sign, rest.distance, rest.leg, rest.homing) for rest in rests_of(moves, "pan")]
     assert found[:3] == [(0, 1, 0, math.inf, 0), (1, 1, 200, math.inf, 0), (2, 1, 60, math.inf, 0)]
     assert found[3:] == [(2, 1, 60, math.inf, 0), (4, -1, -160, 160, 0), (5, -1, 0, math.inf, 5)]
@@ -117,7 +118,7 @@ def test_a_rest_knows_how_it_was_reached():
 
 
 def test_a_stop_error_is_new_once_its_own_counter_has_changed_or_was_set():
-    moves = (*pan_moves(0, 200, 0), Move(3, 0, 3.0, 0, 50), Move(4, 1, 4.0, 0, 50, "unknown", "down"))
+    moves = (*pan_moves(0, 200, 0), move_row(3, 0, 3.0, 0, 50), move_row(4, 1, 4.0, 0, 50, "unknown", "down"))
     # The pan axis went away and came back between the second look and the third.
     new = redraws(moves, (0, 0, 2, 3, 4))
     assert new.redraw.tolist() == [[True, True], [False, False], [True, False], [False, True], [True, True]]

@@ -13,7 +13,7 @@ from experiments.inputs import make_schemas, make_twins
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.four_point import classic, ratio_deg_per_step
 from tvsbayes.files.disk import shipped_data
-from tvsbayes.instrument.campaign import Campaign, read_campaign
+from tvsbayes.instrument.campaign import Campaign, campaign_templates, read_campaign
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, LOOK_SCATTER_NAMES, REGISTRY
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.instrument.protocols import PROTOCOLS
@@ -249,14 +249,14 @@ def test_simulated_campaign_survives_writing(tmp_path):
 
 def test_templates_have_the_columns_of_the_format():
     """Templates parse, hold no stray key and their headers are the format's."""
-    folder = DATA / "templates"
-    moves, spots = ((folder / name).read_text(encoding="utf-8") for name in ("moves.csv", "spots.csv"))
+    files = campaign_templates()
+    moves, spots = (files[name].decode() for name in ("moves.csv", "spots.csv"))
     shipped = DATA / "twins" / "grid_twin"
     header = (shipped / "moves.csv").read_text(encoding="utf-8").splitlines()[0]
     assert moves.splitlines() == [header, "0,0,0.0,0,0,unknown,unknown"]
     assert spots == (shipped / "spots.csv").read_text(encoding="utf-8").splitlines(keepends=True)[0]
     for name in ("campaign.toml", "rig.toml"):
-        assert tomllib.loads((folder / name).read_text(encoding="utf-8"))["format"].startswith("tvsbayes-")
+        assert tomllib.loads(files[name].decode())["format"].startswith("tvsbayes-")
 
 
 @pytest.mark.parametrize("name", ["campaign.toml", "rig.toml"])
@@ -264,10 +264,10 @@ def test_templates_are_read(name: str, tmp_path):
     """With a stereo file beside them the templates are a valid campaign or rig, at the default priors."""
     stereo = (DATA / "rigs" / "mounted" / "stereo.json").read_bytes()
     (tmp_path / "stereo.json").write_bytes(stereo)
-    (tmp_path / name).write_bytes((DATA / "templates" / name).read_bytes())
+    (tmp_path / name).write_bytes(campaign_templates()[name])
     if name == "rig.toml":
         assert read_rig(tmp_path / name).table == RigTable()
         return
     for table in ("moves.csv", "spots.csv"):
-        (tmp_path / table).write_bytes((DATA / "templates" / table).read_bytes())
+        (tmp_path / table).write_bytes(campaign_templates()[table])
     assert read_campaign(tmp_path).rig == RigTable()

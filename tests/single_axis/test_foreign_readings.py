@@ -9,9 +9,8 @@ import pytest
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.foreign_table import read_foreign
-from tvsbayes.instrument.column_names import understand_axis
 from tvsbayes.single_axis.axis_campaign import AxisMove, Reading, parse_readings, readings_bytes
-from tvsbayes.single_axis.foreign_readings import ForeignReadings, readings_of, unwrapped
+from tvsbayes.single_axis.foreign_readings import ForeignReadings, readings_of, understand_axis, unwrapped
 
 NAMES = [
     ("steps", "encoder_deg"),

@@ -9,10 +9,10 @@ import numpy as np
 from support.known_calibration import known_calibration
 from support.partial_arrays import no_gears
 from support.small_campaign import small_campaign
+from support.written_rows import move_row, spot_row
 
 from tvsbayes.calibration.pointing import INPUT_NAMES
 from tvsbayes.estimators.linear_spots import Linearised
-from tvsbayes.instrument.campaign import Move, Spot
 
 STOPS = 27
 
@@ -47,15 +47,15 @@ def stops_of(offsets_deg: np.ndarray, looks: int = 2, noise: float = 0.0) -> Sim
     """
     calibration = known_calibration(**{"backlash_deg.pan": 0.3})
     counters = [n for _ in range(4) for n in (0, 100, 200, 300, 200, 100)]
-    moves = [Move(0, 0, 0.0, -100, 0, "left", "up")]
-    moves += [Move(k + 1, 0, float(k), n, 0) for k, n in enumerate(counters)]
+    moves = [move_row(0, 0, 0.0, -100, 0, "left", "up")]
+    moves += [move_row(k + 1, 0, float(k), n, 0) for k, n in enumerate(counters)]
     # Steps too short to take up the play of 5 steps, at the end: only together they do.
-    moves += [Move(len(moves) + k, 0, 99.0, n, 0) for k, n in enumerate((102, 104, 106))]
+    moves += [move_row(len(moves) + k, 0, 99.0, n, 0) for k, n in enumerate((102, 104, 106))]
     rng = np.random.default_rng(8)
     spots, rows = [], []
     for move in moves[1:]:
         for _ in range(looks):
-            spots.append(Spot(len(spots), move.move, "d1", None, None, *[1.0] * 8))
+            spots.append(spot_row(len(spots), move.move, "d1", None, None, *[1.0] * 8))
             rows.append(move.move)
     off = np.radians(offsets_deg)[np.array(rows) - 1]
     slope = rng.normal(size=(len(rows), 4, 2)) * 1e3

@@ -5,8 +5,9 @@ from __future__ import annotations
 import datetime
 
 import numpy as np
+from support.written_rows import move_row, spot_row
 
-from tvsbayes.instrument.campaign import Campaign, Move, Spot
+from tvsbayes.instrument.campaign import Campaign, Spot
 from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
@@ -42,11 +43,11 @@ def seen_steps(campaign: Campaign) -> np.ndarray:
 def small_campaign() -> Campaign:
     """Five moves in two segments, eight spots (one undetected, one refused), every optional field used."""
     moves = (
-        Move(0, 0, 0.0, 0, 0, "left", "up"),
-        Move(1, 0, 1.5, 200, 0),
-        Move(2, 0, 3.0, 200, 120),
-        Move(3, 1, 60.25, 0, 0, "unknown", "down"),
-        Move(4, 1, 60.25, -100, -7),
+        move_row(0, 0, 0.0, 0, 0, "left", "up"),
+        move_row(1, 0, 1.5, 200, 0),
+        move_row(2, 0, 3.0, 200, 120),
+        move_row(3, 1, 60.25, 0, 0, "unknown", "down"),
+        move_row(4, 1, 60.25, -100, -7),
     )
     sds = (0.08, 0.09, 0.1, 0.11)
     spots = [
@@ -65,7 +66,7 @@ def small_campaign() -> Campaign:
         for i, pixels in enumerate(np.random.default_rng(6).uniform(100.0, 700.0, (8, 4)).tolist())
     ]
     last = spots[7]
-    spots[6] = Spot(22, 4, "d1", None, None, *[None] * 8, status="undetected", ruv_right=-0.5)
+    spots[6] = spot_row(22, 4, "d1", None, None, *[None] * 8, status="undetected", ruv_right=-0.5)
     refused = {f: getattr(last, f) for f in Spot.__slots__} | {"status": "saturated, 41 px", "v_left_px": 1e4}
     spots[7] = Spot(**refused)
     priors = dict(RIG_PRIORS)

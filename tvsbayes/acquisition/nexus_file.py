@@ -26,11 +26,12 @@ from tvsbayes.acquisition.journal import LOG, LOG_BYTES_MAX, Record, event_of, r
 from tvsbayes.acquisition.journal_check import frames_of
 from tvsbayes.acquisition.journal_events import Looked, Stop
 from tvsbayes.errors import escaped, refusal
+from tvsbayes.files.csv_kind import Column
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import CAMERAS, Campaign, read_campaign
+from tvsbayes.instrument.campaign import CAMERAS, MOVES, PIXEL_SDS, SPOTS, Campaign, Move, Spot, read_campaign
 
 NOTHING = -1
 """In place of an experiment or point that a look does not have."""
@@ -41,8 +42,8 @@ _FILES = {
     "spots.csv": CSV_BYTES_MAX,
     LOG: LOG_BYTES_MAX,
 }
-_LISTS = ("spot", "move", "experiment", "point")
-_WORDS = ("target", "status")
+_UNITS = ("s", "steps", "px", "deg")
+"""Ends of the names of columns."""
 
 
 @dataclass(frozen=True)
@@ -164,12 +165,8 @@ def _instrument(instrument: Any, campaign: Campaign) -> None:
 def _moves(group: Any, campaign: Campaign) -> None:
     moves = campaign.moves
     _class(group, "NXdata", signal="pan_steps", axes=["time"], auxiliary_signals=["tilt_steps"])
-    _put(group, "time", [move.time_s for move in moves], "s")
-    for name in ("move", "segment"):
-        _put(group, name, [getattr(move, name) for move in moves])
-    for axis in AXES:
-        _put(group, f"{axis}_steps", [getattr(move, f"{axis}_steps") for move in moves], "steps")
-        _put(group, f"{axis}_approach", [str(getattr(move, f"{axis}_approach")) for move in moves])
+    for column in MOVES.columns.values():
+        _column(group, column, moves)
 
 
 def _looks(group: Any, campaign: Campaign, records: Sequence[Record]) -> None:
@@ -179,19 +176,25 @@ def _looks(group: Any, campaign: Campaign, records: Sequence[Record]) -> None:
     _class(group, "NXdata", signal=signals[0], axes=["spot"], auxiliary_signals=signals[1:])
     times = _look_times(records)
     _put(group, "time", [times.get(spot.spot, moves[spot.move].time_s) for spot in spots], "s")
-    for name in _LISTS:
-        values = [getattr(spot, name) for spot in spots]
-        _put(group, name, [NOTHING if value is None else value for value in values])
-    for name in _WORDS:
-        _put(group, name, [str(getattr(spot, name)) for spot in spots])
     for axis in AXES:
         _put(group, f"{axis}_steps", [getattr(moves[spot.move], f"{axis}_steps") for spot in spots], "steps")
-    for name in signals:
-        _put(group, name, _numbers([getattr(spot, f"{name}_px") for spot in spots]), "px")
-        _put(group, f"{name}_errors", _numbers([getattr(spot, f"s{name}_px") for spot in spots]), "px")
-    for side in CAMERAS:
-        _put(group, f"correlation_uv_{side}", [getattr(spot, f"ruv_{side}") for spot in spots])
-    _put(group, "aperture", _numbers([spot.aperture_deg for spot in spots]), "deg")
+    for column in SPOTS.columns.values():
+        _column(group, column, spots)
+
+
+def _column(group: Any, column: Column, rows: Sequence[Move] | Sequence[Spot]) -> None:
+    """A column of a table: its unit becomes an attribute; standard uncertainties are the `_errors` of a value."""
+    name, unit = column.name, next((unit for unit in _UNITS if column.name.endswith(f"_{unit}")), "")
+    if unit != "steps":
+        name = name.removesuffix(f"_{unit}")
+    if column.name in PIXEL_SDS:
+        name = f"{name[1:]}_errors"
+    name = name.replace("ruv_", "correlation_uv_")
+    values = [getattr(row, column.name) for row in rows]
+    if column.kind is float:
+        _put(group, name, _numbers(values), unit)
+    else:
+        _put(group, name, [NOTHING if value is None else value for value in values], unit)
 
 
 def _numbers(values: Sequence[float | None]) -> np.ndarray:

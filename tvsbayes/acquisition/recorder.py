@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Literal, cast
 
 from msgspec import UNSET
 
 from tvsbayes.acquisition.journal import Record, event_of, refused
 from tvsbayes.acquisition.journal_events import Gap, Homed, Looked, Moved, Placed, Start, Stop, Verified
 from tvsbayes.instrument.axes import PanApproach, TiltApproach
-from tvsbayes.instrument.campaign import NO_PIXELS, Move, Spot, with_pixels
+from tvsbayes.instrument.campaign import NO_PIXELS, Move, Spot, next_move, with_pixels
 
 HOME_TOLERANCE_STEPS = 2
 """Scatter of a home switch, as homing finds it again; more than that are lost steps."""
@@ -105,7 +105,7 @@ class Recorder:
             case Homed():
                 self._homed(event)
             case Moved():
-                self.moves.append(Move(len(self.moves), self.moves[-1].segment, *_head(event)))
+                self._moved(event, self.moves[-1].segment)
             case Looked():
                 self._looks(event)
         if isinstance(event, Homed | Moved | Placed | Looked) and event.step is not None:
@@ -125,9 +125,18 @@ class Recorder:
         pan, tilt = event.approach
         # What sides they are is checked where the tables are written.
         approach = cast("PanApproach", pan), cast("TiltApproach", tilt)
-        self.moves.append(Move(len(self.moves), segment, *_head(event), *approach))
+        self._moved(event, segment, approach)
         # Only a homing of the plan states counters; one of a resumed run repeats them.
         self.state = replace(self.state, boot=event.boot, home_steps=(event.pan_steps, event.tilt_steps))
+
+    def _moved(
+        self,
+        event: Moved | Homed,
+        segment: int,
+        approach: tuple[PanApproach | Literal[""], TiltApproach | Literal[""]] = ("", ""),
+    ) -> None:
+        steps = event.pan_steps, event.tilt_steps
+        self.moves.append(next_move(self.moves, segment, event.time_s, steps, approach))
 
     def _looks(self, event: Looked) -> None:
         self.spots.append(_spot(event, len(self.moves) - 1))
@@ -167,12 +176,14 @@ def recorded(records: Iterable[Record]) -> Recorded:
     return recorder.result()
 
 
-def _head(event: Homed | Moved) -> tuple[float, int, int]:
-    return event.time_s, event.pan_steps, event.tilt_steps
-
-
 def _spot(event: Looked, move: int) -> Spot:
-    aperture = None if event.aperture_deg is UNSET else event.aperture_deg
-    row = Spot(event.spot, move, event.target, event.experiment, event.point, *NO_PIXELS, *NO_PIXELS, aperture)
+    row = Spot(
+        spot=event.spot,
+        move=move,
+        target=event.target,
+        experiment=event.experiment,
+        point=event.point,
+        aperture_deg=None if event.aperture_deg is UNSET else event.aperture_deg,
+    )
     pixels, sds = event.pixels_px or NO_PIXELS, event.sds_px or NO_PIXELS
     return with_pixels(row, event.status, pixels, sds, event.correlations)

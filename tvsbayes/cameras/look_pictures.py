@@ -20,7 +20,7 @@ from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, 
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, PNG_SIGNATURE, decode_image, image_size, png_bytes
-from tvsbayes.instrument.campaign import CAMERAS, NO_PIXELS, UNDETECTED, Spot, frame_name
+from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, Spot, frame_name
 from tvsbayes.progress import Advance, unshown
 
 Matching = Literal["number", "order"]
@@ -189,8 +189,7 @@ def pair_looks(
         return _onto_rows(views, numbers, rows, waiting, how)
     order = sorted(range(len(views)), key=lambda k: (numbers[k], natural_order(views[k].name)))
     targets = _differences(names)
-    empty = (*NO_PIXELS, *NO_PIXELS)
-    spots = [Spot(spot, numbers[k], targets[k], None, None, *empty, status=UNDETECTED) for spot, k in enumerate(order)]
+    spots = [Spot(spot=n, move=numbers[k], target=targets[k], status=UNDETECTED) for n, k in enumerate(order)]
     used = set(numbers)
     without = tuple(move for move in (range(1 + max(used)) if moves is None else moves) if move not in used)
     return PairedLooks(tuple(spots), {spot: views[k] for spot, k in enumerate(order)}, how, (), without, renumbered)

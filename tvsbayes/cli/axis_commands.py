@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from tvsbayes.cli.app import command_line, finish, keep, report_line, tell_part, tell_removed
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
-from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
+from tvsbayes.files.disk import make_folder, output_place, write_atomically
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
@@ -52,11 +52,12 @@ def refuse_axis(folder: Path, command: str, remedy: str = FOR_AN_AXIS) -> None:
 
 def new_axis(out: Path, as_json: bool) -> None:
     """An empty axis folder, explained in campaign.toml."""
+    from tvsbayes.single_axis.axis_campaign import axis_templates
+
     make_folder(out, empty=True)
-    templates = sorted((shipped_data() / "axis_templates").iterdir())
-    for template in templates:
-        write_atomically(out / template.name, template.read_bytes())
-    names = [template.name for template in templates]
+    names = list(files := axis_templates())
+    for name, data in files.items():
+        write_atomically(out / name, data)
     text = f"{escaped(str(out), 200)}: {', '.join(names)}\n"
     text += "next: log moves and readings, then `tvsbayes check` this folder, then `tvsbayes fit`"
     finish({"campaign": str(out), "files": names}, text, as_json)

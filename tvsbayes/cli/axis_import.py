@@ -11,7 +11,7 @@ import typer
 from tvsbayes.cli.app import finish, somebody_there
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
 from tvsbayes.errors import escaped, refusal, typed
-from tvsbayes.files.disk import make_folder, shipped_data, write_atomically
+from tvsbayes.files.disk import make_folder, write_atomically
 
 if TYPE_CHECKING:
     from tvsbayes.single_axis.foreign_readings import ForeignReadings
@@ -26,15 +26,9 @@ def import_readings(
 ) -> None:
     """A table of an axis into its folder, new or still with the tables of the template."""
     from tvsbayes.files.foreign_table import read_foreign
-    from tvsbayes.instrument.column_names import (
-        AXIS_FIELDS,
-        READING_UNITS,
-        SECONDS,
-        understand_axis,
-        unit_of_name,
-    )
+    from tvsbayes.instrument.column_names import READING_UNITS, SECONDS, unit_of_name
     from tvsbayes.single_axis.axis_campaign import unit_of_folder
-    from tvsbayes.single_axis.foreign_readings import readings_of, unwrapped
+    from tvsbayes.single_axis.foreign_readings import AXIS_FIELDS, readings_of, understand_axis, unwrapped
 
     table = read_foreign(file, sheet)
     known = understand_axis(table.columns, stated)
@@ -75,18 +69,15 @@ def _unit_told(to: Path, named: str | None) -> str:
     return f"unit: of readings as campaign.toml says{'' if kept else f', {UNIT} until you change it'}{says}"
 
 
-def _templates() -> dict[str, bytes]:
-    """The files of an empty axis folder."""
-    return {path.name: path.read_bytes() for path in sorted((shipped_data() / "axis_templates").iterdir())}
-
-
 def _refuse_filled(to: Path) -> None:
     """Nothing is overwritten: a table goes only where none is."""
+    from tvsbayes.single_axis.axis_campaign import axis_templates
+
     if not (to / "campaign.toml").is_file():
         if to.exists():
             make_folder(to, empty=True)
         return
-    for name, template in _templates().items():
+    for name, template in axis_templates().items():
         place = to / name
         if name.endswith(".csv") and place.is_file() and place.read_bytes() != template:
             allowed, remedy = "no rows yet", "name another folder with --to; nothing is overwritten"
@@ -95,12 +86,12 @@ def _refuse_filled(to: Path) -> None:
 
 def _write(to: Path, found: ForeignReadings, unit: str | None) -> list[str]:
     """The tables, in a folder with the explained campaign.toml, which comes last; `unit` as the column says."""
-    from tvsbayes.single_axis.axis_campaign import axis_moves_bytes, readings_bytes
+    from tvsbayes.single_axis.axis_campaign import axis_moves_bytes, axis_templates, readings_bytes
 
     contents = {"moves.csv": axis_moves_bytes(found.moves), "readings.csv": readings_bytes(found.readings)}
     if not (to / "campaign.toml").is_file():
         make_folder(to, empty=True)
-        template = _templates()["campaign.toml"]
+        template = axis_templates()["campaign.toml"]
         own = unit or UNIT
         contents["campaign.toml"] = template.replace(f'\nunit = "{UNIT}"'.encode(), f'\nunit = "{own}"'.encode())
     for name, data in contents.items():

@@ -16,7 +16,7 @@ from tvsbayes.cli.app import Json, finish, refuse_options
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, listed, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes
-from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
+from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
@@ -61,10 +61,12 @@ def new(
 
 def write_templates(out: Path) -> list[str]:
     """The commented files of an empty campaign."""
-    templates = sorted((shipped_data() / "templates").iterdir())
-    for template in templates:
-        write_atomically(out / template.name, template.read_bytes())
-    return [template.name for template in templates]
+    from tvsbayes.instrument.campaign import campaign_templates
+
+    files = campaign_templates()
+    for name, data in files.items():
+        write_atomically(out / name, data)
+    return list(files)
 
 
 def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_json: bool) -> None:
@@ -108,9 +110,10 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
 
 def moves_file(out: Path, folder: Path) -> Path | None:
     """Where the moves of the pictures are listed: in the campaign, beside the pictures, or not yet."""
-    template = (shipped_data() / "templates" / "moves.csv").read_bytes()
+    from tvsbayes.instrument.campaign import campaign_templates
+
     own, beside = out / "moves.csv", folder / "moves.csv"
-    if own.is_file() and read_bytes(own, CSV_BYTES_MAX) != template:
+    if own.is_file() and read_bytes(own, CSV_BYTES_MAX) != campaign_templates()["moves.csv"]:
         return own
     return beside if beside.is_file() else None
 
@@ -128,10 +131,10 @@ def _moves_of(file: Path | None) -> tuple[Move | None, ...]:
 
 def _moves_to_fill_in(count: int) -> bytes:
     """A `moves.csv` whose counters are left to its owner."""
-    from tvsbayes.instrument.campaign import MOVE_COLUMNS
+    from tvsbayes.instrument.campaign import MOVES
 
     rows = ((k, 0, float(k), None, None, *(("unknown",) * 2 if k == 0 else ("", ""))) for k in range(count))
-    return csv_bytes(MOVE_COLUMNS, rows)
+    return csv_bytes(MOVES.required, rows)
 
 
 def _rows_of(out: Path) -> tuple[Spot, ...]:

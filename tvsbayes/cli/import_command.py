@@ -18,7 +18,7 @@ from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
-from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
+from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 
 if TYPE_CHECKING:
     from tvsbayes.files.foreign_table import ForeignTable
@@ -166,15 +166,14 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
 
 def _listed_moves(to: Path) -> tuple[Move, ...] | None:
     """The moves that a campaign lists already, beyond the row of the template."""
-    from tvsbayes.instrument.campaign import parse_moves
+    from tvsbayes.instrument.campaign import campaign_templates, parse_moves
     from tvsbayes.instrument.column_names import COUNTERS
 
     file = moves_file(to, to)
     if file is None or (to / "campaign.toml").is_file() is False:
         return None
     data = read_bytes(file, CSV_BYTES_MAX)
-    template = (shipped_data() / "templates" / "moves.csv").read_bytes()
-    if data == template:
+    if data == campaign_templates()["moves.csv"]:
         return None
     try:
         return parse_moves(data, str(file))

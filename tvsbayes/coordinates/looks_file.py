@@ -8,22 +8,47 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from tvsbayes.coordinates.location import Settings, settings_of
 from tvsbayes.errors import InputError, escaped
+from tvsbayes.files.csv_kind import Column, CsvKind, Values
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_table, table_blocks
 from tvsbayes.files.disk import opened, read_bytes
 from tvsbayes.files.foreign_table import is_foreign, read_foreign
-from tvsbayes.instrument.axes import SENSES
+from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import APERTURE_MAX_DEG
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.progress import Advance, unshown
 
-LOOK_COLUMNS = ("pan_steps", "tilt_steps", "pan_approach", "tilt_approach", "aperture_deg")
 HEAD_BYTES = 4096
 """From which the kind of a file is known."""
 BLOCK_ROWS = 8192
 """Lines read at a time: 10 MB with everything that is made of them."""
+
+
+def _direction(table: Table, column: Column, values: Values) -> None:
+    """Refuses anything but one of the words of a column."""
+    for row, word in enumerate(values[column.name]):
+        if word not in column.words:
+            remedy = "name the direction of the last move of the axis"
+            raise table.refuse(row, column.name, "approach", ", ".join(column.words), remedy)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """A row of a file of looks: absolute counters, steps, the directions of the last moves, the reading."""
+
+    pan_steps: Annotated[float, Column("absolute counters, decimals allowed", -COUNTER_MAX, COUNTER_MAX)]
+    tilt_steps: Annotated[float, Column("", -COUNTER_MAX, COUNTER_MAX)]
+    pan_approach: Annotated[
+        PanApproach, Column("direction of the last move: `left`, `right` or `unknown`", rule=_direction)
+    ]
+    tilt_approach: Annotated[TiltApproach, Column("likewise `up`, `down`, `unknown`", rule=_direction)]
+    aperture_deg: Annotated[float, Column("the scanner's own reading, deg", -APERTURE_MAX_DEG, APERTURE_MAX_DEG)]
+
+
+LOOKS = CsvKind(Look, "FILE.csv")
 
 
 @dataclass(frozen=True)
@@ -51,16 +76,9 @@ class LookRows:
 
 def _rows(table: Table) -> LookRows:
     """Checked cells of a table."""
-    for axis, directions in SENSES.items():
-        allowed = (*directions, "unknown")
-        for row, word in enumerate(table.columns[f"{axis}_approach"]):
-            if word not in allowed:
-                remedy = "name the direction of the last move of the axis"
-                raise table.refuse(row, f"{axis}_approach", "approach", ", ".join(allowed), remedy)
-    pan, tilt = (table.numbers(name, -COUNTER_MAX, COUNTER_MAX) for name in ("pan_steps", "tilt_steps"))
-    readings = table.numbers("aperture_deg", -APERTURE_MAX_DEG, APERTURE_MAX_DEG)
-    pairs = zip(table.columns["pan_approach"], table.columns["tilt_approach"], strict=True)
-    return LookRows(tuple(table.lines), tuple(pan), tuple(tilt), tuple(readings), tuple(pairs))
+    found = {name: tuple(cells) for name, cells in LOOKS.values(table).items()}
+    pairs = zip(found.pop("pan_approach"), found.pop("tilt_approach"), strict=True)
+    return LookRows(lines=tuple(table.lines), approach=tuple(pairs), **found)
 
 
 def _no_points(path: Path) -> InputError:
@@ -75,7 +93,7 @@ def _foreign(path: Path) -> Table | None:
             return None
     found = read_foreign(path)
     # The same columns are asked for, with the same words.
-    parse_table(csv_bytes(list(found.columns), ()), found.file, LOOK_COLUMNS)
+    parse_table(csv_bytes(list(found.columns), ()), found.file, LOOKS.required)
     return Table(found.file, list(found.lines), dict(found.columns))
 
 
@@ -93,7 +111,7 @@ def read_looks(path: Path) -> LookRows:
     """
     table = _foreign(path)
     if table is None:
-        table = parse_table(read_bytes(path, CSV_BYTES_MAX), escaped(path.name), LOOK_COLUMNS)
+        table = parse_table(read_bytes(path, CSV_BYTES_MAX), escaped(path.name), LOOKS.required)
     if not len(table):
         raise _no_points(path)
     return _rows(table)
@@ -111,7 +129,7 @@ def look_blocks(path: Path, advance: Advance = unshown) -> Iterator[LookRows]:
     """
     empty, whole = True, _foreign(path)
     if whole is None:
-        blocks = table_blocks(path, LOOK_COLUMNS, BLOCK_ROWS, advance)
+        blocks = table_blocks(path, LOOKS.required, BLOCK_ROWS, advance)
     else:
         blocks = (_part(whole, begin) for begin in range(0, len(whole), BLOCK_ROWS))
     for table in blocks:

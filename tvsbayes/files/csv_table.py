@@ -152,40 +152,6 @@ class Table:
                 raise self.refuse(row, column, "missing", allowed, "fill the cell in")
         return list(self.columns[column])
 
-    def check_counting(self, column: str, values: Sequence[int | None]) -> None:
-        """Refuses a column that does not count 0, 1, 2 ..."""
-        for row, value in enumerate(values):
-            if value != row:
-                raise self.refuse(row, column, "order", f"{row}", "number the rows 0, 1, 2 ... in time order")
-
-    def check_segments(self, segments: Sequence[int], times_s: Sequence[float]) -> None:
-        """Refuses a `segment` that does not count from 0 by one at most, and a `time_s` that goes back."""
-        for row, (segment, time_s) in enumerate(zip(segments, times_s, strict=True)):
-            before = segments[row - 1] if row else -1
-            if segment not in ((before, before + 1) if row else (0,)):
-                allowed = f"{before} or {before + 1}" if row else "0"
-                raise self.refuse(row, "segment", "order", allowed, "count segments 0, 1, 2 ... without gaps")
-            if row and time_s < times_s[row - 1]:
-                allowed = f"at least {times_s[row - 1]!r}, the time of the row before"
-                raise self.refuse(row, "time_s", "order", allowed, "list the moves in order of time")
-
-    def check_first_words(self, column: str, segments: Sequence[int], words: Sequence[str], remedy: str) -> None:
-        """Refuses a column that does not hold one of `words` in the first row of every segment, and nothing else."""
-        for row, word in enumerate(self.columns[column]):
-            first = row == 0 or segments[row] != segments[row - 1]
-            if word not in (words if first else ("",)):
-                allowed = ", ".join(words) if first else "an empty cell inside a segment"
-                told = remedy if first else "leave it empty, or begin a segment"
-                raise self.refuse(row, column, "approach", allowed, told)
-
-    def check_unique(self, column: str, values: Sequence[object], what: str) -> None:
-        """Refuses a value that stands twice; None does not count."""
-        seen: dict[object, int] = {}
-        for row, value in enumerate(values):
-            if value is not None and seen.setdefault(value, row) != row:
-                found = f"{shown(self.columns[column][row])} again (first on line {self.lines[seen[value]]})"
-                raise self.refuse(row, column, "duplicate", what, "renumber one of them", found)
-
 
 def _csv_rows(text: str, file: str, skipped: int) -> Iterator[tuple[int, list[str]]]:
     """Rows of a CSV text with the line on which each begins; `skipped` lines of the file follow its first."""

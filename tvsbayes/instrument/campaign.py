@@ -10,24 +10,72 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, escaped, refusal
-from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes, parse_table
+from tvsbayes.files.csv_kind import (
+    Column,
+    CsvKind,
+    Values,
+    counted,
+    filled_where_ok,
+    first_of_segment,
+    follows_a_move,
+    refuse_repeated,
+    segments_in_time,
+    templates,
+    unique,
+)
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX, parse_toml, toml_line
-from tvsbayes.instrument.axes import SENSES, PanApproach, TiltApproach
+from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign_header import parse_header
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.rig import RigTable, parse_rig_table, rig_table_toml
 from tvsbayes.instrument.stereo_pair import Stereo, parse_stereo, stereo_bytes
 
+CAMERAS: tuple[Literal["left"], Literal["right"]] = ("left", "right")
+"""The two cameras, in the order of the columns of spots.csv."""
+PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
+"""Columns of a spot's centres."""
+PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
+"""Columns of their standard uncertainties."""
+NO_PIXELS = (None, None, None, None)
+"""Pixels, or their standard uncertainties, of a look without a spot."""
+UNDETECTED = "undetected"
+"""Status of a look whose pictures wait for `detect`."""
+PIXEL_SD_MIN, PIXEL_SD_MAX = 1e-4, 100.0
+"""Of a standard uncertainty of a centre, px."""
+APERTURE_MAX_DEG = 360.0
+"""Of a reading of the aperture, either sign."""
+# How far outside the image a centroid may lie, in image sizes: half a spot at the edge, not a wrong file.
+_IMAGE_MARGIN = 0.1
+_SIDES = "approach side from anfahrt seite von lado desde aproximacion cote approche depuis"
+_WHERE_OK = filled_where_ok("give the value or a refusal reason")
+_PIXEL = Column(
+    "raw centroids, px, integer = centre of a pixel, (0, 0) the centre of the first (MATLAB counts from 1: subtract 1)",
+    *(-1e6, 1e6),
+    rule=_WHERE_OK,
+)
+_PIXEL_SD = Column("their standard uncertainties, px", PIXEL_SD_MIN, PIXEL_SD_MAX, rule=_WHERE_OK)
+# At a correlation of 1 the two coordinates of a centroid would be one.
+_CORRELATION = Column(
+    "optional: correlation of u and v",
+    *(-0.999999, 0.999999),
+    group="correlations",
+    rule=filled_where_ok(
+        "write 0 where it is not known", "a finite decimal number from -0.999999 to 0.999999", "number"
+    ),
+)
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Move:
     """A row of `moves.csv`: absolute counters AFTER the move.
 
@@ -35,16 +83,64 @@ class Move:
     empty elsewhere.
     """
 
-    move: int
-    segment: int
-    time_s: float
-    pan_steps: int
-    tilt_steps: int
-    pan_approach: PanApproach | Literal[""] = ""
-    tilt_approach: TiltApproach | Literal[""] = ""
+    move: Annotated[
+        int,
+        Column(
+            "0, 1, 2, ...",
+            rule=counted,
+            names="move movement bewegung fahrt movimiento mouvement deplacement pose",
+        ),
+    ]
+    segment: Annotated[
+        int,
+        Column(
+            "0, then the same or one more: a homing begins the next segment",
+            rule=segments_in_time,
+            names="segment seg homing homings home homed rehomed reference referenced referenzfahrt referenziert "
+            "referenciado segmento",
+        ),
+    ]
+    time_s: Annotated[
+        float,
+        Column(
+            "seconds, never decreasing",
+            *(-1e12, 1e12),
+            names="time t timestamp datetime date zeit uhrzeit zeitstempel datum tiempo hora fecha temps heure utc",
+        ),
+    ]
+    pan_steps: Annotated[
+        int,
+        Column(
+            "absolute counters AFTER the move, whole numbers; left and up count up",
+            *(-COUNTER_MAX, COUNTER_MAX),
+            names="pan azimuth azimut acimut horizontal horizontale horiz hor schwenk schwenken giro panoramique",
+        ),
+    ]
+    tilt_steps: Annotated[
+        int,
+        Column(
+            "",
+            *(-COUNTER_MAX, COUNTER_MAX),
+            names="tilt elevation vertical vert vertikal vertikale verticale hohe hoehe neigung neigen kippen "
+            "elevacion inclinacion inclinaison",
+        ),
+    ]
+    pan_approach: Annotated[
+        PanApproach | Literal[""],
+        Column(
+            "in the first row of a segment: `left`, `right` or `unknown`, the side from which the axis came there; "
+            "empty elsewhere",
+            rule=first_of_segment,
+            names=_SIDES,
+        ),
+    ] = ""
+    tilt_approach: Annotated[
+        TiltApproach | Literal[""],
+        Column("likewise `up`, `down`, `unknown`", rule=first_of_segment, names=_SIDES),
+    ] = ""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Spot:
     """A row of `spots.csv`: raw centroids and their standard uncertainties, px.
 
@@ -52,23 +148,68 @@ class Spot:
     reads the pixels of a spot that is not "ok".
     """
 
-    spot: int
-    move: int
-    target: str
-    experiment: int | None
-    point: int | None
-    u_left_px: float | None
-    v_left_px: float | None
-    u_right_px: float | None
-    v_right_px: float | None
-    su_left_px: float | None
-    sv_left_px: float | None
-    su_right_px: float | None
-    sv_right_px: float | None
-    aperture_deg: float | None = None
-    status: str = "ok"
-    ruv_left: float = 0.0
-    ruv_right: float = 0.0
+    spot: Annotated[
+        int,
+        Column(
+            "unique id",
+            rule=unique,
+            names="spot look id nr no num index shot nummer aufnahme fleck numero toma mancha tache vue",
+        ),
+    ]
+    move: Annotated[int, Column("the last move before the look")]
+    target: Annotated[
+        str,
+        Column(
+            "any name for the placement of the sheet",
+            names="target sheet plane screen wall blatt schirm wand ebene tafel hoja plano pantalla pared feuille "
+            "ecran mur cible",
+        ),
+    ]
+    experiment: Annotated[
+        int | None,
+        Column(
+            "of the four-point method: number, and 1 to 4; both or neither",
+            names="experiment exp versuch experimento ensayo essai experience trial run",
+        ),
+    ] = None
+    point: Annotated[int | None, Column("", 1, 4, names="point pt punkt punto")] = None
+    u_left_px: Annotated[float | None, _PIXEL] = None
+    v_left_px: Annotated[float | None, _PIXEL] = None
+    u_right_px: Annotated[float | None, _PIXEL] = None
+    v_right_px: Annotated[float | None, _PIXEL] = None
+    su_left_px: Annotated[float | None, _PIXEL_SD] = None
+    sv_left_px: Annotated[float | None, _PIXEL_SD] = None
+    su_right_px: Annotated[float | None, _PIXEL_SD] = None
+    sv_right_px: Annotated[float | None, _PIXEL_SD] = None
+    aperture_deg: Annotated[
+        float | None,
+        Column(
+            "the scanner's own reading, deg, or empty",
+            *(-APERTURE_MAX_DEG, APERTURE_MAX_DEG),
+            names="aperture b receiver rx blende offnung empfanger apertura receptor ouverture recepteur apertur",
+        ),
+    ] = None
+    status: Annotated[
+        str,
+        Column(
+            "`ok`; `undetected` (pixels empty, frames wait); or a reason in words",
+            chars_max=200,
+            filled=True,
+            names="status state ok valid quality zustand gultig qualitat estado valido calidad etat valide qualite",
+        ),
+    ] = "ok"
+    ruv_left: Annotated[float, _CORRELATION] = 0.0
+    ruv_right: Annotated[float, _CORRELATION] = 0.0
+
+
+MOVES = CsvKind(
+    Move,
+    "moves.csv",
+    "a row after every command to the motors, in time order",
+    ("at least one row", "write row 0: the counters and approaches after homing"),
+    [Move(move=0, segment=0, time_s=0.0, pan_steps=0, tilt_steps=0, pan_approach="unknown", tilt_approach="unknown")],
+)
+SPOTS = CsvKind(Spot, "spots.csv", "a row for every look, in any order")
 
 
 NAME_ACQUIRED = "acquired campaign"
@@ -107,37 +248,12 @@ class Campaign(Shown):
         ok = sum(spot.status == "ok" for spot in self.spots)
         title = f"Campaign {self.title!r}: {len(self.moves)} moves, {len(self.spots)} spots ({ok} ok)"
         at = {move.move: (move.pan_steps, move.tilt_steps) for move in self.moves}
-        columns = ("spot", "move", "pan_steps", "tilt_steps", *SPOT_COLUMNS[2:])
+        others = SPOTS.required[2:]
         rows = [
-            (s.spot, s.move, *at.get(s.move, (None, None)), *(getattr(s, column) for column in SPOT_COLUMNS[2:]))
+            (s.spot, s.move, *at.get(s.move, (None, None)), *(getattr(s, column) for column in others))
             for s in self.spots
         ]
-        return View(title, columns, rows, most=5)
-
-
-CAMERAS: tuple[Literal["left"], Literal["right"]] = ("left", "right")
-"""The two cameras, in the order of the columns of spots.csv."""
-PIXELS = ("u_left_px", "v_left_px", "u_right_px", "v_right_px")
-"""Columns of a spot's centres."""
-NO_PIXELS = (None, None, None, None)
-"""Pixels, or their standard uncertainties, of a look without a spot."""
-UNDETECTED = "undetected"
-"""Status of a look whose pictures wait for `detect`."""
-MOVE_COLUMNS = ("move", "segment", "time_s", "pan_steps", "tilt_steps", "pan_approach", "tilt_approach")
-PIXEL_SDS = ("su_left_px", "sv_left_px", "su_right_px", "sv_right_px")
-"""Columns of their standard uncertainties."""
-PIXEL_SD_MIN, PIXEL_SD_MAX = 1e-4, 100.0
-"""Of a standard uncertainty of a centre, px."""
-APERTURE_MAX_DEG = 360.0
-"""Of a reading of the aperture, either sign."""
-SPOT_COLUMNS = (
-    *("spot", "move", "target", "experiment", "point"),
-    *(*PIXELS, *PIXEL_SDS, "aperture_deg", "status"),
-)
-_CORRELATIONS = ("ruv_left", "ruv_right")
-ID_MAX = 10**9
-# How far outside the image a centroid may lie, in image sizes: half a spot at the edge, not a wrong file.
-_IMAGE_MARGIN = 0.1
+        return View(title, ("spot", "move", "pan_steps", "tilt_steps", *others), rows, most=5)
 
 
 def frame_name(spot: int, camera: str, folder: str = "frames") -> str:
@@ -161,42 +277,34 @@ def with_pixels(
         sds_px: their standard uncertainties.
         correlations: of u and v, left and right.
     """
-    (u_left, v_left, u_right, v_right), (su_left, sv_left, su_right, sv_right) = pixels_px, sds_px
-    return replace(
-        spot,
-        status=status,
-        u_left_px=u_left,
-        v_left_px=v_left,
-        u_right_px=u_right,
-        v_right_px=v_right,
-        su_left_px=su_left,
-        sv_left_px=sv_left,
-        su_right_px=su_right,
-        sv_right_px=sv_right,
-        ruv_left=correlations[0],
-        ruv_right=correlations[1],
+    columns = (*PIXELS, *PIXEL_SDS, "ruv_left", "ruv_right")
+    values = dict(zip(columns, (*pixels_px, *sds_px, *correlations), strict=True))
+    return replace(spot, status=status, **values)  # type: ignore[arg-type]
+
+
+def next_move(
+    moves: Sequence[Move],
+    segment: int,
+    time_s: float,
+    steps: tuple[int, int],
+    approach: tuple[PanApproach | Literal[""], TiltApproach | Literal[""]] = ("", ""),
+) -> Move:
+    """The row behind `moves`; counters and approaches of (pan, tilt)."""
+    (pan, tilt), (pan_side, tilt_side) = steps, approach
+    return Move(
+        move=len(moves),
+        segment=segment,
+        time_s=time_s,
+        pan_steps=pan,
+        tilt_steps=tilt,
+        pan_approach=pan_side,
+        tilt_approach=tilt_side,
     )
 
 
-def parse_moves(data: bytes, file: str = "moves.csv") -> tuple[Move, ...]:
+def parse_moves(data: bytes, file: str = MOVES.file) -> tuple[Move, ...]:
     """The checked rows of `moves.csv`; at least one."""
-    table = parse_table(data, file, MOVE_COLUMNS)
-    if not len(table):
-        allowed, remedy = "at least one row", "write row 0: the counters and approaches after homing"
-        raise refusal("empty", file=file, line=1, found="no rows", allowed=allowed, remedy=remedy)
-    moves = table.integers("move", 0, ID_MAX)
-    segments = table.integers("segment", 0, ID_MAX)
-    times_s = table.numbers("time_s", -1e12, 1e12)
-    table.check_counting("move", moves)
-    table.check_segments(segments, times_s)
-    approaches = {}
-    for axis, words in SENSES.items():
-        column = f"{axis}_approach"
-        table.check_first_words(column, segments, (*words, "unknown"), "state how the axis arrived there")
-        approaches[column] = table.columns[column]
-    pan = table.integers("pan_steps", -COUNTER_MAX, COUNTER_MAX)
-    tilt = table.integers("tilt_steps", -COUNTER_MAX, COUNTER_MAX)
-    return tuple(map(Move, moves, segments, times_s, pan, tilt, *approaches.values()))
+    return MOVES.parse(data, file)
 
 
 def check_experiments(
@@ -210,7 +318,7 @@ def check_experiments(
             allowed = "experiment and point both given or both empty"
             raise table.refuse(row, column, "missing", allowed, "complete the pair or empty it")
     keys = [pair if counted and pair != (None, None) else None for pair, counted in zip(pairs, counts, strict=True)]
-    table.check_unique("point", keys, "every point of an experiment once")
+    refuse_repeated(table, "point", keys, "every point of an experiment once")
 
 
 def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spot, ...]:
@@ -222,37 +330,24 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
         moves: number of moves, which `move` must name.
         stereo: gives the image size.
     """
-    table = parse_table(data, file, SPOT_COLUMNS, _CORRELATIONS)
-    spots = table.integers("spot", 0, ID_MAX)
-    table.check_unique("spot", spots, "unique ids")
-    move_ids = table.integers("move", 0, ID_MAX)
-    for row, move in enumerate(move_ids):
-        if move is None or move >= moves:
-            allowed = f"a row of moves.csv: 0 to {moves - 1}"
-            raise table.refuse(row, "move", "missing-move", allowed, "name the last move before the look")
-    experiments, points = table.integers("experiment", 0, ID_MAX, True), table.integers("point", 1, 4, True)
-    statuses = table.texts("status", 200, empty=False)
-    # A look that found no spot may be taken again.
-    check_experiments(table, experiments, points, [status == "ok" for status in statuses])
-    size = {"u": float(stereo.image_width), "v": float(stereo.image_height)}
-    pixels = [table.numbers(column, -1e6, 1e6, empty=True) for column in PIXELS]
-    sds = [table.numbers(column, PIXEL_SD_MIN, PIXEL_SD_MAX, empty=True) for column in PIXEL_SDS]
-    for column, values in zip((*PIXELS, *PIXEL_SDS), (*pixels, *sds), strict=True):
-        extent = size.get(column[0], 0.0)
-        for row, value in enumerate(values):
-            if statuses[row] != "ok":
-                continue
-            if value is None:
-                allowed = "a finite decimal number, or an empty cell with a status other than ok"
-                raise table.refuse(row, column, "missing", allowed, "give the value or a refusal reason")
-            if column in PIXELS and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN:
+    return SPOTS.parse(data, file, follows_a_move(moves, "look"), _points_once, partial(_in_image, stereo=stereo))
+
+
+def _points_once(table: Table, values: Values) -> None:
+    """Refuses a point of an experiment that was seen twice; a look that found no spot may be taken again."""
+    check_experiments(table, values["experiment"], values["point"], [status == "ok" for status in values["status"]])
+
+
+def _in_image(table: Table, values: Values, stereo: Stereo) -> None:
+    """Refuses a centroid outside the image."""
+    statuses, pixels = values["status"], [values[column] for column in PIXELS]
+    for column, centres in zip(PIXELS, pixels, strict=True):
+        extent = float(stereo.image_width if column[0] == "u" else stereo.image_height)
+        for row, value in enumerate(centres):
+            if statuses[row] == "ok" and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN:
                 allowed = f"a position in the image, 0 to {extent:g} px, or close to it"
-                remedy = _outside_remedy(values, extent, _exchanged(pixels, statuses, stereo))
+                remedy = _outside_remedy(centres, extent, _exchanged(pixels, statuses, stereo))
                 raise table.refuse(row, column, "outside-image", allowed, remedy)
-    apertures = table.numbers("aperture_deg", -APERTURE_MAX_DEG, APERTURE_MAX_DEG, empty=True)
-    correlations = [_parse_correlations(table, column, statuses) for column in _CORRELATIONS]
-    head = (spots, move_ids, table.texts("target"), experiments, points)
-    return tuple(map(Spot, *head, *pixels, *sds, apertures, statuses, *correlations))
 
 
 def _outside_remedy(values: Sequence[float | None], extent: float, exchanged: bool) -> str:
@@ -275,19 +370,6 @@ def _exchanged(pixels: Sequence[Sequence[float | None]], statuses: Sequence[str]
         if status == "ok"
     ]
     return all(value is None or -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN for value, extent in cells)
-
-
-def _parse_correlations(table: Table, column: str, statuses: Sequence[str]) -> list[float]:
-    """Correlations of u and v; 0 without the column, and where a row without a spot leaves the cell empty."""
-    if column not in table.columns:
-        return [0.0] * len(table)
-    # At a correlation of 1 the two coordinates of a centroid would be one.
-    values = table.numbers(column, -0.999999, 0.999999, empty=True)
-    for row, value in enumerate(values):
-        if value is None and statuses[row] == "ok":
-            allowed = "a finite decimal number from -0.999999 to 0.999999"
-            raise table.refuse(row, column, "number", allowed, "write 0 where it is not known")
-    return [value or 0.0 for value in values]
 
 
 # campaign.toml is written last: a folder without it is recognisably unfinished.
@@ -345,16 +427,19 @@ def _no_campaign(folder: Path) -> InputError:
     return refusal("missing-file", file="campaign.toml", found=found, allowed=allowed, remedy=remedy)
 
 
+def campaign_templates() -> dict[str, bytes]:
+    """The commented files of an empty campaign."""
+    return templates("templates", MOVES, SPOTS)
+
+
 def moves_bytes(moves: Iterable[Move]) -> bytes:
     """The content of `moves.csv`."""
-    return csv_bytes(MOVE_COLUMNS, ([getattr(m, c) for c in MOVE_COLUMNS] for m in moves))
+    return MOVES.content(moves)
 
 
-def spots_bytes(spots: Sequence[Spot]) -> bytes:
+def spots_bytes(spots: Iterable[Spot]) -> bytes:
     """The content of `spots.csv`; the correlations appear only where one is not zero."""
-    correlated = any(s.ruv_left or s.ruv_right for s in spots)
-    columns = (*SPOT_COLUMNS, *(_CORRELATIONS if correlated else ()))
-    return csv_bytes(columns, ([getattr(s, c) for c in columns] for s in spots))
+    return SPOTS.content(spots)
 
 
 def campaign_toml(campaign: Campaign) -> bytes:

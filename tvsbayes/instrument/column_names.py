@@ -13,9 +13,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from tvsbayes.errors import InputError, closest, escaped
-from tvsbayes.instrument.campaign import MOVE_COLUMNS, PIXELS, SPOT_COLUMNS
+from tvsbayes.files.csv_kind import Column
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import MOVES, PIXELS, SPOTS
 
-FIELDS: tuple[str, ...] = tuple(dict.fromkeys((*MOVE_COLUMNS, *SPOT_COLUMNS)))
+_COLUMNS = {**SPOTS.columns, **MOVES.columns}
+FIELDS = tuple(dict.fromkeys((*MOVES.columns, *SPOTS.columns)))
 """All that a table can give, by the columns of our files."""
 COUNTERS = ("pan_steps", "tilt_steps")
 # English, German, Spanish, French; without accents, as `words_of` takes names apart.
@@ -27,63 +30,13 @@ _IMAGE_AXES = {
     "u": {"u", "x", "col", "column", "spalte", "columna", "colonne"},
     "v": {"v", "y", "row", "zeile", "fila", "renglon", "ligne"},
 }
-_SPREAD = {
+SPREAD = {
     *("sd", "std", "sigma", "s", "stdev", "unc", "uncertainty", "err", "error", "streuung", "unsicherheit"),
     *("desviacion", "incertidumbre", "ecart", "incertitude"),
 }
-_APPROACH = {
-    *(
-        "approach",
-        "side",
-        "from",
-        "anfahrt",
-        "seite",
-        "von",
-        "lado",
-        "desde",
-        "aproximacion",
-        "cote",
-        "approche",
-        "depuis",
-    ),
-}
-_WORDS = {
-    "move": {"move", "movement", "bewegung", "fahrt", "movimiento", "mouvement", "deplacement", "pose"},
-    "segment": {
-        *("segment", "seg", "homing", "homings", "home", "homed", "rehomed", "reference", "referenced"),
-        *("referenzfahrt", "referenziert", "referenciado", "segmento"),
-    },
-    "time_s": {
-        *("time", "t", "timestamp", "datetime", "date", "zeit", "uhrzeit", "zeitstempel", "datum"),
-        *("tiempo", "hora", "fecha", "temps", "heure", "utc"),
-    },
-    "pan_steps": {
-        *("pan", "azimuth", "azimut", "acimut", "horizontal", "horizontale", "horiz", "hor", "schwenk", "schwenken"),
-        *("giro", "panoramique"),
-    },
-    "tilt_steps": {
-        *("tilt", "elevation", "vertical", "vert", "vertikal", "vertikale", "verticale", "hohe", "hoehe", "neigung"),
-        *("neigen", "kippen", "elevacion", "inclinacion", "inclinaison"),
-    },
-    "spot": {
-        *("spot", "look", "id", "nr", "no", "num", "index", "shot", "nummer", "aufnahme", "fleck", "numero", "toma"),
-        *("mancha", "tache", "vue"),
-    },
-    "target": {
-        *("target", "sheet", "plane", "screen", "wall", "blatt", "schirm", "wand", "ebene", "tafel", "hoja", "plano"),
-        *("pantalla", "pared", "feuille", "ecran", "mur", "cible"),
-    },
-    "experiment": {"experiment", "exp", "versuch", "experimento", "ensayo", "essai", "experience", "trial", "run"},
-    "point": {"point", "pt", "punkt", "punto"},
-    "aperture_deg": {
-        *("aperture", "b", "receiver", "rx", "blende", "offnung", "empfanger", "apertura", "receptor", "ouverture"),
-        *("recepteur", "apertur"),
-    },
-    "status": {
-        *("status", "state", "ok", "valid", "quality", "zustand", "gultig", "qualitat", "estado", "valido", "calidad"),
-        *("etat", "valide", "qualite"),
-    },
-}
+"""Words of standard uncertainties."""
+# A word of an approach is one beside a word of its axis alone.
+_NAMED = [column for name, column in _COLUMNS.items() if not name.endswith("_approach")]
 SECONDS = {"us": 1e-6, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 """Units of times that a name may say, in s."""
 DEGREES = {
@@ -154,42 +107,18 @@ def _field_of(name: str) -> str | None:
     axes = [axis for axis, spellings in _IMAGE_AXES.items() if words & spellings]
     sides = [side for side, spellings in _SIDES.items() if words & spellings]
     if len(axes) == len(sides) == 1:
-        return f"{'s' if words & _SPREAD else ''}{axes[0]}_{sides[0]}_px"
-    for axis in ("pan", "tilt"):
-        if words & _APPROACH and words & _WORDS[f"{axis}_steps"]:
+        return f"{'s' if words & SPREAD else ''}{axes[0]}_{sides[0]}_px"
+    for axis in AXES:
+        both = (_COLUMNS[f"{axis}_approach"], _COLUMNS[f"{axis}_steps"])
+        if all(words.intersection(column.names.split()) for column in both):
             return f"{axis}_approach"
-    # The first word tells most: "sheet_id" is of the sheet, "id of sheet" of the id.
-    return next((field for word in listed for field, spellings in _WORDS.items() if word in spellings), None)
+    return field_by_word(listed, _NAMED)
 
 
-AXIS_FIELDS = ("command", "value", "u", "time_s", "segment", "approach", "status")
-"""All that a table of an axis can give."""
-_AXIS_WORDS = {
-    "command": {
-        *("command", "commanded", "cmd", "counter", "steps", "step", "counts", "target", "goal", "position", "pos"),
-        *("microsteps", "microstep", "mikroschritte", "mikroschritt", "usteps", "ustep", "micropasos", "micropas"),
-        *("schritte", "soll", "sollwert", "zahler", "pasos", "contador", "consigna", "posicion", "pas", "consigne"),
-    },
-    "value": {
-        *("value", "reading", "read", "measured", "encoder", "angle", "ist", "istwert", "messwert", "winkel", "lesung"),
-        *("lectura", "medida", "valor", "angulo", "codificador", "lecture", "mesure", "codeur", "autocollimator"),
-    },
-    "u": {"u", "sd", "std", "sigma", "unc", "uncertainty", *_SPREAD} - {"s"},
-    "approach": _APPROACH | {"direction", "richtung", "direccion"},
-    # Of a scanner a run is an experiment; of an axis, what lies between two homings.
-    "segment": {*_WORDS["segment"], "run", "lauf", "durchlauf"},
-    **{name: _WORDS[name] for name in ("time_s", "status")},
-}
-_FOUND_BY_ENCODERS = {"position", "pos", "posicion", "counts", "zahler", "contador"}
-"""Words of commands that name what was read where another column is the command for certain."""
-_TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura", "humidity"}
-"""Degrees of these are no angle."""
-
-
-def axis_field_of(name: str) -> str | None:
-    """The field of an axis that a column's name tells of: by its first word that is known."""
-    known = (field for word in words_of(name) for field, spellings in _AXIS_WORDS.items() if word in spellings)
-    return next(known, None)
+def field_by_word(words: Sequence[str], columns: Iterable[Column]) -> str | None:
+    """The column that the first known word is a name of: "sheet_id" is of the sheet, "id of sheet" of the id."""
+    known = {word: column.name for column in columns for word in column.names.split()}
+    return next((known[word] for word in words if word in known), None)
 
 
 def understand(
@@ -230,43 +159,6 @@ def understand(
     claimed = {field: tuple(own) for field, own in claims.items() if len(own) > 1}
     used = {*found.values(), *(name for own in claimed.values() for name in own)}
     return Understood(found, claimed, tuple(name for name in names if name not in used))
-
-
-def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = None) -> Understood:
-    """Guess what columns of an axis are, as `understand`; some names are clear only beside others.
-
-    Beside "microsteps" a "position [um]" is what was read; where nothing else is, "mm" alone, or the one other column
-    that names a unit of readings, as "dial gauge mm".
-
-    Args:
-        columns: their names.
-        stated: column by field of `AXIS_FIELDS`, where somebody has said it; an empty column: the table has none.
-
-    Raises:
-        InputError: a field or column that does not exist.
-    """
-    names, said = list(columns), dict(stated or {})
-    known = understand(names, said, AXIS_FIELDS, axis_field_of)
-    if "value" in known.columns or "value" in known.claimed or "value" in said:
-        return known
-    claims = known.claimed.get("command", ())
-    found = [name for name in claims if _FOUND_BY_ENCODERS.intersection(words_of(name))]
-    sure = [name for name in claims if name not in found]
-    units = [name for name in known.unused if (words := words_of(name)) and all(map(_is_reading_unit, words))]
-    if len(sure) == len(found) == 1 and not units and (unit_of_name(found[0], READING_UNITS) or not known.unused):
-        return understand(names, {**said, "command": sure[0], "value": found[0]}, AXIS_FIELDS, axis_field_of)
-    units = units or [
-        name
-        for name in known.unused
-        if unit_of_name(name, READING_UNITS) and not _TEMPERATURE.intersection(words_of(name))
-    ]
-    if len(units) == 1 and not claims:
-        return understand(names, {**said, "value": units[0]}, AXIS_FIELDS, axis_field_of)
-    return known
-
-
-def _is_reading_unit(word: str) -> bool:
-    return any(word in _UNITS[unit] for unit in READING_UNITS)
 
 
 def missing(columns: Iterable[str], moves_known: bool) -> list[str]:

@@ -12,27 +12,28 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.files.csv_kind import ID_MAX, Column
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.foreign_table import ForeignTable
 from tvsbayes.instrument.axes import AXES, SENSES, Axis
 from tvsbayes.instrument.campaign import (
     APERTURE_MAX_DEG,
-    ID_MAX,
-    NO_PIXELS,
+    MOVES,
     PIXEL_SD_MAX,
     PIXEL_SD_MIN,
     PIXEL_SDS,
     PIXELS,
+    SPOTS,
     Move,
     Spot,
-    with_pixels,
+    next_move,
 )
 from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, unit_of_name
-from tvsbayes.instrument.counter_limits import COUNTER_MAX
 
 SD_PX = 0.1
 """Standard uncertainty of a centroid where a table states none; the fit scales it by what the spots show."""
@@ -101,29 +102,32 @@ class FieldCells:
         """Cells of a field; empty ones where no column gives it."""
         return list(self.table.columns[self.columns[field]]) if field in self else [""] * len(self.table)
 
-    def numbers(self, field: str, high: float, *, low: float | None = None, empty: bool = False) -> list[float | None]:
-        """Numbers from `low` (None: -`high`) to `high`; None for an empty cell where `empty` allows it."""
-        least = -high if low is None else low
-        found: list[float | None] = []
+    def read(self, column: Column, low: float | None = None, high: float | None = None, empty: bool = False) -> list:
+        """Values of a column of our files, its default in empty cells, None where it has none and `empty` allows it.
+
+        Args:
+            column: its limits hold where no others are given; "200.0" is a whole number.
+            low: another limit.
+            high: another limit.
+            empty: whether a cell may be empty although the column has no default.
+        """
+        field, empty = column.name, empty or column.may_be_empty
+        default = column.default if column.may_be_empty else None
+        least, most = column.low if low is None else low, column.high if high is None else high
+        found: list[Any] = []
         for row, cell in enumerate(self.text(field)):
             value = float(cell) if NUMBER.fullmatch(cell) else math.nan
             if not cell and empty:
-                found.append(None)
-            elif least <= value <= high:
-                found.append(value)
-            else:
+                found.append(default)
+            elif not least <= value <= most:
                 remedy = "correct the cell, or name another column"
-                raise self.refuse(row, field, f"a number from {least:g} to {high:g} for {field}", remedy)
-        return found
-
-    def integers(self, field: str, high: int, *, low: int | None = None, empty: bool = False) -> list[int | None]:
-        """Whole numbers, limits as of `numbers`; "200.0" is one."""
-        values = self.numbers(field, high, low=low, empty=empty)
-        for row, value in enumerate(values):
-            if value is not None and not value.is_integer():
+                raise self.refuse(row, field, f"a number from {least:g} to {most:g} for {field}", remedy)
+            elif column.kind is int and not value.is_integer():
                 remedy = "give the counters of the motors; angles are what the fit finds" if field in COUNTERS else ""
                 raise self.refuse(row, field, f"a whole number for {field}", remedy or "correct the cell")
-        return [None if value is None else int(value) for value in values]
+            else:
+                found.append(column.kind(value))
+        return found
 
     def refuse(self, row: int, field: str, allowed: str, remedy: str) -> InputError:
         """The error of one cell."""
@@ -168,18 +172,18 @@ def _listed_moves(cells: FieldCells, listed: Sequence[Move]) -> list[int]:
             allowed, remedy = "a column of move numbers, or a look for every move", "add --column move=NAME"
             raise refusal("missing-column", file=table.file, found=found, allowed=allowed, remedy=remedy)
         return list(range(count))
-    numbers = cells.integers("move", ID_MAX)
+    numbers = cells.read(MOVES["move"], low=-ID_MAX)
     for row, number in enumerate(numbers):
-        if number is None or not 0 <= number < len(listed):
+        if not 0 <= number < len(listed):
             allowed = f"the number of a move, 0 to {len(listed) - 1}"
             raise cells.refuse(row, "move", allowed, "moves count from 0; list them first")
-    return [int(number or 0) for number in numbers]
+    return numbers
 
 
 def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[tuple[Move, ...], list[int]]:
     """The moves of a table with counters, and the move of every row."""
     count = len(cells.table)
-    pairs = list(zip(*(cells.integers(field, COUNTER_MAX) for field in COUNTERS), strict=True))
+    pairs = list(zip(*(cells.read(MOVES[field]) for field in COUNTERS), strict=True))
     numbers = cells.text("move") if "move" in cells else None
     homings = homings_of(cells, assumed)
     times_s = seconds_of(cells, assumed)
@@ -188,7 +192,7 @@ def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[t
     of_row: list[int] = []
     at, segment = (0, 0), 0
     for row in range(count):
-        step = pairs[row][0] or 0, pairs[row][1] or 0
+        step = pairs[row]
         homed = homings[row]
         segment += homed
         again = row > 0 and (numbers[row] == numbers[row - 1] if numbers else True) and not homed
@@ -196,9 +200,9 @@ def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[t
         if not same:
             at = (at[0] + step[0], at[1] + step[1]) if notation.relative and row and not homed else step
             first = row == 0 or homed
-            words = [own[row] if first else "" for own in approaches]
+            pan_side, tilt_side = (own[row] if first else "" for own in approaches)
             time_s = float(len(moves)) if times_s is None else times_s[row]
-            moves.append(Move(len(moves), segment, time_s, *at, *words))  # type: ignore[arg-type]
+            moves.append(next_move(moves, segment, time_s, at, (pan_side, tilt_side)))  # type: ignore[arg-type]
         elif not notation.relative and step != at:
             remedy = "a new move begins a new number; or leave the column out with --column move="
             raise cells.refuse(
@@ -297,14 +301,14 @@ def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
 
 def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed: list[str]) -> tuple[Spot, ...]:
     """The looks of a table with pixels."""
-    pixels = [cells.numbers(field, 1e6, empty=True) for field in PIXELS]
-    stated = [cells.numbers(field, PIXEL_SD_MAX, empty=True) if field in cells else None for field in PIXEL_SDS]
+    pixels = [cells.read(SPOTS[field]) for field in PIXELS]
+    stated = [cells.read(SPOTS[field], low=-PIXEL_SD_MAX) if field in cells else None for field in PIXEL_SDS]
     if any(column is None for column in stated):
         text = f"standard uncertainty of a centroid: {notation.sd_px:g} px; --sd-px states another"
         assumed.append(f"{text}, the fit finds the scale" if all(c is None for c in stated) else text)
-    experiments = cells.integers("experiment", ID_MAX, low=0, empty=True)
-    points = cells.integers("point", 4, low=1, empty=True)
-    numbers = cells.integers("spot", ID_MAX, low=0, empty=True)
+    experiments, points = cells.read(SPOTS["experiment"]), cells.read(SPOTS["point"])
+    numbers = cells.read(SPOTS["spot"], empty=True)
+    others = {name: cells.read(SPOTS[name]) for name in SPOTS.optional}
     statuses, targets = cells.text("status"), cells.text("target")
     # The others are moves that nobody looked at.
     looked = [
@@ -319,7 +323,8 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
     if half:
         assumed.append(f"experiment, point: {half} row{'s' * (half != 1)} with one of both alone, which is left out")
     scale_deg = DEGREES[notation.angle_unit or unit_of_name(cells.columns.get("aperture_deg", ""), DEGREES) or "deg"]
-    readings = cells.numbers("aperture_deg", APERTURE_MAX_DEG / scale_deg, empty=True)
+    limit = APERTURE_MAX_DEG / scale_deg
+    readings = cells.read(SPOTS["aperture_deg"], -limit, limit)
     spots = []
     for row, move in enumerate(of_row):
         if not looked[row]:
@@ -329,12 +334,23 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
         number = numbers[row] if unique else row
         reading = None if (read := readings[row]) is None else scale_deg * read
         both = (experiments[row], points[row]) if None not in (experiments[row], points[row]) else (None, None)
-        target = readable(targets[row], "sheet", 100)
-        spot = Spot(number or 0, move, target, *both, *NO_PIXELS, *NO_PIXELS, status=status)
+        values = {name: column[row] for name, column in others.items()}
         if status == "ok":
             sds = [_sd_px(cells, row, field, column, notation) for field, column in zip(PIXEL_SDS, stated, strict=True)]
-            spot = with_pixels(spot, "ok", [(value or 0.0) - notation.pixels_from for value in centre], sds)
-        spots.append(replace(spot, aperture_deg=reading))
+            centre = [value - notation.pixels_from for value in centre]
+            values |= dict(zip((*PIXELS, *PIXEL_SDS), (*centre, *sds), strict=True))
+        spots.append(
+            Spot(
+                spot=number,
+                move=move,
+                target=readable(targets[row], "sheet", 100),
+                experiment=both[0],
+                point=both[1],
+                aperture_deg=reading,
+                status=status,
+                **values,
+            )
+        )
     assumed += left_out(cells, statuses, "look")
     return tuple(spots)
 

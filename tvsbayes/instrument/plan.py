@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tvsbayes.errors import InputError, escaped, refusal
-from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes, parse_table
+from tvsbayes.errors import InputError, escaped
+from tvsbayes.files.csv_kind import Column, CsvKind, Values, counted
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table
 from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.instrument.axes import AXES, HOME_APPROACH, Axis, PanApproach, TiltApproach, direction_of
-from tvsbayes.instrument.campaign import ID_MAX, Move, check_experiments
+from tvsbayes.instrument.campaign import Move, check_experiments, next_move
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import rests_of
@@ -30,13 +31,18 @@ LOOKS_PER_EXPERIMENT = 4
 class PlanStep:
     """A row of `plan.csv`. `home` begins a segment; `place` names a target; `look` observes."""
 
-    step: int
-    action: Literal["home", "place", "move", "look"]
-    pan_steps: int | None = None
-    tilt_steps: int | None = None
-    target: str = ""
-    experiment: int | None = None
-    point: int | None = None
+    step: Annotated[int, Column("0, 1, 2, ...", rule=counted)]
+    action: Annotated[
+        Literal["home", "place", "move", "look"],
+        Column("`home` (the first), `place`, `move` or `look`; which columns it fills, see below"),
+    ]
+    pan_steps: Annotated[
+        int | None, Column("absolute counters, whole numbers, or empty", -COUNTER_MAX, COUNTER_MAX)
+    ] = None
+    tilt_steps: Annotated[int | None, Column("", -COUNTER_MAX, COUNTER_MAX)] = None
+    target: Annotated[str, Column("name of a sheet of the rig file, or empty")] = ""
+    experiment: Annotated[int | None, Column("of the four-point method: number, and 1 to 4; both or neither")] = None
+    point: Annotated[int | None, Column("", 1, 4)] = None
 
     def counters(self, at: tuple[int, int]) -> tuple[int, int]:
         """Counters (pan, tilt) after this step, where the axes stood at `at` before it."""
@@ -46,7 +52,7 @@ class PlanStep:
         return pan if self.pan_steps is None else self.pan_steps, tilt if self.tilt_steps is None else self.tilt_steps
 
 
-_PLAN_COLUMNS = ("step", "action", "pan_steps", "tilt_steps", "target", "experiment", "point")
+PLANS = CsvKind(PlanStep, "plan.csv", no_rows=("at least one step", "begin with step 0, action home"))
 # Columns that an action must fill, and those it must leave empty; the others are optional.
 _PLAN_ACTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "home": ((), ("target", "experiment", "point")),
@@ -56,21 +62,11 @@ _PLAN_ACTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def parse_plan(data: bytes, file: str = "plan.csv") -> tuple[PlanStep, ...]:
-    """The checked rows of `plan.csv`; see `read_plan`."""
-    table = parse_table(data, file, _PLAN_COLUMNS)
-    if not len(table):
-        allowed, remedy = "at least one step", "begin with step 0, action home"
-        raise refusal("empty", file=file, line=1, found="no rows", allowed=allowed, remedy=remedy)
-    steps = table.integers("step", 0, ID_MAX)
-    table.check_counting("step", steps)
-    actions, targets = table.columns["action"], table.texts("target")
-    pan = table.integers("pan_steps", -COUNTER_MAX, COUNTER_MAX, empty=True)
-    tilt = table.integers("tilt_steps", -COUNTER_MAX, COUNTER_MAX, empty=True)
-    experiments, points = table.integers("experiment", 0, ID_MAX, True), table.integers("point", 1, 4, True)
-    check_experiments(table, experiments, points, [True] * len(table))
-    placed = ""
-    for row, action in enumerate(actions):
+def _actions(table: Table, values: Values) -> None:
+    """Refuses an action without its columns or with another's, and a look before a place."""
+    check_experiments(table, values["experiment"], values["point"], [True] * len(table))
+    targets, placed = values["target"], ""
+    for row, action in enumerate(values["action"]):
         if action not in (_PLAN_ACTIONS if row else ("home",)):
             allowed = "home, place, move or look" if row else "home, the first action"
             raise table.refuse(row, "action", "action", allowed, "begin with home; one action per row")
@@ -84,11 +80,15 @@ def parse_plan(data: bytes, file: str = "plan.csv") -> tuple[PlanStep, ...]:
         elif action == "look" and (not placed or targets[row] not in ("", placed)):
             allowed = f"an empty cell or {placed}, placed last" if placed else "a place before the look"
             raise table.refuse(row, "target", "target", allowed, "place the target first")
-    pan, tilt = (
-        [0 if action == "home" and n is None else n for action, n in zip(actions, counters, strict=True)]
-        for counters in (pan, tilt)
+
+
+def parse_plan(data: bytes, file: str = PLANS.file) -> tuple[PlanStep, ...]:
+    """The checked rows of `plan.csv`; see `read_plan`."""
+    steps = PLANS.parse(data, file, _actions)
+    return tuple(
+        replace(step, pan_steps=step.pan_steps or 0, tilt_steps=step.tilt_steps or 0) if step.action == "home" else step
+        for step in steps
     )
-    return tuple(map(PlanStep, steps, actions, pan, tilt, targets, experiments, points))
 
 
 def read_plan(path: Path) -> tuple[PlanStep, ...]:
@@ -102,7 +102,7 @@ def read_plan(path: Path) -> tuple[PlanStep, ...]:
 
 def write_plan(steps: Sequence[PlanStep], path: Path) -> None:
     """Writes `plan.csv` atomically; refuses what `read_plan` would refuse."""
-    data = csv_bytes(_PLAN_COLUMNS, ([getattr(s, c) for c in _PLAN_COLUMNS] for s in steps))
+    data = PLANS.content(steps)
     parse_plan(data, escaped(Path(path).name))
     write_atomically(path, data)
 
@@ -195,9 +195,9 @@ def run_plan(
         if step.action == "home" or (not log.moves and step.action in ("move", "look")):
             segment += 1
             counters = step.counters((0, 0)) if step.action == "home" else (0, 0)
-            log.moves.append(Move(len(log.moves), segment, time_s, *counters, *home_approach))
+            log.moves.append(next_move(log.moves, segment, time_s, counters, home_approach))
         if step.action == "move":
-            log.moves.append(Move(len(log.moves), segment, time_s, *step.counters(log.at)))
+            log.moves.append(next_move(log.moves, segment, time_s, step.counters(log.at)))
         elif step.action == "place":
             if step.target not in rig.sheets_mm:
                 raise InputError(

@@ -9,16 +9,26 @@ from __future__ import annotations
 import datetime
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, escaped, refusal
-from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes, parse_table
+from tvsbayes.files.csv_kind import (
+    Column,
+    CsvKind,
+    filled_where_ok,
+    first_of_segment,
+    follows_a_move,
+    templates,
+    unique,
+)
+from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
-from tvsbayes.instrument.column_names import DEGREES
+from tvsbayes.instrument.campaign import MOVES, SPOTS
+from tvsbayes.instrument.column_names import DEGREES, SPREAD
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, STATED_KEYS, AxisPrior
 
 FORMAT = "tvsbayes-axis/1"
@@ -31,18 +41,35 @@ TURNS = {**{unit: 360.0 / in_deg for unit, in_deg in DEGREES.items()}, "turn": 1
 """One turn in the units of angles."""
 _NEVER_NOUGHT = ("transmission_error_length", "reading_scale")
 """Log-normals that the model divides by: held at 0, every density is without a value."""
-_ID_MAX = 10**9
+_MOVE = replace(MOVES["move"], names="")
 
 
 @dataclass(frozen=True, slots=True)
 class AxisMove:
     """A row of `moves.csv`: the command AFTER the move; `approach` in the first row of a segment, else empty."""
 
-    move: int
-    segment: int
-    time_s: float
-    command: float
-    approach: Approach | Literal[""] = ""
+    move: Annotated[int, _MOVE]
+    # Of a scanner a run is an experiment; of an axis, what lies between two homings.
+    segment: Annotated[int, replace(MOVES["segment"], names=MOVES["segment"].names + " run lauf durchlauf")]
+    time_s: Annotated[float, MOVES["time_s"]]
+    command: Annotated[
+        float,
+        Column(
+            "absolute counter or commanded position AFTER the move; decimals allowed",
+            *(-COMMAND_MAX, COMMAND_MAX),
+            names="command commanded cmd counter steps step counts target goal position pos microsteps microstep "
+            "mikroschritte mikroschritt usteps ustep micropasos micropas schritte soll sollwert zahler pasos contador "
+            "consigna posicion pas consigne",
+        ),
+    ]
+    approach: Annotated[
+        Approach | Literal[""],
+        Column(
+            "in the first row of a segment: `forward` (rising command), `backward` or `unknown`; empty elsewhere",
+            rule=first_of_segment,
+            names=MOVES["pan_approach"].names + " direction richtung direccion",
+        ),
+    ] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +79,42 @@ class Reading:
     `value` is a number where `status` is "ok", and may be None elsewhere.
     """
 
-    reading: int
-    move: int
-    value: float | None
-    u: float = 0.0
-    status: str = "ok"
+    reading: Annotated[int, Column("unique id", rule=unique)]
+    move: Annotated[int, Column("the last move before it")]
+    value: Annotated[
+        float | None,
+        Column(
+            "in `unit`; angles without jumps of a whole turn (those are refused: add or subtract a turn, as `import` "
+            "does)",
+            *(-COMMAND_MAX, COMMAND_MAX),
+            rule=filled_where_ok("give the value, or say why there is none"),
+            names="value reading read measured encoder angle ist istwert messwert winkel lesung lectura medida valor "
+            "angulo codificador lecture mesure codeur autocollimator",
+        ),
+    ] = None
+    u: Annotated[
+        float,
+        Column(
+            "standard uncertainty; empty or 0 where nobody knows: readings repeated at one move tell it, else the "
+            "scatter of stops covers it",
+            *(0.0, COMMAND_MAX),
+            names=" ".join(["u", *sorted(SPREAD - {"s"})]),
+        ),
+    ] = 0.0
+    status: Annotated[
+        str,
+        replace(SPOTS["status"], meaning="`ok`, or why the reading is not to be used (`value` may be empty)"),
+    ] = "ok"
+
+
+AXIS_MOVES = CsvKind(
+    AxisMove,
+    "moves.csv",
+    "a row after every move, in time order",
+    ("at least one row", "write row 0: the command and the approach to the first stop"),
+    [AxisMove(0, 0, 0.0, 0, "unknown")],
+)
+READINGS = CsvKind(Reading, "readings.csv", "a row for every reading")
 
 
 @dataclass(frozen=True, repr=False)
@@ -90,8 +148,6 @@ class AxisCampaign(Shown):
         )
 
 
-_MOVE_COLUMNS = ("move", "segment", "time_s", "command", "approach")
-_READING_COLUMNS = ("reading", "move", "value", "u", "status")
 _TEXTS = {**dict.fromkeys(("name", "operator", "instrument", "serial", "method"), 200), "notes": 4000}
 _FILES = {"moves.csv": CSV_BYTES_MAX, "readings.csv": CSV_BYTES_MAX, "campaign.toml": TOML_BYTES_MAX}
 """campaign.toml is written last: a folder without it is recognisably unfinished."""
@@ -99,38 +155,12 @@ _FILES = {"moves.csv": CSV_BYTES_MAX, "readings.csv": CSV_BYTES_MAX, "campaign.t
 
 def parse_axis_moves(data: bytes, file: str = "moves.csv") -> tuple[AxisMove, ...]:
     """The checked rows of `moves.csv`; at least one."""
-    table = parse_table(data, file, _MOVE_COLUMNS)
-    if not len(table):
-        allowed, remedy = "at least one row", "write row 0: the command and the approach to the first stop"
-        raise refusal("empty", file=file, line=1, found="no rows", allowed=allowed, remedy=remedy)
-    moves = table.integers("move", 0, _ID_MAX)
-    segments = table.integers("segment", 0, _ID_MAX)
-    times_s = table.numbers("time_s", -1e12, 1e12)
-    commands = table.numbers("command", -COMMAND_MAX, COMMAND_MAX)
-    table.check_counting("move", moves)
-    table.check_segments(segments, times_s)
-    table.check_first_words("approach", segments, APPROACHES, "state how the axis arrived there")
-    return tuple(map(AxisMove, moves, segments, times_s, commands, table.columns["approach"]))  # type: ignore[arg-type]
+    return AXIS_MOVES.parse(data, file)
 
 
 def parse_readings(data: bytes, file: str, moves: int) -> tuple[Reading, ...]:
     """The checked rows of `readings.csv`; `moves` is the number of moves, which `move` must name."""
-    table = parse_table(data, file, _READING_COLUMNS)
-    ids = table.integers("reading", 0, _ID_MAX)
-    table.check_unique("reading", ids, "unique ids")
-    move_ids = table.integers("move", 0, _ID_MAX)
-    for row, move in enumerate(move_ids):
-        if move >= moves:
-            allowed = f"a row of moves.csv: 0 to {moves - 1}"
-            raise table.refuse(row, "move", "missing-move", allowed, "name the last move before the reading")
-    values = table.numbers("value", -COMMAND_MAX, COMMAND_MAX, True)
-    sds = table.numbers("u", 0.0, COMMAND_MAX, True)
-    statuses = table.texts("status", 200, empty=False)
-    for row, value in enumerate(values):
-        if value is None and statuses[row] == "ok":
-            allowed = "a finite decimal number, or an empty cell with a status other than ok"
-            raise table.refuse(row, "value", "missing", allowed, "give the value, or say why there is none")
-    return tuple(map(Reading, ids, move_ids, values, (u or 0.0 for u in sds), statuses))
+    return READINGS.parse(data, file, follows_a_move(moves, "reading"))
 
 
 def _parse_header(keys: Keys) -> dict[str, object]:
@@ -216,14 +246,19 @@ def read_axis(folder: Path | str) -> AxisCampaign:
     return _parse_files({name: read_bytes(folder / name, cap, folder) for name, cap in _FILES.items()}, folder)
 
 
+def axis_templates() -> dict[str, bytes]:
+    """The commented files of an empty axis folder."""
+    return templates("axis_templates", AXIS_MOVES, READINGS)
+
+
 def axis_moves_bytes(moves: Iterable[AxisMove]) -> bytes:
     """The content of `moves.csv`."""
-    return csv_bytes(_MOVE_COLUMNS, ([getattr(m, c) for c in _MOVE_COLUMNS] for m in moves))
+    return AXIS_MOVES.content(moves)
 
 
 def readings_bytes(readings: Iterable[Reading]) -> bytes:
     """The content of `readings.csv`."""
-    return csv_bytes(_READING_COLUMNS, ([getattr(r, c) for c in _READING_COLUMNS] for r in readings))
+    return READINGS.content(readings)
 
 
 def _axis_table_lines(stated: dict[str, AxisPrior]) -> list[str]:

@@ -17,7 +17,7 @@ import numpy as np
 from tvsbayes.display import Shown, View
 from tvsbayes.files.disk import make_folder, write_atomically
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
-from tvsbayes.instrument.campaign import NO_PIXELS, UNDETECTED, Campaign, Move, Spot, campaign_bytes, with_pixels
+from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Move, Spot, campaign_bytes, with_pixels
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
 from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, require_periods
@@ -263,7 +263,14 @@ def _spot(
 ) -> Spot:
     """A row of spots.csv; the aperture sees what a camera sees, so an unseen spot has no reading."""
     step = look.step
-    row = Spot(number, look.move, target, step.experiment, step.point, *NO_PIXELS, *NO_PIXELS, status=UNDETECTED)
+    row = Spot(
+        spot=number,
+        move=look.move,
+        target=target,
+        experiment=step.experiment,
+        point=step.point,
+        status=UNDETECTED,
+    )
     if not np.isfinite(pixels).all():
         return row
     return with_pixels(replace(row, aperture_deg=aperture_deg), "ok", pixels.tolist(), (sd_px,) * 4)
