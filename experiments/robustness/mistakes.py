@@ -30,6 +30,7 @@ from tvsbayes.instrument.parameters import Prior, names_of
 from tvsbayes.instrument.plan import PlanStep, read_plan
 from tvsbayes.instrument.protocols import PROTOCOLS, four_point_protocol, grid_protocol
 from tvsbayes.instrument.rig import Rig, read_rig
+from tvsbayes.instrument.stereo_pair import pair_doubts
 from tvsbayes.twin.simulated_campaign import simulate
 
 PLANS = ("paper", "paper_twin", "mixed", "grid")
@@ -207,9 +208,16 @@ SHEETS = {
 
 
 def poorly_calibrated(campaign: Campaign, rng: np.random.Generator) -> Campaign:
-    """Cameras that are off by ten draws' worth of their stated covariance."""
-    off = 10 * rng.multivariate_normal(np.zeros(24), campaign.stereo.parameter_covariance)
-    return replace(campaign, stereo=campaign.stereo.with_vector(campaign.stereo.vector + off))
+    """Cameras that are off by ten draws' worth of their stated covariance.
+
+    A draw that no lens has (distortion that folds inside the picture) is a mistake of its own, and rightly named:
+    it is drawn again.
+    """
+    while True:
+        off = 10 * rng.multivariate_normal(np.zeros(24), campaign.stereo.parameter_covariance)
+        stereo = campaign.stereo.with_vector(campaign.stereo.vector + off)
+        if not pair_doubts(stereo):
+            return replace(campaign, stereo=stereo)
 
 
 FIRST_LOOKS, CUTS = 24, 12

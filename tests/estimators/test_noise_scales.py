@@ -9,12 +9,13 @@ from tests.support.dense_spots import dense_covariance
 from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
 from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.estimators.noise_scales import ScalesAlone, noise_draws
-from tvsbayes.instrument.parameters import INDEX, names_of
+from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, names_of
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.statistics.weighted_draws import effective_draws
 
 STOPS = [INDEX[name] for name in names_of("stop_sd_deg")]
 PIXEL = INDEX["pixel_scale"]
+SCATTER = [INDEX[name] for name in LOOK_SCATTER_NAMES]
 
 
 def dense_density(fit, z: np.ndarray) -> float:
@@ -29,11 +30,15 @@ def dense_density(fit, z: np.ndarray) -> float:
     covariance = dense_covariance(spots) + columns @ columns.T
     # Residuals are in units of the pixel noise; of four components of a look its range takes one.
     scale = 3 * count * np.log(physical_at(z, fit.space).value[PIXEL])
+    # These units have the scatter of looks in them: of the unit covariance the pixels have 1 - slope D slope^T.
+    slope = np.asarray(lin.slope)
+    pixels = np.eye(4) - np.einsum("nia,na,nja->nij", slope, np.asarray(lin.scatter_variance), slope)
+    scale -= 0.5 * float(np.sum(np.linalg.slogdet(pixels)[1]))
     prior = 0.5 * float(np.sum(z[fit.held & fit.free] ** 2))
     return -0.5 * (np.linalg.slogdet(covariance)[1] + residual @ np.linalg.solve(covariance, residual)) - scale - prior
 
 
-@pytest.mark.parametrize("column", [*STOPS, PIXEL])
+@pytest.mark.parametrize("column", [*STOPS, PIXEL, *SCATTER])
 def test_the_density_is_that_of_a_dense_gaussian(mixed_fit, column):
     other = mixed_fit.z.copy()
     other[column] += 0.4

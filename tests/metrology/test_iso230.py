@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -71,7 +72,7 @@ def test_figures_of_many_tests_are_those_of_each():
     together = figures_of(up, down)
     for k in range(3):
         one = figures_of(up[k], down[k])
-        for name in vars(one):
+        for name in msgspec.structs.asdict(one):
             np.testing.assert_allclose(getattr(together, name)[k], getattr(one, name), rtol=ROUNDING)
 
 
@@ -97,7 +98,7 @@ def test_runs_that_were_not_made_are_left_out():
     up, down = rng.normal(size=(2, 3)), rng.normal(size=(2, 4))
     padded = np.full((2, 6), np.nan)
     padded[:, 1:4] = up
-    for name, value in vars(figures_of(padded, down)).items():
+    for name, value in msgspec.structs.asdict(figures_of(padded, down)).items():
         np.testing.assert_allclose(value, getattr(figures_of(up, down), name), rtol=ROUNDING)
 
 

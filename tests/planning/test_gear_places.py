@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 from support.coarse_planning import ROUNDING, with_priors
 
 from tvsbayes.instrument.axes import DIRECTIONS
@@ -289,8 +290,10 @@ def test_a_point_between_the_places_has_what_they_leave_open(real):
         assert at.gradient.shape == (1, known.size)
         own[y_mm] = float(at.own[GEARS_AT_POINT][0])
         errors = float(np.sum(at.gradient[0, PARAMETERS:] ** 2)) + own[y_mm]
-        # Stop errors of 0.04 deg; errors of 0.05 and half the play's 0.02 deg, root mean squares of half-normals.
-        assert np.sqrt(errors / at.own[AT_POINT[0]][0]) == pytest.approx(np.hypot(0.05, 0.01) / 0.04, rel=1e-3)
+        # Errors of 0.05 and half the play's 0.02 deg, root mean squares of half-normals. A look there meets a stop
+        # error of 0.04 deg and the scatter of looks, both as most probable: the median of a half-normal of 0.01 deg.
+        of_a_look = np.hypot(0.04, 0.01 * stats.halfnorm.median())
+        assert np.sqrt(errors / at.own[AT_POINT[0]][0]) == pytest.approx(np.hypot(0.05, 0.01) / of_a_look, rel=1e-3)
     assert own[0.0] < 0.1 * own[900.0]
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import optimize
+from scipy import optimize, stats
 from support.coarse_planning import with_priors
 
 from tvsbayes.errors import InputError
@@ -104,8 +104,10 @@ def test_stops_and_reading_at_a_point_are_those_of_the_twins_optics(mounted_rig,
     # Central differences: the step moves the point by 3e-4 of its distance, the third derivative by its square.
     step_deg = 0.01
     moved = np.array([(seen_at(*step) - seen_at(*-step)) / (2 * step_deg) for step in step_deg * np.eye(3)])
-    # By default a point is reached left and up.
-    stop_mm2 = (moved[0] * 0.03) ** 2 + (moved[1] * 0.04) ** 2
+    # By default a point is reached left and up; a look there meets the scatter of looks besides the stop error, which
+    # before any data is the median of its half-normal prior.
+    scatter_deg = [table.priors[f"look_scatter_deg.{axis}"].u * stats.halfnorm.median() for axis in ("pan", "tilt")]
+    stop_mm2 = moved[0] ** 2 * (0.03**2 + scatter_deg[0] ** 2) + moved[1] ** 2 * (0.04**2 + scatter_deg[1] ** 2)
     reading_mm2 = (moved[2] * values["aperture_sd_deg"]) ** 2
     target = parse_target("u(xyz) at 900,50,250 mm <= 1 mm")
     at = sensitivity(target, known.z, known.space, table, np.zeros(2))
@@ -114,3 +116,6 @@ def test_stops_and_reading_at_a_point_are_those_of_the_twins_optics(mounted_rig,
     for cause, variance_mm2 in zip(AT_POINT, (stop_mm2, reading_mm2), strict=True):
         assert at.own[cause] == pytest.approx(variance_mm2, abs=half_step_rad * variance_mm2.max()), cause
     assert (moved[1] * 0.04)[2] ** 2 > 0.1 * stop_mm2[2], "tilt counts, or it could be left out"
+    # Tolerance of the loop above, the half step: without the scatter of looks it would be missed.
+    without_mm2 = (moved[0] * 0.03) ** 2 + (moved[1] * 0.04) ** 2
+    assert stop_mm2.max() - without_mm2.max() > half_step_rad * stop_mm2.max()

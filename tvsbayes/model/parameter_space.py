@@ -27,6 +27,7 @@ from tvsbayes.instrument.parameters import (
     BLOCKS,
     INDEX,
     KINDS,
+    LOOK_SCATTER_NAMES,
     NAMES,
     PERIODS_MAX,
     RECEIVER_NAMES,
@@ -195,6 +196,7 @@ def _slopes(space: ParameterSpace, z: Any, values: Any, functions: ModuleType) -
 SCALE = np.array([np.pi / 180 if REGISTRY[name].unit.startswith("deg") else 1.0 for name in NAMES])
 """Contract units -> rad and mm."""
 STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{side}"] for side in SIDES[axis]] for axis in AXES])
+SCATTER_COLUMNS = np.array([INDEX[name] for name in LOOK_SCATTER_NAMES])
 """Coordinates of the stop sds by axis and approach side, (right, left) and (down, up): shape (2, 2)."""
 
 

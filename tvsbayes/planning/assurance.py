@@ -16,7 +16,7 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace
+from tvsbayes.model.parameter_space import SCATTER_COLUMNS, STOP_COLUMNS, ParameterSpace
 from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, Knowledge
@@ -240,16 +240,25 @@ class Assurance:
         return Sensitivity(np.einsum("nqi,niqp->nqp", weights, scene.gradient))
 
     def rescaled(self, seen: Seen, instruments: Instruments, z: np.ndarray) -> Seen:
-        """The same looks (n, m) whitened with noise scales of other coordinates (n, p): I s^2 + slope S slope^T."""
+        """The same looks (n, m) whitened with noise scales of other coordinates (n, p), the scatter of looks as it is.
+
+        Rows and slope J are in units of pixels and scatter of looks D together: J D J^T of I is the scatter's, the rest
+        goes with the pixel scale s. With stop errors S the covariance is s^2 (I - J D J^T) + J (D + S) J^T.
+        """
         u, true = np.asarray(self.family.knowledge.space.u)[SCALES], instruments.value[:, SCALES]
         before, after = (true * np.exp(u * point[:, SCALES]) for point in (instruments.z, z))
         pixel = after[:, 4] / before[:, 4]
         sides = (self.looks.side > 0).astype(int)
+
+        def of_angles(sd_deg: np.ndarray) -> np.ndarray:
+            return (seen.slope * np.radians(sd_deg)[:, :, None] ** 2) @ np.swapaxes(seen.slope, -1, -2)
+
+        by_looks = of_angles(instruments.physical[:, None, SCATTER_COLUMNS])
         # Both roots are taken in the three dimensions that the residual has; rows are turned, not only scaled.
         old, new = (
-            p[:, None, None, None] ** 2 * np.eye(4)
-            + (seen.slope * np.radians(scale[:, :4].reshape(-1, 2, 2)[:, [0, 1], sides])[:, :, None] ** 2)
-            @ np.swapaxes(seen.slope, -1, -2)
+            p[:, None, None, None] ** 2 * (np.eye(4) - by_looks)
+            + by_looks
+            + of_angles(scale[:, :4].reshape(-1, 2, 2)[:, [0, 1], sides])
             for p, scale in ((np.ones(len(pixel)), before), (pixel, after))
         )
         turn = np.linalg.solve(np.linalg.cholesky(new), np.linalg.cholesky(old))

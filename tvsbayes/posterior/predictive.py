@@ -28,16 +28,15 @@ from tvsbayes.estimators.likelihood import (
 from tvsbayes.estimators.looks import observe_with_stop_errors
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
-from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, names_of
+from tvsbayes.instrument.parameters import INDEX, names_of
 from tvsbayes.model.compiled import compiled, in_batches
-from tvsbayes.model.parameter_space import STOP_COLUMNS, ParameterSpace
+from tvsbayes.model.parameter_space import SCATTER_COLUMNS, STOP_COLUMNS, ParameterSpace
 from tvsbayes.posterior.draws import Posterior
 
 if TYPE_CHECKING:
     import xarray as xr
 
 DRIFT_COLUMNS = [INDEX[name] for name in names_of("drift_deg_per_root_hour")]
-SCATTER_COLUMNS = [INDEX[name] for name in LOOK_SCATTER_NAMES]
 RANK_TOLERANCE = 1e-12
 """Share of a state's precision below which what other states leave of it is rounding, not information."""
 

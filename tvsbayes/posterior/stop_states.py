@@ -15,10 +15,7 @@ import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots
-from tvsbayes.instrument.parameters import INDEX, names_of
-from tvsbayes.model.parameter_space import STOP_COLUMNS
-
-SCATTER_COLUMNS = np.array([INDEX[name] for name in names_of("look_scatter_deg")])
+from tvsbayes.model.parameter_space import SCATTER_COLUMNS, STOP_COLUMNS
 
 
 @dataclass(frozen=True)

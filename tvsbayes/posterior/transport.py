@@ -26,8 +26,14 @@ from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, NOISE_NA
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import place_root
-from tvsbayes.model.parameter_space import FARTHEST_SD, STOP_COLUMNS, half_normal, half_normal_slope
-from tvsbayes.posterior.stop_states import SCATTER_COLUMNS, Elimination, StopStates, stop_states
+from tvsbayes.model.parameter_space import (
+    FARTHEST_SD,
+    SCATTER_COLUMNS,
+    STOP_COLUMNS,
+    half_normal,
+    half_normal_slope,
+)
+from tvsbayes.posterior.stop_states import Elimination, StopStates, stop_states
 
 GEAR_SCALES = np.array(
     [
