@@ -9,6 +9,7 @@ from itertools import chain
 import cv2
 import numpy as np
 import pytest
+from msgspec import structs
 
 from tvsbayes.cameras.assumed_covariance import (
     CORRELATED,
@@ -244,7 +245,7 @@ def test_command_takes_what_is_known(mounted, tmp_path, capsys):
 
 def test_a_fit_says_how_much_comes_from_it(mounted):
     row = BudgetRow("stereo calibration", "deg", None, 0.1, "B", "normal", None, 1.0, 0.1, 0.62)
-    other = replace(row, share=0.01)
+    other = structs.replace(row, share=0.01)
     tables = [
         BudgetTable(name, "deg", 1.0, (entry,), 0.1, None, 2.0, 0.95, 0.2, ())
         for name, entry in (("effective_deg_per_step.left", row), ("backlash_deg.pan", other))

@@ -37,7 +37,7 @@ from tvsbayes.report.page import (
     typeset,
 )
 from tvsbayes.report.parameter_words import cause_in_words, name_in_words, share_in_words, source_in_words
-from tvsbayes.report.tables import Issue, Page, Section, TableView
+from tvsbayes.report.tables import Issue, Page, Section, TableView, chance_text
 
 BYTES_MAX = 3_000_000
 
@@ -110,7 +110,10 @@ def test_numbers_of_the_page_are_the_libraries(page, evidence):
         assert word in text
     for sha in evidence.fit.provenance.inputs.values():
         assert sha in text
-    assert "Not met" in text and "probability at most" in text
+    # One draw of a point within 1 mm, or none: the fit decides whether the chance is a bound or below what draws tell.
+    (missed,) = (c for c in evidence.criteria if c.verdict == "not met")
+    chance = chance_text(missed.probability, "at most ")
+    assert f"Not met: {missed.quantity} within 1 mm (probability {chance})" in text
 
 
 def test_the_first_page_has_the_answer_and_who_asked(page, evidence):

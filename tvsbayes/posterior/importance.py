@@ -338,7 +338,7 @@ def importance_run(
     seed: int,
     advance: Advance = unshown,
     rounds_max: int = ROUNDS_MAX,
-    rounds_least: int = ROUNDS_LEAST,
+    rounds_least: int | None = None,
 ) -> ImportanceRun:
     """Draw rounds until the answer is accepted; where that would take too long, from a proposal fitted anew.
 
@@ -347,7 +347,7 @@ def importance_run(
         seed: of the draws.
         advance: told how far it is.
         rounds_max: of all proposals together.
-        rounds_least: of the proposal that gives the answer.
+        rounds_least: of the proposal that gives the answer, by default `ROUNDS_LEAST`.
 
     Raises:
         NotConverged: the density is not finite around the mode.
@@ -360,7 +360,8 @@ def importance_run(
     target = Target(fit, path)
     try:
         pool = piloted(target, generator)
-        total, rounds, wanted, patience = PILOT_ROUNDS, 0, rounds_least, PATIENCE * rounds_least
+        wanted = ROUNDS_LEAST if rounds_least is None else rounds_least
+        total, rounds, patience = PILOT_ROUNDS, 0, PATIENCE * wanted
         while True:
             while rounds < wanted:
                 rounds, total = rounds + 1, total + 1

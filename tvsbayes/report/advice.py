@@ -120,7 +120,7 @@ def assumed_stereo(stereo: Stereo, budgets: Sequence[BudgetTable]) -> str | None
 
 
 def steps_ahead(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()) -> list[str]:
-    """What to do next, most urgent first, for whoever reads the page of the campaign in a folder of that name.
+    """What to do next, most urgent first, in words for the page of the campaign in a folder of that name.
 
     `causes` explain a fit that failed.
     """

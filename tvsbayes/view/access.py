@@ -81,7 +81,7 @@ class Access:
         return None
 
     def key_for(self, token: str) -> str | None:
-        """A key for whoever brings the token, the first of which controls; None for a wrong one."""
+        """A key for a browser that brings the token, the first of which controls; None for a wrong one."""
         if not _same(token, self._token):
             return None
         key = secrets.token_urlsafe(TOKEN_BYTES)
