@@ -223,7 +223,7 @@ def test_opencvs_own_sample_files():
     assert len(keys.table("extrinsic_parameters").values["data"]) == 78
     with pytest.raises(InputError, match="one camera"):
         read_calibration([OPENCV_DATA / "left_intrinsics.yml"])
-    with pytest.raises(InputError, match="found no R T .* name the other file too"):
+    with pytest.raises(InputError, match="name the other file too"):
         read_calibration([OPENCV_DATA / "intrinsics.yml"], (640, 480))
 
 
