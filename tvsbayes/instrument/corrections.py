@@ -1,7 +1,7 @@
 """Corrections of whole tables that `check` names: the other sign of a counter, rows shifted, cameras exchanged.
 
 Moves and spots in, moves and spots out; steps and px. An approach is the direction in which the beam moved, in words of
-whoever saw it, so it stays where a counter gets the other sign.
+the person who saw it, so it stays where a counter gets the other sign.
 """
 
 from __future__ import annotations

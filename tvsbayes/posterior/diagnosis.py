@@ -21,8 +21,6 @@ from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_name
 from tvsbayes.posterior.importance import ImportanceRun, uncertain
 from tvsbayes.posterior.proposal import Target, place_normals
 from tvsbayes.results.convergence import (
-    ROUGH_END_ERROR_MAX,
-    ROUGH_MEAN_ERROR_MAX,
     Agreement,
     Convergence,
     MonteCarloError,
@@ -266,7 +264,7 @@ def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
         rough=bool(
             np.max(quality.rhat) <= ROUGH_RHAT
             and not quality.stuck.any()
-            and all(error.within(ROUGH_MEAN_ERROR_MAX, ROUGH_END_ERROR_MAX) for error in errors.values())
+            and all(error.roughly_known for error in errors.values())
         ),
     )
     weights = np.full((walkers, draws), 1 / (walkers * draws))

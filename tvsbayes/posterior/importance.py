@@ -33,8 +33,6 @@ from tvsbayes.progress import Advance, OpenEnded, unshown
 from tvsbayes.results.convergence import (
     END_ERROR_MAX,
     MEAN_ERROR_MAX,
-    ROUGH_END_ERROR_MAX,
-    ROUGH_MEAN_ERROR_MAX,
     Importance,
     MonteCarloError,
     Reweighted,
@@ -239,7 +237,7 @@ class Weighing:
         rough = (
             pareto < ROUGH_K_MAX
             and heaviest <= ROUGH_HEAVIEST_MAX
-            and all(e.within(ROUGH_MEAN_ERROR_MAX, ROUGH_END_ERROR_MAX) for e in self.monte_carlo_error.values())
+            and all(e.roughly_known for e in self.monte_carlo_error.values())
         )
         return Importance(
             accepted=not missing,
@@ -480,5 +478,6 @@ def _joined(parts: Sequence[Posterior], chance: np.ndarray) -> Reweighted:
     errors = monte_carlo_errors(names, weighted_summary(np.concatenate(rows), np.concatenate(weights)))
     unknown, known = uncertain(errors), diagnosis.importance
     if unknown and known.accepted:
-        known = replace(known, accepted=False, missing=unknown, answer="rough")
+        rough = all(error.roughly_known for error in errors.values())
+        known = replace(known, accepted=False, missing=unknown, answer="rough" if rough else "laplace")
     return replace(diagnosis, importance=known, monte_carlo_error=errors)

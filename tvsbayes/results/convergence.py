@@ -45,6 +45,11 @@ class MonteCarloError:
         return self.mean <= mean and all(each <= end for each in self.interval95)
 
     @property
+    def roughly_known(self) -> bool:
+        """Whether the errors leave a rough answer."""
+        return self.within(ROUGH_MEAN_ERROR_MAX, ROUGH_END_ERROR_MAX)
+
+    @property
     def rounds_factor(self) -> float:
         """How many times as many draws an accepted answer takes."""
         return max(self.mean / MEAN_ERROR_MAX, *(each / END_ERROR_MAX for each in self.interval95)) ** 2
