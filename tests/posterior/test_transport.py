@@ -10,14 +10,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from support.small_posterior import ROUNDING, small_fit
-from support.two_parameters import BACKLASH, CURVE, NARROW_SD, RATIO, TURN, no_places, ridge, ridge_density, route
+from support.small_posterior import ROUNDING, play_priors, small_fit
+from support.two_parameters import (
+    BACKLASH,
+    CURVE,
+    NARROW_SD,
+    RATIO,
+    TURN,
+    no_places,
+    play_density,
+    play_near_zero,
+    ridge,
+    ridge_density,
+    route,
+)
 
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
 from tvsbayes.posterior.proposal import Target
-from tvsbayes.posterior.transport import BLOCK_ROWS, Transport, by_width
+from tvsbayes.posterior.transport import BLOCK_ROWS, Cut, Transport, by_width
 
 STOP_NAMES = (("stop_sd_deg.right", "stop_sd_deg.left"), ("stop_sd_deg.down", "stop_sd_deg.up"))
 """By axis, in the order of `redraw_mix`."""
@@ -65,20 +77,20 @@ def test_no_coordinates_have_an_order():
 
 
 def test_to_w_undoes_the_map():
-    """Points on both sides of a block's end; what is held stays; the origin is the mode."""
+    """Points on both sides of a block's end; what is held stays; whitened, the mode is the origin."""
     fitted, path = small_fit()
     assert path.dimension == fitted.free.sum() and 0 < path.narrow < path.dimension - path.noise
     w = np.random.default_rng(8).normal(size=(BLOCK_ROWS + 6, path.dimension))
     with jax.enable_x64(True):
         z = path.mapped(w).z
-        back, origin = path.to_w(z), path.mapped(np.zeros((1, path.dimension))).z[0]
+        back, origin = path.to_w(z), path.to_whitened(fitted.z[None])
         widest = np.abs(path.to_whitened(z)).max()
     # A triangular solve amplifies rounding by the condition of the root.
     amplified = ROUNDING * np.linalg.cond(path.root) * widest * path.dimension
     assert np.abs(back - w).max() < amplified + FLOOR
     fixed = ~fitted.free
     np.testing.assert_array_equal(z[:, fixed], np.repeat(fitted.z[None, fixed], len(w), axis=0))
-    np.testing.assert_allclose(origin, fitted.z, rtol=0, atol=amplified + FLOOR)
+    np.testing.assert_allclose(origin, 0, atol=amplified)
 
 
 def test_the_jacobian_of_the_map_is_what_it_says():
@@ -149,7 +161,9 @@ def test_the_precision_at_other_noise_scales_is_the_smoothers():
         variance = linear.variance.copy()
         variance[:, :2] = np.sum(mix * stops**2, axis=2)
         scaled = replace(linear, load=linear.load / pixels, jacobian=linear.jacobian / pixels, variance=variance)
-        expected = wide.T @ (np.eye(len(others)) + stop_information(scaled).fisher[np.ix_(others, others)]) @ wide
+        expected = (
+            wide.T @ (np.diag(play_priors(path)[0]) + stop_information(scaled).fisher[np.ix_(others, others)]) @ wide
+        )
         factor = path.conditional(held[None]).own[0]
         # The map has the narrowest coordinate first. The information spans ten decades in z; in y it is of order 1.
         found = (factor @ factor.T)[::-1, ::-1]
@@ -207,19 +221,43 @@ def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
 
 def test_a_ratio_follows_the_degrees_of_a_backlash():
     """Along the ridge of both the ratio is linear in b, and b = halfnorm.ppf(Phi(z)) by SciPy's own law."""
-    at = 0.4
-    mode = np.zeros(len(NAMES))
-    mode[BACKLASH] = at
-    path = replace(route(), mode=mode, root=np.array([[1.2, 0.0], [-0.6, 0.05]]))
-    y = np.column_stack([np.linspace(-3.0, 3.0, 13), np.zeros(13)])
+    path = play_near_zero()
+    y = np.column_stack([np.linspace(-0.5, 3.0, 13), np.zeros(13)])
     z = path.from_whitened(y)
-
-    def play(z):
-        return stats.halfnorm.ppf(stats.norm.cdf(z))
-
-    np.testing.assert_allclose(z[:, BACKLASH], at + 1.2 * y[:, 0], rtol=1e-12)
-    slope = (play(at + 1e-5) - play(at - 1e-5)) / 2e-5
-    # A central difference of 1e-5 is good to 1e-10 of the slope, SciPy's two laws to 1e-12.
-    np.testing.assert_allclose(z[:, RATIO], -0.5 * (play(z[:, BACKLASH]) - play(at)) / slope, atol=1e-8)
+    play = stats.halfnorm.ppf(stats.norm.cdf(z[:, BACKLASH]))
+    lines = np.polynomial.polynomial.polyfit(y[:, 0], np.column_stack([play, z[:, RATIO]]), 1)
+    # SciPy's laws are good to 1e-12.
+    np.testing.assert_allclose(lines[0] + np.outer(y[:, 0], lines[1]), np.column_stack([play, z[:, RATIO]]), atol=1e-11)
+    np.testing.assert_allclose(path.to_whitened(z), y, atol=1e-11)
     apart = path.from_whitened(y + np.array([0.0, 1.0])) - z
-    np.testing.assert_allclose(apart[:, RATIO], 0.05, rtol=1e-9)
+    np.testing.assert_allclose(apart[:, RATIO], path.root[1, 1], rtol=1e-9)
+
+
+def test_the_map_of_a_play_near_zero_is_exact():
+    """Measured below zero, where none is: a normal cut at zero, and what follows it. In w it is standard normal."""
+    path = play_near_zero()
+    w = np.random.default_rng(17).normal(size=(400, 2))
+    w[:4, 0] = -5.0, -4.0, 4.0, 5.0
+    seen = path.mapped(w)
+    assert stats.norm.cdf(path.mode[BACKLASH]) < 0.1, "the play is not near zero"
+    density = play_density(seen.z) + seen.log_jacobian + 0.5 * np.sum(w**2, axis=1)
+    # The mode is good to 1e-7, with slopes of 1 / sd = 12; laws of tails to 1e-9.
+    assert np.ptp(density) < 1e-5, np.ptp(density)
+    np.testing.assert_allclose(path.to_w(seen.z), w, atol=1e-7)
+
+
+@pytest.mark.parametrize("bound", [-40.0, -1.0, 0.0, 5.0, 30.0])
+def test_a_cut_normal_is_scipys(bound):
+    free = np.linspace(-7.0, 7.0, 57)
+    cut = Cut(np.full(len(free), bound))
+    within = cut.within(free)
+    # SciPy's own law loses digits farther out.
+    good = np.abs(free) < 4.5
+    expected = stats.truncnorm(bound, np.inf).isf(stats.norm.sf(free[good]))
+    np.testing.assert_allclose(within[good], expected, rtol=1e-6, atol=1e-6)
+    assert np.all(np.diff(within) > 0) and np.all(within >= bound)
+    if bound <= 0:
+        np.testing.assert_allclose(cut.without(within)[good], free[good], atol=1e-6)
+    step = 1e-4
+    slope = (cut.within(free + step) - cut.within(free - step)) / (2 * step)
+    np.testing.assert_allclose(cut.log_slope(free, within)[good], np.log(slope[good]), atol=1e-3)

@@ -7,9 +7,11 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 from support.varying_gears import perfect_rig
 
 from tvsbayes.estimators.joint_fit import JointFit, fit
+from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.posterior.transport import Transport, transport
@@ -19,6 +21,22 @@ SIGMAS = 5.0
 """Standard errors: a right value lies farther out in 6 of 10 million runs, and the runs are seeded."""
 ROUNDING = 2.0**-52
 """Relative spacing of float64."""
+
+
+def play_priors(path: Transport) -> tuple[np.ndarray, np.ndarray]:
+    """Precision (g,) and score (g,) of the prior at the mode, of steps along the line of each quantity.
+
+    Of a backlash that is not narrow: -b^2 / 2 by central differences of SciPy's half-normal law, less the prior of z.
+    """
+    others = path.free[path.noise :]
+    precision, score, step = np.ones(len(others)), np.zeros(len(others)), 1e-4
+    wide = np.array(NAMES)[others[: len(others) - path.narrow]]
+    for place in np.flatnonzero(np.char.startswith(wide, "backlash_deg")):
+        at = path.mode[others[place]]
+        before, value, after = stats.halfnorm.ppf(stats.norm.cdf(at + step * np.array([-1, 0, 1])))
+        slope = (after - before) / (2 * step)
+        precision[place], score[place] = slope**2, at - slope * value
+    return precision, score
 
 
 @cache

@@ -6,6 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+from scipy import optimize, stats
 from support.partial_arrays import no_gears, partial_arrays
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
@@ -99,6 +100,47 @@ def ridge() -> Transport:
         gear_noise=np.zeros((len(GEAR_SCALES), 0)),
     )
     return replace(straight, bend=bends(straight))
+
+
+PLAY, PLAY_SD, FOLLOW, RATIO_SD = -0.04, 0.08, -0.6, 0.3
+"""Of the play below: measured value and its sd in prior scales, and the ratio that the data see: ratio - 0.6 play = 0
++- 0.3."""
+
+
+def play_residual(z: np.ndarray) -> np.ndarray:
+    """Of a play that was measured below zero and a ratio that follows it, by SciPy's own half-normal; shape (n, 4)."""
+    play = stats.halfnorm.ppf(stats.norm.cdf(z[:, BACKLASH]))
+    found = np.zeros((len(z), ROWS))
+    found[:, 0], found[:, 1] = (PLAY - play) / PLAY_SD, (FOLLOW * play - z[:, RATIO]) / RATIO_SD
+    return found
+
+
+def play_density(z: np.ndarray) -> np.ndarray:
+    """Log posterior density, standard normal priors of both coordinates."""
+    return -0.5 * (np.sum(play_residual(z) ** 2, axis=1) + z[:, BACKLASH] ** 2 + z[:, RATIO] ** 2)
+
+
+def play_near_zero() -> Transport:
+    """The map of these two at the mode of their density."""
+    mode = np.zeros(len(NAMES))
+    free = np.array([BACKLASH, RATIO])
+
+    def of_two(z: np.ndarray) -> np.ndarray:
+        whole = np.zeros((1, len(NAMES)))
+        whole[0, free] = z
+        return whole
+
+    mode[free] = optimize.minimize(lambda z: -play_density(of_two(z))[0], [-1.0, 0.0], tol=1e-14).x
+    at, step = mode[BACKLASH], 1e-5
+    slope = np.diff(stats.halfnorm.ppf(stats.norm.cdf([at - step, at + step])))[0] / (2 * step)
+    root = np.array([[0.7, 0.0], [-0.2, 0.25]])
+    jacobian = np.array([[slope / PLAY_SD, 0.0], [-FOLLOW * slope / RATIO_SD, 1 / RATIO_SD], [0, 0], [0, 0]])
+    linear = replace(
+        linear_campaign(np.zeros(2), (root.T * [slope**2, 1.0]) @ root, 0),
+        residual=play_residual(mode[None])[0],
+        along=jacobian @ root,
+    )
+    return replace(ridge(), mode=mode, free=free, root=root, narrow=0, linear=linear, bend=np.zeros((2, 0, 0)))
 
 
 def fit() -> SimpleNamespace:

@@ -122,7 +122,8 @@ def _half_normal_along(
 
 def half_normal_coordinate(value: np.ndarray) -> np.ndarray:
     """The coordinate of a half-normal quantity of scale 1, by the tail that keeps its digits; values of any sign."""
-    return -special.ndtri(np.minimum(2 * special.ndtr(-np.maximum(value, 0.0)), 1 - 1e-16))
+    near = special.ndtri(np.maximum(special.erf(np.maximum(value, 0.0) / np.sqrt(2)), 1e-16))
+    return np.where(np.less(value, 0.5), near, -special.ndtri(2 * special.ndtr(-np.maximum(value, 0.5))))
 
 
 def half_normal_sd(mean: float, sd: float) -> float:

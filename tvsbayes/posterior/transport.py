@@ -16,7 +16,7 @@ from functools import cached_property
 
 import jax
 import numpy as np
-from scipy import linalg
+from scipy import linalg, special
 from scipy.linalg import lapack
 
 from tvsbayes.estimators.joint_fit import JointFit
@@ -31,6 +31,7 @@ from tvsbayes.model.parameter_space import (
     SCATTER_COLUMNS,
     STOP_COLUMNS,
     half_normal,
+    half_normal_coordinate,
     half_normal_slope,
 )
 from tvsbayes.posterior.stop_states import Elimination, StopStates, stop_states
@@ -181,6 +182,65 @@ class Conditional:
 
 
 @dataclass(frozen=True)
+class HalfNormal:
+    """A half-normal quantity about its mode: z, in which the prior is normal, and the line of the quantity there.
+
+    Steps are in units of z at the mode.
+    """
+
+    mode: float
+
+    @property
+    def _slope(self) -> float:
+        return float(half_normal_slope(self.mode))
+
+    @property
+    def least(self) -> float:
+        """The step at which the quantity is zero."""
+        return -float(half_normal(self.mode)) / self._slope
+
+    def bent(self, straight: np.ndarray) -> np.ndarray:
+        """The step of z by which the quantity moves along its line as far as these steps say."""
+        return half_normal_coordinate(half_normal(self.mode) + self._slope * straight) - self.mode
+
+    def straight(self, bent: np.ndarray) -> np.ndarray:
+        """The inverse of `bent`."""
+        return (half_normal(np.minimum(self.mode + bent, FARTHEST_SD)) - half_normal(self.mode)) / self._slope
+
+    @property
+    def precision(self) -> float:
+        """Of a step, a priori."""
+        return self._slope**2
+
+    @property
+    def score(self) -> float:
+        """d(log density)/d(step) at the mode, where that by z is zero: less the share of the volume."""
+        return self.mode - self._slope * float(half_normal(self.mode))
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A standard normal quantity of which only values above bounds (n,) are possible, by one without bounds.
+
+    Probabilities of the upper tails are multiplied, as logarithms: both ends keep their digits.
+    """
+
+    bound: np.ndarray
+
+    def within(self, free: np.ndarray) -> np.ndarray:
+        """From a standard normal quantity to the bounded one."""
+        return -special.ndtri_exp(special.log_ndtr(-self.bound) + special.log_ndtr(-free))
+
+    def without(self, within: np.ndarray) -> np.ndarray:
+        """The inverse of `within`."""
+        return -special.ndtri_exp(np.minimum(special.log_ndtr(-within) - special.log_ndtr(-self.bound), 0.0))
+
+    def log_slope(self, free: np.ndarray, within: np.ndarray) -> np.ndarray:
+        """Ln of d(within)/d(free)."""
+        return special.log_ndtr(-self.bound) + 0.5 * (within**2 - free**2)
+
+
+@dataclass(frozen=True)
 class Centred:
     """Narrow coordinates y given the others: y = centre + turn^-1 (y by the linearised campaign - mean).
 
@@ -277,30 +337,20 @@ class Transport:
         return np.isin(np.array(NAMES)[self.free], OPTICS_NAMES)
 
     @cached_property
-    def curved(self) -> np.ndarray:
-        """Places in `free` of coordinates whose physical value is no linear function of z over a posterior's width."""
-        return np.flatnonzero(np.isin(np.array(NAMES)[self.free], BLOCKS["backlash_deg"]))
+    def plays(self) -> tuple[int, ...]:
+        """Places in y, noise coordinates not counted, of backlashes that are not narrow."""
+        wide = np.array(NAMES)[self.free[self.noise : self.dimension - self.narrow]]
+        return tuple(np.flatnonzero(np.isin(wide, BLOCKS["backlash_deg"])))
 
-    def _beyond_linear(self, place: int, step: np.ndarray) -> np.ndarray:
-        """What steps of the z at a place (n,) move its physical value beyond the line at the mode, in units of z."""
-        at = self.mode[self.free[place]]
-        # Where no value is distinguished any more, the line goes on.
-        near = np.clip(at + step, -FARTHEST_SD, FARTHEST_SD) - at
-        return (half_normal(at + near) - half_normal(at)) / half_normal_slope(at) - near
-
-    def _follow(self, place: int) -> np.ndarray:
-        """How far the places behind one follow a unit step of its z, shape (d - place - 1,)."""
-        return self.root[place + 1 :, place] / self.root[place, place]
+    def _play_at_mode(self, place: int) -> HalfNormal:
+        return HalfNormal(float(self.mode[self.free[self.noise + place]]))
 
     def from_whitened(self, y: np.ndarray) -> np.ndarray:
-        """From y (n, d) to z (n, p).
-
-        What follows a backlash follows its degrees, not its z: along a ridge as wide as the prior the line in z is
-        wrong by more than a ratio's width. Each place moves later ones only: no volume changes.
-        """
+        """From y (n, d) to z (n, p): linear, but for a backlash, whose degrees are linear in y and never below zero."""
         step = y @ self.root.T
-        for place in self.curved:
-            step[:, place + 1 :] += self._beyond_linear(place, step[:, place])[:, None] * self._follow(place)
+        for place in self.plays:
+            column = self.noise + place
+            step[:, column] = self._play_at_mode(place).bent(step[:, column])
         z = np.repeat(self.mode[None], len(y), axis=0)
         z[:, self.free] += step
         return z
@@ -308,10 +358,23 @@ class Transport:
     def to_whitened(self, z: np.ndarray) -> np.ndarray:
         """From z (n, p) to y (n, d)."""
         step = (z - self.mode)[:, self.free]
-        linear = step.copy()
-        for place in self.curved:
-            linear[:, place + 1 :] -= self._beyond_linear(place, step[:, place])[:, None] * self._follow(place)
-        return np.linalg.solve(self.root, linear.T).T
+        for place in self.plays:
+            column = self.noise + place
+            step[:, column] = self._play_at_mode(place).straight(step[:, column])
+        return np.linalg.solve(self.root, step.T).T
+
+    def _log_bend(self, z: np.ndarray) -> np.ndarray:
+        """Ln |dz/dy| at z (n, p), relative to the mode, shape (n,)."""
+        columns = self.free[self.noise + np.array(self.plays, dtype=int)]
+        return np.log(half_normal_slope(self.mode[columns]) / half_normal_slope(z[:, columns])).sum(axis=1)
+
+    def _bounds(self, place: int, found: Conditional, y: np.ndarray) -> np.ndarray:
+        """Where a backlash is zero, in its coordinate w less the mean's shift, given y (n, g) of the wider ones."""
+        row = self.root[self.noise + place, self.noise :]
+        least = (self._play_at_mode(place).least - y[:, :place] @ row[:place]) / row[place]
+        factor = found.own[:, ::-1, ::-1][:, :, place]
+        others = np.einsum("nj,nj->n", y[:, :place], factor[:, :place])
+        return others + least * factor[:, place] - found.shift[:, ::-1][:, place]
 
     def _log_scale(self, noise: np.ndarray) -> np.ndarray:
         """Ln of the noise scales over those at the mode, at noise coordinates (n, q)."""
@@ -365,11 +428,18 @@ class Transport:
 
     @cached_property
     def _score_at_mode(self) -> np.ndarray:
+        """What is left of the score there that stays: of the likelihood by other ways than the residuals."""
         found = self._conditional(np.zeros((1, self.noise)), np.zeros(len(self.linear.prior)))
-        return found.own[0] @ found.shift[0]
+        own = np.zeros(len(self.linear.prior))
+        for place in self.plays:
+            own += self._play_at_mode(place).score * self.root[self.noise + place, self.noise :]
+        return found.own[0] @ found.shift[0] - own[::-1]
 
     def conditional(self, noise: np.ndarray) -> Conditional:
-        """The normal density of y at noise coordinates (n, q), its mean at the mode where the scales are those."""
+        """The normal density of y at noise coordinates (n, q), its mean at the mode where the scales are those.
+
+        That of a backlash is cut where it is zero: its mean lies elsewhere.
+        """
         return self._conditional(noise, self._score_at_mode)
 
     def _centred(self, noise: np.ndarray, wide: np.ndarray, found: Conditional) -> Centred:
@@ -390,16 +460,24 @@ class Transport:
         return Mapped.joined([self._mapped(block) for block in np.split(w, range(BLOCK_ROWS, len(w), BLOCK_ROWS))])
 
     def _mapped(self, w: np.ndarray) -> Mapped:
-        noise, y = w[:, : self.noise], w.copy()
+        noise, y, w = w[:, : self.noise], w.copy(), w.copy()
+        own = w[:, self.noise :]
         found = self.conditional(noise)
-        y[:, self.noise :] = found.solved(w[:, self.noise :][:, ::-1] + found.shift)[:, ::-1]
+        y[:, self.noise :] = found.solved(own[:, ::-1] + found.shift)[:, ::-1]
         log_jacobian = -np.log(np.diagonal(found.own, axis1=1, axis2=2)).sum(axis=1)
+        for place in self.plays:
+            cut = Cut(self._bounds(place, found, y[:, self.noise :]))
+            within = cut.within(own[:, place])
+            log_jacobian += cut.log_slope(own[:, place], within)
+            own[:, place] = within
+            y[:, self.noise :] = found.solved(own[:, ::-1] + found.shift)[:, ::-1]
         if self.narrow:
             narrow = self.dimension - self.narrow
             about = self._centred(noise, y[:, self.noise : narrow], found)
             y[:, narrow:] = about.centre + np.linalg.solve(about.turn, (y[:, narrow:] - about.mean)[..., None])[..., 0]
             log_jacobian -= np.linalg.slogdet(about.turn)[1]
-        return Mapped(self.from_whitened(y), log_jacobian)
+        z = self.from_whitened(y)
+        return Mapped(z, log_jacobian + self._log_bend(z))
 
     def to_w(self, z: np.ndarray) -> np.ndarray:
         """From z (n, p) to w (n, d); the inverse of `mapped` on the sampled columns."""
@@ -409,8 +487,10 @@ class Transport:
         if self.narrow:
             about = self._centred(noise, y[:, self.noise : narrow], found)
             y[:, narrow:] = about.mean + np.einsum("nij,nj->ni", about.turn, y[:, narrow:] - about.centre)
-        turned = np.einsum("nij,ni->nj", found.own, y[:, self.noise :][:, ::-1]) - found.shift
-        return np.concatenate([noise, turned[:, ::-1]], axis=1)
+        own = (np.einsum("nij,ni->nj", found.own, y[:, self.noise :][:, ::-1]) - found.shift)[:, ::-1].copy()
+        for place in self.plays:
+            own[:, place] = Cut(self._bounds(place, found, y[:, self.noise :])).without(own[:, place])
+        return np.concatenate([noise, own], axis=1)
 
 
 def bends(path: Transport) -> np.ndarray:
@@ -423,6 +503,8 @@ def bends(path: Transport) -> np.ndarray:
     if not narrow:
         return np.zeros((count, 0, 0))
     steps, whole = BEND_STEP * np.eye(count), np.zeros((1, path.noise))
+    # Degrees of a play are linear, and below zero there are none.
+    steps[list(path.plays)] = 0.0
 
     def curvature(y: np.ndarray) -> np.ndarray:
         both = np.concatenate([np.zeros((1, count)), y, -y])
@@ -501,6 +583,9 @@ def transport(fit: JointFit) -> Transport:
 
     wider = np.flatnonzero(np.diag(wide) >= NARROW)
     narrow = len(others) - (int(wider[-1]) + 1 if len(wider) else 0)
+    precision = np.ones(len(others))
+    for place in np.flatnonzero(np.isin(names[others[: len(others) - narrow]], BLOCKS["backlash_deg"])):
+        precision[place] = HalfNormal(float(fit.z[others[place]])).precision
     path = Transport(
         mode=fit.z,
         free=np.concatenate([noise, others]),
@@ -518,7 +603,7 @@ def transport(fit: JointFit) -> Transport:
             # Stop errors whose sd is not estimated keep their variance.
             constant=stops.constant + stops.variance @ ~by_noise.any(axis=1) - stops.scatter @ by_scatter.any(axis=1),
             places=np.column_stack([columns[:, np.concatenate([seen, len(places.steps) + seen])], drifts.columns]),
-            prior=wide.T @ wide,
+            prior=(wide.T * precision) @ wide,
         ),
         residuals=misfit,
         bend=np.zeros((len(others), narrow, narrow)),
