@@ -20,7 +20,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import blocks_filled, innovations
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.posterior import transport
-from tvsbayes.posterior.proposal import Target
+from tvsbayes.posterior.target import Target
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
 """Of draws (chain, draw)."""

@@ -38,9 +38,9 @@ from experiments.common.worlds import campaign_of
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.coordinates.location import locate
 from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.inference import importance
+from tvsbayes.inference.importance import K_MAX
 from tvsbayes.instrument.model_choice import ModelChoice
-from tvsbayes.posterior import importance
-from tvsbayes.posterior.importance import K_MAX
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate

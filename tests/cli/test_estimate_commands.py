@@ -140,7 +140,7 @@ def test_fit_samples_writes_for_arviz_and_gives_the_better_answer(ask, grid_fold
     """The limits are loosened: what is tested is the way from options to files, not convergence."""
     import arviz
 
-    from tvsbayes.posterior import diagnosis, ensemble
+    from tvsbayes.inference import diagnosis, ensemble
 
     for module, loose in (
         (ensemble, {"FIRST_CHECK": 40, "BLOCK": 20, "TAU_LIMIT": 1}),
@@ -177,11 +177,12 @@ def test_fit_samples_writes_for_arviz_and_gives_the_better_answer(ask, grid_fold
 @pytest.mark.slow
 def test_weights_that_are_not_sound_leave_laplaces_table_with_its_warning(ask, say, grid_folder, monkeypatch):
     """The posterior is proper and its mode explains the data: there is an answer, and exit code 0."""
-    from tvsbayes.posterior import importance, sampling
+    from tvsbayes.inference import importance
+    from tvsbayes.posterior import sampling
 
     for name, value in {"ROUNDS_LEAST": 1, "K_MAX": 0.0, "ROUGH_K_MAX": 0.0}.items():
         monkeypatch.setattr(importance, name, value)
-    monkeypatch.setattr(sampling, "importance_run", partial(importance.importance_run, rounds_max=3))
+    monkeypatch.setattr(sampling, "importance_run", partial(sampling.importance_run, rounds_max=3))
     code, document = ask("fit", grid_folder, "--quick")
     assert (code, document["estimator"], document["answer"], document["converged"]) == (0, "laplace", "laplace", False)
     assert document["problems"][0].startswith("LAPLACE: the weights of importance sampling have Pareto k")

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from support.two_parameters import autoregressive
 
+from tvsbayes.inference.summaries import propagated
 from tvsbayes.instrument.parameters import INDEX, NAMES
-from tvsbayes.posterior.draws import Posterior, propagated
+from tvsbayes.posterior.draws import Posterior
 
 SIGMAS = 5.0
 

@@ -55,7 +55,8 @@ def test_the_line_through_the_looks_is_found_and_the_local_slope_knows_less(gear
 def test_both_samplers_say_the_same(gear_fit):
     """The chain's limits are met; where importance sampling wants more draws for its own, it still says the same."""
     fitted = gear_fit[1]
-    chain, weighted = sample(fitted, "emcee", seed=5, max_minutes=20.0), importance_run(fitted, 5).posterior
+    chain, run = sample(fitted, "emcee", seed=5, max_minutes=20.0), importance_run(fitted, 5)
+    weighted = run.density.posterior(run.sample, run.seed)
     assert chain.convergence.stuck_walkers == ()
     importance = weighted.convergence.importance
     assert importance.pareto_k < K_MAX and importance.least_ess.value > 400, importance

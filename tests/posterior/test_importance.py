@@ -12,7 +12,6 @@ from scipy import stats
 from scipy.special import gamma
 from support.small_posterior import SIGMAS, small_fit
 from support.tabulated import no_followers
-from support.two_parameters import no_places
 from support.varying_gears import perfect_gears
 
 from tvsbayes.assessment.summary import summarise
@@ -20,15 +19,17 @@ from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.campaign_arrays import spot_constants
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.files.disk import shipped_data
+from tvsbayes.inference import importance
+from tvsbayes.inference.density import Points
+from tvsbayes.inference.importance import Pool, Weighing, k_max, lacking, uncertain
+from tvsbayes.inference.proposal import Independence, first_proposal
+from tvsbayes.inference.tables import Tables
 from tvsbayes.instrument.parameters import BLOCKS, Prior
 from tvsbayes.pipeline import unusable
-from tvsbayes.posterior import importance
 from tvsbayes.posterior.draws import headline_names
-from tvsbayes.posterior.importance import Pool, Weighing, empty_pool, importance_run, k_max, lacking, uncertain
-from tvsbayes.posterior.proposal import Independence, Target, Valued
+from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.posterior.tables import Tables
-from tvsbayes.posterior.transport import Mapped
+from tvsbayes.posterior.target import Target
 from tvsbayes.results.convergence import MonteCarloError
 from tvsbayes.statistics.weighted_draws import smoothed_weights, weighted_summary
 
@@ -46,8 +47,6 @@ def normal(mean: float, sd: float, dimension: int) -> Independence:
 class Skewed:
     """A target of mass e^1.7: Gumbel's density in the first coordinate, whom the second follows, the rest normal."""
 
-    path = SimpleNamespace(mode=np.zeros(5), dimension=5, heavy=np.arange(5) == 0, coupled=np.arange(5) >= 3)
-    fit = SimpleNamespace(arrays=no_places())
     invalid = 0
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
@@ -56,14 +55,18 @@ class Skewed:
         second = stats.norm.logpdf(w[:, 1], 0.3 * w[:, 0], np.exp(0.05 * w[:, 0]))
         return first + second + stats.norm.logpdf(w[:, 2:], 0.2, 1.1).sum(axis=1) + 1.7
 
-    def valued(self, w: np.ndarray, normal: np.ndarray) -> Valued:
-        """With errors at no places."""
-        return Valued(self(w), normal, Mapped(w, np.zeros(len(w))))
+    def valued(self, w: np.ndarray, generator: np.random.Generator) -> Points:
+        """Nothing was integrated out."""
+        return Points(w, self(w), {})
+
+    def first_proposal(self) -> Independence:
+        """With one tabulated coordinate and two that are coupled."""
+        return first_proposal(self, 5, np.arange(5) == 0, np.arange(5) >= 3)
 
 
 def skewed_pool(rounds: int = 5) -> Pool:
     target, generator = Skewed(), np.random.RandomState(SEED)
-    pool = empty_pool(target)
+    pool = Pool.empty(target.first_proposal())
     for number in range(rounds):
         pool = pool.extended(target, generator, fitted=number < 3)
     return pool
@@ -73,7 +76,7 @@ def test_weights_are_the_target_over_the_mixture_of_all_proposals():
     """By hand, for two proposals of other numbers of draws; by each draw's own proposal alone they are others."""
     one, other = normal(0.0, 1.0, 2), normal(0.8, 1.5, 2)
     w = np.random.default_rng(1).standard_normal((6, 2))
-    pool = Pool(w, np.arange(6.0), np.zeros((6, 0)), Mapped(w, np.zeros(6)), (one, other), (2, 4), other)
+    pool = Pool(Points(w, np.arange(6.0), {}), (one, other), (2, 4), other)
     densities = np.exp([q.log_density(w) for q in (one, other)])
     expected = np.exp(np.arange(6.0)) / (densities[0] * 2 / 6 + densities[1] * 4 / 6)
     np.testing.assert_allclose(np.exp(pool.log_weights), expected, rtol=1e-12)
@@ -83,7 +86,7 @@ def test_weights_are_the_target_over_the_mixture_of_all_proposals():
 
 def test_moments_ends_and_mass_of_a_skewed_target():
     pool = skewed_pool()
-    found = weighted_summary(pool.w, smoothed_weights(pool.log_weights).weights)
+    found = weighted_summary(pool.drawn.w, smoothed_weights(pool.log_weights).weights)
     first = stats.gumbel_r
     exact_mean = [first.mean(), 0.3 * first.mean(), 0.2, 0.2, 0.2]
     # E exp(0.1 w) of Gumbel's is the gamma function at 0.9.
@@ -115,7 +118,7 @@ def normal_fit(monkeypatch):
         value = fitted.log_density - 0.5 * np.sum(away @ precision * away, axis=1)
         return SimpleNamespace(log_density=value, place_errors_rad=normal)
 
-    monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
+    monkeypatch.setattr("tvsbayes.posterior.target.evaluate", evaluate)
     return fitted, straight
 
 
@@ -123,10 +126,10 @@ def test_the_evidence_of_a_normal_posterior_is_laplaces(normal_fit):
     """L + ln |C| / 2 + constants: the normal integral over the coordinates against their normal priors."""
     fitted, path = normal_fit
     target, generator = Target(fitted, path), np.random.RandomState(SEED)
-    pool = empty_pool(target)
+    pool = Pool.empty(target.first_proposal())
     for number in range(4):
         pool = pool.extended(target, generator, fitted=number < 3)
-    found = Weighing(fitted, path, pool).importance
+    found = Weighing(target, pool).importance
     free = np.flatnonzero(fitted.free)
     log_volume = 0.5 * np.linalg.slogdet(fitted.covariance[np.ix_(free, free)])[1]
     expected = fitted.log_density + log_volume + spot_constants(fitted.campaign).sum()
@@ -139,41 +142,41 @@ def sampled():
     """(fit, its run) with the map of the shared fit."""
     fitted, path = small_fit()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(importance, "transport", lambda fit: path)
-        return fitted, importance_run(fitted, SEED)
+        patch.setattr("tvsbayes.posterior.importance.transport", lambda fit: path)
+        run = importance_run(fitted, SEED)
+        return fitted, run, run.density.posterior(run.sample, SEED)
 
 
 def test_a_campaign_is_sampled_in_few_rounds_and_accepted(sampled):
-    fitted, run = sampled
-    found = run.posterior.convergence.importance
-    assert found.accepted and found.missing == () and run.posterior.tier == "importance"
-    every = run.posterior.convergence.monte_carlo_error
+    fitted, run, posterior = sampled
+    found = posterior.convergence.importance
+    assert found.accepted and found.missing == () and posterior.tier == "importance"
+    every = posterior.convergence.monte_carlo_error
     assert set(every) == set(headline_names(fitted)) and all(error.within(0.1, 0.2) for error in every.values())
     assert found.draws == importance.ROUND * found.rounds and found.rounds <= 2 * importance.ROUNDS_LEAST
     assert found.effective_share > 0.5 and found.pareto_k < 0.6 and found.heaviest_share < 0.01
-    weights = run.posterior.weights
-    assert weights.shape == run.posterior.z.shape[:2] == (1, found.draws)
+    weights = posterior.weights
+    assert weights.shape == posterior.z.shape[:2] == (1, found.draws)
     assert weights.sum() == pytest.approx(1.0, rel=1e-12)
     # The stored density is that of the stored draws.
-    z = run.posterior.z[0, :64]
-    again = (
-        Target(fitted, run.path)(run.path.to_w(z)) + fitted.log_density - run.path.mapped(run.path.to_w(z)).log_jacobian
-    )
-    np.testing.assert_allclose(run.posterior.log_density[0, :64], again, atol=1e-6)
+    path, z = run.density.path, posterior.z[0, :64]
+    w = path.to_w(z)
+    again = Target(fitted, path)(w) + fitted.log_density - path.mapped(w).log_jacobian
+    np.testing.assert_allclose(posterior.log_density[0, :64], again, atol=1e-6)
 
 
 def test_the_same_seed_gives_the_same_draws(sampled, monkeypatch):
-    fitted, run = sampled
-    monkeypatch.setattr(importance, "transport", lambda fit: run.path)
+    fitted, run, _ = sampled
+    monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
     again = sample(fitted, "importance", seed=SEED)
-    np.testing.assert_array_equal(again.z, run.posterior.z)
-    np.testing.assert_array_equal(again.weights, run.posterior.weights)
-    assert again.convergence == run.posterior.convergence
+    np.testing.assert_array_equal(again.z, sampled[2].z)
+    np.testing.assert_array_equal(again.weights, sampled[2].weights)
+    assert again.convergence == sampled[2].convergence
 
 
 def test_draws_of_the_same_weight_say_what_weighted_ones_say(sampled):
     """Moments of 4000 resampled draws, and of the walkers' starts without replacement."""
-    posterior = sampled[1].posterior
+    posterior = sampled[2]
     known = posterior.propagate(lambda p: p["backlash_deg.pan"])
     equal = posterior.resampled(4, 1000)
     assert equal.z.shape[:2] == (4, 1000) and np.ptp(equal.weights) == 0
@@ -200,14 +203,14 @@ def narrowed(proposal: Independence, factor: float) -> Independence:
 @pytest.fixture
 def too_narrow(sampled, monkeypatch):
     """The run's map, no heavy tails, and pilot rounds that arrive at a proposal of half the width."""
-    fitted, run = sampled
-    monkeypatch.setattr(importance, "transport", lambda fit: run.path)
+    fitted, run, _ = sampled
+    monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
     for name in ("HEAVY_SHARE", "COUPLED_SHARE"):
-        monkeypatch.setattr(f"tvsbayes.posterior.proposal.{name}", 1e-12)
+        monkeypatch.setattr(f"tvsbayes.inference.proposal.{name}", 1e-12)
     arrived = importance.piloted
 
     def piloted(target, generator):
-        return replace(empty_pool(target), next_proposal=narrowed(arrived(target, generator).next_proposal, 0.5))
+        return Pool.empty(narrowed(arrived(target, generator).next_proposal, 0.5))
 
     monkeypatch.setattr(importance, "piloted", piloted)
     return fitted
@@ -217,29 +220,29 @@ def test_a_proposal_that_is_too_narrow_is_fitted_anew(too_narrow, sampled, monke
     """Its draws teach the next one; they take no part in the answer, which is that of the right proposal."""
     begun = []
 
-    def empty(target, proposal=None):
+    def empty(proposal, invalid=0):
         begun.append(proposal)
-        return empty_pool(target, proposal)
+        return Pool(None, (), (), proposal, invalid)
 
-    monkeypatch.setattr(importance, "empty_pool", empty)
+    monkeypatch.setattr(Pool, "empty", empty)
     run = importance_run(too_narrow, SEED)
-    found, other = run.posterior.convergence, sampled[1].posterior.convergence
+    posterior = run.density.posterior(run.sample, SEED)
+    found, other = posterior.convergence, sampled[2].convergence
     assert found.answer == "accepted" and found.missing == ()
-    # `piloted` begins twice, with a pilot and without draws: what comes then are proposals fitted anew.
-    taught = [proposal for proposal in begun if proposal is not None]
-    assert len(taught) >= 2 and run.pool.proposals == (taught[-1],)
+    # The pilot, what it arrives at, and the same narrowed: what comes then are proposals fitted anew.
+    assert len(begun) > 3 and run.pool.proposals == (begun[-1],)
     assert run.pool.counts == (found.importance.draws,), "draws of the narrow proposal are in the answer"
     # Fitted to draws of a bad proposal it is worth less than one from good pilot rounds, but no tenth of it.
     assert found.importance.effective_share > 0.1 * other.importance.effective_share
     name = other.importance.least_ess.quantity
-    one, two = (each.posterior.propagate(lambda p: p[name]) for each in (run, sampled[1]))
+    one, two = (each.propagate(lambda p: p[name]) for each in (posterior, sampled[2]))
     assert abs(one.mean - two.mean) < SIGMAS * np.hypot(one.mcse_mean, two.mcse_mean)
 
 
 def test_a_budget_that_is_used_up_leaves_a_worse_answer(too_narrow):
     """Two pilot rounds and four of the narrow proposal: none is left for another."""
     run = importance_run(too_narrow, SEED, rounds_max=6)
-    posterior, found = run.posterior, run.posterior.convergence.importance
+    posterior, found = run.density.posterior(run.sample, SEED), run.sample.convergence.importance
     assert found.rounds == importance.ROUNDS_LEAST and found.answer == "laplace" and not posterior.converged
     assert found.pareto_k > importance.K_MAX
     said = "; ".join(posterior.convergence.missing)
@@ -253,11 +256,12 @@ def test_a_budget_that_is_used_up_leaves_a_worse_answer(too_narrow):
 
 def test_few_draws_of_a_good_proposal_are_a_rough_answer(sampled, monkeypatch):
     """Weights are sound and the mean is known to a tenth of an sd or two; the posterior's numbers are given."""
-    fitted, run = sampled
-    monkeypatch.setattr(importance, "transport", lambda fit: run.path)
+    fitted, run, _ = sampled
+    monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
     monkeypatch.setattr(importance, "ROUNDS_LEAST", 1)
     monkeypatch.setattr(importance, "ROUND", 512)
-    posterior = importance_run(fitted, SEED, rounds_max=3).posterior
+    run = importance_run(fitted, SEED, rounds_max=3)
+    posterior = run.density.posterior(run.sample, SEED)
     found = posterior.convergence
     assert (found.importance.draws, found.answer, posterior.converged) == (512, "rough", True), found.missing
     assert all(error.within(0.3, 0.6) for error in found.monte_carlo_error.values())
@@ -304,11 +308,11 @@ def test_the_draws_that_an_accepted_answer_takes_follow_from_the_worst_error():
 
 
 def test_a_density_without_values_is_refused(sampled, monkeypatch):
-    fitted, run = sampled
-    monkeypatch.setattr(importance, "transport", lambda fit: run.path)
+    fitted, run, _ = sampled
+    monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
 
-    def valued(target, w, normal):
-        return Valued(np.where(np.abs(w).max(axis=1) > 0, -np.inf, 0.0), normal, target.path.mapped(w))
+    def valued(target, w, generator):
+        return Points(w, np.where(np.abs(w).max(axis=1) > 0, -np.inf, 0.0), {})
 
     monkeypatch.setattr(Target, "valued", valued)
     with pytest.raises(NotConverged, match="not finite"):

@@ -10,7 +10,7 @@ from support.small_posterior import SIGMAS
 from support.tabulated import tabulated
 from support.two_parameters import AT_MODE, BACKLASH, RATIO, STRETCH, fit, route
 
-from tvsbayes.posterior.proposal import Target
+from tvsbayes.posterior.target import Target
 
 
 def test_the_density_of_walkers_is_the_models_times_the_jacobian(x64, monkeypatch):
@@ -18,7 +18,7 @@ def test_the_density_of_walkers_is_the_models_times_the_jacobian(x64, monkeypatc
         value = AT_MODE - 0.5 * (z[:, RATIO] ** 2 + z[:, BACKLASH] ** 2)
         return SimpleNamespace(log_density=value, place_errors_rad=normal)
 
-    monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
+    monkeypatch.setattr("tvsbayes.posterior.target.evaluate", evaluate)
     w = np.random.default_rng(4).standard_normal((50, 2))
     value = Target(fit(), route())(w)
     log_factor = STRETCH * w[:, 0]

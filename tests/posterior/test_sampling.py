@@ -12,11 +12,11 @@ from support.small_posterior import ROUNDING, SIGMAS, small_fit
 from support.waits import check_forward, doings
 
 from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.inference.diagnosis import diagnose
 from tvsbayes.posterior.chain import stored_chain
-from tvsbayes.posterior.diagnosis import diagnose
 from tvsbayes.posterior.importance import importance_run
-from tvsbayes.posterior.proposal import Target
 from tvsbayes.posterior.sampling import DRAWING, WALKING, sample
+from tvsbayes.posterior.target import Target
 
 LONG, SHORT, BLOCK = 96, 12, 6
 SEED = 3
@@ -33,19 +33,19 @@ def limits(patch: pytest.MonkeyPatch, steps: int) -> None:
     """Stop after so many steps, whatever they are worth."""
     anything = {"RHAT_LIMIT": np.inf, "ESS_LIMIT": 0, "TAU_LIMIT": 0, "AGREEMENT_LIMIT": np.inf}
     for name, value in {**anything, "STUCK_ACCEPTANCE": 0.0, "STUCK_DEVIATION": np.inf}.items():
-        patch.setattr(f"tvsbayes.posterior.diagnosis.{name}", value)
+        patch.setattr(f"tvsbayes.inference.diagnosis.{name}", value)
     for name, value in {"BLOCK": BLOCK, "FIRST_CHECK": steps}.items():
-        patch.setattr(f"tvsbayes.posterior.ensemble.{name}", value)
+        patch.setattr(f"tvsbayes.inference.ensemble.{name}", value)
     for name in ("MEAN_ERROR_MAX", "END_ERROR_MAX"):
-        patch.setattr(f"tvsbayes.posterior.importance.{name}", np.inf)
+        patch.setattr(f"tvsbayes.inference.importance.{name}", np.inf)
     quickly(patch)
 
 
 def quickly(patch: pytest.MonkeyPatch) -> None:
     """The map takes seconds and no random number; three small rounds are enough for a start."""
     patch.setattr("tvsbayes.posterior.importance.transport", lambda fit: small_fit()[1])
-    patch.setattr("tvsbayes.posterior.importance.ROUND", 512)
-    patch.setattr("tvsbayes.posterior.importance.ROUNDS_LEAST", 1)
+    patch.setattr("tvsbayes.inference.importance.ROUND", 512)
+    patch.setattr("tvsbayes.inference.importance.ROUNDS_LEAST", 1)
     patch.setattr("tvsbayes.posterior.sampling.importance_run", partial(importance_run, rounds_max=3))
 
 
@@ -53,12 +53,12 @@ def only_when_long(patch: pytest.MonkeyPatch) -> None:
     """`sample` looks at a resumed chain at once, and under `limits` any chain has converged."""
     judge = diagnose
 
-    def strict(fit, start, chain):
-        result = judge(fit, start, chain)
+    def strict(start, chain):
+        result = judge(start, chain)
         missing = () if len(chain.w) >= SHORT else ("too short",)
         return replace(result, convergence=replace(result.convergence, missing=missing))
 
-    patch.setattr("tvsbayes.posterior.ensemble.diagnose", strict)
+    patch.setattr("tvsbayes.inference.ensemble.diagnose", strict)
 
 
 @pytest.fixture(scope="module")
@@ -168,11 +168,11 @@ def test_only_a_converged_fit_is_sampled(fitted):
 
 
 def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
-    monkeypatch.setattr("tvsbayes.posterior.ensemble.BLOCK", BLOCK)
+    monkeypatch.setattr("tvsbayes.inference.ensemble.BLOCK", BLOCK)
     quickly(monkeypatch)
     # What weighted draws say is then no answer either: it would be given instead.
     for limit in ("K_MAX", "ROUGH_K_MAX"):
-        monkeypatch.setattr(f"tvsbayes.posterior.importance.{limit}", -1.0)
+        monkeypatch.setattr(f"tvsbayes.inference.importance.{limit}", -1.0)
     result = sample(fitted, max_minutes=1e-9, seed=SEED)
     assert result.convergence.answer != "accepted" and result.convergence.steps == BLOCK
     said = "; ".join(result.convergence.missing)
@@ -183,13 +183,13 @@ def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
 def test_a_stuck_walker_is_found(fitted, long):
     with jax.enable_x64(True):
         start, chain = stored_chain(long[1], fitted, SEED)
-        before = diagnose(fitted, start, chain).convergence
+        before = diagnose(start, chain).convergence
         walker = int(np.argmax(before.acceptance))
         assert walker not in before.stuck_walkers
         w, density, accepted = chain.w.copy(), chain.log_density.copy(), chain.accepted.copy()
         w[:, walker], density[:, walker], accepted[walker] = w[0, walker], density[0, walker], 0
         frozen = replace(chain, w=w, log_density=density, accepted=accepted)
-        after = diagnose(fitted, start, frozen).convergence
+        after = diagnose(start, frozen).convergence
     assert walker in after.stuck_walkers and not after.converged
     sentence = next(m for m in after.missing if m.startswith("stuck walkers: "))
     assert str(walker) in sentence.removeprefix("stuck walkers: ").split(", ")

@@ -28,7 +28,7 @@ from support.two_parameters import (
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
-from tvsbayes.posterior.proposal import Target
+from tvsbayes.posterior.target import Target
 from tvsbayes.posterior.transport import BLOCK_ROWS, Cut, Transport, by_width
 
 STOP_NAMES = (("stop_sd_deg.right", "stop_sd_deg.left"), ("stop_sd_deg.down", "stop_sd_deg.up"))
@@ -208,7 +208,7 @@ def test_a_density_without_value_is_refused_and_counted(x64, monkeypatch):
         value = jnp.where(z[:, RATIO] > 50, jnp.nan, 5.0 - z[:, BACKLASH])
         return SimpleNamespace(log_density=value, place_errors_rad=normal)
 
-    monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
+    monkeypatch.setattr("tvsbayes.posterior.target.evaluate", evaluate)
     target = Target(SimpleNamespace(space=None, arrays=no_places(), log_density=2.0), path)
     value = target(w)
     expected = (5.0 - w[:, 0]) - 2.0 + path.mapped(w).log_jacobian

@@ -30,10 +30,21 @@ HARDWARE_USERS = {
 }
 """Who may import the hardware side; nobody else."""
 MODEL = {"model", "estimators", "posterior", "assessment", "coordinates", "comparison", "planning", "studies"}
-BESIDE_THE_TWIN = {"calibration", "metrology", "results", *MODEL}
+BESIDE_THE_TWIN = {"calibration", "metrology", "results", "inference", *MODEL}
 """What the digital twin shares no formula with, nor with the mirrors of the instrument."""
 JAX_FREE_PACKAGES = (
-    *("errors", "progress", "display", "files", "instrument", "calibration", "metrology", "results", "single_axis"),
+    *(
+        "errors",
+        "progress",
+        "display",
+        "files",
+        "instrument",
+        "calibration",
+        "metrology",
+        "results",
+        "inference",
+        "single_axis",
+    ),
     *("twin", "coordinates", "positioner", "acquisition", "report"),
 )
 JAX_FREE_MODULES = (

@@ -10,7 +10,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parents[2] / "tvsbayes"
 ORDER = (
     *("errors", "progress", "display", "files", "statistics", "instrument"),
-    *("calibration", "results", "metrology", "single_axis", "twin", "model"),
+    *("calibration", "results", "inference", "metrology", "single_axis", "twin", "model"),
     *("estimators", "posterior", "assessment", "coordinates", "comparison", "planning", "studies"),
     *("positioner", "cameras", "acquisition"),
     *("pipeline", "report", "view", "cli"),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tvsbayes.posterior.proposal import Independence
-from tvsbayes.posterior.tables import LEADER_NODES, NODES, Followers, Tables
+from tvsbayes.inference.proposal import Independence
+from tvsbayes.inference.tables import LEADER_NODES, NODES, Followers, Tables
 
 
 def tabulated(mean: np.ndarray, sd: np.ndarray, places: np.ndarray) -> Independence:

@@ -1,4 +1,4 @@
-"""A chain of emcee and what it began with: all that continues it bit for bit, and the file that keeps it.
+"""The file that keeps a chain of emcee and what it began with: all that continues it bit for bit.
 
 Coordinates w of `posterior.transport`; arrays of a chain are ordered (step, walker, ...).
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,38 +17,19 @@ import numpy as np
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.files.disk import read_arrays, write_atomically
+from tvsbayes.inference.chain import Chain
+from tvsbayes.inference.density import Points
+from tvsbayes.inference.importance import ImportanceRun, Pool, Weighing
+from tvsbayes.inference.proposal import Independence
+from tvsbayes.inference.tables import Followers, Tables
 from tvsbayes.instrument.campaign import input_hashes
-from tvsbayes.posterior.importance import ImportanceRun, Pool, Weighing
-from tvsbayes.posterior.proposal import Independence
-from tvsbayes.posterior.tables import Followers, Tables
-from tvsbayes.posterior.transport import Transport, transport
+from tvsbayes.posterior.target import Target
+from tvsbayes.posterior.transport import transport
 
 CHAIN_KIND = "tvsbayes-chain/"
 CHAIN_FORMAT = f"{CHAIN_KIND}7"
 CHAIN_BYTES_MAX = 2**32
 """A chain is the user's own file: what was in memory when it was written fits there again."""
-
-
-@dataclass(frozen=True)
-class Chain:
-    """Everything a run has done: enough to continue it bit for bit.
-
-    Attributes:
-        w: positions, shape (steps, walkers, d); log_density: relative to the mode, shape (steps, walkers).
-        accepted: accepted moves by walker.
-        random_state: NumPy's legacy generator after the last step.
-        invalid: evaluations that gave no number.
-        seconds: spent so far, importance sampling included.
-        goal: steps at which convergence is looked at next.
-    """
-
-    w: np.ndarray
-    log_density: np.ndarray
-    accepted: np.ndarray
-    random_state: tuple
-    invalid: int
-    seconds: float
-    goal: int
 
 
 def fingerprint(fit: JointFit) -> str:
@@ -65,44 +45,47 @@ def fingerprint(fit: JointFit) -> str:
 
 def _pool_arrays(pool: Pool) -> dict[str, np.ndarray]:
     """A pool as arrays; the proposal that comes next is the last of them."""
-    every = (*pool.proposals, pool.next_proposal)
+    every = [each for each in (*pool.proposals, pool.next_proposal) if isinstance(each, Independence)]
+    last = every[-1]
     return {
-        "pool_w": pool.w,
-        "pool_log_target": pool.log_target,
-        "pool_place_errors_rad": pool.place_errors_rad,
+        "pool_w": pool.drawn.w,
+        "pool_log_target": pool.drawn.log_target,
+        "pool_place_errors_rad": pool.drawn.parts["place_errors_rad"],
         "pool_counts": np.array(pool.counts),
         "pool_invalid": np.array(pool.invalid),
         "proposal_mean": np.stack([each.mean for each in every]),
         "proposal_sd": np.stack([each.sd for each in every]),
-        "proposal_places": pool.next_proposal.places,
-        "proposal_coupled": pool.next_proposal.coupled,
+        "proposal_places": last.places,
+        "proposal_coupled": last.coupled,
         "proposal_tables": np.stack([each.tables.log_density for each in every]),
-        "proposal_leader": pool.next_proposal.followers.leader,
-        "proposal_follower": pool.next_proposal.followers.follower,
+        "proposal_leader": last.followers.leader,
+        "proposal_follower": last.followers.follower,
         "proposal_followers": np.stack([each.followers.log_density for each in every]),
         "proposal_origin": np.stack([each.origin for each in every]),
         "proposal_turn": np.stack([each.turn for each in every]),
     }
 
 
-def _pool_of(stored: dict[str, np.ndarray], path: Transport) -> Pool:
-    """The pool of `_pool_arrays`, drawn in the coordinates of a path."""
+def _pool_of(stored: dict[str, np.ndarray], target: Target) -> Pool:
+    """The pool of `_pool_arrays`."""
     names = "mean", "sd", "tables", "followers", "origin", "turn"
-    parts = zip(*(stored[f"proposal_{name}"] for name in names), strict=True)
+    rounds = zip(*(stored[f"proposal_{name}"] for name in names), strict=True)
     places, coupled = stored["proposal_places"], stored["proposal_coupled"]
     leads = stored["proposal_leader"], stored["proposal_follower"]
     every = tuple(
         Independence(mean, sd, places, Tables(table), coupled, Followers(*leads, rows), origin, turn)
-        for mean, sd, table, rows, origin, turn in parts
+        for mean, sd, table, rows, origin, turn in rounds
     )
     counts = tuple(stored["pool_counts"].tolist())
-    draws = stored["pool_w"], stored["pool_log_target"], stored["pool_place_errors_rad"]
-    if len(counts) != len(every) - 1 or {len(each) for each in draws} != {sum(counts)}:
-        raise ValueError(f"{len(draws[0])} weighted draws with parts of other lengths")
-    return Pool(*draws, path.mapped(draws[0]), every[:-1], counts, every[-1], int(stored["pool_invalid"]))
+    w, log_target, errors_rad = stored["pool_w"], stored["pool_log_target"], stored["pool_place_errors_rad"]
+    if len(counts) != len(every) - 1 or {len(each) for each in (w, log_target, errors_rad)} != {sum(counts)}:
+        raise ValueError(f"{len(w)} weighted draws with parts of other lengths")
+    mapped = target.path.mapped(w)
+    parts = {"z": mapped.z, "log_jacobian": mapped.log_jacobian, "place_errors_rad": errors_rad}
+    return Pool(Points(w, log_target, parts), every[:-1], counts, every[-1], int(stored["pool_invalid"]))
 
 
-def write_chain(path: Path, fit: JointFit, start: ImportanceRun, chain: Chain) -> None:
+def write_chain(path: Path, fit: JointFit, start: ImportanceRun[Target], chain: Chain) -> None:
     """Keep a chain and what it started from, whole or not at all."""
     buffer = io.BytesIO()
     kind, keys, position, has_gauss, gauss = chain.random_state
@@ -111,9 +94,9 @@ def write_chain(path: Path, fit: JointFit, start: ImportanceRun, chain: Chain) -
         allow_pickle=False,
         format=CHAIN_FORMAT,
         fingerprint=fingerprint(fit),
-        seed=start.posterior.seed,
+        seed=start.seed,
         **_pool_arrays(start.pool),
-        start_seconds=start.posterior.seconds,
+        start_seconds=start.sample.seconds,
         w=chain.w,
         log_density=chain.log_density,
         accepted=chain.accepted,
@@ -127,7 +110,7 @@ def write_chain(path: Path, fit: JointFit, start: ImportanceRun, chain: Chain) -
     write_atomically(path, buffer.getvalue())
 
 
-def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun, Chain]:
+def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun[Target], Chain]:
     """Read a chain; refuse one of other data, model, priors, versions or seed."""
     name = escaped(path.name)
     if not path.exists():
@@ -146,10 +129,10 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun, C
         if found != CHAIN_FORMAT:
             raise ValueError(f"format {found!r}")
         same = str(stored["fingerprint"]) == fingerprint(fit) and int(stored["seed"]) == seed
-        route = transport(fit)
-        pool, chain, spent = _pool_of(stored, route), _chain_of(stored), float(stored["start_seconds"])
-        if not pool.w.shape[1] == chain.w.shape[2] == len(pool.next_proposal.mean):
-            raise ValueError(f"weighted draws of {pool.w.shape[1]} coordinates, walkers of {chain.w.shape[2]}")
+        target = Target(fit, transport(fit))
+        pool, chain, spent = _pool_of(stored, target), _chain_of(stored), float(stored["start_seconds"])
+        if not pool.drawn.w.shape[1] == chain.w.shape[2] == target.dimension:
+            raise ValueError(f"weighted draws of {pool.drawn.w.shape[1]} coordinates, walkers of {chain.w.shape[2]}")
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise InputError(
             "damaged-chain",
@@ -166,7 +149,7 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun, C
             allowed="the chain of the same campaign, options and versions",
             remedy="run without --resume, or restore the inputs and options it was started with",
         )
-    return ImportanceRun(route, pool, Weighing(fit, route, pool).posterior(seed, spent)), chain
+    return ImportanceRun(target, pool, Weighing(target, pool).sample(spent), seed), chain
 
 
 def _chain_of(stored: dict[str, np.ndarray]) -> Chain:

@@ -6,29 +6,24 @@ of a chain weigh the same; chains are walkers of the ensemble.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
-from tvsbayes.display import Cell, Shown, View
+from tvsbayes.display import Shown, View
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import no_draw
+from tvsbayes.inference.summaries import Propagated, propagated, reweighted
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import BLOCKS, NAMES
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import Derived, derived_quantities
-from tvsbayes.results.convergence import Convergence, MonteCarloError, Reweighted
-from tvsbayes.statistics.weighted_draws import (
-    TAILS,
-    WeightedSummary,
-    systematic,
-    weighted_mean,
-    weighted_summary,
-)
+from tvsbayes.results.convergence import Convergence, Reweighted
+from tvsbayes.statistics.weighted_draws import systematic, weighted_mean
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,6 +41,7 @@ class Draws(Mapping[str, np.ndarray]):
     """
 
     def __init__(self, draws: Derived):
+        self.derived = draws
         physical = np.asarray(draws.physical).reshape(-1, len(NAMES))
         self._columns: dict[str, np.ndarray] = dict(zip(NAMES, physical.T, strict=True))
         for axis, (positive, negative) in SENSES.items():
@@ -86,38 +82,6 @@ def headline_names(fit: JointFit) -> tuple[str, ...]:
     contrasts = [f"effective_contrast_deg_per_step.{axis}" for axis, pair in SENSES.items() if set(pair) <= moved]
     names = [*ratios, *contrasts, *BLOCKS["degrees_per_step"], *BLOCKS["backlash_deg"], "effective_mirror_offset_mm"]
     return tuple(name for name in names if name not in NAMES or fit.free[NAMES.index(name)])
-
-
-@dataclass(frozen=True, repr=False)
-class Propagated(Shown):
-    """A quantity under the posterior; every field but the last two has the quantity's own shape.
-
-    Attributes:
-        mean, sd: of the posterior.
-        interval95: equal-tailed, first axis (low, high).
-        mcse_mean, mcse_sd, mcse_interval95: Monte Carlo standard errors of the above.
-        ess: effective draws behind the mean.
-        draws: the values, shape (chain, draw, ...).
-        weights: of the draws, sum 1, shape (chain, draw).
-    """
-
-    mean: np.ndarray
-    sd: np.ndarray
-    interval95: np.ndarray
-    mcse_mean: np.ndarray
-    mcse_sd: np.ndarray
-    mcse_interval95: np.ndarray
-    ess: np.ndarray
-    draws: np.ndarray
-    weights: np.ndarray
-
-    def shown(self) -> View:
-        """Mean, sd and interval; of arrays, element by element."""
-        low, high = np.atleast_1d(self.interval95[0]).ravel(), np.atleast_1d(self.interval95[1]).ravel()
-        mean, sd, error = (np.atleast_1d(each).ravel().tolist() for each in (self.mean, self.sd, self.mcse_mean))
-        columns = zip(mean, sd, low.tolist(), high.tolist(), error, strict=True)
-        rows: list[tuple[Cell, ...]] = [(str(k), *row) for k, row in enumerate(columns)]
-        return View("Propagated quantity", ("element", "mean", "sd", "2.5 %", "97.5 %", "Monte Carlo error"), rows)
 
 
 @dataclass(frozen=True, repr=False)
@@ -272,60 +236,6 @@ class Posterior(Shown):
                 np.multiply.outer(p[f"degrees_per_step.{direction}"], count), p[f"backlash_deg.{axis}"][:, None]
             )
         )
-
-
-def reweighted(values: np.ndarray, weights: np.ndarray) -> Propagated:
-    """Summary of independent draws (chain, draw, ...) with weights (chain, draw)."""
-    found = weighted_summary(values.reshape(-1, *values.shape[2:]), weights.ravel())
-    return Propagated(
-        mean=found.mean,
-        sd=found.sd,
-        interval95=found.interval95,
-        mcse_mean=found.mcse_mean,
-        mcse_sd=found.mcse_sd,
-        mcse_interval95=found.mcse_interval95,
-        ess=found.ess_mean,
-        draws=values,
-        weights=weights,
-    )
-
-
-def propagated(values: np.ndarray) -> Propagated:
-    """Summary of draws (chain, draw, ...) of chains with memory, which weigh the same."""
-    # Loading it takes as long as a fit of stored functions: only who asks for a chain waits.
-    from arviz_stats.base import array_stats
-
-    flat = values.reshape(*values.shape[:2], -1)
-    weights = np.full(values.shape[:2], 1 / (values.shape[0] * values.shape[1]))
-    # A quantity that no draw changes has no effective number of draws and no Monte Carlo error.
-    moving = np.ptp(flat, axis=(0, 1)) > 0
-
-    def each(statistic: Callable[..., np.ndarray], otherwise: float, **options) -> np.ndarray:
-        result = np.full(flat.shape[2], otherwise)
-        if moving.any():
-            result[moving] = statistic(flat[..., moving], chain_axis=0, draw_axis=1, **options)
-        return result.reshape(values.shape[2:])
-
-    errors = [each(array_stats.mcse, 0.0, method="quantile", prob=prob) for prob in TAILS]
-    return Propagated(
-        mean=values.mean(axis=(0, 1)),
-        sd=values.std(axis=(0, 1)),
-        interval95=np.quantile(values, TAILS, axis=(0, 1)),
-        mcse_mean=each(array_stats.mcse, 0.0, method="mean"),
-        mcse_sd=each(array_stats.mcse, 0.0, method="sd"),
-        mcse_interval95=np.stack(errors),
-        ess=each(array_stats.ess, float(values.shape[0] * values.shape[1]), method="bulk"),
-        draws=values,
-        weights=weights,
-    )
-
-
-def monte_carlo_errors(names: Sequence[str], found: Propagated | WeightedSummary) -> dict[str, MonteCarloError]:
-    """Of quantities, the last axis of a summary, in their posterior sds; a quantity that no draw changes has none."""
-    sd = np.where(found.sd > 0, found.sd, 1.0)
-    parts = found.mcse_mean / sd, *(found.mcse_interval95 / sd)
-    rows = zip(*(np.reshape(part, len(names)).tolist() for part in parts), strict=True)
-    return {name: MonteCarloError(mean, (low, high)) for name, (mean, low, high) in zip(names, rows, strict=True)}
 
 
 def derived_of(fit: JointFit, z: np.ndarray, place_errors_rad: np.ndarray) -> Derived:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import jax
 
 from tvsbayes.errors import NotConverged, require_kind
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.posterior.chain import stored_chain
+from tvsbayes.inference.importance import ROUNDS_LEAST, ImportanceRun
+from tvsbayes.posterior.chain import stored_chain, write_chain
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.importance import ROUNDS_LEAST, ImportanceRun, importance_run, mixed, run_beside
+from tvsbayes.posterior.importance import importance_run, mixed, run_beside
+from tvsbayes.posterior.target import Target
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.convergence import Convergence
 
@@ -84,7 +87,7 @@ def sample(
             job.begin(DRAWING)
             start, chain = importance_run(fit, seed, job.at), None
         early = _mixture(start, seed)
-        if early.convergence.answer == "rough" and start.posterior.convergence.answer == "accepted" and chain is None:
+        if early.convergence.answer == "rough" and start.sample.convergence.answer == "accepted" and chain is None:
             # The share of a less probable way of homing asks for more draws than the most probable one needs.
             start = importance_run(fit, seed, job.at, rounds_least=MIXTURE_ROUNDS)
             early = _mixture(start, seed)
@@ -92,30 +95,20 @@ def sample(
             return early
         if first is not None:
             first(early)
-        from tvsbayes.posterior.ensemble import Run
+        from tvsbayes.inference.ensemble import Run, better
 
         job.begin(WALKING)
-        walked = Run(fit, start, chain, checkpoint, job.at, began).until_converged(60 * max_minutes)
-        return _better(early, walked)
+        keep = None if checkpoint is None else partial(write_chain, checkpoint, fit, start)
+        walked = start.density.posterior(Run(start, chain, keep, job.at, began).until_converged(60 * max_minutes), seed)
+        found = walked.convergence
+        assert isinstance(found, Convergence)
+        agrees = found.agreement is None or found.agreement.agrees
+        # A chain knows one way of homing; where others count, the weighted draws of all have the last word.
+        return early if len(early.fit.mixture) > 1 and walked.converged and agrees else better(early, walked)
 
 
-def _mixture(start: ImportanceRun, seed: int) -> Posterior:
+def _mixture(start: ImportanceRun[Target], seed: int) -> Posterior:
     """The posterior of all ways of homing, from the draws of the most probable one."""
-    first = start.posterior
+    first = start.density.posterior(start.sample, seed)
     others = [run_beside(way.fit, start, seed) for way in first.fit.mixture[1:] if way.fit]
     return mixed([first, *others]) if others else first
-
-
-def _better(early: Posterior, walked: Posterior) -> Posterior:
-    """The posterior with the better answer, a chain's of two that are as good.
-
-    A chain that contradicts the weighted draws leaves neither accepted. It knows one way of homing; where others count,
-    the weighted draws of all have the last word.
-    """
-    chain, order = walked.convergence, ("accepted", "rough", "laplace")
-    assert isinstance(chain, Convergence)
-    if chain.agreement is not None and not chain.agreement.agrees:
-        return walked
-    several = len(early.fit.mixture) > 1 and walked.converged
-    better = order.index(early.convergence.answer) < order.index(chain.answer)
-    return early if several or better else walked

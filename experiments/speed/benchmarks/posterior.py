@@ -26,9 +26,9 @@ from experiments.common.rigs import dense_plan, mounted_rig
 from experiments.speed.benchmarks.measure import Bench, Case, Column
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.likelihood import log_density
-from tvsbayes.posterior.ensemble import WALKERS
 from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
+from tvsbayes.posterior.target import WALKERS
 from tvsbayes.posterior.transport import Transport
 from tvsbayes.statistics.weighted_draws import weighted_summary
 from tvsbayes.twin.simulated_campaign import simulate
@@ -133,7 +133,7 @@ def measure(bench: Bench) -> None:
     joint = fit(simulate(mounted_rig(), dense_plan(("d1", "d3")), seed=1).campaign)
     # Compiles everything that `sample` calls, and gives the stretch move walkers that are draws already.
     run = importance_run(joint, 0)
-    samplers = Contenders(joint, run.path, run.starts(WALKERS))
+    samplers = Contenders(joint, run.density.path, run.starts(WALKERS))
     works = {OURS: samplers.ours, FIRST_TIER: samplers.weighted, STRETCH: samplers.stretched}
     works |= {NUTS: samplers.hamiltonian(nuts), BLACKJAX: samplers.hamiltonian(blackjax_nuts)}
     bench.interleaved(NAME, works, repeats)

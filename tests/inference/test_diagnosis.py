@@ -8,12 +8,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.two_parameters import AT_MODE, BACKLASH, RATIO, STRETCH, autoregressive, fit, route
+from support.two_parameters import AT_MODE, BACKLASH, RATIO, STRETCH, autoregressive, route
 
+from tvsbayes.inference.chain import Chain
+from tvsbayes.inference.density import Points
+from tvsbayes.inference.diagnosis import AGREEMENT_LIMIT, GROUPS, autocorrelation_steps, diagnose, grouped
+from tvsbayes.inference.importance import Sample
 from tvsbayes.instrument.parameters import NAMES
-from tvsbayes.posterior.chain import Chain
-from tvsbayes.posterior.diagnosis import AGREEMENT_LIMIT, GROUPS, autocorrelation_steps, diagnose, grouped
-from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.convergence import Importance, NamedValue, Reweighted
 
 WALKERS, STEPS = 64, 400
@@ -37,38 +38,44 @@ def independent(steps: int = STEPS) -> np.ndarray:
     return np.random.default_rng(1).standard_normal((steps, WALKERS, 2))
 
 
-def derived_of(fit, z, place_errors_rad):
-    """Headlines of the two parameters alone."""
-    zero, ratios = np.zeros(z.shape[:2]), np.zeros((*z.shape[:2], 4))
-    return SimpleNamespace(
-        physical=z, effective_deg_per_step=ratios, local_deg_per_step=ratios, effective_mirror_offset_mm=zero
-    )
+class TwoNormals:
+    """A density of the two parameters, mapped by hand; nothing was integrated out."""
 
+    headlines = (NAMES[RATIO], NAMES[BACKLASH])
+    fixed = frozenset()
 
-def evaluate(z, normal, space, arrays):
-    """No campaign: only what errors at places would be drawn, none."""
-    return SimpleNamespace(log_density=np.zeros(len(z)), place_errors_rad=normal)
+    def valued(self, w, generator):
+        """With the map of `route`; the density is the chain's."""
+        mapped = route().mapped(w)
+        return Points(w, np.zeros(len(w)), {"z": mapped.z, "log_jacobian": mapped.log_jacobian})
+
+    def log_density(self, points):
+        """In z."""
+        return points.log_target + AT_MODE - points.parts["log_jacobian"]
+
+    def quantities(self, points):
+        """By their names, and one that no draw changes."""
+        z = points.parts["z"]
+        return {NAMES[k]: z[:, k] for k in (RATIO, BACKLASH)} | {"effective_mirror_offset_mm": np.zeros(len(z))}
 
 
 @pytest.fixture
-def judged(monkeypatch):
+def judged():
     """Diagnosis of a chain, by default after importance sampling that was not accepted: it is judged alone."""
-    monkeypatch.setattr("tvsbayes.posterior.diagnosis.derived_of", derived_of)
-    monkeypatch.setattr("tvsbayes.posterior.proposal.evaluate", evaluate)
-    monkeypatch.setattr("tvsbayes.posterior.diagnosis.headline_names", lambda fit: (NAMES[RATIO], NAMES[BACKLASH]))
-    refused = SimpleNamespace(converged=False, seed=0, convergence=SimpleNamespace(importance=None, answer="laplace"))
+    refused = SimpleNamespace(convergence=SimpleNamespace(importance=None, answer="laplace"))
 
-    def judge(chain: Chain, first: object = refused) -> Posterior:
-        return diagnose(fit(), SimpleNamespace(path=route(), posterior=first), chain)
+    def judge(chain: Chain, first: object = refused) -> Sample:
+        return diagnose(SimpleNamespace(density=TwoNormals(), sample=first, seed=0), chain)
 
     return judge
 
 
 def test_independent_draws_have_converged_and_keep_their_density(judged):
     found = judged(chain_of(independent()))
-    assert found.converged, found.convergence.missing
+    assert found.convergence.converged, found.convergence.missing
     assert found.convergence.stuck_walkers == ()
-    np.testing.assert_allclose(found.log_density, log_normal_density(found.z), rtol=1e-12)
+    points = found.points
+    np.testing.assert_allclose(TwoNormals().log_density(points), log_normal_density(points.parts["z"]), rtol=1e-12)
 
 
 def test_groups_of_other_means_are_told_by_r_hat(judged):
@@ -121,22 +128,23 @@ def test_a_walker_is_stuck_that_hardly_moves_or_lives_at_another_density(judged)
         assert convergence.missing[-1] == f"stuck walkers: {stuck}"
 
 
-def weighted(shift: float = 0.0) -> Posterior:
+def weighted(shift: float = 0.0) -> Sample:
     """The same two normals by 8000 draws of twice their variance, accepted; the ratio shifted by so many sds."""
     draws = np.sqrt(2) * np.random.default_rng(7).standard_normal((8000, 2))
     weights = np.exp(-0.25 * np.sum(draws**2, axis=1))
     weights /= weights.sum()
-    z = np.zeros((1, 8000, len(NAMES)))
-    z[0][:, [BACKLASH, RATIO]] = draws + np.array([0.0, shift])
+    z = np.zeros((8000, len(NAMES)))
+    z[:, [BACKLASH, RATIO]] = draws + np.array([0.0, shift])
     worst = NamedValue(NAMES[RATIO], 0.1)
     importance = Importance(True, (), 8, 8000, 0.5, worst, 0.1, worst, 0.001, 0.0, 0.01, 0, "accepted")
-    found = derived_of(None, z, None)
-    return Posterior(None, z, np.zeros((1, 8000)), found, weights[None], Reweighted(importance, {}, {}, {}), 0, 0.0)
+    points = Points(draws, np.zeros(8000), {"z": z})
+    found = TwoNormals().quantities(points)
+    return Sample(points, found, weights[None], Reweighted(importance, {}, {}, {}), 0.0)
 
 
 def test_a_chain_that_says_the_same_as_importance_sampling_agrees(judged):
     found = judged(chain_of(independent()), weighted())
-    assert found.converged and found.convergence.agreement.agrees
+    assert found.convergence.converged and found.convergence.agreement.agrees
     assert found.convergence.agreement.worst.value < AGREEMENT_LIMIT
     assert found.convergence.importance.draws == 8000
 
@@ -157,8 +165,8 @@ def test_a_chain_that_says_something_else_is_known_no_better_than_both_agree(jud
 
 def test_where_every_headline_is_fixed_the_others_must_agree(judged, monkeypatch):
     """A rig whose geometry is stated as known: the campaign teaches its noise."""
-    monkeypatch.setattr("tvsbayes.posterior.diagnosis.headline_names", lambda fit: ("effective_mirror_offset_mm",))
-    assert judged(chain_of(independent()), weighted()).converged
+    monkeypatch.setattr(TwoNormals, "headlines", ("effective_mirror_offset_mm",))
+    assert judged(chain_of(independent()), weighted()).convergence.converged
     found = judged(chain_of(independent()), weighted(-0.15))
     assert found.convergence.missing and NAMES[RATIO] in found.convergence.agreement.worst.quantity
 

@@ -10,8 +10,8 @@ from scipy import stats
 from support.small_posterior import SIGMAS
 from support.tabulated import tabulated
 
-from tvsbayes.posterior.proposal import Independence, first_proposal, forest
-from tvsbayes.posterior.tables import CUT_NODES, LEADER_NODES, NODES, Followers, Tables, between_cuts
+from tvsbayes.inference.proposal import Independence, first_proposal, forest
+from tvsbayes.inference.tables import CUT_NODES, LEADER_NODES, NODES, Followers, Tables, between_cuts
 
 GRID = np.linspace(-12.0, 16.0, 561)
 
@@ -114,7 +114,7 @@ def test_a_pair_that_explains_the_same_scatter_is_proposed_as_the_target_has_it(
         return -0.5 * np.sum(w**2, axis=1) / 4 - 0.5 * (both - 3.0) ** 2 / 0.15
 
     followed = effective_share(target, 2)
-    monkeypatch.setattr("tvsbayes.posterior.proposal.forest", lambda *_: [])
+    monkeypatch.setattr("tvsbayes.inference.proposal.forest", lambda *_: [])
     # Between the leader's nodes tables are mixed: that costs a part.
     assert followed > 0.2 > 20 * effective_share(target, 2)
 
@@ -132,7 +132,7 @@ def test_coordinates_follow_those_that_they_depend_on_most(monkeypatch):
     assert {frozenset(pair) for pair in forest(target, np.array([3, 1, 2]), 4)} == {frozenset((1, 2))}
     assert forest(target, np.array([3]), 4) == [] and forest(target, np.array([1, 3]), 4) == []
     followed = effective_share(target, 4)
-    monkeypatch.setattr("tvsbayes.posterior.proposal.forest", lambda *_: [])
+    monkeypatch.setattr("tvsbayes.inference.proposal.forest", lambda *_: [])
     assert followed > 0.3 > 2 * effective_share(target, 4)
 
 

@@ -12,12 +12,13 @@ import pytest
 from support.small_posterior import ROUNDING, SIGMAS
 from support.tabulated import tabulated
 
+from tvsbayes.inference import ensemble
+from tvsbayes.inference.chain import Chain
+from tvsbayes.inference.diagnosis import GROUPS, TAU_LIMIT
+from tvsbayes.inference.ensemble import GroupEvolution
+from tvsbayes.inference.proposal import Independence
 from tvsbayes.model.compiled import BATCH
-from tvsbayes.posterior import ensemble
-from tvsbayes.posterior.chain import Chain
-from tvsbayes.posterior.diagnosis import GROUPS, TAU_LIMIT
-from tvsbayes.posterior.ensemble import WALKERS, GroupEvolution, walkers_for
-from tvsbayes.posterior.proposal import Independence
+from tvsbayes.posterior.target import WALKERS, walkers_for
 
 RESOLVED = 0.05
 """Five standard errors of E[x.x]/d have to be below this, or the run could not see a bias of sd x0.97."""

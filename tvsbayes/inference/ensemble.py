@@ -1,34 +1,25 @@
 """The ensemble of walkers: its moves, and the run that extends a chain until it has converged.
 
-Coordinates w of `posterior.transport`. The walkers form groups that never use one another, so that R-hat compares
+The walkers form groups that never use one another, so that R-hat compares
 independent chains.
 """
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
+from collections.abc import Callable
+from typing import Protocol
 
 import emcee
 import numpy as np
 
-from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.model.compiled import BATCH
-from tvsbayes.posterior.chain import Chain, write_chain
-from tvsbayes.posterior.diagnosis import ESS_LIMIT, GROUPS, TAU_LIMIT, diagnose, steps_wanted
-from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.importance import ImportanceRun
-from tvsbayes.posterior.proposal import Independence, Target
+from tvsbayes.inference.chain import Chain
+from tvsbayes.inference.density import Density, Proposal
+from tvsbayes.inference.diagnosis import ESS_LIMIT, GROUPS, TAU_LIMIT, diagnose, steps_wanted
+from tvsbayes.inference.importance import ImportanceRun, Sample
 from tvsbayes.progress import Advance, OpenEnded
-from tvsbayes.results.convergence import Convergence
+from tvsbayes.results.convergence import Convergence, Reweighted
 
-WALKERS = 64
-SHARES = (0.6, 0.35, 0.05)
-"""All coordinates anew from the proposal, some of them, differential evolution.
-
-Where the proposal is too thin a walker stays for as many steps as its weight says, and effective draws of the tails are
-lost: new values of some coordinates lead out of there. Differential evolution needs no proposal.
-"""
 FIRST_CHECK = 200
 GROWTH_RANGE = 1.1, 1.6
 """Steps at the first look at convergence; least and largest growth of the chain from one look to the next."""
@@ -66,15 +57,13 @@ class GroupEvolution(emcee.moves.DEMove):
         return np.concatenate(moved), np.zeros(len(s))
 
 
-def moves(proposal: Independence) -> list[tuple[emcee.moves.Move, float]]:
-    """The moves and their shares; never emcee 3.1.6's snooker or full-covariance Gaussian (both are biased)."""
-    independent = (emcee.moves.MHMove(each) for each in (proposal, proposal.renewed))
-    return list(zip((*independent, GroupEvolution()), SHARES, strict=True))
+def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
+    """The proposal's steps and, for the rest, differential evolution, which needs no proposal.
 
-
-def walkers_for(dimension: int) -> int:
-    """Ensemble size: at least half as many walkers as dimensions, whole batches and whole groups in each half."""
-    return max(WALKERS, 2 * BATCH * -(-dimension // (4 * BATCH)))
+    Never emcee 3.1.6's snooker or full-covariance Gaussian: both are biased.
+    """
+    steps = [(emcee.moves.MHMove(step), share) for step, share in proposal.steps]
+    return [*steps, (GroupEvolution(), 1 - sum(share for _, share in steps))]
 
 
 def lengthening(found: Convergence) -> float:
@@ -93,33 +82,30 @@ def next_look(chain: Chain, found: Convergence) -> int:
     return int(np.ceil(len(chain.w) * growth))
 
 
-class Run:
-    """One call of `sampling.sample`: emcee in blocks, looks on a schedule that depends on the chain alone."""
+class Run[D: Density]:
+    """One call of a sampler: emcee in blocks, looks on a schedule that depends on the chain alone."""
 
     def __init__(
         self,
-        fit: JointFit,
-        start: ImportanceRun,
+        start: ImportanceRun[D],
         chain: Chain | None,
-        checkpoint: Path | None,
+        keep: Callable[[Chain], None] | None,
         advance: Advance,
         began: float,
     ):
-        self.fit, self.start = fit, start
-        self.checkpoint, self.told, self.began = checkpoint, advance, began
-        self.positions = start.starts(walkers_for(start.path.dimension))
+        self.start, self.keep, self.told, self.began = start, keep, advance, began
+        density = start.density
+        self.positions = start.starts(density.walkers)
         walkers, dimension = self.positions.shape
         if chain is None:
-            state = np.random.RandomState(start.posterior.seed).get_state()
+            state = np.random.RandomState(start.seed).get_state()
             empty = np.zeros((0, walkers, dimension))
             chain = Chain(empty, np.zeros((0, walkers)), np.zeros(walkers), state, 0, 0.0, FIRST_CHECK)
         self.before, self.goal, self.saved_at = chain, chain.goal, began
-        self.target = Target(fit, start.path)
-        self.sampler = emcee.EnsembleSampler(
-            walkers, dimension, self.target, moves=moves(start.proposal), vectorize=True
-        )
+        self.invalid = density.invalid
+        self.sampler = emcee.EnsembleSampler(walkers, dimension, density, moves=moves(start.proposal), vectorize=True)
         # emcee's wrapper prints the walkers and a traceback for every exception, Ctrl-C among them.
-        self.sampler.log_prob_fn = self.target
+        self.sampler.log_prob_fn = density
 
     def chain(self) -> Chain:
         """All steps so far, earlier runs included."""
@@ -132,15 +118,15 @@ class Run:
             np.concatenate([self.before.log_density, backend.get_log_prob()]),
             self.before.accepted + backend.accepted,
             backend.random_state,
-            self.before.invalid + self.target.invalid,
+            self.before.invalid + self.start.density.invalid - self.invalid,
             seconds,
             self.goal,
         )
 
     def save(self) -> None:
         """Write the checkpoint, if one is kept."""
-        if self.checkpoint is not None:
-            write_chain(self.checkpoint, self.fit, self.start, self.chain())
+        if self.keep is not None:
+            self.keep(self.chain())
         self.saved_at = time.monotonic()
 
     def advance(self, steps: int) -> None:
@@ -156,17 +142,17 @@ class Run:
         for _ in self.sampler.sample(state, iterations=steps, skip_initial_state_check=True):
             pass
 
-    def look(self) -> tuple[Posterior, bool]:
-        """The posterior so far, and whether it is the last word; else the next look is set."""
+    def look(self) -> tuple[Sample, bool]:
+        """The sample so far, and whether it is the last word; else the next look is set."""
         chain = self.chain()
-        posterior = diagnose(self.fit, self.start, chain)
-        found = posterior.convergence
+        sample = diagnose(self.start, chain)
+        found = sample.convergence
         assert isinstance(found, Convergence)
         if not found.missing or hopeless(found):
-            return posterior, True
+            return sample, True
         if len(chain.w) >= self.goal:
             self.goal = next_look(chain, found)
-        return posterior, False
+        return sample, False
 
     def too_short(self) -> bool:
         """Whether autocorrelation times alone ask for more steps; then the next look is set."""
@@ -177,14 +163,14 @@ class Run:
         self.goal = int(np.ceil(len(chain.w) * np.clip(growth, *LENGTHENING_RANGE)))
         return True
 
-    def until_converged(self, seconds: float) -> Posterior:
+    def until_converged(self, seconds: float) -> Sample:
         """Extend, look, extend."""
         done, towards = len(self.before.w), OpenEnded()
         # An interrupted chain is first brought to its next look: it ends where an unbroken run ends.
         if done >= self.goal and not self.too_short():
-            posterior, ended = self.look()
+            sample, ended = self.look()
             if ended:
-                return posterior
+                return sample
         try:
             while True:
                 steps = min(BLOCK, self.goal - done)
@@ -193,10 +179,10 @@ class Run:
                 elapsed = time.monotonic() - self.began
                 over = elapsed > seconds
                 if over or (done >= self.goal and not self.too_short()):
-                    posterior, ended = self.look()
+                    sample, ended = self.look()
                     if ended or over:
                         self.save()
-                        return posterior
+                        return sample
                 elif time.monotonic() - self.saved_at > CHECKPOINT_SECONDS:
                     self.save()
                 self.told(max(towards.share(done, self.goal), elapsed / seconds))
@@ -209,3 +195,22 @@ def hopeless(found: Convergence) -> bool:
     """Whether nothing but the agreement with importance sampling is missing of a chain far longer than wanted."""
     disagrees = found.agreement is not None and not found.agreement.agrees
     return disagrees and len(found.missing) == 1 and SETTLED * lengthening(found) <= 1
+
+
+class Judged(Protocol):
+    """What has an answer."""
+
+    @property
+    def convergence(self) -> Convergence | Reweighted: ...  # noqa: D102
+
+
+def better[J: Judged](early: J, walked: J) -> J:
+    """Of weighted draws and a chain the one with the better answer, the chain of two that are as good.
+
+    A chain that contradicts the weighted draws leaves neither accepted.
+    """
+    chain, order = walked.convergence, ("accepted", "rough", "laplace")
+    assert isinstance(chain, Convergence)
+    if chain.agreement is not None and not chain.agreement.agrees:
+        return walked
+    return early if order.index(early.convergence.answer) < order.index(chain.answer) else walked

@@ -1,6 +1,6 @@
-"""What is sampled and from where draws are proposed: the target in the map's coordinates, and the proposal's shape.
+"""A proposal for many coordinates that are nearly standard normal: each by itself, some by tables, turned and led.
 
-Coordinates w of `posterior.transport`, nearly standard normal; log densities are exact, the map's Jacobian in them.
+Coordinates w (n, d); log densities are exact.
 """
 
 from __future__ import annotations
@@ -9,15 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import jax
 import numpy as np
 from scipy import special
 
-from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.likelihood import evaluate, no_draw
-from tvsbayes.model.compiled import in_batches
-from tvsbayes.posterior.tables import CUT_NODES, LEADER_NODES, NODES, Followers, Tables, between_cuts
-from tvsbayes.posterior.transport import Mapped, Transport
+from tvsbayes.inference.density import Step
+from tvsbayes.inference.tables import CUT_NODES, LEADER_NODES, NODES, Followers, Tables, between_cuts
 
 HEAVY_DOF = 5.0
 """Of all t distributions but the one of the coupled coordinates."""
@@ -31,6 +27,11 @@ COUPLED_SHARE, COUPLED_DOF, COUPLED_WIDTH = 0.2, 10.0, 1.2
 single draws of the paper's protocol carried so much weight that half as many again were needed."""
 INFLATION = 1.03
 """Factor on the proposal's sds: one lighter than the target lets single draws weigh much, and walkers freeze."""
+SHARES = 0.6, 0.35
+"""Of a chain's steps: all coordinates anew from the proposal, some of them.
+
+Where the proposal is too thin a walker stays for as many steps as its weight says, and effective draws of the tails are
+lost: new values of some coordinates lead out of there."""
 RENEWED_RANGE = 0.1, 0.6
 """Share of its coordinates of which a walker asks for new values, where not for all: uniform between these. A draw of
 great weight is left soon: what made it rare is mostly a few coordinates."""
@@ -58,56 +59,7 @@ MATTERS = 12.0
 """Draws whose log weight lies farther below the largest tell nothing of the target's shape."""
 
 
-@dataclass(frozen=True)
-class Valued:
-    """Points by their density, and a draw of the errors at places for each.
-
-    Attributes:
-        log_target: log density of w relative to z's at the mode, -inf where the model has no value, shape (n,).
-        place_errors_rad: shape (n, e).
-        mapped: where they lie in z.
-    """
-
-    log_target: np.ndarray
-    place_errors_rad: np.ndarray
-    mapped: Mapped
-
-
-def place_normals(count: int, fit: JointFit, generator: np.random.Generator) -> np.ndarray:
-    """What `evaluate` makes draws of the errors at places from."""
-    return generator.standard_normal((count, 2 * len(fit.arrays.gears.places.steps)))
-
-
-class Target:
-    """The log posterior density of points w, as samplers call it: NumPy in, NumPy out, NaN refused and counted."""
-
-    def __init__(self, fit: JointFit, path: Transport):
-        self.fit, self.path = fit, path
-        self.invalid = 0
-
-    def __call__(self, w: np.ndarray) -> np.ndarray:
-        """Log density of w (n, d), relative to z's at the mode; -inf where the model has no value."""
-        return self.valued(w, no_draw(len(w), self.fit.arrays)).log_target
-
-    def valued(self, w: np.ndarray, normal: np.ndarray) -> Valued:
-        """The same, with draws of the errors at places from standard normal numbers (n, e)."""
-        return self.at(self.path.mapped(w), normal)
-
-    def at(self, found: Mapped, normal: np.ndarray) -> Valued:
-        """The same of points that are mapped already."""
-
-        def value_and_errors(z: np.ndarray, normal: np.ndarray) -> tuple[jax.Array, jax.Array]:
-            seen = evaluate(z, normal, self.fit.space, self.fit.arrays)
-            return seen.log_density, seen.place_errors_rad
-
-        value, errors_rad = in_batches(value_and_errors, found.z, normal)
-        invalid = np.isnan(value)
-        self.invalid += int(invalid.sum())
-        log_target = np.where(invalid, -np.inf, value - self.fit.log_density + found.log_jacobian)
-        return Valued(log_target, np.asarray(errors_rad), found)
-
-
-def _log_t(distance2: np.ndarray, dimension: int, dof: float = HEAVY_DOF) -> np.ndarray:
+def log_t(distance2: np.ndarray, dimension: int, dof: float = HEAVY_DOF) -> np.ndarray:
     """Log density of a multivariate t of unit scale at squared distances."""
     constant = special.gammaln(0.5 * (dof + dimension)) - special.gammaln(0.5 * dof)
     constant -= 0.5 * dimension * np.log(dof * np.pi)
@@ -237,7 +189,7 @@ class Independence:
         """Log densities of the coordinates v one by one, shape (n, d)."""
         distance2 = ((v - self.mean) / self.sd) ** 2
         found = -0.5 * np.log(2 * np.pi) - 0.5 * distance2 - np.log(self.sd)
-        single = _log_t(distance2[:, self.places], 1) - np.log(self.sd[self.places])
+        single = log_t(distance2[:, self.places], 1) - np.log(self.sd[self.places])
         table = self.tables.at(v[:, self.places])
         table[:, self.followers.follower] = self.followers.at(v[:, self.places])
         found[:, self.places] = np.logaddexp(np.log(1 - OWN_SHARE) + table, np.log(OWN_SHARE) + single)
@@ -249,9 +201,9 @@ class Independence:
         each, log_sd, some = self._each(v), np.log(self.sd), self.coupled
         distance2 = ((v - self.mean) / self.sd) ** 2
         alone = np.sum(each, axis=1)
-        partly = _log_t(np.sum(distance2[:, some], axis=1) / COUPLED_WIDTH**2, len(some), COUPLED_DOF)
+        partly = log_t(np.sum(distance2[:, some], axis=1) / COUPLED_WIDTH**2, len(some), COUPLED_DOF)
         partly += alone - np.sum(each[:, some], axis=1) - np.sum(log_sd[some] + np.log(COUPLED_WIDTH))
-        whole = _log_t(np.sum(distance2, axis=1), len(log_sd)) - np.sum(log_sd)
+        whole = log_t(np.sum(distance2, axis=1), len(log_sd)) - np.sum(log_sd)
         shares = np.log([1 - COUPLED_SHARE - HEAVY_SHARE, COUPLED_SHARE, HEAVY_SHARE])
         return np.logaddexp.reduce(shares[:, None] + np.stack([alone, partly, whole]), axis=0) - self._log_volume
 
@@ -306,6 +258,11 @@ class Independence:
         """The protocol of `emcee.moves.MHMove`."""
         proposed = self.draw(len(w), generator)
         return proposed, self.log_density(w) - self.log_density(proposed)
+
+    @property
+    def steps(self) -> tuple[tuple[Step, float], ...]:
+        """Of a chain, with their shares."""
+        return tuple(zip((self, self.renewed), SHARES, strict=True))
 
     def renewed(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """The same protocol, with new values of some coordinates of every point, each from its own density."""

@@ -6,26 +6,17 @@ Judged on the stored draws, so that what ArviZ computes from `posterior.nc` is w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import emcee
 import numpy as np
-from arviz_stats.base import array_stats
 
-from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.likelihood import no_draw
-from tvsbayes.instrument.parameters import NAMES
-from tvsbayes.model.headlines import Derived
-from tvsbayes.posterior.chain import Chain
-from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names, monte_carlo_errors, propagated
-from tvsbayes.posterior.importance import ImportanceRun, uncertain
-from tvsbayes.posterior.proposal import Target, place_normals
-from tvsbayes.results.convergence import (
-    Agreement,
-    Convergence,
-    MonteCarloError,
-    extreme,
-)
+from tvsbayes.inference.chain import Chain
+from tvsbayes.inference.density import Density, columns_of
+from tvsbayes.inference.importance import ImportanceRun, Sample, uncertain
+from tvsbayes.inference.summaries import monte_carlo_errors, propagated
+from tvsbayes.results.convergence import Agreement, Convergence, MonteCarloError, extreme
 
 GROUPS = 4
 """Of walkers that share no partners: chains that know nothing of each other, for R-hat."""
@@ -152,10 +143,11 @@ class Comparison:
         return {name: MonteCarloError(mean, (*ends,)) for name, (mean, *ends) in zip(self.names, rows, strict=True)}
 
 
-def compared(first: Posterior, chain_draws: Derived, names: tuple[str, ...]) -> Comparison:
+def compared(
+    first: Sample, own: Mapping[str, np.ndarray], shape: tuple[int, int], names: tuple[str, ...]
+) -> Comparison:
     """Draws (chain, draw) with the weighted ones, by the columns of those names that vary; by all if none does."""
-    own, theirs = Draws(chain_draws), first.by_name
-    shape = np.shape(chain_draws.effective_mirror_offset_mm)
+    theirs = first.quantities
     varying = [name for name in own if np.ptp(own[name]) > 0 and np.ptp(theirs[name]) > 0]
     # Where nothing that a fit is for is left open, everything else stands for it.
     names = tuple(name for name in names if name in varying) or tuple(varying)
@@ -166,80 +158,50 @@ def compared(first: Posterior, chain_draws: Derived, names: tuple[str, ...]) -> 
     return Comparison(names, np.abs(one - other), np.hypot(*errors), ours.sd)
 
 
-@dataclass(frozen=True)
-class Stored:
-    """What is kept of a chain: thinned draws (walker, draw, ...), after `discarded` steps, every `thin`-th."""
+def quality_of(chain: Chain, discarded: int, columns: Mapping[str, np.ndarray], shape: tuple[int, int]) -> ChainQuality:
+    """By columns of the stored draws (walker, draw)."""
+    # It puts a module of JAX's name among those that are loaded.
+    from arviz_stats.base import array_stats
 
-    chain: Chain
-    discarded: int
-    thin: int
-    w: np.ndarray
-    z: np.ndarray
-    log_density: np.ndarray
-
-    @classmethod
-    def of(cls, fit: JointFit, start: ImportanceRun, chain: Chain) -> Stored:
-        """Leave out the warm-up, and thin."""
-        discarded = len(chain.w) // WARM_UP
-        kept = chain.w[discarded:]
-        thin = max(1, len(kept) // STORED_DRAWS)
-        w = kept[::thin].transpose(1, 0, 2)
-        found = start.path.mapped(w.reshape(-1, w.shape[2]))
-        density = chain.log_density[discarded:][::thin].T + fit.log_density - found.log_jacobian.reshape(w.shape[:2])
-        return cls(chain, discarded, thin, w, found.z.reshape(*w.shape[:2], -1), density)
-
-    @property
-    def kept(self) -> int:
-        """Steps after those left out."""
-        return len(self.chain.w) - self.discarded
-
-    def quality(self, fit: JointFit, derived: Derived, tau_steps: float) -> ChainQuality:
-        """Of all columns that vary: `derived` are the draws', `tau_steps` their longest autocorrelation time."""
-        columns = {**Draws(derived), "log_density": self.log_density.ravel()}
-        fixed = {NAMES[i] for i in np.flatnonzero(~fit.free)}
-        names = tuple(name for name, column in columns.items() if name not in fixed and np.ptp(column) > 0)
-        values = np.stack([columns[name].reshape(self.log_density.shape) for name in names], axis=2)
-        axes = {"chain_axis": 0, "draw_axis": 1}
-        return ChainQuality(
-            names,
-            rhat=array_stats.rhat(grouped(values), method="rank", **axes),
-            ess_bulk=array_stats.ess(values, method="bulk", **axes),
-            ess_tail=array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes),
-            kept=self.kept,
-            tau_steps=tau_steps,
-            stuck=stuck_walkers(self.chain, self.discarded),
-        )
+    values = np.stack([column.reshape(shape) for column in columns.values()], axis=2)
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    return ChainQuality(
+        tuple(columns),
+        rhat=array_stats.rhat(grouped(values), method="rank", **axes),
+        ess_bulk=array_stats.ess(values, method="bulk", **axes),
+        ess_tail=array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes),
+        kept=len(chain.w) - discarded,
+        tau_steps=autocorrelation_steps(chain.w[discarded:]),
+        stuck=stuck_walkers(chain, discarded),
+    )
 
 
-def chain_errors(fit: JointFit, derived: Derived, shape: tuple[int, int]) -> dict[str, MonteCarloError]:
+def chain_errors(
+    headlines: tuple[str, ...], own: Mapping[str, np.ndarray], shape: tuple[int, int]
+) -> dict[str, MonteCarloError]:
     """Of the headlines that vary, by draws (walker, draw) of a chain."""
-    columns = Draws(derived)
-    names = [name for name in headline_names(fit) if np.ptp(columns[name]) > 0]
+    names = [name for name in headlines if np.ptp(own[name]) > 0]
     if not names:
         return {}
-    return monte_carlo_errors(names, propagated(np.stack([columns[name].reshape(shape) for name in names], axis=-1)))
+    return monte_carlo_errors(names, propagated(np.stack([own[name].reshape(shape) for name in names], axis=-1)))
 
 
-def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
-    """Leave out the warm-up, thin, and judge what is left.
-
-    Where the chain is long enough for its autocorrelation times each draw gets errors at places, a density's work each;
-    else they are nought, in draws that must not be used.
-    """
-    stored = Stored.of(fit, start, chain)
-    walkers, draws = stored.log_density.shape
-    tau_steps, first = autocorrelation_steps(chain.w[stored.discarded :]), start.posterior
-    errors_rad = no_draw(walkers * draws, fit.arrays)
-    if stored.kept >= TAU_LIMIT * tau_steps:
-        normal = place_normals(walkers * draws, fit, np.random.default_rng([first.seed, 5]))
-        errors_rad = Target(fit, start.path).valued(stored.w.reshape(walkers * draws, -1), normal).place_errors_rad
-    derived = derived_of(fit, stored.z, errors_rad.reshape(walkers, draws, -1))
-    quality = stored.quality(fit, derived, tau_steps)
+def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
+    """Leave out the warm-up, thin, draw what was integrated out, and judge what is left."""
+    density, first = start.density, start.sample
+    discarded = len(chain.w) // WARM_UP
+    thin = max(1, (len(chain.w) - discarded) // STORED_DRAWS)
+    w = chain.w[discarded:][::thin].transpose(1, 0, 2)
+    shape = walkers, draws = w.shape[:2]
+    points = density.valued(w.reshape(walkers * draws, -1), np.random.default_rng([start.seed, 5]))
+    points = replace(points, log_target=chain.log_density[discarded:][::thin].T.ravel())
+    own = density.quantities(points)
+    quality = quality_of(chain, discarded, columns_of(density, points), shape)
     missing, same = quality.missing, None
-    errors = chain_errors(fit, derived, stored.log_density.shape)
+    errors = chain_errors(density.headlines, own, shape)
     missing.extend(uncertain(errors))
     if not missing and first.convergence.answer == "accepted":
-        beside = compared(first, derived, headline_names(fit))
+        beside = compared(first, own, shape, density.headlines)
         same = beside.agreement
         # What two samplers do not agree on is known no better than they agree.
         errors = errors if same.agrees else errors | beside.gaps
@@ -248,8 +210,8 @@ def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
         missing.append(f"emcee and importance sampling differ on {same.worst.quantity} {gap}")
     convergence = Convergence(
         steps=len(chain.w),
-        discarded=stored.discarded,
-        thin=stored.thin,
+        discarded=discarded,
+        thin=thin,
         tau_steps=quality.tau_steps,
         rhat=quality.by_name(quality.rhat),
         ess_bulk=quality.by_name(quality.ess_bulk),
@@ -267,5 +229,5 @@ def diagnose(fit: JointFit, start: ImportanceRun, chain: Chain) -> Posterior:
             and all(error.roughly_known for error in errors.values())
         ),
     )
-    weights = np.full((walkers, draws), 1 / (walkers * draws))
-    return Posterior(fit, stored.z, stored.log_density, derived, weights, convergence, first.seed, chain.seconds)
+    weights = np.full(shape, 1 / (walkers * draws))
+    return Sample(points, own, weights, convergence, chain.seconds)

@@ -1,6 +1,6 @@
 """Densities of single coordinates by tables, and of coordinates that follow another: exact densities, exact draws.
 
-Coordinates w of `posterior.transport`; a table is a broken line through the logarithm at `NODES`.
+Coordinates w, nearly standard normal; a table is a broken line through the logarithm at `NODES`.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from scipy import stats
 from support.small_posterior import SIGMAS
 from support.tabulated import tabulated
 
-from tvsbayes.posterior.proposal import PAIR_T, Independence, regression
+from tvsbayes.inference.proposal import PAIR_T, Independence, regression
 
 DIMENSION = 8
 TABULATED = np.arange(1, DIMENSION, 3)

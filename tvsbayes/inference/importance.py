@@ -1,0 +1,368 @@
+"""The posterior by importance sampling: independent draws from a proposal that follows it, weighted (formulation 4.3).
+
+Pilot rounds of draws teach the proposal: pooled, each draw weighted by the target over the mixture of all proposals
+that made them, the balance heuristic (Veach and Guibas, SIGGRAPH 95, 419; Owen and Zhou, J. Am. Stat. Assoc. 95 (2000)
+135), so that a poor first round costs little. They take no part in the posterior: a proposal fitted to a draw is high
+where that draw is, whose weight would come out too small (Marin, Pudlo and Sedki, Bernoulli 25 (2019) 1977). Where the
+draws of a proposal would take too long to be accepted, they in turn are the pilot of the next one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from tvsbayes.errors import NotConverged
+from tvsbayes.inference.density import Density, Points, Proposal, columns_of
+from tvsbayes.inference.summaries import Propagated, monte_carlo_errors, propagated, reweighted
+from tvsbayes.progress import Advance, OpenEnded, unshown
+from tvsbayes.results.convergence import (
+    END_ERROR_MAX,
+    MEAN_ERROR_MAX,
+    Convergence,
+    Importance,
+    MonteCarloError,
+    Reweighted,
+    extreme,
+)
+from tvsbayes.statistics.weighted_draws import (
+    SmoothedWeights,
+    WeightedSummary,
+    effective_draws,
+    pareto_k,
+    smoothed_weights,
+    systematic,
+    weighted_summary,
+)
+
+ROUND = 1024
+PILOT_ROUNDS = 2
+"""Rounds after each of which the proposal is fitted to all draws so far."""
+ROUNDS_MAX = 64
+"""All rounds of all proposals: the budget."""
+ROUNDS_LEAST = 4
+"""Of fewer rounds nobody knows how many effective draws they have."""
+PATIENCE = 3
+"""A proposal is fitted anew if it would take more than this many times the rounds that it has had."""
+K_MAX = 0.7
+"""Tail index from which weighted means cannot be trusted, however many the draws ..."""
+ROUGH_K_MAX = 1.0
+"""... and from which they do not exist (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72)."""
+HEAVIEST_MAX, ROUGH_HEAVIEST_MAX = 0.05, 0.2
+"""Share of the weight that one draw may have."""
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Weighted draws and what they were drawn from.
+
+    Attributes:
+        points: draws, round by round; None before the first.
+        proposals: that made them; counts: how many each, in order.
+        next_proposal: fitted to all of them.
+        invalid: draws whose density has no value.
+    """
+
+    points: Points | None
+    proposals: tuple[Proposal, ...]
+    counts: tuple[int, ...]
+    next_proposal: Proposal
+    invalid: int = 0
+
+    @classmethod
+    def empty(cls, proposal: Proposal, invalid: int = 0) -> Pool:
+        """Before the first round."""
+        return cls(None, (), (), proposal, invalid)
+
+    @property
+    def drawn(self) -> Points:
+        """The draws, of which there must be some."""
+        assert self.points is not None
+        return self.points
+
+    @property
+    def log_weights(self) -> np.ndarray:
+        """Log (target / mixture of the proposals), shape (n,)."""
+        each = np.stack([proposal.log_density(self.drawn.w) for proposal in self.proposals])
+        share = np.log(np.array(self.counts) / len(self.drawn))
+        return self.drawn.log_target - np.logaddexp.reduce(each + share[:, None], axis=0)
+
+    @property
+    def refitted(self) -> Proposal:
+        """The next proposal fitted to all draws."""
+        return self.next_proposal.fitted(self.drawn.w, self.drawn.log_target, self.log_weights)
+
+    def extended(self, density: Density, generator: np.random.RandomState, fitted: bool) -> Pool:
+        """With another round; the proposal is fitted again if `fitted`."""
+        proposal, before = self.next_proposal, density.invalid
+        w = proposal.draw(ROUND, generator)
+        # A stream of its own: what was integrated out leaves the draws of w as they are.
+        valued = density.valued(w, np.random.default_rng([0 if self.points is None else len(self.points), 4]))
+        proposals, counts = self.proposals, self.counts
+        if proposals and proposals[-1] is proposal:
+            counts = (*counts[:-1], counts[-1] + ROUND)
+        else:
+            proposals, counts = (*proposals, proposal), (*counts, ROUND)
+        points = valued if self.points is None else Points.joined([self.points, valued])
+        found = Pool(points, proposals, counts, proposal, self.invalid + density.invalid - before)
+        if not np.isfinite(points.log_target).sum() > 8 * w.shape[1]:
+            raise FloatingPointError("the posterior density is not finite around the mode")
+        if fitted:
+            found = replace(found, next_proposal=found.refitted)
+        return found
+
+
+def piloted(density: Density, generator: np.random.RandomState) -> Pool:
+    """Without draws, from the proposal that the pilot rounds arrive at."""
+    pilot = Pool.empty(density.first_proposal())
+    for _ in range(PILOT_ROUNDS):
+        pilot = pilot.extended(density, generator, fitted=True)
+    return Pool.empty(pilot.next_proposal, pilot.invalid)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A sampled posterior.
+
+    Attributes:
+        points: draws, chains joined.
+        quantities: of all draws, by name, shapes (n,).
+        weights: of the draws, sum 1, shape (chain, draw).
+        convergence: the diagnosis.
+        seconds: spent on it.
+    """
+
+    points: Points
+    quantities: Mapping[str, np.ndarray]
+    weights: np.ndarray
+    convergence: Convergence | Reweighted
+    seconds: float
+
+    @property
+    def tier(self) -> str:
+        """What made the draws: "importance" (independent, weighted) or "emcee" (a chain, equal)."""
+        return "importance" if isinstance(self.convergence, Reweighted) else "emcee"
+
+    def summarised(self, values: np.ndarray) -> Propagated:
+        """Mean, sd, interval and errors of values (chain, draw, ...), one for every draw."""
+        return reweighted(values, self.weights) if self.tier == "importance" else propagated(values)
+
+    def equal(self, count: int, generator: np.random.Generator) -> np.ndarray:
+        """Coordinates (count, d) of draws that weigh the same, in random order."""
+        return self.points.w[generator.permutation(systematic(self.weights.ravel(), count, generator.random()))]
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """A pool by the weights of its draws: whether they may be used, which a look at the headlines says, and for what.
+
+    Attributes:
+        density: whose posterior it is.
+        pool: the draws.
+    """
+
+    density: Density
+    pool: Pool
+
+    @cached_property
+    def log_weights(self) -> np.ndarray:
+        """Of all draws, shape (n,)."""
+        return self.pool.log_weights
+
+    @cached_property
+    def finite(self) -> np.ndarray:
+        """Draws whose density has a value, shape (n,); only these have weights."""
+        return np.isfinite(self.log_weights)
+
+    @cached_property
+    def smoothed(self) -> SmoothedWeights:
+        """Weights, and their tail index."""
+        return smoothed_weights(self.log_weights[self.finite])
+
+    @cached_property
+    def points(self) -> Points:
+        """The draws that have weights."""
+        return self.pool.drawn.taken(self.finite)
+
+    @cached_property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Draws of every quantity that is not the same in all of them."""
+        return columns_of(self.density, self.points)
+
+    def summary(self, names: Sequence[str]) -> WeightedSummary:
+        """Of the columns of those names."""
+        return weighted_summary(np.stack([self.columns[name] for name in names], axis=1), self.smoothed.weights)
+
+    @cached_property
+    def headlines(self) -> tuple[str, ...]:
+        """What the draws are judged by; all quantities where no headline is left open."""
+        return tuple(name for name in self.density.headlines if name in self.columns) or tuple(self.columns)
+
+    @cached_property
+    def monte_carlo_error(self) -> dict[str, MonteCarloError]:
+        """Of every headline."""
+        return monte_carlo_errors(self.headlines, self.summary(self.headlines))
+
+    @property
+    def log_evidence(self) -> float:
+        """Log of the integral of likelihood times prior: the mean weight, and the constants of the density."""
+        highest = np.max(self.log_weights)
+        return float(highest + np.log(np.mean(np.exp(self.log_weights - highest))) + self.density.log_constant)
+
+    @cached_property
+    def importance(self) -> Importance:
+        """The weights judged by the headlines."""
+        summary = self.summary(self.headlines)
+        raw = np.exp(self.log_weights - np.max(self.log_weights))
+        kish, count = effective_draws(raw), len(self.log_weights)
+        deviations = {n: self.columns[n] - mean for n, mean in zip(self.headlines, summary.mean, strict=True)}
+        pareto, heaviest = self.smoothed.pareto_k, float(np.max(self.smoothed.weights))
+        missing = lacking(pareto, heaviest, count, self.monte_carlo_error)
+        rough = (
+            pareto < ROUGH_K_MAX
+            and heaviest <= ROUGH_HEAVIEST_MAX
+            and all(e.roughly_known for e in self.monte_carlo_error.values())
+        )
+        return Importance(
+            accepted=not missing,
+            missing=missing,
+            rounds=count // ROUND,
+            draws=count,
+            effective_share=kish / count,
+            least_ess=extreme(dict(zip(self.headlines, summary.ess_least.tolist(), strict=True)), min),
+            pareto_k=pareto,
+            worst_pareto_k=extreme({name: pareto_k(raw[self.finite] * x**2) for name, x in deviations.items()}, max),
+            heaviest_share=heaviest,
+            log_evidence=self.log_evidence,
+            log_evidence_mcse=float(np.sqrt(max(1 / kish - 1 / count, 0.0))),
+            invalid_evaluations=self.pool.invalid,
+            answer="accepted" if not missing else "rough" if rough else "laplace",
+        )
+
+    @property
+    def rounds_wanted(self) -> float:
+        """How many rounds of the same proposal an accepted answer takes, as far as the draws say."""
+        found = self.importance
+        factor = max(e.rounds_factor for e in self.monte_carlo_error.values())
+        return found.rounds * max(factor, found.heaviest_share / HEAVIEST_MAX)
+
+    def sample(self, seconds: float) -> Sample:
+        """All of them, on which `seconds` were spent."""
+        every = self.summary(list(self.columns))
+        convergence = Reweighted(
+            self.importance,
+            dict(zip(self.columns, every.ess_mean.tolist(), strict=True)),
+            dict(zip(self.columns, every.ess_interval95.min(axis=0).tolist(), strict=True)),
+            self.monte_carlo_error,
+        )
+        return Sample(
+            self.points, self.density.quantities(self.points), self.smoothed.weights[None], convergence, seconds
+        )
+
+
+def k_max(draws: int) -> float:
+    """Largest tail index with which the smoothed weights of so many draws can be trusted (Vehtari et al. 2024, 3.2)."""
+    return min(1 - 1 / np.log10(draws), K_MAX)
+
+
+def lacking(pareto: float, heaviest: float, draws: int, errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
+    """What an accepted answer lacks, in sentences.
+
+    Args:
+        pareto: tail index of the weights.
+        heaviest: share of the weight in one draw.
+        draws: their number.
+        errors: Monte Carlo errors of every headline.
+    """
+    missing, limit = [], k_max(draws)
+    if not pareto < limit:
+        missing.append(f"the weights of importance sampling have Pareto k {pareto:.2f}, wanted below {limit:.2f}")
+    if not heaviest <= HEAVIEST_MAX:
+        wanted = f"wanted at most {100 * HEAVIEST_MAX:.0f} %"
+        missing.append(f"one draw holds {100 * heaviest:.1f} % of the weight, {wanted}")
+    return (*missing, *uncertain(errors))
+
+
+def uncertain(errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
+    """The headline that sampling knows worst, in a sentence; none where all are known well enough."""
+    bad = {name: e for name, e in errors.items() if not e.within(MEAN_ERROR_MAX, END_ERROR_MAX)}
+    if not bad:
+        return ()
+    name = max(bad, key=lambda each: bad[each].rounds_factor)
+    mean, ends = bad[name].mean, max(bad[name].interval95)
+    wanted = f"wanted at most {MEAN_ERROR_MAX:g} and {END_ERROR_MAX:g}"
+    return (f"sampling knows the mean of {name} to {mean:.2f} sd and its interval's ends to {ends:.2f} sd, {wanted}",)
+
+
+@dataclass(frozen=True)
+class ImportanceRun[D: Density]:
+    """What importance sampling leaves for a chain: the density, the pool of draws, and the posterior by them."""
+
+    density: D
+    pool: Pool
+    sample: Sample
+    seed: int
+
+    @cached_property
+    def proposal(self) -> Proposal:
+        """Fitted to all draws: a chain that starts from them is right whatever it is proposed."""
+        return self.pool.refitted
+
+    def starts(self, count: int) -> np.ndarray:
+        """Weighted draws of w without replacement, shape (count, d)."""
+        log_weights = self.pool.log_weights
+        generator = np.random.RandomState(self.seed)
+        # Gumbel's trick: the largest perturbed weights are a weighted sample without replacement.
+        keys = np.where(np.isfinite(log_weights), log_weights, -np.inf) + generator.gumbel(size=len(log_weights))
+        return self.pool.drawn.w[np.argsort(-keys)[:count]]
+
+
+def weighted_run[D: Density](
+    density: D,
+    seed: int,
+    advance: Advance = unshown,
+    rounds_max: int | None = None,
+    rounds_least: int | None = None,
+) -> ImportanceRun[D]:
+    """Draw rounds until the answer is accepted; where that would take too long, from a proposal fitted anew.
+
+    Args:
+        density: about a mode.
+        seed: of the draws.
+        advance: told how far it is.
+        rounds_max: of all proposals together, by default `ROUNDS_MAX`.
+        rounds_least: of the proposal that gives the answer, by default `ROUNDS_LEAST`.
+
+    Raises:
+        NotConverged: the density is not finite around the mode.
+    """
+    began = time.monotonic()
+    generator = np.random.RandomState(seed)
+    drawn = OpenEnded()
+    try:
+        pool = piloted(density, generator)
+        wanted = ROUNDS_LEAST if rounds_least is None else rounds_least
+        total, rounds, patience = PILOT_ROUNDS, 0, PATIENCE * wanted
+        while True:
+            while rounds < wanted:
+                rounds, total = rounds + 1, total + 1
+                pool = pool.extended(density, generator, fitted=False)
+                advance(drawn.share(total, total + wanted - rounds))
+            weighed = Weighing(density, pool)
+            left = (ROUNDS_MAX if rounds_max is None else rounds_max) - total
+            if weighed.importance.accepted or left <= 0:
+                return ImportanceRun(density, pool, weighed.sample(time.monotonic() - began), seed)
+            needed = weighed.rounds_wanted
+            if needed > patience and left >= 2 * rounds:
+                # These draws teach the next proposal, which is allowed twice as many.
+                pool = Pool.empty(pool.refitted, pool.invalid)
+                rounds, wanted, patience = 0, min(2 * rounds, left), 2 * patience
+            else:
+                # Few draws do not say well how many more it takes.
+                wanted = min(rounds + left, max(rounds + 1, int(min(np.ceil(1.1 * needed), 2 * rounds))))
+    except FloatingPointError as error:
+        raise NotConverged("no-density", str(error), remedy="see the weak directions of --no-sample") from error
