@@ -1,4 +1,4 @@
-"""Tables that other programs wrote, as text cells: CSV of any usual kind, lines of "name: value", sheets of an XLSX file.
+"""Tables that other programs wrote, as text cells: CSV of any usual kind, lines of "name: value", sheets of XLSX files.
 
 Found out, and said in words: encoding, what stands between cells, decimal commas, lines above the names of columns.
 Numbers come out with decimal points; nothing else of a cell changes. Rows count from 1 as in the file; sizes are capped
