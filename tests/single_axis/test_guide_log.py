@@ -97,8 +97,7 @@ SETTLING = "INFO: SETTLING STATE CHANGE, Settling {}"
 EVENTS = {
     0: [SETTLING.format("started")],
     3: [SETTLING.format("complete")],
-    100: ["INFO: SET LOCK POSITION, new lock pos = 1, 2", "INFO: DITHER by 4.0, 0.0, new lock pos = 5, 2"]
-    + [SETTLING.format("started")],
+    100: ["INFO: DITHER by 4.0, 0.0, new lock pos = 5, 2", SETTLING.format("started")],
     105: [SETTLING.format("complete")],
     150: ['998,451.5,"DROP",,,,,,,,,,,,,0,0.00,3,"Star lost - low mass"'],
     200: ["INFO: Server received PAUSE", "INFO: Server received RESUME"],

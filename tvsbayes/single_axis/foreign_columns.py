@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from tvsbayes.errors import InputError, escaped, refusal
@@ -57,23 +57,39 @@ def plain_column(name: str, cells: Sequence[str]) -> PlainColumn:
     filled = [cell for cell in cells if cell]
     if all(NUMBER.fullmatch(cell) for cell in filled):
         return PlainColumn(tuple(cells), None, "")
-    for read, unit, words in ((_degrees, "deg", "degrees, minutes and seconds"), (_fraction, None, "fractions")):
-        found = [read(cell) if cell else None for cell in cells]
-        if all(value is not None or not cell for value, cell in zip(found, cells, strict=True)):
-            plain = tuple("" if value is None else repr(value) for value in found)
-            own = unit if words.startswith("deg") else unit_of_name(filled[0], READING_UNITS)
-            return PlainColumn(
-                plain, own, f"column {escaped(name)}: {words}, read as decimal{' degrees' * (own == 'deg')}"
-            )
-    matches = [_WITH_UNIT.fullmatch(cell) for cell in filled]
-    units = {match["unit"].strip() for match in matches if match}
-    if all(matches) and len(units) == 1:
-        text = units.pop()
-        own = "inch" if text == '"' else unit_of_name(text, READING_UNITS)
-        if own is not None:
-            plain = tuple(match["number"] if cell and (match := _WITH_UNIT.fullmatch(cell)) else "" for cell in cells)
-            return PlainColumn(plain, own, f"column {escaped(name)}: every cell is in {own}")
+    for read in (_in(_degrees, "deg", "degrees, minutes and seconds"), _one_unit, _in(_fraction, None, "fractions")):
+        if (found := read(name, cells)) is not None:
+            return found
     return PlainColumn(tuple(cells), None, "")
+
+
+def _in(
+    value_of: Callable[[str], float | None], unit: str | None, words: str
+) -> Callable[[str, Sequence[str]], PlainColumn | None]:
+    """A reader of columns in one notation."""
+
+    def read(name: str, cells: Sequence[str]) -> PlainColumn | None:
+        found = [value_of(cell) if cell else None for cell in cells]
+        if any(value is None and cell for value, cell in zip(found, cells, strict=True)):
+            return None
+        plain = tuple("" if value is None else repr(value) for value in found)
+        return PlainColumn(plain, unit, f"column {escaped(name)}: {words}, read as decimal numbers")
+
+    return read
+
+
+def _one_unit(name: str, cells: Sequence[str]) -> PlainColumn | None:
+    """A column whose cells carry one unit each, all the same."""
+    matches = [_WITH_UNIT.fullmatch(cell) if cell else None for cell in cells]
+    units = {match["unit"].strip() for match in matches if match}
+    if len(units) != 1 or any(match is None and cell for match, cell in zip(matches, cells, strict=True)):
+        return None
+    text = units.pop()
+    unit = "inch" if text == '"' else unit_of_name(text, READING_UNITS)
+    if unit is None:
+        return None
+    plain = tuple("" if match is None else match["number"] for match in matches)
+    return PlainColumn(plain, unit, f"column {escaped(name)}: every cell is in {unit}")
 
 
 def _degrees(cell: str) -> float | None:

@@ -80,7 +80,7 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
         InputError: no pair that is surely command and reading, or no time at which both are known.
     """
     found: dict[str, list[tuple[float, float]]] = {}
-    left_out = 0
+    left_out, begin = 0, None
     for line in text.splitlines():
         match = _CAMONITOR.fullmatch(line.strip())
         if match is None:
@@ -91,8 +91,9 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
             found.setdefault(match["name"], [])
             left_out += 1
             continue
-        when = datetime.datetime.fromisoformat(match["time"]).replace(tzinfo=datetime.UTC).timestamp()
-        found.setdefault(match["name"], []).append((when, float(match["value"])))
+        when = datetime.datetime.fromisoformat(match["time"])
+        begin = begin or when
+        found.setdefault(match["name"], []).append(((when - begin).total_seconds(), float(match["value"])))
     series = {name: _series(rows) for name, rows in found.items() if rows}
     command, value = _pair(series, file, stated)
     kind = f"EPICS camonitor, {len(found)} series, {left_out} lines without a number left out"
