@@ -226,7 +226,7 @@ def test_readings_are_reported_in_the_unit_of_their_column(ask, say, tmp_path, c
     log.write_text(f"steps;{column}\n" + "".join(f"{n};{0.0005 * n:.4f}\n" for n in turns))
     code, document = ask("import", log, "--to", out, "--axis", "--yes")
     assert code == 0 and ask("check", out)[1]["unit"] == unit
-    said = f"unit: {unit}, as the column says" if column != "encoder" else "campaign.toml says, deg until you change it"
+    said = f"unit: {unit}, as the file says" if column != "encoder" else "campaign.toml says, deg until you change it"
     assert any(said in text for text in document["assumed"])
     assert "0, 40000" in say("check", out)[1], "counters are no powers of ten"
 

@@ -56,7 +56,7 @@ def test_remarks_empty_lines_and_missing_names(tmp_path):
     [
         ("t,day,n,v\n" + "0,d1,5,7\n" * 3 + "# later\n0,5,d1,5,7,25\n", 6, "6 cells under the 4 names", "commas"),
         ("time n v\n" + "2026-01-02 10:00 5 7\n" * 20, 2, "4 cells under the 3 names", "spaces"),
-        ("bench 3\n" + "n;v\n" + "1;2\n" * 20, 2, "2 cells under the 1 name of line 1", "put #"),
+        ("bench 3\n" + "1;2\n" * 20, 2, "2 cells under the 1 name of line 1", "put #"),
         ("n;v\n" + "1;2\n" * 20 + "1;2;a;b\n", 22, "4 cells under the 2 names of line 1", "quotes"),
         ("# unit deg\nn;v\n0;0,1\n1;0,7;5\n2;1,3\n", 4, "3 cells under the 2 names of line 2", "quotes"),
     ],
@@ -66,6 +66,42 @@ def test_rows_with_more_cells_than_names_are_refused(tmp_path, lines, line, coun
     with pytest.raises(InputError) as refused:
         written(tmp_path / "t.csv", lines.encode())
     assert refused.value.line == line and counts in refused.value.message and cause in refused.value.remedy
+
+
+@pytest.mark.parametrize("above", ["bench 3\n", "Serial;117\n\nOperator: A. B.\n", "a\n" * 30])
+def test_lines_above_the_names_are_left_out(tmp_path, above):
+    """And said; a short table below them is one too."""
+    for rows in (20, 4):
+        table = written(tmp_path / "t.csv", (above + "n;v;w\n" + "1;2,5;3\n" * (rows + above.count("\n"))).encode())
+        assert list(table.columns) == ["n", "v", "w"] and set(table.columns["v"]) == {"2.5"}
+        assert table.first_line == above.count("\n") + 1 and "above the names left out" in table.kind
+
+
+def test_lines_above_the_names_of_a_sheet(tmp_path):
+    book = openpyxl.Workbook()
+    for row in (("Protocol 7",), (), ("Pan", "XL"), (200, 640.25), (400, 641.5)):
+        book.active.append(row)
+    book.save(tmp_path / "t.xlsx")
+    assert read_foreign(tmp_path / "t.xlsx").columns == {"Pan": ("200", "400"), "XL": ("640.25", "641.5")}
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"),
+    [
+        ("boot\nStep: 0, Angle: 1.5\nStep: 200, Angle: 2.5\n", {"Step": ("0", "200"), "Angle": ("1.5", "2.5")}),
+        ("Step=0\tAngle=1.5\nStep=9\tAngle=-2\n", {"Step": ("0", "9"), "Angle": ("1.5", "-2")}),
+        ("Target: 0\nRead: 1.5 deg\nTarget: 5\nTarget: 9\nRead: 2 deg\n", None),
+        (
+            "23:59:59.500 -> n: 1 v: 2\n00:00:01.000 -> n: 3 v: 4\n",
+            {"time (s)": ("0.000000", "1.500000"), "n": ("1", "3"), "v": ("2", "4")},
+        ),
+    ],
+)
+def test_lines_of_a_serial_monitor(tmp_path, text, columns):
+    """A name that comes again begins a row; a clock becomes seconds, also past midnight."""
+    table = written(tmp_path / "t.txt", text.encode())
+    assert table.columns == (columns or {"Target": ("0", "5", "9"), "Read (deg)": ("1.5", "", "2")})
+    assert ("1 other line left out" in table.kind) == text.startswith("boot")
 
 
 def test_separators_at_the_end_of_rows_are_no_cells(tmp_path):

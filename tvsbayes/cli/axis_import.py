@@ -1,70 +1,239 @@
-"""`import` of a table into an axis folder: moves and readings, after what was understood has been shown."""
+"""`import` of a table or log into an axis folder: moves and readings, after what was understood has been shown."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from tvsbayes.cli.app import finish, somebody_there
+from tvsbayes.cli.app import finish, refuse_options, somebody_there
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
-from tvsbayes.errors import escaped, refusal, typed
+from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, write_atomically
+from tvsbayes.files.documents import toml_line
 
 if TYPE_CHECKING:
-    from tvsbayes.single_axis.foreign_readings import ForeignReadings
+    from tvsbayes.files.foreign_table import ForeignTable
+    from tvsbayes.single_axis.foreign_readings import ForeignReadings, LoggedDrive
+    from tvsbayes.single_axis.guide_log import GuideRun
 
+KINDS = ("csv", "phd2", "epics", "klipper")
+"""Of files of an axis: tables, guide logs, series that camonitor or Klipper logged."""
 NEEDED = ("command", "value")
 UNIT = "deg"
 """Of readings in the template, where no column names one."""
 
 
+@dataclass(frozen=True)
+class AxisNotation:
+    """How a file of an axis is meant, as the options say.
+
+    Attributes:
+        kind: "auto" or one of `KINDS`.
+        run: number of a run of a guide log.
+        deviations: whether readings are actual less commanded position.
+        counts_per_turn: where readings begin anew.
+        assume: numbers that a guide log does not state, by name.
+    """
+
+    kind: str = "auto"
+    run: int | None = None
+    deviations: bool = False
+    counts_per_turn: float | None = None
+    assume: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Understood:
+    """A file, understood: lines that say what, the same for programs, and what comes of it."""
+
+    lines: list[str]
+    document: dict[str, Any]
+    found: ForeignReadings
+    unit: str | None
+
+
 def import_readings(
-    file: Path, to: Path, stated: Mapping[str, str], sheet: str | None, *, yes: bool, as_json: bool
+    file: Path, to: Path, stated: Mapping[str, str], sheet: str | None, wish: AxisNotation, *, yes: bool, as_json: bool
 ) -> None:
-    """A table of an axis into its folder, new or still with the tables of the template."""
-    from tvsbayes.files.foreign_table import read_foreign
-    from tvsbayes.instrument.column_names import READING_UNITS, SECONDS, unit_of_name
-    from tvsbayes.single_axis.axis_campaign import unit_of_folder
-    from tvsbayes.single_axis.foreign_readings import AXIS_FIELDS, readings_of, understand_axis, unwrapped
+    """A table or log of an axis into its folder, new or still with the tables of the template."""
+    from tvsbayes.files.csv_table import CSV_BYTES_MAX
+    from tvsbayes.files.disk import read_bytes
+    from tvsbayes.files.foreign_table import read_foreign, text_of
+    from tvsbayes.single_axis.guide_log import is_guide_log, read_runs
+    from tvsbayes.single_axis.joined_series import camonitor_table, is_camonitor, is_klipper, klipper_table
 
-    table = read_foreign(file, sheet)
-    known = understand_axis(table.columns, stated)
-    missing = [field for field in NEEDED if field not in known.columns]
-    if missing or known.claimed:
-        raise not_sure(table, known, [*missing, *(f for f in known.claimed if f not in missing)], AXIS_FIELDS, NEEDED)
+    data, name = read_bytes(file, CSV_BYTES_MAX), escaped(file.name)
+    packed = data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"\x1f\x8b"))
+    text = "" if packed else data.decode("utf-8-sig", errors="replace")
+    kind = wish.kind
+    if kind == "auto":
+        known = {"phd2": is_guide_log(text), "epics": is_camonitor(text), "klipper": is_klipper(data)}
+        kind = next((kind for kind, fits in known.items() if fits), "csv")
+    _refuse_unfit(kind, wish, stated, sheet)
+    if kind == "phd2":
+        runs = read_runs(text_of(data, name)[0], name)
+        if wish.run is None and len(runs) > 1:
+            _list_runs(file, to, runs, yes=yes, as_json=as_json)
+            return
+        understood = _run_understood(runs, file, wish)
+    else:
+        if kind == "epics":
+            table = camonitor_table(text_of(data, name)[0], name, stated)
+            stated = {**stated, "time_s": "time_s", **dict(zip(NEEDED, list(table.columns)[1:], strict=True))}
+        elif kind == "klipper":
+            table = klipper_table(data, name)
+        else:
+            table = read_foreign(file, sheet)
+        understood = _table_understood(table, stated, wish, to)
     _refuse_filled(to)
-    named = unit_of_name(known.columns["value"], READING_UNITS)
-    found = unwrapped(readings_of(table, known.columns), unit_of_folder(to) or named or UNIT)
+    _finish_import(understood, to, yes=yes, as_json=as_json)
 
-    def unit(field: str, name: str) -> str:
-        return unit_of_name(name, SECONDS) or "s" if field == "time_s" else ""
 
+def _finish_import(understood: _Understood, to: Path, *, yes: bool, as_json: bool) -> None:
+    """Show what was understood, write it if that is wanted, and say what is next."""
+    found, named = understood.found, understood.unit
     told = _unit_told(to, named)
-    lines = table_lines(table, known, AXIS_FIELDS, unit)
-    lines += [f"assumed: {text}" for text in (*found.assumed, told)]
-    shown = "\n".join([*lines, f"gives: {len(found.moves)} moves, {len(found.readings)} readings"])
+    assumed = [*found.assumed, told, *_drive_told(found)]
+    lines = [*understood.lines, *found.notes, *(f"assumed: {text}" for text in assumed)]
+    ok = sum(reading.status == "ok" for reading in found.readings)
+    lines.append(f"gives: {len(found.moves)} moves, {len(found.readings)} readings{_minutes(found)}")
+    shown = "\n".join(lines)
     if not (yes or as_json) and somebody_there():
         typer.echo(shown)
         yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
         shown = ""
     written = _write(to, found, named) if yes else []
-    document = {**table_document(table, known), "assumed": [*found.assumed, told], "moves": len(found.moves)}
-    ok = sum(reading.status == "ok" for reading in found.readings)
-    document |= {"readings": len(found.readings), "ok": ok, "campaign": str(to), "files": written}
+    document = {**understood.document, "notes": list(found.notes), "assumed": assumed, "moves": len(found.moves)}
+    following = f"tvsbayes calibrate {typed(to)}" if written else None
+    document |= {"readings": len(found.readings), "ok": ok, "campaign": str(to), "files": written, "next": following}
     said = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
-    place = escaped(str(to), 200)
-    after = f"\nnext: `unit` and `[axis]` in {place}/campaign.toml, then `tvsbayes check {typed(to)}`" * bool(written)
+    after = f"\nnext: `{following}`" * bool(written)
     finish(document, f"{shown}\n{said}{after}".lstrip("\n"), as_json)
+
+
+def _minutes(found: ForeignReadings) -> str:
+    """How long a log lasts."""
+    times = [reading.time_s for reading in found.readings if reading.time_s is not None]
+    return f" over {(times[-1] - times[0]) / 60:.1f} minutes" if times else ""
+
+
+def _refuse_unfit(kind: str, wish: AxisNotation, stated: Mapping[str, str], sheet: str | None) -> None:
+    """Refuse options that a file of this kind would ignore."""
+    log = kind == "phd2"
+    unfit: dict[str, object] = {"run": None if log else wish.run, "assume": None if log else wish.assume or None}
+    if log:
+        unfit |= {"column": stated or None, "deviations": wish.deviations, "counts_per_turn": wish.counts_per_turn}
+    unfit |= {"sheet": None if kind == "csv" else sheet}
+    refuse_options(f"of another kind of file: this one is read as {kind}", "leave it out, or name --format", **unfit)
+
+
+def _list_runs(file: Path, to: Path, runs: Sequence[GuideRun], *, yes: bool, as_json: bool) -> None:
+    """The runs of a log, of which an import takes one.
+
+    Raises:
+        InputError: one was to be written, and nobody said which.
+    """
+    from tvsbayes.report.tables import TableView
+    from tvsbayes.single_axis.guide_log import run_rows
+
+    rows = run_rows(runs)
+    longest = max(rows, key=lambda row: row["minutes"])["run"]  # type: ignore[arg-type, return-value]
+    command = f"tvsbayes import {typed(file)} --axis --run {longest} --to {typed(to)} --yes"
+    if yes:
+        found, allowed = f"{len(runs)} runs", "one run a campaign"
+        remedy = f"name one: `{command}` takes the longest"
+        raise refusal("usage", file=escaped(file.name), found=found, allowed=allowed, remedy=remedy)
+    cells = [["" if value is None else escaped(str(value), 40) for value in row.values()] for row in rows]
+    caption = f"{escaped(file.name)}: guide log of PHD2 with {len(runs)} runs, one campaign each"
+    text = f"{TableView(caption, list(rows[0]), cells).text()}\nnothing written\nnext: `{command}`"
+    document = {"file": escaped(file.name), "kind": "phd2", "runs": rows, "campaign": str(to), "files": []}
+    finish({**document, "next": command}, text, as_json)
+
+
+def _run_understood(runs: Sequence[GuideRun], file: Path, wish: AxisNotation) -> _Understood:
+    """One run of a guide log."""
+    from tvsbayes.single_axis.guide_log import readings_of_run, run_rows
+
+    number = 1 if wish.run is None else wish.run
+    if not 1 <= number <= len(runs):
+        message = f"--run {number}: {escaped(file.name)} holds {len(runs)} runs; allowed: 1 to {len(runs)}"
+        remedy = "leave --run and --yes out for the list"
+        raise InputError("usage", message, allowed=f"1 to {len(runs)}", remedy=remedy)
+    run = runs[number - 1]
+    found = readings_of_run(run, escaped(file.name), wish.assume)
+    (row,) = run_rows([run])
+    lines = [f"{escaped(file.name)}: guide log of PHD2, run {number} of {len(runs)}, {escaped(run.mount)}"]
+    lines.append(f"begins {escaped(run.begins)}, {run.minutes:.1f} minutes")
+    document = {"file": escaped(file.name), "kind": "phd2", "run": row, "rows": len(run.frames) + len(run.dropped)}
+    return _Understood(lines, document, found, found.unit)
+
+
+def _table_understood(table: ForeignTable, stated: Mapping[str, str], wish: AxisNotation, to: Path) -> _Understood:
+    """A table, its columns as they were understood, and what the cells tell besides.
+
+    Raises:
+        InputError: columns or cells that do not say enough, or what they must not.
+    """
+    from tvsbayes.files.csv_table import NUMBER
+    from tvsbayes.instrument.column_names import READING_UNITS, SECONDS, unit_of_name
+    from tvsbayes.single_axis.axis_campaign import unit_of_folder
+    from tvsbayes.single_axis.foreign_columns import deviation_columns, one_reading_a_row, refuse_small
+    from tvsbayes.single_axis.foreign_readings import AXIS_FIELDS, readings_of, understand_axis, unwrapped
+
+    table, remarks = one_reading_a_row(table, stated)
+    known = understand_axis(table.columns, stated)
+    missing = [field for field in NEEDED if field not in known.columns]
+    if missing or known.claimed:
+        besides = "; or is a column actual less commanded position: --column value=NAME --deviations"
+        wanted = [*missing, *(f for f in known.claimed if f not in missing)]
+        raise not_sure(table, known, wanted, AXIS_FIELDS, NEEDED, besides * ("value" in missing))
+    if not wish.deviations and "value" not in stated:
+        refuse_small(table, known.columns)
+    apart = {} if wish.deviations else deviation_columns(table, known.columns)
+    for name, text in apart.items():
+        remarks.append(f"column {escaped(name)} is {text} in every row: a deviation, no uncertainty; set aside")
+    kept = {field: name for field, name in known.columns.items() if name not in apart or field in stated}
+    known = replace(known, columns=kept, unused=tuple(dict.fromkeys((*known.unused, *apart))))
+    found = readings_of(table, known.columns, wish.deviations)
+    unit = found.unit or unit_of_name(known.columns["value"], READING_UNITS)
+    cells = [cell for cell in table.columns[known.columns["value"]] if cell]
+    numbers = [float(cell) for cell in cells if NUMBER.fullmatch(cell)]
+    if unit is None and numbers and all(n.is_integer() for n in numbers) and max(numbers) - min(numbers) > 360:
+        unit = "counts"
+        remarks.append("unit: whole numbers over more than 360, so counts; `unit` in campaign.toml says another")
+    found = unwrapped(found, unit_of_folder(to) or unit or UNIT, wish.counts_per_turn)
+    found = replace(found, assumed=(*remarks, *found.assumed))
+
+    def unit_shown(field: str, name: str) -> str:
+        return unit_of_name(name, SECONDS) or "s" if field == "time_s" else ""
+
+    return _Understood(table_lines(table, known, AXIS_FIELDS, unit_shown), table_document(table, known), found, unit)
+
+
+def _drive_told(found: ForeignReadings) -> list[str]:
+    """What campaign.toml gets of a drive at constant rate."""
+    drive = found.drive
+    if drive is None:
+        return []
+    said = [f"campaign.toml: {name} = {{ value = {v:g}, u = {u:g} }}" for name, (v, u) in drive.priors.items()]
+    if drive.period_between is None:
+        return [*said, "too short a run to look for a period; state `periods` in campaign.toml where one is known"]
+    low, high = drive.period_between
+    said.append(
+        f"campaign.toml: period_between = [{low:g}, {high:g}] s, a minute to a third of the run; change it there"
+    )
+    return said
 
 
 def _unit_told(to: Path, named: str | None) -> str:
     """Which unit results will have: a reading in mm must not be reported in degrees."""
     kept = (to / "campaign.toml").is_file()
     if named and not kept:
-        return f"unit: {named}, as the column says; it goes into campaign.toml"
+        return f"unit: {named}, as the file says; it goes into campaign.toml"
     says = f"; the column says {named}" if named else ""
     return f"unit: of readings as campaign.toml says{'' if kept else f', {UNIT} until you change it'}{says}"
 
@@ -93,7 +262,19 @@ def _write(to: Path, found: ForeignReadings, unit: str | None) -> list[str]:
         make_folder(to, empty=True)
         template = axis_templates()["campaign.toml"]
         own = unit or UNIT
-        contents["campaign.toml"] = template.replace(f'\nunit = "{UNIT}"'.encode(), f'\nunit = "{own}"'.encode())
+        template = template.replace(f'\nunit = "{UNIT}"'.encode(), f'\nunit = "{own}"'.encode())
+        contents["campaign.toml"] = template if found.drive is None else _with_drive(template, found.drive)
     for name, data in contents.items():
         write_atomically(to / name, data)
     return [str(to / name) for name in contents]
+
+
+def _with_drive(template: bytes, drive: LoggedDrive) -> bytes:
+    """The explained campaign.toml of a drive at constant rate."""
+    header = "\n".join(toml_line(key, value) for key, value in {"rate": drive.rate, **drive.header}.items())
+    given = {name: {"value": value, "u": u} for name, (value, u) in drive.priors.items()}
+    axis = [toml_line(name, entry) for name, entry in given.items()]
+    if drive.period_between is not None:
+        axis += [toml_line("periods_in", "seconds"), toml_line("period_between", list(drive.period_between))]
+    text = template.decode().replace('\nname = "my axis"\n', f"\n{header}\n")
+    return text.replace("\n[axis]\n", "\n[axis]\n" + "\n".join(axis) + "\n").encode()

@@ -16,8 +16,8 @@ from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import Json, finish, refuse_options, report_line, somebody_there
 from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
-from tvsbayes.errors import InputError, escaped, refusal, typed
-from tvsbayes.files.csv_table import CSV_BYTES_MAX
+from tvsbayes.errors import InputError, closest, escaped, refusal, typed
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 
 if TYPE_CHECKING:
@@ -47,6 +47,20 @@ def import_(
         float | None, typer.Option("--sd-px", min=1e-4, max=100.0, help="Of centroids, where no column has it: 0.1.")
     ] = None,
     axis: Annotated[bool, typer.Option("--axis", help="Of one axis: commands and readings.")] = False,
+    kind: Annotated[
+        str, typer.Option("--format", help="Of an axis: auto, csv, phd2 (guide log), epics (camonitor), klipper.")
+    ] = "auto",
+    run: Annotated[int | None, typer.Option("--run", min=1, help="Of a guide log: run; without it a list.")] = None,
+    deviations: Annotated[
+        bool, typer.Option("--deviations", help="Of an axis: readings are actual less commanded position.")
+    ] = False,
+    counts_per_turn: Annotated[
+        float | None,
+        typer.Option("--counts-per-turn", min=0.0, max=1e12, help="Of an axis: where readings begin anew; 0: nowhere."),
+    ] = None,
+    assume: Annotated[
+        list[str] | None, typer.Option("--assume", help="NAME=NUMBER: what a guide log does not state; repeatable.")
+    ] = None,
     relative: Annotated[bool, typer.Option("--relative", help="Counters are the steps of each move.")] = False,
     flip: Annotated[
         list[str] | None, typer.Option("--flip", help="pan_steps or tilt_steps: write the other sign; repeatable.")
@@ -89,14 +103,18 @@ def import_(
         _correct_campaign(file, to, wish, yes=yes, as_json=as_json)
         return
     if axis or axis_commands.is_axis(to):
-        from tvsbayes.cli.axis_import import import_readings
+        from tvsbayes.cli.axis_import import AxisNotation, import_readings
 
         unfit = {"pixels_from": pixels_from or None, "angles": angles, "sd_px": sd_px, "relative": relative}
         unfit |= {"flip": flip, "shift_moves": shift_moves, "swap": swap}
         sides = {f"{a}_approach": None if side == "unknown" else side for a, side in zip(AXES, approach, strict=True)}
         refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit, **sides)
-        import_readings(file, to, stated, sheet, yes=yes, as_json=as_json)
+        meant = AxisNotation(_word(kind), run, deviations, counts_per_turn, dict(map(_assumption, assume or ())))
+        import_readings(file, to, stated, sheet, meant, yes=yes, as_json=as_json)
         return
+    of_axis: dict[str, object] = {"run": run, "deviations": deviations, "assume": assume}
+    of_axis |= {"format": None if kind == "auto" else kind, "counts_per_turn": counts_per_turn}
+    refuse_options("for files of an axis", "add --axis, or leave it out", **of_axis)
     listed = _listed_moves(to)
     table = read_foreign(file, sheet)
     asking = not (yes or as_json) and somebody_there()
@@ -129,6 +147,29 @@ def _field_and_column(text: str) -> tuple[str, str]:
         remedy = "write --column u_left_px=XL; --column target= where the table has none"
         raise InputError("usage", f"--column {escaped(text)}: no =", allowed="FIELD=NAME", remedy=remedy)
     return field.strip(), name.strip()
+
+
+def _word(kind: str) -> str:
+    """The value of --format."""
+    from tvsbayes.cli.axis_import import KINDS
+
+    if kind not in ("auto", *KINDS):
+        allowed = ", ".join(("auto", *KINDS))
+        remedy = closest(kind, KINDS, "leave it out: the file itself says it")
+        raise InputError("usage", f"--format {escaped(kind)}; allowed: {allowed}", allowed=allowed, remedy=remedy)
+    return kind
+
+
+def _assumption(text: str) -> tuple[str, float]:
+    """The two sides of --assume NAME=NUMBER."""
+    from tvsbayes.single_axis.guide_log import ASSUMPTIONS
+
+    name, _, number = text.partition("=")
+    allowed = ", ".join(f"{known}=NUMBER ({what})" for known, what in ASSUMPTIONS.items())
+    if name.strip() not in ASSUMPTIONS or not NUMBER.fullmatch(number.strip()):
+        remedy = "write --assume declination_deg=45.9"
+        raise InputError("usage", f"--assume {escaped(text)}; allowed: {allowed}", allowed=allowed, remedy=remedy)
+    return name.strip(), float(number)
 
 
 def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bool, as_json: bool) -> None:

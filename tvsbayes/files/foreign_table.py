@@ -1,7 +1,8 @@
-"""Tables that other programs wrote, as text cells: CSV of any usual kind, and the sheets of an XLSX file.
+"""Tables that other programs wrote, as text cells: CSV of any usual kind, lines of "name: value", sheets of XLSX files.
 
-Found out, and said in words: encoding, what stands between cells, decimal commas. Numbers come out with decimal points;
-nothing else of a cell changes. Rows count from 1 as in the file; sizes are capped before anything is unpacked.
+Found out, and said in words: encoding, what stands between cells, decimal commas, lines above the names of columns.
+Numbers come out with decimal points; nothing else of a cell changes. Rows count from 1 as in the file; sizes are capped
+before anything is unpacked.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import re
 import warnings
 import zipfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,10 @@ CELLS_MAX = 10_000_000
 SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
 """In the order in which they are tried: a decimal comma must not pass for one between cells."""
 ROWS_TRIED = 50
+ABOVE_MAX = 50
+"""Lines that may stand above the names of columns: serial number, date, operator."""
+PAIRED_SHARE = 0.6
+"""Of the lines, from which on a file of "name: value" is one; the others are what a program says at its start."""
 _WIDE = {
     SEPARATORS[","]: "decimal commas beside commas between cells? export with semicolons, or with decimal points",
     SEPARATORS[" "]: "dates or texts with spaces? export with semicolons or tabs between cells",
@@ -45,6 +50,14 @@ _MARKS = (
 )
 _COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?")
 _GROUPED_POINT = re.compile(r"[+-]?[0-9]{1,3}(?:,[0-9]{3})+\.[0-9]+")
+_PAIR = re.compile(
+    r"(?P<name>[^\W\d][^:=,;|\t]*?)\s*[:=]\s*(?P<value>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
+    r"(?:\s*(?P<unit>\u00b0|mm|um|\u00b5m|deg|rad|counts|steps|ms|us|s)(?![\w:]))?\s*(?:[,;|\t]\s*|\s+|$)"
+)
+"""One of "Step: 200, Angle: 12.5 deg"."""
+_CLOCK = re.compile(r"\[?(\d{1,2}):(\d{2}):(\d{2}(?:\.\d+)?)\]?\s*(?:->|>)?\s*")
+"""What a serial monitor puts before a line."""
+DAY_S = 86400.0
 _GROUPED_COMMA = re.compile(r"[+-]?[0-9]{1,3}(?:\.[0-9]{3})+,[0-9]+")
 
 
@@ -94,17 +107,35 @@ def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
         raise bad("kind", found="a workbook of an old Excel", remedy="save it as XLSX or CSV")
     if data.startswith(b"PK\x03\x04"):
         rows, words = _sheet_rows(data, file, sheet)
+        rows, above = _without_heading(rows)
+        words += above
     elif sheet is not None:
         raise bad("usage", found="text, which has no sheets", remedy="leave out --sheet")
     else:
-        text, encoding = _text(data, file)
+        text, encoding = text_of(data, file)
+        if paired := _paired_rows(text):
+            return _table(file, *paired)
         rows, between = _csv_rows(text, file)
+        rows, above = _without_heading(rows)
         _refuse_wide(rows, between, file)
-        words = [f"CSV with {between} between cells", encoding]
+        words = [f"CSV with {between} between cells", encoding, *above]
     rows = [(line, cells) for line, cells in rows if any(cells)]
     if not rows:
         raise bad("empty", found="no cells", remedy="name the file, or with --sheet the sheet, that holds the table")
     return _table(file, rows, words)
+
+
+def table_of(file: str, kind: str, columns: Mapping[str, Sequence[object]], lines: Sequence[int]) -> ForeignTable:
+    """A table of values that a log of another kind gave, as `read_foreign` has them.
+
+    Args:
+        file: name of the log, for messages.
+        kind: what it is, in words.
+        columns: values by name; None is an empty cell.
+        lines: the line of the log for each row.
+    """
+    cells = {name: tuple("" if v is None else str(v) for v in values) for name, values in columns.items()}
+    return ForeignTable(file, kind, tuple(lines), cells, lines[0] if lines else 1)
 
 
 def is_foreign(head: bytes) -> bool:
@@ -113,7 +144,7 @@ def is_foreign(head: bytes) -> bool:
     return head.startswith(marks) or re.search(rb"[;\t|]", head.partition(b"\n")[0]) is not None
 
 
-def _text(data: bytes, file: str) -> tuple[str, str]:
+def text_of(data: bytes, file: str) -> tuple[str, str]:
     """The text and the name of its encoding."""
     marked = [(codec, name) for mark, codec, name in _MARKS if data.startswith(mark)]
     codec, name = marked[0] if marked else ("utf-8", "UTF-8")
@@ -131,6 +162,76 @@ def _text(data: bytes, file: str) -> tuple[str, str]:
     return text, name
 
 
+def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | None:
+    """Rows of a file whose lines are "name: value" pairs, as a serial monitor shows them; None of any other file.
+
+    A row ends where a name comes again; a clock before the lines becomes seconds since the first of them.
+    """
+    names: dict[str, None] = {}
+    rows: list[tuple[int, dict[str, str]]] = []
+    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    paired, day_s, before_s = 0, 0.0, -1.0
+    for number, line in lines:
+        clock = _CLOCK.match(line)
+        rest = line[clock.end() if clock else 0 :]
+        found = list(_PAIR.finditer(rest))
+        if not found or found[0].start() or "".join(match.group() for match in found) != rest:
+            continue
+        paired += 1
+        values = {m["name"].strip() + (f" ({m['unit']})" if m["unit"] else ""): m["value"] for m in found}
+        if len(values) < len(found):
+            return None
+        names.update(dict.fromkeys(values))
+        if not rows or rows[-1][1].keys() & values.keys():
+            rows.append((number, {}))
+            if clock:
+                at_s = int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]) + day_s
+                day_s, at_s = (day_s + DAY_S, at_s + DAY_S) if at_s < before_s else (day_s, at_s)
+                rows[-1][1]["time (s)"], before_s = f"{at_s:.6f}", at_s
+        rows[-1][1].update(values)
+    if len(names) < 2 or len(rows) < 2 or paired < PAIRED_SHARE * len(lines):
+        return None
+    if timed := all("time (s)" in cells for _, cells in rows) and "time (s)" not in names:
+        start_s = float(rows[0][1]["time (s)"])
+        for _, cells in rows:
+            cells["time (s)"] = f"{float(cells['time (s)']) - start_s:.6f}"
+    columns = ["time (s)"] * timed + list(names)
+    words = ['lines of "name: value"']
+    if other := len(lines) - paired:
+        words.append(f"{other} other line{'s' * (other > 1)} left out")
+    body = [(line, [cells.get(name, "") for name in columns]) for line, cells in rows]
+    return [(rows[0][0], columns), *body], words
+
+
+def _without_heading(rows: list[tuple[int, list[str]]]) -> tuple[list[tuple[int, list[str]]], list[str]]:
+    """The rows from the names of the columns on, and the lines above them in words.
+
+    The names stand in the first row with as many cells as most rows have, and are no numbers; rows above have fewer.
+    """
+
+    def width(cells: Sequence[str]) -> int:
+        return max((k for k, cell in enumerate(cells, start=1) if cell), default=0)
+
+    filled = [(width(cells), k) for k, (_, cells) in enumerate(rows) if any(cells)]
+    often = Counter(count for count, _ in filled).most_common(1)
+    if not often or often[0][0] < 2 or 2 * often[0][1] <= len(filled):
+        return rows, []
+    most = often[0][0]
+    first = next(k for count, k in filled if count == most)
+    above = [k for count, k in filled if k < first]
+    names = [cell for cell in rows[first][1] if cell]
+    wider = any(count > most for count, k in filled if k < first)
+    if not above or wider or len(above) > ABOVE_MAX or any(map(_is_number, names)):
+        return rows, []
+    text = " ".join(cell for cell in rows[above[0]][1] if cell)
+    several = f"{len(above)} lines" if len(above) > 1 else "a line"
+    return rows[first:], [f'{several} above the names left out ("{escaped(text, 40)}")']
+
+
+def _is_number(cell: str) -> bool:
+    return bool(NUMBER.fullmatch(cell) or _COMMA.fullmatch(cell))
+
+
 def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
     """Rows with their lines, and what stands between their cells; lines that begin with # or % are remarks."""
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
@@ -142,7 +243,7 @@ def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
     if stated == '"':
         found, allowed = 'the quote " between cells', ", ".join(SEPARATORS.values())
         raise refusal("csv", file=file, line=1, found=found, allowed=allowed, remedy="correct or remove the line sep=")
-    separator = stated or _separator([line for _, line in kept[:ROWS_TRIED]])
+    separator = stated or _separator([line for _, line in kept])
     if separator == " ":
         rows = [(number, line.split()) for number, line in kept]
     else:
@@ -183,15 +284,21 @@ def _refuse_wide(rows: Sequence[tuple[int, list[str]]], between: str, file: str)
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """The first that divides nine of ten lines into equally many cells, two or more.
+    """The first that divides nine of ten lines into equally many cells, two or more; at the file's end, else its begin.
 
     If none does, some row is damaged: then the first that divides most lines, that of the names too, and else commas.
     """
-    counted = {s: [len(line.split(None if s == " " else s)) for line in lines] for s in SEPARATORS}
-    often = {s: max(Counter(counts).items(), key=lambda item: item[1], default=(1, 0)) for s, counts in counted.items()}
-    clear = (s for s, (cells, count) in often.items() if cells > 1 and count >= 0.9 * len(lines))
-    most = (s for s, (cells, count) in often.items() if 1 < cells == counted[s][0] and 2 * count > len(lines))
-    return next(clear, None) or next(most, ",")
+    for tried in (lines[:ROWS_TRIED], lines[-ROWS_TRIED:]):
+        counted = {s: [len(line.split(None if s == " " else s)) for line in tried] for s in SEPARATORS}
+        often = {s: max(Counter(of).items(), key=lambda item: item[1], default=(1, 0)) for s, of in counted.items()}
+        clear = (s for s, (cells, count) in often.items() if cells > 1 and count >= 0.9 * len(tried))
+        most = (s for s, (cells, count) in often.items() if 1 < cells == counted[s][0] and 2 * count > len(tried))
+        if found := next(clear, None) or next(most, None):
+            return found
+    # A short table below a heading: names and rows alone are divided.
+    whole = {s: Counter(len(line.split(None if s == " " else s)) for line in lines) for s in SEPARATORS}
+    divided = {s: max(((n, c) for c, n in of.items() if c > 1), default=(0, 0)) for s, of in whole.items() if s != " "}
+    return next((s for s, (count, _) in divided.items() if 2 * count > len(lines)), ",")
 
 
 def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[int, list[str]]], list[str]]:
@@ -269,7 +376,7 @@ def _table(file: str, rows: Sequence[tuple[int, list[str]]], words: list[str]) -
         allowed, remedy = f"at most {COLUMNS_MAX} columns", "save the table alone in a file"
         raise refusal("size", file=file, found=f"{width} columns", allowed=allowed, remedy=remedy)
     filled = [(line, cells + [""] * (width - len(cells))) for line, cells in rows]
-    named = not all(NUMBER.fullmatch(cell) or _COMMA.fullmatch(cell) for cell in filled[0][1] if cell)
+    named = not all(_is_number(cell) for cell in filled[0][1] if cell)
     names = _unique(filled[0][1]) if named else [f"column {k}" for k in range(1, width + 1)]
     body = filled[1:] if named else filled
     cells = [cell for _, row in body for cell in row if not isinstance(cell, _Number)]

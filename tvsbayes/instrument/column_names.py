@@ -44,7 +44,7 @@ DEGREES = {
     **{"arcmin": 1 / 60, "arcsec": 1 / 3600},
 }
 """Units of angles that a name may say, in deg."""
-READING_UNITS = (*DEGREES, "mm", "um", "nm", "counts")
+READING_UNITS = (*DEGREES, "mm", "um", "nm", "counts", "inch")
 """Units of readings that a name may say."""
 _UNITS = {
     "us": {"us", "usec", "micros", "microseconds", "mikrosekunden", "microsegundos", "microsecondes"},
@@ -61,6 +61,8 @@ _UNITS = {
     "um": {"um", "micron", "microns", "micrometer", "micrometers", "mikrometer", "micrometros", "micrometres"},
     "nm": {"nm", "nanometer", "nanometers", "nanometros", "nanometres"},
     "counts": {"counts", "count", "ticks", "inkremente"},
+    # Last in `READING_UNITS`: "in" is a word too.
+    "inch": {"in", "inch", "inches", "zoll", "pulgadas", "pouces"},
 }
 
 

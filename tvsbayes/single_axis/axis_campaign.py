@@ -105,6 +105,15 @@ class Reading:
         str,
         replace(SPOTS["status"], meaning="`ok`, or why the reading is not to be used (`value` may be empty)"),
     ] = "ok"
+    time_s: Annotated[
+        float | None,
+        Column(
+            "of a reading in motion, in a folder with `rate`: seconds, on the clock of moves.csv, not before its move",
+            *(MOVES["time_s"].low, MOVES["time_s"].high),
+            group="motion",
+            names=MOVES["time_s"].names,
+        ),
+    ] = None
 
 
 AXIS_MOVES = CsvKind(

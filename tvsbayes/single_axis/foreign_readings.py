@@ -1,17 +1,20 @@
 """Moves and readings of somebody's table of an axis: one row is a move, a reading, or both; unit of the folder.
 
 Rows that follow each other at the same command are readings of one stop; rows without a value are moves that nobody
-read. What a table does not say is assumed and listed in words.
+read. A column of directions says from which side a stop was reached; where the rows before do not lead there, the move
+that did is put in. What a table does not say is assumed and listed in words.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 
-from tvsbayes.errors import refusal
+from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.foreign_table import ForeignTable
 from tvsbayes.instrument.column_names import (
     READING_UNITS,
@@ -30,11 +33,30 @@ from tvsbayes.instrument.foreign_looks import (
     seconds_of,
     word_of,
 )
-from tvsbayes.single_axis.axis_campaign import APPROACHES, AXIS_MOVES, READINGS, TURNS, Approach, AxisMove, Reading
+from tvsbayes.single_axis.axis_campaign import AXIS_MOVES, READINGS, TURNS, Approach, AxisMove, Reading
 from tvsbayes.single_axis.axis_rows import turn_jumps
+from tvsbayes.single_axis.foreign_columns import plain_column, positions_of_deviations
 
 WHOLE = 0.1
 """Of a turn, by which play and errors of gears may make a jump differ from whole turns."""
+BITS = range(8, 33)
+"""Of encoders that count modulo a power of two."""
+BEYOND = 0.05
+"""Of the range of commands, by which a move that no row lists is taken to have gone past a stop: more than any play."""
+CONTRARY_MIN = 4
+"""Rows whose direction is the opposite of their command's, all of them, from which on the sign is another."""
+FORWARD = {
+    *("forward", "forwards", "fwd", "f", "+", "+1", "1", "up", "rising", "increasing", "positive", "pos", "below"),
+    *("from below", "vorwarts", "vor", "hin", "aufwarts", "adelante", "subida", "avant", "aller", "\u2191", "\u2192"),
+}
+"""Words of a direction that is that of rising commands, without accents."""
+BACKWARD = {
+    *("backward", "backwards", "back", "bwd", "b", "rev", "reverse", "-", "-1", "down", "falling", "decreasing"),
+    *("negative", "neg", "above", "from above", "ruckwarts", "zuruck", "ruck", "abwarts", "atras", "bajada"),
+    *("arriere", "retour", "\u2193", "\u2190", "\u2212"),
+}
+_AGAIN = {"repeat", "repetition", "cycle", "zyklus", "wiederholung", "ciclo", "repeticion", "cycles", "rep"}
+"""Words of columns that count approaches to one stop."""
 
 _COLUMNS = {c.name: c for kind in (READINGS, AXIS_MOVES) for c in kind.columns.values() if c.names}
 AXIS_FIELDS = tuple(dict.fromkeys(("command", "value", *_COLUMNS)))
@@ -88,65 +110,225 @@ def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = N
 
 
 @dataclass(frozen=True)
+class LoggedDrive:
+    """A drive at constant rate, of a log whose readings were taken in motion.
+
+    Attributes:
+        rate: commands per second.
+        header: keys of `campaign.toml` that the log states.
+        period_between: seconds among which a period is looked for; None where the log is too short.
+        priors: entries of `[axis]`, value and u.
+    """
+
+    rate: float
+    header: Mapping[str, object]
+    period_between: tuple[float, float] | None
+    priors: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
 class ForeignReadings:
-    """Rows of `moves.csv` and `readings.csv`, and what the table does not say."""
+    """Rows of `moves.csv` and `readings.csv`, and what the table does not say.
+
+    Attributes:
+        moves: rows.
+        readings: rows.
+        assumed: in words, each with the option that overrules it where there is one.
+        unit: of readings where cells or the log say it.
+        drive: of a log of readings in motion.
+        notes: what was counted and left out.
+    """
 
     moves: tuple[AxisMove, ...]
     readings: tuple[Reading, ...]
     assumed: tuple[str, ...]
+    unit: str | None = None
+    drive: LoggedDrive | None = None
+    notes: tuple[str, ...] = ()
 
 
-def readings_of(table: ForeignTable, columns: Mapping[str, str]) -> ForeignReadings:
+def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: bool = False) -> ForeignReadings:
     """Moves and readings of a table.
 
     Args:
         table: as it was read.
         columns: its columns by field, of `AXIS_FIELDS`; "command" and "value" among them.
+        deviations: whether the readings are actual less commanded position.
 
     Raises:
         InputError: a cell that is no value of its field, or no row.
     """
-    cells = FieldCells(table, columns)
     if not len(table):
         found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
         raise refusal("empty", file=table.file, found=found, allowed="at least one row", remedy=remedy)
     assumed: list[str] = []
+    table, unit = _plain(table, columns, assumed)
+    cells = FieldCells(table, columns)
     commands, values, stated_u = (cells.read(_COLUMNS[name]) for name in ("command", "value", "u"))
+    if deviations:
+        values, factor = positions_of_deviations(columns, commands, values)
+        stated_u, unit = [factor * u for u in stated_u], unit_of_name(columns["command"], READING_UNITS) or unit
+        assumed.append("value: the command plus the deviation, because --deviations says so")
     times, homings, statuses = seconds_of(cells, assumed), homings_of(cells, assumed), cells.text("status")
     if times is None:
         assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
-    moves: list[AxisMove] = []
+    stops = _Stops(cells, commands, values, homings)
     readings: list[Reading] = []
     for row, (command, value) in enumerate(zip(commands, values, strict=True)):
-        homed = homings[row]
-        if not moves or homed or command != moves[-1].command:
-            segment = 0 if not moves else moves[-1].segment + homed
-            side = _approach(cells, row) if not moves or homed else ""
-            at_s = float(len(moves)) if times is None else times[row]
-            moves.append(AxisMove(len(moves), segment, at_s, command, side))
+        stops.go(row, command, None if times is None else times[row])
         if value is not None or statuses[row]:
-            readings.append(Reading(len(readings), moves[-1].move, value, stated_u[row], _status(cells, row, value)))
-    assumed += left_out(cells, statuses, "reading")
-    if again := len(table) - len(moves):
-        assumed.append(f"{again} row{'s' * (again > 1)} at the command before: read at that stop again, without a move")
-    if "approach" not in cells:
-        assumed.append("approach: unknown at the beginning of each segment")
+            move = stops.moves[-1].move
+            readings.append(Reading(len(readings), move, value, stated_u[row], _status(cells, row, value)))
+    assumed += left_out(cells, statuses, "reading") + stops.remarks()
     if "u" not in cells:
         assumed.append("u: none, so that the scatter of stops covers the readings' own")
-    return ForeignReadings(tuple(moves), tuple(readings), tuple(assumed))
+    return ForeignReadings(tuple(stops.moves), tuple(readings), tuple(assumed), unit)
 
 
-def unwrapped(found: ForeignReadings, unit: str) -> ForeignReadings:
+def _plain(table: ForeignTable, columns: Mapping[str, str], assumed: list[str]) -> tuple[ForeignTable, str | None]:
+    """A table with plain numbers for commands, readings and their u, and the unit that cells of readings state."""
+    units: dict[str, str | None] = {}
+    plain = dict(table.columns)
+    for field in ("command", "value", "u"):
+        if field in columns:
+            found = plain_column(columns[field], table.columns[columns[field]])
+            plain[columns[field]], units[field] = found.cells, found.unit
+            assumed += [found.remark] * bool(found.remark)
+    return replace(table, columns=plain), units.get("value")
+
+
+class _Stops:
+    """Moves of a table, row by row, with those that its column of directions implies.
+
+    Attributes:
+        moves: so far.
+    """
+
+    def __init__(
+        self,
+        cells: FieldCells,
+        commands: Sequence[float],
+        values: Sequence[float | None],
+        homings: Sequence[bool],
+    ) -> None:
+        self._cells, self._commands, self._values, self._homings = cells, commands, values, homings
+        self._sides = _sides(cells)
+        again = [name for name in cells.table.columns if _AGAIN.intersection(words_of(name))]
+        self._counts = cells.table.columns[again[0]] if again else None
+        self._reach = BEYOND * (max(commands) - min(commands)) or 1.0
+        self._overshoots = self._went_past()
+        self.moves: list[AxisMove] = []
+        self._put_in = self._again = 0
+        self._refuse_contrary()
+
+    def _went_past(self) -> bool:
+        """Whether the axis went past an end and came back, where the side changes at one command.
+
+        Either that or it was read again where it stood: readings that change there as they differ between the two sides
+        elsewhere say the first, in most such rows.
+        """
+        read: dict[float, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+        for command, side, value in zip(self._commands, self._sides, self._values, strict=True):
+            if side and value is not None:
+                read[command][side].append(value)
+        gaps = [median(own[-1]) - median(own[1]) for own in read.values() if len(own) == 2]
+        gap = median(gaps) if gaps else 0.0
+        votes = []
+        for row in range(1, len(self._commands)):
+            value, before, side = self._values[row], self._values[row - 1], self._sides[row]
+            turned = self._commands[row] == self._commands[row - 1] and side * self._sides[row - 1] < 0
+            if turned and value is not None and before is not None:
+                votes.append(abs(value - before + side * gap) <= abs(value - before))
+        return 2 * sum(votes) >= len(votes)
+
+    def _refuse_contrary(self) -> None:
+        """Refuse directions that say the opposite of what commands do, all of them."""
+        steps = [b - a for a, b in zip(self._commands, self._commands[1:], strict=False)]
+        moved = [row for row, step in enumerate(steps, start=1) if step and self._sides[row] and not self._homings[row]]
+        contrary = [row for row in moved if self._sides[row] * steps[row - 1] < 0]
+        if len(contrary) >= CONTRARY_MIN and contrary == moved and {self._sides[row] for row in moved} == {-1, 1}:
+            allowed = "forward where commands rise"
+            remedy = "exchange the words; or --column approach= takes directions from the order of the commands"
+            raise self._cells.refuse(contrary[0], "approach", allowed, remedy)
+
+    def go(self, row: int, command: float, at_s: float | None) -> None:
+        """What a row says of where the axis went, at a time of the table or at the number of the move."""
+        homed = self._homings[row] or not self.moves
+        side = self._sides[row]
+        step = 0.0 if homed else command - self.moves[-1].command
+        if not homed and side and side * step <= 0 and (step or self._turned(row, side)):
+            before = self.moves[-1].time_s
+            via = min(command, self.moves[-1].command) - self._reach
+            if side < 0:
+                via = max(command, self.moves[-1].command) + self._reach
+            self._add(via, None if at_s is None else 0.5 * (before + at_s), homed=False)
+            self._put_in += 1
+            step = command - via
+        if homed or step:
+            self._add(command, at_s, homed=homed, side=side)
+        else:
+            self._again += 1
+
+    def _turned(self, row: int, side: int) -> bool:
+        """Whether a stop at the command before was reached anew: from the other side, or as another repetition."""
+        if side == self._sides[row - 1] or not self._sides[row - 1]:
+            return (
+                self._counts is not None and self._counts[row] != self._counts[row - 1] and bool(self._sides[row - 1])
+            )
+        return self._overshoots
+
+    def _add(self, command: float, at_s: float | None, *, homed: bool, side: int = 0) -> None:
+        segment = 0 if not self.moves else self.moves[-1].segment + homed
+        words: dict[int, Approach] = {1: "forward", -1: "backward", 0: "unknown"}
+        time_s = float(len(self.moves)) if at_s is None else at_s
+        self.moves.append(AxisMove(len(self.moves), segment, time_s, command, words[side] if homed else ""))
+
+    def remarks(self) -> list[str]:
+        """What was assumed of moves."""
+        said = []
+        if n := self._again:
+            said.append(f"{n} row{'s' * (n > 1)} at the command before: read at that stop again, without a move")
+        if n := self._put_in:
+            name = escaped(self._cells.columns["approach"])
+            said.append(
+                f"{n} move{'s' * (n > 1)} put in, {self._reach:.6g} past the stop, where column {name} says another "
+                "side than the row before leads to; --column approach= takes sides from the order alone"
+            )
+        if "approach" not in self._cells:
+            said.append("approach: unknown at the beginning of each segment")
+        return said
+
+
+def _sides(cells: FieldCells) -> list[int]:
+    """1 where a row's column of directions says forward, -1 backward, 0 where it says nothing."""
+    found = []
+    for row, text in enumerate(cells.text("approach")):
+        word = word_of(text)
+        if word not in FORWARD | BACKWARD | {"", "unknown"}:
+            allowed = "forward or backward, + or -, fwd or rev, up or down, unknown"
+            remedy = "forward is the direction of rising commands; or leave it out with --column approach="
+            raise cells.refuse(row, "approach", allowed, remedy)
+        found.append((word in FORWARD) - (word in BACKWARD))
+    return found
+
+
+def unwrapped(found: ForeignReadings, unit: str, counts_per_turn: float | None = None) -> ForeignReadings:
     """The same with the whole turns added that an encoder or autocollimator which begins anew leaves out.
 
     Args:
         found: moves and readings.
-        unit: of the readings; those of no angle stay as they are.
+        unit: of the readings; those of no angle stay as they are unless they count to a power of two.
+        counts_per_turn: where readings begin anew, in their unit; 0: nowhere.
+
+    Raises:
+        InputError: readings jump by one number again and again, and nobody said that they begin anew there.
     """
-    turn = TURNS.get(unit)
+    if counts_per_turn == 0:
+        return found
     rows = [k for k, reading in enumerate(found.readings) if reading.status == "ok" and reading.value is not None]
     command = np.array([found.moves[found.readings[k].move].command for k in rows])
     value = np.array([found.readings[k].value for k in rows], dtype=float)
+    turn = counts_per_turn or TURNS.get(unit) or _counts_of(command, value)
     jumps = turn_jumps(command, value, turn) if turn is not None else {}
     # A wild reading jumps too, and back: by no whole turns.
     if turn is None or not jumps or any(abs(far - round(far)) > WHOLE for far in jumps.values()):
@@ -156,17 +338,29 @@ def unwrapped(found: ForeignReadings, unit: str) -> ForeignReadings:
         turns -= round(jumps.get(row, 0.0))
         readings[k] = replace(readings[k], value=float(value[row]) + turn * turns)
     times = "once" if len(jumps) == 1 else f"{len(jumps)} times"
-    told = f"value: jumps by whole turns {times}, which are added: {turn:g} {unit} each"
+    told = f"value: jumps by whole turns {times}, which are added: {turn:g} {unit} each; --counts-per-turn says another"
     return replace(found, readings=tuple(readings), assumed=(*found.assumed, told))
 
 
-def _approach(cells: FieldCells, row: int) -> Approach:
-    """How the axis came to the first stop of a segment."""
-    word = cells.text("approach")[row].lower() or "unknown"
-    for known in APPROACHES:
-        if word == known:
-            return known
-    raise cells.refuse(row, "approach", ", ".join(APPROACHES), "forward is the direction of rising commands")
+def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
+    """Where whole numbers begin anew: at the power of two that holds them all, if they jump by it.
+
+    Raises:
+        InputError: they jump by another number.
+    """
+    if len(value) < 3 or np.any(value != np.round(value)):
+        return None
+    span = float(np.ptp(value)) + 1.0
+    turn = next((2.0**bits for bits in BITS if 2.0**bits >= span), None)
+    if turn is not None and turn_jumps(command, value, turn):
+        return turn
+    jumps = turn_jumps(command, value, span)
+    if not jumps or any(abs(abs(far) - 1.0) > WHOLE for far in jumps.values()):
+        return None
+    typical = span * float(np.median(np.abs(list(jumps.values()))))
+    found, allowed = f"readings that jump by about {typical:.0f} counts, {len(jumps)} times", "a continuous count"
+    remedy = "say where the encoder begins anew, --counts-per-turn N; or that these are motions, --counts-per-turn 0"
+    raise refusal("wrapped", file="value", found=found, allowed=allowed, remedy=remedy)
 
 
 def _status(cells: FieldCells, row: int, value: float | None) -> str:

@@ -1,0 +1,116 @@
+"""What columns of a table of an axis hold, beyond their names."""
+
+from __future__ import annotations
+
+import pytest
+
+from tvsbayes.errors import InputError
+from tvsbayes.files.foreign_table import table_of
+from tvsbayes.single_axis.foreign_columns import (
+    deviation_columns,
+    one_reading_a_row,
+    plain_column,
+    refuse_small,
+    run_columns,
+)
+
+
+def table(**columns):
+    names = {name.replace("_", " "): cells for name, cells in columns.items()}
+    return table_of("t.csv", "CSV", names, range(2, 2 + len(next(iter(names.values())))))
+
+
+@pytest.mark.parametrize(
+    ("cells", "plain", "unit"),
+    [
+        (("1.5", "-2"), (1.5, -2.0), None),
+        (("12\u00b034'30\"", "-0\u00b030'00\"", "0\u00b0 15' 18.0\""), (12.575, -0.5, 0.255), "deg"),
+        (("12:34:30", "-0:30:00"), (12.575, -0.5), "deg"),
+        (("-1d 12m 0s", "3 6 9"), (-1.2, 3.1025), "deg"),
+        (('1 3/8"', "2", "-1/4", "1-1/2"), (1.375, 2.0, -0.25, 1.5), None),
+        (("1.5 mm", "-2 mm"), (1.5, -2.0), "mm"),
+        (('1.002"', '2.0"'), (1.002, 2.0), "inch"),
+        (("90\u00b0", "91\u00b0"), (90.0, 91.0), "deg"),
+    ],
+)
+def test_notations_of_numbers(cells, plain, unit):
+    """The sign of an angle of less than a degree is kept; a minute has 60 seconds."""
+    found = plain_column("x", cells)
+    assert [float(cell) for cell in found.cells] == pytest.approx(plain, rel=1e-12)
+    assert found.unit == unit and bool(found.remark) == (found.cells != cells)
+
+
+@pytest.mark.parametrize("cells", [("1.5 mm", "2 deg"), ("12:61:00", "1:2:3"), ("slipped", "1"), ("1/0", "1/2")])
+def test_cells_of_no_one_notation_stay(cells):
+    assert plain_column("x", cells).cells == cells
+
+
+@pytest.mark.parametrize(
+    ("names", "runs"),
+    [
+        (("Position", "Forward 1", "Backward 1", "Forward 2"), [(1, 1), (1, -1), (2, 1)]),
+        (("Soll", "Vorw\u00e4rts 1", "R\u00fcckw\u00e4rts 1"), [(1, 1), (1, -1)]),
+        (("mm", "Run 1 \u2191", "Run 1 \u2193"), [(1, 1), (1, -1)]),
+        (("mm", "fwd", "rev"), [(1, 1), (1, -1)]),
+        (("mm", "fwd"), []),
+        (("steps", "reading"), []),
+    ],
+)
+def test_columns_of_runs(names, runs):
+    assert list(run_columns(dict.fromkeys(names, ("1.0",))).values()) == runs
+
+
+def test_runs_side_by_side_follow_each_other():
+    """Forward up, backward down, whatever the order of the rows; lines are those of the file."""
+    wide = table(
+        **{"Position": ("10", "0"), "Backward 1 (mm)": ("b10", "b0"), "Forward 1 (mm)": ("1", "2")},
+        **{"Forward 2 (mm)": ("3", "4")},
+    )
+    wide.columns["Backward 1 (mm)"] = ("5", "6")
+    found, (told,) = one_reading_a_row(wide, {})
+    assert found.columns["reading (mm)"] == ("2", "1", "5", "6", "4", "3")
+    assert found.columns["Position"] == ("0", "10", "10", "0", "0", "10")
+    assert found.columns["direction"] == ("forward",) * 2 + ("backward",) * 2 + ("forward",) * 2
+    assert found.lines == (3, 2, 2, 3, 3, 2) and "3 columns" in told
+    assert one_reading_a_row(wide, {"value": "Forward 1 (mm)"}) == (wide, [])
+
+
+def test_runs_in_two_units_or_without_positions_are_refused():
+    with pytest.raises(InputError, match="runs in mm, um"):
+        one_reading_a_row(table(**{"p": ("1",), "Forward 1 (mm)": ("1",), "Forward 2 (um)": ("1",)}), {})
+    with pytest.raises(InputError, match="no column that is surely their position"):
+        one_reading_a_row(table(p=("1",), q=("2",), Forward_1=("1",), Backward_1=("1",)), {})
+
+
+COLUMNS = {"command": "target mm", "value": "actual mm"}
+
+
+@pytest.mark.parametrize(
+    ("name", "cells", "text"),
+    [
+        ("error mm", ("0.01", "0.03", "-0.02"), "actual mm - target mm"),
+        ("error mm", ("-0.01", "-0.03", "0.02"), "target mm - actual mm"),
+        ("deviation um", ("10", "30", "-20"), "actual mm - target mm"),
+        ("Fehler", ("0.01", "0.03", "0.02"), "|actual mm - target mm|"),
+        ("error mm", ("0.01", "0.03", "0.02"), "|actual mm - target mm|"),
+        ("error mm", ("0.01", "0.03", "-0.03"), None),
+        ("error mm", ("0.01", "0.01", "0.01"), None),
+        ("humidity", ("0.01", "0.03", "-0.02"), None),
+    ],
+)
+def test_a_column_that_is_actual_less_target_is_no_uncertainty(name, cells, text):
+    known = table(target_mm=("0", "1", "2"), actual_mm=("0.01", "1.03", "1.98"), **{name: cells})
+    assert deviation_columns(known, COLUMNS) == ({} if text is None else {name: text})
+
+
+def test_readings_that_are_deviations_are_asked_for():
+    """Those of a gear of 1 to 100 lie on a line, and go through."""
+    commands = [str(k) for k in range(0, 100, 10)]
+    loose = table(target_mm=commands, actual_mm=[str(0.001 * (k * 7 % 10)) for k in range(10)])
+    with pytest.raises(InputError, match="--deviations"):
+        refuse_small(loose, COLUMNS)
+    refuse_small(table(target_mm=commands, actual_mm=[str(0.1 * k) for k in range(10)]), COLUMNS)
+    refuse_small(
+        table(target=commands, actual=[str(0.001 * (k * 7 % 10)) for k in range(10)]),
+        {"command": "target", "value": "actual"},
+    )

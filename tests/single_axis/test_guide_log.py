@@ -1,0 +1,168 @@
+"""A guide log whose mount is known gives back how that mount moved; what is not tracking is left out and counted."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from tvsbayes.errors import InputError
+from tvsbayes.single_axis.guide_log import SIDEREAL_ARCSEC_PER_S, is_guide_log, read_runs, readings_of_run, run_rows
+
+PIXEL, DECLINATION, CALIBRATED, RATE_PX = 2.0, 40.0, 10.0, 3.0
+AXIS_RATE = RATE_PX * PIXEL / math.cos(math.radians(CALIBRATED))
+"""Arcsec of the axis per second of pulse, where xRate is that of the calibration's declination."""
+COSINE = math.cos(math.radians(DECLINATION))
+HEADER = f"""Guiding Begins at 2026-01-02 21:00:00
+Equipment Profile = test
+Pixel scale = {PIXEL} arc-sec/px, Binning = 1, Focal length = 500 mm
+Exposure = 2000 ms
+Mount = Some Mount (ASCOM),  connected, guiding enabled, xAngle = 1.0, xRate = {RATE_PX}, yAngle = 2.0, yRate = 3.0
+{{norm}}Max RA duration = 800, Max DEC duration = 2500, DEC guide mode = Auto
+RA Guide Speed = 6.1 a-s/s, Dec Guide Speed = 7.5 a-s/s, Cal Dec = {CALIBRATED}, Last Cal Issue = None
+RA = 20.34 hr, Dec = {DECLINATION} deg, Hour angle = -1.70 hr, Pier side = West, Rotator pos = N/A
+Frame,Time,mount,dx,dy,RARawDistance,DECRawDistance,RAGuideDistance,DECGuideDistance,RADuration,RADirection,DECDuration,DECDirection,XStep,YStep,StarMass,SNR,ErrorCode
+"""
+
+
+def motion_of(time_s: float) -> float:
+    """Of the axis that nobody corrects, arcsec."""
+    return 8.0 * math.sin(2 * math.pi * time_s / 480.0) + 0.01 * time_s
+
+
+def night(frames: int = 300, events: dict[int, list[str]] | None = None, pulse_rate: float = AXIS_RATE, norm: str = ""):
+    """A log of one run: a guider that corrects the mount of `motion_of`, with rows or INFO lines before some frames."""
+    lines, pulsed, lock = [HEADER.format(norm=norm).rstrip("\n")], 0.0, 0.0
+    for k in range(frames):
+        for event in (events or {}).get(k, []):
+            lines.append(event)
+            if "DITHER by" in event:
+                lock += float(event.split("by ")[1].split(",")[0])
+        time_s = 3.0 * (k + 1) + 0.1 * (k % 3)
+        raw = (motion_of(time_s) - pulsed) * COSINE / PIXEL - lock
+        ms = min(round(abs(raw) * 120), 800)
+        way = "" if not ms else "W" if raw > 0 else "E"
+        lines.append(f'{k + 1},{time_s:.3f},"Mount",0,0,{raw:.4f},0,0,0,{ms},{way},0,,,,900,30.0,{int(k == 7)}')
+        pulsed += math.copysign(ms / 1000.0 * pulse_rate, raw)
+    return "\n".join([*lines, "Guiding Ends at 2026-01-02 21:30:00", ""])
+
+
+def motions(found):
+    """Measured less driven angle of the readings that are ok, arcsec, and their times."""
+    ok = [reading for reading in found.readings if reading.status == "ok"]
+    times = np.array([reading.time_s for reading in ok])
+    return times, np.array([reading.value for reading in ok]) - SIDEREAL_ARCSEC_PER_S * times
+
+
+# Raw distances are written to 1e-4 px, values to 1e-4 arcsec; what is summed are pulses, whole ms and exact.
+ROUNDED = 0.5e-4 * PIXEL / COSINE + 0.5e-4 + 1e-6
+
+
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+def test_the_uncorrected_motion_is_that_of_the_mount(ends):
+    """Pulses act after their frame, at a rate that is of the calibration's declination; distances are on the sky."""
+    (run,) = read_runs("\n \n" + night().replace("\n", ends), "log.txt")
+    found = readings_of_run(run, "log.txt", {})
+    times, motion = motions(found)
+    assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
+    assert (found.unit, found.drive.rate, len(found.moves)) == ("arcsec", SIDEREAL_ARCSEC_PER_S, 1)
+    assert found.moves[0].command == pytest.approx(SIDEREAL_ARCSEC_PER_S * found.moves[0].time_s, abs=1e-6)
+    assert found.drive.period_between == (60.0, round((times[-1] - times[0]) / 3))
+    assert found.drive.header["created"].isoformat() == "2026-01-02T21:00:00"
+    assert any("calibration's declination of 10 deg" in text for text in found.assumed)
+    assert any("1 frame with a saturated star" in text for text in found.notes)
+
+
+def test_a_rate_at_the_declination_of_the_run_is_recognised():
+    """Later versions of the guider scale it, and state the rate at the equator beside it."""
+    scaled = RATE_PX * PIXEL / COSINE
+    norm = f'Norm rates RA = {scaled:.1f}"/s @ dec 0, Dec = 7.3"/s; ortho.err. = 8.7 deg\n'
+    (run,) = read_runs(night(pulse_rate=scaled, norm=norm), "log.txt")
+    found = readings_of_run(run, "log.txt", {})
+    times, motion = motions(found)
+    assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
+    assert any("at the run's declination" in text and "guide speed is 6.1, -22 %" in text for text in found.assumed)
+
+
+def test_what_is_stated_counts_before_the_log():
+    (run,) = read_runs(night(pulse_rate=9.0), "log.txt")
+    times, motion = motions(readings_of_run(run, "log.txt", {"pulse_arcsec_per_s": 9.0}))
+    assert motion == pytest.approx([motion_of(t) for t in times], abs=ROUNDED)
+    wrong = motions(readings_of_run(run, "log.txt", {"pulse_arcsec_per_s": 9.0, "declination_deg": 0.0}))[1]
+    assert np.abs(wrong - motion).max() > 0.1
+
+
+SETTLING = "INFO: SETTLING STATE CHANGE, Settling {}"
+EVENTS = {
+    0: [SETTLING.format("started")],
+    3: [SETTLING.format("complete")],
+    100: ["INFO: DITHER by 4.0, 0.0, new lock pos = 5, 2", SETTLING.format("started")],
+    105: [SETTLING.format("complete")],
+    150: ['998,451.5,"DROP",,,,,,,,,,,,,0,0.00,3,"Star lost - low mass"'],
+    200: ["INFO: Server received PAUSE", "INFO: Server received RESUME"],
+    250: ['999,751.5,"AO",0,0,1.0,0,0,0,500,W,0,,,,900,30.0,0', "1000,7", "INFO: Guiding parameter change, RA x = 1"],
+}
+
+
+def test_dithers_settling_drops_and_pauses_are_left_out_and_no_jump_is_bridged():
+    """Each stretch has a zero of its own; within it the motion is that of the mount."""
+    (run,) = read_runs(night(events=EVENTS), "log.txt")
+    found = readings_of_run(run, "log.txt", {})
+    assert [move.segment for move in found.moves] == [0, 1, 2]
+    counts = {"ok": 292, "settling": 5, "dropped": 1}
+    assert {status: sum(r.status == status for r in found.readings) for status in counts} == counts
+    assert found.notes[0] == (
+        "frames: 292 used of 301 (8 while settling, 1 dropped, 1 damaged row, 1 rows of AO left out); "
+        "3 stretches with a zero of its own each (1 dither, 1 pause)"
+    )
+    times, motion = motions(found)
+    part = np.array([r.move for r in found.readings if r.status == "ok"])
+    off = motion - np.array([motion_of(t) for t in times])
+    for stretch in range(3):
+        assert np.ptp(off[part == stretch]) < 2 * ROUNDED
+    assert abs(off[part == 1][0] - off[part == 0][0]) > 1.0, "the dither's jump is a zero, no motion"
+    begins = [move.time_s for move in found.moves]
+    assert all(begins[r.move] <= r.time_s for r in found.readings)
+
+
+def test_several_runs_calibrations_and_empty_logs():
+    """A header repeats, a run without a frame is none, steps of a calibration are no frames."""
+    empty = HEADER.format(norm="") + "Guiding Ends at 2026-01-02 20:00:00\n"
+    calibration = "Calibration Begins at 2026-01-02 20:30:00\nDirection,Step,dx,dy,x,y,Dist\nWest,0,0,0,1,2,0\n"
+    log = "PHD2 version 2.6.14 [Windows], Log version 2.5.\n" + empty + calibration + night(50) + "\n" + night(20)[:-80]
+    assert is_guide_log(log)
+    runs = read_runs(log, "log.txt")
+    assert [(row["run"], row["frames"], row["pier"]) for row in run_rows(runs)] == [(1, 50, "West"), (2, 19, "West")]
+    found = [readings_of_run(run, "log.txt", {}) for run in runs]
+    assert "1 calibration step" in found[0].notes[0] and found[0].drive.period_between is None
+    assert any("may be cut off" in text for text in found[1].notes)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found", "remedy"),
+    [
+        ("Dec = 40.0 deg", "Dec = Unknown", "does not state the declination", "--assume declination_deg=NUMBER"),
+        ("Pixel scale = 2.0", "Pixel scale = ?", "does not state the pixel scale", "--assume pixel_arcsec=NUMBER"),
+        (", xRate = 3.0", "", "does not state xRate", "--assume pulse_arcsec_per_s=NUMBER"),
+        ("Dec = 40.0 deg", "Dec = 89.3 deg", "a declination of 89.3 deg", "nearer to the equator"),
+    ],
+)
+def test_what_the_log_does_not_state_is_asked_for(old, new, found, remedy):
+    (run,) = read_runs(night(20).replace(old, new), "log.txt")
+    with pytest.raises(InputError, match=found) as refused:
+        readings_of_run(run, "log.txt", {})
+    assert remedy in refused.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("log", "found"),
+    [
+        ("PHD2 version 2\n", "no run with frames"),
+        (night(9).replace("RADuration", "Duration"), "no column RADuration"),
+        (night(2), "2 frames"),
+    ],
+)
+def test_logs_without_frames_are_refused(log, found):
+    with pytest.raises(InputError, match=found):
+        readings_of_run(read_runs(log, "log.txt")[0], "log.txt", {})

@@ -1,0 +1,271 @@
+"""What the columns of somebody's table of an axis hold, beyond their names: runs side by side, deviations, notations.
+
+A table with a column for each run becomes one with a row for each reading; cells in degrees, minutes and seconds, with
+fractions or with units become plain numbers; a column that is actual less commanded position is no uncertainty.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.files.foreign_table import ForeignTable, table_of
+from tvsbayes.instrument.column_names import DEGREES, READING_UNITS, SPREAD, unit_of_name, words_of
+
+DIRECTIONS = {
+    1: {"forward", "forwards", "fwd", "up", "vorwarts", "hin", "adelante", "ida", "avant", "aller"},
+    -1: {"backward", "backwards", "back", "bwd", "rev", "reverse", "down", "ruckwarts", "zuruck", "ruck", "atras"}
+    | {"vuelta", "arriere", "retour"},
+}
+"""Words of columns that hold the readings of one direction, without accents."""
+DEVIATION = {"deviation", "dev", "abweichung", "desviacion", "diff", "difference", "delta", "differenz", "ecart"}
+"""Words of columns that may be actual less commanded position, beside those of uncertainties."""
+LENGTHS_MM = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "inch": 25.4}
+SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
+"""Readings in the unit of the commands that span less than the first share of them, and scatter by more than the second
+share of their own span about a line, are no positions."""
+_ARROWS = str.maketrans({"\u2191": " forward ", "\u2193": " backward ", "\u2192": " forward ", "\u2190": " backward "})
+_SEXAGESIMAL = re.compile(
+    r"(?P<sign>[+-]?)\s*(?P<d>\d+)\s*(?:\u00b0|deg|d|:|\s)\s*(?P<m>\d{1,2})\s*(?:['\u2032m:]|\s|$)\s*"
+    r"(?:(?P<s>\d{1,2}(?:\.\d+)?)\s*(?:\"|''|\u2033|s)?)?"
+)
+_FRACTION = re.compile(r"(?P<sign>[+-]?)(?:(?P<whole>\d+)[ -])?(?P<above>\d+)/(?P<below>\d+)")
+_WITH_UNIT = re.compile(r"(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>[^\d\s.,;+-].*)")
+
+
+@dataclass(frozen=True)
+class PlainColumn:
+    """A column of numbers.
+
+    Attributes:
+        cells: as plain decimal numbers, what is none as it was.
+        unit: that the cells state.
+        remark: which notation they had, "" where they were plain.
+    """
+
+    cells: tuple[str, ...]
+    unit: str | None
+    remark: str
+
+
+def plain_column(name: str, cells: Sequence[str]) -> PlainColumn:
+    """A column whose cells may be in degrees, minutes and seconds, have fractions or carry one unit."""
+    filled = [cell for cell in cells if cell]
+    if all(NUMBER.fullmatch(cell) for cell in filled):
+        return PlainColumn(tuple(cells), None, "")
+    for read in (_in(_degrees, "deg", "degrees, minutes and seconds"), _one_unit, _in(_fraction, None, "fractions")):
+        if (found := read(name, cells)) is not None:
+            return found
+    return PlainColumn(tuple(cells), None, "")
+
+
+def _in(
+    value_of: Callable[[str], float | None], unit: str | None, words: str
+) -> Callable[[str, Sequence[str]], PlainColumn | None]:
+    """A reader of columns in one notation."""
+
+    def read(name: str, cells: Sequence[str]) -> PlainColumn | None:
+        found = [value_of(cell) if cell else None for cell in cells]
+        if any(value is None and cell for value, cell in zip(found, cells, strict=True)):
+            return None
+        plain = tuple("" if value is None else repr(value) for value in found)
+        return PlainColumn(plain, unit, f"column {escaped(name)}: {words}, read as decimal numbers")
+
+    return read
+
+
+def _one_unit(name: str, cells: Sequence[str]) -> PlainColumn | None:
+    """A column whose cells carry one unit each, all the same."""
+    matches = [_WITH_UNIT.fullmatch(cell) if cell else None for cell in cells]
+    units = {match["unit"].strip() for match in matches if match}
+    if len(units) != 1 or any(match is None and cell for match, cell in zip(matches, cells, strict=True)):
+        return None
+    text = units.pop()
+    unit = "inch" if text == '"' else unit_of_name(text, READING_UNITS)
+    if unit is None:
+        return None
+    plain = tuple("" if match is None else match["number"] for match in matches)
+    return PlainColumn(plain, unit, f"column {escaped(name)}: every cell is in {unit}")
+
+
+def _degrees(cell: str) -> float | None:
+    """Decimal degrees; the sign is of the whole, also of -0 deg 12 min."""
+    match = _SEXAGESIMAL.fullmatch(cell)
+    if match is None or NUMBER.fullmatch(cell):
+        return None
+    minutes, seconds = int(match["m"]), float(match["s"] or 0.0)
+    if minutes >= 60 or seconds >= 60:
+        return None
+    return math.copysign(int(match["d"]) + minutes / 60.0 + seconds / 3600.0, -1.0 if match["sign"] == "-" else 1.0)
+
+
+def _fraction(cell: str) -> float | None:
+    """A number with a common fraction, of inches: 1 3/8; plain ones beside them stay."""
+    text = cell.removesuffix('"').removesuffix("in").strip()
+    if NUMBER.fullmatch(text):
+        return float(text)
+    match = _FRACTION.fullmatch(text)
+    if match is None or not int(match["below"]):
+        return None
+    return (-1.0 if match["sign"] == "-" else 1.0) * (
+        int(match["whole"] or 0) + int(match["above"]) / int(match["below"])
+    )
+
+
+def run_columns(columns: Mapping[str, Sequence[str]]) -> dict[str, tuple[int, int]]:
+    """Columns that hold a run each, by name: its number and its direction; empty where the table has none."""
+    found: dict[str, tuple[int, int]] = {}
+    for name, cells in columns.items():
+        words = words_of(name.translate(_ARROWS))
+        sides = [side for side, spellings in DIRECTIONS.items() if spellings.intersection(words)]
+        numbers = [int(word) for word in words if word.isdigit()]
+        first = next((cell for cell in cells if cell), "")
+        if len(sides) == 1 and len(numbers) < 2 and NUMBER.fullmatch(first):
+            found[name] = (numbers[0] if numbers else 1, sides[0])
+    both = {side for _, side in found.values()} == {-1, 1}
+    return found if (both or len(found) > 1) and len(set(found.values())) == len(found) else {}
+
+
+def one_reading_a_row(table: ForeignTable, stated: Mapping[str, str]) -> tuple[ForeignTable, list[str]]:
+    """A table with a column for each run as one with a row for each reading, and that in words; any other as it is.
+
+    Forward runs rise, backward runs fall, in the order of their numbers.
+
+    Args:
+        table: as it was read.
+        stated: column by field, where somebody has said it; with `value` or `approach` stated, the table stays.
+
+    Raises:
+        InputError: no column, or several, of the positions; runs in several units.
+    """
+    runs = run_columns(table.columns)
+    if not runs or stated.get("value") or stated.get("approach"):
+        return table, []
+    others = [name for name in table.columns if name not in runs]
+    numeric = [name for name in others if table.columns[name] and all(map(NUMBER.fullmatch, table.columns[name]))]
+    position = stated.get("command") or (numeric[0] if len(numeric) == 1 else None)
+    named = ", ".join(map(escaped, runs))
+    if position is None or position not in others or not all(map(NUMBER.fullmatch, table.columns[position])):
+        found, allowed = f"runs ({named}) and no column that is surely their position", "one column of numbers"
+        remedy = "say which: --column command=NAME"
+        raise refusal(
+            "missing-column", file=table.file, line=table.first_line, found=found, allowed=allowed, remedy=remedy
+        )
+    units = {unit_of_name(name, READING_UNITS) for name in runs}
+    if len(units) > 1:
+        found, remedy = f"runs in {', '.join(str(unit) for unit in units)} ({named})", "give all runs in one unit"
+        raise refusal("csv", file=table.file, line=table.first_line, found=found, allowed="one unit", remedy=remedy)
+    at = [float(cell) for cell in table.columns[position]]
+    rising = sorted(range(len(at)), key=at.__getitem__)
+    rows = [
+        (row, name, side)
+        for name, (_, side) in sorted(runs.items(), key=lambda item: (item[1][0], -item[1][1]))
+        for row in (rising if side > 0 else rising[::-1])
+    ]
+    unit = next(iter(units))
+    columns: dict[str, Sequence[object]] = {
+        position: [table.columns[position][row] for row, _, _ in rows],
+        "direction": ["forward" if side > 0 else "backward" for _, _, side in rows],
+        "reading" + f" ({unit})" * (unit is not None): [table.columns[name][row] for row, name, _ in rows],
+        "cycle": [str(runs[name][0]) for _, name, _ in rows],
+    }
+    told = f"runs: {len(runs)} columns ({named}), read one after the other; forward runs rise, backward runs fall"
+    return table_of(table.file, table.kind, columns, [table.lines[row] for row, _, _ in rows]), [told]
+
+
+def deviation_columns(table: ForeignTable, columns: Mapping[str, str]) -> dict[str, str]:
+    """Columns that are actual less commanded position in every row, by name, and which way in words.
+
+    Args:
+        table: as it was read.
+        columns: its columns by field, `command` and `value` among them.
+    """
+    command, value = (_numbers(table.columns[columns[field]]) for field in ("command", "value"))
+    names = (columns["value"], columns["command"])
+    found = {}
+    for name, cells in table.columns.items():
+        words = set(words_of(name))
+        if name in names or not words & (SPREAD | DEVIATION | {"fehler"}):
+            continue
+        scale = _scale(name, columns["value"])
+        own = _numbers(cells)
+        rows = [k for k, cell in enumerate(own) if cell is not None and None not in (command[k], value[k])]
+        for sign, text in ((1.0, f"{names[0]} - {names[1]}"), (-1.0, f"{names[1]} - {names[0]}"), (0.0, "")):
+            off = [
+                abs(_signed(value[k] - command[k], sign) * scale - own[k]) <= _half_digit(cells[k])  # type: ignore
+                for k in rows
+            ]
+            if len(rows) > 2 and all(off) and any(own[k] for k in rows):
+                found[name] = escaped(text or f"|{names[0]} - {names[1]}|", 120)
+                break
+    return found
+
+
+def _signed(deviation: float, sign: float) -> float:
+    return sign * deviation if sign else abs(deviation)
+
+
+def _numbers(cells: Sequence[str]) -> list[float | None]:
+    return [float(cell) if NUMBER.fullmatch(cell) else None for cell in cells]
+
+
+def _half_digit(cell: str) -> float:
+    """Half of the last digit of a number as it is written, and rounding of double numbers."""
+    decimals = len(cell.lower().partition("e")[0].partition(".")[2])
+    return 0.5000001 * 10.0**-decimals + 1e-12
+
+
+def _scale(name: str, beside: str) -> float:
+    """Units of one column in one of another, by their names; 1 where they do not say."""
+    own, other = unit_of_name(name, READING_UNITS), unit_of_name(beside, READING_UNITS)
+    for units in (LENGTHS_MM, DEGREES):
+        if own in units and other in units:
+            return units[other] / units[own]
+    return 1.0
+
+
+def refuse_small(table: ForeignTable, columns: Mapping[str, str]) -> None:
+    """Refuse readings in the unit of the commands that are too small and too loose to be positions.
+
+    Raises:
+        InputError: they look like deviations, and nobody said that they are none.
+    """
+    names = columns["command"], columns["value"]
+    units = [unit_of_name(name, READING_UNITS) for name in names]
+    same = any(units[0] in known and units[1] in known for known in (LENGTHS_MM, DEGREES))
+    pairs = zip(*(_numbers(table.columns[name]) for name in names), strict=True)
+    known = [(c, v * _scale(names[0], names[1])) for c, v in pairs if c is not None and v is not None]
+    if not same or len(known) < 4:
+        return
+    commands, values = zip(*known, strict=True)
+    span = max(values) - min(values)
+    if not 0 < span < SMALL_SHARE * (max(commands) - min(commands)):
+        return
+    middle, level = sum(commands) / len(known), sum(values) / len(known)
+    slope = sum((c - middle) * (v - level) for c, v in known) / (sum((c - middle) ** 2 for c in commands) or 1.0)
+    scatter = math.sqrt(sum((v - level - slope * (c - middle)) ** 2 for c, v in known) / len(known))
+    if scatter > LOOSE_SHARE * span:
+        found = f"readings that span {span:.3g} {units[0]} over {max(commands) - min(commands):.6g} of commands"
+        raise InputError(
+            "deviations",
+            f"{table.file}, {escaped(names[1])}: found {found}; allowed: positions; are they actual less commanded "
+            "position? then add --deviations; they are positions? then --column value="
+            f"{escaped(names[1])}",
+            file=table.file,
+            column=names[1],
+            found=found,
+            allowed="positions",
+            remedy=f"add --deviations, or --column value={escaped(names[1])}",
+        )
+
+
+def positions_of_deviations(
+    columns: Mapping[str, str], commands: Sequence[float], deviations: Sequence[float | None]
+) -> tuple[list[float | None], float]:
+    """Positions in the unit of the commands, and by which factor deviations were turned into it."""
+    factor = _scale(columns["command"], columns["value"])
+    return [None if d is None else c + factor * d for c, d in zip(commands, deviations, strict=True)], factor

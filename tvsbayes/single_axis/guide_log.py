@@ -1,0 +1,388 @@
+"""Guide logs of PHD2: the motion of a mount's RA axis while it tracks a star, run by run.
+
+A run lies between "Guiding Begins" and "Guiding Ends". Distances are pixels on the sky, durations ms, times s since the
+run's begin. A pulse acts after its frame: the star's uncorrected motion is the raw distance plus the pulses of all
+frames before. Angles of the axis, arcsec: what is on the sky over cos(declination). No JAX.
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import median
+
+from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.single_axis.axis_campaign import AxisMove, Reading
+from tvsbayes.single_axis.foreign_readings import ForeignReadings, LoggedDrive
+
+SIDEREAL_ARCSEC_PER_S = 1296000.0 / 86164.0905
+"""A turn in a sidereal day (Explanatory Supplement to the Astronomical Almanac, 3rd edition, table 15.3)."""
+BEGINS, ENDS = "Guiding Begins at ", "Guiding Ends"
+NEEDED = ("Time", "RARawDistance", "RADuration", "RADirection")
+DECLINATION_MAX_DEG = 85.0
+"""Above which 1 / cos(declination) makes more of the seeing than of the axis."""
+RATES_DIFFER = 0.1
+"""Of two rates of a pulse, a share from which on it is said that they differ."""
+PRIORS = {"per_command": (1.0, 1e-3), "transmission_error": (0.0, 10.0)}
+"""Of `[axis]`, arcsec: refraction and polar alignment change the apparent rate by parts in 1000; periodic errors of
+worms are some arcsec to some tens of arcsec."""
+ASSUMED = (
+    "a pulse acts after its frame: motion = raw distance + W - E pulses of the frames before",
+    "sign: positive where the star runs ahead of the mount, so that the axis lags and W pulses answer",
+)
+ASSUMPTIONS = {
+    "declination_deg": "declination of the star",
+    "pulse_arcsec_per_s": "what a pulse turns the axis by, arcsec/s",
+    "pixel_arcsec": "scale of the guide camera, arcsec per pixel",
+    "drive_arcsec_per_s": "rate of the drive: sidereal",
+}
+"""What `--assume` may state of a log."""
+_NUMBER = r"(-?\d+(?:\.\d+)?)"
+_HEADER = {
+    "pixel_arcsec": re.compile(rf"^Pixel scale = {_NUMBER} arc-sec/px"),
+    "exposure_ms": re.compile(rf"^Exposure = {_NUMBER} ms"),
+    "rate_px_per_s": re.compile(rf"\bxRate = {_NUMBER}"),
+    "at_equator": re.compile(rf"^Norm rates RA = {_NUMBER}"),
+    "guide_speed": re.compile(rf"\bRA Guide Speed = {_NUMBER} a-s/s"),
+    "calibration_deg": re.compile(rf"\bCal Dec = {_NUMBER}"),
+    "declination_deg": re.compile(rf"^(?:RA = [^,]*, *)?Dec = {_NUMBER} deg"),
+    "pulse_max_ms": re.compile(rf"\bMax RA duration = {_NUMBER}"),
+}
+_MOUNT, _PIER = re.compile(r"^Mount = ([^,]*)"), re.compile(r"\bPier side = (\w+)")
+
+
+@dataclass
+class GuideRun:
+    """A run as the log has it.
+
+    Attributes:
+        number: from 1.
+        line: where it begins.
+        begins: local time as written, "" where there is none.
+        mount: driver of the mount as logged.
+        pier: side of the pier.
+        header: numbers of the header by the names of `_HEADER`.
+        frames: (line, time_s, raw distance px, pulse ms with W positive, settling) of frames with a star.
+        dropped: (line, time_s) of frames without one.
+        breaks: places among `frames` before which the zero is another: dithers, new lock positions, settling, pauses.
+        counts: of what happened, in words.
+        ended: whether the log says that it ended.
+    """
+
+    number: int
+    line: int
+    begins: str
+    mount: str = "unknown"
+    pier: str = "unknown"
+    header: dict[str, float] = field(default_factory=dict)
+    frames: list[tuple[int, float, float, float, bool]] = field(default_factory=list)
+    dropped: list[tuple[int, float]] = field(default_factory=list)
+    breaks: set[int] = field(default_factory=set)
+    counts: Counter[str] = field(default_factory=Counter)
+    ended: bool = False
+
+    @property
+    def minutes(self) -> float:
+        """From the first frame to the last."""
+        return (self.frames[-1][1] - self.frames[0][1]) / 60.0 if self.frames else 0.0
+
+    @property
+    def settling(self) -> int:
+        """Frames while the mount settled."""
+        return sum(frame[4] for frame in self.frames)
+
+
+def is_guide_log(text: str) -> bool:
+    """Whether a text is a log of PHD2."""
+    return BEGINS in text or text.startswith("PHD2 version")
+
+
+def read_runs(text: str, file: str) -> list[GuideRun]:
+    """The runs of a log, those without a frame left out.
+
+    Raises:
+        InputError: no run, or a table of frames without a column that is needed.
+    """
+    runs: list[GuideRun] = []
+    run: GuideRun | None = None
+    columns: list[str] | None = None
+    settling, calibrating, calibration_steps = False, False, 0
+    for number, raw in enumerate(text.splitlines(), start=1):
+        line = raw.strip()
+        if line.startswith(BEGINS):
+            run, columns, settling, calibrating = (
+                GuideRun(len(runs) + 1, number, line[len(BEGINS) :]),
+                None,
+                False,
+                False,
+            )
+            run.counts["calibration step"], calibration_steps = calibration_steps, 0
+            runs.append(run)
+        elif line.startswith("Calibration Begins at"):
+            calibrating, run = True, None
+        elif calibrating:
+            calibration_steps += line.startswith(("West,", "East,", "North,", "South,", "Backlash,"))
+        elif run is None or not line:
+            continue
+        elif line.startswith(ENDS):
+            run.ended, run = True, None
+        elif line.startswith("INFO:"):
+            settling = _event(run, line, settling)
+        elif line.startswith("Frame,"):
+            columns = line.split(",")
+            if lacking := [name for name in NEEDED if name not in columns]:
+                found, remedy = f"no column {', '.join(lacking)}", "export the log of the guider as it was written"
+                raise refusal("csv", file=file, line=number, found=found, allowed=", ".join(NEEDED), remedy=remedy)
+        elif columns is None:
+            _header(run, line)
+        else:
+            _frame(run, number, line, columns, settling)
+    kept = [one for one in runs if one.frames]
+    for k, one in enumerate(kept, start=1):
+        one.number = k
+    if not kept:
+        found, remedy = "no run with frames", "give a log that holds guiding, not calibration alone"
+        raise refusal("empty", file=file, found=found, allowed=f'frames after "{BEGINS.strip()}"', remedy=remedy)
+    return kept
+
+
+def _header(run: GuideRun, line: str) -> None:
+    for name, pattern in _HEADER.items():
+        if (match := pattern.search(line)) and name not in run.header:
+            run.header[name] = float(match[1])
+    if match := _MOUNT.search(line):
+        run.mount = match[1].strip()
+    if match := _PIER.search(line):
+        run.pier = match[1]
+
+
+def _event(run: GuideRun, line: str, settling: bool) -> bool:
+    """What an INFO line says of the frames that follow; whether the mount settles from here on."""
+    if "Settling started" in line:
+        run.breaks.add(len(run.frames))
+        return True
+    if "Settling complete" in line or "Settling failed" in line:
+        run.breaks.add(len(run.frames))
+        return False
+    if "DITHER by" in line or "SET LOCK POSITION" in line or "LOCK SHIFT" in line:
+        run.counts["dither"] += "DITHER by" in line
+        run.breaks.add(len(run.frames))
+    elif "received RESUME" in line or "Resumed" in line:
+        run.counts["pause"] += 1
+        run.breaks.add(len(run.frames))
+    elif "Guiding parameter change" in line and " RA " in line:
+        run.counts["change of the RA algorithm"] += 1
+    return settling
+
+
+def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settling: bool) -> None:
+    """A row of the table; one that is cut off or of no frame of the mount is counted."""
+    try:
+        cells = dict(zip(columns, next(csv.reader([line])), strict=False))
+        time_s, kind = float(cells["Time"]), cells.get("mount", "Mount")
+        last = max((run.frames[-1][1] if run.frames else 0.0, run.dropped[-1][1] if run.dropped else 0.0))
+        if time_s < last or not math.isfinite(time_s):
+            run.counts["damaged row"] += 1
+        elif kind == "DROP" or cells["RARawDistance"] == "":
+            run.dropped.append((number, time_s))
+        elif kind != "Mount":
+            run.counts[f"rows of {escaped(kind, 12)}"] += 1
+        else:
+            raw, pulse_ms = float(cells["RARawDistance"]), float(cells["RADuration"] or 0)
+            way = {"W": 1.0, "E": -1.0, "": 0.0}[cells["RADirection"].strip()[:1].upper()]
+            run.frames.append((number, time_s, raw, way * pulse_ms, settling))
+            run.counts["frame with a saturated star"] += cells.get("ErrorCode") == "1"
+    except (KeyError, ValueError, csv.Error, StopIteration):
+        run.counts["damaged row"] += 1
+
+
+def run_rows(runs: Sequence[GuideRun]) -> list[dict[str, object]]:
+    """A row a run, for the list that is printed where a log holds several."""
+    return [
+        {
+            "run": run.number,
+            "begins": run.begins,
+            "minutes": round(run.minutes, 1),
+            "frames": len(run.frames),
+            "dropped": len(run.dropped),
+            "settling": run.settling,
+            "dithers": run.counts["dither"],
+            "declination_deg": run.header.get("declination_deg"),
+            "pier": run.pier,
+            "mount": run.mount,
+        }
+        for run in runs
+    ]
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """Numbers that turn a log into angles of the axis, and their sources in words."""
+
+    pixel_arcsec: float
+    cos_declination: float
+    pulse_arcsec_per_s: float
+    drive_arcsec_per_s: float
+    assumed: tuple[str, ...]
+
+
+def _scale(run: GuideRun, stated: Mapping[str, float], file: str) -> _Scale:
+    """Of a run.
+
+    Raises:
+        InputError: what the log does not state, with the option that does.
+    """
+    known = {**run.header, **stated}
+
+    def need(name: str, words: str, option: str = "") -> float:
+        if name in known:
+            return known[name]
+        found, remedy = f"run {run.number} does not state {words}", f"state it: --assume {option or name}=NUMBER"
+        raise refusal("missing-value", file=file, line=run.line, found=found, allowed="a number", remedy=remedy)
+
+    pixel, declination = need("pixel_arcsec", "the pixel scale"), need("declination_deg", "the declination")
+    if not abs(declination) <= DECLINATION_MAX_DEG:
+        found, allowed = f"a declination of {declination:g} deg", f"at most {DECLINATION_MAX_DEG:g} deg"
+        remedy = "take a run on a star nearer to the equator; or is another one right: --assume declination_deg=NUMBER"
+        raise refusal("range", file=file, line=run.line, found=found, allowed=allowed, remedy=remedy)
+    if not pixel > 0:
+        raise InputError("usage", "--assume pixel_arcsec: allowed: above 0", remedy="state arcsec per pixel")
+    cosine = math.cos(math.radians(declination))
+    told = [f"declination {declination:g} deg: distances on the sky over {cosine:.4f}; --assume declination_deg="]
+    told.append(f"pixel scale {pixel:g} arcsec/px; --assume pixel_arcsec=")
+    if "pulse_arcsec_per_s" in stated:
+        pulse = stated["pulse_arcsec_per_s"]
+        told.append(f"pulses turn the axis by {pulse:g} arcsec/s, as stated")
+    else:
+        pulse = _logged_pulse(run, known, need("rate_px_per_s", "xRate", "pulse_arcsec_per_s") * pixel, cosine, told)
+    drive = stated.get("drive_arcsec_per_s", SIDEREAL_ARCSEC_PER_S)
+    told.append(f"the drive turns at {drive:.6g} arcsec/s; --assume drive_arcsec_per_s=")
+    return _Scale(pixel, cosine, pulse, drive, tuple(told))
+
+
+def _logged_pulse(run: GuideRun, known: Mapping[str, float], sky: float, cosine: float, told: list[str]) -> float:
+    """What a pulse turns the axis by, arcsec/s: xRate is that of the run's declination or of the calibration's.
+
+    Args:
+        run: for its pulses.
+        known: numbers of the header.
+        sky: xRate times pixel scale, arcsec/s.
+        cosine: of the declination.
+        told: sentences, to which the source is added.
+    """
+    calibration = known.get("calibration_deg")
+    of_run, where = sky / cosine, "at the run's declination"
+    pulse = of_run
+    if calibration is not None and abs(calibration) < 90:
+        of_calibration = sky / math.cos(math.radians(calibration))
+        norm = known.get("at_equator")
+        if norm is None or abs(of_calibration - norm) < abs(of_run - norm):
+            pulse, where = of_calibration, f"at the calibration's declination of {calibration:g} deg"
+    text = f"pulses turn the axis by {pulse:.4g} arcsec/s: xRate {sky:.4g} arcsec/s on the sky, taken {where}"
+    if (speed := known.get("guide_speed")) and abs(pulse / speed - 1) > RATES_DIFFER:
+        text += f"; the mount's guide speed is {speed:g}, {100 * (speed / pulse - 1):+.0f} %"
+    told.append(f"{text}; --assume pulse_arcsec_per_s=")
+    return pulse
+
+
+def readings_of_run(run: GuideRun, file: str, stated: Mapping[str, float]) -> ForeignReadings:
+    """A run as moves and readings: the drive's angle plus the star's uncorrected motion, both in arcsec of the axis.
+
+    Args:
+        run: of the log.
+        file: its name.
+        stated: numbers by the names of `ASSUMPTIONS`, which count before those of the log.
+
+    Raises:
+        InputError: a number that neither says, or fewer than three frames that can be used.
+    """
+    scale = _scale(run, stated, file)
+    moves: list[AxisMove] = []
+    found: list[tuple[float, int, float | None, str]] = []
+    pulsed, waiting = 0.0, True
+    for k, (_, time_s, raw, pulse_ms, settling) in enumerate(run.frames):
+        waiting = waiting or k in run.breaks
+        status, value = "settling" if settling else "ok", None
+        if not settling:
+            if waiting:
+                command = round(scale.drive_arcsec_per_s * time_s, 6)
+                moves.append(AxisMove(len(moves), len(moves), time_s, command, "forward"))
+                pulsed, waiting = 0.0, False
+            motion = raw * scale.pixel_arcsec / scale.cos_declination + pulsed
+            value = scale.drive_arcsec_per_s * time_s + motion
+        found.append((time_s, len(moves) - 1, value, status))
+        pulsed += pulse_ms / 1000.0 * scale.pulse_arcsec_per_s
+    used = sum(value is not None for _, _, value, _ in found)
+    if used < 3:
+        remedy = "name another run with --run"
+        raise refusal("empty", file=file, line=run.line, found=f"{used} frames", allowed="three or more", remedy=remedy)
+    # A frame before the first stretch belongs to no move.
+    found += [(time_s, -1, None, "dropped") for _, time_s in run.dropped]
+    begins = [move.time_s for move in moves]
+    rows = [
+        (time_s, max(0, sum(at <= time_s for at in begins) - 1) if move < 0 else move, value, status)
+        for time_s, move, value, status in sorted(found, key=lambda row: row[0])
+        if time_s >= begins[0]
+    ]
+    readings = tuple(
+        Reading(k, move, None if value is None else round(value, 4), 0.0, status, time_s)
+        for k, (time_s, move, value, status) in enumerate(rows)
+    )
+    drive = LoggedDrive(scale.drive_arcsec_per_s, _header_of(run, file), _between(rows), PRIORS)
+    notes = (_counted(run, used, len(moves)), *_remarks(run))
+    return ForeignReadings(tuple(moves), readings, (*scale.assumed, *ASSUMED), "arcsec", drive, notes)
+
+
+def _several(count: int, name: str) -> str:
+    return f"{count} {name}{'s' * (count != 1)}"
+
+
+def _counted(run: GuideRun, used: int, stretches: int) -> str:
+    """What is used and what is left out."""
+    events = [f"{run.settling} while settling", f"{len(run.dropped)} dropped"]
+    events += [_several(n, name) for name in ("damaged row", "calibration step") if (n := run.counts[name])]
+    events += [f"{n} {name}" for name, n in run.counts.items() if name.startswith("rows of") and n]
+    text = f"frames: {used} used of {len(run.frames) + len(run.dropped)} ({', '.join(events)} left out)"
+    broken = [_several(run.counts["dither"], "dither"), *([_several(n, "pause")] if (n := run.counts["pause"]) else [])]
+    own = "of its own each" if stretches > 1 else "of its own"
+    return f"{text}; {stretches} stretch{'es' * (stretches != 1)} with a zero {own} ({', '.join(broken)})"
+
+
+def _remarks(run: GuideRun) -> list[str]:
+    """What else a reader should know of a run."""
+    said = [f"pier side {run.pier}"]
+    if not run.ended:
+        said.append("the log does not say that the run ended: it may be cut off")
+    times = [frame[1] for frame in run.frames]
+    step = median([b - a for a, b in pairwise(times)] or [0.0])
+    pulses = [abs(frame[3]) for frame in run.frames]
+    if late := sum(p > 1000.0 * step for p in pulses):
+        said.append(f"{late} pulses last longer than the {step:.2g} s between frames and act in part later")
+    if (most := run.header.get("pulse_max_ms")) and (capped := sum(p >= most for p in pulses)):
+        said.append(f"{capped} pulses at their limit of {most:g} ms")
+    if n := run.counts["frame with a saturated star"]:
+        said.append(f"{n} frame{'s' * (n > 1)} with a saturated star, used")
+    if n := run.counts["change of the RA algorithm"]:
+        said.append(f"{n} change{'s' * (n > 1)} of the RA algorithm during the run")
+    return said
+
+
+def _header_of(run: GuideRun, file: str) -> dict[str, object]:
+    header: dict[str, object] = {"name": f"{file}, run {run.number}", "instrument": run.mount[:200]}
+    try:
+        header["created"] = datetime.datetime.fromisoformat(run.begins)
+    except ValueError:
+        header["notes"] = f"begins {run.begins[:100]}"
+    return header
+
+
+def _between(rows: Sequence[tuple[float, int, float | None, str]]) -> tuple[float, float] | None:
+    """Periods, s, among which a search makes sense: from a minute to a third of the run; None of a short run."""
+    span_s = rows[-1][0] - rows[0][0]
+    return (60.0, round(span_s / 3.0, 0)) if span_s > 360.0 else None

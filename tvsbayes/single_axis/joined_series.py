@@ -1,0 +1,290 @@
+"""Logs that hold the command and the reading of an axis as two series, each with its own times: EPICS, Klipper.
+
+A value is logged when it changes. A reading gets the command of its time: interpolated while the command changes,
+held where it stands. The result is a table, as `read_foreign` gives one.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.files.foreign_table import ForeignTable, table_of
+from tvsbayes.instrument.column_names import words_of
+
+STANDS = 5.0
+"""Typical intervals of a series from which on nothing changed in between: its value stood still."""
+SAME_S = 1e-6
+"""Times closer than this are one."""
+ROWS_KEPT = 2000
+"""Joined rows, as many as a fit takes; of more every n-th is kept."""
+INFLATED_BYTES_MAX = 256 * 2**20
+KLIPPER_TURN = 65536
+"""Of an angle sensor in Klipper (klippy/extras/angle.py, ANGLE_BITS)."""
+STEPS_MAX = 20_000_000
+_CAMONITOR = re.compile(
+    r"(?P<name>\S+)\s+(?:\(\S+\)\s*)?(?P<time>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(?:\.\d+)?)\s+"
+    r"(?P<value>\S+)(?:\s+(?P<rest>\S.*))?"
+)
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
+_READ = ("encoder", "enc", "ssi", "biss", "endat", "absolute", "reading", "measured", "interferometer")
+_COMMANDED = ("axis", "motor", "setpoint", "sp", "val", "command", "cmd", "steps", "step", "counter", "demand")
+_READ_BACK = ("rbv", "readback", "act", "actual")
+
+
+@dataclass(frozen=True)
+class Series:
+    """Values as they changed.
+
+    Attributes:
+        times_s: rising, shape (n,).
+        values: shape (n,).
+    """
+
+    times_s: np.ndarray
+    values: np.ndarray
+
+    @property
+    def changes(self) -> bool:
+        """Whether it holds more than one value."""
+        return len(np.unique(self.values)) > 1
+
+
+def is_camonitor(text: str) -> bool:
+    """Whether most lines of a text are of EPICS' camonitor."""
+    lines = [line for line in text.splitlines()[:50] if line.strip()]
+    return bool(lines) and 2 * sum(bool(_CAMONITOR.match(line)) for line in lines) > len(lines)
+
+
+def is_klipper(data: bytes) -> bool:
+    """Whether a file is a log of Klipper's data logger, packed or not, or a configuration with an angle sensor."""
+    return data.startswith(b"\x1f\x8b") or b"\x03" in data[:100000] or _CALIBRATED.search(data[: 2**20]) is not None
+
+
+def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignTable:
+    """The pair of series of a camonitor log, joined in time.
+
+    Args:
+        text: of the log.
+        file: its name, for messages.
+        stated: name of a series by `command` or `value`, where somebody has said it.
+
+    Raises:
+        InputError: no pair that is surely command and reading, or no time at which both are known.
+    """
+    found: dict[str, list[tuple[float, float]]] = {}
+    left_out, begin = 0, None
+    for line in text.splitlines():
+        match = _CAMONITOR.fullmatch(line.strip())
+        if match is None:
+            left_out += bool(line.strip())
+            continue
+        rest = (match["rest"] or "").upper()
+        if not _NUMBER.fullmatch(match["value"]) or "INVALID" in rest:
+            found.setdefault(match["name"], [])
+            left_out += 1
+            continue
+        when = datetime.datetime.fromisoformat(match["time"])
+        begin = begin or when
+        found.setdefault(match["name"], []).append(((when - begin).total_seconds(), float(match["value"])))
+    series = {name: _series(rows) for name, rows in found.items() if rows}
+    command, value = _pair(series, file, stated)
+    kind = f"EPICS camonitor, {len(found)} series, {left_out} lines without a number left out"
+    return _joined(series, command, value, file, kind)
+
+
+def _series(rows: Sequence[tuple[float, float]]) -> Series:
+    """Rows in order of time; of several at one time the last."""
+    ordered = sorted(enumerate(rows), key=lambda row: (row[1][0], row[0]))
+    times = np.array([row[0] for _, row in ordered])
+    kept = np.r_[np.diff(times) > SAME_S, True]
+    return Series(times[kept], np.array([row[1] for _, row in ordered])[kept])
+
+
+def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) -> tuple[str, str]:
+    """Names of the command and of the reading: as stated, else by words in their names.
+
+    Raises:
+        InputError: nobody can tell.
+    """
+    changing = [name for name, one in series.items() if one.changes]
+    listed = ", ".join(f"{escaped(name)} ({len(series[name].times_s)} values)" for name in changing) or "none"
+    for field in ("command", "value"):
+        if (name := stated.get(field)) and name not in series:
+            message = f"--column {field}={escaped(name)}: no such series; allowed: {listed}"
+            raise InputError("usage", message, allowed=listed, remedy="name one of them")
+    free = [name for name in changing if name not in stated.values()]
+    known = {field: name for field in ("command", "value") if (name := stated.get(field))}
+    for field, words in (("value", _READ), ("command", _COMMANDED), ("value", _READ_BACK)):
+        own = [name for name in free if set(words_of(name)).intersection(words)]
+        if field not in known and len(own) == 1:
+            known[field] = own[0]
+            free.remove(own[0])
+    lacking = [field for field in ("command", "value") if field not in known]
+    if len(lacking) == 1 and len(free) == 1:
+        known[lacking[0]] = free[0]
+    elif lacking:
+        found, allowed = f"series that change: {listed}", "one that is commanded and one that is read"
+        remedy = "say which: --column command=NAME --column value=NAME"
+        raise refusal("missing-column", file=file, found=found, allowed=allowed, remedy=remedy)
+    return known["command"], known["value"]
+
+
+def _joined(series: Mapping[str, Series], command: str, value: str, file: str, kind: str) -> ForeignTable:
+    """Samples of the reading with the command of their times.
+
+    Raises:
+        InputError: the series do not overlap in time.
+    """
+    ordered, read = series[command], series[value]
+    inside = (read.times_s >= ordered.times_s[0] - SAME_S) & (read.times_s <= ordered.times_s[-1] + SAME_S)
+    if not inside.any():
+        found, remedy = f"no value of {escaped(value)} between the first and the last of {escaped(command)}", ""
+        remedy = "name two series of one time with --column command=NAME --column value=NAME"
+        raise refusal("empty", file=file, found=found, allowed="series that overlap in time", remedy=remedy)
+    times, values = read.times_s[inside], read.values[inside]
+    commands, interpolated = command_at(ordered, times)
+    every = -(-len(times) // ROWS_KEPT)
+    times, values, commands = times[::every], values[::every], commands[::every]
+    words = [kind, f"command {escaped(command)}, reading {escaped(value)}"]
+    words.append(f"{interpolated} commands interpolated in time, {int((~inside).sum())} readings outside left out")
+    words += [f"every {every}th reading kept"] * (every > 1)
+    columns: dict[str, Sequence[object]] = {
+        "time_s": [f"{t:.6f}" for t in times - times[0]],
+        command: [repr(float(f"{c:.10g}")) for c in commands],
+        value: [f"{v:.12g}" for v in values],
+    }
+    return table_of(file, "; ".join(words), columns, range(1, len(times) + 1))
+
+
+def command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]:
+    """Commands at times between the first and the last of a series, and how many had to be interpolated.
+
+    Args:
+        commands: as they changed.
+        times_s: shape (n,).
+    """
+    at = np.clip(np.searchsorted(commands.times_s, times_s + SAME_S, side="right") - 1, 0, len(commands.times_s) - 1)
+    after = np.minimum(at + 1, len(commands.times_s) - 1)
+    gap = commands.times_s[after] - commands.times_s[at]
+    typical = float(np.median(np.diff(commands.times_s))) if len(commands.times_s) > 1 else 0.0
+    share = np.where(gap > 0, (times_s - commands.times_s[at]) / np.where(gap > 0, gap, 1.0), 0.0)
+    moving = (gap <= STANDS * typical) & (share * gap > SAME_S)
+    rise = commands.values[after] - commands.values[at]
+    return commands.values[at] + np.where(moving, share * rise, 0.0), int(moving.sum())
+
+
+_CALIBRATED = re.compile(
+    rb"^(?:#\*# )?\[angle\s+([^\]]+)\](?:(?!^(?:#\*# )?\[).*\n?)*?^(?:#\*# )?calibrate\s*[=:][ \t]*"
+    rb"((?:[-\d.,\s]|#\*#)+)",
+    re.MULTILINE,
+)
+
+
+def klipper_table(data: bytes, file: str) -> ForeignTable:
+    """Angles of a motor's shaft by Klipper: a log of its data logger, or the table that ANGLE_CALIBRATE saves.
+
+    Args:
+        data: of the file; a log of the data logger may be packed.
+        file: its name, for messages.
+
+    Raises:
+        InputError: no angles in it, or no steps beside them.
+    """
+    if (match := _CALIBRATED.search(data)) and not data.startswith(b"\x1f\x8b"):
+        numbers = [float(text) for text in re.findall(rb"-?\d+(?:\.\d+)?", match[2].replace(b"#*#", b""))]
+        if len(numbers) < 3:
+            found, remedy = f"a calibration of {len(numbers)} angles", "run ANGLE_CALIBRATE and SAVE_CONFIG"
+            raise refusal("empty", file=file, found=found, allowed="one for every full step", remedy=remedy)
+        kind = f"Klipper, ANGLE_CALIBRATE of {escaped(match[1].decode(errors='replace'))}: a mean of both directions "
+        kind += "for each full step, so that it holds no play"
+        angles = [repr(number * 360.0 / KLIPPER_TURN) for number in numbers]
+        columns: dict[str, Sequence[object]] = {"full steps": range(len(numbers)), "angle (deg)": angles}
+        return table_of(file, kind, columns, range(1, len(numbers) + 1))
+    angles_s: list[tuple[float, float]] = []
+    steps: list[tuple[np.ndarray, np.ndarray]] = []
+    names: dict[str, None] = {}
+    for message in _messages(data, file):
+        kind_of, _, name = str(message.get("q", "")).partition(":")
+        params = message.get("params")
+        if not isinstance(params, dict) or kind_of not in ("angle", "stepq"):
+            continue
+        names[f"{kind_of}:{name}"] = None
+        if kind_of == "angle":
+            angles_s += [(float(row[0]), float(row[1]) * 360.0 / KLIPPER_TURN) for row in params.get("data", [])]
+        else:
+            steps.append(_steps(params, file))
+    kinds = {name.partition(":")[0] for name in names}
+    if len(names) != 2 or kinds != {"angle", "stepq"}:
+        found, allowed = f"series {', '.join(map(escaped, names)) or 'none'}", "one angle:NAME and one stepq:NAME"
+        remedy = "log one sensor and its stepper with data_logger.py; or name it in a table of your own"
+        raise refusal("missing-column", file=file, found=found, allowed=allowed, remedy=remedy)
+    command, value = "steps", "angle (deg)"
+    times, positions = (np.concatenate(part) for part in zip(*steps, strict=True))
+    order = np.argsort(times, kind="stable")
+    read = _series(angles_s)
+    # Steps are commands at once; nothing is interpolated between them.
+    held = Series(times[order], positions[order])
+    inside = read.times_s >= held.times_s[0]
+    at = np.searchsorted(held.times_s, read.times_s, side="right") - 1
+    joined = Series(read.times_s, np.where(inside, held.values[np.maximum(at, 0)], np.nan))
+    every = -(-int(inside.sum()) // ROWS_KEPT) or 1
+    rows = np.flatnonzero(inside)[::every]
+    kind = f"Klipper, {', '.join(map(escaped, names))}; {int((~inside).sum())} angles before the first step left out"
+    kind += f"; every {every}th angle kept" * (every > 1)
+    columns = {
+        "time_s": [f"{t:.6f}" for t in read.times_s[rows] - read.times_s[rows][0]],
+        command: [f"{c:.12g}" for c in joined.values[rows]],
+        value: [repr(float(v)) for v in read.values[rows]],
+    }
+    return table_of(file, kind, columns, range(1, len(rows) + 1))
+
+
+def _messages(data: bytes, file: str) -> Iterator[dict]:
+    """JSON objects of a log, packed or not, each ended by the byte 3 or by a line end."""
+    if data.startswith(b"\x1f\x8b"):
+        try:
+            data = zlib.decompressobj(31).decompress(data, INFLATED_BYTES_MAX)
+        except zlib.error as error:
+            found, remedy = "a damaged gzip file", "copy it again, or cut it where it ends"
+            raise refusal("kind", file=file, found=found, allowed="a log of data_logger.py", remedy=remedy) from error
+    for part in re.split(rb"[\x03\n]", data):
+        try:
+            message = json.loads(part) if part.strip() else None
+        except ValueError:
+            # A log that is cut off ends inside a message.
+            continue
+        if isinstance(message, dict):
+            yield message
+
+
+def _steps(params: Mapping[str, object], file: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times and counter after every step of one message of a stepper's queue."""
+    try:
+        first_s, last_s = float(params["first_step_time"]), float(params["last_step_time"])  # type: ignore[arg-type]
+        first_clock, last_clock = int(params["first_clock"]), int(params["last_clock"])  # type: ignore[call-overload]
+        blocks = [tuple(int(cell) for cell in row) for row in params["data"]]  # type: ignore[attr-defined]
+        position = int(params.get("start_mcu_position", 0))  # type: ignore[call-overload]
+    except (KeyError, TypeError, ValueError) as error:
+        found, remedy = "a queue of steps of another form", "log it with data_logger.py of this Klipper"
+        raise refusal("kind", file=file, found=found, allowed="its fields", remedy=remedy) from error
+    if sum(abs(count) for _, count, _ in blocks) > STEPS_MAX:
+        raise refusal("size", file=file, found="more steps", allowed=f"{STEPS_MAX}", remedy="log a shorter time")
+    per_clock_s = (last_s - first_s) / (last_clock - first_clock) if last_clock > first_clock else 0.0
+    clocks, signs, clock = [], [], first_clock - (blocks[0][0] if blocks else 0)
+    for interval, count, add in blocks:
+        k = np.arange(abs(count))
+        # The k-th interval is interval + k add (klippy/chelper/stepcompress.c).
+        clocks.append(clock + np.cumsum(interval + k * add))
+        signs.append(np.full(len(k), 1 if count > 0 else -1))
+        clock = int(clocks[-1][-1]) if len(k) else clock
+    if not clocks:
+        return np.empty(0), np.empty(0)
+    return first_s + (np.concatenate(clocks) - first_clock) * per_clock_s, position + np.cumsum(np.concatenate(signs))
