@@ -28,8 +28,9 @@ from support.two_parameters import (
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
+from tvsbayes.posterior.plays import Cut
 from tvsbayes.posterior.target import Target
-from tvsbayes.posterior.transport import BLOCK_ROWS, Cut, Transport, by_width
+from tvsbayes.posterior.transport import BLOCK_ROWS, Transport, by_width
 
 STOP_NAMES = (("stop_sd_deg.right", "stop_sd_deg.left"), ("stop_sd_deg.down", "stop_sd_deg.up"))
 """By axis, in the order of `redraw_mix`."""
