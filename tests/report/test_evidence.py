@@ -10,7 +10,7 @@ from support.reported_twin import BATCH, PLANNED, evidence_of
 from support.small_results import small_summary
 
 from tvsbayes.errors import InputError
-from tvsbayes.report.evidence import MET, NOT_MET, Criterion, criterion
+from tvsbayes.report.evidence import CANNOT_TELL, MET, NOT_MET, Criterion, criterion
 from tvsbayes.report.first_page import criteria_table, verdict_of
 
 STORED = {"compare.json": "held_out", "plan.json": "planned"}
@@ -74,5 +74,8 @@ def test_the_headline_and_the_table_say_a_probability_alike():
     sure = Criterion("ratio left", 1e-3, "deg/step", 1.0, MET)
     assert verdict_of(small_summary(), (sure,)).text.endswith("(probability above 0.999)")
     assert criteria_table((sure,)).rows[0][2] == "above 0.999"
+    open_ = Criterion("3D point", 60.0, "mm", 0.551, CANNOT_TELL)
+    assert criteria_table((open_,)).rows[0][2] == "0.551: 45 of 100 are off by more"
+    assert verdict_of(small_summary(), (open_,)).text.endswith("(probability 0.551)")
     far = Criterion("ratio left", 1e-3, "deg/step", 0.0, NOT_MET)
     assert verdict_of(small_summary(), (far,)).text.endswith("(probability below 0.001)")

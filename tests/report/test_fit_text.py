@@ -150,7 +150,7 @@ def direction(mean: float, u: float | None) -> DirectionResult:
 def test_classic_text_has_a_row_per_direction_with_or_without_experiments():
     directions = {"left": direction(0.0594, 0.0002), "right": direction(0.062, None), "up": None, "down": None}
     rows = [line.split() for line in classic_text(ClassicResult(directions, (), ())).splitlines()]
-    assert rows[2] == ["left", "4", "0.059400", "0.000400", "0.000200", "[0.059000,", "0.059800]"]
+    assert rows[2] == ["left", "4", "0.059400", "0.000400", "0.000200", "[0.05900,", "0.05980]"]
     assert rows[3] == ["right", "1", "0.062000", "-", "-", "-"]
     assert rows[4] == ["up", "0", "no", "experiment"]
 

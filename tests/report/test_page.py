@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 from support.reported_twin import PLANNED, Nodes, evidence_of
+from support.small_results import estimate
 
 from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.errors import InputError
@@ -25,6 +26,7 @@ from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.parameters import PRIOR_GROUPS, RIG_NAMES
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
+from tvsbayes.report.first_page import _cells, answer_table
 from tvsbayes.report.fit_sections import _parameters
 from tvsbayes.report.page import (
     BROWSERS,
@@ -36,7 +38,13 @@ from tvsbayes.report.page import (
     report_page,
     typeset,
 )
-from tvsbayes.report.parameter_words import cause_in_words, name_in_words, share_in_words, source_in_words
+from tvsbayes.report.parameter_words import (
+    cause_in_words,
+    name_in_words,
+    sentence_in_words,
+    share_in_words,
+    source_in_words,
+)
 from tvsbayes.report.tables import Issue, Page, Section, TableView, chance_text
 
 BYTES_MAX = 3_000_000
@@ -112,7 +120,7 @@ def test_numbers_of_the_page_are_the_libraries(page, evidence):
         assert sha in text
     # One draw of a point within 1 mm, or none: the fit decides whether the chance is a bound or below what draws tell.
     (missed,) = (c for c in evidence.criteria if c.verdict == "not met")
-    chance = chance_text(missed.probability, "at most ")
+    chance = chance_text(missed.probability)
     assert f"Not met: {missed.quantity} within 1 mm (probability {chance})" in text
 
 
@@ -137,6 +145,37 @@ def test_the_first_page_has_the_answer_and_who_asked(page, evidence):
         assert "Why classic is off there" in first and "of the variance" in first
 
 
+def test_what_check_warns_of_stands_on_the_first_page(evidence):
+    """The page outlives the terminal: an interrupted run is not usable without a word of it."""
+    doubted = replace(evidence, criteria=(), doubts=("whether steps were lost in segment 0 is not known",))
+    first = " ".join(" ".join(Nodes(report_html(doubted).split(b"<nav")[0] + b"</header></body></html>").text).split())
+    assert (
+        "mind what check warns of. No limit" in first and "check warns: whether steps were lost in segment 0" in first
+    )
+    assert "check warns" not in " ".join(Nodes(report_html(replace(evidence, criteria=()))).text)
+
+
+def test_ratios_that_are_one_number_share_a_row(evidence):
+    """Without the classic method's own column; the contrast says what they differ by."""
+    summary = evidence.fit.summary
+    alike = structs.replace(summary, effective=summary.effective | {"right": summary.effective["left"]})
+    fit = replace(evidence.fit, summary=alike)
+    heads = [row[0] for row in answer_table(replace(evidence, fit=fit, classic=None)).rows]
+    assert heads[0] == "left and right, deg/step" and {"up, deg/step", "down, deg/step"} <= set(heads)
+    assert "left - right, \u00b5deg/step" in heads
+    assert [row[0] for row in answer_table(replace(evidence, fit=fit)).rows][:2] == [
+        "left, deg/step",
+        "right, deg/step",
+    ]
+
+
+def test_half_an_interval_is_left_out_where_its_ends_lie_unlike_far():
+    """0.24 - 0.40 would be a negative play."""
+    play = structs.replace(estimate(0.24, 0.21), interval95=(0.016, 0.810))
+    assert _cells(play) == ["0.24(21)", "[0.02, 0.81]", ""]
+    assert _cells(estimate(0.5, 0.01))[2] == "0.020"
+
+
 def test_causes_and_parameters_are_called_by_words():
     """Every prior and every parameter but the cameras'; budgets say the part and the unit as well."""
     told = {cause: cause_in_words(cause) for cause in PRIOR_GROUPS if cause.startswith("prior of ")}
@@ -150,8 +189,12 @@ def test_causes_and_parameters_are_called_by_words():
     assert source_in_words("prior of something else") == "prior of something else"
     assert source_in_words("prior of ln stop_sd_deg.up") == "prior of ln scatter of stops, up, deg"
     assert source_in_words("pixel noise") == share_in_words("pixel noise") == "pixel noise"
-    assert told["prior of mirror2_error_deg"] == "the angle of mirror 2 as stated beforehand (mirror2_error_deg)"
+    assert told["prior of mirror2_error_deg"] == "the angle of mirror 2 as stated beforehand"
     assert cause_in_words("stereo calibration") == "stereo calibration"
+    together = "laser_tilt_deg.x, extrinsics.rotation_rad.y move together; see `fit --without laser_tilt_deg`"
+    assert sentence_in_words(together) == (
+        "the laser's direction (x), the positioner's attitude (y) move together; see `fit --without laser_tilt_deg`"
+    )
 
 
 def test_no_two_reports_have_one_number(evidence, page, no_pictures):

@@ -70,14 +70,15 @@ def test_concise_says_the_uncertainty_to_five_percent(mantissa):
 @pytest.mark.parametrize(
     ("low", "high", "sd", "expected"),
     [
-        (0.061926, 0.0622781, 0.00009, "[0.0619260, 0.0622781]"),
-        (-0.5, 0.5, 0.25, "[-0.500, 0.500]"),
-        (18.3, 24.3, 1.54, "[18.30, 24.30]"),
+        (0.061926, 0.0622781, 0.00009, "[0.061926, 0.062278]"),
+        (-0.5, 0.5, 0.25, "[-0.50, 0.50]"),
+        (18.3, 24.3, 1.54, "[18.3, 24.3]"),
+        (-0.25, 0.25, 0.0996, "[-0.25, 0.25]"),
         (-100.0, 300.0, 123.0, "[-100, 300]"),
         (0.2, 0.2, 0.0, "[0.200000, 0.200000]"),
     ],
 )
-def test_interval_ends_carry_one_digit_more_than_the_uncertainty(low, high, sd, expected):
+def test_interval_ends_have_the_digits_of_the_uncertainty(low, high, sd, expected):
     assert interval_text(low, high, sd) == expected
 
 

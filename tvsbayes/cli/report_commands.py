@@ -166,14 +166,16 @@ class PageWish:
             find_browser()
         from tvsbayes.report.evidence import gather
 
-        limits = {"limit_deg_per_step": self.limit_deg_per_step, "limit_mm": self.limit_mm}
+        asked = {"limit_deg_per_step": self.limit_deg_per_step, "limit_mm": self.limit_mm}
         path = self.out or output_place(self.campaign, "results") / "report.html"
         files = {"report": str(path)}
         stages = {FITTING: 3.0, GATHERING: 1.5, DRAWING: 1.5, PRINTING: 3.0 if self.pdf else 0.0}
         with waiting() as progress, Job(stages, progress) as job:
             record = record_for(data, self.campaign, report_line, job.part(FITTING))
             job.begin(GATHERING)
-            evidence = gather(data, record, load_calibration(self.campaign), range_mm=self.range_mm, **limits)
+            doubts = campaign_held(self.campaign, data)["warnings"]
+            calibration = load_calibration(self.campaign)
+            evidence = gather(data, record, calibration, range_mm=self.range_mm, doubts=doubts, **asked)
             job.begin(DRAWING)
             page = report_page(evidence, self.issue)
             html = page_html(page)

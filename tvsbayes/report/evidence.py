@@ -119,6 +119,7 @@ class Evidence:
         point: the same for its least certain coordinate, by parameter.
         gears: what they repeat over the counters, by axis; none where they do not vary.
         crops: of a few spots, where there are frames.
+        doubts: what `check` warns of.
     """
 
     campaign: Campaign
@@ -135,6 +136,7 @@ class Evidence:
     point: BudgetTable
     gears: tuple[GearBand, ...]
     crops: tuple[SpotCrop, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     @property
     def shown(self) -> FitEvidence:
@@ -150,6 +152,7 @@ def gather(
     range_mm: float,
     limit_deg_per_step: float | None = None,
     limit_mm: float | None = None,
+    doubts: Sequence[str] = (),
 ) -> Evidence:
     """Ask the library for everything a report shows.
 
@@ -160,6 +163,7 @@ def gather(
         range_mm: at which millimetres are stated.
         limit_deg_per_step: largest error allowed of every effective ratio.
         limit_mm: largest 3D error allowed at that range, pan and tilt in the middle of the counters seen.
+        doubts: what `check` warns of.
     """
     classic_result = classic_of(campaign)
     maps = _maps(campaign, classic_result, calibration, range_mm)
@@ -195,6 +199,7 @@ def gather(
         point=coordinate_budget(own, calibration, point.tolist(), least),
         gears=gear_bands(calibration),
         crops=spot_crops(campaign, fit.summary.suspect_spots),
+        doubts=tuple(doubts),
     )
 
 

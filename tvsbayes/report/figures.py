@@ -216,7 +216,7 @@ def setup(
             axes.set_aspect("equal", adjustable="datalim")
         panels[0].set_title("from above" + ("" if baseline_mm is None else f"; TVS baseline {baseline_mm:.4g} mm"))
         panels[1].set(xlabel="X (depth), mm", title="from the side")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 
@@ -333,7 +333,8 @@ def residuals(stops: Sequence[StopResidual], axis: Axis) -> Figure:
     directions = SENSES[axis]
     with drawing(4.6) as figure:
         panels = figure.subplots(2, 1, sharey=True)
-        for direction, colour, marker in (*zip(directions, (BLUE, RED), "^v", strict=True), ("", GREY, "x")):
+        for direction in (*directions, ""):
+            marker, colour = OF_DIRECTION.get(direction, ("x", GREY))
             part = [stop for stop in mine if stop.direction == direction]
             if not part:
                 continue

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
-from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.traceability import NOT_STATED, performed
 from tvsbayes.report import figures
@@ -18,7 +19,7 @@ from tvsbayes.report.advice import assumed_stereo, verdict_line
 from tvsbayes.report.drawing import OF_ESTIMATOR
 from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
 from tvsbayes.report.fit_text import validation_lines
-from tvsbayes.report.parameter_words import cause_in_words
+from tvsbayes.report.parameter_words import cause_in_words, sentence_in_words
 from tvsbayes.report.tables import (
     FigureView,
     Issue,
@@ -36,6 +37,8 @@ from tvsbayes.results.estimates import Estimate, FitSummary
 CLASSIC_BLIND = "cannot see it"
 NOT_RECORDED = "not recorded"
 """Of what `campaign.toml` may say and does not."""
+SYMMETRICAL = 1.5
+"""Of the distances of an interval's ends from its value, up to which half of it stands for both."""
 CAUSES_TOLD = 3
 """Of the uncertainty of a point; the section on budgets has all."""
 RECORDED = (("instrument", "instrument"), ("serial", "serial number"), ("operator", "operator"))
@@ -50,8 +53,11 @@ class Verdict:
     kind: str
 
 
-def verdict_of(summary: FitSummary, criteria: Sequence[Criterion]) -> Verdict:
-    """What the page says first: whether its numbers may be used, and whether the limits are met."""
+def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Sequence[str] = ()) -> Verdict:
+    """What the page says first: whether its numbers may be used, and whether the limits are met.
+
+    `doubts` are what `check` warns of.
+    """
     if not summary.explained:
         return Verdict("NOT CONVERGED: the numbers below must not be used", "not-met")
     validation = summary.validation
@@ -59,7 +65,7 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion]) -> Verdict:
     if failed and not criteria:
         return Verdict(f"{failed}No limit was stated", "cannot-tell")
     if not criteria:
-        usable = verdict_line(summary).removeprefix("verdict: ")
+        usable = verdict_line(summary).removeprefix("verdict: ") + "; mind what check warns of" * bool(doubts)
         return Verdict(f"{usable[0].upper()}{usable[1:]}. No limit was stated", "cannot-tell")
     told = []
     for verdict in (NOT_MET, CANNOT_TELL, MET):
@@ -68,9 +74,8 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion]) -> Verdict:
         for limit, unit in limits:
             part = [c for c in mine if (c.limit, c.unit) == (limit, unit)]
             chances = [c.probability for c in part]
-            worst = (
-                chance_text(max(chances), "at most ") if verdict == NOT_MET else chance_text(min(chances), "at least ")
-            )
+            bound = "" if len(part) == 1 else "at most " if verdict == NOT_MET else "at least "
+            worst = chance_text(max(chances) if verdict == NOT_MET else min(chances), bound)
             names = ", ".join(c.quantity for c in part)
             told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {worst})"))
     text = "; ".join(sentence for _, sentence in told)
@@ -84,9 +89,15 @@ def criteria_table(criteria: Sequence[Criterion]) -> TableView | None:
     """Every limit with its verdict and the rule; None where no limit was stated."""
     if not criteria:
         return None
-    rows = [[c.quantity, f"{c.limit:.3g} {c.unit}", chance_text(c.probability), c.verdict] for c in criteria]
+    rows = [[c.quantity, f"{c.limit:.3g} {c.unit}", _chance(c), c.verdict] for c in criteria]
     caption = "Decision rule: met if P(|error| <= limit) >= 0.95, not met if <= 0.05, else cannot tell"
     return TableView(caption, ["error of", "limit", "probability", "verdict"], rows)
+
+
+def _chance(c: Criterion) -> str:
+    """The probability; where it decides nothing, also how many of a hundred would be off by more."""
+    text = chance_text(c.probability)
+    return text if c.verdict != CANNOT_TELL else f"{text}: {100 - round(100 * c.probability)} of 100 are off by more"
 
 
 def about_table(header: Mapping[str, object], measured: str, issue: Issue) -> TableView:
@@ -106,14 +117,26 @@ def measured_days(campaign: Campaign, issue: Issue) -> str:
 
 
 def answer_table(e: Evidence) -> TableView:
-    """The four ratios and both backlashes, classic beside joint where there are experiments for it."""
+    """Ratios, their contrasts and both backlashes, classic beside joint where there are experiments for it.
+
+    Ratios of both directions that are one number at their uncertainty share a row.
+    """
     summary, rows, applicable = e.fit.summary, [], e.classic is not None
     for direction in DIRECTIONS:
+        pair = next(pair for pair in SENSES.values() if direction in pair)
+        cells = _cells(summary.effective[direction])
+        if not applicable and all(_cells(summary.effective[d]) == cells for d in pair):
+            if direction == pair[0]:
+                rows.append([f"{' and '.join(pair)}, deg/step", *cells])
+            continue
         classic = None if e.classic is None else e.classic.directions[direction]
         told = "no experiment"
         if classic is not None:
             told = f"{concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0)}, n = {classic.n}"
         rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), *[told] * applicable])
+    for axis, pair in SENSES.items():
+        if (contrast := summary.contrasts[axis]) is not None:
+            rows.append([f"{' - '.join(pair)}, \u00b5deg/step", *_cells(scaled(contrast, 1e6))])
     for axis in AXES:
         play = _cells(summary.parameters[f"backlash_deg.{axis}"])
         rows.append([f"backlash {axis}, deg", *play, *[CLASSIC_BLIND] * applicable])
@@ -124,13 +147,23 @@ def answer_table(e: Evidence) -> TableView:
     return TableView(caption, columns, rows)
 
 
+def scaled(estimate: Estimate, factor: float) -> Estimate:
+    """An estimate in another unit."""
+    low, high = estimate.interval95
+    return msgspec.structs.replace(
+        estimate, value=factor * estimate.value, sd=factor * estimate.sd, interval95=(factor * low, factor * high)
+    )
+
+
 def _cells(estimate: Estimate | None) -> list[str]:
-    """Value, interval and its half."""
+    """Value, interval and its half; no half where the ends lie unlike far from the value: value - U may be none."""
     if estimate is None:
         return ["never moved", "", ""]
     low, high = estimate.interval95
     interval = interval_text(low, high, estimate.sd)
-    return [concise(estimate.value, estimate.sd), interval, two_digits(0.5 * (high - low))]
+    near, far = sorted((estimate.value - low, high - estimate.value))
+    half = two_digits(0.5 * (high - low)) if far <= SYMMETRICAL * near or far == near else ""
+    return [concise(estimate.value, estimate.sd), interval, half]
 
 
 def both_estimators(e: Evidence) -> FigureView:
@@ -184,5 +217,6 @@ def warnings_of(e: Evidence) -> list[str]:
         found.append("The campaign is synthetic: made by the digital twin, not measured.")
     if (told := assumed_stereo(e.campaign.stereo, e.shown.budgets)) is not None:
         found.append(f"{told[0].upper()}{told[1:]}.")
-    found += [f"Prior conflict: {text}" for text in summary.prior_conflicts]
+    found += [f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts]
+    found += [f"`check` warns: {sentence_in_words(text)}" for text in e.doubts]
     return found

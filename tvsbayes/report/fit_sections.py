@@ -14,7 +14,7 @@ from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.advice import asks_for_looks
 from tvsbayes.report.fit_text import agreement_line, sampling_line
-from tvsbayes.report.parameter_words import name_in_words
+from tvsbayes.report.parameter_words import name_in_words, sentence_in_words
 from tvsbayes.report.result_tables import gap_table, hold_out_table
 from tvsbayes.report.spot_pictures import spot_gallery
 from tvsbayes.report.tables import FigureView, Section, TableView, concise, figure_view, interval_text, two_digits
@@ -171,7 +171,7 @@ def identifiability_section(e: Evidence) -> Section:
         for i in range(len(kept)):
             for j in range(i):
                 if abs(correlation[i, j]) > 0.8:
-                    rows.append([f"{kept[j]} and {kept[i]}", f"{correlation[i, j]:+.3f}"])
+                    rows.append([f"{name_in_words(kept[j])}; {name_in_words(kept[i])}", f"{correlation[i, j]:+.3f}"])
         views.append(
             figure_view(
                 figures.correlations(kept, correlation),
@@ -181,11 +181,11 @@ def identifiability_section(e: Evidence) -> Section:
         )
     summary = e.fit.summary
     items = [weak.text for weak in summary.weak_directions if not asks_for_looks(weak)]
-    items += [entry.text for entry in summary.leverage]
+    items = [sentence_in_words(text) for text in (*items, *(entry.text for entry in summary.leverage))]
     sensitive = [
         [
-            f"{x.parameter}, {'twice' if x.factor > 1 else 'half'} its u",
-            x.quantity,
+            f"{name_in_words(x.parameter)}: {'twice' if x.factor > 1 else 'half'} its u",
+            name_in_words(x.quantity),
             f"{x.shift_sd:+.2f}",
             f"{x.sd_ratio:.2f}",
         ]

@@ -196,7 +196,7 @@ def page_html(page: Page) -> bytes:
 
 
 def _page(e: Evidence, issue: Issue) -> Page:
-    verdict = verdict_of(e.fit.summary, e.criteria)
+    verdict = verdict_of(e.fit.summary, e.criteria, e.doubts)
     sections = [
         results_section(e),
         setup_section(e),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import REGISTRY
 
@@ -77,6 +79,24 @@ def share_in_words(cause: str) -> str:
 
 
 def cause_in_words(cause: str) -> str:
-    """A cause of uncertainty in a sentence; the name in brackets is that of the files."""
+    """A cause of uncertainty in a sentence."""
     name = cause.removeprefix("prior of ")
-    return f"{IN_WORDS[name]} as stated beforehand ({name})" if name in IN_WORDS else cause
+    return f"{IN_WORDS[name]} as stated beforehand" if name in IN_WORDS else cause
+
+
+_NAMES = re.compile(r"\b(?:" + "|".join(sorted(map(re.escape, IN_WORDS), key=len, reverse=True)) + r")\b(?:\.\w+)*")
+
+
+def sentence_in_words(text: str) -> str:
+    """A sentence with parameters by their words; commands between backticks stay."""
+    parts = text.split("`")
+
+    def words(found: re.Match[str]) -> str:
+        name = found.group()
+        parameter = REGISTRY.get(name)
+        if parameter is None or parameter.block not in IN_WORDS:
+            return IN_WORDS.get(name, name)
+        part = name.removeprefix(parameter.block).lstrip(".").replace(".", " ")
+        return f"{IN_WORDS[parameter.block]} ({part})" if part else IN_WORDS[parameter.block]
+
+    return "`".join(part if k % 2 else _NAMES.sub(words, part) for k, part in enumerate(parts))

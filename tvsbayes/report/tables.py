@@ -55,8 +55,8 @@ def signed(value: float, sd: float) -> str:
 
 
 def interval_text(low: float, high: float, sd: float) -> str:
-    """Interval ends to one digit more than the standard uncertainty's second."""
-    decimals = max(0, 2 - math.floor(math.log10(sd))) if sd > 0 else 6
+    """Interval ends to the digits of the standard uncertainty, as `concise` has them (GUM 7.2.6)."""
+    decimals = max(0, 1 - int(f"{sd:.1e}".split("e")[1])) if 0 < sd < math.inf else 6
     return f"[{low:.{decimals}f}, {high:.{decimals}f}]"
 
 
