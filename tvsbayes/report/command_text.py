@@ -90,7 +90,7 @@ def _foreseen_table(expected: Mapping[str, float], contraction: Mapping[str, flo
         unit = next((unit for begin, unit in PLAN_UNIT.items() if name.startswith(begin)), "deg/step")
         told = contraction.get(name)
         rows.append([name, two_digits(u), unit, "fixed" if told is None else f"{100 * told:.0f} %"])
-    columns = ["result", "u expected", "unit", "told by the data"]
+    columns = ["result", "u expected", "unit", "set by the data"]
     return TableView("what the plan will tell (100 %: the priors no longer matter)", columns, rows)
 
 

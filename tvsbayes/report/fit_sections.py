@@ -153,7 +153,7 @@ def _parameters(e: Evidence) -> TableView:
                 name,
             ]
         )
-    columns = ["parameter", "value(u)", "95 % interval", "u of the prior", "told by the data, %", "in files"]
+    columns = ["parameter", "value(u)", "95 % interval", "u of the prior", "set by the data, %", "in files"]
     caption = "Parameters of the joint model; 100 %: the prior no longer matters"
     return TableView(caption, columns, rows)
 

@@ -25,7 +25,7 @@ from tvsbayes.estimators.plausibility import misfit_causes
 from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
 from tvsbayes.metrology.traceability import traceability
 from tvsbayes.report.advice import steps_ahead
-from tvsbayes.report.evidence import Evidence
+from tvsbayes.report.evidence import MET, Evidence
 from tvsbayes.report.first_page import (
     about_table,
     answer_table,
@@ -241,6 +241,12 @@ def _steps(e: Evidence) -> list[str]:
     if e.planned is not None and not e.planned.stop.now and e.planned.next:
         best = e.planned.next[0]
         found.append(f"Look at {best.text} ({best.minutes:.1f} min): the best next four looks of the plan.")
+    unmet = next((c for c in e.criteria if c.verdict != MET), None)
+    if unmet is not None and e.planned is None and summary.explained:
+        limit = f"{unmet.limit:g} {unmet.unit}"
+        aim = f"u(worst) <= {limit}" if unmet.unit != "mm" else f"U95(x) at {e.range_mm:g},0,0 mm <= {limit}"
+        given = f"`tvsbayes plan {folder}/rig.toml --given {folder} --target '{aim}'`"
+        found.append(f"Add looks until the limit is met; the fewest: {given}.")
     if not found:
         found.append("Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped.")
     if not e.criteria and e.fit.summary.converged:

@@ -326,7 +326,7 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
             for name, e in named.items()
             if e is not None and not name.startswith("stereo.")
         ]
-        return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "told by the data, %"), rows)
+        return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "set by the data, %"), rows)
 
     @property
     def explained(self) -> bool:

@@ -113,7 +113,7 @@ class AxisSummary(Shown, Record, frozen=True):
         ]
         state = "converged" if self.converged else "NOT CONVERGED"
         title = f"AxisSummary in {self.unit}, {self.estimator}, {state}"
-        return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "told by the data, %"), rows)
+        return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "set by the data, %"), rows)
 
 
 class AxisInputs(Record, frozen=True):
