@@ -34,7 +34,7 @@ BESIDE_THE_TWIN = {"calibration", "metrology", "results", *MODEL}
 """What the digital twin shares no formula with, nor with the mirrors of the instrument."""
 JAX_FREE_PACKAGES = (
     *("errors", "progress", "display", "files", "instrument", "calibration", "metrology", "results", "single_axis"),
-    *("twin", "coordinates", "positioner", "acquisition", "report"),
+    *("twin", "coordinates", "compensation", "positioner", "acquisition", "report"),
 )
 JAX_FREE_MODULES = (
     *("statistics.intervals", "estimators.four_point", "estimators.spot_pattern", "estimators.plausibility"),
