@@ -5,12 +5,12 @@
 
 Axis s is drawn with seed s from the default priors of `[axis]` (play, error by position, its variation, scatter of
 stops, drift), its ratio within 0.2 % of nominal, its homings scattering by 0.02 % of the travel (a limit switch). Nine
-positions from -20 to 20 mm are read up and down after each of three homings. Of its fit three formats are made; the axis
-is homed again and driven with what the format adds. `PROMISED` stops a side at random commands are held against the
-promise. `verify` gets 12 readings, drawn anew, in each world: as promised, not applied, applied twice, wrong sign, and
-another axis (drawn with another seed). Where the correction is smaller than what a homing and a stop leave open, no
-number of readings tells: an axis counts as TELLING where the worlds applied and not applied are 5 standard deviations
-apart for its 12 readings, by the model.
+positions from -20 to 20 mm are read up and down after each of three homings. Of its fit three formats are made; the
+axis is homed again and driven with what the format adds. `PROMISED` stops a side at random commands are held against
+the promise. `verify` gets 12 readings, drawn anew, in each world: as promised, not applied, applied twice, wrong sign,
+and another axis (drawn with another seed, and so perhaps like one of the others). Where the correction is smaller than
+what a homing and a stop leave open, no number of readings tells: an axis counts as one that can be told where the
+worlds applied and not applied are `TELLING` standard deviations apart for its 12 readings, by the model.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ import numpy as np
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.rows import output, read_rows, run_rows
+from experiments.compensation.drawn_axes import fresh_moves, read, stands, up_and_down
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.promise import Wish, compensation_of
 from tvsbayes.compensation.verification import SCENARIOS, verify_readings
 from tvsbayes.errors import TvsError
 from tvsbayes.results.compensation_record import APPLIED, BROKEN, KEPT, OTHER_MACHINE, WORLDS
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import results_for
 from tvsbayes.single_axis.predicted_stops import predicted_stops
-from tvsbayes.single_axis.simulated_axis import AxisTruth, draw_axis, stops_of
+from tvsbayes.single_axis.simulated_axis import AxisTruth, draw_axis
 from tvsbayes.statistics.chances import binomial_bounds
 
 ROWS = output(__file__, "kept_promises.jsonl")
@@ -47,19 +48,6 @@ PROMISED, VERIFIED = 8, 12
 TELLING = 5.0
 
 
-def calibration_moves() -> tuple[AxisMove, ...]:
-    """Up and down beyond both ends after every homing."""
-    places = np.linspace(-0.5 * TRAVEL, 0.5 * TRAVEL, POSITIONS)
-    beyond = 0.6 * TRAVEL
-    path = [-beyond, *places, beyond, *places[::-1], -beyond]
-    moves = []
-    for homing in range(HOMINGS):
-        for k, command in enumerate(path):
-            first = "" if k else "backward"
-            moves.append(AxisMove(len(moves), homing, 60.0 * len(moves), float(command), first))
-    return tuple(moves)
-
-
 def true_axis(seed: int) -> AxisTruth:
     """The axis, its curves fine against their lengths."""
     rng = np.random.default_rng([seed, 101])
@@ -68,41 +56,13 @@ def true_axis(seed: int) -> AxisTruth:
     return draw_axis(grid.tolist(), {"home_sd": HOME}, ratio, TRAVEL, rng)
 
 
-def stands(truth: AxisTruth, moves: tuple[AxisMove, ...], rng: np.random.Generator) -> np.ndarray:
-    """Where the axis stands after every move, whatever the commands."""
-    at = np.unique([m.command for m in moves])
-    curves = {name: np.interp(at, truth.command, getattr(truth, name)) for name in ("error", "play_variation")}
-    return stops_of(replace(truth, command=at, **curves), moves, rng)
-
-
-def read(moves: tuple[AxisMove, ...], value: np.ndarray, which: list[int], rng: np.random.Generator) -> AxisCampaign:
-    """A campaign with readings of some moves."""
-    noisy = value + READ_U * rng.standard_normal(len(value))
-    readings = tuple(Reading(k, m, float(noisy[m]), READ_U) for k, m in enumerate(which))
-    return AxisCampaign("mm", moves, readings, {"home_sd": HOME})
-
-
-def fresh_moves(count: int, rng: np.random.Generator) -> tuple[tuple[AxisMove, ...], list[int]]:
-    """Stops at random, half from each side, an overrun before where it is needed; and which are read."""
-    commands = rng.uniform(-0.5 * TRAVEL, 0.5 * TRAVEL, count)
-    sides = rng.permutation(np.repeat([1, -1], count // 2))
-    path, which = [0.0], []
-    for command, side in zip(commands, sides, strict=True):
-        if side * (command - path[-1]) < 0.2 * TRAVEL:
-            path.append(command - side * 0.25 * TRAVEL)
-        which.append(len(path))
-        path.append(float(command))
-    moves = [AxisMove(k, 0, 30.0 * k, float(c), "" if k else "forward") for k, c in enumerate(path)]
-    return tuple(moves), which
-
-
 def driven(truth: AxisTruth, applied: Correction, factors: tuple[float, float], count: int, rng) -> AxisCampaign:  # type: ignore[no-untyped-def]
     """Fresh readings of an axis that is homed again and driven with a table."""
-    asked, which = fresh_moves(count, rng)
+    asked, which = fresh_moves(count, TRAVEL, rng)
     sent = applied.moved(asked, *factors)
     # Before them a segment that is not read: the homing is one more.
     moves = (AxisMove(0, 0, 0.0, 0.0, "forward"), *(replace(m, move=m.move + 1, segment=1) for m in sent))
-    return read(asked, stands(truth, moves, rng)[1:], which, rng)
+    return read(asked, stands(truth, moves, rng)[1:], which, rng, u=READ_U)
 
 
 def one_axis(task: tuple[int]) -> dict[str, object]:
@@ -111,8 +71,8 @@ def one_axis(task: tuple[int]) -> dict[str, object]:
     began = time.perf_counter()
     rng = np.random.default_rng([seed, 102])
     truth = true_axis(seed)
-    moves = calibration_moves()
-    campaign = read(moves, stands(truth, moves, rng), [m.move for m in moves if abs(m.command) <= 0.5 * TRAVEL], rng)
+    moves, which = up_and_down(TRAVEL, POSITIONS, HOMINGS)
+    campaign = replace(read(moves, stands(truth, moves, rng), which, rng, u=READ_U), stated={"home_sd": HOME})
     row: dict[str, object] = {"seed": seed}
     try:
         results = results_for(campaign, seed=seed)

@@ -62,7 +62,7 @@ def compensate(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """A table for a controller, and the promise of what is left after applying it.
+    """A controller's table, and the promise of what it leaves.
 
     Nothing is applied. With -o the promise is kept in results/compensation.json, for `verify`.
     """

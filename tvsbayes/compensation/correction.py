@@ -57,12 +57,12 @@ class Correction:
 
 
 @dataclass(frozen=True)
-class Cycle:
-    """A run up and down through some commands.
+class Cycles:
+    """Runs up and down through some commands, which are read in turn.
 
     Attributes:
-        moves: in order of time.
-        read: numbers of those that are read, ascending, shape (r,).
+        moves: in order of time, of one segment.
+        read: numbers of those that are read, ascending, shape (r,): every command once from each side.
         index, side: of each its command's number, and 1 or -1, shape (r,).
     """
 
@@ -72,11 +72,18 @@ class Cycle:
     side: np.ndarray
 
 
-def cycle(commands: np.ndarray, overrun: float, hours: float) -> Cycle:
-    """Up through ascending commands (m,), beyond the last by `overrun`, and down again, within so many hours."""
+def cycles(commands: np.ndarray, overrun: float, hours: float, count: int) -> Cycles:
+    """So many runs up and down through ascending commands, beyond both ends by `overrun`.
+
+    Command k is read in run k modulo count.
+    """
     m = len(commands)
-    path = [float(c) for c in (*commands, commands[-1] + overrun, *commands[::-1])]
+    run = [commands[0] - overrun, *commands, commands[-1] + overrun, *commands[::-1]]
+    path = [*run * count]
+    sides = np.tile(np.r_[0, np.ones(m, int), 0, -np.ones(m, int)], count)
+    index = np.tile(np.r_[0, np.arange(m), 0, np.arange(m)[::-1]], count)
+    number = np.repeat(np.arange(count), len(run))
+    read = np.flatnonzero((sides != 0) & (index % count == number))
     seconds = 3600.0 * hours / (len(path) - 1)
-    moves = tuple(AxisMove(k, 0, k * seconds, c, "" if k else "forward") for k, c in enumerate(path))
-    read = np.r_[np.arange(m), np.arange(m + 1, 2 * m + 1)]
-    return Cycle(moves, read, np.r_[np.arange(m), np.arange(m)[::-1]], np.repeat([1, -1], m))
+    moves = tuple(AxisMove(k, 0, k * seconds, float(c), "" if k else "backward") for k, c in enumerate(path))
+    return Cycles(moves, read, index[read], sides[read])

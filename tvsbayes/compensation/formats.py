@@ -48,10 +48,10 @@ def stated(made: Compensation, origin: str) -> list[str]:
     for side, left in made.promise.items():
         before = f"{left.without95:.3g} without"
         lines.append(f"promise, arriving {side}: 95 % of errors at most {left.error95:.3g} {unit} ({before})")
-    lines.append(
-        f"within {made.hours:.3g} h of homing; arrive with at least {number(made.reversal_command, 4)} commands of "
-        "travel on a side"
-    )
+    lines += [
+        f"within {made.hours:.3g} h and {number(made.travel_command, 4)} commands of travel since homing",
+        f"arrive with at least {number(made.reversal_command, 4)} commands of travel on a side",
+    ]
     return lines + [plainly(text) for text in made.unsaid]
 
 

@@ -8,6 +8,7 @@ carries out. Commands as the campaign counts them, the rest in its unit. No JAX.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -15,15 +16,15 @@ from pathlib import Path
 import numpy as np
 from msgspec import structs
 
-from tvsbayes.compensation.correction import Correction, Cycle, cycle
+from tvsbayes.compensation.correction import Correction, Cycles, cycles
 from tvsbayes.compensation.formats import FORMATS, LINUXCNC_DECIMALS, Format, number
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import AppliedBy, Compensation, SidePromise, TableRow
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes, read_axis
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis
 from tvsbayes.single_axis.axis_fit import AxisFit, line_weights
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
-from tvsbayes.single_axis.axis_rows import AxisRows
+from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_of
 from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
 from tvsbayes.statistics.intervals import NORMAL_95
 
@@ -35,6 +36,8 @@ TRIED = 20
 """Commands at which the promise is tried, from each side."""
 UNIT_COMMANDS = 0.2
 """Share by which the ratio may differ from 1 or -1 where commands count in the unit of readings."""
+RUNS_MAX = 20
+"""Up and down, in a prediction: a longer travel is not followed."""
 SIDES = (("forward", 1), ("backward", -1))
 
 
@@ -71,9 +74,9 @@ class _Expected:
     u: np.ndarray
 
 
-def _expected(fit: AxisFit, commands: np.ndarray, overrun: float, hours: float, seed: int) -> _Expected:
+def _expected(fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, seed: int) -> _Expected:
     """At the table's commands, without the noise of a reading."""
-    found, run = _run(fit, commands, overrun, hours, None, 0.0, seed)
+    found, run = _run(fit, commands, overrun, since, None, 0.0, seed)
     mean, covariance = found.pooled()
     order = [np.flatnonzero(run.side == side)[np.argsort(run.index[run.side == side])] for _, side in SIDES]
     return _Expected(
@@ -81,11 +84,33 @@ def _expected(fit: AxisFit, commands: np.ndarray, overrun: float, hours: float, 
     )
 
 
+@dataclass(frozen=True)
+class Since:
+    """What a machine does between two homings: hours, and commands travelled."""
+
+    hours: float
+    travel: float
+
+    @classmethod
+    def of(cls, moves: Sequence[AxisMove]) -> Since:
+        """The longest of a campaign's segments."""
+        legs = legs_of(moves)
+        time_s = np.array([move.time_s for move in moves])
+        each = [np.flatnonzero(legs.segment == segment) for segment in np.unique(legs.segment)]
+        hours = max(float(np.ptp(time_s[own])) for own in each) / HOUR_S
+        return cls(hours, max(float(np.abs(legs.step[own]).sum()) for own in each))
+
+    def cycles(self, commands: np.ndarray, overrun: float) -> Cycles:
+        """Runs through commands, as many as make up the travel."""
+        once = 2.0 * (float(np.ptp(commands)) + 2.0 * overrun)
+        return cycles(commands, overrun, self.hours, max(1, min(round(self.travel / once), RUNS_MAX)))
+
+
 def _run(
-    fit: AxisFit, commands: np.ndarray, overrun: float, hours: float, applied: Correction | None, u: float, seed: int
-) -> tuple[PredictedStops, Cycle]:
-    """A run up and down, under a correction."""
-    run = cycle(commands, overrun, hours)
+    fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, applied: Correction | None, u: float, seed: int
+) -> tuple[PredictedStops, Cycles]:
+    """Runs up and down, under a correction."""
+    run = since.cycles(commands, overrun)
     moves = run.moves if applied is None else applied.moved(run.moves)
     return predicted_stops(fit, moves, run.read.tolist(), np.full(len(run.read), u), seed), run
 
@@ -279,13 +304,13 @@ def bound_of(found: PredictedStops, aim: np.ndarray, members: np.ndarray, shift:
 
 
 def _promise(
-    after: PredictedStops, before: PredictedStops, run: Cycle, aim: np.ndarray, u: float, shift: bool
+    after: PredictedStops, before: PredictedStops, run: Cycles, aim: np.ndarray, u: float, shift: bool
 ) -> dict[str, SidePromise]:
     """By side: what is left, and what each cause alone would leave."""
     found = {}
     scales = after.scales
     pooled, covariance = after.pooled()
-    hours = np.array([run.moves[k].time_s for k in run.read]) / 3600.0
+    hours = np.array([run.moves[k].time_s for k in run.read]) / HOUR_S
     for name, side in SIDES:
         mine = np.flatnonzero(run.side == side)
         n = len(mine)
@@ -318,14 +343,6 @@ def reading_u(campaign: AxisCampaign) -> float:
     return float(np.median([r.u for r in campaign.readings if r.status == "ok"]))
 
 
-def _hours(fit: AxisFit) -> float:
-    """Of the campaign's longest segment."""
-    times: dict[int, list[float]] = {}
-    for move in fit.campaign.moves:
-        times.setdefault(move.segment, []).append(move.time_s)
-    return max(each[-1] - each[0] for each in times.values()) / 3600.0
-
-
 def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress: Show | None = None) -> Compensation:
     """The table and its promise.
 
@@ -341,7 +358,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
     """
     refuse_unaccepted(results)
     fit, campaign = results.fit, results.fit.campaign
-    rows, hours = fit.rows, _hours(fit)
+    rows, since = fit.rows, Since.of(campaign.moves)
     draws = fit.draws["effective_per_command"]
     fitted = float(draws.mean())
     form = _checked(wish, fitted)
@@ -350,7 +367,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
     with Job({"table": 1.0, "promise": 2.0}, progress) as job:
         job.begin("table")
         far = 0.05 * (high - low) + 2.0 * abs(float(fit.draws["backlash"].mean()) / fitted)
-        at = _expected(fit, table_commands(rows), far, hours, seed)
+        at = _expected(fit, table_commands(rows), far, since, seed)
         gap = np.abs(at.mean[0] - at.mean[1]) + NORMAL_95 * np.hypot(*at.u)
         overrun = float(np.max(gap)) / abs(fitted)
         shaped = _shaped(form, at, nominal, fitted, wish, _line_draws(fit))
@@ -358,9 +375,9 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         u = reading_u(campaign)
         # Between the lines of the table as well as on them.
         tried = low + (high - low) * (np.arange(TRIED) + 0.5) / TRIED
-        after, run = _run(fit, tried, max(far, overrun), hours, shaped.correction, u, seed)
+        after, run = _run(fit, tried, max(far, overrun), since, shaped.correction, u, seed)
         job.at(0.5)
-        before, _ = _run(fit, tried, max(far, overrun), hours, None, u, seed)
+        before, _ = _run(fit, tried, max(far, overrun), since, None, u, seed)
         tried_aim = nominal * tried[run.index]
         offset = _offset(at, nominal) if form.holds == "table" else float((after.pooled()[0] - tried_aim).mean())
         promise = _promise(after, before, run, offset + tried_aim, u, form.zero_free)
@@ -376,7 +393,8 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         range_command=(low, high),
         resolution=wish.resolution,
         reversal_command=overrun,
-        hours=hours,
+        hours=since.hours,
+        travel_command=since.travel,
         homings=len(np.unique(rows.segment)),
         table=table,
         settings=shaped.settings,

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tvsbayes.compensation.correction import Correction, cycle
-from tvsbayes.compensation.promise import bound_of, reading_u, refuse_unaccepted
+from tvsbayes.compensation.correction import Correction
+from tvsbayes.compensation.promise import Since, bound_of, reading_u, refuse_unaccepted
 from tvsbayes.errors import InputError, NothingToEstimate, refusal
 from tvsbayes.files.csv_table import csv_bytes
 from tvsbayes.progress import Job, Show
@@ -62,8 +62,10 @@ exceeds ln(76), the odds of 0.95 against four others."""
 OTHERS, OTHER_LEAST = 12, 3.0
 """Sizes by which another machine may be off, from so many uncertainties of a reading to half of the travel: one that is
 off by less keeps the promise."""
-PLANNED_MIN, PLANNED_MAX = 6, 40
-"""Stops of a plan."""
+BEYOND = 1.5
+"""Share of the promise's hours or travel from which it is said that the readings go on for longer."""
+CANDIDATES, SPREAD, PLANNED_MAX = 17, 3, 40
+"""Of a plan: commands tried, commands visited whatever they tell, stops at most."""
 
 
 @dataclass(frozen=True)
@@ -197,6 +199,12 @@ def _remarks(made: Compensation, fresh: _Fresh, campaign: AxisCampaign) -> tuple
         found.append(
             f"{outside} of {len(fresh.command)} stops lie outside {low:.10g} to {high:.10g}: the promise does not hold "
             "there; what is expected of them is wider"
+        )
+    since = Since.of(campaign.moves)
+    if since.hours > BEYOND * made.hours or since.travel > BEYOND * made.travel_command:
+        found.append(
+            f"the fresh readings go on for {since.hours:.3g} h and {since.travel:.4g} commands of travel after a "
+            f"homing, the promise for {made.hours:.3g} h and {made.travel_command:.4g}: what is expected is wider"
         )
     named = campaign.header.get("serial") or campaign.header.get("name")
     if named and made.machine and named != made.machine:
@@ -340,9 +348,13 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         NothingToEstimate: the table corrects nothing.
     """
     applied = Correction.of(made)
+    overrun, (low, high) = made.reversal_command, made.range_command
     nodes = np.array([row.command for row in made.table])
-    nodes = nodes[np.linspace(0, len(nodes) - 1, min(len(nodes), 17)).round().astype(int)]
-    run = cycle(nodes, max(made.reversal_command, 0.02 * float(np.ptp(nodes))), made.hours)
+    # Where both sides are reached without leaving the range, if there are such commands.
+    inside = nodes[(nodes - overrun >= low) & (nodes + overrun <= high)]
+    nodes = inside if len(inside) >= SPREAD else nodes
+    nodes = nodes[np.linspace(0, len(nodes) - 1, min(len(nodes), CANDIDATES)).round().astype(int)]
+    run = Since(made.hours, 0.0).cycles(nodes, overrun)
     u = np.full(len(run.read), reading_u(fit.campaign))
 
     def at(common: float, play: float) -> PredictedStops:
@@ -358,15 +370,16 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         off.append(play)
     if not np.any(off[0]):
         raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
-    visits, reached = np.zeros(len(mean)), 0.0
-    for count in range(PLANNED_MAX):
-        if reached >= TELLING and count >= PLANNED_MIN:
-            break
+    visits = np.zeros(len(mean))
+    # Over the range first: what befell a part of the table shows nowhere else.
+    spread = np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)
+    visits[np.isin(run.index, spread)] = 1
+    reached = _parting(off, common, noise, visits)
+    while reached < TELLING and visits.sum() < PLANNED_MAX:
         each = [_parting(off, common, noise, visits + row) for row in np.eye(len(mean))]
         best = int(np.argmax(each))
         visits[best] += 1
         reached = each[best]
     order = [k for k in range(len(mean)) for _ in range(int(visits[k]))]
     stops = tuple((float(nodes[run.index[k]]), int(run.side[k])) for k in order)
-    overrun = run.moves[len(nodes)].command - float(nodes[-1])
     return VerifyPlan(stops, overrun, reached >= TELLING, float(np.sqrt(reached)))

@@ -61,8 +61,9 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
         "",
         promise_table(made).text(),
         "",
-        f"the promise holds within {two_digits(made.hours)} h of homing, between these commands; arrive with at least "
-        f"{made.reversal_command:.4g} commands of travel on a side",
+        f"the promise holds between these commands, within {two_digits(made.hours)} h and {made.travel_command:.4g} "
+        "commands of travel since homing",
+        f"arrive with at least {made.reversal_command:.4g} commands of travel on a side",
         f"most of what is left: {HELPS[largest]}",
         *(f"the format: {text}" for text in made.unsaid),
     ]

@@ -78,7 +78,7 @@ class Compensation(Shown, Record, frozen=True, kw_only=True):
         range_command: the promise holds between these commands.
         resolution: least command that the controller carries out; 0 where it is fine.
         reversal_command: travel, in commands, that arrives on a side whatever came before.
-        hours: since homing, for which the promise holds.
+        hours, travel_command: since homing, for which the promise holds: the campaign's longest segment.
         homings: in the campaign; of one alone, the scatter of homings is known by its prior.
         table: by rising command.
         settings: numbers of formats that hold no table, by name.
@@ -98,6 +98,7 @@ class Compensation(Shown, Record, frozen=True, kw_only=True):
     resolution: NotNegative
     reversal_command: NotNegative
     hours: NotNegative
+    travel_command: NotNegative
     homings: FromOne
     table: Annotated[tuple[TableRow, ...], Meta(min_length=2)]
     settings: dict[str, float]
