@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from tvsbayes.assessment.fitted_calibration import calibration_of as calibration_of
     from tvsbayes.calibration.calibration_file import load_calibration as load_calibration
     from tvsbayes.calibration.pointing import Calibration as Calibration
+    from tvsbayes.compensation.promise import compensate as compensate
+    from tvsbayes.compensation.verification import verify as verify
     from tvsbayes.coordinates.location import Locations as Locations
     from tvsbayes.coordinates.location import locate as locate
     from tvsbayes.errors import TvsError as TvsError
@@ -60,12 +62,14 @@ _HOME = {
     "TvsError": "errors",
     "calibrate": "pipeline",
     "calibration_of": "assessment.fitted_calibration",
+    "compensate": "compensation.promise",
     "fit": "estimators.joint_fit",
     "load_calibration": "calibration.calibration_file",
     "locate": "coordinates.location",
     "read_campaign": "instrument.campaign",
     "read_fit": "results.fit_record",
     "sample": "posterior.sampling",
+    "verify": "compensation.verification",
 }
 __all__ = [*_HOME, "plots"]
 

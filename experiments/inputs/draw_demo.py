@@ -44,6 +44,7 @@ def draw(demo: dict) -> bytes:
 
 
 def main() -> None:
+    """Run the demo and draw it."""
     print_only(__doc__)
     done = subprocess.run([sys.executable, "-m", "tvsbayes", "demo", "--json"], capture_output=True, check=True)
     OUT.write_bytes(draw(json.loads(done.stdout)))

@@ -10,10 +10,11 @@ from typing import Any
 
 from experiments.common.command_line import print_only
 from experiments.common.rows import ROOT
-from tvsbayes.results.fit_record import fit_schema
+from tvsbayes.results.compensation_record import COMPENSATION_FORMAT, Compensation, Verification
+from tvsbayes.results.fit_record import Provenance, fit_schema
 from tvsbayes.results.records import DIALECT, schema_of
 from tvsbayes.results.watch_record import Watch, WatchPlan
-from tvsbayes.single_axis.axis_record import axis_fit_schema
+from tvsbayes.single_axis.axis_record import AxisInputs, axis_fit_schema
 
 FOLDER = ROOT / "data" / "schemas"
 GROWTH = (
@@ -28,6 +29,11 @@ def schemas() -> dict[str, dict[str, Any]]:
         "fit-1": ("results/fit.json of a campaign, tvsbayes-fit/1", fit_schema()),
         "axis-fit-1": ("results/fit.json of an axis folder, tvsbayes-axis-fit/1", axis_fit_schema()),
         "watch-1": ("watch --json", schema_of(Watch)),
+        "compensation-1": (
+            f"results/compensation.json of an axis folder, {COMPENSATION_FORMAT}",
+            schema_of(Compensation, Provenance, format={"const": COMPENSATION_FORMAT}, inputs=AxisInputs),
+        ),
+        "verification-1": ("verify --json", schema_of(Verification)),
         "watch-plan-1": ("plan --watch --json", schema_of(WatchPlan)),
     }
     return {

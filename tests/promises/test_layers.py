@@ -45,7 +45,7 @@ JAX_FREE_PACKAGES = (
         "inference",
         "single_axis",
     ),
-    *("twin", "coordinates", "positioner", "acquisition", "report"),
+    *("twin", "coordinates", "compensation", "positioner", "acquisition", "report"),
 )
 JAX_FREE_MODULES = (
     *("statistics.intervals", "estimators.four_point", "estimators.spot_pattern", "estimators.plausibility"),

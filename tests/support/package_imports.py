@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).resolve().parents[2] / "tvsbayes"
 ORDER = (
     *("errors", "progress", "display", "files", "statistics", "instrument"),
     *("calibration", "results", "inference", "metrology", "single_axis", "twin", "model"),
-    *("estimators", "posterior", "assessment", "coordinates", "comparison", "planning", "studies"),
+    *("estimators", "posterior", "assessment", "coordinates", "compensation", "comparison", "planning", "studies"),
     *("positioner", "cameras", "acquisition"),
     *("pipeline", "report", "view", "cli"),
 )

@@ -42,6 +42,12 @@ EXAMPLES = {
         "tvsbayes steps-for mine --x-mm 500 --y-mm 150 --z-mm 40",
         "tvsbayes steps-for mine --export header > tvs_calibration.h",
     ),
+    "compensate": (
+        "tvsbayes compensate stage --to csv -o stage.csv",
+        "tvsbayes compensate stage --to linuxcnc -o stage.comp",
+        "tvsbayes compensate stage --to grbl --in-force 250 -o stage.nc",
+    ),
+    "verify": ("tvsbayes verify stage fresh",),
     "plan": (
         "tvsbayes plan rig.toml --minutes 30 -o plan.csv",
         "tvsbayes plan rig.toml --given mine --target 'u(worst) <= 8e-5 deg/step'",

@@ -33,6 +33,7 @@ from tvsbayes.cli.app import (
 from tvsbayes.cli.begin_commands import new
 from tvsbayes.cli.bench_commands import doctor, export, stereo
 from tvsbayes.cli.campaign_commands import check, demo, detect, simulate
+from tvsbayes.cli.compensation_commands import compensate, verify
 from tvsbayes.cli.estimate_commands import classic, compare, fit
 from tvsbayes.cli.examples import EXAMPLES, epilog
 from tvsbayes.cli.import_command import import_
@@ -44,7 +45,7 @@ from tvsbayes.errors import InputError, TvsError
 
 COMMANDS = (
     *(demo, new, import_, simulate, detect, stereo, check, acquire, doctor, export),
-    *(classic, fit, calibrate, report, view, compare, watch, locate, steps_for, plan, study),
+    *(classic, fit, calibrate, report, view, compare, watch, locate, steps_for, compensate, verify, plan, study),
 )
 """In the order of `--help`."""
 COLLECTIONS = 100_000, 20, 20

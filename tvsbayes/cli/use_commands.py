@@ -30,6 +30,7 @@ from tvsbayes.cli.app import (
     report_line,
     spared,
 )
+from tvsbayes.cli.compensation_commands import plan_verify
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
 from tvsbayes.errors import InputError, escaped
@@ -258,6 +259,7 @@ def plan(
         typer.Option("--confirm", min=0, help="With --next: sample the posterior where u is at most this, deg/step."),
     ] = None,
     watch: Annotated[bool, typer.Option("--watch", help="Fewest looks for `watch`: plan CAMPAIGN --watch.")] = False,
+    verify: Annotated[bool, typer.Option("--verify", help="Fewest readings for `verify`: plan AXIS --verify.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -268,6 +270,11 @@ def plan(
     # What a plan of looks towards a target may state beside it.
     spare: dict[str, object] = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS, "aperture": aperture}
     onward = {"next": count, "confirm": confirm}
+    if verify:
+        held: dict[str, object] = {"target": target, "minutes": minutes, "watch": watch, **spare, **onward}
+        refuse_options("not for --verify", "leave it out", **held)
+        plan_verify(given or rig, out=out, seed=seed, as_json=as_json)
+        return
     if watch:
         refuse_options("for targets, not for --watch", "leave it out", target=target, **spare, **onward)
         plan_watch(rig, given, minutes=minutes, out=out, seed=seed, as_json=as_json)

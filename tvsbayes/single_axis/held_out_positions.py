@@ -17,6 +17,7 @@ from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.axis_sampling import PARETO_K_MAX, WeightedSample, weighted_sample
 from tvsbayes.single_axis.classic_line import fit_line
+from tvsbayes.single_axis.predicted_stops import carried_scales
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
@@ -214,15 +215,7 @@ def _fitted_without(model: AxisModel, out: np.ndarray, seed: int) -> tuple[np.nd
     start = find_mode(without)
     sample: WeightedSample = weighted_sample(without.log_density, start, rng, EFFECTIVE)
     drawn = sample.equal(DRAWS, rng)
-    # What the others cannot tell, as the scatter from a side that only this position was reached from, has its prior.
-    w = rng.standard_normal((DRAWS, len(model.coordinates.names)))
-    for column, name in enumerate(model.coordinates.names):
-        if name in without.coordinates.names:
-            w[:, column] = drawn[:, without.coordinates.names.index(name)]
-        elif name == "backlash":
-            values, sd = without.linear(drawn).of(without.head(backlash=1.0)[None])
-            prior = model.priors[name]
-            w[:, column] = (values[:, 0] + sd[:, 0] * rng.standard_normal(DRAWS) - prior.value) / prior.u
+    w = carried_scales(without, drawn, model, rng)
     return w, "; ".join(sample.missing)
 
 

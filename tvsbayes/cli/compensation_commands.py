@@ -1,0 +1,159 @@
+"""compensate and verify: a table for a controller with its promise, and whether the machine keeps it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tvsbayes.cli import axis_commands
+from tvsbayes.cli.app import (
+    TARGET_MISSED,
+    CampaignFolder,
+    Ended,
+    Json,
+    Seed,
+    command_line,
+    finish,
+    keep,
+    report_line,
+    spared,
+)
+from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.errors import InputError, NothingToEstimate, escaped
+from tvsbayes.files.disk import output_place, write_atomically
+from tvsbayes.progress import Job
+
+FITTING, MAKING = "fit", "compensation"
+LETTERS, APPLIERS = "XYZABC", ("controller", "host")
+
+
+def _refuse_scanner(folder: Path, command: str) -> None:
+    """An axis folder alone has a table of one command.
+
+    Raises:
+        InputError: it is a campaign of a scanner.
+    """
+    if (folder / "campaign.toml").is_file() and not axis_commands.is_axis(folder):
+        message = f"{command} is for an axis, and {escaped(str(folder), 200)} is the campaign of a scanner"
+        remedy = "its compensation is `tvsbayes steps-for CAMPAIGN --export header`, its verification `tvsbayes watch`"
+        raise InputError("usage", message, remedy=remedy)
+
+
+def compensate(
+    campaign: CampaignFolder,
+    to: Annotated[
+        str, typer.Option("--to", help="csv, linuxcnc, grbl, grblhal, klipper, header (C), urdf (xacro) or pec.")
+    ],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the file here, and keep the promise.")] = None,
+    applied_by: Annotated[str, typer.Option("--applied-by", help="Who adds it: controller or host.")] = "controller",
+    per_command: Annotated[
+        float | None, typer.Option("--per-command", help="Nominal reading per command that is aimed at.")
+    ] = None,
+    resolution: Annotated[
+        float, typer.Option("--resolution", min=0.0, help="Least command that the controller carries out.")
+    ] = 0.0,
+    in_force: Annotated[
+        float | None, typer.Option("--in-force", help="Value of $100 or rotation_distance that is set now.")
+    ] = None,
+    letter: Annotated[str, typer.Option("--letter", help="Axis in settings of grbl: X, Y, Z, A, B or C.")] = "X",
+    period: Annotated[float | None, typer.Option("--period", help="Of a pec table, in commands.")] = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """A controller's table, and the promise of what it leaves.
+
+    Nothing is applied. With -o the promise is kept in results/compensation.json, for `verify`.
+    """
+    from tvsbayes.compensation.promise import Wish, compensation_of, file_text
+    from tvsbayes.report.compensation_text import compensation_text
+    from tvsbayes.results.compensation_record import COMPENSATION_FORMAT
+    from tvsbayes.results.fit_record import provenance
+    from tvsbayes.results.records import plain
+    from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
+    from tvsbayes.single_axis.axis_record import results_for
+
+    _refuse_scanner(campaign, "compensate")
+    _one_of("--applied-by", applied_by, APPLIERS)
+    _one_of("--letter", letter, tuple(LETTERS))
+    spared(out)
+    data = read_axis(campaign)
+    wish = Wish(to, "host" if applied_by == "host" else "controller", per_command, resolution, in_force, letter, period)
+    with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
+        results = results_for(data, progress=job.part(FITTING), seed=seed)
+        if not results.stored:
+            report_line(axis_commands.STORED)
+        made = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
+    document = {"format": COMPENSATION_FORMAT, **made.as_json(), **plain(provenance(axis_hashes(data), seed))}
+    files: dict[str, str] = {}
+    if out is not None:
+        write_atomically(out, file_text(made, data).encode())
+        files[to] = str(out)
+        if keep(document, kept := output_place(campaign, "results") / "compensation.json"):
+            files["compensation"] = str(kept)
+    text = compensation_text(made, list(files.values()))
+    if out is None:
+        text += f"\nnothing written: give -o FILE; it would hold:\n\n{file_text(made, data)}".rstrip("\n")
+    else:
+        text += f"\nnext: apply it, then {command_line('verify', campaign, 'FRESH')}"
+    finish({**document, "files": files}, text, as_json)
+
+
+def _one_of(option: str, given: str, allowed: tuple[str, ...]) -> None:
+    """Refuse a word that is none of these."""
+    if given not in allowed:
+        names = ", ".join(allowed)
+        raise InputError("usage", f"{option} {escaped(given)}", allowed=names, remedy=f"name one of {names}")
+
+
+def verify(
+    campaign: CampaignFolder,
+    fresh: Annotated[Path, typer.Argument(metavar="FRESH", help="Axis folder of readings with the table in force.")],
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Whether a machine keeps the promise of its table: KEPT, BROKEN or CANNOT TELL.
+
+    Exit 0, 1 or 3. FRESH lists the commands that were asked for, before the correction. Which world fits: applied, not
+    applied, applied twice, wrong sign, another machine.
+    """
+    from tvsbayes.compensation.verification import verify as verified
+    from tvsbayes.report.compensation_text import verification_text
+    from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT
+
+    for folder in (campaign, fresh):
+        _refuse_scanner(folder, "verify")
+    with waiting() as progress:
+        found = verified(campaign, fresh, seed=seed, progress=progress)
+    for remark in found.remarks if as_json else ():
+        report_line(f"warning: {remark}")
+    finish(found.as_json(), verification_text(found), as_json)
+    if found.verdict != KEPT:
+        raise Ended(NothingToEstimate.exit_code if found.verdict == CANNOT_TELL else TARGET_MISSED)
+
+
+def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bool) -> None:
+    """`plan FOLDER --verify`: the readings that tell soonest what became of a table."""
+    from tvsbayes.compensation.verification import plan_verification, stored_compensation
+    from tvsbayes.report.compensation_text import verify_plan_text
+    from tvsbayes.results.records import plain
+    from tvsbayes.single_axis.axis_campaign import read_axis
+    from tvsbayes.single_axis.axis_record import results_for
+
+    if folder is None:
+        remedy = "write tvsbayes plan FOLDER --verify -o plan.csv"
+        raise InputError("usage", "--verify needs an axis folder", remedy=remedy)
+    _refuse_scanner(folder, "plan --verify")
+    data = read_axis(folder)
+    made = stored_compensation(data)
+    with waiting() as progress, Job({FITTING: 1.0, "choosing stops": 1.0}, progress) as job:
+        results = results_for(data, progress=job.part(FITTING), seed=seed)
+        job.begin("choosing stops")
+        found = plan_verification(results.fit, made, seed=seed)
+    document, text = plain(found), verify_plan_text(found)
+    if out is not None:
+        write_atomically(out, found.plan_bytes())
+        document["plan"] = str(out)
+        text += f"\nwritten: {escaped(str(out), 200)}"
+    finish({**document, "seed": seed}, text, as_json)

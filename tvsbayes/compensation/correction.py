@@ -1,0 +1,89 @@
+"""What is added to a command so that the reading comes where it should: a two-sided table, as a controller holds it.
+
+Commands as the campaign counts them; forward is a rising command. No JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tvsbayes.results.compensation_record import Compensation
+from tvsbayes.single_axis.axis_campaign import AxisMove
+from tvsbayes.single_axis.axis_rows import legs_of
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Corrections by side, linear between commands, constant beyond the ends.
+
+    Attributes:
+        command: ascending, shape (n,).
+        forward, backward: what is added to the command, shape (n,).
+        resolution: least command that is carried out; 0 where it is fine.
+    """
+
+    command: np.ndarray
+    forward: np.ndarray
+    backward: np.ndarray
+    resolution: float = 0.0
+
+    @classmethod
+    def of(cls, made: Compensation) -> Correction:
+        """That of a compensation."""
+        command, forward, backward = np.array([(r.command, r.add_forward, r.add_backward) for r in made.table]).T
+        return cls(command, forward, backward, made.resolution)
+
+    def sent(self, command: np.ndarray, side: np.ndarray, common: float = 1.0, play: float = 1.0) -> np.ndarray:
+        """What the mechanics get for commands (m,) that are arrived at from sides (m,), 1, -1 or 0 for unknown.
+
+        Args:
+            command: asked for.
+            side: of the arrival.
+            common: factor of what both sides have in common.
+            play: factor of half of what they differ by.
+        """
+        ahead, back = (np.interp(command, self.command, add) for add in (self.forward, self.backward))
+        found = command + 0.5 * common * (ahead + back) + 0.5 * play * side * (ahead - back)
+        return np.round(found / self.resolution) * self.resolution if self.resolution else found
+
+    def moved(self, moves: Sequence[AxisMove], common: float = 1.0, play: float = 1.0) -> list[AxisMove]:
+        """Moves as the mechanics get them."""
+        legs = legs_of(moves)
+        sent = self.sent(legs.command, legs.side, common, play)
+        return [replace(move, command=float(to)) for move, to in zip(moves, sent, strict=True)]
+
+
+@dataclass(frozen=True)
+class Cycles:
+    """Runs up and down through some commands, which are read in turn.
+
+    Attributes:
+        moves: in order of time, of one segment.
+        read: numbers of those that are read, ascending, shape (r,): every command once from each side.
+        index, side: of each its command's number, and 1 or -1, shape (r,).
+    """
+
+    moves: tuple[AxisMove, ...]
+    read: np.ndarray
+    index: np.ndarray
+    side: np.ndarray
+
+
+def cycles(commands: np.ndarray, overrun: float, hours: float, count: int) -> Cycles:
+    """So many runs up and down through ascending commands, beyond both ends by `overrun`.
+
+    Command k is read in run k modulo count.
+    """
+    m = len(commands)
+    run = [commands[0] - overrun, *commands, commands[-1] + overrun, *commands[::-1]]
+    path = [*run * count]
+    sides = np.tile(np.r_[0, np.ones(m, int), 0, -np.ones(m, int)], count)
+    index = np.tile(np.r_[0, np.arange(m), 0, np.arange(m)[::-1]], count)
+    number = np.repeat(np.arange(count), len(run))
+    read = np.flatnonzero((sides != 0) & (index % count == number))
+    seconds = 3600.0 * hours / (len(path) - 1)
+    moves = tuple(AxisMove(k, 0, k * seconds, float(c), "" if k else "backward") for k, c in enumerate(path))
+    return Cycles(moves, read, index[read], sides[read])

@@ -1,0 +1,214 @@
+"""Formats of controllers and models: what each can hold, and how it is written, as a table of entries.
+
+A format holds a two-sided table, or one ratio with one play, or one ratio, or one period. The rest stays with the
+machine, and the promise says how much that is. Numbers have a decimal point, whatever the locale.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tvsbayes.compensation.correction import Correction
+from tvsbayes.results.compensation_record import Compensation
+
+Holds = Literal["table", "ratio and play", "ratio", "period"]
+LINUXCNC_DECIMALS = 7
+_UNCOMMENTED = re.compile(r"[^A-Za-z0-9 .,:=_+%/$\[\]-]")
+"""What a name from a file is not written with: the end of a comment, control characters, other than ASCII."""
+
+
+def plainly(text: str) -> str:
+    """Text from a file as a comment may hold it."""
+    return _UNCOMMENTED.sub("_", text)
+
+
+def number(value: float, digits: int = 9) -> str:
+    """A number with so many digits, zero without a sign."""
+    return f"{value + 0.0:.{digits}g}"
+
+
+def stated(made: Compensation, origin: str) -> list[str]:
+    """What every file says first: of what it is, in which sense it is added, what is left, what it cannot say."""
+    low, high = made.range_command
+    unit = plainly(made.unit)
+    lines = [
+        f"compensation by {plainly(origin)}",
+        f"machine: {plainly(made.machine) or 'not named'}; unit {unit}",
+        f"for commands from {number(low)} to {number(high)}",
+        "state when this was written: applied to nothing; apply it once, in one place; then run tvsbayes verify",
+        f"to be applied by the {made.applied_by}",
+        f"aim: reading = {number(made.offset)} + {number(made.per_command)} x command",
+        "sense: what is added to a command is (aim - reading expected) / (reading per command)",
+    ]
+    for side, left in made.promise.items():
+        before = f"{left.without95:.3g} without"
+        lines.append(f"promise, arriving {side}: 95 % of errors at most {left.error95:.3g} {unit} ({before})")
+    lines += [
+        f"within {made.hours:.3g} h and {number(made.travel_command, 4)} commands of travel since homing",
+        f"arrive with at least {number(made.reversal_command, 4)} commands of travel on a side",
+    ]
+    return lines + [plainly(text) for text in made.unsaid]
+
+
+def _commented(made: Compensation, origin: str, mark: str) -> list[str]:
+    return [f"{mark} {line}" for line in stated(made, origin)]
+
+
+CSV_COLUMNS = ("command", "forward", "backward", "u_forward", "u_backward")
+
+
+def _csv(made: Compensation, origin: str) -> str:
+    rows = [
+        ",".join(number(getattr(row, name), 12 if name == "command" else 9) for name in CSV_COLUMNS)
+        for row in made.table
+    ]
+    says = "# columns: reading expected at a command, arriving forward (rising command) or backward; standard"
+    says += " uncertainty of a single arrival"
+    return "\n".join([*_commented(made, origin, "#"), says, ",".join(CSV_COLUMNS), *rows, ""])
+
+
+def _linuxcnc(made: Compensation, origin: str) -> str:
+    """Triplets nominal, forward, reverse, nominal rising: the controller subtracts what stands there less nominal.
+
+    LinuxCNC counts in units: nominal = per_command x command. Where the unit falls as the command rises, forward and
+    reverse change places. Its reader stops at the first line that is no triplet, so that what is said stands behind.
+    """
+    scale, rows = made.per_command, []
+    for row in made.table:
+        added = {"forward": scale * row.add_forward, "backward": scale * row.add_backward}
+        ahead, back = ("forward", "backward") if scale > 0 else ("backward", "forward")
+        nominal = scale * row.command
+        rows.append((nominal, nominal - added[ahead], nominal - added[back]))
+    lines = [" ".join(f"{value:.{LINUXCNC_DECIMALS}f}" for value in values) for values in sorted(rows)]
+    says = "# in [JOINT_N]: COMP_FILE = this file, COMP_FILE_TYPE = 0; no BACKLASH beside it: play is in the table"
+    return "\n".join([*lines, *_commented(made, origin, "#"), says, ""])
+
+
+def _grbl(made: Compensation, origin: str) -> str:
+    lines = [f"{name}={value:.3f}" for name, value in made.settings.items()]
+    return "\n".join([*(f"; {line}" for line in stated(made, origin)), *lines, ""])
+
+
+def _klipper(made: Compensation, origin: str) -> str:
+    lines = [f"rotation_distance: {made.settings['rotation_distance']:.6f}"]
+    return "\n".join([*_commented(made, origin, "#"), "# in the section of the stepper:", *lines, ""])
+
+
+def _header(made: Compensation, origin: str) -> str:
+    said = "\n".join(f" * {line}" for line in stated(made, origin))
+    arrays = []
+    for name, field in (("command", "command"), ("forward", "add_forward"), ("backward", "add_backward")):
+        values = ", ".join(_c_double(getattr(row, field)) for row in made.table)
+        arrays.append(f"static const double axis_{name}[AXIS_ROWS] = {{{values}}};")
+    return HEADER.replace("@SAID@", said).replace("@ROWS@", str(len(made.table))).replace("@ARRAYS@", "\n".join(arrays))
+
+
+def _c_double(value: float) -> str:
+    text = number(value, 12)
+    return text if set(text) & set(".en") else f"{text}.0"
+
+
+HEADER = """/*
+@SAID@
+ */
+#ifndef TVSBAYES_AXIS_COMPENSATION_H
+#define TVSBAYES_AXIS_COMPENSATION_H
+
+#define AXIS_ROWS @ROWS@
+@ARRAYS@
+
+/* What the mechanics are to get for a command; side: 1 arriving by a rising command, -1 by a falling one. */
+static double axis_sent(double command, int side)
+{
+    const double *add = side < 0 ? axis_backward : axis_forward;
+    int k = 0;
+    if (command <= axis_command[0]) return command + add[0];
+    if (command >= axis_command[AXIS_ROWS - 1]) return command + add[AXIS_ROWS - 1];
+    while (command > axis_command[k + 1]) k++;
+    return command + add[k] + (add[k + 1] - add[k]) * (command - axis_command[k])
+                              / (axis_command[k + 1] - axis_command[k]);
+}
+
+#endif
+"""
+
+
+def _urdf(made: Compensation, origin: str) -> str:
+    values = "\n".join(f'  <xacro:property name="{n}" value="{number(v, 12)}"/>' for n, v in made.settings.items())
+    said = "\n".join(f"  {line.replace('--', '- -')}" for line in stated(made, origin))
+    return f"""<?xml version="1.0"?>
+<!--
+{said}
+  axis_zero: reading at command 0, to be taken off once, in the joint's origin or in the driver, not in both
+  axis_reduction: commands per unit of reading, for <mechanicalReduction>
+  axis_backlash: play between both sides, unit; u_...: standard uncertainties, covariance_...: of zero and reduction
+-->
+<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
+{values}
+</robot>
+"""
+
+
+PHASES = 64
+"""Lines of a period's table."""
+
+
+def _pec(made: Compensation, origin: str) -> str:
+    period, low = made.settings["period_command"], made.range_command[0]
+    phase = np.arange(PHASES) / PHASES
+    at = low + (phase * period - low) % period
+    added = Correction.of(made).sent(at, np.zeros(PHASES)) - at
+    lines = [f"# period: {number(period)} commands; phase 0 at command 0; add is in commands", "phase,add"]
+    lines += [f"{number(float(p), 6)},{number(float(a), 7)}" for p, a in zip(phase, added, strict=True)]
+    return "\n".join([*_commented(made, origin, "#"), *lines, ""])
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format.
+
+    Attributes:
+        holds: what it can say.
+        write: content of the file, from a compensation and what made it.
+        zero_free: whether controllers leave open by which half of the play a first move is off.
+        in_force: name of the setting whose value in force a new one is made from, "" of none.
+        unsaid: what it cannot say, in words.
+    """
+
+    holds: Holds
+    write: Callable[[Compensation, str], str]
+    zero_free: bool = False
+    in_force: str = ""
+    unsaid: tuple[str, ...] = ()
+
+
+_NO_POSITION = "error by position stays: the format has no place for it"
+FORMATS: Mapping[str, Format] = {
+    "csv": Format("table", _csv),
+    "linuxcnc": Format("table", _linuxcnc),
+    "header": Format("table", _header),
+    # gnea/grbl, doc/markdown/settings.md: $100 to $102 are steps per mm; no setting compensates backlash.
+    "grbl": Format("ratio", _grbl, in_force="$100", unsaid=("grbl knows no play: all of it stays", _NO_POSITION)),
+    # grblHAL core, settings.h: Setting_AxisBacklash is $160 and on, built in by ENABLE_BACKLASH_COMPENSATION.
+    "grblhal": Format(
+        "ratio and play",
+        _grbl,
+        zero_free=True,
+        in_force="$100",
+        unsaid=(
+            "grblHAL knows one play for all positions, and only where ENABLE_BACKLASH_COMPENSATION is built in",
+            _NO_POSITION,
+        ),
+    ),
+    # Klipper, Config_Reference.md: [stepper_x] rotation_distance; no option compensates backlash of a stepper.
+    "klipper": Format(
+        "ratio", _klipper, in_force="rotation_distance", unsaid=("Klipper knows no play: all of it stays", _NO_POSITION)
+    ),
+    "urdf": Format("ratio", _urdf, unsaid=("a URDF knows zero and ratio: play and error by position stay",)),
+    "pec": Format("period", _pec, unsaid=("a period's table knows no play, and only what repeats with the period",)),
+}

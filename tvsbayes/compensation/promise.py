@@ -1,0 +1,444 @@
+"""A two-sided table made of a fit, in the terms of a format, and the promise of what is left after applying it.
+
+The promise is a prediction of readings, not of means: error by position, play and its variation, scatter of stops,
+homing, drift since then, the uncertainty of all of them, what the format cannot hold, rounding to what the controller
+carries out. Commands as the campaign counts them, the rest in its unit. No JAX.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from msgspec import structs
+
+from tvsbayes.compensation.correction import Correction, Cycles, cycles
+from tvsbayes.compensation.formats import FORMATS, LINUXCNC_DECIMALS, Format, number
+from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.progress import Job, Show
+from tvsbayes.results.compensation_record import AppliedBy, Compensation, SidePromise, TableRow
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis
+from tvsbayes.single_axis.axis_fit import AxisFit, line_weights
+from tvsbayes.single_axis.axis_record import AxisResults, results_for
+from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_of
+from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
+from tvsbayes.statistics.intervals import NORMAL_95
+
+NODES_FEW, NODES_MANY = 13, 41
+"""Fewest and most lines of a table: positions read, and halfway between where these are few."""
+PERIOD_NODES = 129
+"""Of a period's table over the range."""
+TRIED = 20
+"""Commands at which the promise is tried, from each side."""
+UNIT_COMMANDS = 0.2
+"""Share by which the ratio may differ from 1 or -1 where commands count in the unit of readings."""
+RUNS_MAX = 20
+"""Up and down, in a prediction: a longer travel is not followed."""
+SIDES = (("forward", 1), ("backward", -1))
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a compensation is to be; fields as the options of `compensate`.
+
+    Attributes:
+        target: format, a name in `FORMATS`.
+        applied_by: who adds the corrections.
+        per_command: reading per command that is aimed at; None for that of `[axis]`, 1 or -1 where commands count in
+            the unit of readings, else the fit's.
+        resolution: least command that is carried out; 0 where it is fine.
+        in_force: setting in force, of formats that change one.
+        letter: of the axis, in the settings of grbl: X, Y, Z, A, B or C.
+        period: of a period's table, in commands.
+    """
+
+    target: str = "csv"
+    applied_by: AppliedBy = "controller"
+    per_command: float | None = None
+    resolution: float = 0.0
+    in_force: float | None = None
+    letter: str = "X"
+    period: float | None = None
+
+
+@dataclass(frozen=True)
+class _Expected:
+    """Readings expected at commands (m,): mean and u by side, (2, m) each, forward first."""
+
+    command: np.ndarray
+    mean: np.ndarray
+    u: np.ndarray
+
+
+def _expected(fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, seed: int) -> _Expected:
+    """At the table's commands, without the noise of a reading."""
+    found, run = _run(fit, commands, overrun, since, None, 0.0, seed)
+    mean, covariance = found.pooled()
+    order = [np.flatnonzero(run.side == side)[np.argsort(run.index[run.side == side])] for _, side in SIDES]
+    return _Expected(
+        commands, np.array([mean[o] for o in order]), np.array([np.sqrt(np.diag(covariance)[o]) for o in order])
+    )
+
+
+@dataclass(frozen=True)
+class Since:
+    """What a machine does between two homings: hours, and commands travelled."""
+
+    hours: float
+    travel: float
+
+    @classmethod
+    def of(cls, moves: Sequence[AxisMove]) -> Since:
+        """The longest of a campaign's segments."""
+        legs = legs_of(moves)
+        time_s = np.array([move.time_s for move in moves])
+        each = [np.flatnonzero(legs.segment == segment) for segment in np.unique(legs.segment)]
+        hours = max(float(np.ptp(time_s[own])) for own in each) / HOUR_S
+        return cls(hours, max(float(np.abs(legs.step[own]).sum()) for own in each))
+
+    def cycles(self, commands: np.ndarray, overrun: float) -> Cycles:
+        """Runs through commands, as many as make up the travel."""
+        once = 2.0 * (float(np.ptp(commands)) + 2.0 * overrun)
+        return cycles(commands, overrun, self.hours, max(1, min(round(self.travel / once), RUNS_MAX)))
+
+
+def _run(
+    fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, applied: Correction | None, u: float, seed: int
+) -> tuple[PredictedStops, Cycles]:
+    """Runs up and down, under a correction."""
+    run = since.cycles(commands, overrun)
+    moves = run.moves if applied is None else applied.moved(run.moves)
+    return predicted_stops(fit, moves, run.read.tolist(), np.full(len(run.read), u), seed), run
+
+
+def refuse_unaccepted(results: AxisResults) -> None:
+    """A table is made of an accepted answer alone: it moves a machine.
+
+    Raises:
+        NotConverged: the fit is a Laplace approximation.
+    """
+    if results.summary.estimator == "laplace":
+        message = "the fit is a Laplace approximation: no table is made of it, because its promise would be too small"
+        raise NotConverged("laplace", message, remedy="run `tvsbayes fit` without --no-sample, then compensate again")
+
+
+def _nominal(campaign: AxisCampaign, fitted: float, wish: Wish) -> float:
+    """Reading per command that is aimed at."""
+    if wish.per_command is not None:
+        return wish.per_command
+    if "per_command" in campaign.stated:
+        return campaign.stated["per_command"].value
+    if abs(abs(fitted) - 1.0) < UNIT_COMMANDS:
+        return float(np.sign(fitted))
+    return fitted
+
+
+def _checked(wish: Wish, fitted: float) -> Format:
+    """The format that is wanted.
+
+    Raises:
+        InputError: it is unknown, or a number that it needs is missing or impossible.
+    """
+    form = FORMATS.get(wish.target)
+    if form is None:
+        allowed = ", ".join(FORMATS)
+        raise InputError("format", f"--to {wish.target[:60]!r}: unknown", allowed=allowed, remedy="name one of them")
+    if wish.per_command is not None and not (np.isfinite(wish.per_command) and wish.per_command * fitted > 0):
+        message = f"--per-command {wish.per_command:g}: the readings go by {fitted:.6g} per command"
+        raise InputError("usage", message, remedy="give the nominal ratio with the sign of the readings")
+    if not (np.isfinite(wish.resolution) and wish.resolution >= 0):
+        raise InputError("usage", f"--resolution {wish.resolution:g}", allowed="0 or more", remedy="give commands")
+    if form.in_force and not (wish.in_force is not None and wish.in_force > 0 and np.isfinite(wish.in_force)):
+        message = f"--to {wish.target} changes a setting, and nothing says which value {form.in_force} has now"
+        raise InputError("usage", message, remedy=f"add --in-force with the value of {form.in_force} in force")
+    if wish.in_force is not None and not form.in_force:
+        raise InputError("usage", f"--in-force is not for --to {wish.target}", remedy="leave it out")
+    if (wish.period is not None) != (form.holds == "period"):
+        missing, remedy = ("needs --period, in commands", "add it")
+        if wish.period is not None:
+            missing, remedy = "takes no --period", "leave it out"
+        raise InputError("usage", f"--to {wish.target} {missing}", remedy=remedy)
+    return form
+
+
+def table_commands(rows: AxisRows) -> np.ndarray:
+    """Commands of a table: those read, thinned where they are many, halved where they are few."""
+    found = rows.positions
+    if len(found) > NODES_MANY:
+        found = found[np.linspace(0, len(found) - 1, NODES_MANY).round().astype(int)]
+    while len(found) < NODES_FEW:
+        found = np.sort(np.r_[found, 0.5 * (found[1:] + found[:-1])])
+    return found
+
+
+@dataclass(frozen=True)
+class _Shaped:
+    """What a format makes of the errors: a correction without its rounding, and the format's numbers."""
+
+    correction: Correction
+    settings: dict[str, float] = field(default_factory=dict)
+
+
+def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wish, line: np.ndarray) -> _Shaped:
+    """The errors in the terms of a format, as what is added to a command."""
+    command = at.command
+    if form.holds == "table":
+        offset = _offset(at, nominal)
+        forward, backward = _rounded((offset + nominal * command - at.mean) / fitted, nominal, wish.target)
+        return _Shaped(Correction(command, forward, backward, wish.resolution))
+    middle = at.mean.mean(axis=0)
+    if form.holds == "period":
+        return _folded(at, nominal, fitted, wish)
+    # The line that the format knows, through command 0: what is left over is one shift.
+    slope = float(np.polyfit(command, middle, 1)[0])
+    play = float(np.mean(at.mean[1] - at.mean[0])) * float(np.sign(slope))
+    factor, taken, settings = nominal / slope, 0.0, {}
+    axis = "XYZABC".index(wish.letter)
+    if wish.target in ("grbl", "grblhal"):
+        settings[f"${100 + axis}"] = round(float(wish.in_force or 0.0) * factor, 3)
+        factor = settings[f"${100 + axis}"] / float(wish.in_force or 1.0)
+    if wish.target == "grblhal":
+        taken = settings[f"${160 + axis}"] = max(round(play, 3), 0.0)
+    if wish.target == "klipper":
+        settings["rotation_distance"] = round(float(wish.in_force or 0.0) / factor, 6)
+        factor = float(wish.in_force or 1.0) / settings["rotation_distance"]
+    if wish.target == "urdf":
+        settings = {**_joint(line), "axis_backlash": play}
+    half = 0.5 * taken / abs(slope)
+    added = (factor - 1) * command
+    return _Shaped(Correction(command, added + half, added - half, wish.resolution), settings)
+
+
+def _line_draws(fit: AxisFit) -> np.ndarray:
+    """Zero at command 0 and slope of the line through what was read, (draws, 2)."""
+    model = fit.model
+    slope = model.head(slope=1.0) + line_weights(model)
+    level = model.head(offset=1.0) + model.functional(fit.rows.command).mean(axis=0)
+    return fit.linear.drawn(np.array([level - model.middle * slope, slope]), np.random.default_rng([fit.seed, 22]))
+
+
+def _joint(line: np.ndarray) -> dict[str, float]:
+    """Zero and reduction of a joint with their covariance, from draws (n, 2) of zero and unit per command."""
+    joint = np.column_stack([line[:, 0], 1.0 / line[:, 1]])
+    covariance = np.cov(joint.T)
+    return {
+        "axis_zero": float(joint[:, 0].mean()),
+        "axis_reduction": float(joint[:, 1].mean()),
+        "u_axis_zero": float(np.sqrt(covariance[0, 0])),
+        "u_axis_reduction": float(np.sqrt(covariance[1, 1])),
+        "covariance_zero_reduction": float(covariance[0, 1]),
+    }
+
+
+def _rounded(added: np.ndarray, nominal: float, target: str) -> np.ndarray:
+    """Corrections (2, m) as the file holds them: LinuxCNC's are in units, with a fixed number of decimals."""
+    if target == "linuxcnc":
+        return np.round(added * nominal, LINUXCNC_DECIMALS) / nominal
+    return np.array([[float(number(v)) for v in side] for side in added])
+
+
+def _offset(at: _Expected, nominal: float) -> float:
+    """Of the line that is aimed at: both sides' middle at command 0, or at the nearest to it, needs no correction."""
+    nearest = int(np.argmin(np.abs(at.command)))
+    return float(at.mean[:, nearest].mean() - nominal * at.command[nearest])
+
+
+def _folded(at: _Expected, nominal: float, fitted: float, wish: Wish) -> _Shaped:
+    """Both sides' middle error, off its line, averaged over periods.
+
+    Raises:
+        InputError: the range is shorter than a period, or the table is coarse against it.
+    """
+    period = float(wish.period or 0.0)
+    low, high = float(at.command[0]), float(at.command[-1])
+    spacing = float(np.max(np.diff(at.command)))
+    if not 8 * spacing <= period <= high - low:
+        message = f"--period {period:g}: positions every {spacing:g} commands over {high - low:g}"
+        allowed = "at least eight positions in a period, and a whole period in the range"
+        raise InputError("usage", message, allowed=allowed, remedy="read more positions, or state another period")
+    middle = at.mean.mean(axis=0)
+    off = middle - np.polyval(np.polyfit(at.command, middle, 1), at.command)
+    phase = 2 * np.pi * at.command / period
+    # The mean over periods by harmonics: as many as the positions can tell of, four at most.
+    waves = np.column_stack([f(k * phase) for k in range(1, 5) for f in (np.cos, np.sin)])
+    amplitudes = np.linalg.lstsq(waves, off, rcond=None)[0]
+    command = np.linspace(low, high, PERIOD_NODES)
+    again = 2 * np.pi * command / period
+    added = -np.column_stack([f(k * again) for k in range(1, 5) for f in (np.cos, np.sin)]) @ amplitudes / fitted
+    return _Shaped(Correction(command, added, added, wish.resolution), {"period_command": period})
+
+
+def _bound(mean: np.ndarray, sd: np.ndarray) -> float:
+    """What 95 % of errors do not exceed, either sign, of normal distributions of equal weight."""
+    from scipy.optimize import brentq
+    from scipy.special import ndtr
+
+    sd = np.maximum(sd, 1e-300)
+
+    def beyond(limit: float) -> float:
+        return float(np.mean(ndtr((-limit - mean) / sd) + ndtr((mean - limit) / sd))) - 0.05
+
+    top = float(np.max(np.abs(mean) + 6 * sd))
+    return 0.0 if top < 1e-200 else float(brentq(beyond, 0.0, top, xtol=1e-6 * top))
+
+
+def bound_of(found: PredictedStops, aim: np.ndarray, members: np.ndarray, shift: bool = False) -> float:
+    """What 95 % of the errors of some stops do not exceed.
+
+    Args:
+        found: predicted stops.
+        aim: readings aimed at, shape (r,).
+        members: numbers of the stops.
+        shift: errors count but for one shift common to all.
+    """
+    mean, covariance = found.mean - aim, found.covariance
+    if shift:
+        centre = np.eye(mean.shape[1]) - 1.0 / mean.shape[1]
+        mean, covariance = mean @ centre, centre @ covariance @ centre
+    variance = np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)
+    return _bound(mean[:, members].ravel(), np.sqrt(variance[:, members]).ravel())
+
+
+def _promise(
+    after: PredictedStops, before: PredictedStops, run: Cycles, aim: np.ndarray, u: float, shift: bool
+) -> dict[str, SidePromise]:
+    """By side: what is left, and what each cause alone would leave."""
+    found = {}
+    scales = after.scales
+    pooled, covariance = after.pooled()
+    hours = np.array([run.moves[k].time_s for k in run.read]) / HOUR_S
+    for name, side in SIDES:
+        mine = np.flatnonzero(run.side == side)
+        n = len(mine)
+        stops = scales[f"stop_sd.{name}"][:, None] * np.ones(n)
+        home = scales["home_sd"][:, None] * np.ones(n)
+        drift = scales["drift_per_root_hour"][:, None] * np.sqrt(hours[mine])
+        reading = scales["reading_scale"][:, None] * u * np.ones(n)
+        variance = np.diagonal(after.covariance, axis1=1, axis2=2)[:, mine]
+        rest = np.sqrt(np.maximum(variance - stops**2 - home**2 - drift**2 - reading**2, 0.0))
+        zero = np.zeros_like(rest)
+        causes = {
+            "table": _bound((after.mean - pooled)[:, mine].ravel(), rest.ravel()),
+            "format": float(NORMAL_95 * np.sqrt(np.mean((pooled - aim)[mine] ** 2))),
+            **{
+                cause: _bound(zero.ravel(), sd.ravel())
+                for cause, sd in (("stops", stops), ("homing", home), ("drift", drift), ("readings", reading))
+            },
+        }
+        found[name] = SidePromise(
+            error95=bound_of(after, aim, mine, shift),
+            rms=float(np.sqrt(np.mean((pooled - aim)[mine] ** 2 + np.diag(covariance)[mine]))),
+            without95=bound_of(before, aim, mine, shift),
+            causes=causes,
+        )
+    return found
+
+
+def reading_u(campaign: AxisCampaign) -> float:
+    """Of a reading as the campaign has them, median."""
+    return float(np.median([r.u for r in campaign.readings if r.status == "ok"]))
+
+
+def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress: Show | None = None) -> Compensation:
+    """The table and its promise.
+
+    Args:
+        results: of an accepted fit.
+        wish: what it is to be.
+        seed: of what is drawn.
+        progress: told how far it is.
+
+    Raises:
+        InputError: the format is unknown, or lacks a number.
+        NotConverged: the fit is not accepted.
+    """
+    refuse_unaccepted(results)
+    fit, campaign = results.fit, results.fit.campaign
+    rows, since = fit.rows, Since.of(campaign.moves)
+    draws = fit.draws["effective_per_command"]
+    fitted = float(draws.mean())
+    form = _checked(wish, fitted)
+    nominal = _nominal(campaign, fitted, wish)
+    low, high = float(rows.positions[0]), float(rows.positions[-1])
+    with Job({"table": 1.0, "promise": 2.0}, progress) as job:
+        job.begin("table")
+        far = 0.05 * (high - low) + 2.0 * abs(float(fit.draws["backlash"].mean()) / fitted)
+        at = _expected(fit, table_commands(rows), far, since, seed)
+        gap = np.abs(at.mean[0] - at.mean[1]) + NORMAL_95 * np.hypot(*at.u)
+        overrun = float(np.max(gap)) / abs(fitted)
+        shaped = _shaped(form, at, nominal, fitted, wish, _line_draws(fit))
+        job.begin("promise")
+        u = reading_u(campaign)
+        # Between the lines of the table as well as on them.
+        tried = low + (high - low) * (np.arange(TRIED) + 0.5) / TRIED
+        after, run = _run(fit, tried, max(far, overrun), since, shaped.correction, u, seed)
+        job.at(0.5)
+        before, _ = _run(fit, tried, max(far, overrun), since, None, u, seed)
+        tried_aim = nominal * tried[run.index]
+        offset = _offset(at, nominal) if form.holds == "table" else float((after.pooled()[0] - tried_aim).mean())
+        promise = _promise(after, before, run, offset + tried_aim, u, form.zero_free)
+    table = _table(at, shaped.correction)
+    return Compensation(
+        target=wish.target,
+        machine=str(campaign.header.get("serial") or campaign.header.get("name") or ""),
+        unit=campaign.unit,
+        applied_by=wish.applied_by,
+        per_command=nominal,
+        offset=offset,
+        zero_free=form.zero_free,
+        range_command=(low, high),
+        resolution=wish.resolution,
+        reversal_command=overrun,
+        hours=since.hours,
+        travel_command=since.travel,
+        homings=len(np.unique(rows.segment)),
+        table=table,
+        settings=shaped.settings,
+        promise=promise,
+        unsaid=form.unsaid,
+    )
+
+
+def _table(at: _Expected, correction: Correction) -> tuple[TableRow, ...]:
+    """Lines at the commands of the correction."""
+    mean = [np.interp(correction.command, at.command, side) for side in at.mean]
+    u = [np.interp(correction.command, at.command, side) for side in at.u]
+    columns = (correction.command, *mean, *u, correction.forward, correction.backward)
+    return tuple(TableRow(*map(float, values)) for values in zip(*columns, strict=True))
+
+
+def compensate(
+    folder: AxisCampaign | Path | str, to: str = "csv", *, seed: int = 0, progress: Show | None = None, **wish: object
+) -> Compensation:
+    """A compensation of an axis folder: its table, the promise, and in `text` the file for a controller.
+
+    Args:
+        folder: of an axis, or what `read_axis` made of it; its `results/` are used where they are of its data.
+        to: "csv", "linuxcnc", "grbl", "grblhal", "klipper", "header", "urdf" or "pec".
+        seed: of what is drawn.
+        progress: told how far it is.
+        wish: further fields of `Wish`.
+
+    Raises:
+        InputError: the folder or a wish cannot be used.
+        NotConverged: the fit is not accepted.
+        NothingToEstimate: the folder holds too little.
+    """
+    campaign = folder if isinstance(folder, AxisCampaign) else read_axis(folder)
+    wanted = Wish(target=to, **wish)  # type: ignore[arg-type]
+    with Job({"fit": 1.0, "compensation": 1.0}, progress) as job:
+        results = results_for(campaign, progress=job.part("fit"), seed=seed)
+        made = compensation_of(results, wanted, seed=seed, progress=job.part("compensation"))
+    return structs.replace(made, text=file_text(made, campaign))
+
+
+def file_text(made: Compensation, campaign: AxisCampaign) -> str:
+    """Content of the file."""
+    digest = hashlib.sha256("".join(sorted(axis_hashes(campaign).values())).encode()).hexdigest()
+    name = campaign.path.name if campaign.path else "a campaign"
+    origin = f"tvsbayes {version('tvsbayes')} of {name}, data {digest[:16]}"
+    return FORMATS[made.target].write(made, origin)

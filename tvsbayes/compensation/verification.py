@@ -1,0 +1,385 @@
+"""Fresh readings against a table in force: whether its promise is kept, and if not, what became of the table.
+
+Every world is the same mechanics under other commands: those that the controller sends if the table was applied, not
+applied, applied twice, or with the wrong sign; each also where that befell the play alone. Another machine is off by
+shift, ratio, play and scatter of a size that nobody knows. Commands as the campaign counts them. No JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.compensation.correction import Correction
+from tvsbayes.compensation.promise import Since, bound_of, reading_u, refuse_unaccepted
+from tvsbayes.errors import InputError, NothingToEstimate, refusal
+from tvsbayes.files.csv_table import csv_bytes
+from tvsbayes.progress import Job, Show
+from tvsbayes.results.compensation_record import (
+    APPLIED,
+    BROKEN,
+    CANNOT_TELL,
+    COMPENSATION_FORMAT,
+    KEPT,
+    NOT_APPLIED,
+    OTHER_MACHINE,
+    TWICE,
+    WORLDS,
+    WRONG_SIGN,
+    Compensation,
+    ErrorSize,
+    Verdict,
+    Verification,
+)
+from tvsbayes.results.records import read_record, stored_document
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis
+from tvsbayes.single_axis.axis_fit import AxisFit
+from tvsbayes.single_axis.axis_record import results_for
+from tvsbayes.single_axis.axis_rows import rows_of
+from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
+
+SURE, UNLIKELY, P_MIN = 0.95, 0.01, 0.003
+"""Probability with which a world is named; below which the table counts as not applied as promised; of readings this
+far off. The last two leave less than one false BROKEN in a hundred."""
+REPLICATES = 4000
+"""Simulated readings behind p."""
+SCENARIOS = {
+    APPLIED: ((1.0, 1.0),),
+    NOT_APPLIED: ((0.0, 0.0), (1.0, 0.0)),
+    TWICE: ((2.0, 2.0), (1.0, 2.0)),
+    WRONG_SIGN: ((-1.0, -1.0), (1.0, -1.0)),
+}
+"""Factors of what both sides have in common and of what they differ by."""
+SEPARATE = 16.0
+"""Squared distance, in standard deviations of the readings, from which a fault of the play alone is one of its own: a
+smaller one harms no promise."""
+TELLING = 25.0
+"""Squared distance of two worlds at which readings name the right one in 95 of 100: half of it less 1.645 of its roots
+exceeds ln(76), the odds of 0.95 against four others."""
+OTHERS, OTHER_LEAST = 12, 3.0
+"""Sizes by which another machine may be off, from so many uncertainties of a reading to half of the travel: one that is
+off by less keeps the promise."""
+BEYOND = 1.5
+"""Share of the promise's hours or travel from which it is said that the readings go on for longer."""
+CANDIDATES, SPREAD, PLANNED_MAX = 17, 3, 40
+"""Of a plan: commands tried, commands visited whatever they tell, stops at most."""
+
+
+@dataclass(frozen=True)
+class _Fresh:
+    """Fresh stops: moves, numbers of those read, commands, sides, readings, their u; (r,) each."""
+
+    moves: tuple[AxisMove, ...]
+    read: list[int]
+    command: np.ndarray
+    side: np.ndarray
+    value: np.ndarray
+    u: np.ndarray
+
+    @classmethod
+    def of(cls, campaign: AxisCampaign) -> _Fresh:
+        """Of a folder of fresh readings."""
+        rows = rows_of(campaign)
+        u = np.sqrt(rows.variance)
+        return cls(campaign.moves, rows.move.tolist(), rows.command, rows.side, rows.value, u)
+
+
+def _distance(off: np.ndarray, covariance: np.ndarray) -> float:
+    """Squared distance in standard deviations."""
+    return float(off @ np.linalg.solve(covariance, off))
+
+
+def _other_machine(fresh: _Fresh, found: PredictedStops, travel: float) -> list[np.ndarray]:
+    """Covariances (r, r) of what another machine adds, by size."""
+    centre = fresh.command - fresh.command.mean()
+    span = centre / max(float(np.max(np.abs(centre))), 1e-300)
+    shape = np.ones((len(span), len(span))) + np.outer(span, span) + 0.25 * np.outer(fresh.side, fresh.side)
+    shape += 0.25 * np.eye(len(span))
+    least = OTHER_LEAST * float(np.sqrt(np.median(np.diag(found.pooled()[1]))))
+    return [size**2 * shape for size in np.geomspace(least, max(0.5 * travel, 2 * least), OTHERS)]
+
+
+def _shift(made: Compensation, travel: float, count: int) -> np.ndarray:
+    """Covariance of one shift common to all readings, of formats that leave the zero open."""
+    return (travel**2 if made.zero_free else 0.0) * np.ones((count, count))
+
+
+@dataclass(frozen=True)
+class _Worlds:
+    """Log density of the readings by world, and the predictions if the table is applied and if it is not."""
+
+    logs: dict[str, float]
+    promised: PredictedStops
+    without: PredictedStops
+
+
+def _worlds(fit: AxisFit, made: Compensation, fresh: _Fresh, seed: int) -> _Worlds:
+    applied = Correction.of(made)
+    shift = _shift(made, fit.rows.travel, len(fresh.value))
+
+    def at(common: float, play: float) -> PredictedStops:
+        return predicted_stops(fit, applied.moved(fresh.moves, common, play), fresh.read, fresh.u, seed)
+
+    known = {factors: at(*factors) for factors in ((1.0, 1.0), (0.0, 0.0), (1.0, 0.0))}
+    promised = known[1.0, 1.0]
+    mean, covariance = promised.pooled()
+    play_matters = _distance(known[1.0, 0.0].pooled()[0] - mean, covariance + shift) > SEPARATE
+    found = {}
+    for world, factors in SCENARIOS.items():
+        own = [f for f in factors if f[0] == f[1] or play_matters]
+        found[world] = _mean_density([(known.get(f) or at(*f)).log_density(fresh.value, shift) for f in own])
+    others = _other_machine(fresh, promised, fit.rows.travel)
+    found[OTHER_MACHINE] = _mean_density([promised.log_density(fresh.value, shift + more) for more in others])
+    return _Worlds(found, promised, known[0.0, 0.0])
+
+
+def _mean_density(logs: Sequence[float]) -> float:
+    """Logarithm of the mean of densities."""
+    return float(np.logaddexp.reduce(logs) - np.log(len(logs)))
+
+
+def _p_value(promised: PredictedStops, value: np.ndarray, shift: np.ndarray, seed: int) -> float:
+    """Of the readings' squared distance, by readings drawn from the prediction."""
+    mean, covariance = promised.pooled()
+    inverse = np.linalg.inv(covariance + shift)
+    drawn = promised.drawn(REPLICATES, np.random.default_rng([seed, 23]))
+
+    def squares(values: np.ndarray) -> np.ndarray:
+        off = np.atleast_2d(values) - mean
+        return np.einsum("ni,ij,nj->n", off, inverse, off)
+
+    return float((1 + np.sum(squares(drawn) >= squares(value)[0])) / (REPLICATES + 1))
+
+
+def _size(error: np.ndarray, shift: bool) -> ErrorSize:
+    """Of errors (r,); but for their mean where a shift is free."""
+    left = error - error.mean() if shift else error
+    return ErrorSize(float(np.sqrt(np.mean(left**2))), float(np.max(np.abs(left))))
+
+
+def _verdict(worlds: dict[str, float], p: float) -> Verdict:
+    if p < P_MIN or worlds[APPLIED] < UNLIKELY:
+        return BROKEN
+    return KEPT if worlds[APPLIED] >= SURE else CANNOT_TELL
+
+
+def needed_readings(promised: PredictedStops, off: np.ndarray, noise: np.ndarray) -> int | None:
+    """Readings, of such stops again and again, that part two worlds; None where no number does.
+
+    Args:
+        promised: of r stops, if the table is applied.
+        off: what the other world adds to their readings, shape (r,).
+        noise: variances that every visit draws anew, shape (r,).
+    """
+    _, covariance = promised.pooled()
+    kept = covariance - np.diag(0.999 * np.minimum(noise, np.diag(covariance)))
+    for times in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32):
+        if _distance(off, kept + np.diag(noise) / times) >= TELLING:
+            return times * len(off)
+    return None
+
+
+def _visit_noise(promised: PredictedStops, side: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Variance that a visit draws anew: scatter of stops, and of readings."""
+    scales = promised.scales
+    ahead, back = (float(np.mean(scales[f"stop_sd.{name}"] ** 2)) for name in ("forward", "backward"))
+    reading = float(np.mean(scales["reading_scale"] ** 2)) * u**2
+    return np.where(side > 0, ahead, np.where(side < 0, back, 0.5 * (ahead + back))) + reading
+
+
+def _remarks(made: Compensation, fresh: _Fresh, campaign: AxisCampaign) -> tuple[str, ...]:
+    """What else is to be said."""
+    low, high = made.range_command
+    outside = int(np.sum((fresh.command < low) | (fresh.command > high)))
+    found = []
+    if outside:
+        found.append(
+            f"{outside} of {len(fresh.command)} stops lie outside {low:.10g} to {high:.10g}: the promise does not hold "
+            "there; what is expected of them is wider"
+        )
+    since = Since.of(campaign.moves)
+    if since.hours > BEYOND * made.hours or since.travel > BEYOND * made.travel_command:
+        found.append(
+            f"the fresh readings go on for {since.hours:.3g} h and {since.travel:.4g} commands of travel after a "
+            f"homing, the promise for {made.hours:.3g} h and {made.travel_command:.4g}: what is expected is wider"
+        )
+    named = campaign.header.get("serial") or campaign.header.get("name")
+    if named and made.machine and named != made.machine:
+        found.append("the fresh readings name another machine or campaign than the table: is it the right one?")
+    return tuple(found)
+
+
+def verify_readings(
+    fit: AxisFit, made: Compensation, campaign: AxisCampaign, *, seed: int = 0, progress: Show | None = None
+) -> Verification:
+    """Fresh readings under a table in force.
+
+    Args:
+        fit: that the table was made of.
+        made: the table and its promise.
+        campaign: fresh readings; commands as asked for, before the correction.
+        seed: of what is drawn.
+        progress: told how far it is.
+
+    Raises:
+        InputError: the readings have another unit.
+        NothingToEstimate: they are too few.
+    """
+    if campaign.unit != made.unit:
+        message = f"the fresh readings are in {campaign.unit[:20]!r}, the table is in {made.unit[:20]!r}"
+        raise InputError("unit", message, remedy="give readings in the unit of the table")
+    fresh = _Fresh.of(campaign)
+    with Job({"worlds": 1.0}, progress) as job:
+        job.begin("worlds")
+        found = _worlds(fit, made, fresh, seed)
+    total = float(np.logaddexp.reduce(list(found.logs.values())))
+    worlds = {name: float(np.exp(found.logs[name] - total)) for name in WORLDS}
+    promised, before = found.promised, found.without.pooled()[0]
+    shift = _shift(made, fit.rows.travel, len(fresh.value))
+    p = _p_value(promised, fresh.value, shift, seed)
+    aim = made.offset + made.per_command * fresh.command
+    verdict = _verdict(worlds, p)
+    needed: int | None = 0
+    if verdict == CANNOT_TELL:
+        needed = needed_readings(promised, promised.pooled()[0] - before, _visit_noise(promised, fresh.side, fresh.u))
+    return Verification(
+        verdict=verdict,
+        p=p,
+        worlds=worlds,
+        before=_size(before - aim, made.zero_free),
+        after=_size(fresh.value - aim, made.zero_free),
+        promised95=bound_of(promised, aim, np.arange(len(aim)), made.zero_free),
+        readings=len(fresh.value),
+        unit=campaign.unit,
+        needed=needed,
+        remarks=_remarks(made, fresh, campaign),
+    )
+
+
+def stored_compensation(campaign: AxisCampaign) -> Compensation:
+    """What `compensate` left in a folder's `results/`.
+
+    Raises:
+        InputError: there is none, it is of other data, or it is damaged.
+    """
+    again = "run `tvsbayes compensate` on this folder, and apply what it writes"
+    keys = stored_document(campaign, "compensation.json", (COMPENSATION_FORMAT,), axis_hashes(campaign))
+    if keys is None:
+        found = "no compensation of these data"
+        allowed = "the one whose table is in force"
+        raise refusal("missing-file", file="results/compensation.json", found=found, allowed=allowed, remedy=again)
+    return read_record(Compensation, keys, again)
+
+
+def verify(
+    folder: AxisCampaign | Path | str,
+    fresh: AxisCampaign | Path | str,
+    *,
+    made: Compensation | None = None,
+    seed: int = 0,
+    progress: Show | None = None,
+) -> Verification:
+    """Whether an axis keeps the promise of its table.
+
+    Args:
+        folder: that the table was made of.
+        fresh: readings with the table in force; commands as asked for, before the correction.
+        made: the table; None for the one in `results/compensation.json`.
+        seed: of what is drawn.
+        progress: told how far it is.
+
+    Raises:
+        InputError: a folder cannot be used, or there is no table.
+        NotConverged: the fit is not accepted.
+        NothingToEstimate: too few fresh readings.
+    """
+    known = folder if isinstance(folder, AxisCampaign) else read_axis(folder)
+    new = fresh if isinstance(fresh, AxisCampaign) else read_axis(fresh)
+    table = stored_compensation(known) if made is None else made
+    with Job({"fit": 1.0, "verification": 1.0}, progress) as job:
+        results = results_for(known, progress=job.part("fit"), seed=seed)
+        refuse_unaccepted(results)
+        return verify_readings(results.fit, table, new, seed=seed, progress=job.part("verification"))
+
+
+@dataclass(frozen=True)
+class VerifyPlan:
+    """Stops to be read with the table in force, to be made in this order.
+
+    Attributes:
+        stops: command and side, 1 or -1, of each that is read.
+        overrun: how far beyond a command the axis goes before it comes back to it.
+        enough: whether they part the worlds in 95 of 100.
+        distance: of the nearest two worlds, standard deviations.
+    """
+
+    stops: tuple[tuple[float, int], ...]
+    overrun: float
+    enough: bool
+    distance: float
+
+    def plan_bytes(self) -> bytes:
+        """`plan.csv`: step, command, direction, read (1 or 0)."""
+        words = {1: "forward", -1: "backward"}
+        rows: list[tuple[int, float, str, int]] = []
+        at: float | None = None
+        for command, side in self.stops:
+            if at is None or side * (command - at) < self.overrun:
+                rows.append((len(rows), command - side * self.overrun, words[-side], 0))
+            rows.append((len(rows), command, words[side], 1))
+            at = command
+        return csv_bytes(("step", "command", "direction", "read"), rows)
+
+
+def _parting(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarray, visits: np.ndarray) -> float:
+    """Squared distance of the nearest world, of candidates (m,) visited so many times each."""
+    used = np.flatnonzero(visits)
+    scatter = covariance[np.ix_(used, used)] + np.diag(noise[used] / visits[used])
+    return min(_distance(o[used], scatter) for o in off)
+
+
+def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> VerifyPlan:
+    """The fewest stops that tell the worlds apart, by greedy choice among the table's commands.
+
+    Raises:
+        NothingToEstimate: the table corrects nothing.
+    """
+    applied = Correction.of(made)
+    overrun, (low, high) = made.reversal_command, made.range_command
+    nodes = np.array([row.command for row in made.table])
+    # Where both sides are reached without leaving the range, if there are such commands.
+    inside = nodes[(nodes - overrun >= low) & (nodes + overrun <= high)]
+    nodes = inside if len(inside) >= SPREAD else nodes
+    nodes = nodes[np.linspace(0, len(nodes) - 1, min(len(nodes), CANDIDATES)).round().astype(int)]
+    run = Since(made.hours, 0.0).cycles(nodes, overrun)
+    u = np.full(len(run.read), reading_u(fit.campaign))
+
+    def at(common: float, play: float) -> PredictedStops:
+        return predicted_stops(fit, applied.moved(run.moves, common, play), run.read.tolist(), u, seed)
+
+    promised = at(1.0, 1.0)
+    mean, covariance = promised.pooled()
+    noise = np.minimum(_visit_noise(promised, run.side, u), 0.999 * np.diag(covariance))
+    common = covariance - np.diag(noise) + _shift(made, fit.rows.travel, len(mean))
+    off = [at(0.0, 0.0).pooled()[0] - mean]
+    play = at(1.0, 0.0).pooled()[0] - mean
+    if _distance(play, covariance + _shift(made, fit.rows.travel, len(mean))) > SEPARATE:
+        off.append(play)
+    if not np.any(off[0]):
+        raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
+    visits = np.zeros(len(mean))
+    # Over the range first: what befell a part of the table shows nowhere else.
+    spread = np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)
+    visits[np.isin(run.index, spread)] = 1
+    reached = _parting(off, common, noise, visits)
+    while reached < TELLING and visits.sum() < PLANNED_MAX:
+        each = [_parting(off, common, noise, visits + row) for row in np.eye(len(mean))]
+        best = int(np.argmax(each))
+        visits[best] += 1
+        reached = each[best]
+    order = [k for k in range(len(mean)) for _ in range(int(visits[k]))]
+    stops = tuple((float(nodes[run.index[k]]), int(run.side[k])) for k in order)
+    return VerifyPlan(stops, overrun, reached >= TELLING, float(np.sqrt(reached)))

@@ -1,0 +1,118 @@
+"""What `compensate` and `verify` print: promise or verdict first, then what stands behind it, then what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tvsbayes.compensation.verification import VerifyPlan
+from tvsbayes.errors import escaped
+from tvsbayes.report.tables import TableView, two_digits
+from tvsbayes.results.compensation_record import (
+    APPLIED,
+    BROKEN,
+    CANNOT_TELL,
+    CAUSES,
+    NOT_APPLIED,
+    OTHER_MACHINE,
+    TWICE,
+    WRONG_SIGN,
+    Compensation,
+    Verification,
+)
+
+REMEDIES = {
+    NOT_APPLIED: "the controller does not use the table, or not its play: is the file loaded, were the settings saved, "
+    "does compensation start only after homing?",
+    TWICE: "the table, or its play, acts in two places: take one of them out (a backlash setting beside the table?)",
+    WRONG_SIGN: "the controller adds what it is to take off, or holds forward and backward in each other's place",
+    OTHER_MACHINE: "the table is of another machine, or this one changed: measure it again and compensate anew",
+    APPLIED: "readings lie farther off than the table allows: measure again, and compensate anew if that stays",
+}
+"""By the world that fits best, where the promise is broken."""
+HELPS = {
+    "homing": "the scatter of homings; read after several homings, or verify without homing in between",
+    "stops": "the scatter of single stops; no table takes that out",
+    "table": "the table itself; read more, at more positions",
+    "format": "what the format cannot hold; csv, linuxcnc and header hold both sides by position",
+    "drift": "the walk of the zero; home more often",
+    "readings": "the readings themselves; a better reference",
+}
+"""What the largest cause of what is left is, and what takes it down."""
+
+
+def promise_table(made: Compensation) -> TableView:
+    """What is left by side, and what each cause alone would leave."""
+    rows = []
+    for side, left in made.promise.items():
+        causes = [two_digits(left.causes[cause]) for cause in CAUSES]
+        rows.append([side, two_digits(left.without95), two_digits(left.error95), *causes])
+    caption = f"95 % of errors are at most, {escaped(made.unit)}; each cause alone"
+    return TableView(caption, ["arriving", "without", "after applying", *CAUSES], rows)
+
+
+def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
+    """A compensation for people."""
+    unit, (low, high) = escaped(made.unit), made.range_command
+    largest = max(CAUSES, key=lambda cause: max(left.causes[cause] for left in made.promise.values()))
+    shift = ", but for one shift common to all" if made.zero_free else ""
+    lines = [
+        f"compensation for {made.target}: {len(made.table)} commands from {low:.10g} to {high:.10g}, in {unit}",
+        f"aim: reading = {made.offset:.6g} + {made.per_command:.9g} x command{shift}",
+        "",
+        promise_table(made).text(),
+        "",
+        f"the promise holds between these commands, within {two_digits(made.hours)} h and {made.travel_command:.4g} "
+        "commands of travel since homing",
+        f"arrive with at least {made.reversal_command:.4g} commands of travel on a side",
+        f"most of what is left: {HELPS[largest]}",
+        *(f"the format: {text}" for text in made.unsaid),
+    ]
+    if made.homings == 1:
+        lines.append("one homing alone was read: how far the next one is off is known by its prior; home_sd in [axis]")
+    lines.append(
+        "nothing is applied yet; apply it once, in one place, then take fresh readings and run tvsbayes verify"
+    )
+    return "\n".join([*lines, *(f"written: {escaped(path, 200)}" for path in written)])
+
+
+def verification_text(found: Verification) -> str:
+    """A verification for people."""
+    unit = escaped(found.unit)
+    p = "< 0.0003" if found.p < 3e-4 else f"= {found.p:.2g}"
+    rows = [[name, f"{100 * chance:.1f} %"] for name, chance in found.worlds.items()]
+    sizes = [
+        ["before (expected without the table)", two_digits(found.before.rms), two_digits(found.before.worst)],
+        ["after (read)", two_digits(found.after.rms), two_digits(found.after.worst)],
+    ]
+    lines = [
+        f"{found.verdict}: {found.world} (p {p})",
+        "",
+        TableView(f"{found.readings} readings under the table", ["the table was", "probability"], rows).text(),
+        "",
+        TableView(f"errors, {unit}", ["", "RMS", "worst"], sizes).text(),
+        f"promised: 95 % of errors at most {two_digits(found.promised95)} {unit}",
+        *found.remarks,
+    ]
+    if found.verdict == BROKEN:
+        lines.append(f"what to do: {REMEDIES[found.world]}")
+    elif found.verdict == CANNOT_TELL and found.needed is None:
+        lines.append(
+            "no number of such readings tells: what the table corrects is lost in what homing and fit leave open"
+        )
+    elif found.verdict == CANNOT_TELL:
+        more = f"about {found.needed} readings of this kind" if found.needed else "some more readings"
+        lines.append(f"what to do: {more} would tell; `tvsbayes plan --verify FOLDER` names those that tell soonest")
+    return "\n".join(lines)
+
+
+def verify_plan_text(found: VerifyPlan) -> str:
+    """Readings that tell soonest what became of a table."""
+    words = {1: "forward", -1: "backward"}
+    rows = [[f"{command:.10g}", words[side]] for command, side in found.stops]
+    table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
+    lines = [table.text(), f"to arrive on a side, come from at least {found.overrun:.4g} commands away"]
+    if found.enough:
+        lines.append(f"they tell the worlds apart in 95 of 100: {found.distance:.1f} standard deviations")
+    else:
+        lines.append(f"they hardly tell: the nearest two worlds are {found.distance:.1f} standard deviations apart")
+    return "\n".join(lines)

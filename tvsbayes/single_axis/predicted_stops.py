@@ -1,0 +1,112 @@
+"""Readings of further moves, predicted by a fit: stops after another homing, with everything that is uncertain of them.
+
+The moves are joined to those of the fit, as a segment of their own, and their rows left out (formulation 8): so the
+prediction holds ratio, play, error by position, homing, drift, scatter of stops and of readings as the model has them.
+Commands as in the folder, readings in its unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tvsbayes.single_axis.axis_campaign import AxisMove, Reading
+from tvsbayes.single_axis.axis_fit import AxisFit
+from tvsbayes.single_axis.axis_model import AxisModel
+from tvsbayes.single_axis.axis_rows import rows_of
+
+DRAWS = 160
+"""Of the scales, in a prediction."""
+
+
+@dataclass(frozen=True)
+class PredictedStops:
+    """Readings of r stops by n draws of the scales, normal given each.
+
+    Attributes:
+        mean: shape (n, r).
+        covariance: shape (n, r, r).
+        scales: the draws by name, each (n,).
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    scales: dict[str, np.ndarray]
+
+    def pooled(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (r,) and covariance (r, r) of the mixture."""
+        off = self.mean - self.mean.mean(axis=0)
+        return self.mean.mean(axis=0), self.covariance.mean(axis=0) + off.T @ off / len(off)
+
+    def drawn(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Readings (count, r) of the mixture, as many of each draw as of any other."""
+        which = np.arange(count) % len(self.mean)
+        values, vectors = np.linalg.eigh(self.covariance)
+        normal = rng.standard_normal((count, self.mean.shape[1])) * np.sqrt(np.maximum(values, 0.0))[which]
+        return self.mean[which] + np.einsum("nij,nj->ni", vectors[which], normal)
+
+    def log_density(self, value: np.ndarray, more: np.ndarray | None = None) -> float:
+        """Of readings (r,); `more` is a covariance (r, r) beside those of the prediction."""
+        covariance = self.covariance if more is None else self.covariance + more
+        _, log_det = np.linalg.slogdet(covariance)
+        off = value - self.mean
+        square = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0])
+        each = -0.5 * (log_det + square + len(value) * np.log(2 * np.pi))
+        return float(np.logaddexp.reduce(each) - np.log(len(each)))
+
+
+def carried_scales(of: AxisModel, drawn: np.ndarray, into: AxisModel, rng: np.random.Generator) -> np.ndarray:
+    """Coordinates (n, d) for a model of more rows, from draws (n, d) for one of fewer.
+
+    What the fewer rows do not hold, as the scatter of homings where there was one, has its prior; a backlash that was
+    linear there is drawn given the scales.
+    """
+    w = rng.standard_normal((len(drawn), len(into.coordinates.names)))
+    for column, name in enumerate(into.coordinates.names):
+        if name in of.coordinates.names:
+            w[:, column] = drawn[:, of.coordinates.names.index(name)]
+        elif name == "backlash":
+            values, sd = of.linear(drawn).of(of.head(backlash=1.0)[None])
+            prior = into.priors[name]
+            w[:, column] = (values[:, 0] + sd[:, 0] * rng.standard_normal(len(drawn)) - prior.value) / prior.u
+    return w
+
+
+def predicted_stops(
+    fit: AxisFit, moves: Sequence[AxisMove], read: Sequence[int], u: np.ndarray, seed: int = 0
+) -> PredictedStops:
+    """Readings of moves that come after those of a fit and after another homing.
+
+    Args:
+        fit: of an axis.
+        moves: of a campaign of its own, in order of time; commands as the mechanics get them.
+        read: numbers of the moves that are read, ascending, shape (r,).
+        u: standard uncertainties of these readings, shape (r,); 0 where nobody knows.
+        seed: of what the draws do not hold.
+    """
+    known, rng = fit.campaign, np.random.default_rng([seed, 21])
+    last, number = known.moves[-1], max(r.reading for r in known.readings) + 1
+    count, begins = len(known.moves), moves[0].time_s
+    joined = [
+        replace(
+            move,
+            move=count + move.move,
+            segment=last.segment + 1 + move.segment,
+            time_s=last.time_s + move.time_s - begins,
+        )
+        for move in moves
+    ]
+    # Any value will do where a row counts as not read; on the line it moves nothing that is judged by the line.
+    offset, slope = fit.rows.line
+    readings = [
+        Reading(number + k, count + at, offset + slope * moves[at].command, float(u[k])) for k, at in enumerate(read)
+    ]
+    longer = replace(known, moves=(*known.moves, *joined), readings=(*known.readings, *readings))
+    rows = replace(rows_of(longer), line=fit.rows.line)
+    model = AxisModel.of(rows, fit.model.priors)
+    drawn = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
+    w = carried_scales(fit.model, drawn, model, rng)
+    mean, covariance = model.left_out(w, np.flatnonzero(rows.move >= count))
+    return PredictedStops(mean, covariance, model.coordinates.values(w))
