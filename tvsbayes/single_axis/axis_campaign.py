@@ -67,7 +67,7 @@ class AxisMove:
         Column(
             "in the first row of a segment: `forward` (rising command), `backward` or `unknown`; empty elsewhere",
             rule=first_of_segment,
-            names=MOVES["pan_approach"].names + " direction richtung direccion",
+            names=MOVES["pan_approach"].names + " direction dir richtung direccion",
         ),
     ] = ""
 
