@@ -111,7 +111,6 @@ class Reading:
             "of a reading in motion, in a folder with `rate`: seconds, on the clock of moves.csv, not before its move",
             *(MOVES["time_s"].low, MOVES["time_s"].high),
             group="motion",
-            names=MOVES["time_s"].names,
         ),
     ] = None
 
