@@ -67,7 +67,7 @@ class AxisMove:
         Column(
             "in the first row of a segment: `forward` (rising command), `backward` or `unknown`; empty elsewhere",
             rule=first_of_segment,
-            names=MOVES["pan_approach"].names + " direction richtung direccion",
+            names=MOVES["pan_approach"].names + " direction dir richtung direccion",
         ),
     ] = ""
 
@@ -111,7 +111,6 @@ class Reading:
             "of a reading in motion, in a folder with `rate`: seconds, on the clock of moves.csv, not before its move",
             *(MOVES["time_s"].low, MOVES["time_s"].high),
             group="motion",
-            names=MOVES["time_s"].names,
         ),
     ] = None
 

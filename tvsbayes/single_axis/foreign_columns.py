@@ -157,7 +157,7 @@ def one_reading_a_row(table: ForeignTable, stated: Mapping[str, str]) -> tuple[F
         )
     units = {unit_of_name(name, READING_UNITS) for name in runs}
     if len(units) > 1:
-        found, remedy = f"runs in {', '.join(str(unit) for unit in units)} ({named})", "give all runs in one unit"
+        found, remedy = f"runs in {', '.join(sorted(map(str, units)))} ({named})", "give all runs in one unit"
         raise refusal("csv", file=table.file, line=table.first_line, found=found, allowed="one unit", remedy=remedy)
     at = [float(cell) for cell in table.columns[position]]
     rising = sorted(range(len(at)), key=at.__getitem__)

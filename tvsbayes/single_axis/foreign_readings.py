@@ -39,6 +39,8 @@ from tvsbayes.single_axis.foreign_columns import plain_column, positions_of_devi
 
 WHOLE = 0.1
 """Of a turn, by which play and errors of gears may make a jump differ from whole turns."""
+JUMP_SDS = 6.0
+"""Typical distances of steps from the line, beside two counts, by which a jump may miss a power of two."""
 BITS = range(8, 33)
 """Of encoders that count modulo a power of two."""
 BEYOND = 0.05
@@ -352,12 +354,16 @@ def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
         return None
     span = float(np.ptp(value)) + 1.0
     turn = next((2.0**bits for bits in BITS if 2.0**bits >= span), None)
-    if turn is not None and turn_jumps(command, value, turn):
-        return turn
     jumps = turn_jumps(command, value, span)
-    if not jumps or any(abs(abs(far) - 1.0) > WHOLE for far in jumps.values()):
+    if turn is None or not jumps:
         return None
     typical = span * float(np.median(np.abs(list(jumps.values()))))
+    if any(abs(abs(far) * span / typical - 1.0) > WHOLE for far in jumps.values()):
+        return None
+    rise, step = np.diff(value), np.diff(command)
+    rest = np.delete(rise - np.median(rise[step != 0] / step[step != 0]) * step, [row - 1 for row in jumps])
+    if abs(typical - turn) <= JUMP_SDS * float(np.median(np.abs(rest))) + 2.0:
+        return turn
     found, allowed = f"readings that jump by about {typical:.0f} counts, {len(jumps)} times", "a continuous count"
     remedy = "say where the encoder begins anew, --counts-per-turn N; or that these are motions, --counts-per-turn 0"
     raise refusal("wrapped", file="value", found=found, allowed=allowed, remedy=remedy)

@@ -36,7 +36,6 @@ _CAMONITOR = re.compile(
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 _READ = ("encoder", "enc", "ssi", "biss", "endat", "absolute", "reading", "measured", "interferometer")
 _COMMANDED = ("axis", "motor", "setpoint", "sp", "val", "command", "cmd", "steps", "step", "counter", "demand")
-_READ_BACK = ("rbv", "readback", "act", "actual")
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
             raise InputError("usage", message, allowed=listed, remedy="name one of them")
     free = [name for name in changing if name not in stated.values()]
     known = {field: name for field in ("command", "value") if (name := stated.get(field))}
-    for field, words in (("value", _READ), ("command", _COMMANDED), ("value", _READ_BACK)):
+    for field, words in (("value", _READ), ("command", _COMMANDED)):
         own = [name for name in free if set(words_of(name)).intersection(words)]
         if field not in known and len(own) == 1:
             known[field] = own[0]

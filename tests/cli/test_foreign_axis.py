@@ -1,0 +1,221 @@
+"""Files of an axis as people have them: each read by one command with the right answer, or refused with the mend.
+
+Files in tests/data/foreign are of own numbers in layouts that were met; the others are written here.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from support.commands import assert_error
+
+from tvsbayes.single_axis.axis_campaign import read_axis
+from tvsbayes.single_axis.axis_rows import rows_of
+from tvsbayes.single_axis.classic_line import classic_axis
+
+FOREIGN = Path(__file__).parents[1] / "data" / "foreign"
+RATIO, PLAY = 0.0125, 0.05
+"""Unit per step, and unit: of the axis that the files below read."""
+
+
+def readings(runs: int = 2, stops: int = 9, every: int = 400) -> list[tuple[int, float, int]]:
+    """Command, reading and side of runs up and down; no stop is read twice in a row."""
+    found = []
+    for _ in range(runs):
+        found += [(every * k, RATIO * every * k, 1) for k in range(stops)]
+        found += [(every * k, RATIO * every * k + PLAY, -1) for k in range(stops - 2, -2, -1)]
+    return found
+
+
+def dms(degrees: float) -> str:
+    seconds = round(abs(degrees) * 3600)
+    return f"{'-' if degrees < 0 else ''}{seconds // 3600}\u00b0{seconds // 60 % 60:02d}'{seconds % 60:02d}\""
+
+
+def lines(form: str, **words: object) -> str:
+    """A line for each reading."""
+    rows = readings()
+    return "".join(
+        form.format(c=c, v=v, s="+-"[s < 0], word=("up", "down")[s < 0], d=dms(v), dev=1000 * (v - RATIO * c), k=k)
+        for k, (c, v, s) in enumerate(rows)
+    )
+
+
+WRITTEN = {
+    "heading": "Serial no. 117\nOperator: A. B.\n\nsteps;reading (mm);direction\n" + lines("{c};{v:.4f};{s}\n"),
+    "words": "steps,reading_mm,Richtung\n" + lines("{c},{v:.4f},{word}\n"),
+    "serial": "ready\n" + lines("Step: {c}, Angle: {v:.4f} deg\n"),
+    "clock": lines("10:00:{k:02d}.000 -> step={c} angle={v:.4f}\n"),
+    "dms": "step\tangle\tdir\n" + lines("{c}\t{d}\t{word}\n"),
+    "inch": "step;reading;dir\n" + lines('{c};{v:.4f}";{word}\n'),
+    "units in cells": "step;reading;dir\n" + lines("{c};{v:.4f} mm;{word}\n"),
+    "decimal commas": "Schritte;Messwert (mm);Richtung\n" + lines("{c};{v:.4f};{s}\n").replace(".", ","),
+    "camonitor": lines(
+        "T:Axis1-PosAct 2021-07-09 10:29:{k:02d}.000000 {c}\nT:Enc1 2021-07-09 10:29:{k:02d}.000000 {v:.4f}\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_every_notation_gives_the_same_axis(ask, tmp_path, name):
+    """Ratio and play of the classic line; a wrong side would halve the play, a wrong order lose it."""
+    file, out = tmp_path / "log.txt", tmp_path / "out"
+    file.write_text(WRITTEN[name], encoding="utf-8")
+    code, document = ask("import", file, "--axis", "--to", out, "--yes")
+    assert code == 0 and document["ok"] == len(readings()) and document["next"] == f"tvsbayes calibrate {out}"
+    found = classic_axis(rows_of(read_axis(out)))
+    # A second of arc or 1e-4 is the last digit that is written; of the first stop without a word the side is unknown.
+    loose = PLAY / 3200 if name in ("serial", "clock", "camonitor") else 1e-4 / 3200
+    assert found.per_command == pytest.approx(RATIO, abs=loose)
+    assert abs(found.backlash) == pytest.approx(PLAY, abs=2e-3)
+    unit = {"heading": "mm", "words": "mm", "dms": "deg", "serial": "deg", "inch": "inch"}
+    assert read_axis(out).unit == unit.get(name, "deg" if name in ("clock", "camonitor") else "mm")
+
+
+@pytest.mark.parametrize(
+    ("file", "ratio", "play", "unit", "said"),
+    [
+        # Truths and the scatter of stops of each file: its README in the layouts' collection.
+        ("counts_wrap/log.csv", 1.024, 5.7, "counts", "whole turns 8 times, which are added: 4096 counts each"),
+        ("direction_signs/log.csv", None, None, "mm", "u: none"),
+        ("error_column_as_u/log.csv", 1.010, 0.08, "deg", "Error (deg) is Actual (deg) - Target (deg) in every row"),
+        ("error_column_as_u/signed.csv", 1.010, 0.08, "deg", "a deviation, no uncertainty; set aside"),
+        ("wide_forward_backward/dial.csv", 1.0012, 0.035, "mm", "runs: 4 columns"),
+    ],
+)
+def test_files_that_people_have(ask, tmp_path, file, ratio, play, unit, said):
+    out = tmp_path / "out"
+    code, document = ask("import", FOREIGN / file, "--axis", "--to", out, "--yes")
+    campaign = read_axis(out)
+    rows = rows_of(campaign)
+    found = classic_axis(rows)
+    assert code == 0 and campaign.unit == unit and any(said in text for text in document["assumed"])
+    if ratio is not None:
+        assert abs(found.per_command - ratio) < 4 * found.u_per_command
+        assert abs(abs(found.backlash) - play) < 4 * found.u_backlash
+    assert rows.both_sides and {reading.u for reading in campaign.readings} == {0.0}
+
+
+def test_deviations_on_demand(ask, tmp_path):
+    """A sheet of target and error alone: positions are target plus error, in their own unit."""
+    file, out = tmp_path / "log.csv", tmp_path / "out"
+    rows = [(10.0 * k, 0.002 * k + 0.05 * (side < 0), side) for side in (1, -1) for k in range(0, 10)[::side]]
+    file.write_text("Target (mm),Dir,Deviation (um)\n" + "".join(f"{c},{s},{1000 * d:.1f}\n" for c, d, s in rows))
+    stated = ("--column", "value=Deviation (um)")
+    code, document = ask("import", file, "--axis", "--to", out, "--yes")
+    assert code == 2 and "--deviations" in assert_error(document, "deviations")["remedy"]
+    code, document = ask("import", file, "--axis", "--to", out, "--yes", *stated, "--deviations")
+    found = classic_axis(rows_of(read_axis(out)))
+    assert code == 0 and read_axis(out).unit == "mm"
+    assert found.per_command == pytest.approx(1.0002, abs=1e-6) and abs(found.backlash) == pytest.approx(0.05, abs=2e-4)
+
+
+GUIDE = """Guiding Begins at 2026-01-02 21:00:00
+Pixel scale = 2.0 arc-sec/px, Binning = 1, Focal length = 500 mm
+Mount = A Mount,  connected, guiding enabled, xAngle = 1.0, xRate = 3.0, yAngle = 2.0, yRate = 3.0, parity = +/-
+Dec = 20.0 deg, Hour angle = -1.90 hr, Pier side = West, Rotator pos = N/A
+Frame,Time,mount,dx,dy,RARawDistance,DECRawDistance,RAGuideDistance,DECGuideDistance,RADuration,RADirection,ErrorCode
+"""
+
+
+def night(frames: int) -> str:
+    rows = "".join(f'{k},{3 * k},"Mount",0,0,{math.sin(k / 40):.3f},0,0,0,0,,0\n' for k in range(1, frames))
+    return GUIDE + rows + "Guiding Ends at 2026-01-02 22:00:00\n"
+
+
+def test_a_guide_log_is_listed_and_one_run_taken(ask, say, tmp_path):
+    """`--yes` without a run is no way to get the first of several in silence."""
+    file, out = tmp_path / "PHD2_GuideLog.txt", tmp_path / "out"
+    file.write_text(night(20) + "\n" + night(300))
+    code, document = ask("import", file, "--axis", "--to", out)
+    assert code == 0 and [run["frames"] for run in document["runs"]] == [19, 299] and document["files"] == []
+    assert (
+        f"next: `tvsbayes import {file} --axis --run 2 --to {out} --yes`"
+        in say("import", file, "--axis", "--to", out)[1]
+    )
+    code, document = ask("import", file, "--axis", "--to", out, "--yes")
+    assert code == 2 and "--run 2" in assert_error(document, "usage")["remedy"] and not out.exists()
+    code, document = ask("import", file, "--axis", "--to", out, "--yes", "--run", 2)
+    assert (code, document["readings"], document["moves"]) == (0, 299, 1)
+    said = (out / "campaign.toml").read_text()
+    assert "period_between = [60.0, 298.0]" in said and 'periods_in = "seconds"' in said and "rate = 15.04" in said
+    assert any("[60, 298] s" in text for text in document["assumed"])
+
+
+TABLE = "steps;reading (mm);direction\n" + lines("{c};{v:.4f};{s}\n")
+MISTAKES = {
+    # content, options, what the message says, what the remedy says
+    "directions the other way": (
+        TABLE.replace(";+\n", ";~\n").replace(";-\n", ";+\n").replace(";~\n", ";-\n"),
+        (),
+        "forward where commands rise",
+        "--column approach=",
+    ),
+    "directions of nobody": (TABLE.replace(";+", ";cw"), (), "forward or backward, + or -", "--column approach="),
+    "an uncertainty below zero": ("steps,angle,sd\n0,1,0.1\n1,2,-0.1\n", (), "a number from 0", "correct the cell"),
+    "a word among readings": (TABLE.replace("5.0000", "abc", 1), (), 'found "abc"', "correct the cell"),
+    "two readings": ("steps,mm,deg\n0,1,2\n1,2,3\n", (), "value", "--column value=NAME"),
+    "no names": ("0,1\n5,2\n10,3\n", (), "no column that is surely", "--column command=NAME"),
+    "deviations for positions": (
+        "target (mm),reading (mm)\n" + "".join(f"{10 * k},0.00{k * 7 % 10}\n" for k in range(9)),
+        (),
+        "readings that span",
+        "add --deviations",
+    ),
+    "counts that wrap at another number": (
+        "steps,encoder counts\n" + "".join(f"{100 * k},{97 * k % 1000}\n" for k in range(60)),
+        (),
+        "jump by about 1000 counts",
+        "--counts-per-turn N",
+    ),
+    "times that run back": ("t,steps,angle\n0,0,1\n2,1,2\n1,2,3\n", (), "times that do not decrease", "sort the rows"),
+    "runs in two units": (
+        "mm,Forward 1 (mm),Backward 1 (um)\n0,1,2\n1,2,3\n",
+        (),
+        "runs in mm, um",
+        "in one unit",
+    ),
+    "runs without positions": ("Forward 1,Backward 1\n0,1\n1,2\n", (), "surely their position", "command=NAME"),
+    "more cells than names": ("steps,mm\n0,1\n1,2,3\n", (), "3 cells under the 2 names", "decimal commas"),
+    "an empty file": ("\n", (), "no cells", "name the file"),
+    "names alone": ("steps,mm\n", (), "no rows below the names", "with the data"),
+    "an unknown format": (TABLE, ("--format", "phd"), "--format phd", "phd2"),
+    "a table as a guide log": (TABLE, ("--format", "phd2"), "no run with frames", "holds guiding"),
+    "a run of a table": (TABLE, ("--run", 1), "--run is of another kind of file", "--format"),
+    "a column of a guide log": (night(99), ("--column", "u=dx"), "--column is of another kind", "leave it out"),
+    "a run that is not there": (night(99), ("--run", 3), "holds 1 runs", "list"),
+    "an assumption of nobody": (night(99), ("--assume", "dec=3"), "--assume dec=3", "declination_deg=45.9"),
+    "an assumption that is no number": (night(99), ("--assume", "declination_deg=x"), "allowed:", "declination_deg"),
+    "a declination unknown": (night(99).replace("Dec = 20.0 deg", "Dec = Unknown"), (), "declination", "--assume"),
+    "a scale unknown": (night(99).replace("Pixel scale = 2.0", "Pixel scale = ?"), (), "pixel scale", "--assume"),
+    "a rate unknown": (night(99).replace("xRate = 3.0, ", ""), (), "xRate", "pulse_arcsec_per_s=NUMBER"),
+    "near the pole": (night(99).replace("Dec = 20.0", "Dec = 88.0"), (), "a declination of 88 deg", "equator"),
+    "calibration alone": ("Calibration Begins at 2026\nGuiding Begins at 2026\n", (), "no run with frames", "guiding"),
+    "series of nobody": (
+        WRITTEN["camonitor"].replace("Axis1", "A").replace("Enc1", "B"),
+        (),
+        "series that change",
+        "command=NAME",
+    ),
+    "a series that is not there": (WRITTEN["camonitor"], ("--column", "value=X"), "no such series", "name one of"),
+    "an angle sensor alone": ('{"q": "angle:a", "params": {"data": [[1, 2]]}}\x03', (), "angle:a", "data_logger.py"),
+    "a calibration cut off": ("[angle a]\nstepper: x\ncalibrate = 1.5\n", (), "1 angles", "ANGLE_CALIBRATE"),
+    "minutes beyond 60": ("steps;angle\n0;1\u00b061'00\"\n1;2\u00b000'00\"\n", (), 'found "1', "correct the cell"),
+    "two notations in a column": ("steps;angle\n0;1 mm\n1;2 deg\n", (), 'found "1 mm"', "correct the cell"),
+    "a guide log without --axis": (night(99), None, "no column", "--axis"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_refused_in_one_sentence_with_the_mend(ask, tmp_path, name):
+    """Nothing is written, and the message is one line."""
+    content, options, found, remedy = MISTAKES[name]
+    file, out = tmp_path / "log.txt", tmp_path / "out"
+    file.write_text(content, encoding="utf-8")
+    code, document = ask("import", file, "--to", out, "--yes", *(("--axis", *options) if options is not None else ()))
+    error = document["error"]
+    assert code == 2 and not out.exists()
+    assert found in error["message"] and remedy in error["remedy"]
+    assert "\n" not in error["message"] and len(error["message"]) < 600
