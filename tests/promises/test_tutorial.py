@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import doctest
+import json
 import re
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -194,3 +196,24 @@ def test_shipped_picture_is_what_the_script_draws(drawing, tmp_path, monkeypatch
     assert np.abs(numbers - shipped).max() < HALF_POINT
     # The label at the arc of the pan angle says "> 0: left".
     assert drawing.PAN_DEG > 0
+
+
+@pytest.mark.slow
+def test_the_way_without_an_instrument_ends_as_its_page_says(tmp_path, monkeypatch, capsys):
+    """Six commands of instrument.md, then the sentence below them: looks, minutes, ratio, interval, truth."""
+    page = (ROOT / "data" / "docs" / "instrument.md").read_text(encoding="utf-8")
+    block, sentence = re.search(r"```sh\n(tvsbayes plan .*?)```\s+(The plan holds .*?)\n\n", page, re.DOTALL).groups()
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    monkeypatch.chdir(tmp_path)
+    with caching_in(tmp_path / "cache"):
+        for line in block.splitlines():
+            assert run(shlex.split(line)[1:]) == 0, line
+    printed = capsys.readouterr().out
+    left = json.loads((tmp_path / "run/results/fit.json").read_text())["effective_deg_per_step"]["left"]
+    truth = json.loads((tmp_path / "run/truth.json").read_text())["effective_deg_per_step"]["left"]
+    looks, minutes, *values = map(float, re.findall(r"\d+\.?\d*", sentence))
+    assert [looks, minutes] == [
+        float(re.search(rf"^{name} +([\d.]+)$", printed, re.M)[1]) for name in ("looks", "minutes")
+    ]
+    # To the digits that the page shows.
+    np.testing.assert_allclose([left["value"], *left["interval95"], truth], values, rtol=0, atol=5.1e-5)
