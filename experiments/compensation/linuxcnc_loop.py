@@ -4,9 +4,10 @@
     python -m experiments.compensation.linuxcnc_loop > experiments/compensation/linuxcnc_loop.md
 
 LinuxCNC drives joint 0; a drawn axis of gears follows its pin `motor-pos-cmd`. The axis is measured without a table
-(two homings, nine angles from -80 to 80 deg, both sides), compensated by `compensate --to linuxcnc`, and 12 fresh angles are
-read: with the table, without it, with its sign turned, with a host that adds the same corrections once more, and with
-the play in `BACKLASH`, beside the table and alone. LinuxCNC refuses to run as root: then it runs as the user `nobody`.
+(two homings, nine angles from -80 to 80 deg, both sides), compensated by `compensate --to linuxcnc`, and 12 fresh
+angles are read: with the table, without it, with its sign turned, with a host that adds the same corrections once more,
+and with the play in `BACKLASH`, beside the table and alone. LinuxCNC refuses to run as root: then it runs as the user
+`nobody`.
 """
 
 from __future__ import annotations
