@@ -1,0 +1,109 @@
+"""Files for controllers: what stands in them, in which sense, and what a compiler and LinuxCNC's rule make of it."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from msgspec import structs
+from support.compensated import results, table
+
+from tvsbayes.compensation.correction import Correction
+from tvsbayes.compensation.formats import CSV_COLUMNS, FORMATS
+from tvsbayes.compensation.promise import Wish, compensation_of
+
+WISHES = {
+    "grbl": {"in_force": 250.0},
+    "grblhal": {"in_force": 250.0, "letter": "Y"},
+    "klipper": {"in_force": 8.0},
+    "pec": {"period": 25.0},
+}
+
+
+def written(target: str) -> str:
+    return FORMATS[target].write(table(target, **WISHES.get(target, {})), "tvsbayes of a test")
+
+
+def lines_of(text: str) -> list[str]:
+    return [line for line in text.splitlines() if line and not line.startswith(("#", ";"))]
+
+
+@pytest.mark.parametrize("target", FORMATS)
+def test_every_file_says_of_what_it_is_in_which_sense_and_that_nothing_is_applied(target):
+    text = written(target)
+    for word in ("tvsbayes of a test", "applied to nothing", "sense:", "promise, arriving backward", "since homing"):
+        assert word in text, word
+
+
+def test_csv_holds_the_readings_expected():
+    header, *rows = lines_of(written("csv"))
+    assert header.split(",") == [*CSV_COLUMNS]
+    found = np.array([[float(cell) for cell in row.split(",")] for row in rows])
+    assert found.shape == (17, 5) and np.all(np.diff(found[:, 0]) > 0) and np.all(found[:, 3:] > 0)
+    # Lost motion: arriving forward the reading lags, by a play of 0.3 that varies by 0.02.
+    assert np.mean(found[:, 2] - found[:, 1]) == pytest.approx(0.3, abs=0.06)
+
+
+def test_linuxcnc_sends_the_corrected_command_by_its_rule():
+    """It subtracts (forward - nominal) or (reverse - nominal), linear between lines."""
+    made = table("linuxcnc")
+    nominal, forward, reverse = np.array([[float(c) for c in line.split()] for line in lines_of(written("linuxcnc"))]).T
+    at = np.array([-13.0, 4.4, 17.0])
+    for side, column in ((1, forward), (-1, reverse)):
+        by_rule = at - np.interp(at, nominal, column - nominal)
+        # Seven decimals in the file.
+        np.testing.assert_allclose(by_rule, Correction.of(made).sent(at, np.full(3, side)), atol=2e-7)
+
+
+def test_linuxcnc_of_counters_that_run_backwards_exchanges_the_sides():
+    """The unit falls as the command rises: LinuxCNC's forward is the campaign's backward."""
+    made = compensation_of(results(-1.002), Wish("linuxcnc"))
+    assert made.per_command == -1.0
+    rows = np.array([[float(c) for c in line.split()] for line in lines_of(FORMATS["linuxcnc"].write(made, "x"))])
+    assert np.all(np.diff(rows[:, 0]) > 0)
+    sent = Correction.of(made).sent(np.array([10.0]), np.array([1]))[0]
+    at_unit = rows[np.argmin(np.abs(rows[:, 0] + 10.0))]
+    assert at_unit[0] - (at_unit[2] - at_unit[0]) == pytest.approx(-sent, abs=2e-7)
+
+
+def test_settings_hold_ratio_and_play():
+    ratio = float(lines_of(written("grbl"))[0].removeprefix("$100="))
+    # 250 steps per mm made 1.002 mm; the error by position of 0.05 mm turns the line over 40 mm by 0.3 %.
+    assert ratio == pytest.approx(250 / 1.002, rel=0.004)
+    hal = dict(line.split("=") for line in lines_of(written("grblhal")))
+    assert set(hal) == {"$101", "$161"} and float(hal["$161"]) == pytest.approx(0.3, abs=0.06)
+    klipper = float(lines_of(written("klipper"))[0].removeprefix("rotation_distance: "))
+    assert klipper / 8.0 == pytest.approx(250 / ratio, rel=1e-4)
+
+
+def test_urdf_is_xml_with_zero_and_reduction():
+    tree = ElementTree.fromstring(written("urdf"))
+    values = {node.get("name"): float(node.get("value", "")) for node in tree}
+    assert values["axis_reduction"] == pytest.approx(1 / 1.002, rel=0.004) and values["u_axis_zero"] > 0
+    bound = values["u_axis_zero"] * values["u_axis_reduction"]
+    assert 0 < abs(values["covariance_zero_reduction"]) <= bound
+
+
+def test_pec_repeats_and_names_cannot_end_a_comment():
+    header, *rows = lines_of(written("pec"))
+    assert header == "phase,add" and len(rows) == 64
+    nasty = structs.replace(table("header"), machine="a */ int x; /* b\nc")
+    assert "*/ int" not in FORMATS["header"].write(nasty, "x")
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_header_adds_what_the_table_adds(tmp_path):
+    (tmp_path / "axis.h").write_text(written("header"))
+    at = [-30.0, -13.0, 4.4, 20.0, 31.0]
+    calls = "".join(f'printf("%.9f %.9f\\n", axis_sent({c}, 1), axis_sent({c}, -1));' for c in at)
+    (tmp_path / "try.c").write_text(f'#include <stdio.h>\n#include "axis.h"\nint main(void) {{ {calls} return 0; }}\n')
+    subprocess.run(["cc", "-std=c99", "-Wall", "-Werror", "-o", "try", "try.c"], cwd=tmp_path, check=True)
+    out = subprocess.run([tmp_path / "try"], capture_output=True, text=True, check=True).stdout
+    found = np.array([[float(cell) for cell in line.split()] for line in out.splitlines()])
+    applied = Correction.of(table("header"))
+    for column, side in enumerate((1, -1)):
+        # Nine decimals printed; the table of the file has nine digits.
+        np.testing.assert_allclose(found[:, column], applied.sent(np.array(at), np.full(5, side)), atol=2e-8)

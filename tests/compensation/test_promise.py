@@ -1,0 +1,101 @@
+"""The promise: kept by the axis that it was made of, wider where a format holds less, refused where nothing is sure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.compensated import driven, results, table, to_and_fro, true_axis
+
+from tvsbayes.compensation.correction import Correction
+from tvsbayes.compensation.promise import Since, Wish, compensate, compensation_of
+from tvsbayes.errors import InputError, NotConverged
+from tvsbayes.single_axis.axis_campaign import AxisMove
+from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_record import AxisResults, summarise_axis
+
+
+def errors_after(made, seed: int) -> np.ndarray:
+    """Errors of 28 stops between the positions of the campaign, under a table."""
+    asked, read = to_and_fro(np.linspace(-18.7, 18.7, 14))
+    fresh = driven(true_axis(), asked, read, seed, by=Correction.of(made))
+    at = np.array([asked[r.move].command for r in fresh.readings])
+    return np.array([r.value for r in fresh.readings]) - made.offset - made.per_command * at
+
+
+def test_errors_after_applying_lie_within_the_promise():
+    made = table()
+    bound = np.repeat([made.promise["forward"].error95, made.promise["backward"].error95], 14)
+    inside = np.mean([np.mean(np.abs(errors_after(made, seed)) <= bound) for seed in range(12)])
+    # 95 % of 336 errors that share twelve homings and one table: a few per cent either way.
+    assert 0.88 <= inside <= 1.0
+    before = min(left.without95 for left in made.promise.values())
+    assert bound.max() < 0.2 * before
+
+
+def test_a_format_that_holds_less_leaves_more():
+    left = {name: max(p.error95 for p in table(name, **w).promise.values()) for name, w in CASES.items()}
+    assert left["csv"] < left["grblhal"] < left["grbl"]
+    # grbl leaves half of the play to each side.
+    assert table("grbl", in_force=250.0).promise["forward"].causes["format"] == pytest.approx(0.3, rel=0.3)
+
+
+CASES = {"csv": {}, "grblhal": {"in_force": 250.0}, "grbl": {"in_force": 250.0}}
+
+
+def test_what_rounding_costs_is_in_the_promise():
+    fine, coarse = table(), table("csv", resolution=0.05)
+    for side in ("forward", "backward"):
+        # A rounding of 0.05 mm scatters by 0.05 / sqrt(12) = 0.014 mm.
+        assert coarse.promise[side].error95 > fine.promise[side].error95 + 0.003
+    sent = Correction.of(coarse).sent(np.array([3.0]), np.array([1]))[0]
+    assert sent / 0.05 == pytest.approx(round(sent / 0.05), abs=1e-9)
+
+
+def test_nominal_is_what_is_stated_or_one_or_the_fit():
+    assert table().per_command == 1.0
+    made = table("csv", per_command=1.01)
+    assert made.per_command == 1.01
+    # The table then takes off the ratio too: 0.8 % of 40 mm.
+    assert made.table[-1].add_forward - made.table[0].add_forward == pytest.approx(0.32, abs=0.1)
+
+
+def test_time_and_travel_since_homing_are_the_longest_segment():
+    moves = [
+        AxisMove(0, 0, 0.0, 0.0),
+        AxisMove(1, 0, 3600.0, 5.0),
+        AxisMove(2, 1, 9000.0, 0.0),
+        AxisMove(3, 1, 9001.0, 9.0),
+    ]
+    assert Since.of(moves) == Since(1.0, 9.0)
+
+
+@pytest.mark.parametrize(
+    ("wish", "said"),
+    [
+        (Wish("step7"), "unknown"),
+        (Wish("grbl"), "$100"),
+        (Wish("csv", in_force=3.0), "--in-force"),
+        (Wish("csv", per_command=-1.0), "--per-command"),
+        (Wish("csv", resolution=float("nan")), "--resolution"),
+        (Wish("pec"), "--period"),
+        (Wish("pec", period=4.0), "eight positions"),
+    ],
+)
+def test_wishes_that_cannot_be_met_are_refused(wish, said):
+    with pytest.raises(InputError) as refused:
+        compensation_of(results(), wish)
+    assert said in f"{refused.value.message} {refused.value.allowed}"
+
+
+def test_no_table_is_made_of_a_laplace_approximation():
+    campaign = results().fit.campaign
+    fit = fit_axis(campaign, sampled=False)
+    with pytest.raises(NotConverged, match="Laplace"):
+        compensation_of(AxisResults(summarise_axis(fit), fit, False), Wish())
+
+
+def test_python_makes_the_file_in_one_call():
+    made = compensate(replace(results().fit.campaign, header={"serial": "A 7"}), "linuxcnc")
+    assert made.machine == "A 7" and "machine: A 7" in made.text and made.text.startswith("-20.0")

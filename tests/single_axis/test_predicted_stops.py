@@ -1,0 +1,40 @@
+"""Readings of further moves: predicted as drawn axes give them, and joined to what the fit knows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.compensated import driven, results, to_and_fro, true_axis
+
+from tvsbayes.single_axis.predicted_stops import predicted_stops
+
+
+def test_further_readings_lie_where_they_are_predicted():
+    fit = results().fit
+    asked, read = to_and_fro(np.linspace(-17.3, 17.3, 6))
+    found = predicted_stops(fit, asked, read, np.full(len(read), 0.002))
+    mean, covariance = found.pooled()
+    squares = []
+    for seed in range(20):
+        value = np.array([r.value for r in driven(true_axis(), asked, read, seed).readings])
+        off = value - mean
+        squares.append(off @ np.linalg.solve(covariance, off) / len(off))
+    # Twenty runs share the errors of one table: about 1, within a factor of two.
+    assert 0.5 < np.mean(squares) < 2.0
+    assert np.all(np.sqrt(np.diag(covariance)) < 0.04)
+
+
+def test_draws_have_the_moments_of_the_mixture_and_its_density():
+    fit = results().fit
+    asked, read = to_and_fro(np.array([-5.0, 5.0]))
+    found = predicted_stops(fit, asked, read, np.full(4, 0.002))
+    mean, covariance = found.pooled()
+    drawn = found.drawn(16000, np.random.default_rng(0))
+    sd = np.sqrt(np.diag(covariance))
+    # Means of 16000 to a few hundredths of their sd, standard deviations to a few per cent.
+    np.testing.assert_allclose(drawn.mean(axis=0), mean, atol=0.04 * sd.min())
+    np.testing.assert_allclose(drawn.std(axis=0), sd, rtol=0.05)
+    assert found.log_density(mean) > found.log_density(mean + 3 * sd)
+    flat = 1e4 * np.ones((4, 4))
+    shifts = found.log_density(mean, flat) - found.log_density(mean + 1.0, flat)
+    assert shifts == pytest.approx(0.0, abs=1e-3)
