@@ -22,7 +22,8 @@ from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import AppliedBy, Compensation, SidePromise, TableRow
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis
-from tvsbayes.single_axis.axis_fit import AxisFit, line_weights
+from tvsbayes.single_axis.axis_density import line_weights
+from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_of
 from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops

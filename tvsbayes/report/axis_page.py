@@ -11,13 +11,12 @@ import numpy as np
 from tvsbayes.errors import typed
 from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.axis_text import (
-    CONFLICTING,
+    axis_verdict,
     deviation_table,
     for_firmware,
     iso230_table,
     parameter_table,
     ratio_table,
-    reserved,
     worst_place,
 )
 from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, drawing
@@ -94,12 +93,10 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     classic = summary.classic
     told = f"Least-squares line: {concise(classic.per_command, classic.u_per_command)} {unit} per command, stops "
     told += f"independent, residual scatter {two_digits(classic.residual_sd)} {unit}."
-    usable = f"The intervals may be used{reserved(summary)}."
-    converged = usable if summary.converged else "NOT CONVERGED: the numbers must not be used"
-    if summary.converged and summary.prior_conflicts:
-        converged = f"PRIOR CONFLICT: {CONFLICTING}."
+    verdict = axis_verdict(summary)
+    verdict = f"{verdict[0].upper()}{verdict[1:]}."
     conflicts = [f"Prior conflict: {text}" for text in summary.prior_conflicts]
-    offered = (worst_place(summary), for_firmware(summary)) if summary.converged else ()
+    offered = (worst_place(summary), for_firmware(summary)) if summary.explained else ()
     in_words = [f"{text[0].upper()}{text[1:]}." for text in offered]
     header = fit.campaign.header
     created = header.get("created")
@@ -108,8 +105,8 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
         results=hashlib.sha256(said.encode()).hexdigest()[:NUMBER_DIGITS].upper(),
         name=title_of(header, fit.campaign.path),
         about=about_table(header, str(created) if created else "", issue),
-        verdict=f"{converged} No limit was stated." if summary.converged else converged,
-        verdict_class="cannot-tell" if summary.converged else "not-met",
+        verdict=f"{verdict} No limit was stated." if summary.explained else verdict,
+        verdict_class="cannot-tell" if summary.explained else "not-met",
         numbers=numbers,
         why=(),
         answer=ratio_table(summary),

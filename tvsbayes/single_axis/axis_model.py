@@ -7,7 +7,7 @@ states over the rows, whose innovations whiten the columns of everything else; c
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -54,6 +54,33 @@ class LinearPosterior:
         values, vectors = np.linalg.eigh(covariance)
         normal = rng.standard_normal(values.shape) * np.sqrt(np.maximum(values, 0.0))
         return self.mean @ functionals.T + np.einsum("nij,nj->ni", vectors, normal)
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Of the readings at many coordinates, what is linear integrated out.
+
+    Attributes:
+        log_density: shape (n,).
+        linear: of the functionals that were asked for, in the place of columns.
+    """
+
+    log_density: np.ndarray
+    linear: LinearPosterior
+
+    @classmethod
+    def nowhere(cls, count: int, wanted: int) -> Likelihood:
+        """Without a value."""
+        return cls(
+            np.full(count, -np.inf), LinearPosterior(np.zeros((count, wanted)), np.zeros((count, wanted, wanted)))
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Likelihood]) -> Likelihood:
+        """One after the other."""
+        mean, covariance = ([getattr(part.linear, name) for part in parts] for name in ("mean", "covariance"))
+        linear = LinearPosterior(np.concatenate(mean), np.concatenate(covariance))
+        return cls(np.concatenate([part.log_density for part in parts]), linear)
 
 
 @dataclass(frozen=True)
@@ -264,36 +291,59 @@ class AxisModel:
 
     def log_likelihood(self, w: np.ndarray) -> np.ndarray:
         """Log density of the readings at coordinates (n, d), shape (n,)."""
-        found = np.empty(len(w))
-        rows = len(self.rows.move)
+        return self.likelihood(w, np.zeros((0, self.columns))).log_density
+
+    def likelihood(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
+        """At coordinates (n, d), with what it says of functionals (t, columns) of what is linear."""
+        rows, wanted = len(self.rows.move), len(functionals)
+        log_density, mean, covariance = np.empty(len(w)), np.empty((len(w), wanted)), np.empty((len(w), wanted, wanted))
         for part, block in self._blocks(w):
             information, towards = _information(block, 0)
             root, scaled, scale = _equilibrated(information)
-            solved = np.linalg.solve(scaled, (towards / scale)[..., None])[..., 0]
-            explained = np.sum(towards / scale * solved, axis=1)
+            sides = np.concatenate([towards[:, None], functionals @ block.factor], axis=1) / scale[:, None]
+            solved = np.linalg.solve(scaled, np.swapaxes(sides, 1, 2))
+            found = sides @ solved
             log_det = 2 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)) + np.log(scale), axis=1)
-            left = block.products[:, 0, 0] - explained
-            found[part] = -0.5 * (block.log_scatter + log_det + left + rows * np.log(2 * np.pi))
+            left = block.products[:, 0, 0] - found[:, 0, 0]
+            log_density[part] = -0.5 * (block.log_scatter + log_det + left + rows * np.log(2 * np.pi))
+            mean[part], covariance[part] = found[:, 0, 1:], found[:, 1:, 1:]
+        if wanted:
+            mean += self._prior_means(w) @ functionals.T
+        return Likelihood(log_density, LinearPosterior(mean, covariance))
+
+    def _prior_means(self, w: np.ndarray) -> np.ndarray:
+        """Of the columns, (n, columns): what their deviations are from."""
+        found = np.zeros((len(w), self.columns))
+        found[:, OFFSET] = self.rows.line[0] + self.rows.line[1] * self.middle
+        found[:, SLOPE] = self.priors["per_command"].value
+        found[:, BACKLASH] = self.coordinates.values(w)["backlash"]
         return found
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
         """Log posterior density at coordinates (n, d) up to a constant, shape (n,); -inf where it has no value."""
-        found = np.full(len(w), -np.inf)
+        return self.posterior(w, np.zeros((0, self.columns))).log_density
+
+    def posterior(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
+        """The same with the prior of the coordinates; nought where it has no value."""
+        wanted = len(functionals)
+        found = Likelihood.nowhere(len(w), wanted)
         usable = np.flatnonzero(np.all(np.abs(w) < FARTHEST, axis=1))
         if len(usable):
-            value = self._possible(w[usable]) - 0.5 * np.sum(w[usable] ** 2, axis=1)
-            found[usable] = np.where(np.isfinite(value), value, -np.inf)
+            seen = self._possible(w[usable], functionals)
+            value = seen.log_density - 0.5 * np.sum(w[usable] ** 2, axis=1)
+            found.log_density[usable] = np.where(np.isfinite(value), value, -np.inf)
+            found.linear.mean[usable], found.linear.covariance[usable] = seen.linear.mean, seen.linear.covariance
         return found
 
-    def _possible(self, w: np.ndarray) -> np.ndarray:
-        """`log_likelihood`, -inf where rounding leaves a matrix no factor."""
+    def _possible(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
+        """`likelihood`, -inf where rounding leaves a matrix no factor."""
         try:
-            return self.log_likelihood(w)
+            return self.likelihood(w, functionals)
         except np.linalg.LinAlgError:
             if len(w) == 1:
-                return np.array([-np.inf])
+                return Likelihood.nowhere(1, len(functionals))
             middle = len(w) // 2
-            return np.concatenate([self._possible(w[:middle]), self._possible(w[middle:])])
+            return Likelihood.joined([self._possible(half, functionals) for half in (w[:middle], w[middle:])])
 
     def linear(self, w: np.ndarray) -> LinearPosterior:
         """What is linear, given coordinates (n, d); means are whole, not deviations from the priors'."""
@@ -312,10 +362,7 @@ class AxisModel:
                 # Of the error by position, then of the play: independent beforehand.
                 free = block.factor[:, own[:, None], own]
                 covariances[part, own[:, None], own] += free @ np.swapaxes(free, 1, 2)
-        means[:, OFFSET] += self.rows.line[0] + self.rows.line[1] * self.middle
-        means[:, SLOPE] += self.priors["per_command"].value
-        means[:, BACKLASH] += self.coordinates.values(w)["backlash"]
-        return LinearPosterior(means, covariances)
+        return LinearPosterior(means + self._prior_means(w), covariances)
 
     def left_out(self, w: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is foretold of some rows by all others, given the scales.
