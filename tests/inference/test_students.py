@@ -9,6 +9,7 @@ from support.small_posterior import SIGMAS
 
 from tvsbayes.errors import NotConverged
 from tvsbayes.inference.density import Points
+from tvsbayes.inference.ensemble import moves
 from tvsbayes.inference.importance import weighted_run
 from tvsbayes.inference.students import StudentMixture
 
@@ -69,10 +70,11 @@ def test_a_bent_target_is_followed_from_a_guess_that_is_far_too_narrow():
     assert evidence.log_evidence == pytest.approx(np.log(np.pi), abs=SIGMAS * evidence.log_evidence_mcse)
 
 
-def test_its_chain_keeps_the_target():
+@pytest.mark.parametrize("which", [0, 1])
+def test_its_steps_keep_the_target(which):
     mixture = StudentMixture.about(np.zeros(2), np.eye(2))
-    ((step, share),) = mixture.steps
-    assert 0 < share < 1
+    step, _ = mixture.steps[which]
+    assert sum(share for _, share in mixture.steps) == 1 and len(moves(mixture)) == 2
     generator = np.random.RandomState(3)
     exact = generator.standard_normal((64, 2))
     exact[:, 1] = 0.5 * exact[:, 0] ** 2 + 0.5 * exact[:, 1]

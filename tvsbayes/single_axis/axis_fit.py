@@ -25,6 +25,8 @@ from tvsbayes.single_axis.classic_line import fit_line
 MODE, WEIGHING, WALKING, TELLING = "mode", "weighted draws", "chain", "summarising"
 EQUAL_DRAWS = 2000
 """Kept of a sample, of equal weight."""
+ROUNDS_MAX = 16
+"""Of weighted draws: ends of an interval that is thin there take more draws than are worth the time of a chain."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -169,7 +171,7 @@ def fit_axis(
         mode, sample = find_mode(model), None
         if sampled and len(mode.w) and np.isfinite(mode.log_density):
             job.begin(WEIGHING)
-            run, began = weighted_run(AxisDensity(model, mode), seed, job.at), time.monotonic()
+            run, began = weighted_run(AxisDensity(model, mode), seed, job.at, ROUNDS_MAX), time.monotonic()
             sample = run.sample
             if tier == "emcee":
                 from tvsbayes.inference.ensemble import Run, better
