@@ -132,8 +132,8 @@ controller adds its corrections by itself.
 """
 TURNED = """Had the sign been turned:
 """
-END = """`tvsbayes report stage` shows table, promise and verdict beside the calibration. A nightly job may run `verify`:
-it exits with 0 where the promise is kept, 1 where it is broken, 3 where the readings do not tell.
+END = """`tvsbayes report stage` shows table, promise and verdict beside the calibration. A nightly job may run
+`verify`: it exits with 0 where the promise is kept, 1 where it is broken, 3 where the readings do not tell.
 """
 
 if __name__ == "__main__":

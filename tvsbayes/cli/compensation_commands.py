@@ -115,8 +115,8 @@ def verify(
 ) -> None:
     """Whether a machine keeps the promise of its table.
 
-    KEPT, BROKEN or CANNOT TELL: exit 0, 1 or 3. FRESH lists the commands that were asked for, before the correction. Which world fits: applied, not
-    applied, applied twice, wrong sign, another machine.
+    KEPT, BROKEN or CANNOT TELL: exit 0, 1 or 3. FRESH lists the commands that were asked for, before the correction.
+    Which world fits: applied, not applied, applied twice, wrong sign, another machine.
     """
     from tvsbayes.compensation.verification import stored_compensation
     from tvsbayes.compensation.verification import verify as verified
