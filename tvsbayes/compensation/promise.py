@@ -120,11 +120,14 @@ def refuse_unaccepted(results: AxisResults) -> None:
     """A table is made of an accepted answer alone: it moves a machine.
 
     Raises:
-        NotConverged: the fit is a Laplace approximation.
+        NotConverged: the answer is rough, or a Laplace approximation.
     """
-    if results.summary.estimator == "laplace":
-        message = "the fit is a Laplace approximation: no table is made of it, because its promise would be too small"
-        raise NotConverged("laplace", message, remedy="run `tvsbayes fit` without --no-sample, then compensate again")
+    answer = results.summary.answer
+    if answer != "accepted":
+        what = "a rough answer" if answer == "rough" else "a Laplace approximation"
+        message = f"the fit is {what}, not an accepted answer: the promise of a table made of it cannot be trusted"
+        remedy = "run `tvsbayes fit` again, without --no-sample or --quick, then compensate"
+        raise NotConverged("unaccepted", message, remedy=remedy)
 
 
 def _nominal(campaign: AxisCampaign, fitted: float, wish: Wish) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tvsbayes.compensation.verification import compensation_in, verification_in
 from tvsbayes.errors import typed
 from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.axis_text import (
@@ -19,13 +20,14 @@ from tvsbayes.report.axis_text import (
     ratio_table,
     worst_place,
 )
+from tvsbayes.report.compensation_text import compensation_section
 from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, drawing
 from tvsbayes.report.first_page import about_table
 from tvsbayes.report.page import NUMBER_DIGITS, numbered
 from tvsbayes.report.tables import FigureView, Issue, Number, Page, Section, concise, figure_view, two_digits
 from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.records import plain
-from tvsbayes.single_axis.axis_campaign import axis_hashes
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_record import AxisResults, deviation_functionals
 
 if TYPE_CHECKING:
@@ -75,6 +77,12 @@ def _figure_of(fit: AxisFit) -> FigureView:
     return figure_view(error_figure(fit), alt, caption)
 
 
+def _applied(campaign: AxisCampaign) -> list[Section]:
+    """What `compensate` and `verify` left beside the fit."""
+    made = compensation_in(campaign)
+    return [] if made is None else [compensation_section(made, verification_in(campaign, made))]
+
+
 def axis_page(results: AxisResults, issue: Issue) -> Page:
     """The page with its number; `results.fit` holds `curve_commands` of its range."""
     summary, fit = results.summary, results.fit
@@ -122,6 +130,7 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
                 "What repeats by position",
                 tables=[deviation_table(summary.deviations, unit, TABLE_ROWS)],
             ),
+            *_applied(fit.campaign),
             Section("What the readings cannot tell", items=summary.weak_directions or ["Nothing of note."]),
             Section("Classic", text=[told], tables=[iso230]),
             Section("Method", text=method),
