@@ -29,6 +29,10 @@ BLOCKS_PER_SD = 4
 WIDE_SD_PX = 5.0
 """Of a spot whose noise its own pixels show; in a narrower one they show its shape as well."""
 SHRINK = 4
+LAMP_TIMES, LAMP_DIM = 4.0, 0.8
+"""A bright area at the border, or larger than any spot, is a lamp or a window beside a spot of which it has so many
+times the area, or at most this share of the height: what of a laser's spot lies at the border is brighter than the
+reflections that it makes elsewhere, and no larger than they are."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,9 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     count, labels, stats, centroids = cv2.connectedComponentsWithStats(bright[around], connectivity=8)
     lit = labels > 0
     flux = np.bincount(labels[lit].astype(np.intp), weights=above[around][lit], minlength=count)
+    heights = np.zeros(count)
+    np.maximum.at(heights, labels[lit], above[around][lit])
+    flux[_lamps(stats, heights, flux, (column, row), bright.shape)] = 0.0
     main = int(flux.argmax())
     if np.sort(flux)[-2] > SECOND_SHARE * flux[main]:
         return "two-spots"
@@ -120,6 +127,31 @@ def patch_around(picture: np.ndarray) -> Patch | str:
         outline_px=outline + np.array([left, top]),
         size=(width, height),
     )
+
+
+def _lamps(
+    stats: np.ndarray, heights: np.ndarray, flux: np.ndarray, corner: tuple[int, int], shape: tuple[int, ...]
+) -> list[int]:
+    """Bright areas that are lamps or windows beside a spot: at the border or too large, and large or dim beside it.
+
+    Args:
+        stats: of the areas, as OpenCV counts them from `corner`; (n, 5).
+        heights: over the background, DN; (n,).
+        flux: sum over the area; (n,).
+        corner: column and row of the first cell.
+        shape: rows and columns of the picture in cells.
+    """
+    left, top = stats[:, 0] + corner[0], stats[:, 1] + corner[1]
+    right, bottom = left + stats[:, 2], top + stats[:, 3]
+    area = stats[:, 4].astype(float)
+    at_border = (left <= 0) | (top <= 0) | (right >= shape[1]) | (bottom >= shape[0])
+    odd = at_border | (area > AREA_MAX_SHARE * shape[0] * shape[1])
+    odd[0] = True
+    if odd.all():
+        return []
+    best = int(np.argmax(np.where(odd, -1.0, flux)))
+    large, dim = area >= LAMP_TIMES * area[best], heights <= LAMP_DIM * heights[best]
+    return [k for k in range(1, len(area)) if odd[k] and (large[k] or dim[k])]
 
 
 def _wide_median(wide: np.ndarray) -> np.ndarray:
