@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.common.command_line import parser
-from experiments.real.axis_files import axis_of, tables_of
+from experiments.common.printed_runs import axis_of, tables_of
 from tvsbayes.compensation.promise import Wish, compensation_of
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import AxisFit

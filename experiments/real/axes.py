@@ -20,8 +20,8 @@ import numpy as np
 
 from experiments.common.command_line import parser
 from experiments.common.figures import page_figure, title_and_figure
+from experiments.common.printed_runs import axis_of, tables_of
 from experiments.common.rows import append_row, output, read_rows, run_rows
-from experiments.real.axis_files import axis_of, tables_of
 from tvsbayes.report.drawing import BLUE, RED
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
