@@ -287,6 +287,10 @@ def test_exports_are_read_back(folder, capsys, tmp_path):
         assert run(["steps-for", str(folder), "--export", kind, "--out", str(place)]) == 0
         assert str(place) in capsys.readouterr().out.replace("\n", "")
     assert (tmp_path / "out.header").read_text() == header
+    assert run(["compensate", str(folder), "--to", "header"]) == 0
+    assert capsys.readouterr().out == header
+    code, document = ask("compensate", folder, "--to", "linuxcnc")
+    assert code == 2 and "--to header" in document["error"]["remedy"]
     assert load_calibration(path).steps_for(point).as_json() == exported.steps_for(point).as_json()
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -23,10 +25,15 @@ from tvsbayes.cli.app import (
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
+from tvsbayes.pipeline import calibration_for
 from tvsbayes.progress import Job
 
 FITTING, MAKING = "fit", "compensation"
 LETTERS, APPLIERS = "XYZABC", ("controller", "host")
+
+
+def _is_scanner(folder: Path) -> bool:
+    return (folder / "campaign.toml").is_file() and not axis_commands.is_axis(folder)
 
 
 def _refuse_scanner(folder: Path, command: str) -> None:
@@ -35,9 +42,9 @@ def _refuse_scanner(folder: Path, command: str) -> None:
     Raises:
         InputError: it is a campaign of a scanner.
     """
-    if (folder / "campaign.toml").is_file() and not axis_commands.is_axis(folder):
+    if _is_scanner(folder):
         message = f"{command} is for an axis, and {escaped(str(folder), 200)} is the campaign of a scanner"
-        remedy = "its compensation is `tvsbayes steps-for CAMPAIGN --export header`, its verification `tvsbayes watch`"
+        remedy = "its compensation is `tvsbayes compensate CAMPAIGN --to header`, its verification `tvsbayes watch`"
         raise InputError("usage", message, remedy=remedy)
 
 
@@ -64,7 +71,8 @@ def compensate(
 ) -> None:
     """A controller's table, and the promise of what it leaves.
 
-    Nothing is applied. With -o the promise is kept in results/compensation.json, for `verify`.
+    Nothing is applied. With -o the promise is kept in results/compensation.json, for `verify`. Of a scanner's campaign
+    `--to header` gives its calibration for a microcontroller; its promise is that of `locate`.
     """
     from tvsbayes.compensation.promise import Wish, compensation_of, file_text
     from tvsbayes.report.compensation_text import compensation_text
@@ -74,7 +82,11 @@ def compensate(
     from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
     from tvsbayes.single_axis.axis_record import results_for
 
-    _refuse_scanner(campaign, "compensate")
+    if to == "header" and _is_scanner(campaign):
+        # Counters of two axes follow from the calibration as a whole: it is the table.
+        export_calibration(campaign, to, out, as_json)
+        return
+    _refuse_scanner(campaign, f"compensate --to {escaped(to)}")
     _one_of("--applied-by", applied_by, APPLIERS)
     _one_of("--letter", letter, tuple(LETTERS))
     spared(out)
@@ -98,6 +110,25 @@ def compensate(
     else:
         text += f"\nnext: apply it, then {command_line('verify', campaign, 'FRESH')}"
     finish({**document, "files": files}, text, as_json)
+
+
+def export_calibration(campaign: Path, kind: str, out: Path | None, as_json: bool) -> None:
+    """The calibration for another language, printed or into a file."""
+    with waiting() as progress:
+        calibration = calibration_for(campaign, report_line, progress)
+    from tvsbayes.calibration.c_header import calibration_header
+    from tvsbayes.calibration.calibration_file import Origin, calibration_json
+    from tvsbayes.instrument.campaign import read_campaign
+
+    origin = Origin.of(read_campaign(campaign))
+    stored = calibration_json(calibration, origin)
+    text = calibration_header(calibration, origin) if kind == "header" else json.dumps(stored, indent=1)
+    document: Mapping[str, Any] = {"header": text} if kind == "header" else stored
+    if out is not None:
+        write_atomically(out, f"{text.rstrip()}\n".encode())
+        finish({"files": {kind: str(out)}}, f"written: {escaped(str(out), 200)}", as_json)
+        return
+    finish(document, text.rstrip("\n"), as_json)
 
 
 def _one_of(option: str, given: str, allowed: tuple[str, ...]) -> None:

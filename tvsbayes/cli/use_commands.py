@@ -5,12 +5,10 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -30,11 +28,11 @@ from tvsbayes.cli.app import (
     report_line,
     spared,
 )
-from tvsbayes.cli.compensation_commands import plan_verify
+from tvsbayes.cli.compensation_commands import export_calibration, plan_verify
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
 from tvsbayes.errors import InputError, escaped
-from tvsbayes.files.disk import output_place, write_atomically
+from tvsbayes.files.disk import output_place
 from tvsbayes.pipeline import FITTING, calibration_for, compile_for, fit_for
 from tvsbayes.progress import Job
 
@@ -189,7 +187,7 @@ def steps_for(
         spared(out)
         remedy = "leave it out, --export writes the calibration itself; or leave out --export"
         refuse_options("for one target", remedy, **target, **options)
-        _export(campaign, export, out, as_json)
+        export_calibration(campaign, export, out, as_json)
         return
     refuse_options("for the exported calibration", "add --export header or --export json", out=out)
     if given != (3 if point else 2 if direction else -1):
@@ -211,25 +209,6 @@ def steps_for(
     found = calibration.steps_for(point, azimuth_deg=azimuth, elevation_deg=elevation, approach=sides, limits=limits)
     document = {"estimator": calibration.estimator, **found.as_json()}
     finish(document, steps_text(found), as_json)
-
-
-def _export(campaign: Path, kind: str, out: Path | None, as_json: bool) -> None:
-    """The calibration for another language, printed or into a file."""
-    with waiting() as progress:
-        calibration = calibration_for(campaign, report_line, progress)
-    from tvsbayes.calibration.c_header import calibration_header
-    from tvsbayes.calibration.calibration_file import Origin, calibration_json
-    from tvsbayes.instrument.campaign import read_campaign
-
-    origin = Origin.of(read_campaign(campaign))
-    stored = calibration_json(calibration, origin)
-    text = calibration_header(calibration, origin) if kind == "header" else json.dumps(stored, indent=1)
-    document: Mapping[str, Any] = {"header": text} if kind == "header" else stored
-    if out is not None:
-        write_atomically(out, f"{text.rstrip()}\n".encode())
-        finish({"files": {kind: str(out)}}, f"written: {escaped(str(out), 200)}", as_json)
-        return
-    finish(document, text.rstrip("\n"), as_json)
 
 
 TargetText = Annotated[
