@@ -78,3 +78,46 @@ def test_too_many_pictures_are_refused_before_they_are_opened(tmp_path):
         (tmp_path / f"shot{k}.png").touch()
     with pytest.raises(InputError, match="101 pictures"):
         paired_pictures(tmp_path, most=100)
+
+
+CLOCKS = ("A/t9.png", "A/t10.png", "B/t11.png", "B/t8.png")
+"""Two cameras whose pictures bear the times of their own clocks."""
+
+
+@pytest.mark.parametrize(
+    ("options", "first", "second"),
+    [
+        ({"in_order": True}, "left", "right"),
+        ({"in_order": True, "swap": True}, "right", "left"),
+        ({"globs": ("A/*.png", "B/*.png")}, "left", "right"),
+        ({"globs": ("B/*.png", "A/*.png")}, "right", "left"),
+    ],
+)
+def test_pairs_as_stated_go_by_their_order(tmp_path, options, first, second):
+    """Times of 9 and 10 s belong to 8 and 11 s; numbers are counted, and no name pairs up."""
+    write(tmp_path, CLOCKS)
+    found = paired_pictures(tmp_path, most=4, **options)
+    by_view: dict[str, dict[str, str]] = {}
+    for picture in found:
+        (side,) = picture.sides
+        by_view.setdefault(picture.view, {})[side] = picture.path.relative_to(tmp_path).as_posix()
+    assert sorted((pair[first], pair[second]) for pair in by_view.values()) == [
+        ("A/t10.png", "B/t11.png"),
+        ("A/t9.png", "B/t8.png"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"globs": ("A/*.png", "B/t8.png")}, "2 left and 1 right pictures"),
+        ({"globs": ("A/*.png", "C/*.png")}, "2 and 0 pictures"),
+        ({"globs": ("A/*.png", "../B/*.png")}, "pictures of two cameras"),
+        ({"in_order": True, "most": 3}, "3 at most"),
+    ],
+)
+def test_pairs_as_stated_that_are_none_are_refused(tmp_path, options, message):
+    """A pattern that leaves the folder names nothing."""
+    write(tmp_path, CLOCKS)
+    with pytest.raises(InputError, match=message):
+        paired_pictures(tmp_path, **{"most": 4, **options})

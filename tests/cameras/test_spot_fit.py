@@ -37,6 +37,13 @@ def lamp() -> np.ndarray:
     return dark
 
 
+def window(frame: np.ndarray) -> np.ndarray:
+    """A bright window that reaches in from the corner: 60 x 50 px of 320 x 240."""
+    lit = frame.copy()
+    lit[:50, :60] = 235
+    return lit
+
+
 def hot_pixel() -> np.ndarray:
     raw = np.full((HEIGHT, WIDTH), 12, np.uint8)
     raw[100, 151] = 240
@@ -48,6 +55,7 @@ REFUSED = {
     "two-spots": lambda: picture(Footprint(HERE, SMALL, 180.0), Footprint(THERE, SMALL, 150.0)),
     "too-small": hot_pixel,
     "too-large": lamp,
+    "lamp": lambda: window(picture(None)),
     "border": lambda: picture(Footprint(np.array([2.0, 100.0]), 4 * SMALL, 180.0)),
     "clipped": lambda: picture(Footprint(HERE, 2 * SMALL, 3000.0)),
     "misshapen": lambda: picture(Footprint(HERE, SMALL, 150.0), Footprint(HERE + np.array([7.0, 2.0]), SMALL, 60.0)),
@@ -63,6 +71,14 @@ def test_every_refusal_has_its_name(reason):
 def test_all_reasons_are_tested():
     """`epipolar` below; `unfitted` has no picture of its own."""
     assert set(REASONS) - set(REFUSED) == {"epipolar", "unfitted"}
+
+
+def test_a_window_in_the_corner_moves_no_spot():
+    """The centre is that of the dark picture to a quarter of its sd: the background is estimated from other pixels."""
+    frame = picture(Footprint(HERE, SMALL, 180.0))
+    dark, lit = (find_spot(made, SpotNoise(0.04, 0)) for made in (frame, window(frame)))
+    assert dark.status == lit.status == "ok"
+    assert np.abs(lit.centre_px - dark.centre_px).max() < 0.25 * np.sqrt(dark.covariance_px2.max())
 
 
 def test_a_weak_second_reflection_and_a_gradient_do_no_harm():
