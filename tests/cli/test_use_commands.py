@@ -267,7 +267,7 @@ def test_limits_of_a_rig_are_kept(ask, folder, tmp_path):
     assert (code, document["error"]["code"]) == (2, "outside-limits")
 
 
-def test_exports_are_read_back(folder, capsys, tmp_path):
+def test_exports_are_read_back(folder, ask, capsys, tmp_path):
     assert run(["steps-for", str(folder), "--export", "json"]) == 0
     path = tmp_path / "calibration.json"
     path.write_text(capsys.readouterr().out)
