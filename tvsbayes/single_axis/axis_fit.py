@@ -26,6 +26,7 @@ from tvsbayes.single_axis.axis_sampling import (
     weighted_sample,
 )
 from tvsbayes.single_axis.classic_line import fit_line
+from tvsbayes.single_axis.period_search import waves_of
 from tvsbayes.statistics.weighted_draws import TAILS, weighted_summary
 
 MODE, WEIGHING, WALKING, TELLING = "mode", "weighted draws", "chain", "summarising"
@@ -134,8 +135,16 @@ class AxisFit(Shown):
         """Equal draws (draws,) of every sampled parameter, of the linear ones, and of the line through the stops."""
         rng = np.random.default_rng([self.seed, 3])
         found = {name: v for name, v in self.model.coordinates.values(self.w).items() if name in self.free}
-        linear = self.linear.drawn(headline_functionals(self.model), rng)
-        return found | dict(zip(HEADLINE_DRAWS, linear.T, strict=True))
+        linear = self.linear.drawn(headline_functionals(self.model, self.w), rng)
+        return found | dict(zip(HEADLINE_DRAWS, linear.T, strict=True)) | self._shift_draws(rng)
+
+    def _shift_draws(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Of the zero's shifts in time."""
+        names = self.model.shifts
+        if not names:
+            return {}
+        drawn = self.linear.drawn(np.array([self.model.shift(name) for name in names]), rng)
+        return dict(zip(names, drawn.T, strict=True))
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -150,17 +159,29 @@ HEADLINE_DRAWS = (
 """Rows of `headline_functionals`."""
 
 
-def line_weights(model: AxisModel) -> np.ndarray:
-    """Slope (columns,) of the least-squares line of the error by position over the rows, each counting once."""
+def line_weights(model: AxisModel, w: np.ndarray) -> np.ndarray:
+    """Slope of the least-squares line of the error by position over the rows, each counting once.
+
+    Shape (columns,), or (n, columns) at draws w (n, d) where a period is not known.
+    """
     rows = model.rows
     off = rows.command - rows.command.mean()
-    return (off / (off @ off)) @ model.functional(rows.command)
+    weights = off / (off @ off)
+    if not model.repeats_by_draw:
+        return weights @ model.functional(rows.command)
+    return np.concatenate([weights @ model.functional(rows.command, part) for part in blocks_of(w)])
 
 
-def headline_functionals(model: AxisModel) -> np.ndarray:
-    """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns)."""
+def blocks_of(w: np.ndarray) -> list[np.ndarray]:
+    """Draws (n, d) in blocks small enough for functionals of many commands."""
+    return np.array_split(w, max(1, len(w) // 100))
+
+
+def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
+    """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns), or (n, ...) as those of `line_weights`."""
     of = model.head
-    return np.array(
+    weights = line_weights(model, w)
+    found = np.array(
         [
             # At command nought, where folders count from.
             of(offset=1.0, slope=-model.middle),
@@ -169,9 +190,13 @@ def headline_functionals(model: AxisModel) -> np.ndarray:
             of(backlash=1.0),
             of(slope=1.0, contrast=0.5),
             of(slope=1.0, contrast=-0.5),
-            of(slope=1.0) + line_weights(model),
+            of(slope=1.0),
         ]
     )
+    if weights.ndim == 2:
+        found = np.repeat(found[None], len(weights), axis=0)
+    found[..., -1, :] += weights
+    return found
 
 
 def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisModel:
@@ -182,7 +207,8 @@ def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisMode
         InputError: too many moves, or angles that wrap.
     """
     rows = rows_of(campaign)
-    return AxisModel.of(rows, default_priors(rows) | campaign.stated, more)
+    priors = default_priors(rows) | campaign.stated
+    return AxisModel.of(rows, priors, more, waves_of(rows, priors, campaign.periods))
 
 
 def default_priors(rows: AxisRows) -> dict[str, AxisPrior]:
@@ -274,7 +300,9 @@ def _walked(
 
 def _agreement(model: AxisModel, first: WeightedSample, w: np.ndarray, rng: np.random.Generator) -> TierAgreement:
     """Both tiers' means and interval ends of the headlines, given their scales: expectations and spreads alike."""
-    functionals = headline_functionals(model)[[HEADLINE_DRAWS.index(name) for name in HEADLINES]]
+    picked = [HEADLINE_DRAWS.index(name) for name in HEADLINES]
+    # Of no headline the functional depends on the draw.
+    functionals = headline_functionals(model, first.w[:1]).reshape(-1, model.columns)[picked]
     keep = slice(None, None, max(1, len(first.w) // 6000))
     theirs = weighted_summary(
         model.linear(first.w[keep]).drawn(functionals, rng), first.weights[keep] / first.weights[keep].sum()

@@ -210,7 +210,7 @@ def _rms(z: list[float]) -> float:
 
 def _fitted_without(model: AxisModel, out: np.ndarray, seed: int) -> tuple[np.ndarray, str]:
     """Coordinates of the scales, for the whole model, from the rows not left out; what is wrong with them, or ""."""
-    without = AxisModel.of(model.rows.without(out), model.priors)
+    without = AxisModel.of(model.rows.without(out), model.priors, None, model.coordinates.waves)
     rng = np.random.default_rng([seed, 5])
     start = find_mode(without)
     sample: WeightedSample = weighted_sample(without.log_density, start, rng, EFFECTIVE)

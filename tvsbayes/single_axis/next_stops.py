@@ -133,7 +133,7 @@ def _functionals(fit: AxisFit, target: str, places: np.ndarray) -> np.ndarray:
     """What is to be made surer, as functionals (t, columns) of the fit's model."""
     if target == "position":
         return deviation_functionals(fit, places)
-    return headline_functionals(fit.model)[[HEADLINE_DRAWS.index(target)]]
+    return headline_functionals(fit.model, fit.w)[..., [HEADLINE_DRAWS.index(target)], :]
 
 
 @dataclass(frozen=True)
@@ -152,9 +152,9 @@ class _Known:
 def _known(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray, w: np.ndarray) -> _Known:
     """With the rows of a campaign, at draws w (n, d)."""
     rows = replace(rows_of(campaign), line=fit.rows.line)
-    model = AxisModel.of(rows, fit.model.priors, places)
+    model = AxisModel.of(rows, fit.model.priors, places, fit.model.coordinates.waves)
     model = replace(model, coordinates=fit.model.coordinates)
-    mean, sd = model.linear(w).of(_functionals(replace(fit, rows=rows, model=model), target, places))
+    mean, sd = model.linear(w).of(_functionals(replace(fit, rows=rows, model=model, w=w), target, places))
     return _Known(float(np.mean(sd**2)), float(np.mean(np.var(mean, axis=0))))
 
 
