@@ -118,7 +118,8 @@ class AxisModel:
             unused.add("creep_minutes")
         unused |= {"stop_sd.forward", "stop_sd.backward"} if rows.in_motion else {"seeing_scale", "seeing_s"}
         if rows.in_motion:
-            unused |= {"transmission_error", "transmission_error_length", "play_variation"}
+            # Averaged readings hardly part white noise from seeing: theirs is as stated, what is beyond it is seeing.
+            unused |= {"transmission_error", "transmission_error_length", "play_variation", "reading_scale"}
         if not np.any(rows.variance > 0):
             unused.add("reading_scale")
         if len(np.unique(rows.segment)) < 2:
