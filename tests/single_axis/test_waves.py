@@ -15,9 +15,11 @@ from tvsbayes.single_axis.axis_periods import separate_periods
 from tvsbayes.single_axis.axis_record import summarise_axis
 from tvsbayes.single_axis.waves import (
     SECOND,
+    WANDER,
     AskedPeriods,
     Tabulated,
     Wave,
+    WaveRecord,
     log_order,
     wave_columns,
     wave_draws,
@@ -89,12 +91,13 @@ def test_waves_that_share_a_range_are_counted_once():
 
 
 def test_columns_are_averaged_over_their_width():
-    period, width = np.array([3.0]), 1.2
+    # A record so long that a wave does not change within the width.
+    period, width, still = np.array([3.0]), 1.2, WaveRecord(0.0, 1e9)
     x = np.array([0.3, 5.0, 8.8])
     # Midpoints of 2000 parts: to the square of their length.
     over = (np.arange(2000) + 0.5) / 2000 * width - 0.5 * width
-    fine = np.mean([wave_columns(x + each, period)[0] for each in over], axis=0)
-    np.testing.assert_allclose(wave_columns(x, period, np.full(3, width))[0], fine, atol=1e-6)
+    fine = np.mean([wave_columns(x + each, period, still)[0] for each in over], axis=0)
+    np.testing.assert_allclose(wave_columns(x, period, still, np.full(3, width))[0], fine, atol=1e-6)
 
 
 def test_a_drive_is_the_dense_gaussian():
@@ -121,6 +124,9 @@ def test_a_drive_is_the_dense_gaussian():
         for harmonic, share in ((1, 1.0), (2, SECOND)):
             wave_of = np.cos(2 * np.pi * harmonic * (t[:, None] - t) / PERIOD)
             total += (share * wave.scale[k]) ** 2 * wave_of
+        along = (t - t.mean()) / (0.5 * np.ptp(t))
+        changed = (WANDER * wave.scale[k]) ** 2 * np.outer(along, along)
+        total += changed * np.cos(2 * np.pi * (t[:, None] - t) / PERIOD)
         residual = rows.value - rows.line[0] - rows.line[1] * model.middle - g
         _, log_det = np.linalg.slogdet(2 * np.pi * total)
         wanted = -0.5 * (log_det + residual @ np.linalg.solve(total, residual))
@@ -136,8 +142,9 @@ def test_readings_in_motion_are_averaged_without_losing_the_wave():
     assert summary.readings == 4000 and summary.moves < 250
     [found] = summary.periods
     assert found.source == "inferred" and found.probability > 0.99
-    # Least squares: sd of the period sqrt(6 / n) s P^2 / (pi A span), of the amplitude s sqrt(2 / n).
-    sd_period = np.sqrt(6 / 4000) * PERIOD**2 / (np.pi * AMPLITUDE * 4000)
+    # Least squares: sd of the period sqrt(6 / n) s P^2 / (pi A span), of the amplitude s sqrt(2 / n); besides, a phase
+    # that may wander by a tenth of s at both ends, and s is 2 / 3 of the amplitude or so.
+    sd_period = (np.sqrt(6 / 4000) / AMPLITUDE + WANDER) * PERIOD**2 / (np.pi * 4000)
     assert abs(found.period.value - PERIOD) < 5 * sd_period and found.period.sd < 3 * sd_period
     assert abs(found.amplitude.value - AMPLITUDE) < 5 * np.sqrt(2 / 4000)
 
@@ -175,4 +182,6 @@ def test_what_is_not_asked_for_changes_nothing():
 
 def test_periods_that_lie_apart_are_named():
     period = np.concatenate([np.full(70, 3.7), np.full(30, 12.4)])
-    assert separate_periods(period) == [(pytest.approx(3.7), 0.7), (pytest.approx(12.4), 0.3)]
+    found = separate_periods(period)
+    assert [(group.mean, group.share) for group in found] == [(pytest.approx(3.7), 0.7), (pytest.approx(12.4), 0.3)]
+    assert found[1].between == (12.4, 12.4)

@@ -77,7 +77,7 @@ def error_figure(fit: AxisFit) -> Figure:
 def wave_figure(sample: WaveSample, unit: str) -> Figure:
     """One wave over its mean period, with its 95 % band, given that it is there."""
     turn = np.linspace(0.0, 1.0, CURVE_POINTS)
-    curve = sample.curve(turn, sample.middle)
+    curve = sample.curve(turn)
     low, high = np.percentile(curve, (2.5, 97.5), axis=0)
     of = "s" if sample.wave.clock == "seconds" else unit
     at = turn * float(np.mean(sample.period))
@@ -85,7 +85,7 @@ def wave_figure(sample: WaveSample, unit: str) -> Figure:
         axes = figure.add_subplot()
         axes.fill_between(at, low, high, color=SKY, alpha=0.4, linewidth=0, label="wave, 95 %")
         axes.plot(at, curve.mean(axis=0), color=BLUE, linewidth=1.2, label="its mean")
-        axes.set(xlabel=f"{of}, from {sample.middle:.6g} on", ylabel=unit)
+        axes.set(xlabel=f"{of}, from {sample.record.middle:.6g} on", ylabel=unit)
         figure.legend(loc="outside lower center", ncols=2)
     return figure
 

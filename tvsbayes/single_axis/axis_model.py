@@ -18,7 +18,7 @@ import numpy as np
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, AxisCoordinates, AxisPrior
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_are_long, play_places, reversal_of
 from tvsbayes.single_axis.process_places import ProcessPlaces, process_places
-from tvsbayes.single_axis.waves import COLUMNS, SHARES, Wave, wave_columns
+from tvsbayes.single_axis.waves import COLUMNS, SHARES, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
 
 OFFSET_TRAVELS = 1.0
@@ -196,13 +196,19 @@ class AxisModel:
         found = {"position": abs(self.rows.line[1]) * command, "seconds": time_s, "encoder": value}
         return found[wave.clock]
 
+    def record(self, wave: Wave) -> WaveRecord:
+        """Where the rows lie on the clock of a wave."""
+        rows = self.rows
+        return WaveRecord.of(self.clock(wave, rows.command, rows.time_s, rows.value))
+
     def _wave_columns(self, w: np.ndarray) -> Iterator[np.ndarray]:
         """Columns (n or 1, rows, `COLUMNS`) of every wave at coordinates (n, d)."""
         rows = self.rows
         speed = abs(rows.line[1] * (rows.rate or 0.0))
         for wave, draws in zip(self.coordinates.waves, self.coordinates.wave_draws(w), strict=True):
             width = rows.width_s * (1.0 if wave.clock == "seconds" else speed)
-            yield wave_columns(self.clock(wave, rows.command, rows.time_s, rows.value), draws.period, width)
+            x = self.clock(wave, rows.command, rows.time_s, rows.value)
+            yield wave_columns(x, draws.period, WaveRecord.of(x), width)
 
     def _shift_columns(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Columns (n or 1, rows) of the shifts of the zero in time."""
@@ -485,7 +491,7 @@ class AxisModel:
             if wave.clock == "position":
                 begins = self.waves_begin + COLUMNS * k
                 at = self.clock(wave, command, command, command)
-                found[:, :, begins : begins + COLUMNS] = wave_columns(at, each.period)
+                found[:, :, begins : begins + COLUMNS] = wave_columns(at, each.period, self.record(wave))
         return found if own else found[0]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from tvsbayes.results.records import NotNegative, Probability, Record
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import AxisModel
-from tvsbayes.single_axis.waves import COLUMNS, Wave, wave_columns
+from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.weighted_draws import systematic
 
 WITH_WAVE_MIN, WITH_WAVE = 200, 1000
@@ -36,7 +36,7 @@ class Measured(Record, frozen=True):
 
 
 class PeriodEstimate(Record, frozen=True):
-    """One wave.
+    """One wave. Where more than one period explains the readings, value and sd are of the likeliest, intervals of all.
 
     Attributes:
         period: in the unit of the readings, or s.
@@ -61,16 +61,16 @@ class WaveSample:
     Attributes:
         wave: what was asked for.
         period: shape (n,).
-        coefficients: cosine and sine of both harmonics, shape (n, 4).
+        coefficients: of the wave's columns, shape (n, `COLUMNS`).
         probability: that there is one.
-        middle: of the readings, on the clock of the wave, where its phase is known best.
+        record: of the readings on the clock of the wave; its middle is where the phase is known best.
     """
 
     wave: Wave
     period: np.ndarray
     coefficients: np.ndarray
     probability: float
-    middle: float
+    record: WaveRecord
 
     @property
     def amplitude(self) -> np.ndarray:
@@ -83,10 +83,10 @@ class WaveSample:
         middle = np.angle(np.mean(np.exp(1j * phase)))
         return np.degrees(middle + np.angle(np.exp(1j * (phase - middle))))
 
-    def curve(self, turn: np.ndarray, at: float) -> np.ndarray:
-        """The wave over one mean period from `at` on, at shares `turn` (t,) of it: shape (n, t)."""
-        x = at + turn * float(np.mean(self.period))
-        return np.einsum("ntc,nc->nt", wave_columns(x, self.period), self.coefficients)
+    def curve(self, turn: np.ndarray) -> np.ndarray:
+        """The wave over one mean period from the middle of the record on, at shares `turn` (t,) of it: shape (n, t)."""
+        x = self.record.middle + turn * float(np.mean(self.period))
+        return np.einsum("ntc,nc->nt", wave_columns(x, self.period, self.record), self.coefficients)
 
 
 def _with_wave(model: AxisModel, w: np.ndarray, k: int, rng: np.random.Generator) -> np.ndarray:
@@ -128,34 +128,46 @@ def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
         picked[range(COLUMNS), range(begins, begins + COLUMNS)] = 1.0
         coefficients = model.linear(w).drawn(picked, rng)
         period = np.broadcast_to(model.coordinates.wave_draws(w)[k].period, len(w)).copy()
-        rows = fit.rows
-        middle = float(np.mean(model.clock(wave, rows.command, rows.time_s, rows.value)))
-        found.append(WaveSample(wave, period, coefficients, probability, middle))
+        found.append(WaveSample(wave, period, coefficients, probability, model.record(wave)))
     return tuple(found)
 
 
-def _measured(draws: np.ndarray) -> Measured:
+def _measured(draws: np.ndarray, likeliest: np.ndarray) -> Measured:
     low, high = np.percentile(draws, TAILS_PERCENT)
-    return Measured(float(draws.mean()), float(draws.std()), (float(low), float(high)))
+    chosen = draws[likeliest]
+    return Measured(float(chosen.mean()), float(chosen.std()), (float(low), float(high)))
 
 
 def period_estimate(sample: WaveSample) -> PeriodEstimate:
     """One wave in numbers."""
+    groups = separate_periods(sample.period)
+    low, high = groups[0].between if groups else (0.0, np.inf)
+    likeliest = (sample.period >= low) & (sample.period <= high)
     return PeriodEstimate(
-        period=_measured(sample.period),
-        amplitude=_measured(sample.amplitude),
-        phase_deg=_measured(sample.phase_deg()),
+        period=_measured(sample.period, likeliest),
+        amplitude=_measured(sample.amplitude, likeliest),
+        phase_deg=_measured(sample.phase_deg(), likeliest),
         source="stated" if sample.wave.is_stated else "inferred",
         probability=sample.probability,
     )
 
 
-def separate_periods(period: np.ndarray) -> list[tuple[float, float]]:
-    """Groups of draws (n,) of a period that lie apart, each with its share, the likeliest first."""
+@dataclass(frozen=True)
+class PeriodGroup:
+    """Draws of a period that lie together: their mean, their least and greatest, their share of all."""
+
+    mean: float
+    between: tuple[float, float]
+    share: float
+
+
+def separate_periods(period: np.ndarray) -> list[PeriodGroup]:
+    """Groups of draws (n,) of a period that lie apart, the likeliest first; the rarest are left out."""
     ordered = np.sort(period)
     cut = np.flatnonzero(np.diff(ordered) > ALIKE * ordered[1:]) + 1
     groups = [group for group in np.split(ordered, cut) if len(group) >= ALIKE * len(period)]
-    return sorted(((float(g.mean()), len(g) / len(period)) for g in groups), key=lambda found: -found[1])
+    found = [PeriodGroup(float(g.mean()), (float(g[0]), float(g[-1])), len(g) / len(period)) for g in groups]
+    return sorted(found, key=lambda group: -group.share)
 
 
 def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
@@ -165,7 +177,7 @@ def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
         unit = "s" if sample.wave.clock == "seconds" else fit.campaign.unit
         groups = separate_periods(sample.period)
         if sample.probability > 0.5 and len(groups) > 1:
-            said = ", ".join(f"{period:.4g} {unit} ({100 * share:.0f} %)" for period, share in groups[:4])
+            said = ", ".join(f"{group.mean:.4g} {unit} ({100 * group.share:.0f} %)" for group in groups[:4])
             found.append(
                 f"the readings cannot tell which period the wave has: {said}; read a longer run, at places that are "
                 "not evenly spaced"

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import InputError
+from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.csv_table import csv_bytes
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.records import plain
@@ -177,7 +177,15 @@ def plan_next(
 
     Raises:
         InputError: an unknown target.
+        NothingToEstimate: the folder is of a drive that never stops.
     """
+    if fit.rows.in_motion:
+        raise NothingToEstimate(
+            "in-motion",
+            "a drive at constant rate has no stops to choose",
+            file="campaign.toml",
+            remedy="drive on: a run of N periods tells a period to about period / (2 N) times noise over amplitude",
+        )
     if target not in TARGETS:
         allowed = ", ".join(TARGETS)
         raise InputError("target", f"--target {target[:60]!r}", allowed=allowed, remedy="name one of them")

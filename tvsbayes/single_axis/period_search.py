@@ -1,7 +1,7 @@
 """Where the evidence of a wave lies: over a grid fine against 1 / span, then between its points where it is sharp.
 
 Everything is linear and normal given the scales of noise and errors: these are held at the mode, the readings and all
-columns are whitened once, and every period costs products with its own four columns. What is found makes the tables of
+columns are whitened once, and every period costs products with its own few columns. What is found makes the tables of
 `waves.Wave`, from which the sampler starts; it weighs against the density without any of these approximations.
 """
 
@@ -25,6 +25,7 @@ from tvsbayes.single_axis.waves import (
     Clock,
     Tabulated,
     Wave,
+    WaveRecord,
     log_scale_prior,
     wave_columns,
 )
@@ -79,7 +80,7 @@ def _log_evidence(ready: _Prepared, wave: Wave, log_period: np.ndarray, scales: 
     found = np.empty((len(log_period), len(scales)))
     for begins in range(0, len(log_period), AT_ONCE):
         part = slice(begins, begins + AT_ONCE)
-        columns = wave_columns(x, np.exp(log_period[part]), width) * np.array(SHARES)
+        columns = wave_columns(x, np.exp(log_period[part]), WaveRecord.of(x), width) * np.array(SHARES)
         count = len(columns)
         flat = np.moveaxis(columns, 0, 1).reshape(len(x), -1)
         white = model.whitened_extra(ready.w, flat)

@@ -3,6 +3,8 @@
 A wave is A cos(2 pi x / P - phase) with a second harmonic. x is the position |unit per command| x command, the time in
 seconds, or the reading itself (a wave of the encoder). Cosines and sines are linear and have a normal prior of sd s,
 those of the second harmonic of `SECOND` times s; s is half-normal, and with probability 1/2 there is no wave at all.
+No turn of a gear is quite like the one before: cosine and sine of the first harmonic change over the record, linearly,
+by a normal share of sd `WANDER` of s at its ends, without which a period would be surer than gears are regular.
 
 Coordinates with a standard normal density are needed where the posterior has many peaks: s and P are quantiles of
 tables close to their posterior (`period_search`), and the prior over the table is part of the density. So the draws are
@@ -20,12 +22,17 @@ from typing import Literal
 import numpy as np
 
 Clock = Literal["position", "seconds", "encoder"]
-SECOND = 0.5
-"""sd of the second harmonic's cosine and sine, of the first's."""
+SECOND = 0.25
+"""sd of the second harmonic's cosine and sine, of the first's: with more, twice the period would explain a wave nearly
+as well, by its second harmonic alone."""
 WAVE_PRIOR = 0.5
 """Probability beforehand that there is a wave."""
-COLUMNS = 4
-"""Cosine and sine of both harmonics."""
+WANDER = 0.1
+"""sd of what the first harmonic's cosine and sine have changed by at an end of the record, of s."""
+SHARES = (1.0, 1.0, SECOND, SECOND, WANDER, WANDER)
+"""sds of a wave's columns, of s."""
+COLUMNS = len(SHARES)
+"""Cosine and sine of both harmonics, then of what the first changes by."""
 SCALE_RANGE = (1e-4, 4.0)
 """Of s, over the scale of its half-normal prior, which has 1e-4 of its probability outside."""
 
@@ -220,24 +227,35 @@ def log_order(waves: Sequence[Wave], draws: Sequence[WaveDraws]) -> np.ndarray:
     return found
 
 
-def wave_columns(x: np.ndarray, period: np.ndarray, width: np.ndarray | float = 0.0) -> np.ndarray:
-    """Cosine and sine of both harmonics, averaged over `width` about x: shape (n, rows, 4).
+@dataclass(frozen=True)
+class WaveRecord:
+    """Where on the clock of a wave the readings lie: the middle, and half of the way from the first to the last."""
+
+    middle: float
+    half: float
+
+    @classmethod
+    def of(cls, x: np.ndarray) -> WaveRecord:
+        """Of the readings' places (rows,)."""
+        return cls(float(np.mean(x)), 0.5 * float(np.ptp(x)) or 1.0)
+
+
+def wave_columns(x: np.ndarray, period: np.ndarray, record: WaveRecord, width: np.ndarray | float = 0.0) -> np.ndarray:
+    """A wave's columns (`COLUMNS`), averaged over `width` about x: shape (n, rows, columns).
 
     Args:
         x: shape (rows,).
         period: shape (n,).
+        record: that the wave changes over.
         width: over which every row was averaged, shape (rows,).
     """
     turn = x[None] / period[:, None]
     turn = 2 * pi * (turn - np.round(turn))
     cosine, sine = np.cos(turn), np.sin(turn)
-    found = np.stack([cosine, sine, cosine**2 - sine**2, 2 * sine * cosine], axis=-1)
+    second = [cosine**2 - sine**2, 2 * sine * cosine]
     if np.any(width):
         share = np.asarray(width)[None] / period[:, None]
-        found[..., :2] *= np.sinc(share)[..., None]
-        found[..., 2:] *= np.sinc(2 * share)[..., None]
-    return found
-
-
-SHARES = (1.0, 1.0, SECOND, SECOND)
-"""sds of a wave's columns, of s."""
+        cosine, sine = cosine * np.sinc(share), sine * np.sinc(share)
+        second = [each * np.sinc(2 * share) for each in second]
+    along = ((x - record.middle) / record.half)[None]
+    return np.stack([cosine, sine, *second, along * cosine, along * sine], axis=-1)
