@@ -13,13 +13,12 @@ from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.axis_text import (
     CONFLICTING,
     deviation_table,
-    for_firmware,
     iso230_table,
+    offered,
     parameter_table,
     period_table,
     ratio_table,
     reserved,
-    worst_place,
 )
 from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, drawing
 from tvsbayes.report.first_page import about_table
@@ -135,14 +134,11 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     if summary.converged and summary.prior_conflicts:
         converged = f"PRIOR CONFLICT: {CONFLICTING}."
     conflicts = [f"Prior conflict: {text}" for text in summary.prior_conflicts]
-    offered = [for_firmware(summary)] if summary.converged else []
-    if summary.converged and summary.deviations:
-        offered.insert(0, worst_place(summary))
     waves, figures = period_table(summary), _wave_figures(fit)
     picture = _figure_of(fit)
     if picture is None and figures:
         picture, figures = figures[0], figures[1:]
-    in_words = [f"{text[0].upper()}{text[1:]}." for text in offered]
+    in_words = [f"{text[0].upper()}{text[1:]}." for text in (offered(summary) if summary.converged else ())]
     header = fit.campaign.header
     created = header.get("created")
     folder = "AXIS" if fit.campaign.path is None else typed(fit.campaign.path.resolve().name)

@@ -95,6 +95,13 @@ def for_firmware(summary: AxisSummary) -> str:
     return f"{said}play of {in_commands} commands"
 
 
+def offered(summary: AxisSummary) -> list[str]:
+    """What an owner takes from a converged fit: the worst place, numbers for firmware. Neither of a drive in motion."""
+    if "seeing_s" in summary.parameters:
+        return []
+    return [*([worst_place(summary)] if summary.deviations else []), for_firmware(summary)]
+
+
 def worst_place(summary: AxisSummary) -> str:
     """Where the error by position is largest, and whose it may be."""
     worst = max(summary.deviations, key=lambda d: abs(d.value))
@@ -173,10 +180,10 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     lines += [f"written: {', '.join(written)}"] if written else []
     counted = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}"
     waves = period_table(summary)
-    parts = [counted, parameter_table(summary).text(), ratio_table(summary).text()]
-    parts += [] if waves is None else [waves.text()]
+    parts = [counted, *([] if waves is None else [waves.text()])]
+    parts += [parameter_table(summary).text(), ratio_table(summary).text()]
     if summary.converged:
-        parts += [*([worst_place(summary)] if summary.deviations else []), for_firmware(summary)]
+        parts += offered(summary)
     verdict = "NOT CONVERGED, use none of these numbers"
     if summary.converged:
         verdict = f"PRIOR CONFLICT, {CONFLICTING}" if summary.prior_conflicts else f"usable{reserved(summary)}"
