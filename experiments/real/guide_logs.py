@@ -19,7 +19,7 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import summarise_axis
-from tvsbayes.single_axis.guide_log import GuideRun, read_runs, readings_of_run
+from tvsbayes.single_axis.guide_log import GuideRun, is_guide_log, read_runs, readings_of_run
 from tvsbayes.single_axis.waves import AskedPeriods
 
 ROWS = output(__file__, "guide_logs.jsonl")
@@ -42,8 +42,9 @@ def campaign_of(run: GuideRun, file: str) -> AxisCampaign:
 def run(arguments: argparse.Namespace) -> None:
     """A row for every run of every log in a folder that is not there yet."""
     done = {(row["file"], row["run"]) for row in read_rows(ROWS)}
-    for file in sorted(arguments.folder.glob("*[0-9].txt")):
-        for logged in read_runs(file.read_text(encoding="utf-8", errors="replace"), file.name):
+    for file in sorted(arguments.folder.glob("*.txt"), reverse=True):
+        text = file.read_text(encoding="utf-8", errors="replace")
+        for logged in read_runs(text, file.name) if is_guide_log(text) else ():
             if len(logged.frames) < FRAMES_MIN or (file.name, logged.number) in done:
                 continue
             began = time.process_time()
@@ -66,9 +67,9 @@ def run(arguments: argparse.Namespace) -> None:
 TEXT = """# Periods of real mounts, from guide logs
 
 Made by `python -m experiments.real.guide_logs`. Logs of PHD2 (OpenPHDGuiding/phd2, commit 27ca7e21dd, and
-ste7e/PHD2Insight, commit 7de4df4d1e), uncorrected motion as `import --axis` makes it. Value(u) with 95 % interval, given
-that there is the wave; P/2N: period / (2 N) for N periods in the run; arcsec: amplitude on the axis. The log names a driver, not a model: the worm is that of the
-driver's mount that is published.
+ste7e/PHD2Insight, commit 7de4df4d1e), uncorrected motion as `import --axis` makes it. Value(u) with 95 % interval,
+given that there is the wave; P/2N: period / (2 N) for N periods in the run; arcsec: amplitude on the axis. The log names a
+driver, not a model: the worm is that of the driver's mount that is published.
 
 | log, run | frames | 60 to 200 s | 200 to 700 s | 95 % | P/2N | published | inside | arcsec | there | CPU s |
 |---|---|---|---|---|---|---|---|---|---|---|"""

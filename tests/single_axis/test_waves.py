@@ -124,7 +124,7 @@ def test_a_drive_is_the_dense_gaussian():
         for harmonic, share in ((1, 1.0), (2, SECOND)):
             wave_of = np.cos(2 * np.pi * harmonic * (t[:, None] - t) / PERIOD)
             total += (share * wave.scale[k]) ** 2 * wave_of
-        along = (t - t.mean()) / (0.5 * np.ptp(t))
+        along = (t - 0.5 * (t[0] + t[-1])) / (0.5 * np.ptp(t))
         changed = (WANDER * wave.scale[k]) ** 2 * np.outer(along, along)
         total += changed * np.cos(2 * np.pi * (t[:, None] - t) / PERIOD)
         residual = rows.value - rows.line[0] - rows.line[1] * model.middle - g

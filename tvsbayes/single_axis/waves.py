@@ -237,7 +237,7 @@ class WaveRecord:
     @classmethod
     def of(cls, x: np.ndarray) -> WaveRecord:
         """Of the readings' places (rows,)."""
-        return cls(float(np.mean(x)), 0.5 * float(np.ptp(x)) or 1.0)
+        return cls(0.5 * float(np.min(x) + np.max(x)), 0.5 * float(np.ptp(x)) or 1.0)
 
 
 def wave_columns(x: np.ndarray, period: np.ndarray, record: WaveRecord, width: np.ndarray | float = 0.0) -> np.ndarray:
