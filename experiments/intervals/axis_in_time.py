@@ -92,8 +92,8 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
             one["amplitude"] = _scored(sample.amplitude, wave.amplitude)
             phase = sample.phase_deg()
             one["phase"] = _scored(phase, phase.mean() + (wave.phase_deg - phase.mean() + 180.0) % 360.0 - 180.0)
-            if not sample.wave.is_stated:
-                one["period"] = _scored(np.log(sample.period), float(np.log(wave.period)))
+            if sample.wave.known is None:
+                one["period"] = _scored(np.log(sample.true_period), float(np.log(wave.period)))
         waves.append(one)
     return {**row, "waves": waves}
 

@@ -68,8 +68,8 @@ TEXT = """# Periods of real mounts, from guide logs
 
 Made by `python -m experiments.real.guide_logs`. Logs of PHD2 (OpenPHDGuiding/phd2, commit 27ca7e21dd, and
 ste7e/PHD2Insight, commit 7de4df4d1e), uncorrected motion as `import --axis` makes it. Value(u) with 95 % interval,
-given that there is the wave; P/2N: period / (2 N) for N periods in the run; arcsec: amplitude on the axis. The log names a
-driver, not a model: the worm is that of the driver's mount that is published.
+given that there is the wave; P/2N: period / (2 N) for N periods in the run; arcsec: amplitude on the axis. The log
+names a driver, not a model: the worm is that of the driver's mount that is published.
 
 | log, run | frames | 60 to 200 s | 200 to 700 s | 95 % | P/2N | published | inside | arcsec | there | CPU s |
 |---|---|---|---|---|---|---|---|---|---|---|"""

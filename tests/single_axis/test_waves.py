@@ -62,7 +62,7 @@ def test_the_prior_of_a_wave_is_the_prior_whatever_its_tables():
     low, high = 2.0, 2.0 * np.exp(2.0)
     table = Tabulated(a_table().at + np.log(low), a_table().density)
     table = Tabulated.of(np.concatenate([[np.log(low)], table.at[1:-1], [np.log(high)]]), np.zeros(30), 0.3)
-    wave = replace(Wave.stated("position", low, 0.4), high=high, log_period=table, absent=0.2)
+    wave = replace(Wave.fixed("position", low, 0.4), high=high, log_period=table, absent=0.2)
     count = 200_000
     w = np.random.default_rng(1).standard_normal((2, count))
     found = wave_draws(wave, *w)
@@ -77,7 +77,7 @@ def test_the_prior_of_a_wave_is_the_prior_whatever_its_tables():
 
 def test_waves_that_share_a_range_are_counted_once():
     """Over all states the prior adds up to that of waves that are told apart."""
-    wave = replace(Wave.stated("seconds", 2.0, 1.0), high=20.0, log_period=a_table())
+    wave = replace(Wave.fixed("seconds", 2.0, 1.0), high=20.0, log_period=a_table())
     pair = [replace(wave, peak=4.0), replace(wave, peak=11.0)]
     rng = np.random.default_rng(2)
     period = np.exp(rng.uniform(np.log(2.0), np.log(20.0), (2, 100_000)))

@@ -470,7 +470,7 @@ class AxisModel:
     @property
     def repeats_by_draw(self) -> bool:
         """Whether what repeats by position has a period that is not known."""
-        return any(wave.clock == "position" and not wave.is_stated for wave in self.coordinates.waves)
+        return any(wave.clock == "position" and not wave.is_fixed for wave in self.coordinates.waves)
 
     def functional(self, command: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """What repeats by position at commands (t,): the error by position and the waves of position, the gear's.

@@ -141,7 +141,7 @@ class AxisCoordinates:
         """Every wave at coordinates (n, d)."""
         found = []
         for k, wave in enumerate(self.waves, start=1):
-            place = None if wave.is_stated else w[:, self.names.index(f"wave_period.{k}")]
+            place = None if wave.is_fixed else w[:, self.names.index(f"wave_period.{k}")]
             found.append(wave_draws(wave, w[:, self.names.index(f"wave_scale.{k}")], place))
         return found
 

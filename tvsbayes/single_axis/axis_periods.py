@@ -60,7 +60,8 @@ class WaveSample:
 
     Attributes:
         wave: what was asked for.
-        period: shape (n,).
+        period: on the model's clock, shape (n,).
+        true_period: with the ratio's uncertainty, shape (n,).
         coefficients: of the wave's columns, shape (n, `COLUMNS`).
         probability: that there is one.
         record: of the readings on the clock of the wave; its middle is where the phase is known best.
@@ -68,6 +69,7 @@ class WaveSample:
 
     wave: Wave
     period: np.ndarray
+    true_period: np.ndarray
     coefficients: np.ndarray
     probability: float
     record: WaveRecord
@@ -104,7 +106,7 @@ def _with_wave(model: AxisModel, w: np.ndarray, k: int, rng: np.random.Generator
     column = names.index(f"wave_scale.{k + 1}")
     before[:, column] = ndtri(0.5 * wave.absent)
     found[:, column] = ndtri(wave.absent + (1 - wave.absent) * rng.uniform(1e-9, 1 - 1e-9, len(found)))
-    if not wave.is_stated:
+    if not wave.is_fixed:
         place = names.index(f"wave_period.{k + 1}")
         found[:, place] = before[:, place] = rng.standard_normal(len(found))
     gain = model.log_density(found) - model.log_density(before)
@@ -124,11 +126,14 @@ def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
         probability = float(np.mean(model.coordinates.wave_draws(fit.w)[k].scale > 0))
         w = _with_wave(model, fit.w, k, rng)
         begins = model.waves_begin + COLUMNS * k
-        picked = np.zeros((COLUMNS, model.columns))
+        picked = np.concatenate([np.zeros((COLUMNS, model.columns)), model.head(slope=1.0)[None]])
         picked[range(COLUMNS), range(begins, begins + COLUMNS)] = 1.0
-        coefficients = model.linear(w).drawn(picked, rng)
+        drawn = model.linear(w).drawn(picked, rng)
+        coefficients, ratio = drawn[:, :COLUMNS], drawn[:, COLUMNS] / fit.rows.line[1]
         period = np.broadcast_to(model.coordinates.wave_draws(w)[k].period, len(w)).copy()
-        found.append(WaveSample(wave, period, coefficients, probability, model.record(wave)))
+        # Positions of the model are by the line; the true ratio makes them longer or shorter.
+        true_period = period * ratio if wave.clock == "position" else period
+        found.append(WaveSample(wave, period, true_period, coefficients, probability, model.record(wave)))
     return tuple(found)
 
 
@@ -140,14 +145,15 @@ def _measured(draws: np.ndarray, likeliest: np.ndarray) -> Measured:
 
 def period_estimate(sample: WaveSample) -> PeriodEstimate:
     """One wave in numbers."""
+    known = sample.wave.known
     groups = separate_periods(sample.period)
     low, high = groups[0].between if groups else (0.0, np.inf)
     likeliest = (sample.period >= low) & (sample.period <= high)
     return PeriodEstimate(
-        period=_measured(sample.period, likeliest),
+        period=_measured(sample.true_period, likeliest) if known is None else Measured(known, 0.0, (known, known)),
         amplitude=_measured(sample.amplitude, likeliest),
         phase_deg=_measured(sample.phase_deg(), likeliest),
-        source="stated" if sample.wave.is_stated else "inferred",
+        source="inferred" if known is None else "stated",
         probability=sample.probability,
     )
 
@@ -176,7 +182,7 @@ def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
     for sample in samples:
         unit = "s" if sample.wave.clock == "seconds" else fit.campaign.unit
         groups = separate_periods(sample.period)
-        if sample.probability > 0.5 and len(groups) > 1:
+        if sample.probability > 0.5 and len(groups) > 1 and sample.wave.known is None:
             said = ", ".join(f"{group.mean:.4g} {unit} ({100 * group.share:.0f} %)" for group in groups[:4])
             found.append(
                 f"the readings cannot tell which period the wave has: {said}; read a longer run, at places that are "

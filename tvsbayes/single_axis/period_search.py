@@ -17,6 +17,7 @@ from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
 from tvsbayes.single_axis.axis_rows import AxisRows
+from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.waves import (
     COLUMNS,
     SCALE_RANGE,
@@ -105,9 +106,9 @@ def _searched(ready: _Prepared, wave: Wave) -> Wave:
     prior = log_scale_prior(log_scale, wave.unit)
     weights = prior + np.log(np.gradient(log_scale))
     scales = np.exp(log_scale)
-    grid = np.array([np.log(wave.low)]) if wave.is_stated else _grid(ready.model.rows, wave, ready.model)
+    grid = np.array([np.log(wave.low)]) if wave.is_fixed else _grid(ready.model.rows, wave, ready.model)
     evidence = _log_evidence(ready, wave, grid, scales)
-    for _ in range(0 if wave.is_stated else REFINEMENTS):
+    for _ in range(0 if wave.is_fixed else REFINEMENTS):
         by_period = np.logaddexp.reduce(evidence + weights, axis=1)
         best = np.maximum(by_period[1:], by_period[:-1])
         steep = (np.abs(np.diff(by_period)) > STEEP) & (best > by_period.max() - NEAR)
@@ -121,7 +122,7 @@ def _searched(ready: _Prepared, wave: Wave) -> Wave:
         grid = np.concatenate([grid, more])[order]
         evidence = np.concatenate([evidence, _log_evidence(ready, wave, more, scales)])[order]
     by_period = np.logaddexp.reduce(evidence + weights, axis=1)
-    if wave.is_stated:
+    if wave.is_fixed:
         total, table, over = float(by_period[0]), None, np.zeros(1)
     else:
         over = np.log(np.gradient(grid) / np.ptp(grid))
@@ -184,17 +185,17 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], asked: AskedPeriod
     error = priors["transmission_error"]
     unit = error.u or error.value or (AXIS_KEYS["transmission_error"].share or 0.0) * rows.travel
     clock: Clock = "seconds" if asked.in_seconds else "position"
-    stated = [Wave.stated(clock, period, unit) for period in asked.stated]
-    unknown = [replace(Wave.stated(clock, low, unit), high=high) for low, high in asked.between]
-    encoder = [] if asked.encoder is None else [Wave.stated("encoder", asked.encoder, unit)]
-    known = [*stated, *encoder]
+    stated = [_of_stated(clock, period, unit, rows, priors) for period in asked.stated]
+    unknown = [replace(Wave.fixed(clock, low, unit), high=high) for low, high in asked.between]
+    encoder = [] if asked.encoder is None else [_of_stated("encoder", asked.encoder, unit, rows, priors)]
+    known = [Wave.fixed(wave.clock, wave.peak, unit) for wave in (*stated, *encoder)]
     # One after the other, strongest evidence first, then each anew beside all others.
     peaks: list[Wave] = []
     for wave in unknown:
         model = AxisModel.of(rows, priors, None, [*known, *peaks])
         found = _searched(_prepared(model, find_mode(model).w[None]), wave)
-        peaks.append(replace(Wave.stated(clock, found.peak, unit), absent=found.absent))
-    every = [*stated, *peaks, *encoder]
+        peaks.append(replace(Wave.fixed(clock, found.peak, unit), absent=found.absent))
+    every = [*known[: len(stated)], *peaks, *known[len(stated) :]]
     model = AxisModel.of(rows, priors, None, every)
     mode = find_mode(model).w
     final = []
@@ -202,6 +203,31 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], asked: AskedPeriod
         others = [*every[:k], *every[k + 1 :]]
         final.append(_searched(_prepared(*_without(rows, priors, others, model, mode, k)), wave))
     return tuple(final)
+
+
+RATIO_SDS = 3.0
+"""sds of the ratio that a stated period of position may be off by on the line's."""
+ERROR_SLOPE = 1.7
+"""Slope that an error by position of sd 1 typically gives a line over a range of 1: half of the largest, root 12."""
+
+
+def _of_stated(clock: Clock, period: float, unit: float, rows: AxisRows, priors: Mapping[str, AxisPrior]) -> Wave:
+    """The wave of a stated period: on a clock of position the line's ratio stands for the true one, which is not known.
+
+    What that may be off by is a narrow range of the period; where `per_command` is stated better, by that.
+    """
+    if clock != "position":
+        return replace(Wave.fixed(clock, period, unit), known=period)
+    ratio, prior = abs(rows.line[1]), priors["per_command"]
+    error = max(priors["transmission_error"].u, priors["transmission_error"].value)
+    spread = float(np.hypot(np.sqrt(fit_line(rows).covariance[1, 1]) / ratio, ERROR_SLOPE * error / rows.travel))
+    middle = period
+    if prior.u < spread * abs(prior.value):
+        spread, middle = prior.u / abs(prior.value), period * ratio / abs(prior.value)
+    if spread * RATIO_SDS < 1e-9:
+        return replace(Wave.fixed(clock, middle, unit), known=period)
+    factor = float(np.exp(RATIO_SDS * spread))
+    return replace(Wave.fixed(clock, middle, unit), low=middle / factor, high=middle * factor, known=period)
 
 
 def _without(

@@ -120,12 +120,13 @@ class Wave:
 
     Attributes:
         clock: of its period.
-        low, high: of the period; equal where it is stated.
+        low, high: of the period; equal where it is stated and its clock is known exactly.
         unit: scale of the half-normal prior of s, in the unit of the readings, > 0.
         log_scale: table of log s, given that there is a wave.
-        log_period: table of the log of the period; None where it is stated.
+        log_period: table of the log of the period; None where it is fixed.
         absent: share of the coordinate's probability that is given to no wave at all.
         peak: period of most evidence.
+        known: the period that was stated; None of one that is looked for.
     """
 
     clock: Clock
@@ -136,18 +137,19 @@ class Wave:
     log_period: Tabulated | None
     absent: float
     peak: float
+    known: float | None = None
 
     @classmethod
-    def stated(cls, clock: Clock, period: float, unit: float) -> Wave:
-        """Of a known period, before anything was searched."""
+    def fixed(cls, clock: Clock, period: float, unit: float) -> Wave:
+        """Of one period, before anything was searched."""
         low, high = (log(end * unit) for end in SCALE_RANGE)
         at = np.linspace(low, high, 200)
         table = Tabulated.of(at, 0.3 * np.maximum(log_scale_prior(at, unit), -20.0), 0.5)
         return cls(clock, period, period, unit, table, None, 0.05, period)
 
     @property
-    def is_stated(self) -> bool:
-        """Whether the period is known."""
+    def is_fixed(self) -> bool:
+        """Whether the period has no coordinate."""
         return self.low == self.high
 
 
@@ -187,7 +189,7 @@ def names_of(waves: Sequence[Wave]) -> tuple[str, ...]:
     """Coordinates of the waves, in order."""
     found = []
     for k, wave in enumerate(waves, start=1):
-        found += [f"wave_scale.{k}", *([] if wave.is_stated else [f"wave_period.{k}"])]
+        found += [f"wave_scale.{k}", *([] if wave.is_fixed else [f"wave_period.{k}"])]
     return tuple(found)
 
 
@@ -209,7 +211,7 @@ def log_order(waves: Sequence[Wave], draws: Sequence[WaveDraws]) -> np.ndarray:
     found = np.zeros(1)
     alike: dict[tuple[float, float, Clock], list[int]] = {}
     for k, wave in enumerate(waves):
-        if not wave.is_stated:
+        if wave.known is None and not wave.is_fixed:
             alike.setdefault((wave.low, wave.high, wave.clock), []).append(k)
     for group in alike.values():
         if len(group) < 2:
