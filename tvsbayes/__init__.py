@@ -10,6 +10,9 @@ From a campaign folder to a robot:
     results = tvsbayes.calibrate(campaign, folder)       # all of it at once, and the files that `tvsbayes fit` writes
     calibration = tvsbayes.load_calibration("mine")      # the same from results/ after `tvsbayes fit mine`: NumPy alone
 
+One axis: `compensate("stage", "linuxcnc")` makes a table for a controller, `verify("stage", "fresh")` says whether its
+promise is kept.
+
 mm, px, and degrees where a name says `deg`; frames, signs and names are in `data/docs/conventions.md`, the map of all
 modules in `data/docs/architecture.md`, more examples in `data/docs/python.md`. Figures: `tvsbayes.plots`. Classic
 estimator: `tvsbayes.estimators.four_point`; simulation: `tvsbayes.twin.simulated_campaign`; planning:

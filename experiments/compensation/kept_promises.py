@@ -157,8 +157,8 @@ def worlds_table(found: list[dict]) -> None:
             counts = [sum(v[world][0] == verdict for v in rows) for verdict in (KEPT, BROKEN, "CANNOT TELL")]
             print(f"| {world} | {where} | {share(named, len(rows))} | " + " | ".join(map(str, counts)) + " |")
     broken = sum(v[APPLIED][0] == BROKEN for v in found)
-    low, high = binomial_bounds(len(found), 0.01)
-    print(f"\nFalse BROKEN: {share(broken, len(found))}; {low} to {high} would be usual at 1 %.")
+    _, high = binomial_bounds(len(found), 0.01)
+    print(f"\nFalse BROKEN: {share(broken, len(found))}; up to {100 * high:.1f} % would be usual at 1 %.")
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ import pytest
 from support.drawn_boards import BOARD, FOUND_PX, POSES, SIZE, pictures, true_corners, write_pair
 
 from tvsbayes.cameras import boards
-from tvsbayes.cameras.boards import Board, find_corners, find_views
+from tvsbayes.cameras.boards import Board, Pairing, find_corners, find_views
 from tvsbayes.errors import InputError, NothingToEstimate
 
 
@@ -75,7 +75,7 @@ def test_wide_frames_are_split(tmp_path, six, six_views, swap):
         halves = [cv2.imread(str(next(six.glob(f"{side}{view.name}.*"))), 0) for side in ("left", "right")]
         cv2.imwrite(str(tmp_path / f"frame{view.name}.png"), np.hstack(halves[::-1] if swap else halves))
     cv2.imwrite(str(tmp_path / "portrait.png"), np.zeros((400, 300), np.uint8))
-    found = find_views(tmp_path, BOARD, swap=swap)
+    found = find_views(tmp_path, BOARD, pairing=Pairing(swap=swap))
     assert (found.image_width, found.image_height) == SIZE
     for split, view in zip(found.views, six_views.views[:2], strict=True):
         assert split.name == f"frame{view.name}"

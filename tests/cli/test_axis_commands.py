@@ -105,7 +105,14 @@ def test_two_positions_leave_nothing_to_foretell(ask, tmp_path):
     assert code == 3 and assert_error(document, "too-few-positions")
 
 
-def test_a_chain_that_has_no_time_ends_with_4(ask, folder, monkeypatch):
-    monkeypatch.setattr("tvsbayes.single_axis.axis_sampling.BLOCK_STEPS", 40)
+def test_a_sampler_without_an_answer_leaves_laplaces_and_says_so(ask, folder, monkeypatch):
+    """As of a scanner: exit 0 with a warning, no mode is exit 4; of a chain without time weighted draws answer."""
     code, document = ask("fit", folder, "--max-minutes", "0.01")
-    assert code == 4 and document["error"]["code"] == "unconverged" and not document["converged"]
+    assert (code, document["converged"]) == (0, True)
+    assert document["monte_carlo_error"]["backlash"]["mean"] < 0.3
+    monkeypatch.setattr("tvsbayes.inference.importance.ROUGH_K_MAX", -9.0)
+    monkeypatch.setattr("tvsbayes.inference.importance.K_MAX", -9.0)
+    monkeypatch.setattr("tvsbayes.inference.importance.ROUNDS_MAX", 4)
+    code, document = ask("fit", folder, "--quick")
+    assert (code, document["converged"], document["answer"]) == (0, False, "laplace")
+    assert document["estimator"] == "laplace" and document["problems"][0].startswith("LAPLACE: the weights")

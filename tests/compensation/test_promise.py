@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from support.compensated import driven, results, table, to_and_fro, true_axis
 
 from tvsbayes.compensation.correction import Correction
@@ -89,11 +90,14 @@ def test_wishes_that_cannot_be_met_are_refused(wish, said):
     assert said in f"{refused.value.message} {refused.value.allowed}"
 
 
-def test_no_table_is_made_of_a_laplace_approximation():
+def test_no_table_is_made_of_what_is_not_accepted():
     campaign = results().fit.campaign
     fit = fit_axis(campaign, sampled=False)
     with pytest.raises(NotConverged, match="Laplace"):
         compensation_of(AxisResults(summarise_axis(fit), fit, False), Wish())
+    rough = structs.replace(results().summary, answer="rough")
+    with pytest.raises(NotConverged, match="rough"):
+        compensation_of(AxisResults(rough, results().fit, False), Wish())
 
 
 def test_python_makes_the_file_in_one_call():

@@ -170,3 +170,17 @@ def test_between_cuts_a_density_goes_on_as_it_does_at_them():
     some = between_cuts(np.where(CUT_NODES < 3, parabola[cuts], np.nan))
     np.testing.assert_array_equal(np.isfinite(some), NODES < 2.5)
     assert not np.isfinite(between_cuts(np.full((2, len(CUT_NODES)), -np.inf))).any()
+
+
+def test_a_hole_between_cuts_swings_nothing_above_its_neighbours():
+    """The target may fall by 1e5 where the map's steps diverge: a cubic through it would rise as far beside."""
+    parabola = -0.5 * NODES**2
+    cuts = parabola[::2].copy()
+    inner, outer = 10, 18
+    for hole in (inner, outer):
+        cuts[hole] = -2e5
+    found = between_cuts(cuts)
+    assert found.max() == pytest.approx(0.0, abs=1e-9)
+    # The inner one, at 2, is filled to the lower of its neighbours, at 3.
+    at = np.argmin(np.abs(NODES - CUT_NODES[inner]))
+    assert found[at] == pytest.approx(-0.5 * CUT_NODES[inner + 1] ** 2)

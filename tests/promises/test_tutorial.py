@@ -212,8 +212,7 @@ def test_the_way_without_an_instrument_ends_as_its_page_says(tmp_path, monkeypat
     left = json.loads((tmp_path / "run/results/fit.json").read_text())["effective_deg_per_step"]["left"]
     truth = json.loads((tmp_path / "run/truth.json").read_text())["effective_deg_per_step"]["left"]
     looks, minutes, *values = map(float, re.findall(r"\d+\.?\d*", sentence))
-    assert [looks, minutes] == [
-        float(re.search(rf"^{name} +([\d.]+)$", printed, re.M)[1]) for name in ("looks", "minutes")
-    ]
+    shown = (float(re.search(rf"^{name} +([\d.]+)$", printed, re.M)[1]) for name in ("looks", "minutes"))
+    assert [looks, minutes] == [round(value, 1) for value in shown]
     # To the digits that the page shows.
     np.testing.assert_allclose([left["value"], *left["interval95"], truth], values, rtol=0, atol=5.1e-5)

@@ -88,5 +88,5 @@ def test_a_fit_says_where_the_error_by_position_is_largest_and_whose_it_may_be(c
 
 def test_numbers_that_must_not_be_used_are_not_offered_to_firmware(clean):
     assert "for firmware" in axis_fit_text(clean) and "largest at command" in axis_fit_text(clean)
-    broken = axis_fit_text(structs.replace(clean, converged=False, problems=("the chain stands still",)))
+    broken = axis_fit_text(structs.replace(clean, converged=False, sampling={}, problems=("no mode",)))
     assert "for firmware" not in broken and "largest at command" not in broken

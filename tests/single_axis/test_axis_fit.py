@@ -36,7 +36,8 @@ def test_both_tiers_agree_and_a_seed_gives_the_same():
     made = drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign
     one = fit_axis(made, seed=1)
     assert one.tier == "emcee" and one.error is None
-    assert one.agreement is not None and one.agreement.agrees
+    agreement = one.sample.convergence.agreement
+    assert agreement is not None and agreement.agrees
     quick, again = (fit_axis(made, tier="importance", seed=1) for _ in range(2))
     np.testing.assert_array_equal(quick.draws["backlash"], again.draws["backlash"])
     json.dumps(summarise_axis(one).as_json(), allow_nan=False)

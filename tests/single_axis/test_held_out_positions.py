@@ -48,8 +48,8 @@ def test_weighted_draws_of_one_fit_say_what_fits_without_a_position_say(monkeypa
     monkeypatch.setattr(held_out_positions, "REFITTED_MAX", 0)
     weighted = hold_out_positions(made).positions
     for one, other in zip(refitted, weighted, strict=True):
-        # Some hundred effective draws either way: means to a few tenths of u, u to a quarter.
-        assert one.predicted == pytest.approx(other.predicted, abs=0.3 * one.u)
+        # A hundred effective draws where an end is weighted out: means to a tenth of u, four of them, u to a quarter.
+        assert one.predicted == pytest.approx(other.predicted, abs=0.4 * one.u)
         assert one.u == pytest.approx(other.u, rel=0.25)
 
 

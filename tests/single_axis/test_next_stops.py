@@ -12,7 +12,8 @@ from support.axes import campaign, drawn, runs
 
 from tvsbayes.errors import InputError
 from tvsbayes.single_axis.axis_campaign import Reading, read_axis
-from tvsbayes.single_axis.axis_fit import HEADLINE_DRAWS, fit_axis, headline_functionals
+from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals
+from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_rows import reversal_of, rows_of
 from tvsbayes.single_axis.next_stops import NextStop, _with_stop, plan_next

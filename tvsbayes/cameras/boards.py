@@ -22,6 +22,7 @@ import numpy as np
 
 from tvsbayes.cameras.camera_marks import paired_pictures, unnamed_pictures
 from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
+from tvsbayes.cameras.seen_boards import why_no_board
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, in_grey_levels, read_image
@@ -43,6 +44,10 @@ PIXELS_MAX = 20_000_000
 SECTOR_PIXELS_MAX = 3_000_000
 """Larger pictures are searched by sectors in a smaller copy, then refined: 20 million pixels would take 3.8 GB and half
 a minute."""
+
+
+TRIED_MAX, TRIED_AT_ONCE = 12, 4
+"""Pictures in which a board is looked for before all are searched; as soon as one shows it, all are."""
 
 
 @dataclass(frozen=True)
@@ -251,8 +256,31 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
+@dataclass(frozen=True)
+class Pairing:
+    """Which picture is of which camera, where somebody has said it.
+
+    Attributes:
+        swap: the left camera's image is the right half of a wide frame, or has the larger number or later folder.
+        globs: patterns of the pictures of the left and of the right camera.
+        in_order: pictures are paired by the order of their names.
+    """
+
+    swap: bool = False
+    globs: tuple[str, str] | None = None
+    in_order: bool = False
+
+
+AS_NAMED = Pairing()
+
+
 def find_views(
-    folder: Path, board: Board, *, finder: Finder = "classic", swap: bool = False, advance: Advance = unshown
+    folder: Path,
+    board: Board,
+    *,
+    finder: Finder = "classic",
+    pairing: Pairing = AS_NAMED,
+    advance: Advance = unshown,
 ) -> Views:
     """Finds the board in all pictures of a folder.
 
@@ -263,19 +291,22 @@ def find_views(
         folder: of the pictures.
         board: what to look for.
         finder: see `find_corners`.
-        swap: the left camera's image is the right half of a wide frame.
+        pairing: which picture is of which camera.
         advance: told the share of the pictures that is done.
 
     Raises:
         InputError: no folder, an unreadable picture, or two for one camera and view.
-        NothingToEstimate: no picture of a camera.
+        NothingToEstimate: no picture of a camera, or no board in any.
     """
     folder = Path(folder)
-    sizes = _sizes(folder, swap)
+    sizes = _sizes(folder, pairing)
     _refuse_two_sizes(sizes, folder)
     counted = Counter(sizes.values())
     size = max(counted, key=lambda s: (counted[s], s))
     used = [picture for picture, own in sizes.items() if own == size]
+    spread = _spread(used)
+    if len(used) > len(spread) and not _any_board(folder, spread, size, board, finder):
+        raise _without_board(folder, spread, len(used), size, board)
     boards: dict[str, dict[str, _Detection]] = {}
     names: dict[tuple[str, str], str] = {}
     without, fallback = [], []
@@ -292,6 +323,8 @@ def find_views(
             boards.setdefault(picture.view, {})[side] = detection
             if detection.by_fallback:
                 fallback.append(name)
+    if not boards:
+        raise _without_board(folder, spread, len(used), size, board)
     views, reordered = [], []
     for name in sorted(boards, key=natural_order):
         left, right = (boards[name].get(side) for side in CAMERAS)
@@ -314,6 +347,47 @@ def find_views(
     )
 
 
+def _spread(used: Sequence[Picture]) -> list[Picture]:
+    """Some pictures, spread evenly over all."""
+    return [used[k] for k in sorted({round(x) for x in np.linspace(0, len(used) - 1, min(TRIED_MAX, len(used)))})]
+
+
+def _any_board(folder: Path, tried: Sequence[Picture], size: tuple[int, int], board: Board, finder: Finder) -> bool:
+    """Whether one of some pictures shows the board: all would take minutes."""
+    for k in range(0, len(tried), TRIED_AT_ONCE):
+        found = _detections(folder, tried[k : k + TRIED_AT_ONCE], size, board, finder)
+        if any(one is not None for detections in found for one in detections.values()):
+            return True
+    return False
+
+
+def _without_board(
+    folder: Path, tried: Sequence[Picture], count: int, size: tuple[int, int], board: Board
+) -> NothingToEstimate:
+    """That pictures do not show the board, and what they show instead."""
+    greys = [part for picture in tried for part in _greys(picture, folder, size).values()]
+    reason, remedy = why_no_board(greys, board.columns, board.rows)
+    where = f"{len(tried)} of {count} pictures" if len(tried) < count else f"{count} pictures"
+    return NothingToEstimate(
+        "no-board",
+        f"no board of {board.columns}x{board.rows} inner corners in {where} of {size[0]} x {size[1]} px: {reason}",
+        allowed="pictures that show the whole board",
+        remedy=remedy,
+    )
+
+
+def _greys(picture: Picture, folder: Path, size: tuple[int, int]) -> dict[str, np.ndarray]:
+    """The grey images in a picture by their camera, uint8."""
+    pixels = in_grey_levels(read_image(picture.path, folder))
+    # The finders want 8 bits; a corner is an average over hundreds of pixels.
+    if pixels.dtype != np.uint8:
+        pixels = np.rint(pixels).astype(np.uint8)
+    grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+    return {
+        side: np.ascontiguousarray(grey[:, k * size[0] : (k + 1) * size[0]]) for k, side in enumerate(picture.sides)
+    }
+
+
 def _refuse_two_sizes(sizes: dict[Picture, tuple[int, int]], folder: Path) -> None:
     """Refuses two cameras of two picture sizes: one of them would pass for a camera without boards."""
     usual = []
@@ -331,13 +405,14 @@ def _refuse_two_sizes(sizes: dict[Picture, tuple[int, int]], folder: Path) -> No
         )
 
 
-def _sizes(folder: Path, swap: bool) -> dict[Picture, tuple[int, int]]:
+def _sizes(folder: Path, pairing: Pairing) -> dict[Picture, tuple[int, int]]:
     """Width and height of one camera's image in every picture of a board, by their headers.
 
     The pictures of the majority are one calibration, and only those are decoded.
     """
     sizes, refused = {}, []
-    for picture in paired_pictures(folder, swap=swap, most=PICTURES_MAX):
+    stated = {"swap": pairing.swap, "globs": pairing.globs, "in_order": pairing.in_order}
+    for picture in paired_pictures(folder, most=PICTURES_MAX, **stated):  # type: ignore[arg-type]
         try:
             width, height = _size(picture.path, folder)
         except InputError as error:
@@ -352,7 +427,8 @@ def _sizes(folder: Path, swap: bool) -> dict[Picture, tuple[int, int]]:
             "no-pictures",
             f"{escaped(str(folder), 200)}: no checkerboard picture",
             allowed=f"{NAMING} (PNG or JPEG); or frames of both cameras side by side",
-            remedy="name the pictures left01.png, right01.png, left02.png ...",
+            remedy="name the pictures left01.png, right01.png, left02.png ...; or --pair order with a folder a camera, "
+            'or --left "cam_a/*.png" --right "cam_b/*.png"',
         )
     return sizes
 
@@ -374,18 +450,9 @@ def _detections(
 
     def detect(picture: Picture) -> dict[str, _Detection | None] | InputError:
         try:
-            pixels = in_grey_levels(read_image(picture.path, folder))
+            return {side: _detection(part, board, finder) for side, part in _greys(picture, folder, size).items()}
         except InputError as error:
             return error
-        # The finders want 8 bits; a corner is an average over hundreds of pixels.
-        if pixels.dtype != np.uint8:
-            pixels = np.rint(pixels).astype(np.uint8)
-        grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
-        parts = (grey[:, k * size[0] : (k + 1) * size[0]] for k in range(len(picture.sides)))
-        return {
-            side: _detection(np.ascontiguousarray(part), board, finder)
-            for side, part in zip(picture.sides, parts, strict=True)
-        }
 
     at_once = PIXELS_MAX // (size[0] * size[1] * max(len(p.sides) for p in pictures))
     with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, at_once))) as pool:

@@ -34,17 +34,23 @@ _NUMBERS = (
 )
 
 
-def paired_pictures(folder: Path, *, swap: bool = False, most: int) -> list[Picture]:
+def paired_pictures(
+    folder: Path, *, swap: bool = False, most: int, globs: tuple[str, str] | None = None, in_order: bool = False
+) -> list[Picture]:
     """The pictures of a folder as `pictures_of` has them; where its names give no pair, by other marks in them.
 
     Args:
         folder: with pictures in it or in folders below.
         swap: the left camera is the right half of wide pictures, or has the larger number or the later folder.
         most: how many pictures there may be.
+        globs: patterns of the pictures of the left and of the right camera, below the folder.
+        in_order: whether the first of the left belongs to the first of the right camera, whatever their names.
 
     Raises:
         InputError: no readable folder, too many pictures, two of one camera and view, or none of a format that is read.
     """
+    if globs is not None or in_order:
+        return _stated_pairs(Path(folder), globs, CAMERAS[::-1] if swap else CAMERAS, most)
     usual = pictures_of(folder, swap=swap, most=most)
     if any(count > 1 for count in Counter(picture.view for picture in usual if len(picture.sides) == 1).values()):
         return usual
@@ -60,6 +66,50 @@ def paired_pictures(folder: Path, *, swap: bool = False, most: int) -> list[Pict
         found, remedy = f"{len(images)} pictures", "move those that are not needed elsewhere"
         raise refusal("size", file=place, found=found, allowed=f"at most {most}", remedy=remedy)
     return _paired_otherwise(Path(folder), images, CAMERAS[::-1] if swap else CAMERAS) or usual
+
+
+def _stated_pairs(folder: Path, globs: tuple[str, str] | None, sides: tuple[str, str], most: int) -> list[Picture]:
+    """Pictures in the order of their names, the first of one camera with the first of the other.
+
+    The cameras are those of two patterns, else of two folders, else of the names.
+
+    Raises:
+        InputError: no two cameras, unlike numbers of pictures, or too many.
+    """
+    place = escaped(str(folder), 200)
+    if globs is not None:
+        # Of a pattern that leaves the folder nothing is taken.
+        inside = [pattern for pattern in globs if not Path(pattern).is_absolute() and ".." not in Path(pattern).parts]
+        groups = [
+            sorted((str(p) for p in folder.glob(pattern) if p.is_file()), key=natural_order) for pattern in inside
+        ]
+    else:
+        names = sorted((n for n in _names(folder) if n.lower().endswith(SUFFIXES)), key=natural_order)
+        stems = [name[: name.rindex(".")] for name in names]
+        marked = next(
+            (keys for keys in ([_by_words(s) for s in stems], [_by_letter(s) for s in stems]) if any(keys)),
+            _by_folder(stems, sides),
+        )
+        groups = [
+            [str(folder / n) for n, key in zip(names, marked, strict=True) if key and key[1] == side]
+            for side in CAMERAS
+        ]
+    counts = [len(group) for group in groups]
+    if len(groups) < 2 or not all(counts):
+        found = f"{' and '.join(str(count) for count in counts) or 'no'} pictures of the left and the right camera"
+        remedy = 'name them: --left "cam_a/*.png" --right "cam_b/*.png"'
+        raise refusal("no-pictures", file=place, found=found, allowed="pictures of two cameras", remedy=remedy)
+    if counts[0] != counts[1] or sum(counts) > most:
+        found, allowed = f"{counts[0]} left and {counts[1]} right pictures", f"as many of both, together {most} at most"
+        remedy = "take out those without their counterpart: pictures are paired by their order"
+        raise refusal("size", file=place, found=found, allowed=allowed, remedy=remedy)
+    views = [_plain(Path(path).stem) for path in groups[0]]
+    views = views if len(set(views)) == len(views) else [f"pair {k}" for k in range(1, len(views) + 1)]
+    return [
+        Picture(view, Path(path), (side,))
+        for side, group in zip(CAMERAS, groups, strict=True)
+        for view, path in zip(views, group, strict=True)
+    ]
 
 
 def unnamed_pictures(folder: Path, used: Iterable[Picture]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ green, red, uint8 or float32 DN of deeper ones.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi, sqrt
 
@@ -29,6 +30,12 @@ BLOCKS_PER_SD = 4
 WIDE_SD_PX = 5.0
 """Of a spot whose noise its own pixels show; in a narrower one they show its shape as well."""
 SHRINK = 4
+LAMP_SHARE = 0.01
+"""Of the picture, from which on a bright area that reaches its border is a lamp or a window, without a spot beside."""
+LAMP_TIMES, LAMP_DIM = 4.0, 0.8
+"""A bright area at the border, or larger than any spot, is a lamp or a window beside a spot of which it has so many
+times the area, or at most this share of the height: what of a laser's spot lies at the border is brighter than the
+reflections that it makes elsewhere, and no larger than they are."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,16 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     count, labels, stats, centroids = cv2.connectedComponentsWithStats(bright[around], connectivity=8)
     lit = labels > 0
     flux = np.bincount(labels[lit].astype(np.intp), weights=above[around][lit], minlength=count)
+    heights = np.zeros(count)
+    np.maximum.at(heights, labels[lit].astype(np.intp), above[around][lit])
+    if count > 2 or stats[1, cv2.CC_STAT_AREA] > 0.2 * LAMP_SHARE * bright.size:
+        ground = cv2.subtract(small, above, dtype=cv2.CV_32F)[around]
+        levels = [float((ground[labels == k] + 0.5 * heights[k]).mean()) for k in range(1, count)]
+        inside = [np.argwhere(labels == k)[0] + (row, column) for k in range(1, count)]
+        lamps, alone = _lamps(small, levels, inside, heights, flux)
+        if alone:
+            return "lamp"
+        flux[lamps] = 0.0
     main = int(flux.argmax())
     if np.sort(flux)[-2] > SECOND_SHARE * flux[main]:
         return "two-spots"
@@ -120,6 +137,39 @@ def patch_around(picture: np.ndarray) -> Patch | str:
         outline_px=outline + np.array([left, top]),
         size=(width, height),
     )
+
+
+def _lamps(
+    small: np.ndarray, levels: Sequence[float], inside: Sequence[np.ndarray], heights: np.ndarray, flux: np.ndarray
+) -> tuple[list[int], bool]:
+    """Bright areas that are lamps or windows beside a spot, and whether there is a lamp and no spot.
+
+    Beside a spot: at the border or too large, and large or dim beside it.
+
+    Args:
+        small: the picture in cells, (h, w).
+        levels: half way between what surrounds each area and its peak, DN: all that is connected above it belongs to
+            the area, also where the median of the surroundings had taken it away.
+        inside: row and column of a cell of each area.
+        heights: over the background, DN, of the areas from the second on; (n + 1,).
+        flux: sum over the area, likewise; (n + 1,).
+    """
+    import cv2
+
+    count = len(levels)
+    area, odd, at_border = np.zeros(count + 1), np.ones(count + 1, dtype=bool), np.zeros(count + 1, dtype=bool)
+    for k, (level, (row, column)) in enumerate(zip(levels, inside, strict=True), start=1):
+        _, labels, stats, _ = cv2.connectedComponentsWithStats((small > level).astype(np.uint8), connectivity=8)
+        whole = labels == labels[row, column]
+        area[k] = stats[labels[row, column], cv2.CC_STAT_AREA] if labels[row, column] else 1
+        at_border[k] = whole[0].any() or whole[-1].any() or whole[:, 0].any() or whole[:, -1].any()
+        at_border[k] &= bool(labels[row, column])
+        odd[k] = at_border[k] or area[k] > AREA_MAX_SHARE * small.size
+    if odd.all():
+        return [], bool(at_border[int(flux.argmax())] and area[int(flux.argmax())] > LAMP_SHARE * small.size)
+    best = int(np.argmax(np.where(odd, -1.0, flux)))
+    large, dim = area >= LAMP_TIMES * area[best], heights <= LAMP_DIM * heights[best]
+    return [k for k in range(1, count + 1) if odd[k] and (large[k] or dim[k])], False
 
 
 def _wide_median(wide: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from tvsbayes.cameras.board_errors import board_errors
-from tvsbayes.cameras.boards import Board, Finder, View, Views, find_views
+from tvsbayes.cameras.boards import AS_NAMED, Board, Finder, Pairing, View, Views, find_views
 from tvsbayes.cameras.bundle_adjustment import Adjustment, bundle_adjustment
 from tvsbayes.cameras.stereo_start import (
     DOUBTFUL_START_PX,
@@ -319,7 +319,7 @@ def calibrate_folder(
     board: Board,
     *,
     finder: Finder = "classic",
-    swap: bool = False,
+    pairing: Pairing = AS_NAMED,
     fix_k3: bool = False,
     robust: bool = False,
     progress: Show | None = None,
@@ -328,7 +328,7 @@ def calibrate_folder(
     began = time.perf_counter()
     with Job(STAGES, progress) as job:
         job.begin(FINDING)
-        found = find_views(folder, board, finder=finder, swap=swap, advance=job.at)
+        found = find_views(folder, board, finder=finder, pairing=pairing, advance=job.at)
         seconds = {"corners": time.perf_counter() - began}
         size = (found.image_width, found.image_height)
         job.begin(ADJUSTING)

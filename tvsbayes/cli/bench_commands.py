@@ -22,7 +22,7 @@ from tvsbayes.pipeline import compile_for
 
 if TYPE_CHECKING:
     from tvsbayes.cameras.assumed_covariance import Known
-    from tvsbayes.cameras.boards import Board, Finder
+    from tvsbayes.cameras.boards import Board, Finder, Pairing
     from tvsbayes.cameras.calibration_export import Format
     from tvsbayes.instrument.stereo_pair import Stereo
 
@@ -50,6 +50,13 @@ def stereo(
     swap: Annotated[
         bool, typer.Option("--swap", help="Wide frames hold the left camera's image on the right.")
     ] = False,
+    pair: Annotated[
+        str | None, typer.Option("--pair", help="name (default) or order: of the names of each camera.")
+    ] = None,
+    left: Annotated[
+        str | None, typer.Option("--left", help='Pictures of the left camera in FOLDER: "a/*.png".')
+    ] = None,
+    right: Annotated[str | None, typer.Option("--right", help="Likewise of the right camera.")] = None,
     fix_k3: Annotated[bool, typer.Option("--fix-k3", help="Keep k3 at 0.")] = False,
     robust: Annotated[bool, typer.Option("--robust", help="Leave out outlying views, by name.")] = False,
     image_size: Annotated[str | None, typer.Option("--image-size", help="1280x720, where imports lack it.")] = None,
@@ -76,9 +83,13 @@ def stereo(
     as_json: Json = False,
 ) -> None:
     """Calibrate the camera pair from checkerboard pictures. With the covariance of all 24 parameters; or import one."""
-    words = (export, ("opencv", "ros")), (finder, ("classic", "sector")), (import_unit, ("mm", "cm", "m"))
+    words = (
+        *((export, ("opencv", "ros")), (finder, ("classic", "sector"))),
+        *((import_unit, ("mm", "cm", "m")), (pair, ("name", "order"))),
+    )
     if odd := [escaped(str(value)) for value, allowed in words if value not in (None, *allowed)]:
         remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm, cm or m"
+        remedy += ", --pair name or order"
         raise InputError("usage", f"{', '.join(odd)}: no option of stereo takes this value", remedy=remedy)
     if (folder is None) == (not imports):
         found = "stereo needs pictures of a board, or a calibration to import"
@@ -91,7 +102,8 @@ def stereo(
     form: Format | None = None if export is None else "ros" if export == "ros" else "opencv"
     places = _new_files(out, form)
     if folder is None:
-        options = {"finder": finder, "swap": swap, "fix_k3": fix_k3, "robust": robust}
+        options: dict[str, object] = {"finder": finder, "swap": swap, "fix_k3": fix_k3, "robust": robust}
+        options |= {"pair": pair, "left": left, "right": right}
         refuse_options("for pictures of a board", "leave out --import", **options)
         _positive(rms_px=rms_px, **uncertainties)
         known = _known(board, pitch_mm, pitch_u_mm, made_by)
@@ -109,14 +121,28 @@ def stereo(
         from tvsbayes.report.command_text import stereo_calibration_text
 
         compile_for(report_line)
+        pairing = _pairing(pair, left, right, swap)
         kind: Finder = "sector" if finder == "sector" else "classic"
         with waiting() as progress:
             result = calibrate_folder(
-                folder, pattern, finder=kind, swap=swap, fix_k3=fix_k3, robust=robust, progress=progress
+                folder, pattern, finder=kind, pairing=pairing, fix_k3=fix_k3, robust=robust, progress=progress
             )
         document = {"source": "pictures", **result.as_json()}
         made = MadePair(result.stereo, stereo_calibration_text(result), document)
     _write_pair(made, places, form, as_json)
+
+
+def _pairing(pair: str | None, left: str | None, right: str | None, swap: bool) -> Pairing:
+    """Which picture is of which camera, by the options."""
+    from tvsbayes.cameras.boards import Pairing
+
+    if (left is None) != (right is None):
+        remedy = 'give both: --left "cam_a/*.png" --right "cam_b/*.png"'
+        raise InputError("usage", "--left and --right: one of both is missing", remedy=remedy)
+    if left is not None and right is not None:
+        refuse_options("of no use beside --left and --right", "leave it out, or exchange them", swap=swap)
+        return Pairing(globs=(left, right), in_order=True)
+    return Pairing(swap=swap, in_order=pair == "order")
 
 
 @dataclass(frozen=True)

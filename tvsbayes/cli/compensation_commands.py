@@ -113,19 +113,25 @@ def verify(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Whether a machine keeps the promise of its table: KEPT, BROKEN or CANNOT TELL.
+    """Whether a machine keeps the promise of its table.
 
-    Exit 0, 1 or 3. FRESH lists the commands that were asked for, before the correction. Which world fits: applied, not
-    applied, applied twice, wrong sign, another machine.
+    KEPT, BROKEN or CANNOT TELL: exit 0, 1 or 3. FRESH lists the commands that were asked for, before the correction.
+    Which world fits: applied, not applied, applied twice, wrong sign, another machine.
     """
+    from tvsbayes.compensation.verification import stored_compensation
     from tvsbayes.compensation.verification import verify as verified
     from tvsbayes.report.compensation_text import verification_text
-    from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT
+    from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
+    from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
 
     for folder in (campaign, fresh):
         _refuse_scanner(folder, "verify")
+    data = read_axis(campaign)
+    made = stored_compensation(data)
     with waiting() as progress:
-        found = verified(campaign, fresh, seed=seed, progress=progress)
+        found = verified(data, fresh, made=made, seed=seed, progress=progress)
+    kept = {"format": VERIFICATION_FORMAT, "inputs": axis_hashes(data), "table": made.digest, **found.as_json()}
+    keep(kept, output_place(campaign, "results") / "verification.json")
     for remark in found.remarks if as_json else ():
         report_line(f"warning: {remark}")
     finish(found.as_json(), verification_text(found), as_json)

@@ -85,7 +85,9 @@ def _linuxcnc(made: Compensation, origin: str) -> str:
         nominal = scale * row.command
         rows.append((nominal, nominal - added[ahead], nominal - added[back]))
     lines = [" ".join(f"{value:.{LINUXCNC_DECIMALS}f}" for value in values) for values in sorted(rows)]
-    says = "# in [JOINT_N]: COMP_FILE = this file, COMP_FILE_TYPE = 0; no BACKLASH beside it: play is in the table"
+    says = (
+        "# in [JOINT_N]: COMP_FILE = this file, COMP_FILE_TYPE = 0; the play is in it: BACKLASH beside it is not used"
+    )
     return "\n".join([*lines, *_commented(made, origin, "#"), says, ""])
 
 

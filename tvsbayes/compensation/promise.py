@@ -22,7 +22,8 @@ from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import AppliedBy, Compensation, SidePromise, TableRow
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis
-from tvsbayes.single_axis.axis_fit import AxisFit, line_weights
+from tvsbayes.single_axis.axis_density import line_weights
+from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_of
 from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
@@ -119,11 +120,14 @@ def refuse_unaccepted(results: AxisResults) -> None:
     """A table is made of an accepted answer alone: it moves a machine.
 
     Raises:
-        NotConverged: the fit is a Laplace approximation.
+        NotConverged: the answer is rough, or a Laplace approximation.
     """
-    if results.summary.estimator == "laplace":
-        message = "the fit is a Laplace approximation: no table is made of it, because its promise would be too small"
-        raise NotConverged("laplace", message, remedy="run `tvsbayes fit` without --no-sample, then compensate again")
+    answer = results.summary.answer
+    if answer != "accepted":
+        what = "a rough answer" if answer == "rough" else "a Laplace approximation"
+        message = f"the fit is {what}, not an accepted answer: the promise of a table made of it cannot be trusted"
+        remedy = "run `tvsbayes fit` again, without --no-sample or --quick, then compensate"
+        raise NotConverged("unaccepted", message, remedy=remedy)
 
 
 def _nominal(campaign: AxisCampaign, fitted: float, wish: Wish) -> float:

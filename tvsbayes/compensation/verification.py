@@ -27,6 +27,7 @@ from tvsbayes.results.compensation_record import (
     NOT_APPLIED,
     OTHER_MACHINE,
     TWICE,
+    VERIFICATION_FORMAT,
     WORLDS,
     WRONG_SIGN,
     Compensation,
@@ -259,19 +260,42 @@ def verify_readings(
     )
 
 
+AGAIN = "run `tvsbayes compensate` on this folder, and apply what it writes"
+
+
+def compensation_in(campaign: AxisCampaign) -> Compensation | None:
+    """What `compensate` left in a folder's `results/`, if it is of these data.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    keys = stored_document(campaign, "compensation.json", (COMPENSATION_FORMAT,), axis_hashes(campaign))
+    return None if keys is None else read_record(Compensation, keys, AGAIN)
+
+
 def stored_compensation(campaign: AxisCampaign) -> Compensation:
-    """What `compensate` left in a folder's `results/`.
+    """The same where there has to be one.
 
     Raises:
         InputError: there is none, it is of other data, or it is damaged.
     """
-    again = "run `tvsbayes compensate` on this folder, and apply what it writes"
-    keys = stored_document(campaign, "compensation.json", (COMPENSATION_FORMAT,), axis_hashes(campaign))
-    if keys is None:
-        found = "no compensation of these data"
-        allowed = "the one whose table is in force"
-        raise refusal("missing-file", file="results/compensation.json", found=found, allowed=allowed, remedy=again)
-    return read_record(Compensation, keys, again)
+    found = compensation_in(campaign)
+    if found is None:
+        what, allowed = "no compensation of these data", "the one whose table is in force"
+        raise refusal("missing-file", file="results/compensation.json", found=what, allowed=allowed, remedy=AGAIN)
+    return found
+
+
+def verification_in(campaign: AxisCampaign, made: Compensation) -> Verification | None:
+    """What `verify` said last of this table; None of another one.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    keys = stored_document(campaign, "verification.json", (VERIFICATION_FORMAT,), axis_hashes(campaign))
+    if keys is None or keys.values.get("table") != made.digest:
+        return None
+    return read_record(Verification, keys, "run `tvsbayes verify` again")
 
 
 def verify(

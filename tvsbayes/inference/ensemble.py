@@ -63,7 +63,8 @@ def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
     Never emcee 3.1.6's snooker or full-covariance Gaussian: both are biased.
     """
     steps = [(emcee.moves.MHMove(step), share) for step, share in proposal.steps]
-    return [*steps, (GroupEvolution(), 1 - sum(share for _, share in steps))]
+    rest = 1 - sum(share for _, share in steps)
+    return [*steps, (GroupEvolution(), rest)] if rest > 0 else steps
 
 
 def lengthening(found: Convergence) -> float:

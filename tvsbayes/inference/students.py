@@ -20,7 +20,9 @@ FLOOR = 1e-6
 FAR_SHARE, FAR_DRAWS, FAR_EFFECTIVE = 0.3, 50, 20.0
 """Of the weight in the tail that has a part of its own, and draws that it takes."""
 SHARE = 0.6
-"""Of a chain's steps that draw from it."""
+"""Of a chain's steps that draw from it; the others walk. Both ask the density of all walkers at once."""
+STRIDE = 2.38
+"""Of a random walk, over the root of the dimension (Gelman, Roberts and Gilks, Bayesian Statistics 5 (1996) 599)."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,12 @@ class StudentMixture:
     @property
     def steps(self) -> tuple[tuple[Step, float], ...]:
         """Of a chain, with their shares."""
-        return ((self, SHARE),)
+        return (self, SHARE), (self.walked, 1 - SHARE)
+
+    def walked(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """The same protocol: a random walk with the covariance of the last part."""
+        root = self.roots[-1] * STRIDE / np.sqrt(INFLATION * w.shape[1])
+        return w + generator.standard_normal(w.shape) @ root.T, np.zeros(len(w))
 
     def fitted(self, w: np.ndarray, log_target: np.ndarray, log_weights: np.ndarray) -> StudentMixture:
         """By the moments of weighted draws; where so few count that they have none, about the best of them."""

@@ -16,11 +16,21 @@ CUT_NODES = NODES[::2]
 """Where the target is cut: its logarithm is smooth."""
 STEP = float(NODES[1] - NODES[0])
 FLOOR = -40.0
-"""Of a tabulated log density below its largest: what lies lower is never drawn, and nought has no logarithm."""
+"""Of a tabulated log density below its largest: what lies lower is never drawn, and zero has no logarithm."""
+
+
+def _filled(values: np.ndarray) -> np.ndarray:
+    """Valleys (..., cuts) filled to the lower of the heights beside them.
+
+    A target may fall by 1e5 where the map's steps diverge: a cubic through such a hole rises as far beside it, and what
+    follows a leader would fill the leader's hole, each follower anew.
+    """
+    before, behind = values, values[..., ::-1]
+    return np.minimum(np.maximum.accumulate(before, axis=-1), np.maximum.accumulate(behind, axis=-1)[..., ::-1])
 
 
 def between_cuts(log_density: np.ndarray) -> np.ndarray:
-    """Log densities at `NODES` from those at `CUT_NODES` (..., cuts); -inf beside where none is.
+    """Log densities at `NODES` from those at `CUT_NODES` (..., cuts); -inf beside where none is, no valley.
 
     By Akima's (1970) cubics, exact for parabolas. They are local: the map's own tables bend at nodes.
     """
@@ -29,6 +39,7 @@ def between_cuts(log_density: np.ndarray) -> np.ndarray:
     none = ~np.isfinite(log_density)
     least = np.min(np.where(none, np.inf, log_density), axis=-1, keepdims=True)
     seen = np.where(none, np.where(np.isfinite(least), least, 0.0), log_density)
+    seen = _filled(seen)
     beside = np.zeros((*none.shape[:-1], len(NODES)), dtype=bool)
     beside[..., ::2], beside[..., 1::2] = none, none[..., :-1] | none[..., 1:]
     return np.where(beside, -np.inf, Akima1DInterpolator(CUT_NODES, seen, axis=-1)(NODES))

@@ -54,6 +54,8 @@ def factor_told(validation: Validation) -> str:
 
 
 LAPLACE_WORTH = "the table is the Laplace approximation, whose intervals are up to a quarter too short"
+UNSAMPLED = f"usable with care: the posterior could not be sampled; {LAPLACE_WORTH}"
+ROUGH = "usable, but rough: see the Monte Carlo error"
 """On 900 simulated campaigns its 95 % intervals of play hold the truth in 89 %, all others in 92 to 96 %
 (experiments/intervals): a normal interval of 89 % is 1.6 sd wide instead of 1.96."""
 
@@ -74,9 +76,9 @@ def verdict_line(summary: FitSummary) -> str:
     unseen = [d for d in DIRECTIONS if (e := summary.effective[d]) is not None and not e.informed]
     validation = summary.validation
     if not summary.converged:
-        told = f"usable with care: the posterior could not be sampled; {LAPLACE_WORTH}"
+        told = UNSAMPLED
     elif summary.answer == "rough":
-        told = "usable, but rough: see the Monte Carlo error"
+        told = ROUGH
     elif validation is None or not validation.tests:
         told = "usable; too few spots to look for model errors"
     else:

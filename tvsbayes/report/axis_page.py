@@ -8,25 +8,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tvsbayes.compensation.verification import compensation_in, verification_in
 from tvsbayes.errors import typed
 from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.axis_text import (
-    CONFLICTING,
+    axis_verdict,
     deviation_table,
     iso230_table,
     offered,
     parameter_table,
     period_table,
     ratio_table,
-    reserved,
 )
+from tvsbayes.report.compensation_text import compensation_section
 from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, drawing
 from tvsbayes.report.first_page import about_table
 from tvsbayes.report.page import NUMBER_DIGITS, numbered
 from tvsbayes.report.tables import FigureView, Issue, Number, Page, Section, concise, figure_view, two_digits
 from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.records import plain
-from tvsbayes.single_axis.axis_campaign import axis_hashes
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_periods import WaveSample, wave_samples
 from tvsbayes.single_axis.axis_record import AxisResults, drawn_deviations
 
@@ -110,6 +111,12 @@ def _figure_of(fit: AxisFit) -> FigureView | None:
     return figure_view(error_figure(fit), alt, caption)
 
 
+def _applied(campaign: AxisCampaign) -> list[Section]:
+    """What `compensate` and `verify` left beside the fit."""
+    made = compensation_in(campaign)
+    return [] if made is None else [compensation_section(made, verification_in(campaign, made))]
+
+
 def axis_page(results: AxisResults, issue: Issue) -> Page:
     """The page with its number; `results.fit` holds `curve_commands` of its range."""
     summary, fit = results.summary, results.fit
@@ -129,16 +136,14 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     classic = summary.classic
     told = f"Least-squares line: {concise(classic.per_command, classic.u_per_command)} {unit} per command, stops "
     told += f"independent, residual scatter {two_digits(classic.residual_sd)} {unit}."
-    usable = f"The intervals may be used{reserved(summary)}."
-    converged = usable if summary.converged else "NOT CONVERGED: the numbers must not be used"
-    if summary.converged and summary.prior_conflicts:
-        converged = f"PRIOR CONFLICT: {CONFLICTING}."
+    verdict = axis_verdict(summary)
+    verdict = f"{verdict[0].upper()}{verdict[1:]}."
     conflicts = [f"Prior conflict: {text}" for text in summary.prior_conflicts]
     waves, figures = period_table(summary), _wave_figures(fit)
     picture = _figure_of(fit)
     if picture is None and figures:
         picture, figures = figures[0], figures[1:]
-    in_words = [f"{text[0].upper()}{text[1:]}." for text in (offered(summary) if summary.converged else ())]
+    in_words = [f"{text[0].upper()}{text[1:]}." for text in (offered(summary) if summary.explained else ())]
     header = fit.campaign.header
     created = header.get("created")
     folder = "AXIS" if fit.campaign.path is None else typed(fit.campaign.path.resolve().name)
@@ -146,8 +151,8 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
         results=hashlib.sha256(said.encode()).hexdigest()[:NUMBER_DIGITS].upper(),
         name=title_of(header, fit.campaign.path),
         about=about_table(header, str(created) if created else "", issue),
-        verdict=f"{converged} No limit was stated." if summary.converged else converged,
-        verdict_class="cannot-tell" if summary.converged else "not-met",
+        verdict=f"{verdict} No limit was stated." if summary.explained else verdict,
+        verdict_class="cannot-tell" if summary.explained else "not-met",
         numbers=numbers,
         why=(),
         answer=waves or ratio_table(summary),
@@ -169,6 +174,7 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
                 "What repeats by position",
                 tables=[deviation_table(summary.deviations, unit, TABLE_ROWS) if summary.deviations else None],
             ),
+            *_applied(fit.campaign),
             Section("What the readings cannot tell", items=summary.weak_directions or ["Nothing of note."]),
             Section("Classic", text=[told], tables=[iso230]),
             Section("Method", text=method),

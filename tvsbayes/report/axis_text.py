@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tvsbayes.errors import escaped
+from tvsbayes.report.advice import ROUGH, UNSAMPLED
 from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
 from tvsbayes.results.estimates import Estimate
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS
@@ -175,19 +176,28 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     elif summary.weak_directions:
         count = len(summary.weak_directions)
         lines.append(f"--details and the report say more: {count} weak direction{'s' * (count > 1)}")
-    lines += [*_lines("NOT CONVERGED", summary.problems), *_lines("warning", summary.warnings)]
+    title = "not accepted" if summary.explained else "NOT CONVERGED"
+    lines += [*_lines(title, summary.problems), *_lines("warning", summary.warnings)]
     lines += _lines("prior conflict", summary.prior_conflicts)
     lines += [f"written: {', '.join(written)}"] if written else []
     counted = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}"
     waves = period_table(summary)
     parts = [counted, *([] if waves is None else [waves.text()])]
     parts += [parameter_table(summary).text(), ratio_table(summary).text()]
-    if summary.converged:
+    if summary.explained:
         parts += offered(summary)
-    verdict = "NOT CONVERGED, use none of these numbers"
-    if summary.converged:
-        verdict = f"PRIOR CONFLICT, {CONFLICTING}" if summary.prior_conflicts else f"usable{reserved(summary)}"
-    return "\n".join([*lines, *[""] * bool(lines), *parts, f"verdict: {verdict}"])
+    return "\n".join([*lines, *[""] * bool(lines), *parts, f"verdict: {axis_verdict(summary)}"])
+
+
+def axis_verdict(summary: AxisSummary) -> str:
+    """Whether the numbers may be used."""
+    if not summary.explained:
+        return "NOT CONVERGED, use none of these numbers"
+    if summary.prior_conflicts:
+        return f"PRIOR CONFLICT, {CONFLICTING}"
+    if not summary.converged:
+        return f"{UNSAMPLED}{reserved(summary)}"
+    return f"{ROUGH if summary.answer == 'rough' else 'usable'}{reserved(summary)}"
 
 
 def hold_out_table(found: AxisHoldOut, unit: str) -> TableView:

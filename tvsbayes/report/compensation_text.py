@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from msgspec import structs
+
 from tvsbayes.compensation.verification import VerifyPlan
 from tvsbayes.errors import escaped
-from tvsbayes.report.tables import TableView, two_digits
+from tvsbayes.report.tables import Section, TableView, two_digits
 from tvsbayes.results.compensation_record import (
     APPLIED,
     BROKEN,
@@ -50,6 +52,15 @@ def promise_table(made: Compensation) -> TableView:
     return TableView(caption, ["arriving", "without", "after applying", *CAUSES], rows)
 
 
+def sizes_table(found: Verification) -> TableView:
+    """Errors without the table and with it."""
+    rows = [
+        ["before (expected without the table)", two_digits(found.before.rms), two_digits(found.before.worst)],
+        ["after (read)", two_digits(found.after.rms), two_digits(found.after.worst)],
+    ]
+    return TableView(f"errors, {escaped(found.unit)}", ["", "RMS", "worst"], rows)
+
+
 def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
     """A compensation for people."""
     unit, (low, high) = escaped(made.unit), made.range_command
@@ -77,20 +88,15 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
 
 def verification_text(found: Verification) -> str:
     """A verification for people."""
-    unit = escaped(found.unit)
     p = "< 0.0003" if found.p < 3e-4 else f"= {found.p:.2g}"
     rows = [[name, f"{100 * chance:.1f} %"] for name, chance in found.worlds.items()]
-    sizes = [
-        ["before (expected without the table)", two_digits(found.before.rms), two_digits(found.before.worst)],
-        ["after (read)", two_digits(found.after.rms), two_digits(found.after.worst)],
-    ]
     lines = [
         f"{found.verdict}: {found.world} (p {p})",
         "",
         TableView(f"{found.readings} readings under the table", ["the table was", "probability"], rows).text(),
         "",
-        TableView(f"errors, {unit}", ["", "RMS", "worst"], sizes).text(),
-        f"promised: 95 % of errors at most {two_digits(found.promised95)} {unit}",
+        sizes_table(found).text(),
+        f"promised: 95 % of errors at most {two_digits(found.promised95)} {escaped(found.unit)}",
         *found.remarks,
     ]
     if found.verdict == BROKEN:
@@ -103,6 +109,24 @@ def verification_text(found: Verification) -> str:
         more = f"about {found.needed} readings of this kind" if found.needed else "some more readings"
         lines.append(f"what to do: {more} would tell; `tvsbayes plan --verify FOLDER` names those that tell soonest")
     return "\n".join(lines)
+
+
+def compensation_section(made: Compensation, found: Verification | None) -> Section:
+    """Report: what was made to be applied, what is left by the promise, and what fresh readings say of it."""
+    low, high = made.range_command
+    text = [
+        f"Made for {made.target}, to be applied by the {made.applied_by}; the promise holds for commands from "
+        f"{low:.10g} to {high:.10g}, within {two_digits(made.hours)} h and {made.travel_command:.4g} commands of "
+        "travel since homing."
+    ]
+    tables = [promise_table(made)]
+    if found is None:
+        text.append("No fresh readings have verified it.")
+    else:
+        said = f"{found.verdict}: {found.readings} fresh readings, most probable: {found.world}, p = {found.p:.2g}."
+        text.append(f"{said} Promised: 95 % of errors at most {two_digits(found.promised95)} {escaped(made.unit)}.")
+        tables.append(sizes_table(structs.replace(found, unit=made.unit)))
+    return Section("Applied, and what is left", text, made.unsaid, tables)
 
 
 def verify_plan_text(found: VerifyPlan) -> str:

@@ -5,6 +5,8 @@ Commands as the campaign counts them; readings, errors and uncertainties in its 
 
 from __future__ import annotations
 
+import hashlib
+import json
 from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta
@@ -13,6 +15,7 @@ from tvsbayes.display import Shown, View
 from tvsbayes.results.records import Count, FromOne, NotNegative, Positive, Probability, Record
 
 COMPENSATION_FORMAT = "tvsbayes-compensation/1"
+VERIFICATION_FORMAT = "tvsbayes-verification/1"
 AppliedBy = Literal["controller", "host"]
 Verdict = Literal["KEPT", "BROKEN", "CANNOT TELL"]
 KEPT: Verdict = "KEPT"
@@ -106,6 +109,11 @@ class Compensation(Shown, Record, frozen=True, kw_only=True):
     unsaid: tuple[str, ...]
     text: str = ""
     beside: ClassVar = ("text",)
+
+    @property
+    def digest(self) -> str:
+        """Of table and promise, so that a verification knows of which it is."""
+        return hashlib.sha256(json.dumps(self.as_json(), sort_keys=True).encode()).hexdigest()
 
     def shown(self) -> View:
         """The table."""

@@ -1,7 +1,8 @@
-"""The fit of one axis: mode, both tiers of the posterior, equal draws of everything that is said of it."""
+"""The fit of one axis: mode, the sampled posterior, equal draws of everything that is said of it."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,39 +10,24 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged, TvsError
-from tvsbayes.progress import Advance, Job, Show
+from tvsbayes.inference.importance import Sample, weighted_run
+from tvsbayes.progress import Job, Show
+from tvsbayes.results.records import AnswerKind, EstimatorName, Tier
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_conflicts import PriorConflict, conflict_text, prior_conflicts
+from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, AxisDensity, headline_functionals
 from tvsbayes.single_axis.axis_mode import AxisMode, find_mode
 from tvsbayes.single_axis.axis_model import AxisModel, LinearPosterior
 from tvsbayes.single_axis.axis_parameters import AxisPrior, axis_priors
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
-from tvsbayes.single_axis.axis_sampling import (
-    EQUAL_DRAWS,
-    AxisChain,
-    WeightedSample,
-    chain_quality,
-    grouped,
-    run_chain,
-    weighted_sample,
-)
 from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.period_search import waves_of
-from tvsbayes.statistics.weighted_draws import TAILS, weighted_summary
 
 MODE, WEIGHING, WALKING, TELLING = "mode", "weighted draws", "chain", "summarising"
-AGREEMENT_MAX = 4.0
-"""Monte Carlo errors by which a mean or an interval's end of both tiers may differ."""
-HEADLINES = ("per_command.forward", "per_command.backward", "backlash")
-
-
-@dataclass(frozen=True)
-class TierAgreement:
-    """Whether both tiers say the same: the largest difference in Monte Carlo errors, of which quantity."""
-
-    agrees: bool
-    worst: float
-    quantity: str
+EQUAL_DRAWS = 2000
+"""Kept of a sample, of equal weight."""
+ROUNDS_MAX = 16
+"""Of weighted draws: ends of an interval that is thin there take more draws than are worth the time of a chain."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -51,10 +37,8 @@ class AxisFit(Shown):
     Attributes:
         campaign, rows, model: what was fitted.
         mode: of the sampled parameters.
-        first: weighted draws; None of a Laplace approximation.
-        chain: None where none was run.
-        agreement: of both; None where there is one only, or the weighted draws were not accepted.
-        w: coordinates of equal draws, (draws, d).
+        sample: the sampled posterior; None where nothing was sampled.
+        w: coordinates of equal draws, (draws, d): of the Laplace approximation where no sample has an answer.
         seed: of everything random.
     """
 
@@ -62,9 +46,7 @@ class AxisFit(Shown):
     rows: AxisRows
     model: AxisModel
     mode: AxisMode
-    first: WeightedSample | None
-    chain: AxisChain | None
-    agreement: TierAgreement | None
+    sample: Sample | None
     w: np.ndarray
     seed: int
 
@@ -78,46 +60,43 @@ class AxisFit(Shown):
     def of_draws(cls, campaign: AxisCampaign, model: AxisModel, w: np.ndarray, seed: int) -> AxisFit:
         """Of draws that were kept; how they were made is not."""
         mode = AxisMode(w.mean(axis=0), np.atleast_2d(np.cov(w.T)), 0.0)
-        return cls(campaign, model.rows, model, mode, None, None, None, w, seed)
+        return cls(campaign, model.rows, model, mode, None, w, seed)
 
     @property
-    def estimator(self) -> str:
+    def answer(self) -> AnswerKind:
+        """What the intervals are."""
+        return "laplace" if self.sample is None else self.sample.convergence.answer
+
+    @property
+    def estimator(self) -> EstimatorName:
         """What made the intervals."""
-        return "laplace" if self.first is None else "posterior"
+        return "laplace" if self.answer == "laplace" else "posterior"
 
     @property
-    def tier(self) -> str | None:
+    def tier(self) -> Tier | None:
         """Of the posterior."""
-        return None if self.first is None else "importance" if self.chain is None else "emcee"
+        return None if self.sample is None or self.answer == "laplace" else self.sample.tier
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Why the intervals must not be used; empty where they may."""
-        if self.first is None or not self.free:
+        """What an accepted answer lacks, in sentences; without a sample why the mode must not be used."""
+        if self.sample is None:
             return self.mode.missing
-        if self.chain is None:
-            return self.first.missing
-        if self.agreement is not None and not self.agreement.agrees:
-            text = f"both tiers differ in {self.agreement.quantity} by {self.agreement.worst:.1f} Monte Carlo errors"
-            return (*self.chain.missing, text)
-        return self.chain.missing
+        lacks = {"accepted": "", "rough": "ROUGH", "laplace": "LAPLACE"}[self.answer]
+        return tuple(f"{lacks}: {sentence}" for sentence in self.sample.convergence.missing)
 
     @property
     def error(self) -> TvsError | None:
-        """`NotConverged` where the intervals must not be used."""
-        if not self.missing:
+        """`NotConverged` where there is no mode: nothing was sampled then, or no sample has an answer."""
+        if self.estimator == "posterior" or not self.mode.missing:
             return None
         if not self.free:
             remedy = "state other values in [axis]: every scale is held where the readings cannot be"
         elif contradicted := [conflict for conflict in self.conflicts if conflict.stated]:
-            # Between a prior and readings that contradict it no sampler comes to rest: longer helps nothing.
             remedy = "; ".join(conflict_text(conflict) for conflict in contradicted)
-        elif self.first is None:
-            remedy = "run again without --no-sample"
         else:
-            longer = "more --max-minutes" if self.chain is not None and self.chain.missing else "another --seed"
-            remedy = "run again without --quick" if self.chain is None else f"run again with {longer}"
-        return NotConverged("unconverged", "UNCONVERGED: " + "; ".join(self.missing), remedy=remedy)
+            remedy = "look for wild readings, and at the values and u of [axis]"
+        return NotConverged("unconverged", "UNCONVERGED: " + "; ".join(self.mode.missing), remedy=remedy)
 
     @cached_property
     def conflicts(self) -> tuple[PriorConflict, ...]:
@@ -150,53 +129,6 @@ class AxisFit(Shown):
     def free(self) -> tuple[str, ...]:
         """Sampled parameters."""
         return self.model.coordinates.names
-
-
-HEADLINE_DRAWS = (
-    *("offset", "per_command", "ratio_contrast", "backlash"),
-    *("per_command.forward", "per_command.backward", "effective_per_command"),
-)
-"""Rows of `headline_functionals`."""
-
-
-def line_weights(model: AxisModel, w: np.ndarray) -> np.ndarray:
-    """Slope of the least-squares line of the error by position over the rows, each counting once.
-
-    Shape (columns,), or (n, columns) at draws w (n, d) where a period is not known.
-    """
-    rows = model.rows
-    off = rows.command - rows.command.mean()
-    weights = off / (off @ off)
-    if not model.repeats_by_draw:
-        return weights @ model.functional(rows.command)
-    return np.concatenate([weights @ model.functional(rows.command, part) for part in blocks_of(w)])
-
-
-def blocks_of(w: np.ndarray) -> list[np.ndarray]:
-    """Draws (n, d) in blocks small enough for functionals of many commands."""
-    return np.array_split(w, max(1, len(w) // 100))
-
-
-def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
-    """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns), or (n, ...) as those of `line_weights`."""
-    of = model.head
-    weights = line_weights(model, w)
-    found = np.array(
-        [
-            # At command nought, where folders count from.
-            of(offset=1.0, slope=-model.middle),
-            of(slope=1.0),
-            of(contrast=1.0),
-            of(backlash=1.0),
-            of(slope=1.0, contrast=0.5),
-            of(slope=1.0, contrast=-0.5),
-            of(slope=1.0),
-        ]
-    )
-    if weights.ndim == 2:
-        found = np.repeat(found[None], len(weights), axis=0)
-    found[..., -1, :] += weights
-    return found
 
 
 def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisModel:
@@ -244,86 +176,26 @@ def fit_axis(
     """
     model = model_of(campaign, more)
     stages = {MODE: 1.0, WEIGHING: 2.0 * sampled, WALKING: 8.0 * (sampled and tier == "emcee"), TELLING: 0.5}
-    rng = np.random.default_rng([seed, 1])
     with Job(stages, progress) as job:
         job.begin(MODE)
-        mode = find_mode(model)
-        first, chain, agreement = None, None, None
-        if sampled:
+        mode, sample = find_mode(model), None
+        if sampled and len(mode.w) and np.isfinite(mode.log_density):
             job.begin(WEIGHING)
-            first = weighted_sample(model.log_density, mode, rng, advance=job.at)
-            w = first.equal(EQUAL_DRAWS, rng)
-            if tier == "emcee" and len(mode.w):
+            run, began = weighted_run(AxisDensity(model, mode), seed, job.at, ROUNDS_MAX), time.monotonic()
+            sample = run.sample
+            if tier == "emcee":
+                from tvsbayes.inference.ensemble import Run, better
+
                 job.begin(WALKING)
-                walked = _walked(model, first, seed, 60.0 * max_minutes, rng, job.at)
-                chain, agreement = walked.chain, walked.agreement
-                flat = chain.w.reshape(-1, chain.w.shape[2])
-                w = flat[np.linspace(0, len(flat) - 1, EQUAL_DRAWS).astype(int)]
+                sample = better(sample, Run(run, None, None, job.at, began).until_converged(60.0 * max_minutes))
+        job.begin(TELLING)
+        rng = np.random.default_rng([seed, 1])
+        if sample is not None and sample.convergence.converged:
+            w = sample.equal(EQUAL_DRAWS, rng)
         elif len(mode.w):
             w = rng.multivariate_normal(mode.w, mode.covariance, EQUAL_DRAWS, method="cholesky")
         else:
             w = np.zeros((EQUAL_DRAWS, 0))
-        job.begin(TELLING)
-        found = AxisFit(campaign, model.rows, model, mode, first, chain, agreement, w, seed)
+        found = AxisFit(campaign, model.rows, model, mode, sample, w, seed)
         assert found.draws
     return found
-
-
-@dataclass(frozen=True)
-class _Walked:
-    """A chain, and whether it agrees with the weighted draws; None where these cannot be used."""
-
-    chain: AxisChain
-    agreement: TierAgreement | None
-
-
-def _walked(
-    model: AxisModel,
-    first: WeightedSample,
-    seed: int,
-    max_seconds: float,
-    rng: np.random.Generator,
-    advance: Advance,
-) -> _Walked:
-    """A chain that agrees with the weighted draws, where these may be used, or went on for long."""
-    if first.missing:
-        return _Walked(run_chain(model.log_density, first, seed, max_seconds, advance), None)
-    found: list[TierAgreement] = []
-
-    def agrees(w: np.ndarray) -> bool:
-        found.append(_agreement(model, first, w, rng))
-        return found[-1].agrees
-
-    chain = run_chain(model.log_density, first, seed, max_seconds, advance, agrees)
-    return _Walked(chain, found[-1] if found else _agreement(model, first, chain.w, rng))
-
-
-def _agreement(model: AxisModel, first: WeightedSample, w: np.ndarray, rng: np.random.Generator) -> TierAgreement:
-    """Both tiers' means and interval ends of the headlines, given their scales: expectations and spreads alike."""
-    picked = [HEADLINE_DRAWS.index(name) for name in HEADLINES]
-    # Of no headline the functional depends on the draw.
-    functionals = headline_functionals(model, first.w[:1]).reshape(-1, model.columns)[picked]
-    keep = slice(None, None, max(1, len(first.w) // 6000))
-    theirs = weighted_summary(
-        model.linear(first.w[keep]).drawn(functionals, rng), first.weights[keep] / first.weights[keep].sum()
-    )
-    stride = max(1, w.shape[1] * w.shape[0] // 6000)
-    part = w[:, ::stride]
-    ours = model.linear(part.reshape(-1, part.shape[2])).drawn(functionals, rng)
-    values = ours.reshape(*part.shape[:2], len(HEADLINES))
-    _, bulk, tail = chain_quality(values)
-    gaps = {}
-    for k, name in enumerate(HEADLINES):
-        flat = grouped(values)[..., k].ravel()
-        if flat.std() == 0:
-            continue
-        gap = abs(flat.mean() - theirs.mean[k]) / np.hypot(flat.std() / np.sqrt(bulk[k]), theirs.mcse_mean[k])
-        gaps[name] = float(gap)
-        for end, probability in enumerate(TAILS):
-            about = probability + np.array([-1, 0, 1]) * np.sqrt(probability * (1 - probability) / tail[k])
-            low, middle, high = np.quantile(flat, np.clip(about, 0.0, 1.0))
-            error = np.hypot(0.5 * (high - low), theirs.mcse_interval95[end][k])
-            gap = float(abs(middle - theirs.interval95[end][k]) / error)
-            gaps[f"{name}, {('lower', 'upper')[end]} end"] = gap
-    worst = max(gaps, key=lambda name: gaps[name])
-    return TierAgreement(gaps[worst] < AGREEMENT_MAX, gaps[worst], worst)

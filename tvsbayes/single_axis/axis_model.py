@@ -17,6 +17,7 @@ import numpy as np
 
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, AxisCoordinates, AxisPrior
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_are_long, play_places, reversal_of
+from tvsbayes.single_axis.filter_of_rows import averaged_variance, whitened
 from tvsbayes.single_axis.process_places import ProcessPlaces, process_places
 from tvsbayes.single_axis.waves import COLUMNS, SHARES, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
@@ -62,6 +63,33 @@ class LinearPosterior:
         normal = rng.standard_normal(values.shape) * np.sqrt(np.maximum(values, 0.0))
         mean = np.einsum("ni,nti->nt", self.mean, functionals) if functionals.ndim == 3 else self.mean @ functionals.T
         return mean + np.einsum("nij,nj->ni", vectors, normal)
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Of the readings at many coordinates, what is linear integrated out.
+
+    Attributes:
+        log_density: shape (n,).
+        linear: of the functionals that were asked for, in the place of columns.
+    """
+
+    log_density: np.ndarray
+    linear: LinearPosterior
+
+    @classmethod
+    def nowhere(cls, count: int, wanted: int) -> Likelihood:
+        """Without a value."""
+        return cls(
+            np.full(count, -np.inf), LinearPosterior(np.zeros((count, wanted)), np.zeros((count, wanted, wanted)))
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Likelihood]) -> Likelihood:
+        """One after the other."""
+        mean, covariance = ([getattr(part.linear, name) for part in parts] for name in ("mean", "covariance"))
+        linear = LinearPosterior(np.concatenate(mean), np.concatenate(covariance))
+        return cls(np.concatenate([part.log_density for part in parts]), linear)
 
 
 @dataclass(frozen=True)
@@ -372,38 +400,64 @@ class AxisModel:
 
     def log_likelihood(self, w: np.ndarray) -> np.ndarray:
         """Log density of the readings at coordinates (n, d), shape (n,)."""
-        found = np.empty(len(w))
-        rows = len(self.rows.move)
+        return self.likelihood(w, np.zeros((0, self.columns))).log_density
+
+    def likelihood(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
+        """At coordinates (n, d), with what it says of functionals (t, columns) of what is linear."""
+        rows, wanted = len(self.rows.move), len(functionals)
+        log_density, mean, covariance = np.empty(len(w)), np.empty((len(w), wanted)), np.empty((len(w), wanted, wanted))
         for part, block in self._blocks(w):
             information, towards = _information(block, 0)
             root, scaled, scale = _equilibrated(information)
-            solved = np.linalg.solve(scaled, (towards / scale)[..., None])[..., 0]
-            explained = np.sum(towards / scale * solved, axis=1)
+            sides = np.concatenate([towards[:, None], functionals @ block.factor], axis=1) / scale[:, None]
+            solved = np.linalg.solve(scaled, np.swapaxes(sides, 1, 2))
+            found = sides @ solved
             log_det = 2 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)) + np.log(scale), axis=1)
-            left = block.products[:, 0, 0] - explained
-            found[part] = -0.5 * (block.log_scatter + log_det + left + rows * np.log(2 * np.pi))
+            left = block.products[:, 0, 0] - found[:, 0, 0]
+            log_density[part] = -0.5 * (block.log_scatter + log_det + left + rows * np.log(2 * np.pi))
+            mean[part], covariance[part] = found[:, 0, 1:], found[:, 1:, 1:]
+        if wanted:
+            mean += self._prior_means(w) @ functionals.T
+        return Likelihood(log_density, LinearPosterior(mean, covariance))
+
+    def _prior_means(self, w: np.ndarray) -> np.ndarray:
+        """Of the columns, (n, columns): what their deviations are from."""
+        found = np.zeros((len(w), self.columns))
+        found[:, OFFSET] = self.rows.line[0] + self.rows.line[1] * self.middle
+        found[:, SLOPE] = self.priors["per_command"].value
+        found[:, BACKLASH] = self.coordinates.values(w)["backlash"]
+        for k, name in enumerate(self.shifts, start=HEAD + len(self.homed) + len(self.unknown_segments)):
+            found[:, k] = self.priors[name].value
         return found
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
         """Log posterior density at coordinates (n, d) up to a constant, shape (n,); -inf where it has no value."""
-        found = np.full(len(w), -np.inf)
+        return self.posterior(w, np.zeros((0, self.columns))).log_density
+
+    def posterior(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
+        """The same with the prior of the coordinates; nought where it has no value."""
+        wanted = len(functionals)
+        found = Likelihood.nowhere(len(w), wanted)
         usable = np.flatnonzero(np.all(np.abs(w) < FARTHEST, axis=1))
         if len(usable):
             prior = self.coordinates.log_prior(w[usable])
             usable, prior = usable[np.isfinite(prior)], prior[np.isfinite(prior)]
-            value = self._possible(w[usable]) + prior
-            found[usable] = np.where(np.isfinite(value), value, -np.inf)
+        if len(usable):
+            seen = self._possible(w[usable], functionals)
+            value = seen.log_density + prior
+            found.log_density[usable] = np.where(np.isfinite(value), value, -np.inf)
+            found.linear.mean[usable], found.linear.covariance[usable] = seen.linear.mean, seen.linear.covariance
         return found
 
-    def _possible(self, w: np.ndarray) -> np.ndarray:
-        """`log_likelihood`, -inf where rounding leaves a matrix no factor."""
+    def _possible(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
+        """`likelihood`, -inf where rounding leaves a matrix no factor."""
         try:
-            return self.log_likelihood(w)
+            return self.likelihood(w, functionals)
         except np.linalg.LinAlgError:
             if len(w) == 1:
-                return np.array([-np.inf])
+                return Likelihood.nowhere(1, len(functionals))
             middle = len(w) // 2
-            return np.concatenate([self._possible(w[:middle]), self._possible(w[middle:])])
+            return Likelihood.joined([self._possible(half, functionals) for half in (w[:middle], w[middle:])])
 
     def linear(self, w: np.ndarray) -> LinearPosterior:
         """What is linear, given coordinates (n, d); means are whole, not deviations from the priors'."""
@@ -422,12 +476,7 @@ class AxisModel:
                 # Of the error by position, then of the play: independent beforehand.
                 free = block.factor[:, own[:, None], own]
                 covariances[part, own[:, None], own] += free @ np.swapaxes(free, 1, 2)
-        means[:, OFFSET] += self.rows.line[0] + self.rows.line[1] * self.middle
-        means[:, SLOPE] += self.priors["per_command"].value
-        means[:, BACKLASH] += self.coordinates.values(w)["backlash"]
-        for k, name in enumerate(self.shifts, start=HEAD + len(self.homed) + len(self.unknown_segments)):
-            means[:, k] += self.priors[name].value
-        return LinearPosterior(means, covariances)
+        return LinearPosterior(means + self._prior_means(w), covariances)
 
     def left_out(self, w: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is foretold of some rows by all others, given the scales.
@@ -500,12 +549,6 @@ def _creeps(rows: AxisRows) -> bool:
     return bool(np.ptp(rows.warm_s) > 0)
 
 
-def averaged_variance(over: np.ndarray) -> np.ndarray:
-    """Variance of an exponentially correlated process' mean over a time, in units of its own; `over` its lasting."""
-    far = np.maximum(over, 1e-3)
-    return np.where(over > 1e-3, 2 / far * (1 + np.expm1(-far) / far), 1.0 - over / 3)
-
-
 _HEAD_COLUMNS = {"offset": OFFSET, "slope": SLOPE, "contrast": CONTRAST, "backlash": BACKLASH}
 
 
@@ -536,58 +579,3 @@ def rows_log_density(rows: AxisRows, reading_scale: np.ndarray) -> np.ndarray:
     known = rows.variance > 0
     freedom = float(np.sum(rows.count[known] - 1))
     return -freedom * np.log(reading_scale) - 0.5 * float(rows.within[known].sum()) / reading_scale**2
-
-
-def whitened(
-    columns: np.ndarray, rows: AxisRows, drift: np.ndarray, stop: np.ndarray, reading: np.ndarray, carry: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Columns in units of the scatter of drift, stop errors and readings, decorrelated: innovations of the filter.
-
-    Args:
-        columns: shape (n or 1, rows, c).
-        rows: their times and segments.
-        drift: variance per hour, shape (n,).
-        stop: variances of stop errors or seeing, shape (n, rows).
-        reading: variances of readings, shape (n, rows).
-        carry: how much of the stop error or seeing of the row before each has; 0 where it is a new one, 1 where it is
-            the same; shape (n or 1, rows).
-
-    Returns:
-        Innovations over their sd (n, rows, c), and the log-determinant of the scatter (n,).
-    """
-    n, count, width = len(drift), columns.shape[1], columns.shape[2]
-    white = np.empty((n, count, width))
-    log_scatter = np.zeros(n)
-    zero, held = np.zeros((n, width)), np.zeros((n, width))
-    p_zero, p_held, p_both = np.zeros(n), np.zeros(n), np.zeros(n)
-    for k in range(count):
-        if k and rows.segment[k] != rows.segment[k - 1]:
-            zero, p_zero, p_both = np.zeros((n, width)), np.zeros(n), np.zeros(n)
-        p_zero = p_zero + drift * rows.hours[k]
-        kept = carry[:, k]
-        if np.all(kept == 0):
-            held, p_held, p_both = np.zeros((n, width)), stop[:, k], np.zeros(n)
-        else:
-            held, p_both = kept[:, None] * held, kept * p_both
-            p_held = kept**2 * p_held + (1 - kept**2) * stop[:, k]
-        noise = reading[:, k]
-        variance = p_zero + 2 * p_both + p_held + noise
-        innovation = columns[:, k] - zero - held
-        white[:, k] = innovation / np.sqrt(variance)[:, None]
-        log_scatter += np.log(variance)
-        gain_zero, gain_held = (p_zero + p_both) / variance, (p_held + p_both) / variance
-        zero = zero + gain_zero[:, None] * innovation
-        if k + 1 < count and np.any(carry[:, k + 1]):
-            held = held + gain_held[:, None] * innovation
-        # Joseph's form: differences of large variances keep the rest positive.
-        left_zero, left_held = 1 - gain_zero, 1 - gain_held
-        after_zero = left_zero**2 * p_zero - 2 * left_zero * gain_zero * p_both + gain_zero**2 * (p_held + noise)
-        after_held = left_held**2 * p_held - 2 * left_held * gain_held * p_both + gain_held**2 * (p_zero + noise)
-        p_both = (
-            (left_zero * left_held + gain_zero * gain_held) * p_both
-            - left_zero * gain_held * p_zero
-            - gain_zero * left_held * p_held
-            + gain_zero * gain_held * noise
-        )
-        p_zero, p_held = after_zero, after_held
-    return white, log_scatter

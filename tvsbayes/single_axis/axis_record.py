@@ -9,15 +9,17 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from msgspec import Meta
+from msgspec import Meta, field
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate, TvsError, escaped, listed, refusal
 from tvsbayes.files.disk import RESULTS_BYTES_MAX, make_folder, read_arrays, write_atomically
 from tvsbayes.progress import Show
+from tvsbayes.results.convergence import Convergence, MonteCarloError
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate
 from tvsbayes.results.fit_record import Provenance, Sha256, provenance
 from tvsbayes.results.records import (
+    AnswerKind,
     Count,
     EstimatorName,
     NotNegative,
@@ -31,8 +33,9 @@ from tvsbayes.results.records import (
 )
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_conflicts import conflict_text
+from tvsbayes.single_axis.axis_density import blocks_of, line_weights
 from tvsbayes.single_axis.axis_doubts import data_doubts
-from tvsbayes.single_axis.axis_fit import AxisFit, blocks_of, fit_axis, line_weights, model_of
+from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, kind_of, prior_sd
 from tvsbayes.single_axis.axis_periods import PeriodEstimate, period_estimate, wave_samples, weak_waves
 from tvsbayes.single_axis.axis_rows import AxisRows
@@ -71,8 +74,8 @@ class AxisSummary(Shown, Record, frozen=True):
         unit: of everything but commands, hours and shares.
         estimator: "laplace" or "posterior".
         tier: what made a posterior's draws, "importance" or "emcee"; None of a Laplace approximation.
-        converged: whether the intervals may be used.
-        problems: why not.
+        converged: there is a mode, and an answer of the sampler, accepted or rough, where one was asked for.
+        problems: what an accepted answer lacks.
         per_command: ratio by direction, "forward" and "backward"; it holds beyond the range read.
         effective_per_command: slope of the least-squares line through the positions read, by direction.
         range_command: least and largest command read; `effective_per_command` belongs to it.
@@ -86,6 +89,8 @@ class AxisSummary(Shown, Record, frozen=True):
         weak_directions, warnings: sentences.
         sampling: diagnosis of the draws.
         prior_conflicts: priors that the readings contradict, in words.
+        answer: what the intervals are: of a sample that was accepted, of a rough one, of the Laplace approximation.
+        monte_carlo_error: of every headline, in its sd.
     """
 
     unit: str
@@ -106,9 +111,16 @@ class AxisSummary(Shown, Record, frozen=True):
     warnings: tuple[str, ...]
     sampling: dict[str, float | int | None]
     prior_conflicts: tuple[str, ...] = ()
+    answer: AnswerKind = "laplace"
+    monte_carlo_error: dict[str, MonteCarloError] = field(default_factory=dict)
     periods: tuple[PeriodEstimate, ...] = ()
     encoder_periods: tuple[PeriodEstimate, ...] = ()
     periods_in: PeriodClock = "unit"
+
+    @property
+    def explained(self) -> bool:
+        """There is a mode: only then is anything sampled."""
+        return self.converged or bool(self.sampling)
 
     def shown(self) -> View:
         """Ratios by direction, then every parameter."""
@@ -148,20 +160,13 @@ def _estimate(
 
 
 def _diagnoses(fit: AxisFit) -> dict[str, tuple[float | None, float | None, float | None]]:
-    """R-hat, bulk and tail effective draws by sampled parameter; what is linear has those of the least known."""
-    nothing = (None, None, None)
-    names = fit.free
-    if fit.first is None or not names:
-        return {"": nothing}
-    if fit.chain is None:
-        worth = (None, fit.first.effective, fit.first.effective)
-        return {"": worth}
-    chain = fit.chain
-    each: dict[str, tuple[float | None, float | None, float | None]] = {
-        name: (float(chain.rhat[k]), float(chain.ess_bulk[k]), float(chain.ess_tail[k])) for k, name in enumerate(names)
-    }
-    each[""] = (float(chain.rhat.max()), float(chain.ess_bulk.min()), float(chain.ess_tail.min()))
-    return each
+    """R-hat, bulk and tail effective draws by quantity; every other has those of the least known."""
+    if fit.sample is None or fit.answer == "laplace":
+        return {"": (None, None, None)}
+    found = fit.sample.convergence
+    each = {name: (found.rhat.get(name), found.ess_bulk[name], found.ess_tail[name]) for name in found.ess_bulk}
+    worst = max(found.rhat.values(), default=None), min(found.ess_bulk.values()), min(found.ess_tail.values())
+    return {**each, "": worst}
 
 
 def _prior_sds(fit: AxisFit) -> dict[str, float]:
@@ -196,7 +201,9 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         unit=fit.campaign.unit,
         estimator=fit.estimator,
         tier=fit.tier,
-        converged=not fit.missing,
+        answer=fit.answer,
+        monte_carlo_error={} if fit.sample is None else fit.sample.convergence.monte_carlo_error,
+        converged=fit.error is None and (fit.sample is None or fit.answer != "laplace"),
         problems=fit.missing,
         per_command={side: of(f"per_command.{side}") for side in sides},
         effective_per_command={
@@ -271,19 +278,21 @@ def _deviations(fit: AxisFit) -> tuple[PositionDeviation, ...]:
 
 
 def _sampling(fit: AxisFit) -> dict[str, float | int | None]:
-    first, chain = fit.first, fit.chain
-    if first is None:
+    if fit.sample is None:
         return {}
+    judged = fit.sample.convergence
+    first = judged.importance
     found: dict[str, float | int | None] = {
-        "draws": len(first.w),
+        "draws": first.draws,
         "rounds": first.rounds,
-        "effective": float(first.effective) if np.isfinite(first.effective) else None,
+        "effective": first.effective_share * first.draws,
         "pareto_k": first.pareto_k,
     }
-    if chain is not None:
-        found |= {"steps": chain.steps, "acceptance": chain.acceptance, "autocorrelation_times": chain.taus}
-    if fit.agreement is not None:
-        found["agreement"] = fit.agreement.worst
+    if isinstance(judged, Convergence):
+        found |= {"steps": judged.steps, "acceptance": float(judged.acceptance.mean())}
+        found["autocorrelation_times"] = (judged.steps - judged.discarded) / judged.tau_steps
+        if judged.agreement is not None:
+            found["agreement"] = judged.agreement.worst.value
     return found
 
 

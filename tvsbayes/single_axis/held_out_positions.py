@@ -8,21 +8,22 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate
+from tvsbayes.inference.importance import K_MAX, weighted_run
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
+from tvsbayes.single_axis.axis_density import AxisDensity
 from tvsbayes.single_axis.axis_fit import model_of
 from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
-from tvsbayes.single_axis.axis_sampling import PARETO_K_MAX, WeightedSample, weighted_sample
 from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.predicted_stops import carried_scales
 from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
-EFFECTIVE, DRAWS = 600.0, 300
-"""Effective draws of every fit without a position, and draws that foretell."""
+DRAWS, HELD_ROUNDS = 300, 2
+"""Draws that foretell, of every fit without a position, and its rounds of importance sampling at least."""
 POSITIONS_MIN, POSITIONS_MAX = 3, 200
 REFITTED_MAX, WEIGHED, WEIGHED_MIN = 30, 400, 80
 """Positions up to which each has a fit of its own; beyond, draws of one fit are weighted, as long as so many of them
@@ -134,7 +135,7 @@ def _reweighted(model: AxisModel, w: np.ndarray, left: np.ndarray) -> _Foretold 
     _, log_det = np.linalg.slogdet(covariances)
     square = np.einsum("ni,ni->n", off, np.linalg.solve(covariances, off[..., None])[..., 0])
     smooth = smoothed_weights(0.5 * (log_det + square))
-    if not smooth.pareto_k < PARETO_K_MAX or effective_draws(smooth.weights) < WEIGHED_MIN:
+    if not smooth.pareto_k < K_MAX or effective_draws(smooth.weights) < WEIGHED_MIN:
         return None
     return _mixture(means, covariances, smooth.weights)
 
@@ -201,7 +202,24 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
 def _whole_draws(model: AxisModel, seed: int) -> np.ndarray:
     """Coordinates (`WEIGHED`, d) of the scales by all rows."""
     rng = np.random.default_rng([seed, 8])
-    return weighted_sample(model.log_density, find_mode(model), rng, EFFECTIVE).equal(WEIGHED, rng)
+    return _drawn(model, WEIGHED, seed, rng).w
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Coordinates (n, d) of equal draws, and what their sample lacks, or ""."""
+
+    w: np.ndarray
+    fault: str
+
+
+def _drawn(model: AxisModel, count: int, seed: int, rng: np.random.Generator) -> _Drawn:
+    """By importance sampling."""
+    mode = find_mode(model)
+    if not len(mode.w):
+        return _Drawn(np.zeros((count, 0)), "; ".join(mode.missing))
+    sample = weighted_run(AxisDensity(model, mode), seed, rounds_least=HELD_ROUNDS).sample
+    return _Drawn(sample.equal(count, rng), "; ".join(sample.convergence.missing))
 
 
 def _rms(z: list[float]) -> float:
@@ -212,11 +230,8 @@ def _fitted_without(model: AxisModel, out: np.ndarray, seed: int) -> tuple[np.nd
     """Coordinates of the scales, for the whole model, from the rows not left out; what is wrong with them, or ""."""
     without = AxisModel.of(model.rows.without(out), model.priors, None, model.coordinates.waves)
     rng = np.random.default_rng([seed, 5])
-    start = find_mode(without)
-    sample: WeightedSample = weighted_sample(without.log_density, start, rng, EFFECTIVE)
-    drawn = sample.equal(DRAWS, rng)
-    w = carried_scales(without, drawn, model, rng)
-    return w, "; ".join(sample.missing)
+    found = _drawn(without, DRAWS, seed, rng)
+    return carried_scales(without, found.w, model, rng), found.fault
 
 
 def _scored(

@@ -17,7 +17,8 @@ from tvsbayes.files.csv_table import csv_bytes
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
-from tvsbayes.single_axis.axis_fit import HEADLINE_DRAWS, AxisFit, headline_functionals
+from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals
+from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_record import deviation_functionals
 from tvsbayes.single_axis.axis_rows import AxisRows, reversal_of, rows_of

@@ -153,7 +153,7 @@ FAULTS = (
     Fault("what must not be used ends with exit code 0", "app.finish", Call("Ended", "function(0)"),
           "test_a_fit_that_did_not_converge_is_exit_4"),
     Fault("numbers of an axis that must not be used are offered to firmware", "axis_fit_text",
-          Reads("summary.converged", "True"), "test_numbers_that_must_not_be_used_are_not_offered_to_firmware"),
+          Reads("summary.explained", "True"), "test_numbers_that_must_not_be_used_are_not_offered_to_firmware"),
     # Files and their refusals.
     Fault("a cell that is no number is accepted", "Table.numbers", Never("isfinite"),
           "test_message_tells_place_found_allowed_and_remedy"),
@@ -213,6 +213,15 @@ FAULTS = (
           "test_repeats_at_one_stop_share_its_error"),
     Fault("a left-out reading is predicted on its other side", "AxisModel.left_out", Local("found", "-value"),
           "test_rows_left_out_are_the_conditional_of_the_dense_gaussian"),
+    # Compensation.
+    Fault("corrections of both sides change places", "Correction.sent", Argument("side", "-value"),
+          "test_both_sides_are_linear_between_lines_and_constant_beyond"),
+    Fault("LinuxCNC's table has the wrong sign", "formats._linuxcnc",
+          Reads("added", "{k: -v for k, v in value.items()}"), "test_linuxcnc_sends_the_corrected_command_by_its_rule"),
+    Fault("a table is made of a fit that is not accepted", "refuse_unaccepted", Never("answer"),
+          "test_no_table_is_made_of_what_is_not_accepted"),
+    Fault("a fault of the play alone goes for a kept promise", "verification.SEPARATE", Constant("1e12"),
+          "test_every_world_is_named"),
 )  # fmt: skip
 
 

@@ -1,0 +1,112 @@
+"""compensate, verify and plan --verify: files, documents by their schemas, exit codes, what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jsonschema
+import numpy as np
+import pytest
+from support.commands import DATA, PAPER_TWIN, assert_error
+from support.compensated import driven, results, to_and_fro, true_axis
+
+from tvsbayes.compensation.correction import Correction
+from tvsbayes.compensation.verification import stored_compensation
+from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
+from tvsbayes.single_axis.axis_record import keep_fit
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """An axis with its fit."""
+    write_axis(replace(results().fit.campaign, path=None), tmp_path / "stage")
+    keep_fit(results().fit, results().summary, tmp_path / "stage" / "results")
+    return tmp_path / "stage"
+
+
+def schema(name: str):
+    return json.loads((DATA / "schemas" / f"{name}-1.schema.json").read_text())
+
+
+def drive(folder, place, factors):
+    """Fresh readings under the table in a folder's results."""
+    asked, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
+    by = Correction.of(stored_compensation(read_axis(folder)))
+    write_axis(driven(true_axis(), asked, read, 7, by=by, factors=factors), place)
+    return place
+
+
+def test_from_a_fit_to_a_verified_machine(ask, say, folder, tmp_path):
+    out = tmp_path / "stage.comp"
+    code, document = ask("compensate", folder, "--to", "linuxcnc", "-o", out, "--applied-by", "host")
+    assert code == 0 and document["applied_by"] == "host" and out.read_text().startswith("-20.0000000")
+    kept = json.loads((folder / "results" / "compensation.json").read_text())
+    jsonschema.validate(kept, schema("compensation"))
+    assert set(kept) == set(schema("compensation")["properties"]) and kept["table"] == document["table"]
+
+    code, planned = ask("plan", folder, "--verify", "-o", tmp_path / "plan.csv")
+    assert (
+        code == 0
+        and planned["enough"]
+        and (tmp_path / "plan.csv").read_text().startswith("step,command,direction,read")
+    )
+
+    code, told = ask("verify", folder, drive(folder, tmp_path / "kept", (1.0, 1.0)))
+    jsonschema.validate(told, schema("verification"))
+    assert set(told) == {"verdict", "p", "worlds", "before", "after", "promised95", "readings"}
+    assert (code, told["verdict"]) == (0, "KEPT")
+    code, _, _ = say("report", folder)
+    shown = (folder / "results" / "report.html").read_text()
+    assert "Applied, and what is left" in shown and "KEPT: 12 fresh readings" in shown
+
+    code, told, _ = say("verify", folder, drive(folder, tmp_path / "turned", (-1.0, -1.0)))
+    assert code == 1 and told.startswith("BROKEN: wrong sign") and "what to do" in told
+    ask("compensate", folder, "--to", "csv", "-o", tmp_path / "stage.csv")
+    say("report", folder)
+    assert "No fresh readings have verified it" in (folder / "results" / "report.html").read_text()
+
+
+def test_without_a_file_nothing_is_written(say, folder):
+    code, told, _ = say("compensate", folder, "--to", "csv")
+    assert code == 0 and "nothing written" in told and "command,forward,backward" in told
+    assert not (folder / "results" / "compensation.json").exists()
+    code, _, err = say("verify", folder, folder)
+    assert code == 2 and "tvsbayes compensate" in err
+
+
+def test_too_few_readings_tell_nothing(ask, folder, tmp_path):
+    ask("compensate", folder, "--to", "csv", "-o", tmp_path / "stage.csv")
+    fresh = read_axis(drive(folder, tmp_path / "many", (1.0, 1.0)))
+    few = replace(fresh, readings=tuple(replace(r, u=0.5) for r in fresh.readings[:3]))
+    write_axis(few, tmp_path / "few")
+    code, document = ask("verify", folder, tmp_path / "few")
+    assert code == 3 and document["verdict"] == "CANNOT TELL"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        ("compensate", PAPER_TWIN, "--to", "csv"),
+        ("verify", PAPER_TWIN, PAPER_TWIN),
+        ("plan", PAPER_TWIN, "--verify"),
+        ("plan", "--verify"),
+    ],
+)
+def test_scanners_are_sent_elsewhere(ask, line):
+    code, document = ask(*line)
+    assert code == 2
+    assert_error(document, "usage")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--to", "csv", "--resolution", "0,01"),
+        ("--to", "csv", "--applied-by", "me"),
+        ("--to", "grbl", "--in-force", "250", "--letter", "Q"),
+    ],
+)
+def test_options_that_cannot_be(ask, folder, options):
+    code, document = ask("compensate", folder, *options)
+    assert code == 2 and document["error"]["remedy"]

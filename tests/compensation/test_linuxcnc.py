@@ -1,0 +1,24 @@
+"""A table in LinuxCNC itself: what it sends to the motor is what the table adds, by side, and nothing twice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.compensated import table
+
+from experiments.compensation.linuxcnc_loop import installed, motor_positions
+from tvsbayes.compensation.correction import Correction
+from tvsbayes.compensation.formats import FORMATS
+
+PATH = [5.0, 17.0, 10.0, -5.0, 10.0]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not installed(), reason="no linuxcnc: apt-get install --no-install-recommends linuxcnc-uspace")
+def test_motor_gets_what_the_table_adds():
+    made = table("linuxcnc")
+    text = FORMATS["linuxcnc"].write(made, "a test")
+    wanted = Correction.of(made).sent(np.array(PATH), np.sign(np.diff([0.0, *PATH])))
+    # The file has seven decimals, the pin six digits.
+    np.testing.assert_allclose(motor_positions(PATH, text), wanted, atol=1e-4)
+    np.testing.assert_allclose(motor_positions(PATH, text, backlash=0.5), wanted, atol=1e-4)

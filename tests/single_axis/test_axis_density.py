@@ -1,0 +1,71 @@
+"""Sampling of an axis: what is integrated out in one pass is what it is given the scales; a lost search is found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.axes import campaign, drawn, random_moves
+
+from tvsbayes.single_axis.axis_campaign import AxisMove
+from tvsbayes.single_axis.axis_density import AxisDensity, headline_functionals
+from tvsbayes.single_axis.axis_fit import fit_axis, model_of
+from tvsbayes.single_axis.axis_mode import find_mode
+
+RATIO, WILD = 2.5, 400.0
+
+
+def belt():
+    """Eleven counts of an encoder on a belt, a reading every 500; one of them belongs to no stop."""
+    commands = [0, 200, 400, 600, 1000, 800, 600, 400, 200, 0, 300]
+    moves = [AxisMove(k, 0, float(k), float(c), "" if k else "unknown") for k, c in enumerate(commands)]
+    values = np.round(RATIO * np.array(commands) + np.random.default_rng(3).standard_normal(len(commands)))
+    values[5:10] += 6.0
+    values[7] += WILD
+    return replace(campaign(moves, values), unit="mm")
+
+
+def test_one_wild_reading_does_not_lose_the_mode():
+    """The search from the scatter of repeats ends far away, in a density lower by hundreds.
+
+    The answer is narrower than the reading could turn the line, its distance over the travel.
+    """
+    mode = find_mode(model_of(belt()))
+    assert mode.missing == () and mode.log_density > -100
+    fit = fit_axis(belt(), tier="importance")
+    low, high = np.quantile(fit.draws["per_command"], [0.025, 0.975])
+    assert not fit.missing and low < RATIO < high
+    assert high - low < WILD / 1000
+
+
+def test_draws_of_the_line_have_the_moments_that_it_has_given_the_scales():
+    """Inverted alone, with the places that no row knows apart, it comes out the same; points beyond reach have none."""
+    model = model_of(drawn(5, random_moves(5)).campaign)
+    w = np.random.default_rng(2).standard_normal((6, len(model.coordinates.names)))
+    functionals = headline_functionals(model, w)
+    mean, sd = model.linear(w).of(functionals)
+    seen = model.posterior(w, functionals)
+    # Solved with other right-hand sides beside it the same number comes out in another order of sums.
+    np.testing.assert_allclose(seen.log_density, model.log_density(w), atol=1e-8)
+    # Of numbers of some 1e3 the differences of the two ways round in the seventh digit of an sd.
+    np.testing.assert_allclose(seen.linear.mean, mean, atol=1e-6 * float(sd.max()))
+    np.testing.assert_allclose(np.sqrt(np.diagonal(seen.linear.covariance, axis1=1, axis2=2)), sd, rtol=1e-6)
+    far = AxisDensity(model, find_mode(model)).valued(np.full_like(w, 20.0), np.random.default_rng(1))
+    assert np.all(far.log_target == -np.inf) and np.isfinite(far.parts["linear"]).all()
+
+
+def test_both_answers_of_a_short_time_are_given_and_said():
+    """A chain without time is no answer, and the weighted draws before it are; of a single round they are rough."""
+    made = drawn(1).campaign
+    found = fit_axis(made, max_minutes=1e-9)
+    assert found.error is None and found.tier == "importance" and found.answer in ("accepted", "rough")
+    assert set(found.sample.convergence.monte_carlo_error) >= {"backlash", "per_command.forward"}
+
+
+@pytest.mark.parametrize("tier", ["importance", "emcee"])
+def test_errors_of_the_headlines_are_within_what_is_accepted(tier):
+    found = fit_axis(drawn(3, random_moves(5, 60)).campaign, tier=tier, seed=2)
+    assert found.answer == "accepted" and found.tier == tier and found.missing == ()
+    errors = found.sample.convergence.monte_carlo_error
+    assert all(error.within(0.1, 0.2) for error in errors.values())

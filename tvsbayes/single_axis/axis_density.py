@@ -1,0 +1,108 @@
+"""The posterior of an axis as samplers see it: its scales, with draws of the line that was integrated out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tvsbayes.inference.density import Points
+from tvsbayes.inference.students import StudentMixture
+from tvsbayes.single_axis.axis_mode import AxisMode
+from tvsbayes.single_axis.axis_model import AxisModel
+
+HEADLINES = ("per_command.forward", "per_command.backward", "backlash")
+HEADLINE_DRAWS = (
+    *("offset", "per_command", "ratio_contrast", "backlash"),
+    *("per_command.forward", "per_command.backward", "effective_per_command"),
+)
+"""Rows of `headline_functionals`."""
+
+
+def line_weights(model: AxisModel, w: np.ndarray) -> np.ndarray:
+    """Slope of the least-squares line of the error by position over the rows, each counting once.
+
+    Shape (columns,), or (n, columns) at draws w (n, d) where a period is not known.
+    """
+    rows = model.rows
+    off = rows.command - rows.command.mean()
+    weights = off / (off @ off)
+    if not model.repeats_by_draw:
+        return weights @ model.functional(rows.command)
+    return np.concatenate([weights @ model.functional(rows.command, part) for part in blocks_of(w)])
+
+
+def blocks_of(w: np.ndarray) -> list[np.ndarray]:
+    """Draws (n, d) in blocks small enough for functionals of many commands."""
+    return np.array_split(w, max(1, len(w) // 100))
+
+
+def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
+    """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns), or (n, ...) as those of `line_weights`."""
+    lines, weights = line_functionals(model), line_weights(model, w)
+    found = np.concatenate([lines, model.head(slope=1.0)[None]])
+    if weights.ndim == 2:
+        found = np.repeat(found[None], len(weights), axis=0)
+    found[..., -1, :] += weights
+    return found
+
+
+def line_functionals(model: AxisModel) -> np.ndarray:
+    """Those of `HEADLINE_DRAWS` but the last, which no draw changes."""
+    of = model.head
+    return np.array(
+        [
+            # At command nought, where folders count from.
+            of(offset=1.0, slope=-model.middle),
+            of(slope=1.0),
+            of(contrast=1.0),
+            of(backlash=1.0),
+            of(slope=1.0, contrast=0.5),
+            of(slope=1.0, contrast=-0.5),
+        ]
+    )
+
+
+class AxisDensity:
+    """A `Density`; the part `linear` (n, t) of its points is a draw of `HEADLINE_DRAWS` but the last."""
+
+    headlines = HEADLINES
+    fixed: frozenset[str] = frozenset()
+    walkers = 48
+
+    def __init__(self, model: AxisModel, mode: AxisMode):
+        self.model, self.mode, self.invalid = model, mode, 0
+        self.functionals = line_functionals(model)
+
+    @property
+    def dimension(self) -> int:
+        """Number of sampled scales."""
+        return len(self.mode.w)
+
+    @property
+    def log_constant(self) -> float:
+        """Of the normal priors of the coordinates, and the density at the mode."""
+        return self.mode.log_density - 0.5 * self.dimension * float(np.log(2 * np.pi))
+
+    def __call__(self, w: np.ndarray) -> np.ndarray:
+        """Log density of w (n, d), relative to the mode; -inf where it has no value."""
+        return self.model.log_density(w) - self.mode.log_density
+
+    def valued(self, w: np.ndarray, generator: np.random.Generator) -> Points:
+        """The same, with draws of the line."""
+        seen = self.model.posterior(w, self.functionals)
+        linear = seen.linear.drawn(np.eye(len(self.functionals)), generator)
+        return Points(w, seen.log_density - self.mode.log_density, {"linear": linear})
+
+    def log_density(self, points: Points) -> np.ndarray:
+        """Of the sampled coordinates."""
+        return points.log_target + self.mode.log_density
+
+    def quantities(self, points: Points) -> dict[str, np.ndarray]:
+        """Sampled scales, and what is linear."""
+        values, names = self.model.coordinates.values(points.w), self.model.coordinates.names
+        linear = dict(zip(HEADLINE_DRAWS, points.parts["linear"].T, strict=False))
+        # A backlash that is sampled is in the linear one.
+        return {name: values[name] for name in names if name in values} | linear
+
+    def first_proposal(self) -> StudentMixture:
+        """About the mode."""
+        return StudentMixture.about(self.mode.w, self.mode.covariance)
