@@ -101,7 +101,9 @@ def left_out(campaign: AxisCampaign, visits: Sequence[int], visit: int) -> LeftO
 
 def _followed(fit: AxisFit, campaign: AxisCampaign, moves: np.ndarray) -> np.ndarray:
     """Readings of moves of the campaign, expected by a fit that does not know them, at their own times."""
-    model = AxisModel.of(replace(rows_of(campaign), line=fit.rows.line), fit.model.priors)
+    model = AxisModel.of(
+        replace(rows_of(campaign), line=fit.rows.line), fit.model.priors, None, fit.model.coordinates.waves
+    )
     drawn = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
     w = carried_scales(fit.model, drawn, model, np.random.default_rng(1))
     return model.left_out(w, np.flatnonzero(np.isin(model.rows.move, moves)))[0].mean(axis=0)

@@ -47,7 +47,7 @@ def test_a_prior_that_the_readings_contradict_is_named(name, prior, said):
 
 def test_a_fit_that_a_prior_keeps_from_converging_names_it():
     """The ratio stated per full step, commands counted in microsteps."""
-    found = fit_axis(played(per_command=AxisPrior(16 * RATIO, 0.001)), tier="importance")
+    found = fit_axis(played(per_command=AxisPrior(16 * RATIO, 0.001), creep=AxisPrior(0.0, 0.0)), tier="importance")
     assert found.error is not None
     assert "per_command = 0.0100" in found.error.remedy and "value = 0.16" in found.error.remedy
     assert "microsteps" in found.error.remedy and "--quick" not in found.error.remedy

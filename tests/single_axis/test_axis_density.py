@@ -43,7 +43,7 @@ def test_draws_of_the_line_have_the_moments_that_it_has_given_the_scales():
     """Inverted alone, with the places that no row knows apart, it comes out the same; points beyond reach have none."""
     model = model_of(drawn(5, random_moves(5)).campaign)
     w = np.random.default_rng(2).standard_normal((6, len(model.coordinates.names)))
-    functionals = headline_functionals(model)
+    functionals = headline_functionals(model, w)
     mean, sd = model.linear(w).of(functionals)
     seen = model.posterior(w, functionals)
     # Solved with other right-hand sides beside it the same number comes out in another order of sums.

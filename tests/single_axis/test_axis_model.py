@@ -47,6 +47,9 @@ def dense(model, w):
     total += (CONTRAST_SHARE * slope) ** 2 * np.outer(path, path) / 4
     if not sampled:
         total += model.priors["backlash"].u ** 2 * np.outer(side, side) / 4
+    if "creep" in model.shifts:
+        warmed = 1 - np.exp(-rows.time_s / 60 / at["creep_minutes"])
+        total += model.priors["creep"].u ** 2 * np.outer(warmed, warmed)
     residual = rows.value - rows.line[0] - slope * model.middle - model.priors["per_command"].value * g
     return total, residual - (0.5 * side * at["backlash"] if sampled else 0.0)
 

@@ -39,7 +39,7 @@ def test_every_stop_lowers_u_and_stays_within_the_commands(fitted):
 @pytest.mark.parametrize("target", ["per_command", "effective_per_command", "backlash"])
 def test_a_plan_begins_at_the_u_of_the_fit(fitted, target):
     """Not at that given the scales, which is less: their means differ. Places between the rows change neither."""
-    mean, sd = fitted.linear.of(headline_functionals(fitted.model)[[HEADLINE_DRAWS.index(target)]])
+    mean, sd = fitted.linear.of(headline_functionals(fitted.model, fitted.w)[[HEADLINE_DRAWS.index(target)]])
     given = np.sqrt(np.mean(sd**2))
     found = plan_next(fitted, target, count=1)
     assert found.u_now == pytest.approx(np.hypot(given, mean.std()), rel=1e-6)

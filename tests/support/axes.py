@@ -13,7 +13,7 @@ from tvsbayes.single_axis.simulated_axis import SimulatedAxis, simulate_axis
 PLACES = (-2000.0, -1200.0, -500.0, 0.0, 700.0, 1300.0, 2000.0)
 OFF = AxisPrior(0.0, 0.0)
 FIRST_EDITION = {
-    **dict.fromkeys(("transmission_error", "play_variation", "drift_per_root_hour"), OFF),
+    **dict.fromkeys(("transmission_error", "play_variation", "drift_per_root_hour", "creep"), OFF),
     "stop_sd": AxisPrior(0.004, 0.0),
     "reading_scale": AxisPrior(1.0, 0.0),
 }

@@ -220,9 +220,10 @@ def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wi
 def _line_draws(fit: AxisFit) -> np.ndarray:
     """Zero at command 0 and slope of the line through what was read, (draws, 2)."""
     model = fit.model
-    slope = model.head(slope=1.0) + line_weights(model)
-    level = model.head(offset=1.0) + model.functional(fit.rows.command).mean(axis=0)
-    return fit.linear.drawn(np.array([level - model.middle * slope, slope]), np.random.default_rng([fit.seed, 22]))
+    slope = model.head(slope=1.0) + line_weights(model, fit.w)
+    level = model.head(offset=1.0) + model.functional(fit.rows.command, fit.w).mean(axis=-2)
+    both = np.stack([level - model.middle * slope, slope], axis=-2)
+    return fit.linear.drawn(both, np.random.default_rng([fit.seed, 22]))
 
 
 def _joint(line: np.ndarray) -> dict[str, float]:

@@ -14,11 +14,11 @@ from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.axis_text import (
     axis_verdict,
     deviation_table,
-    for_firmware,
     iso230_table,
+    offered,
     parameter_table,
+    period_table,
     ratio_table,
-    worst_place,
 )
 from tvsbayes.report.compensation_text import compensation_section
 from tvsbayes.report.drawing import BLUE, GREY, RED, SKY, drawing
@@ -28,7 +28,8 @@ from tvsbayes.report.tables import FigureView, Issue, Number, Page, Section, con
 from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
-from tvsbayes.single_axis.axis_record import AxisResults, deviation_functionals
+from tvsbayes.single_axis.axis_periods import WaveSample, wave_samples
+from tvsbayes.single_axis.axis_record import AxisResults, drawn_deviations
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,6 +44,8 @@ OF_SIDE: dict[int, tuple[str, str, str]] = {
     0: ("o", GREY, "side unknown"),
 }
 TABLE_ROWS = 60
+LIKELY = 0.5
+"""Probability of a wave from which on its curve is drawn."""
 
 
 def curve_commands(low: float, high: float) -> np.ndarray:
@@ -54,7 +57,7 @@ def error_figure(fit: AxisFit) -> Figure:
     """The error by position with its 95 % band, and the stops on it, off the line through them."""
     model, rows = fit.model, fit.rows
     commands = curve_commands(float(rows.command.min()), float(rows.command.max()))
-    drawn = fit.linear.drawn(deviation_functionals(fit, commands), np.random.default_rng([fit.seed, 6]))
+    drawn = drawn_deviations(fit, commands, np.random.default_rng([fit.seed, 6]))
     low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
     design = np.column_stack([np.ones(len(rows.value)), rows.command - model.middle])
     off = rows.value - design @ np.linalg.lstsq(design, rows.value, rcond=None)[0]
@@ -71,7 +74,38 @@ def error_figure(fit: AxisFit) -> Figure:
     return figure
 
 
-def _figure_of(fit: AxisFit) -> FigureView:
+def wave_figure(sample: WaveSample, unit: str) -> Figure:
+    """One wave over its mean period, with its 95 % band, given that it is there."""
+    turn = np.linspace(0.0, 1.0, CURVE_POINTS)
+    curve = sample.curve(turn)
+    low, high = np.percentile(curve, (2.5, 97.5), axis=0)
+    of = "s" if sample.wave.clock == "seconds" else unit
+    at = turn * float(np.mean(sample.period))
+    with drawing(2.4) as figure:
+        axes = figure.add_subplot()
+        axes.fill_between(at, low, high, color=SKY, alpha=0.4, linewidth=0, label="wave, 95 %")
+        axes.plot(at, curve.mean(axis=0), color=BLUE, linewidth=1.2, label="its mean")
+        axes.set(xlabel=f"{of}, from {sample.record.middle:.6g} on", ylabel=unit)
+        figure.legend(loc="outside lower center", ncols=2)
+    return figure
+
+
+def _wave_figures(fit: AxisFit) -> list[FigureView]:
+    """Every wave that is there more likely than not."""
+    found = []
+    for sample in wave_samples(fit):
+        if sample.probability > LIKELY:
+            alt = "A wave over one period as a curve with a band."
+            caption = f"Wave of the {'encoder' if sample.wave.clock == 'encoder' else 'gear'} over one period, both "
+            caption += "harmonics, with its 95 % band."
+            found.append(figure_view(wave_figure(sample, fit.campaign.unit), alt, caption))
+    return found
+
+
+def _figure_of(fit: AxisFit) -> FigureView | None:
+    if fit.rows.in_motion:
+        return None
+
     alt = "The error that repeats by position over the command as a curve with a band, and every stop as a marker."
     caption = "Deviation from the line through the stops: what repeats by position with its 95 % band, and the stops."
     return figure_view(error_figure(fit), alt, caption)
@@ -93,7 +127,8 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     numbers = [Number("play", concise(backlash.value, backlash.sd), unit)]
     method = [
         "Readings = offset + unit per command x command, play taken up on the side of arrival, an error and a play "
-        "that repeat by position (Matern processes), a drifting zero, an error of every stop, noise. What is linear is "
+        "that repeat by position (Matern processes), waves where periods are asked for, a zero that creeps and drifts, "
+        "an error of every stop, noise. What is linear is "
         "integrated out exactly; scales are sampled, never maximised.",
         "The ratio of the gears holds beyond the range read; the line through the stops belongs to that range.",
     ]
@@ -104,8 +139,11 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
     verdict = axis_verdict(summary)
     verdict = f"{verdict[0].upper()}{verdict[1:]}."
     conflicts = [f"Prior conflict: {text}" for text in summary.prior_conflicts]
-    offered = (worst_place(summary), for_firmware(summary)) if summary.explained else ()
-    in_words = [f"{text[0].upper()}{text[1:]}." for text in offered]
+    waves, figures = period_table(summary), _wave_figures(fit)
+    picture = _figure_of(fit)
+    if picture is None and figures:
+        picture, figures = figures[0], figures[1:]
+    in_words = [f"{text[0].upper()}{text[1:]}." for text in (offered(summary) if summary.explained else ())]
     header = fit.campaign.header
     created = header.get("created")
     folder = "AXIS" if fit.campaign.path is None else typed(fit.campaign.path.resolve().name)
@@ -117,18 +155,24 @@ def axis_page(results: AxisResults, issue: Issue) -> Page:
         verdict_class="cannot-tell" if summary.explained else "not-met",
         numbers=numbers,
         why=(),
-        answer=ratio_table(summary),
-        picture=_figure_of(fit),
+        answer=waves or ratio_table(summary),
+        picture=picture,
         steps=[f"`tvsbayes plan --given {folder}` says which stops to read next."],
         criteria=None,
         traceable="The readings are taken as stated.",
         warnings=[*summary.problems, *summary.warnings, *conflicts],
         versions=made["versions"],
         sections=[
-            Section("Result", text=in_words, tables=[parameter_table(summary)], opened=True),
+            Section(
+                "Result",
+                text=in_words,
+                tables=[ratio_table(summary) if waves else None, parameter_table(summary)],
+                figures=figures,
+                opened=True,
+            ),
             Section(
                 "What repeats by position",
-                tables=[deviation_table(summary.deviations, unit, TABLE_ROWS)],
+                tables=[deviation_table(summary.deviations, unit, TABLE_ROWS) if summary.deviations else None],
             ),
             *_applied(fit.campaign),
             Section("What the readings cannot tell", items=summary.weak_directions or ["Nothing of note."]),

@@ -33,6 +33,28 @@ def _row(name: str, of: Estimate) -> list[str]:
     return [name, concise(of.value, of.sd), interval_text(*of.interval95, of.sd)]
 
 
+def period_table(summary: AxisSummary) -> TableView | None:
+    """Every wave with amplitude and period, given that it is there; None where none was asked for."""
+    unit = escaped(summary.unit)
+    rows = []
+    for what, found in (("gear", summary.periods), ("encoder", summary.encoder_periods)):
+        of = "s" if what == "gear" and summary.periods_in == "seconds" else unit
+        for one in found:
+            period = f"{one.period.value:.10g}" if one.source == "stated" else concise(one.period.value, one.period.sd)
+            amplitude = concise(one.amplitude.value, one.amplitude.sd)
+            across = interval_text(*one.amplitude.interval95, one.amplitude.sd)
+            between = interval_text(*one.period.interval95, one.period.sd) if one.source == "inferred" else "stated"
+            phase, chance = concise(one.phase_deg.value, one.phase_deg.sd), percent(one.probability)
+            rows.append([what, f"{amplitude} {unit} every {period} {of}", across, between, phase, chance])
+    head = ["", "amplitude(u) every period(u)", "amplitude, 95 %", "period, 95 %", "phase(u), deg", "there is a wave"]
+    return TableView("waves, given that they are there; phase at position or time 0", head, rows) if rows else None
+
+
+def percent(probability: float) -> str:
+    """Of draws, so that neither 0 nor 100 % is claimed."""
+    return "> 99.9 %" if probability > 0.999 else "< 0.1 %" if probability < 0.001 else f"{100 * probability:.1f} %"
+
+
 def ratio_table(summary: AxisSummary) -> TableView:
     """Unit per command by direction: of the gears, of the line through what was read, and the classic."""
     unit = escaped(summary.unit)
@@ -72,6 +94,13 @@ def for_firmware(summary: AxisSummary) -> str:
         overshoot = concise(-play.value / abs(ratio), play.sd / abs(ratio))
         return f"{said}no play: a reversal overshoots by {overshoot} commands"
     return f"{said}play of {in_commands} commands"
+
+
+def offered(summary: AxisSummary) -> list[str]:
+    """What an owner takes from a converged fit: the worst place, numbers for firmware. Neither of a drive in motion."""
+    if "seeing_s" in summary.parameters:
+        return []
+    return [*([worst_place(summary)] if summary.deviations else []), for_firmware(summary)]
 
 
 def worst_place(summary: AxisSummary) -> str:
@@ -140,7 +169,8 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     iso230 = iso230_table(summary.classic, summary.unit)
     lines = []
     if details:
-        lines += [deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN).text()]
+        if summary.deviations:
+            lines += [deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN).text()]
         lines += [] if iso230 is None else [iso230.text()]
         lines += _lines("weak (the readings leave it to the priors)", summary.weak_directions)
     elif summary.weak_directions:
@@ -151,9 +181,11 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     lines += _lines("prior conflict", summary.prior_conflicts)
     lines += [f"written: {', '.join(written)}"] if written else []
     counted = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}"
-    parts = [counted, parameter_table(summary).text(), ratio_table(summary).text()]
+    waves = period_table(summary)
+    parts = [counted, *([] if waves is None else [waves.text()])]
+    parts += [parameter_table(summary).text(), ratio_table(summary).text()]
     if summary.explained:
-        parts += [worst_place(summary), for_firmware(summary)]
+        parts += offered(summary)
     return "\n".join([*lines, *[""] * bool(lines), *parts, f"verdict: {axis_verdict(summary)}"])
 
 

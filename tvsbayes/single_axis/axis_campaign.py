@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,18 +18,20 @@ from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_kind import (
     Column,
     CsvKind,
+    Values,
     filled_where_ok,
     first_of_segment,
     follows_a_move,
     templates,
     unique,
 )
-from tvsbayes.files.csv_table import CSV_BYTES_MAX
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.campaign import MOVES, SPOTS
 from tvsbayes.instrument.column_names import DEGREES, SPREAD
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, STATED_KEYS, AxisPrior
+from tvsbayes.single_axis.waves import AskedPeriods
 
 FORMAT = "tvsbayes-axis/1"
 Approach = Literal["forward", "backward", "unknown"]
@@ -39,8 +41,13 @@ COMMAND_MAX = 1e12
 """Of a command or a reading, either sign."""
 TURNS = {**{unit: 360.0 / in_deg for unit, in_deg in DEGREES.items()}, "turn": 1.0}
 """One turn in the units of angles."""
-_NEVER_NOUGHT = ("transmission_error_length", "reading_scale")
+_NEVER_NOUGHT = ("transmission_error_length", "reading_scale", "creep_minutes", "seeing_s")
 """Log-normals that the model divides by: held at 0, every density is without a value."""
+PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
+"""Keys of `[axis]` that ask for waves."""
+PERIODS_MAX, RANGES_MAX = 8, 4
+"""Stated periods, and unknown ones: each adds two coordinates to what is sampled."""
+TEMPERATURE_MAX = 1000.0
 _MOVE = replace(MOVES["move"], names="")
 
 
@@ -70,6 +77,15 @@ class AxisMove:
             names=MOVES["pan_approach"].names + " direction dir richtung direccion",
         ),
     ] = ""
+    temperature_degC: Annotated[
+        float | None,
+        Column(
+            "optional: of the axis; the readings' zero shifts with it. Empty cells are interpolated in time",
+            *(-TEMPERATURE_MAX, TEMPERATURE_MAX),
+            group="temperature",
+            names="temperature temp temperatur temperatura",
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +151,7 @@ class AxisCampaign(Shown):
         readings: in the order of the file.
         stated: entries of `[axis]`; names left out take the default, which scales with the travel.
         header: keys of `campaign.toml` outside `[axis]` but `format` and `unit`.
+        periods: waves that `[axis]` asks for.
         path: the folder, None of one that was never written.
     """
 
@@ -143,7 +160,22 @@ class AxisCampaign(Shown):
     readings: tuple[Reading, ...]
     stated: dict[str, AxisPrior] = field(default_factory=dict)
     header: dict[str, object] = field(default_factory=dict)
+    periods: AskedPeriods = field(default_factory=AskedPeriods)
     path: Path | None = None
+
+    @property
+    def rate(self) -> float | None:
+        """Commands per second of a drive that never stops; None of an axis that is read at stops."""
+        rate = self.header.get("rate")
+        return float(rate) if isinstance(rate, int | float) else None
+
+    @property
+    def powered_on_s(self) -> float | None:
+        """When the machine was switched on, on the clock of `time_s`; None where nothing says it."""
+        on, created = self.header.get("powered_on"), self.header.get("created")
+        if not isinstance(on, datetime.datetime) or not isinstance(created, datetime.datetime):
+            return None
+        return (on - created).total_seconds()
 
     def shown(self) -> View:
         """Counts, and the readings with the commands behind them."""
@@ -166,13 +198,46 @@ def parse_axis_moves(data: bytes, file: str = "moves.csv") -> tuple[AxisMove, ..
     return AXIS_MOVES.parse(data, file)
 
 
-def parse_readings(data: bytes, file: str, moves: int) -> tuple[Reading, ...]:
-    """The checked rows of `readings.csv`; `moves` is the number of moves, which `move` must name."""
-    return READINGS.parse(data, file, follows_a_move(moves, "reading"))
+def parse_readings(
+    data: bytes, file: str, moves: int, moved: tuple[AxisMove, ...] = (), in_motion: bool = False
+) -> tuple[Reading, ...]:
+    """The checked rows of `readings.csv`.
+
+    Args:
+        data: content of the file.
+        file: its name, for errors.
+        moves: number of moves, which `move` must name.
+        moved: the moves, where readings were taken `in_motion`: then each that is ok has its time.
+        in_motion: whether the folder states a `rate`.
+    """
+    return READINGS.parse(data, file, follows_a_move(moves, "reading"), _times_in_motion(moved, in_motion))
+
+
+def _times_in_motion(moves: tuple[AxisMove, ...], in_motion: bool) -> Callable[[Table, Values], None]:
+    """Refuses times of readings at stops, and readings in motion without a time between their move and the next."""
+
+    def check(table: Table, values: Values) -> None:
+        for row, (time_s, move, status) in enumerate(
+            zip(values["time_s"], values["move"], values["status"], strict=True)
+        ):
+            if not in_motion and time_s is not None:
+                allowed = "an empty cell, or no such column, where campaign.toml states no rate"
+                raise table.refuse(row, "time_s", "motion", allowed, "state `rate` in campaign.toml, or remove it")
+            if in_motion and time_s is None and status == "ok":
+                allowed = "the time of every reading that is ok, since campaign.toml states a rate"
+                place = "time_s" if "time_s" in table.columns else "reading"
+                raise table.refuse(row, place, "motion", allowed, "add time_s, or remove `rate`")
+            if in_motion and time_s is not None:
+                until = moves[move + 1].time_s if move + 1 < len(moves) else COMMAND_MAX
+                if not moves[move].time_s <= time_s <= until:
+                    allowed = f"from {moves[move].time_s:g}, the time of move {move}, to {until:g}"
+                    raise table.refuse(row, "time_s", "order", allowed, "name the last move before the reading")
+
+    return check
 
 
 def _parse_header(keys: Keys) -> dict[str, object]:
-    keys.only(("format", "unit", *_TEXTS, "created", "synthetic", "seed", "axis"))
+    keys.only(("format", "unit", *_TEXTS, "created", "powered_on", "rate", "synthetic", "seed", "axis"))
     header: dict[str, object] = {}
     for key in keys.values:
         if key in _TEXTS:
@@ -181,19 +246,37 @@ def _parse_header(keys: Keys) -> dict[str, object]:
             header[key] = keys.flag(key)
         elif key == "seed":
             header[key] = keys.integer(key, 0, 2**63 - 1)
-        elif key == "created":
+        elif key == "rate":
+            header[key] = keys.number(key, -COMMAND_MAX, COMMAND_MAX)
+            if not header[key]:
+                raise keys.refuse(key, "zero", "commands per second, not 0", "leave it out of an axis that stops")
+        elif key in ("created", "powered_on"):
             if not isinstance(keys.values[key], datetime.date):
                 allowed = "a date or time such as 2026-01-15T10:00:00Z"
                 raise keys.refuse(key, "date", allowed, "write it without quotes")
             header[key] = keys.values[key]
+    if "powered_on" in header:
+        _check_power(keys, header)
     return header
 
 
+def _check_power(keys: Keys, header: dict[str, object]) -> None:
+    """Refuses a `powered_on` that cannot be set against the clock of the moves."""
+    on, created = header["powered_on"], header.get("created")
+    allowed = "a time before `created`, which is the time of `time_s` = 0, both with or both without a time zone"
+    if not isinstance(on, datetime.datetime) or not isinstance(created, datetime.datetime):
+        raise keys.refuse("powered_on", "date", allowed, "write both with date and time, such as 2026-01-15T10:00:00Z")
+    if (on.tzinfo is None) != (created.tzinfo is None) or on > created:
+        raise keys.refuse("powered_on", "date", allowed, "correct one of them")
+
+
 def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
-    """The `[axis]` table; a half-normal entry has value 0, or u = 0 and the value that it is fixed at."""
-    keys.only(STATED_KEYS)
+    """Priors of `[axis]`; a half-normal entry has value 0, or u = 0 and the value that it is fixed at."""
+    keys.only((*STATED_KEYS, *PERIODS))
     stated: dict[str, AxisPrior] = {}
     for name in keys.values:
+        if name in PERIODS:
+            continue
         kind = AXIS_KEYS[name].kind
         low = -COMMAND_MAX if kind == "normal" else 0.0
         value, u = keys.quantity(name, low, COMMAND_MAX, COMMAND_MAX)
@@ -208,16 +291,50 @@ def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
     return stated
 
 
+def _parse_periods(keys: Keys) -> AskedPeriods:
+    """Waves that `[axis]` asks for."""
+    least = 1.0 / COMMAND_MAX
+    stated = keys.numbers("periods", least, COMMAND_MAX, PERIODS_MAX) if "periods" in keys else ()
+    encoder = keys.number("encoder_period", least, COMMAND_MAX) if "encoder_period" in keys else None
+    in_seconds = "periods_in" in keys and keys.word("periods_in", ("unit", "seconds")) == "seconds"
+    between = _parse_ranges(keys) if "period_between" in keys else ()
+    return AskedPeriods(stated, between, in_seconds, encoder)
+
+
+def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
+    """`period_between`: [low, high], or a list of such pairs, one for every unknown period."""
+    allowed = f"[low, high] with 0 < low < high, or a list of up to {RANGES_MAX} such pairs"
+    value = keys.values["period_between"]
+    entries: list[object] = value if isinstance(value, list) else [value]
+    found = []
+    for pair in entries if entries and all(isinstance(entry, list) for entry in entries) else [entries]:
+        ends = pair if isinstance(pair, list) else []
+        numbers = [float(end) for end in ends if isinstance(end, int | float) and not isinstance(end, bool)]
+        if len(ends) != 2 or len(numbers) != 2:
+            raise keys.refuse("period_between", "range", allowed, "give both ends of every range, in their unit")
+        low, high = numbers
+        if not 0 < low < high <= COMMAND_MAX:
+            raise keys.refuse("period_between", "range", allowed, "order the ends; a known period goes into `periods`")
+        found.append((low, high))
+    for k, (low, high) in enumerate(found):
+        if any((low, high) != other and low < other[1] and other[0] < high for other in found[:k]):
+            same = "ranges that are the same or do not overlap"
+            raise keys.refuse("period_between", "range", same, "write one range twice where both periods may be there")
+    if len(found) > RANGES_MAX:
+        raise keys.refuse("period_between", "range", allowed, "ask for fewer unknown periods at once")
+    return tuple(found)
+
+
 def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
     keys = parse_toml(files["campaign.toml"], "campaign.toml")
     keys.word("format", (FORMAT,))
     header, unit = _parse_header(keys), keys.text_value("unit", 20)
     if not unit.strip():
         raise keys.refuse("unit", "text", 'the unit of readings, such as "deg" or "mm"', "name it")
-    stated = _parse_axis_table(keys.table("axis"))
+    stated, periods = _parse_axis_table(keys.table("axis")), _parse_periods(keys.table("axis"))
     moves = parse_axis_moves(files["moves.csv"])
-    readings = parse_readings(files["readings.csv"], "readings.csv", len(moves))
-    return AxisCampaign(unit, moves, readings, stated, header, path)
+    readings = parse_readings(files["readings.csv"], "readings.csv", len(moves), moves, "rate" in header)
+    return AxisCampaign(unit, moves, readings, stated, header, periods, path)
 
 
 def _told(folder: Path, key: str) -> str | None:
@@ -269,15 +386,23 @@ def readings_bytes(readings: Iterable[Reading]) -> bytes:
     return READINGS.content(readings)
 
 
-def _axis_table_lines(stated: dict[str, AxisPrior]) -> list[str]:
-    return [toml_line(name, {"value": p.value, "u": p.u}) for name, p in sorted(stated.items())]
+def _axis_table_lines(campaign: AxisCampaign) -> list[str]:
+    priors = [toml_line(name, {"value": p.value, "u": p.u}) for name, p in sorted(campaign.stated.items())]
+    asked = campaign.periods
+    given = {
+        "periods": list(asked.stated),
+        "periods_in": "seconds" if asked.in_seconds else None,
+        "period_between": [list(pair) for pair in asked.between],
+        "encoder_period": asked.encoder,
+    }
+    return [*priors, *(toml_line(name, value) for name, value in given.items() if value)]
 
 
 def axis_toml(campaign: AxisCampaign) -> bytes:
     """The content of `campaign.toml`."""
     lines = [toml_line("format", FORMAT), toml_line("unit", campaign.unit)]
     lines += [toml_line(key, value) for key, value in campaign.header.items()]
-    return ("\n".join([*lines, "[axis]", *_axis_table_lines(campaign.stated)]) + "\n").encode()
+    return ("\n".join([*lines, "[axis]", *_axis_table_lines(campaign)]) + "\n").encode()
 
 
 def write_axis(campaign: AxisCampaign, folder: Path) -> None:
@@ -298,7 +423,8 @@ def write_axis(campaign: AxisCampaign, folder: Path) -> None:
 def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:
     """SHA-256 of what an estimate depends on, by "moves", "readings" and "axis", over values in canonical text."""
     readings = sorted(campaign.readings, key=lambda reading: reading.reading)
-    axis = "\n".join([campaign.unit, *_axis_table_lines(campaign.stated)])
+    timing = [toml_line(key, campaign.header[key]) for key in ("rate", "powered_on") if key in campaign.header]
+    axis = "\n".join([campaign.unit, *timing, *_axis_table_lines(campaign)])
     contents = {
         "moves": axis_moves_bytes(campaign.moves),
         "readings": readings_bytes(readings),

@@ -61,6 +61,8 @@ def prior_conflicts(
     values = model.coordinates.values(w)
     for k, name in enumerate(model.coordinates.names):
         key = name.split(".")[0]
+        if key.startswith("wave_"):
+            continue
         off = float(w[:, k].mean())
         # That an axis is far better than the default is no fault of what was stated.
         if key not in STRETCHED and (off if key not in stated else abs(off)) > CONFLICT_LIMIT:
@@ -87,7 +89,7 @@ def _of_stretched(model: AxisModel, name: str, wide: AxisPrior) -> PriorConflict
     prior = model.priors[name]
     if prior.u >= wide.u or (name == "backlash" and not model.rows.both_sides):
         return None
-    alone = AxisModel.of(model.rows, {**model.priors, name: wide})
+    alone = AxisModel.of(model.rows, {**model.priors, name: wide}, None, model.coordinates.waves)
     mode = find_mode(alone)
     if mode.missing:
         return None

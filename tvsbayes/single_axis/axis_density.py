@@ -17,15 +17,36 @@ HEADLINE_DRAWS = (
 """Rows of `headline_functionals`."""
 
 
-def line_weights(model: AxisModel) -> np.ndarray:
-    """Slope (columns,) of the least-squares line of the error by position over the rows, each counting once."""
+def line_weights(model: AxisModel, w: np.ndarray) -> np.ndarray:
+    """Slope of the least-squares line of the error by position over the rows, each counting once.
+
+    Shape (columns,), or (n, columns) at draws w (n, d) where a period is not known.
+    """
     rows = model.rows
     off = rows.command - rows.command.mean()
-    return (off / (off @ off)) @ model.functional(rows.command)
+    weights = off / (off @ off)
+    if not model.repeats_by_draw:
+        return weights @ model.functional(rows.command)
+    return np.concatenate([weights @ model.functional(rows.command, part) for part in blocks_of(w)])
 
 
-def headline_functionals(model: AxisModel) -> np.ndarray:
-    """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns)."""
+def blocks_of(w: np.ndarray) -> list[np.ndarray]:
+    """Draws (n, d) in blocks small enough for functionals of many commands."""
+    return np.array_split(w, max(1, len(w) // 100))
+
+
+def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
+    """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns), or (n, ...) as those of `line_weights`."""
+    lines, weights = line_functionals(model), line_weights(model, w)
+    found = np.concatenate([lines, model.head(slope=1.0)[None]])
+    if weights.ndim == 2:
+        found = np.repeat(found[None], len(weights), axis=0)
+    found[..., -1, :] += weights
+    return found
+
+
+def line_functionals(model: AxisModel) -> np.ndarray:
+    """Those of `HEADLINE_DRAWS` but the last, which no draw changes."""
     of = model.head
     return np.array(
         [
@@ -36,7 +57,6 @@ def headline_functionals(model: AxisModel) -> np.ndarray:
             of(backlash=1.0),
             of(slope=1.0, contrast=0.5),
             of(slope=1.0, contrast=-0.5),
-            of(slope=1.0) + line_weights(model),
         ]
     )
 
@@ -50,7 +70,7 @@ class AxisDensity:
 
     def __init__(self, model: AxisModel, mode: AxisMode):
         self.model, self.mode, self.invalid = model, mode, 0
-        self.functionals = headline_functionals(model)[:-1]
+        self.functionals = line_functionals(model)
 
     @property
     def dimension(self) -> int:
@@ -81,7 +101,7 @@ class AxisDensity:
         values, names = self.model.coordinates.values(points.w), self.model.coordinates.names
         linear = dict(zip(HEADLINE_DRAWS, points.parts["linear"].T, strict=False))
         # A backlash that is sampled is in the linear one.
-        return {name: values[name] for name in names} | linear
+        return {name: values[name] for name in names if name in values} | linear
 
     def first_proposal(self) -> StudentMixture:
         """About the mode."""

@@ -21,6 +21,7 @@ from tvsbayes.single_axis.axis_model import AxisModel, LinearPosterior
 from tvsbayes.single_axis.axis_parameters import AxisPrior, axis_priors
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
 from tvsbayes.single_axis.classic_line import fit_line
+from tvsbayes.single_axis.period_search import waves_of
 
 MODE, WEIGHING, WALKING, TELLING = "mode", "weighted draws", "chain", "summarising"
 EQUAL_DRAWS = 2000
@@ -113,8 +114,16 @@ class AxisFit(Shown):
         """Equal draws (draws,) of every sampled parameter, of the linear ones, and of the line through the stops."""
         rng = np.random.default_rng([self.seed, 3])
         found = {name: v for name, v in self.model.coordinates.values(self.w).items() if name in self.free}
-        linear = self.linear.drawn(headline_functionals(self.model), rng)
-        return found | dict(zip(HEADLINE_DRAWS, linear.T, strict=True))
+        linear = self.linear.drawn(headline_functionals(self.model, self.w), rng)
+        return found | dict(zip(HEADLINE_DRAWS, linear.T, strict=True)) | self._shift_draws(rng)
+
+    def _shift_draws(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Of the zero's shifts in time."""
+        names = self.model.shifts
+        if not names:
+            return {}
+        drawn = self.linear.drawn(np.array([self.model.shift(name) for name in names]), rng)
+        return dict(zip(names, drawn.T, strict=True))
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -130,7 +139,8 @@ def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisMode
         InputError: too many moves, or angles that wrap.
     """
     rows = rows_of(campaign)
-    return AxisModel.of(rows, default_priors(rows) | campaign.stated, more)
+    priors = default_priors(rows) | campaign.stated
+    return AxisModel.of(rows, priors, more, waves_of(rows, priors, campaign.periods))
 
 
 def default_priors(rows: AxisRows) -> dict[str, AxisPrior]:

@@ -9,6 +9,7 @@ import numpy as np
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import reversal_of
 from tvsbayes.single_axis.classic_line import fit_line
+from tvsbayes.single_axis.waves import start_of
 
 STEP, CURVATURE_STEP = 1e-2, 5e-2
 """Of differences, in units of the coordinates' expected widths: a third derivative of 1 makes 2e-5 of a gradient."""
@@ -42,7 +43,7 @@ def _repeat_sd(model: AxisModel) -> float:
     """Scatter of rows at one position from one side, unit; 1e-4 of the travel where none repeat."""
     rows = model.rows
     squares, freedom = 0.0, 0
-    for command in rows.positions:
+    for command in () if rows.in_motion else rows.positions:
         for side in (-1, 0, 1):
             mine = rows.value[(rows.command == command) & (rows.side == side)]
             if len(mine) > 1:
@@ -60,6 +61,8 @@ def _start(model: AxisModel, stop_sd: float) -> tuple[np.ndarray, np.ndarray]:
             reversal, error = reversal_of(model.rows)
             w[k] = model.coordinates.coordinate(name, reversal)
             width[k] = min(max(error / model.priors[name].u, 1e-9), 1.0)
+        elif name.startswith("wave_"):
+            w[k] = start_of(model.coordinates.waves[int(name.split(".")[1]) - 1], name)
         elif name.startswith("stop_sd"):
             w[k] = np.clip(model.coordinates.coordinate(name, stop_sd), -4.0, 4.0)
     return w, width
@@ -72,7 +75,8 @@ def _gradients(model: AxisModel, w: np.ndarray, width: np.ndarray, step: float) 
     value = model.log_density((w[:, None] + shift).reshape(-1, d)).reshape(len(w), 2, d)
     # Where a density has no value neither has its slope.
     with np.errstate(invalid="ignore"):
-        return (value[:, 0] - value[:, 1]) / (2 * step)
+        found = (value[:, 0] - value[:, 1]) / (2 * step)
+    return np.where(np.isfinite(found), found, 0.0)
 
 
 def _missing(log_density: float, off: float = 0.0) -> tuple[str, ...]:
@@ -110,8 +114,7 @@ def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray) -> AxisMod
         return -found if np.isfinite(found) else 1e30
 
     def slope(v: np.ndarray) -> np.ndarray:
-        found = _gradients(model, (start + width * v)[None], width, STEP)[0]
-        return -np.where(np.isfinite(found), found, 0.0)
+        return -_gradients(model, (start + width * v)[None], width, STEP)[0]
 
     best = minimize(value, np.zeros(len(start)), jac=slope, method="BFGS", options={"gtol": 1e-2, "maxiter": 200})
     v = np.asarray(best.x)
@@ -120,7 +123,6 @@ def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray) -> AxisMod
     slopes = _gradients(model, w + shift, width, CURVATURE_STEP)
     count = len(w)
     curvature = -(slopes[:count] - slopes[count:]) / (2 * CURVATURE_STEP)
-    curvature = np.where(np.isfinite(curvature), curvature, 0.0)
     values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
     inverse = vectors @ np.diag(1 / np.maximum(values, CURVATURE_MIN)) @ vectors.T
     log_density = float(model.log_density(w[None])[0])

@@ -1,8 +1,10 @@
 """The density of an axis' readings: everything linear integrated out exactly, many draws of the scales at once.
 
 A reading = offset + unit per command x command + contrast + place in the play x (backlash + its variation) / 2
-+ error by position + drift + stop error + noise (formulation 8.1). Drift and held stop errors by a Kalman filter of two
-states over the rows, whose innovations whiten the columns of everything else; cost linear in the rows. NumPy.
++ error by position + waves + creep + thermal shift + drift + stop error + noise (formulation 8.1). Drift and held stop
+errors by a Kalman filter of two states over the rows, whose innovations whiten the columns of everything else; cost
+linear in the rows. Of a drive at constant rate time and position are one: no error by position, and seeing in the place
+of stop errors. NumPy.
 """
 
 from __future__ import annotations
@@ -14,8 +16,10 @@ from functools import cached_property
 import numpy as np
 
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, AxisCoordinates, AxisPrior
-from tvsbayes.single_axis.axis_rows import AxisRows, legs_are_long, play_places, reversal_of
+from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_are_long, play_places, reversal_of
+from tvsbayes.single_axis.filter_of_rows import averaged_variance, whitened
 from tvsbayes.single_axis.process_places import ProcessPlaces, process_places
+from tvsbayes.single_axis.waves import COLUMNS, SHARES, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
 
 OFFSET_TRAVELS = 1.0
@@ -44,16 +48,21 @@ class LinearPosterior:
     covariance: np.ndarray
 
     def of(self, functionals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (n, t) and sd (n, t) of functionals (t, columns)."""
+        """Mean (n, t) and sd (n, t) of functionals (t, columns), or (n, t, columns) where each draw has its own."""
+        if functionals.ndim == 3:
+            across = functionals @ self.covariance
+            variance = np.einsum("nti,nti->nt", across, functionals)
+            return np.einsum("ni,nti->nt", self.mean, functionals), np.sqrt(np.maximum(variance, 0.0))
         variance = np.einsum("ti,nij,tj->nt", functionals, self.covariance, functionals, optimize=True)
         return self.mean @ functionals.T, np.sqrt(np.maximum(variance, 0.0))
 
     def drawn(self, functionals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """One draw of functionals (t, columns) for each of the n, shape (n, t)."""
-        covariance = functionals @ self.covariance @ functionals.T
+        """One draw of functionals (t, columns) or (n, t, columns) for each of the n, shape (n, t)."""
+        covariance = functionals @ self.covariance @ np.swapaxes(functionals, -1, -2)
         values, vectors = np.linalg.eigh(covariance)
         normal = rng.standard_normal(values.shape) * np.sqrt(np.maximum(values, 0.0))
-        return self.mean @ functionals.T + np.einsum("nij,nj->ni", vectors, normal)
+        mean = np.einsum("ni,nti->nt", self.mean, functionals) if functionals.ndim == 3 else self.mean @ functionals.T
+        return mean + np.einsum("nij,nj->ni", vectors, normal)
 
 
 @dataclass(frozen=True)
@@ -105,7 +114,7 @@ class AxisModel:
     Attributes:
         rows: what was read.
         priors: of every key of `[axis]`.
-        coordinates: of what is sampled.
+        coordinates: of what is sampled, the waves with it.
         places: of the processes.
         unknown_segments: numbers of segments whose rows do not all know where they stand in the play.
     """
@@ -117,15 +126,28 @@ class AxisModel:
     unknown_segments: tuple[int, ...]
 
     @classmethod
-    def of(cls, rows: AxisRows, priors: Mapping[str, AxisPrior], more: np.ndarray | None = None) -> AxisModel:
+    def of(
+        cls,
+        rows: AxisRows,
+        priors: Mapping[str, AxisPrior],
+        more: np.ndarray | None = None,
+        waves: Sequence[Wave] = (),
+    ) -> AxisModel:
         """Of rows and complete priors.
 
         Args:
             rows: what was read.
             priors: from `axis_priors`.
             more: further commands at which the processes will be asked for.
+            waves: periods that are asked for.
         """
         unused = set()
+        if priors["creep"].u == 0 == priors["creep"].value or not _creeps(rows):
+            unused.add("creep_minutes")
+        unused |= {"stop_sd.forward", "stop_sd.backward"} if rows.in_motion else {"seeing_scale", "seeing_s"}
+        if rows.in_motion:
+            # Averaged readings hardly part white noise from seeing: theirs is as stated, what is beyond it is seeing.
+            unused |= {"transmission_error", "transmission_error_length", "play_variation", "reading_scale"}
         if not np.any(rows.variance > 0):
             unused.add("reading_scale")
         if len(np.unique(rows.segment)) < 2:
@@ -145,8 +167,10 @@ class AxisModel:
         unknown = tuple(k for k in unknown if np.any(lost[rows.segment == k] > 0))
         if legs_are_long(rows):
             unused.add("backlash")
-        places = process_places(rows.command, np.zeros(0) if more is None else more)
-        return cls(rows, dict(priors), AxisCoordinates.of(priors, frozenset(unused)), places, unknown)
+        # In motion at constant rate what goes with position goes with time: the drift has it.
+        command = rows.command[:0] if rows.in_motion else rows.command
+        places = process_places(command, np.zeros(0) if more is None else more)
+        return cls(rows, dict(priors), AxisCoordinates.of(priors, frozenset(unused), waves), places, unknown)
 
     @cached_property
     def homed(self) -> np.ndarray:
@@ -163,10 +187,22 @@ class AxisModel:
         """The command to which the offset belongs."""
         return float(self.rows.command.mean())
 
+    @cached_property
+    def shifts(self) -> tuple[str, ...]:
+        """Which shifts of the zero in time have a column: `creep`, `thermal_per_K`."""
+        there = {"creep": _creeps(self.rows), "thermal_per_K": self.rows.kelvin is not None}
+        named = [name for name, found in there.items() if found]
+        return tuple(name for name in named if not self.priors[name].u == 0 == self.priors[name].value)
+
+    @property
+    def waves_begin(self) -> int:
+        """First column of the waves: `COLUMNS` of each."""
+        return HEAD + len(self.homed) + len(self.unknown_segments) + len(self.shifts)
+
     @property
     def processes(self) -> int:
         """First column of the error by position; that of the play follows it."""
-        return HEAD + len(self.homed) + len(self.unknown_segments)
+        return self.waves_begin + COLUMNS * len(self.coordinates.waves)
 
     @property
     def columns(self) -> int:
@@ -183,13 +219,45 @@ class AxisModel:
         reversal, error = reversal_of(self.rows)
         return play_places(self.rows, np.array([max(abs(reversal), min(error, self.rows.travel))])).spread
 
-    def _columns(self, backlash: np.ndarray, extra: np.ndarray | None) -> np.ndarray:
-        """Readings less what the priors' means say, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
+    def clock(self, wave: Wave, command: np.ndarray, time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
+        """What a wave's period is of, at rows with these commands, times and readings, each (t,)."""
+        found = {"position": abs(self.rows.line[1]) * command, "seconds": time_s, "encoder": value}
+        return found[wave.clock]
+
+    def record(self, wave: Wave) -> WaveRecord:
+        """Where the rows lie on the clock of a wave."""
         rows = self.rows
+        return WaveRecord.of(self.clock(wave, rows.command, rows.time_s, rows.value))
+
+    def _wave_columns(self, w: np.ndarray) -> Iterator[np.ndarray]:
+        """Columns (n or 1, rows, `COLUMNS`) of every wave at coordinates (n, d)."""
+        rows = self.rows
+        speed = abs(rows.line[1] * (rows.rate or 0.0))
+        for wave, draws in zip(self.coordinates.waves, self.coordinates.wave_draws(w), strict=True):
+            width = rows.width_s * (1.0 if wave.clock == "seconds" else speed)
+            x = self.clock(wave, rows.command, rows.time_s, rows.value)
+            yield wave_columns(x, draws.period, WaveRecord.of(x), width)
+
+    def _shift_columns(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Columns (n or 1, rows) of the shifts of the zero in time."""
+        found = {}
+        if "creep" in self.shifts:
+            minutes = values["creep_minutes"]
+            minutes = minutes if "creep_minutes" in self.coordinates.names else minutes[:1]
+            found["creep"] = -np.expm1(-self.rows.warm_s[None] / (60.0 * minutes[:, None]))
+        if "thermal_per_K" in self.shifts and self.rows.kelvin is not None:
+            found["thermal_per_K"] = self.rows.kelvin[None]
+        return found
+
+    def _columns(self, w: np.ndarray, values: Mapping[str, np.ndarray], extra: np.ndarray | None) -> np.ndarray:
+        """Readings less what the priors' means say, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
+        rows, backlash = self.rows, values["backlash"]
+        shifts, waves = self._shift_columns(values), list(self._wave_columns(w))
         play = play_places(rows, backlash if self.play_is_sampled else np.zeros(1))
         spread = play.spread if self.play_is_sampled else self._unknown_spread
         # Draws that differ in nothing share their columns.
-        blocks = len(backlash) if self.play_is_sampled else 1
+        own = self.play_is_sampled or any(len(each) > 1 for each in (*shifts.values(), *waves))
+        blocks = len(backlash) if own else 1
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
         found = np.zeros((blocks, len(rows.move), width))
         level = rows.line[0] + rows.line[1] * self.middle
@@ -202,6 +270,13 @@ class AxisModel:
             found[:, :, 1 + HEAD + k] = rows.segment == segment
         for k, segment in enumerate(self.unknown_segments):
             found[:, :, 1 + HEAD + len(self.homed) + k] = spread * (rows.segment == segment)
+        at = 1 + HEAD + len(self.homed) + len(self.unknown_segments)
+        for k, (name, column) in enumerate(shifts.items(), start=at):
+            found[:, :, 0] -= self.priors[name].value * column
+            found[:, :, k] = column
+        for k, columns in enumerate(waves):
+            begins = 1 + self.waves_begin + COLUMNS * k
+            found[:, :, begins : begins + COLUMNS] = columns
         start, count = 1 + self.processes, len(self.places.command)
         found[:, :, start : start + count] = self._weights
         found[:, :, start + count : start + 2 * count] = 0.5 * play.share[:, :, None] * self._weights
@@ -210,8 +285,12 @@ class AxisModel:
         return found
 
     def _scatter(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Variances of stop errors and of readings, each (n, rows)."""
+        """Variances of stop errors (in motion of the seeing) and of readings, each (n, rows)."""
         rows = self.rows
+        if rows.in_motion:
+            seen = (values["seeing_scale"] * rows.reading_u) ** 2
+            stop = seen[:, None] * averaged_variance(rows.width_s[None] / values["seeing_s"][:, None])
+            return stop, np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
         forward = 0.5 * (1.0 + rows.side)
         stop = np.outer(values["stop_sd.forward"] ** 2, forward)
         stop += np.outer(values["stop_sd.backward"] ** 2, 1.0 - forward)
@@ -219,6 +298,18 @@ class AxisModel:
         if not self.places.exact:
             reading += self._between_nodes(values)[:, None]
         return stop, reading
+
+    def _carry(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """How much of a row's stop error, in motion of the seeing, the next has: shape (n or 1, rows)."""
+        rows = self.rows
+        if not rows.in_motion:
+            return np.where(rows.redrawn, 0.0, 1.0)[None]
+        lasts = values["seeing_s"][:, None]
+        gap = np.maximum(HOUR_S * rows.hours - rows.width_s, 0.0)[None] / lasts
+        over = rows.width_s[None] / lasts
+        whole = np.where(over > 1e-3, -np.expm1(-over) / np.maximum(over, 1e-3), 1.0 - 0.5 * over)
+        found = np.exp(-gap) * whole**2 / averaged_variance(over)
+        return np.where(rows.redrawn, 0.0, np.minimum(found, 1.0))
 
     def _between_nodes(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Variance (n,) that both processes have midway between nodes and lines of third order do not carry."""
@@ -237,8 +328,8 @@ class AxisModel:
         seen = np.any(self._weights != 0, axis=0)
         return np.flatnonzero(np.concatenate((np.ones(self.processes, bool), seen, seen)))
 
-    def _factor(self, values: Mapping[str, np.ndarray], told_first: bool) -> np.ndarray:
-        """Factor of the prior covariance of the columns, shape (n, columns, columns).
+    def _factor(self, values: Mapping[str, np.ndarray], scales: Sequence[np.ndarray], told_first: bool) -> np.ndarray:
+        """Factor of the prior covariance of the columns, shape (n, columns, columns); `scales` (n,) are of the waves.
 
         Cholesky's, places in order; or with the places that rows hang on before the others: then these places depend
         on no unit of the others.
@@ -255,6 +346,11 @@ class AxisModel:
         unknown = HEAD + len(self.homed) + np.arange(len(self.unknown_segments))
         # Uniform from -1 to 1.
         factor[:, unknown, unknown] = np.sqrt(1 / 3)
+        for k, name in enumerate(self.shifts, start=HEAD + len(self.homed) + len(self.unknown_segments)):
+            factor[:, k, k] = self.priors[name].u
+        for k, scale in enumerate(scales):
+            own = self.waves_begin + COLUMNS * k + np.arange(COLUMNS)
+            factor[:, own, own] = np.outer(scale, SHARES)
         distance = slope * (self.places.command[:, None] - self.places.command)
         length = values["transmission_error_length"][:, None, None]
         covariance = matern52(distance[None], length) + JITTER * np.eye(count)
@@ -279,15 +375,28 @@ class AxisModel:
         for start in range(0, len(w), size):
             part = slice(start, start + size)
             values = self.coordinates.values(w[part])
-            stop, reading = self._scatter(values)
-            columns = self._columns(values["backlash"], extra)
+            columns = self._columns(w[part], values, extra)
             if told:
                 columns = columns[:, :, np.concatenate(([0], 1 + self.told))]
-            drift = values["drift_per_root_hour"] ** 2
-            white, log_scatter = whitened(columns, self.rows, drift, stop, reading)
+            white, log_scatter = self._whitened(values, columns)
+            scales = [each.scale for each in self.coordinates.wave_draws(w[part])]
             products = np.swapaxes(white, 1, 2) @ white
             spread = rows_log_density(self.rows, values["reading_scale"])
-            yield part, _Block(products, log_scatter - 2 * spread, self._factor(values, told))
+            yield part, _Block(products, log_scatter - 2 * spread, self._factor(values, scales, told))
+
+    def white(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened readings and columns (rows, 1 + columns) at one draw w (1, d), and the factor of their prior."""
+        values = self.coordinates.values(w)
+        scales = [each.scale for each in self.coordinates.wave_draws(w)]
+        return self._whitened(values, self._columns(w, values, None))[0][0], self._factor(values, scales, False)[0]
+
+    def whitened_extra(self, w: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Further columns (rows, c), whitened as those of one draw w (1, d)."""
+        return self._whitened(self.coordinates.values(w), columns[None])[0][0]
+
+    def _whitened(self, values: Mapping[str, np.ndarray], columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        stop, reading = self._scatter(values)
+        return whitened(columns, self.rows, values["drift_per_root_hour"] ** 2, stop, reading, self._carry(values))
 
     def log_likelihood(self, w: np.ndarray) -> np.ndarray:
         """Log density of the readings at coordinates (n, d), shape (n,)."""
@@ -317,6 +426,8 @@ class AxisModel:
         found[:, OFFSET] = self.rows.line[0] + self.rows.line[1] * self.middle
         found[:, SLOPE] = self.priors["per_command"].value
         found[:, BACKLASH] = self.coordinates.values(w)["backlash"]
+        for k, name in enumerate(self.shifts, start=HEAD + len(self.homed) + len(self.unknown_segments)):
+            found[:, k] = self.priors[name].value
         return found
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
@@ -329,8 +440,11 @@ class AxisModel:
         found = Likelihood.nowhere(len(w), wanted)
         usable = np.flatnonzero(np.all(np.abs(w) < FARTHEST, axis=1))
         if len(usable):
+            prior = self.coordinates.log_prior(w[usable])
+            usable, prior = usable[np.isfinite(prior)], prior[np.isfinite(prior)]
+        if len(usable):
             seen = self._possible(w[usable], functionals)
-            value = seen.log_density - 0.5 * np.sum(w[usable] ** 2, axis=1)
+            value = seen.log_density + prior
             found.log_density[usable] = np.where(np.isfinite(value), value, -np.inf)
             found.linear.mean[usable], found.linear.covariance[usable] = seen.linear.mean, seen.linear.covariance
         return found
@@ -396,11 +510,43 @@ class AxisModel:
             found[_HEAD_COLUMNS[name]] = factor
         return found
 
-    def functional(self, command: np.ndarray) -> np.ndarray:
-        """The error by position at commands (t,): functionals (t, columns)."""
+    def shift(self, name: str) -> np.ndarray:
+        """A functional (columns,) of one of `shifts`."""
+        found = np.zeros(self.columns)
+        found[HEAD + len(self.homed) + len(self.unknown_segments) + self.shifts.index(name)] = 1.0
+        return found
+
+    @property
+    def repeats_by_draw(self) -> bool:
+        """Whether what repeats by position has a period that is not known."""
+        return any(wave.clock == "position" and not wave.is_fixed for wave in self.coordinates.waves)
+
+    def functional(self, command: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+        """What repeats by position at commands (t,): the error by position and the waves of position, the gear's.
+
+        Functionals (t, columns); where a period is not known, of each of the draws w (n, d): (n, t, columns).
+
+        Raises:
+            ValueError: a period is not known, and no draws are given.
+        """
         found = np.zeros((len(command), self.columns))
         found[:, self.processes : self.processes + len(self.places.command)] = self.places.weights(command)
-        return found
+        own = self.repeats_by_draw
+        if own and w is None:
+            raise ValueError("draws are needed where a period is not known")
+        draws = self.coordinates.wave_draws(np.zeros((1, len(self.coordinates.names))) if w is None else w)
+        found = np.repeat(found[None], 1 if w is None or not own else len(w), axis=0)
+        for k, (wave, each) in enumerate(zip(self.coordinates.waves, draws, strict=True)):
+            if wave.clock == "position":
+                begins = self.waves_begin + COLUMNS * k
+                at = self.clock(wave, command, command, command)
+                found[:, :, begins : begins + COLUMNS] = wave_columns(at, each.period, self.record(wave))
+        return found if own else found[0]
+
+
+def _creeps(rows: AxisRows) -> bool:
+    """Whether times are known, so that a creep can be asked for."""
+    return bool(np.ptp(rows.warm_s) > 0)
 
 
 _HEAD_COLUMNS = {"offset": OFFSET, "slope": SLOPE, "contrast": CONTRAST, "backlash": BACKLASH}
@@ -433,52 +579,3 @@ def rows_log_density(rows: AxisRows, reading_scale: np.ndarray) -> np.ndarray:
     known = rows.variance > 0
     freedom = float(np.sum(rows.count[known] - 1))
     return -freedom * np.log(reading_scale) - 0.5 * float(rows.within[known].sum()) / reading_scale**2
-
-
-def whitened(
-    columns: np.ndarray, rows: AxisRows, drift: np.ndarray, stop: np.ndarray, reading: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Columns in units of the scatter of drift, stop errors and readings, decorrelated: innovations of the filter.
-
-    Args:
-        columns: shape (n or 1, rows, c).
-        rows: their times, segments and whether each stop's error is a new one.
-        drift: variance per hour, shape (n,).
-        stop: variances of stop errors, shape (n, rows).
-        reading: variances of readings, shape (n, rows).
-
-    Returns:
-        Innovations over their sd (n, rows, c), and the log-determinant of the scatter (n,).
-    """
-    n, count, width = len(drift), columns.shape[1], columns.shape[2]
-    white = np.empty((n, count, width))
-    log_scatter = np.zeros(n)
-    zero, held = np.zeros((n, width)), np.zeros((n, width))
-    p_zero, p_held, p_both = np.zeros(n), np.zeros(n), np.zeros(n)
-    for k in range(count):
-        if k and rows.segment[k] != rows.segment[k - 1]:
-            zero, p_zero, p_both = np.zeros((n, width)), np.zeros(n), np.zeros(n)
-        p_zero = p_zero + drift * rows.hours[k]
-        if rows.redrawn[k]:
-            held, p_held, p_both = np.zeros((n, width)), stop[:, k], np.zeros(n)
-        noise = reading[:, k]
-        variance = p_zero + 2 * p_both + p_held + noise
-        innovation = columns[:, k] - zero - held
-        white[:, k] = innovation / np.sqrt(variance)[:, None]
-        log_scatter += np.log(variance)
-        gain_zero, gain_held = (p_zero + p_both) / variance, (p_held + p_both) / variance
-        zero = zero + gain_zero[:, None] * innovation
-        if k + 1 < count and not rows.redrawn[k + 1]:
-            held = held + gain_held[:, None] * innovation
-        # Joseph's form: differences of large variances keep the rest positive.
-        left_zero, left_held = 1 - gain_zero, 1 - gain_held
-        after_zero = left_zero**2 * p_zero - 2 * left_zero * gain_zero * p_both + gain_zero**2 * (p_held + noise)
-        after_held = left_held**2 * p_held - 2 * left_held * gain_held * p_both + gain_held**2 * (p_zero + noise)
-        p_both = (
-            (left_zero * left_held + gain_zero * gain_held) * p_both
-            - left_zero * gain_held * p_zero
-            - gain_zero * left_held * p_held
-            + gain_zero * gain_held * noise
-        )
-        p_zero, p_held = after_zero, after_held
-    return white, log_scatter

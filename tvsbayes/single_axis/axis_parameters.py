@@ -7,11 +7,13 @@ Formulation 8.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+
+from tvsbayes.single_axis.waves import Wave, WaveDraws, log_order, names_of, wave_draws
 
 Kind = Literal["normal", "half-normal", "log-normal"]
 
@@ -33,12 +35,14 @@ class AxisKey:
         share: what the default's value (log-normal) or u is of the travel; None where it does not scale.
         u: sd of the log of a log-normal default.
         what: in words, for tables.
+        median: of a log-normal default that does not scale.
     """
 
     kind: Kind
     share: float | None
     u: float
     what: str
+    median: float = 1.0
 
 
 AXIS_KEYS = {
@@ -51,10 +55,16 @@ AXIS_KEYS = {
     "stop_sd": AxisKey("log-normal", 0.0005, 1.5, "scatter of stops"),
     "home_sd": AxisKey("log-normal", 0.001, 1.5, "scatter of homings"),
     "reading_scale": AxisKey("log-normal", None, 0.5, "scatter of readings / u"),
+    "creep": AxisKey("normal", 0.0005, 0.0, "zero creeps while it warms up, in all"),
+    "creep_minutes": AxisKey("log-normal", None, 0.8, "time constant of the creep, minutes", 20.0),
+    "thermal_per_K": AxisKey("normal", 0.0001, 0.0, "zero shifts per kelvin"),
+    "seeing_scale": AxisKey("log-normal", None, 1.0, "seeing / u of a reading"),
+    "seeing_s": AxisKey("log-normal", None, 1.2, "seeing lasts, s", 10.0),
 }
 """Shares of the travel: half-normals and stop scatter by eleven stepper axes that others measured, on which the scales
 integrated out give left-out positions that lie within 1.96 u in 95 % of cases. Backlash: cheap gears lose up to some
-per cent; any reversal measures it well, so a wide prior costs nothing."""
+per cent; any reversal measures it well, so a wide prior costs nothing. Seeing: what readings in motion share for
+seconds, of air, of a guider's loop, of the reader; its sd in units of a reading's u."""
 STATED_KEYS = tuple(AXIS_KEYS)
 CONTRAST_SHARE = 1e-4
 """sd of the difference of both directions' ratios, of the ratio: gears and screws have one. Over a long path more would
@@ -62,6 +72,7 @@ pass a warming frame off as two ratios."""
 SAMPLED = (
     *("backlash", "transmission_error", "transmission_error_length", "play_variation", "drift_per_root_hour"),
     *("stop_sd.forward", "stop_sd.backward", "home_sd", "reading_scale"),
+    *("creep_minutes", "seeing_scale", "seeing_s"),
 )
 """Everything that is not linear in the readings; `stop_sd` of `[axis]` is the prior of both."""
 
@@ -87,7 +98,7 @@ def axis_priors(
         if name == "per_command":
             default = AxisPrior(per_command, abs(per_command) + 2 * u_per_command)
         elif key.share is None:
-            default = AxisPrior(1.0, key.u)
+            default = AxisPrior(key.median, key.u)
         elif key.kind == "log-normal":
             default = AxisPrior(key.share * travel, key.u)
         else:
@@ -110,19 +121,37 @@ class AxisCoordinates:
     """Coordinates with standard normal priors of the sampled parameters, and the values of the fixed ones.
 
     Attributes:
-        names: free parameters, in the order of the coordinates.
+        names: free parameters, in the order of the coordinates; those of the waves last.
         priors: of every name in `SAMPLED`.
+        waves: whose scales and periods are sampled too, as `wave_scale.1`, `wave_period.1`, ...
     """
 
     names: tuple[str, ...]
     priors: dict[str, AxisPrior]
+    waves: tuple[Wave, ...] = ()
 
     @classmethod
-    def of(cls, priors: Mapping[str, AxisPrior], unused: frozenset[str]) -> AxisCoordinates:
+    def of(cls, priors: Mapping[str, AxisPrior], unused: frozenset[str], waves: Sequence[Wave] = ()) -> AxisCoordinates:
         """Of the priors of an axis; what is `unused` by the data, or has u = 0, is held at its value."""
         of_each = {name: priors[name.split(".")[0]] for name in SAMPLED}
         free = tuple(name for name in SAMPLED if of_each[name].u > 0 and name not in unused)
-        return cls(free, of_each)
+        return cls((*free, *names_of(waves)), of_each, tuple(waves))
+
+    def wave_draws(self, w: np.ndarray) -> list[WaveDraws]:
+        """Every wave at coordinates (n, d)."""
+        found = []
+        for k, wave in enumerate(self.waves, start=1):
+            place = None if wave.is_fixed else w[:, self.names.index(f"wave_period.{k}")]
+            found.append(wave_draws(wave, w[:, self.names.index(f"wave_scale.{k}")], place))
+        return found
+
+    def log_prior(self, w: np.ndarray) -> np.ndarray:
+        """Log prior density at coordinates (n, d) up to a constant, shape (n,)."""
+        found: np.ndarray = -0.5 * np.sum(w**2, axis=1)
+        if self.waves:
+            draws = self.wave_draws(w)
+            found = found + log_order(self.waves, draws) + sum(each.log_prior for each in draws)
+        return found
 
     def values(self, w: np.ndarray) -> dict[str, np.ndarray]:
         """Every name of `SAMPLED` at coordinates (n, d): arrays (n,)."""

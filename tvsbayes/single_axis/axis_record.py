@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta, field
@@ -33,15 +33,17 @@ from tvsbayes.results.records import (
 )
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_conflicts import conflict_text
-from tvsbayes.single_axis.axis_density import line_weights
+from tvsbayes.single_axis.axis_density import blocks_of, line_weights
 from tvsbayes.single_axis.axis_doubts import data_doubts
 from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, kind_of, prior_sd
+from tvsbayes.single_axis.axis_periods import PeriodEstimate, period_estimate, wave_samples, weak_waves
 from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
 from tvsbayes.statistics.intervals import NORMAL_95
 
 AXIS_FIT_FORMAT = "tvsbayes-axis-fit/1"
+type PeriodClock = Literal["unit", "seconds"]
 type BothSides[T] = Annotated[dict[str, T], Meta(extra_json_schema={"required": ("forward", "backward")})]
 POSITIONS_FEW = 5
 """Below it a process of position is mostly its prior."""
@@ -78,6 +80,9 @@ class AxisSummary(Shown, Record, frozen=True):
         effective_per_command: slope of the least-squares line through the positions read, by direction.
         range_command: least and largest command read; `effective_per_command` belongs to it.
         parameters: by name.
+        periods: waves of the gear, stated ones first.
+        encoder_periods: of the encoder.
+        periods_in: what those of the gear are in: "unit", that of the readings, or "seconds".
         deviations: off that line, by position read.
         classic: beside it.
         moves, readings, positions: how many were used.
@@ -108,6 +113,9 @@ class AxisSummary(Shown, Record, frozen=True):
     prior_conflicts: tuple[str, ...] = ()
     answer: AnswerKind = "laplace"
     monte_carlo_error: dict[str, MonteCarloError] = field(default_factory=dict)
+    periods: tuple[PeriodEstimate, ...] = ()
+    encoder_periods: tuple[PeriodEstimate, ...] = ()
+    periods_in: PeriodClock = "unit"
 
     @property
     def explained(self) -> bool:
@@ -163,7 +171,8 @@ def _diagnoses(fit: AxisFit) -> dict[str, tuple[float | None, float | None, floa
 
 def _prior_sds(fit: AxisFit) -> dict[str, float]:
     priors = fit.model.priors
-    found = {name: prior_sd(kind_of(name), priors[name.split(".")[0]]) for name in fit.free}
+    sampled = [name for name in fit.free if not name.startswith("wave_")]
+    found = {name: prior_sd(kind_of(name), priors[name.split(".")[0]]) for name in (*sampled, *fit.model.shifts)}
     contrast = CONTRAST_SHARE * abs(fit.rows.line[1])
     side = float(np.hypot(priors["per_command"].u, 0.5 * contrast))
     return found | {
@@ -185,7 +194,9 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
 
     effective, contrast = draws["effective_per_command"], draws["ratio_contrast"]
     sides = {"forward": 0.5, "backward": -0.5}
-    names = [*fit.free, "per_command", "ratio_contrast", "backlash", "offset"]
+    sampled = [name for name in fit.free if not name.startswith("wave_")]
+    names = [*sampled, *fit.model.shifts, "per_command", "ratio_contrast", "backlash", "offset"]
+    samples = wave_samples(fit)
     return AxisSummary(
         unit=fit.campaign.unit,
         estimator=fit.estimator,
@@ -205,10 +216,13 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         moves=len(fit.rows.move),
         readings=int(fit.rows.count.sum()),
         positions=len(fit.rows.positions),
-        weak_directions=tuple(_weak(fit)),
+        weak_directions=tuple([*_weak(fit), *weak_waves(fit, samples)]),
         warnings=tuple([*axis_warnings(fit.campaign, fit.rows), *_reversed(fit)]),
         sampling=_sampling(fit),
         prior_conflicts=tuple(conflict_text(conflict) for conflict in fit.conflicts),
+        periods=tuple(period_estimate(each) for each in samples if each.wave.clock != "encoder"),
+        encoder_periods=tuple(period_estimate(each) for each in samples if each.wave.clock == "encoder"),
+        periods_in="seconds" if fit.campaign.periods.in_seconds else "unit",
     )
 
 
@@ -225,19 +239,37 @@ def _untold(fit: AxisFit) -> dict[str, Estimate]:
 
 
 def deviation_functionals(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
-    """The error by position at commands (t,), less the line that the rows put through it: (t, columns)."""
+    """What repeats by position at commands (t,), less the line that the rows put through it.
+
+    Shape (t, columns); of `fit.w` (n, t, columns) where a period is not known.
+    """
     model = fit.model
-    level = model.functional(fit.rows.command).mean(axis=0)
-    slope = line_weights(model)
-    return model.functional(commands) - level - np.outer(commands - model.middle, slope)
+    level = model.functional(fit.rows.command, fit.w).mean(axis=-2)
+    slope = line_weights(model, fit.w)
+    off = (commands - model.middle)[:, None]
+    return model.functional(commands, fit.w) - level[..., None, :] - off * slope[..., None, :]
+
+
+CURVE_DRAWS = 400
+"""Of the error by position where its functionals are each draw's own."""
+
+
+def drawn_deviations(fit: AxisFit, commands: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The error that repeats by position at commands (t,), off the line, drawn: (draws, t)."""
+    if not fit.model.repeats_by_draw:
+        return fit.linear.drawn(deviation_functionals(fit, commands), rng)
+    w = fit.w[np.linspace(0, len(fit.w) - 1, CURVE_DRAWS).astype(int)]
+    parts = (AxisFit.of_draws(fit.campaign, fit.model, part, fit.seed) for part in blocks_of(w))
+    return np.concatenate([part.linear.drawn(deviation_functionals(part, commands), rng) for part in parts])
 
 
 def _deviations(fit: AxisFit) -> tuple[PositionDeviation, ...]:
     positions = fit.rows.positions
+    if fit.rows.in_motion and not any(wave.clock == "position" for wave in fit.model.coordinates.waves):
+        return ()
     if len(positions) > POSITIONS_LISTED:
         positions = positions[np.linspace(0, len(positions) - 1, POSITIONS_LISTED).astype(int)]
-    functionals = deviation_functionals(fit, positions)
-    drawn = fit.linear.drawn(functionals, np.random.default_rng([fit.seed, 4]))
+    drawn = drawn_deviations(fit, positions, np.random.default_rng([fit.seed, 4]))
     low, high = np.percentile(drawn, TAILS_PERCENT, axis=0)
     return tuple(
         PositionDeviation(float(p), float(v.mean()), float(v.std()), (float(a), float(b)))
@@ -267,6 +299,8 @@ def _sampling(fit: AxisFit) -> dict[str, float | int | None]:
 def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     """What is odd about the data, in sentences."""
     found = []
+    if rows.in_motion:
+        return _warnings_in_motion(campaign, rows)
     legs = rows.legs
     idle = (legs.step == 0) & ~legs.first
     again = [int(m) for m in rows.move if idle[m]]
@@ -285,6 +319,17 @@ def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     return found + data_doubts(campaign, rows)
 
 
+def _warnings_in_motion(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
+    """What is odd about a record of a drive that never stops."""
+    found = []
+    if not any(r.u > 0 for r in campaign.readings):
+        found.append(f"no reading has a stated u: {rows.reading_u:.2g} {rows.unit} by differences of neighbours")
+    unread = len(campaign.readings) - int(rows.count.sum())
+    if unread:
+        found.append(f"{unread} of {len(campaign.readings)} readings are not used: their status is not ok")
+    return found
+
+
 def _reversed(fit: AxisFit) -> list[str]:
     """Where the sign of the reversal is not that of lost motion."""
     if not fit.rows.both_sides or np.mean(fit.draws["backlash"] < 0) < REVERSED:
@@ -297,7 +342,9 @@ def _reversed(fit: AxisFit) -> list[str]:
 
 def _weak(fit: AxisFit) -> list[str]:
     """What the data leave to the priors, and what would tell."""
-    rows, found = fit.rows, []
+    rows, found = fit.rows, _weak_in_time(fit)
+    if rows.in_motion:
+        return [*found, "a drive at constant rate cannot tell error by position from drift: both are in the drift"]
     sides = set(rows.side.tolist()) - {0}
     if not rows.both_sides:
         found.append("backlash cannot be told: every stop was reached from one side; add stops from the other")
@@ -309,6 +356,27 @@ def _weak(fit: AxisFit) -> list[str]:
     repeats = [np.sum((rows.command == p) & (rows.side == s)) for p in rows.positions for s in sides]
     if max(repeats, default=0) < 2:
         found.append("no position was reached twice from one side: scatter and error by position hardly come apart")
+    return found
+
+
+CREEP_SHARE = 0.5
+"""Correlation with the creep from which the contrast of the directions, or the play, is said to be weak."""
+
+
+def _weak_in_time(fit: AxisFit) -> list[str]:
+    """What a shift of the zero in time cannot be told from."""
+    found = []
+    for shift, cure in {
+        "creep": "alternate the directions, come back to the first stop, wait until it is warm",
+        "thermal_per_K": "come back to the first stop at another temperature",
+    }.items():
+        for name, what in {"backlash": "the play", "ratio_contrast": "the contrast of the directions"}.items():
+            if shift not in fit.model.shifts or not fit.rows.both_sides:
+                continue
+            a, b = fit.draws[shift], fit.draws[name]
+            if a.std() and b.std() and abs(np.corrcoef(a, b)[0, 1]) > CREEP_SHARE:
+                words = "a creep of the zero" if shift == "creep" else "a shift with the temperature"
+                found.append(f"{what} and {words} are hardly told apart: {cure}")
     return found
 
 

@@ -1,6 +1,7 @@
 """An axis campaign as arrays: where stops were read, from which side they were reached, where the play stood.
 
-A row is a move with readings, averaged. Positions are commands; `unit` is that of the readings. Formulation 8.1.
+A row is a move with readings, averaged; of a drive at constant rate the readings of a short while
+(`readings_in_motion`). Positions are commands; `unit` is that of the readings. Formulation 8.1.
 """
 
 from __future__ import annotations
@@ -62,6 +63,12 @@ class AxisRows:
         within: sum of squares of the readings about their mean, in units of their u.
         count: readings in the mean.
         line: offset and unit per command of the least-squares line with a reversal.
+        time_s: clock of moves.csv.
+        warm_s: since it was switched on; since the first move where nothing says when that was.
+        kelvin: temperature less that of the first move; None where none was recorded.
+        width_s: over which the readings of a row in motion were averaged; 0 at a stop.
+        rate: commands per second of a drive at constant rate; None of stops.
+        reading_u: of a typical reading, unit; 0 where no u is known.
     """
 
     unit: str
@@ -78,6 +85,17 @@ class AxisRows:
     within: np.ndarray
     count: np.ndarray
     line: tuple[float, float]
+    time_s: np.ndarray
+    warm_s: np.ndarray
+    kelvin: np.ndarray | None
+    width_s: np.ndarray
+    rate: float | None
+    reading_u: float
+
+    @property
+    def in_motion(self) -> bool:
+        """Whether the readings are those of a drive at constant rate."""
+        return self.rate is not None
 
     @property
     def travel(self) -> float:
@@ -106,7 +124,8 @@ class AxisRows:
             hours[row] = since[at] - since[before] if same else since[at] - since[begins] + self.hours[begins]
             redrawn[row] = not same or bool(self.redrawn[before + 1 : at + 1].any())
         arrays = ("move", "command", "side", "segment", "path", "value", "variance", "within", "count")
-        picked = {name: getattr(self, name)[kept] for name in arrays}
+        picked = {name: getattr(self, name)[kept] for name in (*arrays, "time_s", "warm_s", "width_s")}
+        picked["kelvin"] = None if self.kelvin is None else self.kelvin[kept]
         return replace(self, hours=hours, redrawn=redrawn, **picked)
 
 
@@ -197,6 +216,8 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         NothingToEstimate: fewer than two positions were read, fewer than three moves, or the readings do not move.
         InputError: too many moves, or angles that wrap.
     """
+    if campaign.rate is not None:
+        return rows_in_motion(campaign, campaign.rate)
     used = [r for r in campaign.readings if r.status == "ok" and r.value is not None]
     means = _means(used)
     moves = np.array(sorted(means), dtype=int)
@@ -227,7 +248,8 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
             file="readings.csv",
             remedy="check the columns move and value, and that the reading follows this axis",
         )
-    times_h = np.array([m.time_s for m in campaign.moves]) / HOUR_S
+    times_s = np.array([m.time_s for m in campaign.moves])
+    stated = [r.u for r in used if r.u > 0]
     rows_found = AxisRows(
         unit=campaign.unit,
         legs=legs,
@@ -235,7 +257,7 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         command=command,
         side=legs.side[moves],
         segment=legs.segment[moves],
-        hours=_hours(times_h, legs, moves),
+        hours=_hours(times_s / HOUR_S, legs, moves),
         path=_path(legs)[moves],
         redrawn=_redrawn(legs, moves) | (variance == 0),
         value=value,
@@ -243,8 +265,154 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         within=within,
         count=count,
         line=(float(line[0] - line[1] * command.mean()), float(line[1])),
+        time_s=times_s[moves],
+        warm_s=times_s[moves] - warm_from(campaign),
+        kelvin=kelvin_at(campaign, times_s[moves]),
+        width_s=np.zeros(len(moves)),
+        rate=None,
+        reading_u=float(np.median(stated)) if stated else 0.0,
     )
     return rows_found if legs_are_long(rows_found) else _line_with_play(rows_found)
+
+
+ROWS_IN_MOTION, PER_PERIOD, READINGS_IN_MOTION = 2000, 5.0, 100_000
+"""Rows of a drive, readings' groups in the shortest period that is asked for, readings that are taken."""
+WIDE_ROWS = 400
+"""Rows of a drive of which no period is asked, and below which readings stay single."""
+
+
+def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
+    """The rows of a drive at constant rate: means of the readings of equal short times.
+
+    A wave is averaged over them too, so that nothing but detail shorter than a fifth of the shortest period is lost.
+    Where no u is stated, second differences of neighbouring readings tell it.
+
+    Raises:
+        NothingToEstimate, InputError: as `rows_of`.
+    """
+    used = sorted(
+        (r for r in campaign.readings if r.status == "ok" and r.value is not None and r.time_s is not None),
+        key=lambda r: (r.move, r.time_s or 0.0),
+    )
+    if len(used) > READINGS_IN_MOTION:
+        raise InputError(
+            "too-many",
+            f"readings.csv: {len(used)} readings in motion; allowed: at most {READINGS_IN_MOTION}",
+            file="readings.csv",
+            remedy="thin them out, or fit one part of the record",
+        )
+    if len(used) < 5:
+        raise NothingToEstimate(
+            "too-few-positions",
+            f"{len(used)} readings in motion: nothing to estimate",
+            file="readings.csv",
+            remedy="read at least five, better several periods long",
+        )
+    move = np.array([r.move for r in used])
+    time_s, value = np.array([r.time_s for r in used], dtype=float), np.array([r.value for r in used], dtype=float)
+    at = {name: np.array([getattr(m, name) for m in campaign.moves]) for name in ("segment", "time_s", "command")}
+    command = at["command"][move] + rate * (time_s - at["time_s"][move])
+    _check_turns(campaign, command, value, move)
+    slope = float(np.polyfit(command - command.mean(), value, 1)[0])
+    if not abs(slope) * np.ptp(command) > 1e-9 * max(float(np.max(np.abs(value))), 1e-300):
+        raise NothingToEstimate(
+            "no-motion",
+            "the readings do not move with the command: nothing to estimate",
+            file="readings.csv",
+            remedy="give total positions, not what they are off the drive; check the sign of `rate`",
+        )
+    u = np.array([r.u for r in used])
+    u = np.where(u > 0, u, _neighbours_sd(value - slope * command, move))
+    weight = 1.0 / np.maximum(u, FLOOR_SHARE * abs(slope) * np.ptp(command)) ** 2
+    width = _width_s(campaign, abs(slope * rate), time_s, move)
+    begins = np.r_[True, np.diff(move) > 0]
+    since = time_s - time_s[begins][np.cumsum(begins) - 1]
+    bin_of = np.floor(since / width).astype(int) if width else np.arange(len(used))
+    starts = np.flatnonzero(np.r_[True, (np.diff(move) > 0) | (np.diff(bin_of) != 0)])
+    total = np.add.reduceat(weight, starts)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(weight * values, starts) / total
+
+    count = np.diff(np.r_[starts, len(used)])
+    rows_move, rows_time, rows_command, rows_value = move[starts], mean(time_s), mean(command), mean(value)
+    spread = np.sqrt(mean((time_s - np.repeat(rows_time, count)) ** 2))
+    segment = at["segment"][rows_move]
+    first = np.r_[True, np.diff(segment) > 0]
+    starts_s = np.array([at["time_s"][np.flatnonzero(at["segment"] == s)[0]] for s in segment])
+    gaps = np.where(first, rows_time - starts_s, np.r_[0.0, np.diff(rows_time)])
+    design = np.column_stack([np.ones(len(rows_command)), rows_command - rows_command.mean()])
+    line = np.linalg.lstsq(design, rows_value, rcond=None)[0]
+    starts_command = np.array([at["command"][np.flatnonzero(at["segment"] == s)[0]] for s in segment])
+    return AxisRows(
+        unit=campaign.unit,
+        legs=legs_of(campaign.moves),
+        move=rows_move,
+        command=rows_command,
+        side=np.full(len(rows_move), int(np.sign(rate))),
+        segment=segment,
+        hours=np.maximum(gaps, 0.0) / HOUR_S,
+        path=np.abs(rows_command - starts_command),
+        redrawn=first,
+        value=rows_value,
+        variance=1.0 / total,
+        within=np.zeros(len(count)),
+        count=count,
+        line=(float(line[0] - line[1] * rows_command.mean()), float(line[1])),
+        time_s=rows_time,
+        warm_s=rows_time - warm_from(campaign),
+        kelvin=kelvin_at(campaign, rows_time),
+        width_s=np.sqrt(12.0) * spread,
+        rate=rate,
+        reading_u=float(np.median(u)),
+    )
+
+
+FLOOR_SHARE = 1e-9
+"""Of the way: least u of a reading in motion."""
+
+
+def _neighbours_sd(off: np.ndarray, move: np.ndarray) -> float:
+    """Scatter of single readings by the second differences of neighbours, robust: their median is 0.6745 sds."""
+    second = off[2:] - 2 * off[1:-1] + off[:-2]
+    second = second[move[2:] == move[:-2]]
+    return float(np.median(np.abs(second)) / 0.6745 / np.sqrt(6.0)) if len(second) else 0.0
+
+
+def _width_s(campaign: AxisCampaign, speed: float, time_s: np.ndarray, move: np.ndarray) -> float:
+    """Time over which readings are averaged, s; 0 where they stay single.
+
+    Args:
+        campaign: what is asked for.
+        speed: unit per second.
+        time_s: of the readings, s.
+        move: of the readings.
+    """
+    if len(time_s) <= WIDE_ROWS:
+        return 0.0
+    span = sum(float(np.ptp(time_s[move == each])) for each in np.unique(move))
+    shortest = campaign.periods.shortest
+    if shortest is None:
+        return span / WIDE_ROWS
+    width = (shortest if campaign.periods.in_seconds else shortest / speed) / PER_PERIOD
+    return max(width, span / ROWS_IN_MOTION) if span / width < len(time_s) else 0.0
+
+
+def warm_from(campaign: AxisCampaign) -> float:
+    """Time from which the machine warms up, clock of moves.csv, s."""
+    return campaign.moves[0].time_s if campaign.powered_on_s is None else campaign.powered_on_s
+
+
+def kelvin_at(campaign: AxisCampaign, times_s: np.ndarray) -> np.ndarray | None:
+    """Temperatures at times (n,) less that of the first move, linear between those recorded; None where fewer than two.
+
+    Before the first and after the last recorded one they stay as they are.
+    """
+    known = [(m.time_s, m.temperature_degC) for m in campaign.moves if m.temperature_degC is not None]
+    if len(known) < 2:
+        return None
+    at, kelvin = np.array(known, dtype=float).T
+    return np.interp(times_s, at, kelvin) - float(np.interp(campaign.moves[0].time_s, at, kelvin))
 
 
 def _hours(times_h: np.ndarray, legs: Legs, moves: np.ndarray) -> np.ndarray:
@@ -308,11 +476,19 @@ class _End:
             self.side = np.where(taken, side, self.side)
 
 
+def _places_in_motion(rows: AxisRows) -> PlayPlaces:
+    """A drive that never turns has taken up the play on one side."""
+    side = (-float(np.sign(rows.line[1])) * rows.side)[None].astype(float)
+    return PlayPlaces(rows.command[None], rows.path[None], side, side, np.zeros_like(side))
+
+
 def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
     """The play operator for backlash (n,), unit; which legs it swallows is judged at the least-squares line's slope.
 
     A negative backlash is no play but a reversal that overshoots: every stop lies on its own side at once.
     """
+    if rows.in_motion:
+        return _places_in_motion(rows)
     legs, slope = rows.legs, rows.line[1]
     motion = legs.step * slope
     least = np.min(np.abs(motion[motion != 0]), initial=np.inf)

@@ -228,7 +228,7 @@ def _rms(z: list[float]) -> float:
 
 def _fitted_without(model: AxisModel, out: np.ndarray, seed: int) -> tuple[np.ndarray, str]:
     """Coordinates of the scales, for the whole model, from the rows not left out; what is wrong with them, or ""."""
-    without = AxisModel.of(model.rows.without(out), model.priors)
+    without = AxisModel.of(model.rows.without(out), model.priors, None, model.coordinates.waves)
     rng = np.random.default_rng([seed, 5])
     found = _drawn(without, DRAWS, seed, rng)
     return carried_scales(without, found.w, model, rng), found.fault

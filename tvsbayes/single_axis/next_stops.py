@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import InputError
+from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.csv_table import csv_bytes
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.records import plain
@@ -134,7 +134,7 @@ def _functionals(fit: AxisFit, target: str, places: np.ndarray) -> np.ndarray:
     """What is to be made surer, as functionals (t, columns) of the fit's model."""
     if target == "position":
         return deviation_functionals(fit, places)
-    return headline_functionals(fit.model)[[HEADLINE_DRAWS.index(target)]]
+    return headline_functionals(fit.model, fit.w)[..., [HEADLINE_DRAWS.index(target)], :]
 
 
 @dataclass(frozen=True)
@@ -153,9 +153,9 @@ class _Known:
 def _known(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray, w: np.ndarray) -> _Known:
     """With the rows of a campaign, at draws w (n, d)."""
     rows = replace(rows_of(campaign), line=fit.rows.line)
-    model = AxisModel.of(rows, fit.model.priors, places)
+    model = AxisModel.of(rows, fit.model.priors, places, fit.model.coordinates.waves)
     model = replace(model, coordinates=fit.model.coordinates)
-    mean, sd = model.linear(w).of(_functionals(replace(fit, rows=rows, model=model), target, places))
+    mean, sd = model.linear(w).of(_functionals(replace(fit, rows=rows, model=model, w=w), target, places))
     return _Known(float(np.mean(sd**2)), float(np.mean(np.var(mean, axis=0))))
 
 
@@ -178,7 +178,15 @@ def plan_next(
 
     Raises:
         InputError: an unknown target.
+        NothingToEstimate: the folder is of a drive that never stops.
     """
+    if fit.rows.in_motion:
+        raise NothingToEstimate(
+            "in-motion",
+            "a drive at constant rate has no stops to choose",
+            file="campaign.toml",
+            remedy="drive on: a run of N periods tells a period to about period / (2 N) times noise over amplitude",
+        )
     if target not in TARGETS:
         allowed = ", ".join(TARGETS)
         raise InputError("target", f"--target {target[:60]!r}", allowed=allowed, remedy="name one of them")

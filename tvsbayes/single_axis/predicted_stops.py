@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tvsbayes.errors import NothingToEstimate
 from tvsbayes.single_axis.axis_campaign import AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import AxisModel
@@ -85,7 +86,17 @@ def predicted_stops(
         read: numbers of the moves that are read, ascending, shape (r,).
         u: standard uncertainties of these readings, shape (r,); 0 where nobody knows.
         seed: of what the draws do not hold.
+
+    Raises:
+        NothingToEstimate: the fit is of a drive that never stops.
     """
+    if fit.rows.in_motion:
+        raise NothingToEstimate(
+            "in-motion",
+            "the readings are of a drive at constant rate: they tell nothing of stops or of a reversal",
+            file="campaign.toml",
+            remedy="read stops from both directions into a folder without `rate`",
+        )
     known, rng = fit.campaign, np.random.default_rng([seed, 21])
     last, number = known.moves[-1], max(r.reading for r in known.readings) + 1
     count, begins = len(known.moves), moves[0].time_s
@@ -105,7 +116,7 @@ def predicted_stops(
     ]
     longer = replace(known, moves=(*known.moves, *joined), readings=(*known.readings, *readings))
     rows = replace(rows_of(longer), line=fit.rows.line)
-    model = AxisModel.of(rows, fit.model.priors)
+    model = AxisModel.of(rows, fit.model.priors, None, fit.model.coordinates.waves)
     drawn = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
     w = carried_scales(fit.model, drawn, model, rng)
     mean, covariance = model.left_out(w, np.flatnonzero(rows.move >= count))

@@ -31,6 +31,8 @@ class ProcessPlaces:
             ValueError: a command that is no place, of exact ones.
         """
         found = np.zeros((len(command), len(self.command)))
+        if not len(self.command):
+            return found
         if self.exact:
             at = np.searchsorted(self.command, command)
             if not np.array_equal(self.command[np.minimum(at, len(self.command) - 1)], command):
@@ -48,7 +50,9 @@ class ProcessPlaces:
 
 
 def process_places(commands: np.ndarray, more: np.ndarray) -> ProcessPlaces:
-    """For rows at `commands` and whatever is asked for at `more`."""
+    """For rows at `commands` and whatever is asked for at `more`; none for no rows."""
+    if not len(commands):
+        return ProcessPlaces(commands, True)
     every = np.unique(np.concatenate([commands, more]))
     if len(np.unique(commands)) <= PLACES_MAX:
         return ProcessPlaces(every, True)

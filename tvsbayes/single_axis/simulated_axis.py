@@ -1,11 +1,13 @@
 """An axis that is drawn, not measured: true gears from the priors, moved by a list of moves, read with noise.
 
-Written from the definition (formulation 8.1), one stop after the other; it shares no formula with the model.
+Written from the definition (formulation 8.1), one stop after the other; it shares no formula with the model. A folder
+that states a `rate` is read in motion, at the times of the template's readings or evenly.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,12 +17,49 @@ import numpy as np
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import write_atomically
+from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, write_axis
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, AxisPrior, axis_priors, kind_of
+from tvsbayes.single_axis.waves import SECOND, WANDER, AskedPeriods
 
 READING_SHARE = 5e-5
 """Stated u of simulated readings, of the travel, where nothing else is known."""
+IN_TIME = ("creep", "creep_minutes", "thermal_per_K", "seeing_scale", "seeing_s")
+"""Parameters of what shifts in time."""
 TRUTH_FORMAT = "tvsbayes-axis-truth/1"
+
+
+@dataclass(frozen=True)
+class TrueWave:
+    """A true wave; amplitude 0 where there is none.
+
+    Attributes:
+        of: "position", "seconds" or "encoder".
+        period: of that.
+        amplitude, phase_deg: of the first harmonic; `second`, `second_phase_deg` of the second, highest at the phase.
+        change, change_phase_deg: what is added to the first harmonic at the end of the record, and taken off it at the
+            beginning, linearly in between.
+        begin, end: of the record.
+    """
+
+    of: str
+    period: float
+    amplitude: float
+    phase_deg: float
+    second: float
+    second_phase_deg: float
+    change: float
+    change_phase_deg: float
+    begin: float
+    end: float
+
+    def at(self, x: float) -> float:
+        """Its value at a place."""
+        turn = 360.0 * x / self.period
+        first = self.amplitude * math.cos(math.radians(turn - self.phase_deg))
+        share = (2 * x - self.begin - self.end) / (self.end - self.begin)
+        first += share * self.change * math.cos(math.radians(turn - self.change_phase_deg))
+        return first + self.second * math.cos(math.radians(2 * turn - self.second_phase_deg))
 
 
 @dataclass(frozen=True)
@@ -31,18 +70,21 @@ class AxisTruth:
         parameters: by the names of `[axis]`, stop scatter by direction, with `ratio_contrast`.
         command: positions at which both curves are given, ascending, shape (n,).
         error: of the position, and `play_variation`: about the mean play; unit, each (n,).
+        waves: of the gear and, with `encoder`, of the encoder.
     """
 
     parameters: dict[str, float]
     command: np.ndarray
     error: np.ndarray
     play_variation: np.ndarray
+    waves: tuple[TrueWave, ...] = ()
 
     def as_json(self) -> dict[str, object]:
         """The content of `truth.json`."""
         curves = {"command": self.command, "error": self.error, "play_variation": self.play_variation}
         lists = {name: values.tolist() for name, values in curves.items()}
-        return {"format": TRUTH_FORMAT, "parameters": self.parameters, **lists}
+        waves = [plain(wave) for wave in self.waves]
+        return {"format": TRUTH_FORMAT, "parameters": self.parameters, **lists, **({"waves": waves} if waves else {})}
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,6 +110,8 @@ def _drawn(name: str, prior: AxisPrior, rng: np.random.Generator) -> float:
     normal = float(rng.standard_normal())
     if kind == "log-normal":
         return prior.value * float(np.exp(prior.u * normal))
+    if name in ("creep", "thermal_per_K"):
+        return prior.value + prior.u * normal
     # True play is never negative, whatever a fit allows for.
     return abs(prior.value + prior.u * normal) if kind == "half-normal" or name == "backlash" else prior.value
 
@@ -85,6 +129,8 @@ def draw_axis(
     per_command: float,
     travel: float,
     rng: np.random.Generator,
+    asked: AskedPeriods | None = None,
+    between_s: tuple[float, float] = (0.0, 1.0),
 ) -> AxisTruth:
     """A true axis for a list of commands.
 
@@ -94,32 +140,88 @@ def draw_axis(
         per_command: true unit per command; `[axis]` says only how well it is known beforehand.
         travel: range of what is read, unit, with which default scales grow.
         rng: source of everything random.
+        asked: periods; half of them are there, with the scale of `transmission_error`.
+        between_s: least and greatest time of the readings, for waves of time.
     """
     at = np.unique(np.asarray(commands, dtype=float))
     priors = axis_priors(stated, travel, per_command)
     names = [
-        *(name for name in priors if name not in ("per_command", "stop_sd")),
+        *(name for name in priors if name not in ("per_command", "stop_sd", *IN_TIME)),
         "stop_sd.forward",
         "stop_sd.backward",
     ]
     true = {name: _drawn(name, priors[name.split(".")[0]], rng) for name in names}
+    # Of their own, so that the same seed draws the same gears whatever is asked for.
+    [own] = rng.spawn(1)
+    true |= {name: _drawn(name, priors[name], own) for name in IN_TIME}
     true["per_command"] = per_command
     true["ratio_contrast"] = CONTRAST_SHARE * abs(per_command) * float(rng.standard_normal())
     distance = abs(per_command) * (at[:, None] - at)
     length = max(true["transmission_error_length"], 1e-9 * travel)
     error = _curve(distance, length, true["transmission_error"], rng)
     play = _curve(distance, length, true["play_variation"], rng)
-    return AxisTruth(true, at, error, play)
+    ends = (abs(per_command) * float(at[0]), abs(per_command) * float(at[-1]))
+    if asked is None or not asked:
+        return AxisTruth(true, at, error, play)
+    record = {"position": ends, "encoder": tuple(sorted((per_command * at[0], per_command * at[-1])))}
+    record["seconds"] = between_s
+    return AxisTruth(true, at, error, play, _drawn_waves(asked, priors, travel, record, own))
 
 
-def stops_of(truth: AxisTruth, moves: Sequence[AxisMove], rng: np.random.Generator) -> np.ndarray:
-    """Where the output stands after every move, unit, shape (moves,)."""
+def _drawn_waves(
+    asked: AskedPeriods,
+    priors: Mapping[str, AxisPrior],
+    travel: float,
+    record: Mapping[str, tuple[float, float]],
+    rng: np.random.Generator,
+) -> tuple[TrueWave, ...]:
+    """Waves of the periods that are asked for; of an unknown one log-uniform in its range."""
+    clock = "seconds" if asked.in_seconds else "position"
+    periods = [(clock, period) for period in asked.stated]
+    periods += [(clock, float(low * (high / low) ** rng.random())) for low, high in asked.between]
+    periods += [("encoder", asked.encoder)] if asked.encoder is not None else []
+    unit = priors["transmission_error"].u or priors["transmission_error"].value or 0.002 * travel
+    found = []
+    for of, period in periods:
+        scale = unit * abs(float(rng.standard_normal())) * float(rng.random() < 0.5)
+        drawn = rng.standard_normal((3, 2)) @ np.array([1, 1j])
+        size = scale * np.array([1.0, SECOND, WANDER]) * np.abs(drawn)
+        angle = np.degrees(np.angle(drawn))
+        first, second, change = (float(each) for each in size)
+        at, at_second, at_change = (float(each) for each in angle)
+        begin, end = record[of]
+        found.append(TrueWave(of, period, first, at, second, at_second, change, at_change, begin, end))
+    return tuple(found)
+
+
+def _encoder_reads(truth: AxisTruth, stand: float) -> float:
+    """What the encoder says where the output stands so: its waves go with what it reads."""
+    value = stand
+    for _ in range(20):
+        value = stand + sum(wave.at(value) for wave in truth.waves if wave.of == "encoder")
+    return value
+
+
+def _time_shift(truth: AxisTruth, warm_s: float, kelvin: float, time_s: float) -> float:
+    """What the zero has shifted by creep, temperature and waves of time."""
+    true = truth.parameters
+    creep = true["creep"] * (1.0 - math.exp(-warm_s / (60.0 * true["creep_minutes"])))
+    waves = sum(wave.at(time_s) for wave in truth.waves if wave.of == "seconds")
+    return creep + true["thermal_per_K"] * kelvin + waves
+
+
+def stops_of(
+    truth: AxisTruth, moves: Sequence[AxisMove], rng: np.random.Generator, powered_on_s: float | None = None
+) -> np.ndarray:
+    """Where the output stands after every move, unit, (moves,), warming since `powered_on_s` or the first move."""
     true = truth.parameters
     ratio, contrast, backlash = true["per_command"], true["ratio_contrast"], true["backlash"]
     found = np.empty(len(moves))
     wheel = stand = zero = stop = 0.0
     side = 0
     last: AxisMove | None = None
+    since = moves[0].time_s if powered_on_s is None else powered_on_s
+    kelvin = _kelvin(moves)
     for row, move in enumerate(moves):
         if last is None or move.segment != last.segment:
             home = 0.0 if last is None else true["home_sd"] * float(rng.standard_normal())
@@ -143,7 +245,39 @@ def stops_of(truth: AxisTruth, moves: Sequence[AxisMove], rng: np.random.Generat
         place = int(np.searchsorted(truth.command, move.command))
         share = 2 * (stand - wheel) / backlash if backlash else -side * np.sign(ratio)
         found[row] = stand + truth.error[place] + 0.5 * share * truth.play_variation[place] + zero + stop
+        found[row] += sum(wave.at(abs(ratio) * move.command) for wave in truth.waves if wave.of == "position")
+        found[row] += _time_shift(truth, move.time_s - since, kelvin[row], move.time_s)
         last = move
+    return found
+
+
+def _kelvin(moves: Sequence[AxisMove]) -> np.ndarray:
+    """Temperatures less the first, interpolated in time; 0 where fewer than two are recorded."""
+    known = [m for m in moves if m.temperature_degC is not None]
+    if len(known) < 2:
+        return np.zeros(len(moves))
+    at = [m.time_s for m in known]
+    found = np.interp([m.time_s for m in moves], at, [m.temperature_degC or 0.0 for m in known])
+    return found - found[0]
+
+
+def drive_of(
+    truth: AxisTruth, move: AxisMove, rate: float, times_s: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Where the output of a drive at constant rate is at times (n,), ascending, after a move; shape (n,)."""
+    true = truth.parameters
+    found = np.empty(len(times_s))
+    seeing, zero, last = 0.0, 0.0, None
+    for k, time_s in enumerate(times_s):
+        command = move.command + rate * (time_s - move.time_s)
+        gap = time_s - (move.time_s if last is None else last)
+        zero += true["drift_per_root_hour"] * math.sqrt(gap / 3600.0) * float(rng.standard_normal())
+        keep = 0.0 if last is None else math.exp(-gap / true["seeing_s"])
+        seeing = keep * seeing + true["seeing_scale"] * math.sqrt(1.0 - keep**2) * float(rng.standard_normal())
+        found[k] = true["per_command"] * command + zero + _time_shift(truth, time_s - move.time_s, 0.0, time_s)
+        found[k] += sum(wave.at(abs(true["per_command"]) * command) for wave in truth.waves if wave.of == "position")
+        found[k] += seeing * true["reading_u"]
+        last = time_s
     return found
 
 
@@ -163,6 +297,8 @@ def simulate_axis(
         NothingToEstimate: the readings do not say it.
     """
     rng = np.random.default_rng([seed, 11])
+    if template.rate is not None:
+        return _simulated_drive(template, template.rate, seed, rng)
     read = {r.move for r in template.readings} if moves is None and template.readings else None
     moves = template.moves if moves is None else tuple(moves)
     per_command = _per_command(template)
@@ -171,18 +307,45 @@ def simulate_axis(
     travel = (max(seen) - min(seen)) * abs(per_command)
     if not travel > 0:
         raise NothingToEstimate("too-few-positions", "all moves are to one position", remedy="list more positions")
-    truth = draw_axis(commands, template.stated, per_command, travel, rng)
+    truth = draw_axis(
+        commands, template.stated, per_command, travel, rng, template.periods, (moves[0].time_s, moves[-1].time_s)
+    )
     stated = [r.u for r in template.readings if r.u > 0]
     u = float(np.median(stated)) if stated else READING_SHARE * travel
-    stops = stops_of(truth, moves, rng)
+    stops = stops_of(truth, moves, rng, template.powered_on_s)
     readings: list[Reading] = []
     for move, stand in zip(moves, stops, strict=True):
         for _ in range(repeats if read is None or move.move in read else 0):
             noise = truth.parameters["reading_scale"] * u * float(rng.standard_normal())
-            readings.append(Reading(len(readings), move.move, float(stand + noise), u))
+            readings.append(Reading(len(readings), move.move, float(_encoder_reads(truth, stand) + noise), u))
     header = {**template.header, "synthetic": True, "seed": seed}
     campaign = replace(template, moves=moves, readings=tuple(readings), header=header, path=None)
     return SimulatedAxis(campaign, truth)
+
+
+DRIVE_READINGS, DRIVE_S = 1000, 4.0
+"""Readings of a drive whose template has none, and the time between them."""
+
+
+def _simulated_drive(template: AxisCampaign, rate: float, seed: int, rng: np.random.Generator) -> SimulatedAxis:
+    """A drive at constant rate, with one segment, read at the template's times."""
+    per_command = _per_command(template)
+    move = template.moves[0]
+    used = sorted(r.time_s for r in template.readings if r.time_s is not None and r.status == "ok")
+    times = np.array(used) if used else move.time_s + DRIVE_S * np.arange(1, DRIVE_READINGS + 1)
+    travel = abs(rate * per_command) * float(np.ptp(times))
+    truth = draw_axis(
+        [move.command], template.stated, per_command, travel, rng, template.periods, (float(times[0]), float(times[-1]))
+    )
+    stated = [r.u for r in template.readings if r.u > 0]
+    u = float(np.median(stated)) if stated else READING_SHARE * travel
+    truth.parameters["reading_u"] = u
+    stands = drive_of(truth, move, rate, times, rng)
+    noise = truth.parameters["reading_scale"] * u * rng.standard_normal(len(times))
+    values = [_encoder_reads(truth, float(stand)) + float(n) for stand, n in zip(stands, noise, strict=True)]
+    readings = tuple(Reading(k, 0, v, u, "ok", float(t)) for k, (v, t) in enumerate(zip(values, times, strict=True)))
+    header = {**template.header, "synthetic": True, "seed": seed}
+    return SimulatedAxis(replace(template, moves=(move,), readings=readings, header=header, path=None), truth)
 
 
 def _per_command(template: AxisCampaign) -> float:

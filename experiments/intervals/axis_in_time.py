@@ -1,0 +1,167 @@
+"""Do the intervals of an axis hold where zeros creep, follow the temperature, and gears make waves?
+
+    python -m experiments.intervals.axis_in_time run --n 200 --cores 0 1
+    python -m experiments.intervals.axis_in_time table > experiments/intervals/axis_in_time.md
+
+Axes are drawn from the priors, half of the waves that are asked for are there (`single_axis/simulated_axis`, whose
+formulas are its own), and fitted by weighted draws. A wave that is not there and is given a probability above 0.95 is a
+false one. Amplitude, period and phase are asked of the waves that are there, given that there is one.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from experiments.common.command_line import act, study_parser
+from experiments.common.rows import output, read_rows, run_rows
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
+from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.axis_parameters import AxisPrior
+from tvsbayes.single_axis.axis_periods import wave_samples
+from tvsbayes.single_axis.simulated_axis import simulate_axis
+from tvsbayes.single_axis.waves import AskedPeriods
+from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
+
+ROWS = output(__file__, "axis_in_time.jsonl")
+LEVELS = (0.5, 0.95)
+SURE = 0.95
+"""Probability from which on a wave is claimed."""
+PROTOCOLS = {
+    "one after the other": "10 places forward, then backward, warming by sd 0.1 deg of 40 while it is read",
+    "stops": "24 uneven places to and fro, creep, temperature, a stated wave of 8 deg, an unknown one of 2.5 to 7",
+    "drive": "400 readings in 1600 s at constant rate, seeing, an unknown wave of 60 to 600 s",
+}
+"""Of drawn axes; stops once a minute."""
+PARAMETERS = ("per_command", "ratio_contrast", "backlash", "creep", "thermal_per_K")
+
+
+def _stops(places: np.ndarray, seed: int) -> tuple[AxisMove, ...]:
+    """Beyond the low end, up, beyond the high end, down; the room cools and warms by some kelvin."""
+    commands = [places[0] - 300.0, *places, places[-1] + 300.0, *places[::-1]]
+    kelvin = 20.0 + 3.0 * np.sin(np.arange(len(commands)) / 9.0 + seed)
+    return tuple(
+        AxisMove(k, 0, 60.0 * k, float(c), "" if k else "backward", float(t))
+        for k, (c, t) in enumerate(zip(commands, kelvin, strict=True))
+    )
+
+
+def template(protocol: str, seed: int) -> AxisCampaign:
+    """What is moved, stated and asked for."""
+    rng = np.random.default_rng([seed, 99])
+    if protocol == "drive":
+        times = np.sort(rng.uniform(0.0, 1600.0, 400))
+        readings = tuple(Reading(k, 0, 15.0 * float(t), 0.5, "ok", float(t)) for k, t in enumerate(times))
+        stated = {
+            "per_command": AxisPrior(1.0, 1e-3),
+            "transmission_error": AxisPrior(0.0, 5.0),
+            "reading_scale": AxisPrior(1.0, 0.0),
+        }
+        asked = AskedPeriods((), ((60.0, 600.0),), True)
+        return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": 15.0}, asked)
+    stated = {"per_command": AxisPrior(0.01, 0.002)}
+    if protocol == "stops":
+        places = np.sort(rng.choice(np.arange(-2000.0, 2001.0, 10.0), 24, replace=False))
+        asked = AskedPeriods((8.0,), ((2.5, 7.0),))
+        return AxisCampaign("deg", _stops(places, seed), (), stated, periods=asked)
+    moves = tuple(
+        AxisMove(m.move, m.segment, m.time_s, m.command, m.approach) for m in _stops(np.linspace(-2000, 2000, 10), seed)
+    )
+    return AxisCampaign("deg", moves, (), stated | {"creep": AxisPrior(0.0, 0.1)})
+
+
+def _scored(draws: np.ndarray, true: float) -> dict[str, float]:
+    return {"z": float((draws.mean() - true) / draws.std()), "below": float(np.mean(draws < true))}
+
+
+def one_axis(task: tuple[str, int]) -> dict[str, object]:
+    """Draw, read and fit one axis."""
+    protocol, seed = task
+    made = simulate_axis(template(protocol, seed), seed=seed)
+    found = fit_axis(made.campaign, tier="importance", seed=seed)
+    true, draws = made.truth.parameters, found.draws
+    row: dict[str, object] = {"protocol": protocol, "seed": seed, "problems": list(found.missing), "waves": []}
+    for name in PARAMETERS:
+        if name in draws and draws[name].std() > 0 and not (protocol == "drive" and name == "backlash"):
+            row[name] = _scored(draws[name], true[name])
+    waves = []
+    for wave, sample in zip(made.truth.waves, wave_samples(found), strict=True):
+        one: dict[str, object] = {"there": bool(wave.amplitude > 0), "probability": sample.probability}
+        if wave.amplitude > 0:
+            one["amplitude"] = _scored(sample.amplitude, wave.amplitude)
+            phase = sample.phase_deg()
+            one["phase"] = _scored(phase, phase.mean() + (wave.phase_deg - phase.mean() + 180.0) % 360.0 - 180.0)
+            if sample.wave.known is None:
+                one["period"] = _scored(np.log(sample.true_period), float(np.log(wave.period)))
+        waves.append(one)
+    return {**row, "waves": waves}
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Rows of drawn axes."""
+    tasks = [(protocol, seed) for seed in range(arguments.n) for protocol in PROTOCOLS]
+    run_rows(one_axis, tasks, arguments.rows, ("protocol", "seed"), arguments.cores)
+
+
+TEXT = """# Axes that creep, follow the temperature and make waves
+
+Made by `python -m experiments.intervals.axis_in_time`: axes drawn from the priors and fitted by `fit --quick`. Shares
+of truths in central intervals, RMS of z = (mean - truth) / sd; bounds are two-sided at 1e-4 for so many axes.
+Amplitude, period and phase: of the waves that are there, given that there is one; of those too weak to be seen the
+interval is wide.
+
+| protocol | quantity | axes | in 50 % | bounds | in 95 % | bounds | RMS z | bounds |
+|---|---|---|---|---|---|---|---|---|"""
+WAVES_TEXT = """
+## Is there a wave?
+
+| protocol | waves that are not there | claimed above 0.95 | waves that are there | claimed above 0.95 | not accepted |
+|---|---|---|---|---|---|"""
+
+
+def _line(protocol: str, name: str, scores: list[dict]) -> str:
+    below = np.array([score["below"] for score in scores])
+    cells = [protocol, f"`{name}`", str(len(scores))]
+    for level in LEVELS:
+        low, high = binomial_bounds(len(scores), level)
+        cells += [f"{100 * np.mean(np.abs(below - 0.5) <= level / 2):.0f} %", f"{low:.2f} to {high:.2f}"]
+    low, high = rms_bounds(len(scores))
+    cells += [f"{np.sqrt(np.mean(np.square([score['z'] for score in scores]))):.2f}", f"{low:.2f} to {high:.2f}"]
+    return "| " + " | ".join(cells) + " |"
+
+
+def table(arguments: argparse.Namespace) -> None:
+    """Both tables."""
+    rows = [row for row in read_rows(arguments.rows) if not row["problems"]]
+    every = read_rows(arguments.rows)
+    print(TEXT)
+    for protocol, what in PROTOCOLS.items():
+        mine = [row for row in rows if row["protocol"] == protocol]
+        for name in PARAMETERS:
+            if scores := [row[name] for row in mine if name in row]:
+                print(_line(f"{protocol}: {what}", name, scores))
+        waves = [wave for row in mine for wave in row["waves"] if wave["there"]]
+        for name in ("amplitude", "period", "phase"):
+            if scores := [wave[name] for wave in waves if name in wave]:
+                print(_line(protocol, name, scores))
+    print(WAVES_TEXT)
+    for protocol in PROTOCOLS:
+        mine = [row for row in rows if row["protocol"] == protocol]
+        refused = sum(row["protocol"] == protocol for row in every) - len(mine)
+        waves = [wave for row in mine for wave in row["waves"]]
+        cells = [protocol]
+        for there in (False, True):
+            chances = [wave["probability"] for wave in waves if wave["there"] is there]
+            cells += [str(len(chances)), str(sum(chance > SURE for chance in chances))]
+        if waves:
+            print("| " + " | ".join([*cells, str(refused)]) + " |")
+
+
+def main() -> None:
+    """Do what the command line asks for."""
+    act(study_parser(__doc__, ROWS, 200), run=run, table=table)
+
+
+if __name__ == "__main__":
+    main()

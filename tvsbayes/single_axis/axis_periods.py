@@ -1,0 +1,210 @@
+"""What is said of an axis' waves: period, amplitude, phase, the probability that there is one, and its curve.
+
+Numbers are given that there is a wave; `probability` says whether. Amplitude and phase are those of the first harmonic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tvsbayes.results.records import NotNegative, Probability, Record
+from tvsbayes.single_axis.axis_fit import AxisFit
+from tvsbayes.single_axis.axis_model import AxisModel
+from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, wave_columns
+from tvsbayes.statistics.weighted_draws import systematic
+
+WITH_WAVE_MIN, WITH_WAVE = 200, 1000
+"""Draws with a wave that its numbers are told by; where the posterior has fewer, so many are drawn and weighted."""
+TAILS_PERCENT = (2.5, 97.5)
+ALIKE = 0.02
+"""Draws of a period that lie farther apart than this share of it belong to different waves that explain the same."""
+
+
+class Measured(Record, frozen=True):
+    """A quantity by its draws.
+
+    Attributes:
+        value, sd, interval95: mean, standard uncertainty, central interval.
+    """
+
+    value: float
+    sd: NotNegative
+    interval95: tuple[float, float]
+
+
+class PeriodEstimate(Record, frozen=True):
+    """One wave. Where more than one period explains the readings, value and sd are of the likeliest, intervals of all.
+
+    Attributes:
+        period: in the unit of the readings, or s.
+        amplitude: of the first harmonic, unit of the readings; half of what it makes from crest to trough.
+        phase_deg: the wave is highest where 360 x / period is the phase; x is |unit per command| x command, `time_s`,
+            or the reading for a wave of the encoder. About its circular mean: an interval may leave -180 to 180.
+        source: whether the period was stated or inferred.
+        probability: that there is such a wave.
+    """
+
+    period: Measured
+    amplitude: Measured
+    phase_deg: Measured
+    source: Literal["stated", "inferred"]
+    probability: Probability
+
+
+@dataclass(frozen=True)
+class WaveSample:
+    """Draws of one wave, given that there is one.
+
+    Attributes:
+        wave: what was asked for.
+        period: on the model's clock, shape (n,).
+        true_period: with the ratio's uncertainty, shape (n,).
+        coefficients: of the wave's columns, shape (n, `COLUMNS`).
+        probability: that there is one.
+        record: of the readings on the clock of the wave; its middle is where the phase is known best.
+    """
+
+    wave: Wave
+    period: np.ndarray
+    true_period: np.ndarray
+    coefficients: np.ndarray
+    probability: float
+    record: WaveRecord
+
+    @property
+    def amplitude(self) -> np.ndarray:
+        """Of the first harmonic, shape (n,)."""
+        return np.hypot(self.coefficients[:, 0], self.coefficients[:, 1])
+
+    def phase_deg(self) -> np.ndarray:
+        """Phase within half a turn of its circular mean, shape (n,)."""
+        phase = np.arctan2(self.coefficients[:, 1], self.coefficients[:, 0])
+        middle = np.angle(np.mean(np.exp(1j * phase)))
+        return np.degrees(middle + np.angle(np.exp(1j * (phase - middle))))
+
+    def curve(self, turn: np.ndarray) -> np.ndarray:
+        """The wave over one mean period from the middle of the record on, at shares `turn` (t,) of it: shape (n, t)."""
+        x = self.record.middle + turn * float(np.mean(self.period))
+        return np.einsum("ntc,nc->nt", wave_columns(x, self.period, self.record), self.coefficients)
+
+
+def _with_wave(model: AxisModel, w: np.ndarray, k: int, rng: np.random.Generator) -> np.ndarray:
+    """Draws (m, d) of the posterior given that wave k is there."""
+    there = model.coordinates.wave_draws(w)[k].scale > 0
+    if there.sum() >= WITH_WAVE_MIN:
+        return w[there]
+    from scipy.special import ndtri
+
+    # The wave is added to draws without it: all else follows what the readings say without it.
+    names = model.coordinates.names
+    found = w[rng.choice(len(w), WITH_WAVE, replace=len(w) < WITH_WAVE)].copy()
+    before = found.copy()
+    wave = model.coordinates.waves[k]
+    column = names.index(f"wave_scale.{k + 1}")
+    before[:, column] = ndtri(0.5 * wave.absent)
+    found[:, column] = ndtri(wave.absent + (1 - wave.absent) * rng.uniform(1e-9, 1 - 1e-9, len(found)))
+    if not wave.is_fixed:
+        place = names.index(f"wave_period.{k + 1}")
+        found[:, place] = before[:, place] = rng.standard_normal(len(found))
+    gain = model.log_density(found) - model.log_density(before)
+    gain += 0.5 * (found[:, column] ** 2 - before[:, column] ** 2)
+    gain = np.where(np.isfinite(gain), gain, -np.inf)
+    if not np.any(np.isfinite(gain)):
+        return found
+    weights = np.exp(gain - gain.max())
+    return found[systematic(weights / weights.sum(), WITH_WAVE, rng.random())]
+
+
+def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
+    """Every wave of a fit, given that it is there."""
+    model, rng = fit.model, np.random.default_rng([fit.seed, 9])
+    found = []
+    for k, wave in enumerate(model.coordinates.waves):
+        probability = float(np.mean(model.coordinates.wave_draws(fit.w)[k].scale > 0))
+        w = _with_wave(model, fit.w, k, rng)
+        begins = model.waves_begin + COLUMNS * k
+        picked = np.concatenate([np.zeros((COLUMNS, model.columns)), model.head(slope=1.0)[None]])
+        picked[range(COLUMNS), range(begins, begins + COLUMNS)] = 1.0
+        drawn = model.linear(w).drawn(picked, rng)
+        coefficients, ratio = drawn[:, :COLUMNS], drawn[:, COLUMNS] / fit.rows.line[1]
+        period = np.broadcast_to(model.coordinates.wave_draws(w)[k].period, len(w)).copy()
+        # Positions of the model are by the line; the true ratio makes them longer or shorter.
+        true_period = period * ratio if wave.clock == "position" else period
+        found.append(WaveSample(wave, period, true_period, coefficients, probability, model.record(wave)))
+    return tuple(found)
+
+
+def _measured(draws: np.ndarray, likeliest: np.ndarray) -> Measured:
+    low, high = np.percentile(draws, TAILS_PERCENT)
+    chosen = draws[likeliest]
+    return Measured(float(chosen.mean()), float(chosen.std()), (float(low), float(high)))
+
+
+def period_estimate(sample: WaveSample) -> PeriodEstimate:
+    """One wave in numbers."""
+    known = sample.wave.known
+    groups = separate_periods(sample.period)
+    low, high = groups[0].between if groups else (0.0, np.inf)
+    likeliest = (sample.period >= low) & (sample.period <= high)
+    return PeriodEstimate(
+        period=_measured(sample.true_period, likeliest) if known is None else Measured(known, 0.0, (known, known)),
+        amplitude=_measured(sample.amplitude, likeliest),
+        phase_deg=_measured(sample.phase_deg(), likeliest),
+        source="inferred" if known is None else "stated",
+        probability=sample.probability,
+    )
+
+
+@dataclass(frozen=True)
+class PeriodGroup:
+    """Draws of a period that lie together: their mean, their least and greatest, their share of all."""
+
+    mean: float
+    between: tuple[float, float]
+    share: float
+
+
+def separate_periods(period: np.ndarray) -> list[PeriodGroup]:
+    """Groups of draws (n,) of a period that lie apart, the likeliest first; the rarest are left out."""
+    ordered = np.sort(period)
+    cut = np.flatnonzero(np.diff(ordered) > ALIKE * ordered[1:]) + 1
+    groups = [group for group in np.split(ordered, cut) if len(group) >= ALIKE * len(period)]
+    found = [PeriodGroup(float(g.mean()), (float(g[0]), float(g[-1])), len(g) / len(period)) for g in groups]
+    return sorted(found, key=lambda group: -group.share)
+
+
+def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
+    """What the readings leave open about waves, in words, with what would tell."""
+    found = []
+    for sample in samples:
+        unit = "s" if sample.wave.clock == "seconds" else fit.campaign.unit
+        groups = separate_periods(sample.period)
+        if sample.probability > 0.5 and len(groups) > 1 and sample.wave.known is None:
+            said = ", ".join(f"{group.mean:.4g} {unit} ({100 * group.share:.0f} %)" for group in groups[:4])
+            found.append(
+                f"the readings cannot tell which period the wave has: {said}; read a longer run, at places that are "
+                "not evenly spaced"
+            )
+    return found + _one_wave_twice(fit)
+
+
+def _one_wave_twice(fit: AxisFit) -> list[str]:
+    """Gear and encoder with one period, which their readings hardly part."""
+    found = []
+    model, rows = fit.model, fit.rows
+    gears = [wave for wave in model.coordinates.waves if wave.clock == "position"]
+    for wave in gears:
+        for other in model.coordinates.waves:
+            if other.clock != "encoder":
+                continue
+            span = float(np.ptp(rows.value))
+            if abs(1 / wave.peak - 1 / other.peak) * span < 1.0:
+                found.append(
+                    f"gear and encoder both have a wave of about {other.peak:.4g} {fit.campaign.unit}: how it is split "
+                    "between them is weak, their sum is not; turn the encoder's shaft against the gear, or read with a "
+                    "second instrument"
+                )
+    return found

@@ -1,0 +1,263 @@
+"""Waves of known or unknown period beside the error by position: what is asked for, and their coordinates.
+
+A wave is A cos(2 pi x / P - phase) with a second harmonic. x is the position |unit per command| x command, the time in
+seconds, or the reading itself (a wave of the encoder). Cosines and sines are linear and have a normal prior of sd s,
+those of the second harmonic of `SECOND` times s; s is half-normal, and with probability 1/2 there is no wave at all.
+No turn of a gear is quite like the one before: cosine and sine of the first harmonic change over the record, linearly,
+by a normal share of sd `WANDER` of s at its ends, without which a period would be surer than gears are regular.
+
+Coordinates with a standard normal density are needed where the posterior has many peaks: s and P are quantiles of
+tables close to their posterior (`period_search`), and the prior over the table is part of the density. So the draws are
+weighted exactly, whatever the tables are. While there is no wave its period follows its table (pseudo-prior: Carlin and
+Chib, J. R. Stat. Soc. B 57 (1995) 473). Periods in the unit of their clock. NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import factorial, log, pi
+from typing import Literal
+
+import numpy as np
+
+Clock = Literal["position", "seconds", "encoder"]
+SECOND = 0.25
+"""sd of the second harmonic's cosine and sine, of the first's: with more, twice the period would explain a wave nearly
+as well, by its second harmonic alone."""
+WAVE_PRIOR = 0.5
+"""Probability beforehand that there is a wave."""
+WANDER = 0.1
+"""sd of what the first harmonic's cosine and sine have changed by at an end of the record, of s."""
+SHARES = (1.0, 1.0, SECOND, SECOND, WANDER, WANDER)
+"""sds of a wave's columns, of s."""
+COLUMNS = len(SHARES)
+"""Cosine and sine of both harmonics, then of what the first changes by."""
+SCALE_RANGE = (1e-4, 4.0)
+"""Of s, over the scale of its half-normal prior, which has 1e-4 of its probability outside."""
+
+
+@dataclass(frozen=True)
+class AskedPeriods:
+    """Periods of `[axis]`.
+
+    Attributes:
+        stated: periods that are known.
+        between: ranges of unknown periods, each low and high; ranges are the same or do not overlap.
+        in_seconds: whether both are of time; else of position, unit of the readings.
+        encoder: period of the encoder's own wave, unit of the readings; None where none is asked for.
+    """
+
+    stated: tuple[float, ...] = ()
+    between: tuple[tuple[float, float], ...] = ()
+    in_seconds: bool = False
+    encoder: float | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self.stated or self.between or self.encoder is not None)
+
+    @property
+    def shortest(self) -> float | None:
+        """Of the gear's periods; None where none is asked for."""
+        return min((*self.stated, *(low for low, _ in self.between)), default=None)
+
+
+@dataclass(frozen=True)
+class Tabulated:
+    """A density that is linear between nodes.
+
+    Attributes:
+        at: nodes, ascending, shape (nodes,).
+        density: there, positive; its integral is 1.
+    """
+
+    at: np.ndarray
+    density: np.ndarray
+
+    @classmethod
+    def of(cls, at: np.ndarray, log_density: np.ndarray, floor: float) -> Tabulated:
+        """Proportional to exp(log_density), with a uniform part that has the probability `floor`."""
+        found = np.exp(log_density - log_density.max())
+        found = (1 - floor) * found / np.trapezoid(found, at) + floor / np.ptp(at)
+        return cls(at, found / np.trapezoid(found, at))
+
+    @property
+    def _below(self) -> np.ndarray:
+        """Probability below every node."""
+        parts = 0.5 * (self.density[1:] + self.density[:-1]) * np.diff(self.at)
+        return np.concatenate(([0.0], np.cumsum(parts)))
+
+    def quantile(self, share: np.ndarray) -> np.ndarray:
+        """Where the probability below is `share`, any shape."""
+        below = self._below
+        k = np.clip(np.searchsorted(below, share, side="right") - 1, 0, len(self.at) - 2)
+        rest = np.clip(share, 0.0, below[-1]) - below[k]
+        start = self.density[k]
+        slope = (self.density[k + 1] - start) / (self.at[k + 1] - self.at[k])
+        # Of start t + slope t^2 / 2 = rest the root that holds where the slope is 0 too.
+        step = 2 * rest / (start + np.sqrt(np.maximum(start**2 + 2 * slope * rest, 0.0)))
+        return self.at[k] + np.clip(step, 0.0, self.at[k + 1] - self.at[k])
+
+    def share(self, x: float) -> float:
+        """Probability below x."""
+        k = int(np.clip(np.searchsorted(self.at, x, side="right") - 1, 0, len(self.at) - 2))
+        there = np.interp(x, self.at, self.density)
+        return float(self._below[k] + 0.5 * (self.density[k] + there) * (x - self.at[k]))
+
+    def log_density(self, x: np.ndarray) -> np.ndarray:
+        """At x, any shape, inside the nodes."""
+        return np.log(np.interp(x, self.at, self.density))
+
+
+def log_scale_prior(log_scale: np.ndarray, unit: float) -> np.ndarray:
+    """Log density of log s, half-normal by `unit`."""
+    return 0.5 * log(2 / pi) + log_scale - np.log(unit) - 0.5 * np.exp(2 * (log_scale - np.log(unit)))
+
+
+@dataclass(frozen=True)
+class Wave:
+    """One wave that is asked for.
+
+    Attributes:
+        clock: of its period.
+        low, high: of the period; equal where it is stated and its clock is known exactly.
+        unit: scale of the half-normal prior of s, in the unit of the readings, > 0.
+        log_scale: table of log s, given that there is a wave.
+        log_period: table of the log of the period; None where it is fixed.
+        absent: share of the coordinate's probability that is given to no wave at all.
+        peak: period of most evidence.
+        known: the period that was stated; None of one that is looked for.
+    """
+
+    clock: Clock
+    low: float
+    high: float
+    unit: float
+    log_scale: Tabulated
+    log_period: Tabulated | None
+    absent: float
+    peak: float
+    known: float | None = None
+
+    @classmethod
+    def fixed(cls, clock: Clock, period: float, unit: float) -> Wave:
+        """Of one period, before anything was searched."""
+        low, high = (log(end * unit) for end in SCALE_RANGE)
+        at = np.linspace(low, high, 200)
+        table = Tabulated.of(at, 0.3 * np.maximum(log_scale_prior(at, unit), -20.0), 0.5)
+        return cls(clock, period, period, unit, table, None, 0.05, period)
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether the period has no coordinate."""
+        return self.low == self.high
+
+
+@dataclass(frozen=True)
+class WaveDraws:
+    """One wave at draws: arrays (n,).
+
+    Attributes:
+        scale: s; 0 where there is no wave.
+        period: in the unit of its clock; shape (1,) where it is stated.
+        log_prior: what its coordinates' density has beside the standard normal.
+    """
+
+    scale: np.ndarray
+    period: np.ndarray
+    log_prior: np.ndarray
+
+
+def wave_draws(wave: Wave, strength: np.ndarray, place: np.ndarray | None) -> WaveDraws:
+    """One wave at coordinates of its scale (n,) and of its period (n,), None where it is stated."""
+    from scipy.special import ndtr
+
+    share = ndtr(strength)
+    there = share > wave.absent
+    log_scale = wave.log_scale.quantile(np.clip((share - wave.absent) / (1 - wave.absent), 0.0, 1.0))
+    prior = np.where(there, log(WAVE_PRIOR / (1 - wave.absent)), log((1 - WAVE_PRIOR) / max(wave.absent, 1e-300)))
+    own = log_scale_prior(log_scale, wave.unit) - wave.log_scale.log_density(log_scale)
+    period = np.array([wave.low])
+    if place is not None and wave.log_period is not None:
+        log_period = wave.log_period.quantile(ndtr(place))
+        period = np.exp(log_period)
+        own = own - log(log(wave.high / wave.low)) - wave.log_period.log_density(log_period)
+    return WaveDraws(np.where(there, np.exp(log_scale), 0.0), period, prior + np.where(there, own, 0.0))
+
+
+def names_of(waves: Sequence[Wave]) -> tuple[str, ...]:
+    """Coordinates of the waves, in order."""
+    found = []
+    for k, wave in enumerate(waves, start=1):
+        found += [f"wave_scale.{k}", *([] if wave.is_fixed else [f"wave_period.{k}"])]
+    return tuple(found)
+
+
+def start_of(wave: Wave, name: str) -> float:
+    """Coordinate at which a search for the mode begins."""
+    from scipy.special import ndtri
+
+    if name.startswith("wave_scale") or wave.log_period is None:
+        return float(ndtri(wave.absent + 0.5 * (1 - wave.absent)))
+    return float(ndtri(np.clip(wave.log_period.share(log(wave.peak)), 1e-6, 1 - 1e-6)))
+
+
+def log_order(waves: Sequence[Wave], draws: Sequence[WaveDraws]) -> np.ndarray:
+    """Log prior (n or 1,) of the order of waves that share one range: which is called the first is a convention.
+
+    With m waves of K there, the first m are, each the one of the rest that is nearest to its own peak; such an order
+    stands for K! / (K - m)! others. -inf for all others.
+    """
+    found = np.zeros(1)
+    alike: dict[tuple[float, float, Clock], list[int]] = {}
+    for k, wave in enumerate(waves):
+        if wave.known is None and not wave.is_fixed:
+            alike.setdefault((wave.low, wave.high, wave.clock), []).append(k)
+    for group in alike.values():
+        if len(group) < 2:
+            continue
+        there = np.array([draws[k].scale > 0 for k in group])
+        count = there.sum(axis=0)
+        allowed = np.all(there[:-1] | ~there[1:], axis=0)
+        for row, k in enumerate(group):
+            own = np.abs(np.log(draws[k].period / waves[k].peak))
+            for other, j in enumerate(group[row + 1 :], start=row + 1):
+                nearer = own <= np.abs(np.log(draws[j].period / waves[k].peak))
+                allowed &= nearer | ~there[other] | ~there[row]
+        each = np.array([log(factorial(len(group)) / factorial(len(group) - m)) for m in range(len(group) + 1)])
+        found = found + np.where(allowed, each[count], -np.inf)
+    return found
+
+
+@dataclass(frozen=True)
+class WaveRecord:
+    """Where on the clock of a wave the readings lie: the middle, and half of the way from the first to the last."""
+
+    middle: float
+    half: float
+
+    @classmethod
+    def of(cls, x: np.ndarray) -> WaveRecord:
+        """Of the readings' places (rows,)."""
+        return cls(0.5 * float(np.min(x) + np.max(x)), 0.5 * float(np.ptp(x)) or 1.0)
+
+
+def wave_columns(x: np.ndarray, period: np.ndarray, record: WaveRecord, width: np.ndarray | float = 0.0) -> np.ndarray:
+    """A wave's columns (`COLUMNS`), averaged over `width` about x: shape (n, rows, columns).
+
+    Args:
+        x: shape (rows,).
+        period: shape (n,).
+        record: that the wave changes over.
+        width: over which every row was averaged, shape (rows,).
+    """
+    turn = x[None] / period[:, None]
+    turn = 2 * pi * (turn - np.round(turn))
+    cosine, sine = np.cos(turn), np.sin(turn)
+    second = [cosine**2 - sine**2, 2 * sine * cosine]
+    if np.any(width):
+        share = np.asarray(width)[None] / period[:, None]
+        cosine, sine = cosine * np.sinc(share), sine * np.sinc(share)
+        second = [each * np.sinc(2 * share) for each in second]
+    along = ((x - record.middle) / record.half)[None]
+    return np.stack([cosine, sine, *second, along * cosine, along * sine], axis=-1)
