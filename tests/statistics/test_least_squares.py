@@ -8,7 +8,7 @@ import pytest
 from support.certified_problems import MODELS, descended, score
 
 from tvsbayes.cameras.bundle_adjustment import STATIONARY_SD
-from tvsbayes.statistics.least_squares import least_squares_covariance
+from tvsbayes.statistics.least_squares import least_squares_covariance, newton_mode
 
 PARAMETER_DIGITS, ERROR_DIGITS = 6.0, 5.0
 """Digits wanted of every parameter and of every standard error."""
@@ -80,3 +80,16 @@ def test_no_covariance_without_full_rank():
     jacobian[:, 2] = jacobian[:, 0] + jacobian[:, 1]
     with pytest.raises(np.linalg.LinAlgError, match="condition number"):
         least_squares_covariance(jacobian)
+
+
+def test_a_mode_on_a_kink_is_reached():
+    """|x| pulls to 0, the parabola to 0.05: at 0 the slope by differences is not 0, and no step leads down."""
+
+    def objective(points):
+        return 0.5 * (points[:, 0] - 0.05) ** 2 + 0.5 * points[:, 1] ** 2 + 0.1 * np.abs(points[:, 0])
+
+    free = np.ones(2, dtype=bool)
+    found = newton_mode(objective, np.array([0.4, -0.3]), free, np.eye(2))
+    assert found.problems == ()
+    # A kink is found to the step of differences.
+    np.testing.assert_allclose(found.z, 0.0, atol=0.05)

@@ -27,9 +27,9 @@ makes 1e-8."""
 PAIR_STEP = 3e-4
 """Of second differences, one-sided for pairs of ways: a mixed third derivative of a few units is worth 1e-3 of the
 curvature, rounding of a density of 1e4 (1e-11) 2e-4; both are below the thousandth part of any sd that is reported."""
-ROUNDING_STEP = 0.05
-"""Newton step, in posterior sds, that may be left where the density falls nowhere along it: sums of 1000 looks keep
-their value to 1e-5, and slopes by differences then say no more."""
+KINK_STEP = 0.25
+"""Newton step, in posterior sds, that may be left where the density falls nowhere along it: on a kink, where a move is
+as long as the play that it takes up, or where the rounding of a thousand looks hides the rest."""
 NEWTON_SETTLED = 1e-8
 """Squared Newton step, in posterior sds, at which the mode is reached."""
 HESSIAN_KEPT = 2e-3
@@ -210,8 +210,7 @@ def _descended(here: _Surroundings, inverse: np.ndarray) -> tuple[_Surroundings,
         trials = here.at(shortened * step)
         lower = np.isfinite(trials) & (trials < value + 1e-9 * abs(value))
         if not lower.any():
-            # What is left is rounding of the density: no part of such a step leads down.
-            return here, bool(step @ step < ROUNDING_STEP**2)
+            return here, bool(step @ step < KINK_STEP**2)
         chosen = int(np.argmax(lower))
         value = trials[chosen]
         here = replace(here, z=here.z + here.ways @ (shortened[chosen] * step))
