@@ -33,7 +33,9 @@ def test_looks_add_up_to_the_plan_they_make(knowledge, found, seen):
     for after_data in (False, True):
         known = replace(knowledge, after_data=after_data)
         exact = information_of(arranged.steps, known).fisher
-        quick = information_of_looks(seen, picks, arranged.path, knowledge.space, after_data)
+        quick = information_of_looks(
+            seen, picks, arranged.path, knowledge.space, after_data, arranged.warm_minutes(knowledge.rig)
+        )
         assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
 
 
