@@ -57,7 +57,7 @@ def test_moves_without_times_do_not_warm_up(times_s):
     ids=["no clock", "later", "no zone", "a day"],
 )
 def test_a_time_of_switching_on_that_fits_no_clock_is_refused(text):
-    with pytest.raises(InputError, match="powered_on.*`created`"):
+    with pytest.raises(InputError, match=r"powered_on.*`created`"):
         header(text)
 
 

@@ -143,7 +143,7 @@ class _Source:
 
 
 def _absent(fit: JointFit) -> set[str]:
-    """What the model does not have of errors of the gears, scatter of looks and shifts of the zeros, with its scales."""
+    """What the model does not have of errors of the gears, scatter of looks and shifts of the zeros."""
     value = dict(zip(NAMES, np.asarray(fit.mode.physical).tolist(), strict=True))
     none = {name for name in ABSENT_AT_NOUGHT if not fit.free[INDEX[name]] and value[name] == 0}
     for axis in AXES:

@@ -340,7 +340,7 @@ def coordinates_of(space: ParameterSpace, physical: np.ndarray) -> np.ndarray:
 def free_mask(
     space: ParameterSpace, has_aperture: bool, unseen: Collection[str] = ()
 ) -> Bool[np.ndarray, " parameters"]:
-    """Parameters that are estimated: u > 0, the receiver's only where there are aperture readings, and none `unseen`."""
+    """Parameters that are estimated: u > 0, the receiver's only where there are aperture readings, none `unseen`."""
     rig = np.asarray(space.u) > 0
     for name in (*unseen, *(() if has_aperture else RECEIVER_NAMES)):
         rig[INDEX[name]] = False
