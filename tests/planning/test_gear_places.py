@@ -12,7 +12,7 @@ from scipy import stats
 from support.coarse_planning import ROUNDING, with_priors
 
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX, NAMES, Prior, names_of
+from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, Prior, names_of
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
 from tvsbayes.model.compiled import placed
@@ -157,6 +157,8 @@ def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_ow
     family = Family(known, found, np.random.default_rng(4).integers(0, len(found.looks), 24), False)
     drawn = draw_instruments(known, 3, 5)
     drawn.z[:, CONTRAST_COLUMNS] = 0.0
+    # Looks count without creep, by the median of its time constant.
+    drawn.z[:, [INDEX[name] for name in CREEP_NAMES]] = 0.0
     # Cameras turned away from an eighth of the looks.
     drawn.z[2, INDEX["extrinsics.rotation_rad.y"]] = 10.0
     assurance = Assurance(family, WORST, Instruments.at(drawn.z, drawn.value, drawn.common), 5)
