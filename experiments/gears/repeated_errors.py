@@ -36,6 +36,7 @@ from experiments.common.rows import output, read_rows, run_rows
 from experiments.common.true_looks import TrueLooks
 from experiments.common.worlds import campaign_of
 from tvsbayes.assessment.fitted_calibration import calibration_of
+from tvsbayes.assessment.weaknesses import moved_directions, weak_directions
 from tvsbayes.coordinates.location import locate
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.inference import importance
@@ -118,6 +119,7 @@ def one_rig(task: tuple[str, float, str, int]) -> dict[str, object]:
                 "accepted": bool(told.pareto_k < K_MAX),
                 "pareto_k": told.pareto_k,
                 "least_ess": told.least_ess.value,
+                "shift_named": any("zero" in w.text for w in weak_directions(result, moved_directions(result))),
                 "headlines": judged(posterior.draws, None, result.prior_draws, true, posterior.weights),
                 "points": located(calibration, looks_at(simulated, calibration.range_steps, seed), seed),
                 "cpu_s": time.process_time() - start,
@@ -165,7 +167,11 @@ def _effort(found: dict[str, list[dict]]) -> None:
     """Processor time and Pareto k."""
     for name, entries in found.items():
         cpu, k = ([entry[key] for entry in entries] for key in ("cpu_s", "pareto_k"))
-        print(f"- {name}: median {np.median(cpu):.1f} CPU s, median Pareto k {np.median(k):.2f}")
+        named = np.mean([entry.get("shift_named", False) for entry in entries])
+        print(
+            f"- {name}: median {np.median(cpu):.1f} CPU s, median Pareto k {np.median(k):.2f}; "
+            f"a shift of the zero that hides in the gears is named in {100 * named:.0f} %"
+        )
     print()
 
 

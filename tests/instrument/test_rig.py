@@ -78,6 +78,16 @@ def test_the_scatter_of_looks_is_written_where_it_is_stated():
         assert rig_table(text) == table and text.count("look_scatter") == 1
 
 
+def test_shifts_of_the_zeros_are_written_where_they_are_stated():
+    """At their defaults a table reads as it did before; medians and signs come back."""
+    assert not {"creep", "thermal"} & set(re.findall("creep|thermal", rig_table_toml(RigTable(dict(RIG_PRIORS)))))
+    stated = {"creep_deg.pan": Prior(-0.02, 0.01), "creep_minutes": Prior(45.0, 0.3, "log-normal")}
+    stated["thermal_deg_per_K.tilt"] = Prior(0.0, 0.0)
+    table = RigTable({**RIG_PRIORS, **stated})
+    text = rig_table_toml(table)
+    assert rig_table(text) == table and len(re.findall("creep|thermal", text)) == 3
+
+
 def test_periods_in_every_spelling():
     for text, periods in (
         ("30", (30.0,)),

@@ -189,6 +189,12 @@ FIELDS: dict[str, tuple[str, tuple[int, ...], float]] = {
     "stop_sd_deg.up": ("noise.stop_sd_rad", (1, 1), DEG),
     "stop_sd_deg.down": ("noise.stop_sd_rad", (1, 0), DEG),
     **{f"look_scatter_deg.{axis}": ("noise.look_scatter_rad", (i,), DEG) for i, axis in enumerate(("pan", "tilt"))},
+    **{
+        f"{block}.{axis}": (f"transmission.zero_shift.{field}", (i,), DEG)
+        for i, axis in enumerate(("pan", "tilt"))
+        for block, field in (("creep_deg", "creep_rad"), ("thermal_deg_per_K", "thermal_rad_per_K"))
+    },
+    "creep_minutes": ("transmission.zero_shift.creep_minutes", (), 1.0),
     "pixel_scale": ("noise.pixel_scale", (), 1.0),
     "focal_scale": ("cameras.focal_scale", (), 1.0),
     "baseline_mm": ("receiver.baseline_mm", (), 1.0),

@@ -12,7 +12,7 @@ from scipy import stats
 from support.coarse_planning import ROUNDING, with_priors
 
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX, NAMES, Prior, names_of
+from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, Prior, names_of
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.protocols import grid_protocol, paper_protocol
 from tvsbayes.model.compiled import placed
@@ -157,6 +157,8 @@ def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_ow
     family = Family(known, found, np.random.default_rng(4).integers(0, len(found.looks), 24), False)
     drawn = draw_instruments(known, 3, 5)
     drawn.z[:, CONTRAST_COLUMNS] = 0.0
+    # Looks count without creep, by the median of its time constant.
+    drawn.z[:, [INDEX[name] for name in CREEP_NAMES]] = 0.0
     # Cameras turned away from an eighth of the looks.
     drawn.z[2, INDEX["extrinsics.rotation_rad.y"]] = 10.0
     assurance = Assurance(family, WORST, Instruments.at(drawn.z, drawn.value, drawn.common), 5)
@@ -215,7 +217,7 @@ def test_looks_of_real_gears_add_up_to_the_plan_they_make(real):
     picks = np.random.default_rng(5).integers(0, len(found.looks), 24)
     arranged = arrange(found.looks[picks], known.sheets, found.overshoot)
     exact = information_of(arranged.steps, known).fisher
-    quick = information_of_looks(seen, picks, arranged.path, known.space, False)
+    quick = information_of_looks(seen, picks, arranged.path, known.space, False, arranged.warm_minutes(known.rig))
     assert exact.shape == (known.size, known.size) and known.gears.size > 20
     assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
 

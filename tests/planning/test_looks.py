@@ -14,6 +14,7 @@ from tvsbayes.planning.drawn_rigs import draw_instruments
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, PARAMETERS, information_of, plan_minutes
 from tvsbayes.planning.looks import (
     CONTRAST_COLUMNS,
+    CREEP_COLUMNS,
     LookArrays,
     Looks,
     Seen,
@@ -33,8 +34,11 @@ def test_looks_add_up_to_the_plan_they_make(knowledge, found, seen):
     for after_data in (False, True):
         known = replace(knowledge, after_data=after_data)
         exact = information_of(arranged.steps, known).fisher
-        quick = information_of_looks(seen, picks, arranged.path, knowledge.space, after_data)
+        quick = information_of_looks(
+            seen, picks, arranged.path, knowledge.space, after_data, arranged.warm_minutes(knowledge.rig)
+        )
         assert np.abs(quick - exact).max() < ROUNDING * np.abs(exact).max()
+        assert np.all(np.diag(exact)[CREEP_COLUMNS] > 0), "looks at different times tell of the creep"
 
 
 def test_order_of_experiments_does_not_matter(knowledge, found, seen):

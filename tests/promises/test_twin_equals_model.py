@@ -16,7 +16,7 @@ from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.estimators.looks import aperture_angle
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.mirrors import Vectors
-from tvsbayes.instrument.parameters import HARMONIC_NAMES, RIG_NAMES, Prior
+from tvsbayes.instrument.parameters import HARMONIC_NAMES, RIG_NAMES, Prior, names_of
 from tvsbayes.instrument.places import line_share, seen_places
 from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.model.gear_processes import Places
@@ -26,6 +26,7 @@ from tvsbayes.model.headlines import effective_deg_per_step as effective_of_mode
 from tvsbayes.model.laser_path import MoveArrays, beam_angles, mirror_angles, trace
 from tvsbayes.model.parameter_space import coordinates_of, model_of, parameter_space
 from tvsbayes.twin import physics
+from tvsbayes.twin.gear_errors import zero_shift_deg
 from tvsbayes.twin.physics import (
     aperture_angle_deg,
     beam_jacobian,
@@ -53,7 +54,8 @@ ANGLE_RAD = LENGTH_MM / 1000.0
 @pytest.fixture(scope="module")
 def truths(mounted_rig):
     rng = np.random.default_rng(77)
-    wobbling = replace(mounted_rig, truth={**mounted_rig.truth, **dict.fromkeys(HARMONIC_NAMES, Prior(0.0, 0.1))})
+    large = dict.fromkeys((*HARMONIC_NAMES, *names_of("creep_deg")), Prior(0.0, 0.1))
+    wobbling = replace(mounted_rig, truth={**mounted_rig.truth, **large})
     return [draw_truth(wobbling, rng) for _ in range(RIGS)]
 
 
@@ -128,6 +130,17 @@ def test_gears_and_play(truths, values, period_deg):
             wobble = harmonics_deg(p, name), period_deg[axis]
             expected = np.radians(transmission(*args, *wobble) + (p["tilt_zero_deg"] if axis else 0.0))
             assert np.abs(found.angle_rad[rig, :, axis] - expected).max() < ANGLE_RAD
+
+
+def test_zeros_in_time(truths, values):
+    """Creep and temperature, at random times and temperatures."""
+    rng = np.random.default_rng(83)
+    minutes, kelvin = rng.uniform(0, 100, (RIGS, MOVES)), rng.uniform(-5, 5, (RIGS, MOVES))
+    found = batched(lambda v, t, k: model_of(v).transmission.zero_shift.shift_rad(t, k), values, minutes, kelvin)
+    for rig, truth in enumerate(truths):
+        for axis, name in enumerate(AXES):
+            expected = np.radians(zero_shift_deg(truth.parameters, name, minutes[rig], kelvin[rig]))
+            assert np.abs(found[rig, :, axis] - expected).max() < ANGLE_RAD
 
 
 @pytest.mark.parametrize("convention", ["in-plane", "azimuth"])

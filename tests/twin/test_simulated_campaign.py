@@ -5,6 +5,7 @@ Degrees, mm and pixels by suffix. Nothing here imports an estimator's model.
 
 from __future__ import annotations
 
+import datetime
 import json
 import subprocess
 import sys
@@ -406,3 +407,40 @@ def test_the_twin_needs_no_jax():
     modules = "tvsbayes.twin.simulated_campaign, tvsbayes.estimators.four_point"
     code = f"import sys, {modules}; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+ROUNDING_DEG = 1e-12
+"""Sums and differences of angles of some degrees."""
+
+
+def test_zeros_creep_from_switching_on_and_shift_with_the_temperature():
+    """Angles of every move, homings between them, against c (1 - exp(-t / tau)) + k (T - T at the first move)."""
+    rig, plan = make_rig(truth_u=0.0), PlanBuilder()
+    plan.home(0, 0)
+    plan.place("d2")
+    for turn in range(6):
+        plan.move(20 * turn + 10, 5)
+        plan.look()
+        if turn == 3:
+            plan.home(0, 0)
+    still = draw_truth(rig, np.random.default_rng(0))
+    shifts = {"creep_deg.pan": 0.1, "creep_deg.tilt": -0.03, "creep_minutes": 5.0, "thermal_deg_per_K.pan": 0.02}
+    moving = replace(still, parameters={**still.parameters, **shifts})
+    created = datetime.datetime(2026, 1, 15, 10, tzinfo=datetime.UTC)
+    early = {"created": created, "powered_on": created - datetime.timedelta(minutes=3)}
+    costly = replace(rig, costs_s={"move_s": 60.0, "look_s": 1.0})
+
+    def angles(truth, header=None, temperature=None):
+        run = simulate(costly, plan.steps, 5, truth, header=header, temperature_degC=temperature)
+        times_s = np.array([move.time_s for move in run.campaign.moves])
+        return np.array(run.truth.mirror_angles_deg), times_s, run.campaign
+
+    plain, times_s, _ = angles(still)
+    for header, minutes in ((None, times_s / 60), (early, times_s / 60 + 3)):
+        found, _, _ = angles(moving, header)
+        crept = (1 - np.exp(-minutes / 5))[:, None] * [0.1, -0.03]
+        np.testing.assert_allclose(found - plain, crept, atol=ROUNDING_DEG)
+    warmed, _, campaign = angles(moving, temperature=lambda t: 20 + t / 100)
+    crept = (1 - np.exp(-times_s / 300))[:, None] * [0.1, -0.03]
+    np.testing.assert_allclose(warmed - plain - crept, np.outer(times_s / 100, [0.02, 0.0]), atol=ROUNDING_DEG)
+    assert [move.temperature_degC for move in campaign.moves] == pytest.approx(20 + times_s / 100)

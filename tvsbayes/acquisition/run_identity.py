@@ -21,7 +21,7 @@ from tvsbayes.acquisition.journal import Record
 from tvsbayes.cameras.capture import without_password
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.instrument.counter_limits import HOME_KEYS
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, LOOK_SCATTER_NAMES, RIG_PRIORS
+from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, LATE_NAMES, RIG_PRIORS
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
@@ -113,9 +113,10 @@ def check_same(before: Mapping[str, object], rig: Rig, plan: Sequence[PlanStep],
         _check_earlier(before, rig)
         return
     now = data_entries(rig, bool(header.get("synthetic")))
-    # Journals from before looks scattered say nothing of it, and their twins had none.
-    for name in LOOK_SCATTER_NAMES:
-        silent = {f"rig.{name}": [0.0, RIG_PRIORS[name].u], f"truth.{name}": [0.0, 0.0]}
+    # Journals from before looks scattered and zeros shifted say nothing of it, and their twins had none.
+    for name in LATE_NAMES:
+        prior = RIG_PRIORS[name]
+        silent = {f"rig.{name}": [prior.value, prior.u], f"truth.{name}": [prior.value, 0.0]}
         now = {key: value for key, value in now.items() if key in began or value != silent.get(key)}
     changed = changes(began, now)
     if changed:

@@ -26,7 +26,7 @@ from tvsbayes.positioner.driver import SerialPositioner
 from tvsbayes.positioner.firmware_model import DeviceModel
 from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.protocol import SETTINGS, device_settings
-from tvsbayes.twin.gear_errors import PERFECT, SECONDS_PER_HOUR, draw_gear_errors
+from tvsbayes.twin.gear_errors import PERFECT, SECONDS_PER_HOUR, draw_gear_errors, zero_shift_deg
 from tvsbayes.twin.physics import Light, Sheet, harmonics_deg, light_on_sheet, project, take_up, wobble_deg
 from tvsbayes.twin.simulated_campaign import look_scatter_deg, placed_sheet
 from tvsbayes.twin.true_rig import Truth, draw_truth
@@ -240,8 +240,10 @@ class Instrument:
         self._drift_deg[axis] += float(step + np.diff(self._errors[axis].warming_deg(hours))[0])
 
     def _repeated_deg(self, axis: int) -> float:
-        """Error of the output's angle at its place, and the drift of the zero."""
-        return float(self._errors[axis].error_deg(np.array(self._place_deg[axis]))) + self._drift_deg[axis]
+        """Error of the output's angle at its place, and the drift and the creep of the zero."""
+        warm = np.array(self.clock.now_us / 60e6)
+        crept = float(zero_shift_deg(self.truth.parameters, AXES[axis], warm))
+        return float(self._errors[axis].error_deg(np.array(self._place_deg[axis]))) + self._drift_deg[axis] + crept
 
     def _wobble_deg(self, axis: int, angle_deg: float, wheel: bool) -> float:
         """Transmission error of the wheel (behind the play) or of the pinion (before it), degrees."""

@@ -60,7 +60,8 @@ class NormalModel:
         precision = self.precision.copy()
         precision[members, members] += factor**-2 - 1
         values, vectors = np.linalg.eigh(precision)
-        covariance = (vectors / np.maximum(values, 1e-6)) @ vectors.T
+        # Data only add to the precision of the priors: draws that scatter more than these do not say otherwise.
+        covariance = (vectors / np.maximum(values, min(1.0, factor**-2))) @ vectors.T
         # The data's share of the slope at nought stays.
         mean = covariance @ (self.precision @ self.mean)
         variance = np.einsum("qi,ij,qj->q", self.gradient, covariance, self.gradient)

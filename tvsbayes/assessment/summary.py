@@ -28,7 +28,7 @@ from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
     INDEX,
-    LOOK_SCATTER_NAMES,
+    LATE_NAMES,
     NAMES,
     RECEIVER_NAMES,
     RIG_NAMES,
@@ -47,7 +47,9 @@ SEEN_SHARE = 0.5
 """Of the draws that must show an experiment, for it to count: one draw that went astray drops none."""
 LENGTH_NAMES = names_of("transmission_error_length_deg")
 ABSENT_AT_NOUGHT = tuple(
-    name for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LOOK_SCATTER_NAMES) if name not in LENGTH_NAMES
+    name
+    for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
+    if name not in (*LENGTH_NAMES, *names_of("creep_minutes"))
 )
 """Parameters that are not told of where they are held at 0."""
 MIXING_SEED = 11
@@ -141,13 +143,13 @@ class _Source:
 
 
 def _absent(fit: JointFit) -> set[str]:
-    """Errors of the gears and scatter of looks that the model does not have, and the lengths of those errors."""
+    """What the model does not have of errors of the gears, scatter of looks and shifts of the zeros."""
     value = dict(zip(NAMES, np.asarray(fit.mode.physical).tolist(), strict=True))
     none = {name for name in ABSENT_AT_NOUGHT if not fit.free[INDEX[name]] and value[name] == 0}
     for axis in AXES:
         if {f"transmission_error_deg.{axis}", f"play_variation_deg.{axis}"} <= none:
             none.add(f"transmission_error_length_deg.{axis}")
-    return none
+    return none | ({"creep_minutes"} if set(names_of("creep_deg")) <= none else set())
 
 
 def _parameters(source: _Source) -> dict[str, Estimate]:

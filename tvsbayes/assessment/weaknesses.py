@@ -13,7 +13,7 @@ from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.linear_spots import standard_deviations_without
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, STEREO_PARAMETER_NAMES
+from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, STEREO_PARAMETER_NAMES, names_of
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, SPACING_DEG, too_few_counters
 from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, rests_of, separation
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
@@ -100,6 +100,41 @@ def _scatter_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
     return WeakDirection(text, {look: 1.0, **dict.fromkeys(stops, -1.0)})
 
 
+SHIFTS = {
+    "creep_deg": (
+        "a creep of the zero",
+        "alternate the directions, come back to the first stop, wait until it is warm",
+    ),
+    "thermal_deg_per_K": ("a shift with the temperature", "come back to the first stop at another temperature"),
+}
+"""Of a zero in time: in words, and what tells it from the gears."""
+
+
+def _shift_directions(fit: JointFit, axis: Axis) -> list[WeakDirection]:
+    """What of the gears of an axis cannot be told from a shift of its zero."""
+    negative, positive = (fit.draws.effective_deg_per_step[:, DIRECTIONS.index(d)] for d in SENSES[axis])
+    backlash = fit.draws.physical[:, INDEX[f"backlash_deg.{axis}"]]
+    contrast = f"the contrast of {SENSES[axis][0]} and {SENSES[axis][1]}"
+    quantities = {
+        contrast: (negative - positive, f"ratio_contrast_deg_per_step.{axis}"),
+        f"the {axis} ratio": (0.5 * (negative + positive), f"degrees_per_step.{axis}"),
+        f"the {axis} backlash": (backlash, f"backlash_deg.{axis}"),
+    }
+    found = []
+    for block, (words, cure) in SHIFTS.items():
+        shift = f"{block}.{axis}"
+        if not fit.free[INDEX[shift]]:
+            continue
+        draws = fit.draws.physical[:, INDEX[shift]]
+        for what, (values, name) in quantities.items():
+            if np.ptp(values) > 1e-12 * np.max(np.abs(values)):
+                correlation = float(np.corrcoef(values, draws)[0, 1])
+                if inseparable(correlation):
+                    text = f"{what} and {words} are hardly told apart (correlation {correlation:+.2f}): {cure}"
+                    found.append(WeakDirection(text, {name: 1.0, shift: correlation}))
+    return found
+
+
 def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]:
     """Combinations of parameters that data and priors leave wide, in words: axes never moved, play, priors alone."""
     found = []
@@ -110,8 +145,8 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
             continue
         weak = _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])
         rest = _counters_direction(fit, axis), _scatter_direction(fit, axis)
-        found += [one for one in (weak, *rest) if one is not None]
-    noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES}
+        found += [one for one in (weak, *rest, *_shift_directions(fit, axis)) if one is not None]
+    noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES, *names_of("creep_minutes")}
     rows = np.array([i for i, name in enumerate(NAMES) if fit.free[i] and name not in noise])
     if rows.size == 0:
         return tuple(found)

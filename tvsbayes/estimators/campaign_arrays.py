@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.instrument.axes import APPROACH_SIGN
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
+from tvsbayes.instrument.conditions import kelvin, powered_on_s, warm_minutes
 from tvsbayes.instrument.places import SeenPlaces, gears_vary, seen_places
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stereo_pair import triangulate
@@ -104,13 +105,25 @@ def padded(rows: Sequence[object] | ArrayLike, size: int, fill: ArrayLike = 0.0,
     return placed(np.concatenate([given, rest]))
 
 
-def move_arrays(moves: Sequence[Move], size: int | None = None) -> MoveArrays:
-    """Pad the moves, by default to their `bucket`; padding repeats the last counters and therefore changes nothing."""
+def move_arrays(moves: Sequence[Move], size: int | None = None, powered_on_s: float | None = None) -> MoveArrays:
+    """Pad the moves, by default to their `bucket`; padding repeats the last counters and therefore changes nothing.
+
+    Args:
+        moves: in time order.
+        size: padded length.
+        powered_on_s: when the machine was switched on, clock of `time_s`; by default at the first move.
+    """
     size = bucket(len(moves)) if size is None else size
     steps = np.array([(m.pan_steps, m.tilt_steps) for m in moves])
     approach = [(APPROACH_SIGN.get(m.pan_approach, 0), APPROACH_SIGN.get(m.tilt_approach, 0)) for m in moves]
     first = [bool(m.pan_approach) for m in moves]
-    return MoveArrays(padded(steps, size, steps[-1]), padded(first, size, False, bool), padded(approach, size))
+    conditions = warm_minutes(moves, powered_on_s), kelvin(moves)
+    return MoveArrays(
+        padded(steps, size, steps[-1]),
+        padded(first, size, False, bool),
+        padded(approach, size),
+        *(padded(values, size, values[-1]) for values in conditions),
+    )
 
 
 def place_arrays(seen: SeenPlaces, smallest: int = SMALLEST_PLACES) -> Places:
@@ -186,7 +199,8 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
         hours=padded(new.hours, size),
     )
     azimuth = placed(campaign.rig.aperture_convention == "azimuth")
-    return CampaignArrays(move_arrays(campaign.moves), spot_arrays, gears, azimuth)
+    moves = move_arrays(campaign.moves, powered_on_s=powered_on_s(campaign.header))
+    return CampaignArrays(moves, spot_arrays, gears, azimuth)
 
 
 def in_sight(campaign: Campaign) -> np.ndarray:

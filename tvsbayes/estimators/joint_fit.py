@@ -27,7 +27,7 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
 from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, Prior
+from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, ZERO_SHIFT_NAMES, Prior
 from tvsbayes.instrument.places import PLACES_MAX, line_share, seen_places
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import placed
@@ -37,7 +37,7 @@ from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.stored_draws import StoredMode
 from tvsbayes.statistics.chances import chi2_quantile
 from tvsbayes.statistics.intervals import NORMAL_95
-from tvsbayes.statistics.least_squares import Mode, laplace_draws
+from tvsbayes.statistics.least_squares import LAPLACE_DRAWS, Mode, laplace_draws
 
 SMALLEST_CAMPAIGN = 8
 """Spots below which no fit is tried: two beams at two depths, seen before and after one move on each axis."""
@@ -411,10 +411,15 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
     share = placed(np.pad(line_share(seen_at, used), (0, len(places.steps) - len(seen_at.steps))))
     seen = SeenLine(np.asarray(pose), places, share)
     count, joint = len(NAMES), with_places(mode.z, mode.covariance, information)
-    both = laplace_draws(joint.mean, joint.covariance, seed)
+    # What the campaign cannot tell of has no draws: those of the others are then the same whether it is known or not.
+    drawn = np.ones(len(joint.mean), dtype=bool)
+    drawn[[INDEX[name] for name in ZERO_SHIFT_NAMES if not problem.free[INDEX[name]]]] = False
+    both = np.tile(joint.mean, (LAPLACE_DRAWS, 1))
+    both[:, drawn] = laplace_draws(joint.mean[drawn], joint.covariance[np.ix_(drawn, drawn)], seed)
     draws_z, draws_rad = both[:, :count], both[:, count:] @ np.asarray(lin.place_root).T
     centre_rad = np.asarray(lin.place_root) @ information.place_mean
-    prior_both = laplace_draws(np.zeros(both.shape[1]), np.eye(both.shape[1]), seed + 1)
+    prior_both = np.zeros_like(both)
+    prior_both[:, drawn] = laplace_draws(np.zeros(drawn.sum()), np.eye(drawn.sum()), seed + 1)
     prior_z = prior_both[:, :count]
     prior_rad = np.asarray(prior_errors_at_places(prior_z, prior_both[:, count:], problem.space, problem.arrays))
 

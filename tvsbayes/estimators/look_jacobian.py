@@ -34,7 +34,10 @@ def _columns(*blocks: str) -> np.ndarray:
     return np.array([INDEX[name] for name in names_of(*blocks)])
 
 
-GEARS = _columns("degrees_per_step", "ratio_contrast_deg_per_step", "backlash_deg", "harmonic_deg", "tilt_zero_deg")
+GEARS = _columns(
+    *("degrees_per_step", "ratio_contrast_deg_per_step", "backlash_deg", "harmonic_deg", "tilt_zero_deg"),
+    *("creep_deg", "creep_minutes", "thermal_deg_per_K"),
+)
 OPTICS = np.array([INDEX[name] for name in OPTICS_NAMES])
 FRAMES = _columns("extrinsics.rotation_rad", "extrinsics.translation_mm")
 CAMERAS = np.array([INDEX["focal_scale"], *(INDEX[name] for name in STEREO_PARAMETER_NAMES)])

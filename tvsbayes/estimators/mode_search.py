@@ -26,6 +26,7 @@ from tvsbayes.estimators.linear_spots import (
     stop_information,
 )
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.conditions import unseen_shifts
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, NOISE_NAMES, names_of
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.compiled import in_batches, placed
@@ -120,7 +121,7 @@ class Problem:
         valid[: len(used)] *= used
         self.arrays = eqx.tree_at(lambda a: a.spots.valid, arrays, placed(valid))
         readings = (spot.aperture_deg is not None for spot, use in zip(self.spots, used, strict=True) if use)
-        self.free = free_mask(self.space, any(readings))
+        self.free = free_mask(self.space, any(readings), unseen_shifts(campaign.moves, table.priors))
         self.noise = np.flatnonzero(np.isin(NAMES, NOISE_NAMES) & self.free)
         self.held = held_by(self.free)
         self.repeated = np.isin(NAMES, GEAR_ERROR_NAMES) & self.free

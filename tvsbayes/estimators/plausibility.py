@@ -30,6 +30,7 @@ from tvsbayes.estimators.spot_pattern import (
 )
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import PIXEL_SDS, UNDETECTED, Campaign, Spot, pixels_of
+from tvsbayes.instrument.conditions import interpolated
 from tvsbayes.instrument.parameters import names_of
 from tvsbayes.instrument.stereo_pair import SHORTEST_BASELINE_MM, baseline_doubt, pair_doubts, triangulate
 from tvsbayes.instrument.stops import observed_stops, separation
@@ -285,6 +286,8 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     warnings = [*(finding.sentence for finding in findings), *_incomplete(selection.skipped)]
     if not ok:
         warnings.append("no spot has status ok: there is nothing to estimate from")
+    if count := interpolated(campaign.moves):
+        warnings.append(f"{count} of {len(campaign.moves)} moves have no temperature_degC: interpolated in time")
     observed = {spot.move for spot in ok}
     for axis in AXES if ok else ():
         reason = separation(observed_stops(campaign.moves, observed, axis), axis)

@@ -52,6 +52,8 @@ UNDETECTED = "undetected"
 """Status of a look whose pictures wait for `detect`."""
 PIXEL_SD_MIN, PIXEL_SD_MAX = 1e-4, 100.0
 """Of a standard uncertainty of a centre, px."""
+TEMPERATURE_MAX = 1000.0
+"""Of a machine, degC, either sign."""
 APERTURE_MAX_DEG = 360.0
 """Of a reading of the aperture, either sign."""
 # How far outside the image a centroid may lie, in image sizes: half a spot at the edge, not a wrong file.
@@ -77,7 +79,7 @@ _CORRELATION = Column(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Move:
-    """A row of `moves.csv`: absolute counters AFTER the move.
+    """A row of `moves.csv`: absolute counters AFTER the move; the temperature then, None where nobody read it.
 
     Approaches are "left"/"right"/"unknown" and "up"/"down"/"unknown" in the first row of a segment,
     empty elsewhere.
@@ -138,6 +140,15 @@ class Move:
         TiltApproach | Literal[""],
         Column("likewise `up`, `down`, `unknown`", rule=first_of_segment, names=_SIDES),
     ] = ""
+    temperature_degC: Annotated[
+        float | None,
+        Column(
+            "optional: of the machine; its zeros shift with it. Empty cells are interpolated in time",
+            *(-TEMPERATURE_MAX, TEMPERATURE_MAX),
+            group="temperature",
+            names="temperature temp temperatur temperatura",
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

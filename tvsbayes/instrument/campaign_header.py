@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 
 from tvsbayes.files.documents import Keys
+from tvsbayes.instrument.conditions import check_power
 
 _TEXT_CHARS = {
     **dict.fromkeys(("name", "operator", "instrument", "serial", "method", "board_certificate"), 200),
@@ -20,7 +21,7 @@ _HEADER_TABLES = {
     "traceability": ("board_certificate", "pitch_mm", "stereo_calibrated"),
 }
 _HEADER_KEYS = (
-    *("format", "name", "created", "synthetic", "seed"),
+    *("format", "name", "created", "powered_on", "synthetic", "seed"),
     *("operator", "instrument", "serial", "method", "notes", *_HEADER_TABLES, "rig"),
 )
 
@@ -53,4 +54,5 @@ def parse_header(keys: Keys) -> dict[str, object]:
         table.only(allowed)
         if table.values:
             header[name] = {key: _header_value(table, key) for key in table.values}
+    check_power(keys, header)
     return header

@@ -12,7 +12,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -187,6 +187,7 @@ def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[t
     numbers = cells.text("move") if "move" in cells else None
     homings = homings_of(cells, assumed)
     times_s = seconds_of(cells, assumed)
+    warm = cells.read(MOVES["temperature_degC"]) if "temperature_degC" in cells else [None] * count
     approaches = [_approaches(cells, axis, notation.approach[k]) for k, axis in enumerate(AXES)]
     moves: list[Move] = []
     of_row: list[int] = []
@@ -202,7 +203,8 @@ def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[t
             first = row == 0 or homed
             pan_side, tilt_side = (own[row] if first else "" for own in approaches)
             time_s = float(len(moves)) if times_s is None else times_s[row]
-            moves.append(next_move(moves, segment, time_s, at, (pan_side, tilt_side)))  # type: ignore[arg-type]
+            move = next_move(moves, segment, time_s, at, (pan_side, tilt_side))  # type: ignore[arg-type]
+            moves.append(replace(move, temperature_degC=warm[row]))
         elif not notation.relative and step != at:
             remedy = "a new move begins a new number; or leave the column out with --column move="
             raise cells.refuse(

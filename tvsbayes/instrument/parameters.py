@@ -14,7 +14,7 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS
 
 Distribution = Literal["normal", "half-normal", "log-normal"]
 KINDS: tuple[Distribution, ...] = get_args(Distribution)
-Unit = Literal["deg/step", "deg", "rad", "mm", "px", "1"]
+Unit = Literal["deg/step", "deg/K", "deg", "rad", "mm", "px", "min", "1"]
 Place = Literal["rig", "rig.prior", "stereo"]
 HARMONIC_ORDERS = (1, 2)
 """Of a transmission error with a stated shape: turns per period."""
@@ -137,6 +137,9 @@ _PARAMETERS = (
     *_block("drift_deg_per_root_hour", AXES, "deg", Prior(0.0, 0.02, "half-normal"), _SCALE, noise=True),
     *_block("harmonic_amplitude_deg", _AMPLITUDES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE, noise=True),
     *_block("look_scatter_deg", AXES, "deg", Prior(0.0, 0.01, "half-normal"), _SCALE, noise=True),
+    *_block("creep_deg", AXES, "deg", Prior(0.0, 0.05), (-10.0, 10.0, 10.0)),
+    *_block("creep_minutes", (), "min", Prior(20.0, 0.8, "log-normal"), (1e-3, 1e5, 5.0)),
+    *_block("thermal_deg_per_K", AXES, "deg/K", Prior(0.0, 0.01), (-10.0, 10.0, 10.0)),
     *_cameras(),
 )
 
@@ -167,6 +170,12 @@ GEAR_ERROR_NAMES: tuple[str, ...] = (
 """Scales of the gears' errors that repeat by position, of play that varies and of zeros that drift."""
 LOOK_SCATTER_NAMES: tuple[str, ...] = BLOCKS["look_scatter_deg"]
 """Sds of what the beam's angle at a look is off from where the axis stands."""
+CREEP_NAMES: tuple[str, ...] = (*BLOCKS["creep_deg"], *BLOCKS["creep_minutes"])
+"""How far the zeros creep while the machine warms up, and the time constant of both."""
+ZERO_SHIFT_NAMES: tuple[str, ...] = (*CREEP_NAMES, *BLOCKS["thermal_deg_per_K"])
+"""Shifts of the zeros in time and with the temperature."""
+LATE_NAMES: tuple[str, ...] = (*LOOK_SCATTER_NAMES, *ZERO_SHIFT_NAMES)
+"""Parameters that earlier versions did not know: files leave them out at their defaults."""
 NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
 DERIVED_UNITS: dict[str, Unit] = {

@@ -18,7 +18,7 @@ from tvsbayes.instrument.counter_limits import COUNTER_MAX, HOME_KEYS, LIMIT_KEY
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
     HARMONIC_NAMES,
-    LOOK_SCATTER_NAMES,
+    LATE_NAMES,
     NAMES,
     PERIODS_MAX,
     REGISTRY,
@@ -270,7 +270,8 @@ def rig_table_toml(table: RigTable) -> str:
     """`[rig]` and `[rig.prior]` with every entry, also those at their defaults, so that a file says all.
 
     Harmonics and amplitudes stand only where they mean something: on an axis with their period. The scatter of looks
-    stands where it is not the default, so that campaigns from before it was known keep their text and its hash.
+    and shifts of the zeros stand where they are not the defaults, so that campaigns from before they were known keep
+    their text and its hash.
     """
 
     def entry(name: str) -> str:
@@ -284,7 +285,7 @@ def rig_table_toml(table: RigTable) -> str:
     ]
     periodic = [entry(name) for name in PERIODIC_NAMES if _has_period(name, table.harmonic_period_deg)]
     declared = map(entry, _DECLARED_NAMES)
-    silent = {name for name in LOOK_SCATTER_NAMES if table.priors[name] == REGISTRY[name].prior}
+    silent = {name for name in LATE_NAMES if table.priors[name] == REGISTRY[name].prior}
     priors = (entry(name) for name in _PRIOR_NAMES if name not in {*PERIODIC_NAMES, *silent})
     return "\n".join(["[rig]", *declared, *periods, convention, "[rig.prior]", *priors, *periodic]) + "\n"
 

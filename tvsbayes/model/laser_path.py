@@ -47,21 +47,52 @@ def no_harmonics() -> Harmonics:
     return Harmonics(jnp.zeros((2, 2, 2)), jnp.full(2, 2 * jnp.pi), jnp.ones(2, dtype=bool))
 
 
+class ZeroShift(eqx.Module):
+    """Shifts of both zeros: creep c (1 - exp(-t / tau)) of a machine that warms up, and k (T - T_0) (formulation 3.1).
+
+    Attributes:
+        creep_rad: c of each axis.
+        creep_minutes: tau, of both.
+        thermal_rad_per_K: k of each axis.
+    """
+
+    creep_rad: Float[Array, "2"]
+    creep_minutes: Scalar
+    thermal_rad_per_K: Float[Array, "2"]
+
+    def shift_rad(
+        self, warm_minutes: Float[Array, " moves"], kelvin: Float[Array, " moves"]
+    ) -> Float[Array, "moves 2"]:
+        """At times t since the machine was switched on and temperatures T - T_0."""
+        crept = -jnp.expm1(-warm_minutes / self.creep_minutes)
+        return crept[:, None] * self.creep_rad + kelvin[:, None] * self.thermal_rad_per_K
+
+
 class Transmission(eqx.Module):
-    """Gears of both axes: mean ratio, left-minus-right (up-minus-down) contrast, play and transmission error."""
+    """Gears of both axes: mean ratio, left-minus-right (up-minus-down) contrast, play and transmission error.
+
+    `zero_shift` is None where the zeros stay.
+    """
 
     ratio_rad_per_step: Float[Array, "2"]
     contrast_rad_per_step: Float[Array, "2"]
     backlash_rad: Float[Array, "2"]
     harmonics: Harmonics = eqx.field(default_factory=no_harmonics)
+    zero_shift: ZeroShift | None = None
 
 
 class MoveArrays(eqx.Module):
-    """Moves of a campaign, padded; `approach` is +1 left/up, -1 right/down, 0 unknown, read at `first` rows."""
+    """Moves of a campaign, padded; `approach` is +1 left/up, -1 right/down, 0 unknown, read at `first` rows.
+
+    `warm_minutes` have passed since the machine was switched on, `kelvin` is the temperature less that of the first
+    move; both None where the zeros are taken to stay.
+    """
 
     steps: Float[Array, "moves 2"]
     first: Bool[Array, " moves"]
     approach: Float[Array, "moves 2"]
+    warm_minutes: Float[Array, " moves"] | None = None
+    kelvin: Float[Array, " moves"] | None = None
 
 
 class MirrorAngles(eqx.Module):
@@ -84,7 +115,7 @@ def way_steps(moves: MoveArrays) -> Float[Array, "moves 2"]:
 
 
 def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: MoveArrays) -> MirrorAngles:
-    """Follow the counters through gears, play and transmission error.
+    """Follow the counters through gears, play and transmission error, and the zeros through time.
 
     Over a band of unknown play the wheel's error is taken at the band's middle, as a shift of the whole band. At an
     amplitude of 0.1 deg and a play of 0.5 deg its curvature, left out, is worth 1e-6 deg and its slope 0.4 % of the
@@ -117,7 +148,10 @@ def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: Move
     zero = jnp.zeros(2)
     _, (output, play_sd_rad) = jax.lax.scan(take_up, (zero, zero), (driven, moves.first, moves.approach))
     output += jnp.where(harmonics.on_wheel, harmonics.error_rad(output), 0.0)
-    return MirrorAngles(output + jnp.stack([jnp.zeros(()), tilt_zero_rad]), play_sd_rad)
+    output += jnp.stack([jnp.zeros(()), tilt_zero_rad])
+    if transmission.zero_shift is not None and moves.warm_minutes is not None and moves.kelvin is not None:
+        output += transmission.zero_shift.shift_rad(moves.warm_minutes, moves.kelvin)
+    return MirrorAngles(output, play_sd_rad)
 
 
 class Reflections(eqx.Module):

@@ -9,7 +9,7 @@ one compiled function serves every choice of fixed parameters. Physical values h
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -39,7 +39,7 @@ from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_processes import GearScales
 from tvsbayes.model.geometry import Scalar, StereoCameras, Vector, materialise
-from tvsbayes.model.laser_path import Harmonics, Transmission
+from tvsbayes.model.laser_path import Harmonics, Transmission, ZeroShift
 
 NO_PERIOD_DEG = np.full((2, PERIODS_MAX), FULL_TURN_DEG)
 """Stands for the periods of transmission errors that nobody stated; harmless, since those errors are 0."""
@@ -239,6 +239,7 @@ def model_of(
                 period_rad=period_deg[:, 0] * (jnp.pi / 180),
                 on_wheel=period_deg[:, 0] == FULL_TURN_DEG,
             ),
+            zero_shift=ZeroShift(block("creep_deg"), block("creep_minutes"), block("thermal_deg_per_K")),
         ),
         optics=Optics.of(block),
         tilt_zero_rad=block("tilt_zero_deg"),
@@ -336,10 +337,12 @@ def coordinates_of(space: ParameterSpace, physical: np.ndarray) -> np.ndarray:
     return np.concatenate([z, stereo], axis=-1)
 
 
-def free_mask(space: ParameterSpace, has_aperture: bool) -> Bool[np.ndarray, " parameters"]:
-    """Parameters that are estimated: u > 0, and the receiver's only where there are aperture readings."""
+def free_mask(
+    space: ParameterSpace, has_aperture: bool, unseen: Collection[str] = ()
+) -> Bool[np.ndarray, " parameters"]:
+    """Parameters that are estimated: u > 0, the receiver's only where there are aperture readings, none `unseen`."""
     rig = np.asarray(space.u) > 0
-    if not has_aperture:
-        rig[[INDEX[name] for name in RECEIVER_NAMES]] = False
+    for name in (*unseen, *(() if has_aperture else RECEIVER_NAMES)):
+        rig[INDEX[name]] = False
     stereo = np.abs(np.asarray(space.stereo_root)).sum(axis=1) > 0
     return np.concatenate([rig, stereo])

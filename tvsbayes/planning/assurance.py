@@ -173,12 +173,12 @@ class Assurance:
     def values(self, sizes: Sequence[int], advance: Advance = unshown) -> dict[int, np.ndarray]:
         """Reported uncertainty of the target at each truth, shape (draws,), by number of experiments."""
         draws, together = len(self.instruments), max(1, self.PAIRS // len(self.looks))
-        wanted = {n: self.family.arranged(n).path for n in sizes if n not in self._values}
+        wanted = {n: self.family.arranged(n) for n in sizes if n not in self._values}
         found = {n: np.full(draws, np.inf) for n in wanted}
         for first in range(0, draws, together) if wanted else ():
             scene = self._scene(first, min(first + together, draws))
-            for n, path in wanted.items():
-                found[n][scene.rows] = self._reported(scene, n, path)
+            for n, design in wanted.items():
+                found[n][scene.rows] = self._reported(scene, n, design)
             advance((first + together) / draws)
         self._values |= found
         return {n: self._values[n] for n in sizes}
@@ -216,12 +216,13 @@ class Assurance:
             return Sensitivity(np.asarray(gears.parts(z, space, pose_rad).gradient)[:, list(self.target.indices)])
         return sensitivity(self.target, z, space, self.family.knowledge.rig.table, pose_rad, gears)
 
-    def _reported(self, scene: _Scene, experiments: int, path: np.ndarray) -> np.ndarray:
+    def _reported(self, scene: _Scene, experiments: int, design: Arranged) -> np.ndarray:
         """Of the instruments of a scene, shape (n,)."""
         knowledge, chosen = self.family.knowledge, self.index[: LOOKS_PER_EXPERIMENT * experiments]
+        way = design.path, knowledge.space, knowledge.after_data, design.warm_minutes(knowledge.rig)
 
         def covariance(seen: Seen) -> np.ndarray:
-            information = information_of_looks(seen, chosen, path, knowledge.space, knowledge.after_data)
+            information = information_of_looks(seen, chosen, *way)
             return covariance_of(knowledge.precision + information)
 
         first = covariance(scene.seen)

@@ -36,7 +36,7 @@ from tvsbayes.estimators.looks import in_frame_s
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.mirrors import Ray
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
+from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, NOISE_NAMES
 from tvsbayes.instrument.places import gears_vary, seen_places
 from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
@@ -70,6 +70,7 @@ class Knowledge:
         precision: inverse covariance of the coordinates and of the errors at `gears`, shape (p + e, p + e).
         after_data: there is a campaign already: a new session begins with an unknown home offset.
         gears: counters at which the gears' repeating errors are told apart, see `with_gears`.
+        warm_minutes: how long the machine has been on when looks are taken that go on where a campaign ended.
         taught: what a fit says of those errors at its own places.
     """
 
@@ -80,6 +81,7 @@ class Knowledge:
     after_data: bool = False
     gears: GearPlaces = field(default=NO_PLACES)
     taught: TaughtErrors | None = None
+    warm_minutes: float = 0.0
 
     @property
     def size(self) -> int:
@@ -127,10 +129,11 @@ def prior_knowledge(rig: Rig) -> Knowledge:
 
 
 def knowledge_of(result: JointFit, rig: Rig) -> Knowledge:
-    """After a fit: its mode and Laplace covariance; sheets, limits and costs of the rig file."""
+    """After a fit: its mode, looks linearised without creep, and Laplace covariance; the rest is the rig file's."""
     of_data = replace(rig, table=result.campaign.rig, stereo=result.campaign.stereo)
     precision = np.linalg.inv(result.covariance)
-    return Knowledge(of_data, result.space, result.z, precision, True, taught=taught_errors(result, result.covariance))
+    z = np.where(np.isin(NAMES, CREEP_NAMES), 0.0, result.z)
+    return Knowledge(of_data, result.space, z, precision, True, taught=taught_errors(result, result.covariance))
 
 
 def taught_errors(result: JointFit, covariance: np.ndarray) -> TaughtErrors | None:

@@ -180,7 +180,8 @@ def next_experiments(
                 continue
             picks = np.array(search.among(here).greedy(LOOKS_PER_EXPERIMENT))
             design = arrange(found.looks[picks], knowledge.sheets, found.overshoot)
-            information = information_of_looks(seen, picks, design.path, knowledge.space, knowledge.after_data)
+            way = design.path, knowledge.space, knowledge.after_data, design.warm_minutes(knowledge.rig)
+            information = information_of_looks(seen, picks, *way)
             after = at_centre.value(covariance_of(knowledge.precision + information), target.factor)
             minutes = design.minutes(knowledge.rig)
             text = f"{'a full turn of pan away, ' if turned else ''}{described(knowledge.rig, design.steps)}"

@@ -80,6 +80,19 @@ class Arranged:
         path[self.order] = np.cumsum(np.abs(self._legs).sum(axis=1), axis=0)
         return path
 
+    def warm_minutes(self, rig: Rig) -> np.ndarray:
+        """From the homing to the last move before each look (in the caller's order) by `[costs]`, shape (m,)."""
+        cost = {name: action_seconds(rig, {name: 1}) for name in ("home", "place", "move", "look")}
+        moves = self._legs.any(axis=2).sum(axis=1)
+        placed = np.array([now != before for now, before in zip(self.sheet, ("", *self.sheet[:-1]), strict=True)])
+        taken = placed * cost["place"] + moves * cost["move"] + cost["look"]
+        ends = cost["home"] + np.cumsum(taken)
+        # The time of a row is that at which its move begins; without a move the row before holds on.
+        last = np.where(moves > 0, ends - cost["look"] - cost["move"], 0.0)
+        minutes = np.empty(len(self.order))
+        minutes[self.order] = np.maximum.accumulate(last) / 60
+        return minutes
+
     @property
     def actions(self) -> dict[str, int]:
         """How many of each kind the plan has."""
@@ -173,19 +186,20 @@ class _Pairs(eqx.Module):
         """Of one pair."""
         return eqx.tree_at(lambda s: s.value, common, self.value)
 
-    @property
-    def moves(self) -> MoveArrays:
+    def moves(self, warm_minutes: Float[Array, ""]) -> MoveArrays:
         """Of one pair: the look's counters, reached from its side as if homed there."""
-        return MoveArrays(self.steps[None], jnp.ones(1, dtype=bool), self.side[None])
+        steps, side = self.steps[None], self.side[None]
+        return MoveArrays(steps, jnp.ones(1, dtype=bool), side, warm_minutes[None], jnp.zeros(1))
 
 
 class _Eyes(eqx.Module):
-    """What takes the looks: largest (u, v, u, v) inside the images, noise of a spot, and the aperture."""
+    """What takes the looks: largest (u, v, u, v) inside the images, noise of a spot, and the aperture; and when."""
 
     image_px: Float[Array, "4"]
     spot_sd_px: Float[Array, ""]
     has_aperture: Float[Array, ""]
     azimuth_convention: Bool[Array, ""]
+    warm_minutes: Float[Array, ""]
 
 
 @compiled(_Shown)
@@ -210,7 +224,7 @@ def _shown(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> _Shown:
         )
         none = jnp.zeros(0, dtype=bool)
         gears = GearArrays(Places(jnp.zeros(0), none, none), jnp.zeros((1, 0)), jnp.zeros((1, 0)))
-        arrays = CampaignArrays(pair.moves, spot, gears, eyes.azimuth_convention)
+        arrays = CampaignArrays(pair.moves(eyes.warm_minutes), spot, gears, eyes.azimuth_convention)
         # Errors of the gears turn the mirrors as an offset does: their columns follow from its, outside.
         still = jnp.zeros((1, 2, 0))
         found = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], eyes.image_px, still)
@@ -232,7 +246,9 @@ def _in_images(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> Bool[Array,
     """Whether every pair's look puts its spot into both images."""
 
     def one(pair: _Pairs) -> Bool[Array, ""]:
-        return met_sheet(pair.space(space).model(pair.z), pair.moves, pair.depth_mm[None], eyes.image_px).inside[0]
+        return met_sheet(
+            pair.space(space).model(pair.z), pair.moves(eyes.warm_minutes), pair.depth_mm[None], eyes.image_px
+        ).inside[0]
 
     return jax.vmap(one)(pairs)
 
@@ -248,7 +264,8 @@ class LookArrays:
         self.depth_mm = np.array([rig.sheets_mm[name] for name in knowledge.sheets])[looks.sheet]
         azimuth = rig.table.aperture_convention == "azimuth"
         self.turning = knowledge.gears.turning(looks.steps, looks.side)
-        self.eyes = _Eyes(placed(largest_px(rig)), placed(rig.spot_sd_px), placed(float(aperture)), placed(azimuth))
+        of_look = placed(rig.spot_sd_px), placed(float(aperture)), placed(azimuth), placed(knowledge.warm_minutes)
+        self.eyes = _Eyes(placed(largest_px(rig)), *of_look)
 
     def _blocks(self, z: np.ndarray, value: np.ndarray, size: int) -> list[_Pairs]:
         """Every instrument (n,) with every look (m,), the last block filled up with its last pair."""
@@ -297,10 +314,16 @@ class LookArrays:
 
 
 CONTRAST_COLUMNS = [INDEX["ratio_contrast_deg_per_step.pan"], INDEX["ratio_contrast_deg_per_step.tilt"]]
+CREEP_COLUMNS = [INDEX["creep_deg.pan"], INDEX["creep_deg.tilt"]]
 
 
 def information_of_looks(
-    seen: Seen, chosen: np.ndarray, path: np.ndarray, space: ParameterSpace, homed: bool
+    seen: Seen,
+    chosen: np.ndarray,
+    path: np.ndarray,
+    space: ParameterSpace,
+    homed: bool,
+    warm_minutes: np.ndarray | None = None,
 ) -> np.ndarray:
     """Fisher information of chosen looks, shape (..., p + e, p + e); equal to `information_of` of the arranged plan.
 
@@ -312,24 +335,32 @@ def information_of_looks(
         path: steps travelled when each is taken, shape (k, 2).
         space: priors, for the scale of the contrast.
         homed: the session begins with an unknown home offset.
+        warm_minutes: since it began when each is taken, shape (k,); None where the zeros' creep stands still meanwhile,
+            as `seen` has it.
     """
     looks, place, count = np.unique(chosen, return_inverse=True, return_counts=True)
     # q = sum of k_dir dn = k n + (contrast / 2) x path: the contrast's column is the offset's, times the path.
-    far = path * (np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 360)
-    once, twice = np.zeros((len(looks), 2)), np.zeros((len(looks), 2, 2))
+    far, moved, of_axis = path * (np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 360), CONTRAST_COLUMNS, [0, 1]
+    if warm_minutes is not None:
+        # Likewise the creep's: the offset's times how much of it is over.
+        crept = -np.expm1(-warm_minutes / np.asarray(space.value)[INDEX["creep_minutes"]])
+        creep = crept[:, None] * (np.asarray(space.u)[CREEP_COLUMNS] * np.pi / 180)
+        far, moved, of_axis = np.hstack([far, creep]), [*CONTRAST_COLUMNS, *CREEP_COLUMNS], [0, 1, 0, 1]
+    once, twice = np.zeros((len(looks), len(moved))), np.zeros((len(looks), len(moved), len(moved)))
     np.add.at(once, place, far)
     np.add.at(twice, place, far[:, :, None] * far[:, None, :])
     rows = seen.rows[..., looks, :, :]
-    rows[..., CONTRAST_COLUMNS] = 0.0
+    rows[..., moved] = 0.0
     *lead, m, components, columns = rows.shape
     flat, offset = rows.reshape(*lead, m * components, columns), rows[..., -2:]
+    turned_by = offset[..., of_axis]
     turned = np.swapaxes(flat, -1, -2)
     information = turned @ (flat * np.repeat(count, components)[:, None])
-    across = turned @ (offset * once[:, None, :]).reshape(*lead, m * components, 2)
-    information[..., CONTRAST_COLUMNS] = across
-    information[..., CONTRAST_COLUMNS, :] = np.swapaxes(across, -1, -2)
-    information[..., np.array(CONTRAST_COLUMNS)[:, None], CONTRAST_COLUMNS] = np.einsum(
-        "...mia,...mib,mab->...ab", offset, offset, twice
+    across = turned @ (turned_by * once[:, None, :]).reshape(*lead, m * components, len(moved))
+    information[..., moved] = across
+    information[..., moved, :] = np.swapaxes(across, -1, -2)
+    information[..., np.array(moved)[:, None], moved] = np.einsum(
+        "...mia,...mib,mab->...ab", turned_by, turned_by, twice
     )
     if not homed:
         return information[..., :-2, :-2]

@@ -15,6 +15,7 @@ from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import ordered_spots
+from tvsbayes.instrument.conditions import powered_on_s, warm_minutes
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.expectation import knowledge_of
@@ -134,7 +135,9 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
     """
     if not fit.converged:
         raise NotConverged.of(fit.problems, "see `tvsbayes fit`")
-    asked = question(knowledge_of(fit, rig), target, fit.reference_pose_rad, False)
+    on_s = powered_on_s(fit.campaign.header)
+    warm = replace(knowledge_of(fit, rig), warm_minutes=float(warm_minutes(fit.campaign.moves, on_s)[-1]))
+    asked = question(warm, target, fit.reference_pose_rad, False)
     # The segment goes on: no home offset is drawn anew.
     asked = replace(asked, knowledge=replace(asked.knowledge, after_data=False))
     last, sheet = fit.campaign.moves[-1], ordered_spots(fit.campaign)[-1].target

@@ -401,8 +401,9 @@ def _planned(
     exact = judge(steps, knowledge, aperture=scope.aperture)
     chosen = judged("planned", exact.information, knowledge, target, pose_rad)
     share = float(np.mean(refined.reported <= target.limit))
-    path = family.arranged(family.largest).path
-    most = information_of_looks(asked.seen, family.picks, path, knowledge.space, knowledge.after_data)
+    largest = family.arranged(family.largest)
+    way = largest.path, knowledge.space, knowledge.after_data, largest.warm_minutes(knowledge.rig)
+    most = information_of_looks(asked.seen, family.picks, *way)
     limit = limit_of(knowledge, most, asked.at_centre, target)
     pixels = _pixel_part(exact.information.expectation)
     batches = next_experiments(knowledge, asked.found, asked.seen, target, asked.at_centre, asked.now)

@@ -257,7 +257,8 @@ def _reached(family: Family, seen: Seen, target: Target, at_centre: Sensitivity,
         if scope.minutes is not None and duration > scope.minutes:
             break
         chosen = family.picks[: LOOKS_PER_EXPERIMENT * n]
-        information = information_of_looks(seen, chosen, design.path, knowledge.space, knowledge.after_data)
+        way = design.path, knowledge.space, knowledge.after_data, design.warm_minutes(knowledge.rig)
+        information = information_of_looks(seen, chosen, *way)
         value = at_centre.value(covariance_of(knowledge.precision + information), target.factor)
         best = min(best, _Reached(duration if value <= target.limit else math.inf, value))
     return best

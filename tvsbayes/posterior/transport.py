@@ -22,7 +22,7 @@ from scipy.linalg import lapack
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import residuals
 from tvsbayes.estimators.linear_spots import linear_spots
-from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
+from tvsbayes.instrument.parameters import BLOCKS, CREEP_NAMES, INDEX, KINDS, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import place_root
@@ -62,10 +62,13 @@ CENTRINGS = 2
 """Gauss-Newton steps of the narrow coordinates at every draw."""
 BEND_STEP = 0.5
 """Step of second differences in posterior sds: they should hold over +-2 sd, not only at the mode."""
-HEAVY_NAMES = (*NOISE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y", "mirror_offset_mm")
+HEAVY_NAMES = (
+    *(*NOISE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y", "mirror_offset_mm"),
+    *CREEP_NAMES,
+)
 """Coordinates whose tails are heavier than normal: those that few stops tell (a walker stood still for 155 steps at 3.7
-sd of a stop sd), and the tilt of the frames with the mirrors' offset. Each of them is always proposed from a t of its
-own."""
+sd of a stop sd), the tilt of the frames with the mirrors' offset, and a creep: wide where its time constant is long.
+Each of them is always proposed from a t of its own."""
 
 
 @dataclass(frozen=True)

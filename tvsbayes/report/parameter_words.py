@@ -42,6 +42,9 @@ IN_WORDS = {
     "drift_deg_per_root_hour": "the drift in a root hour, sd",
     "look_scatter_deg": "the scatter of looks, sd",
     "harmonic_amplitude_deg": "the amplitude of a periodic error",
+    "creep_deg": "the creep of the zero while the machine warms up, in all",
+    "creep_minutes": "the time constant of the creep",
+    "thermal_deg_per_K": "the shift of the zero per kelvin",
 }
 """By block of parameters; those of the positioner's pose also as one."""
 _RESULTS = {

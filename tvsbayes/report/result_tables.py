@@ -98,6 +98,8 @@ GEAR_SCALES = (
     ("transmission_error_length_deg", "over an angle of", "deg"),
     ("play_variation_deg", "play variation sd", "deg"),
     ("drift_deg_per_root_hour", "drift in a root hour", "deg"),
+    ("creep_deg", "creep of the zero", "deg"),
+    ("thermal_deg_per_K", "zero per kelvin", "deg/K"),
     *((f"harmonic_amplitude_deg.{{axis}}.{n}", f"period {n}, amplitude sd", "deg") for n in range(1, PERIODS_MAX + 1)),
 )
 """Scales of what gears repeat and how zeros drift: block, or name with its axis, label and unit."""

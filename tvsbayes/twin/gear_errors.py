@@ -140,6 +140,23 @@ def draw_gear_errors(
     return errors
 
 
+def zero_shift_deg(
+    parameters: Mapping[str, float], axis: str, warm_minutes: np.ndarray, kelvin: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """How far the zero of an axis has crept while the machine warmed up, and shifted with its temperature.
+
+    Args:
+        parameters: of the true rig; one that names none stays where it is.
+        axis: "pan" or "tilt".
+        warm_minutes: since switching on, any shape.
+        kelvin: temperature less that at which the zero holds.
+    """
+    still = np.exp(np.asarray(warm_minutes, float) / -parameters.get("creep_minutes", 1.0))
+    crept = parameters.get(f"creep_deg.{axis}", 0.0) * (1.0 - still)
+    shift: np.ndarray = crept + parameters.get(f"thermal_deg_per_K.{axis}", 0.0) * kelvin
+    return shift
+
+
 def drift_deg(
     time_s: np.ndarray, first: np.ndarray, scale_deg_per_root_hour: float, draws: np.ndarray, warming_deg: ErrorFunction
 ) -> np.ndarray:

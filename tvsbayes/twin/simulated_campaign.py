@@ -8,7 +8,7 @@ sides, scatter of looks) have their own random streams: changing one leaves the 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from tvsbayes.display import Shown, View
 from tvsbayes.files.disk import make_folder, write_atomically
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Move, Spot, campaign_bytes, with_pixels
+from tvsbayes.instrument.conditions import powered_on_s
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
 from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, require_periods
@@ -25,6 +26,7 @@ from tvsbayes.twin.gear_errors import (
     PERFECT,
     draw_gear_errors,
     drift_deg,
+    zero_shift_deg,
 )
 from tvsbayes.twin.physics import (
     Light,
@@ -109,6 +111,7 @@ def simulate(
     home_approach: tuple[PanApproach, TiltApproach] | None = HOME_APPROACH,
     sides_recorded: bool = True,
     header: Mapping[str, object] | None = None,
+    temperature_degC: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> SimulatedCampaign:
     """Run a plan on a true rig and return the campaign a stranger would see, with its truth.
 
@@ -123,7 +126,8 @@ def simulate(
         home_approach: side from which each homing ends, (pan, tilt); "unknown" is anywhere in the play, anew each
             time; None draws one of the three per axis, by `HOME_SIDE_CHANCES`.
         sides_recorded: whether the campaign says so; False writes "unknown" whatever the side is.
-        header: further keys of campaign.toml.
+        header: further keys of campaign.toml; the zeros creep from `powered_on` on, by default from the first move.
+        temperature_degC: of the machine at times (n,) in s, recorded with every move; None where nobody reads it.
 
     Raises:
         InputError: the plan looks before a sheet is placed, or names a sheet the rig does not have; the true
@@ -141,7 +145,12 @@ def simulate(
     log = run_plan(plan, rig, home_approach)
     fixed = {name: Prior(value, 0.0) for name, value in truth.parameters.items() if name in PERIODIC_NAMES}
     require_periods(fixed, rig.table.harmonic_period_deg)
-    driven = _drive(log.moves, truth, rig.table.first_period_deg, streams)
+    full_header = {"name": "simulated campaign", "synthetic": True, "seed": int(seed), **(header or {})}
+    if temperature_degC is not None:
+        time_s = np.array([move.time_s for move in log.moves])
+        measured = np.asarray(temperature_degC(time_s), float).tolist()
+        log.moves = [replace(move, temperature_degC=one) for move, one in zip(log.moves, measured, strict=True)]
+    driven = _drive(log.moves, truth, rig.table.first_period_deg, streams, powered_on_s(full_header))
     truth = replace(driven.truth, homing_side=home_approach)
     light = _light(log, rig, truth, streams)
     pixels = project(light.points_mm, truth.stereo, truth.parameters["focal_scale"])
@@ -156,7 +165,6 @@ def simulate(
     if seen:
         pan, tilt = driven.resting_deg[seen].mean(axis=0)
         truth = replace(truth, reference_pose_deg=(float(pan), float(tilt)))
-    full_header = {"name": "simulated campaign", "synthetic": True, "seed": int(seed), **(header or {})}
     moves = log.moves if sides_recorded else [_unrecorded(move) for move in log.moves]
     campaign = Campaign(tuple(moves), spots, rig.stereo, rig.table, full_header)
     return SimulatedCampaign(campaign, truth, light)
@@ -183,8 +191,14 @@ class _Driven:
     resting_deg: np.ndarray
 
 
-def _drive(moves: Sequence[Move], truth: Truth, first_period_deg: Mapping[str, float], streams: _Streams) -> _Driven:
-    """Realise the mirror angles of all moves."""
+def _drive(
+    moves: Sequence[Move],
+    truth: Truth,
+    first_period_deg: Mapping[str, float],
+    streams: _Streams,
+    on_s: float | None,
+) -> _Driven:
+    """Realise the mirror angles of all moves of a machine switched on at `on_s`, by default at the first."""
     p = truth.parameters
     counters = np.array([(m.pan_steps, m.tilt_steps) for m in moves], float).reshape(-1, 2)
     segments = np.array([m.segment for m in moves], int)
@@ -194,6 +208,9 @@ def _drive(moves: Sequence[Move], truth: Truth, first_period_deg: Mapping[str, f
     stop_draws = streams.stops.standard_normal((len(moves), 2))
     start_draws = streams.stops.uniform(-0.5, 0.5, (len(moves), 2))
     drift_draws, time_s = streams.drift.standard_normal((len(moves), 2)), np.array([m.time_s for m in moves])
+    warm_minutes = (time_s - (time_s[0] if on_s is None else on_s)) / 60.0
+    degC = np.array([0.0 if m.temperature_degC is None else m.temperature_degC for m in moves])
+    kelvin = degC - degC[0]
     resting, errors, drift = np.empty_like(counters), np.empty_like(counters), np.empty_like(counters)
     for i, (axis, (negative, positive)) in enumerate(SIDES.items()):
         approach = [getattr(m, f"{axis}_approach") for m in moves]
@@ -215,6 +232,7 @@ def _drive(moves: Sequence[Move], truth: Truth, first_period_deg: Mapping[str, f
         scale = p.get(f"drift_deg_per_root_hour.{axis}", 0.0)
         drift[:, i] = drift_deg(time_s, first, scale, drift_draws[:, i], repeated.warming_deg)
         resting[:, i] += repeated.error_deg(place_deg) + drift[:, i]
+        resting[:, i] += zero_shift_deg(p, axis, warm_minutes, kelvin)
         sds = {"+": p[f"stop_sd_deg.{positive}"], "-": p[f"stop_sd_deg.{negative}"]}
         errors[:, i] = stop_errors(counters[:, i], first, approach, stop_draws[:, i], sds)
     resting[:, 1] += p["tilt_zero_deg"]

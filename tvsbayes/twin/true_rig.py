@@ -20,7 +20,7 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
-    LOOK_SCATTER_NAMES,
+    LATE_NAMES,
     REGISTRY,
     RIG_NAMES,
     RIG_PRIORS,
@@ -142,8 +142,8 @@ class Truth:
     def from_json(cls, document: TruthDocument, stated: Stereo) -> Truth:
         """Rebuild from truth.json; image size and covariance come from the campaign's `stated` stereo."""
         pose, known = document["reference_pose_deg"], document["stereo"]
-        # Files from before the gears repeated errors and looks scattered are of perfect ones.
-        perfect = {name: RIG_PRIORS[name].value for name in (*GEAR_ERROR_NAMES, *LOOK_SCATTER_NAMES)}
+        # Files from before the gears repeated errors, looks scattered and zeros shifted are of perfect ones.
+        perfect = {name: RIG_PRIORS[name].value for name in (*GEAR_ERROR_NAMES, *LATE_NAMES)}
         parameters = {name: float(value) for name, value in document["parameters"].items()}
         parameters |= {name: value for name, value in perfect.items() if name not in parameters}
         side, tables = document.get("homing_side"), document.get("gear_error")
@@ -213,7 +213,7 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
     def drawn(names: Iterable[str], stream: np.random.Generator) -> dict[str, float]:
         return {name: _draw(rig.truth.get(name, rig.table.priors[name]), stream) for name in names}
 
-    late = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LOOK_SCATTER_NAMES)
+    late = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
     parameters = drawn((n for n in RIG_NAMES if n not in late), rng)
     # Through the eigenvectors: fixed parameters give a semi-definite covariance that Cholesky refuses.
     variances, vectors = np.linalg.eigh(np.asarray(rig.stereo.parameter_covariance, float))
@@ -223,7 +223,7 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
     stereo = rig.stereo.with_vector(rig.stereo.vector + offset)
     errors = draw_gear_errors(parameters, rig.table.harmonic_period_deg, gears)
     # Behind the gears' errors, which are the same whatever is drawn here.
-    parameters |= drawn(LOOK_SCATTER_NAMES, gears)
+    parameters |= drawn(LATE_NAMES, gears)
     return Truth(with_derived(parameters), stereo, gear_errors=errors)
 
 

@@ -1,0 +1,44 @@
+"""A shift of a zero that cannot be told from what the gears do is a weak direction in words."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tvsbayes.assessment.weaknesses import _shift_directions
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import INDEX, NAMES
+
+DRAWS = 4000
+
+
+def fit_with(correlation: float, shift: str, *, free: bool = True) -> SimpleNamespace:
+    """A fit whose contrast of pan goes with a shift of the zero; everything else is independent."""
+    rng = np.random.default_rng(3)
+    physical = rng.standard_normal((DRAWS, len(NAMES)))
+    ratios = 0.06 + 1e-5 * rng.standard_normal((DRAWS, len(DIRECTIONS)))
+    own = physical[:, INDEX[shift]]
+    apart = correlation * own + np.sqrt(1 - correlation**2) * rng.standard_normal(DRAWS)
+    left, right = DIRECTIONS.index("left"), DIRECTIONS.index("right")
+    mean = 0.5 * (ratios[:, left] + ratios[:, right])
+    ratios[:, left], ratios[:, right] = mean + 1e-4 * apart, mean - 1e-4 * apart
+    draws = SimpleNamespace(physical=physical, effective_deg_per_step=ratios)
+    return SimpleNamespace(draws=draws, free=np.full(len(NAMES), free))
+
+
+@pytest.mark.parametrize(
+    ("shift", "cure"), [("creep_deg.pan", "alternate the directions"), ("thermal_deg_per_K.pan", "another temperature")]
+)
+def test_a_contrast_that_goes_with_a_shift_is_named_with_its_cure(shift, cure):
+    (found,) = _shift_directions(fit_with(0.8, shift), "pan")
+    assert found.text.startswith("the contrast of left and right and a ") and cure in found.text
+    assert set(found.loadings) == {"ratio_contrast_deg_per_step.pan", shift}
+    assert found.loadings[shift] == pytest.approx(0.8, abs=4 / np.sqrt(DRAWS))
+
+
+def test_what_is_told_apart_or_not_estimated_is_not_named():
+    assert _shift_directions(fit_with(0.3, "creep_deg.pan"), "pan") == []
+    assert _shift_directions(fit_with(0.8, "creep_deg.pan"), "tilt") == []
+    assert _shift_directions(fit_with(0.8, "creep_deg.pan", free=False), "pan") == []

@@ -1,0 +1,85 @@
+"""How long the machine was on and how warm, at every move; what the moves then tell of shifts of the zeros."""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tvsbayes.errors import InputError
+from tvsbayes.files.documents import parse_toml
+from tvsbayes.instrument.campaign import MOVES, Move, parse_moves
+from tvsbayes.instrument.campaign_header import parse_header
+from tvsbayes.instrument.conditions import interpolated, kelvin, powered_on_s, unseen_shifts, warm_minutes
+from tvsbayes.instrument.parameters import CREEP_NAMES, RIG_PRIORS, ZERO_SHIFT_NAMES, Prior, names_of
+
+HEAD = 'format = "tvsbayes-campaign/1"\n'
+CREATED = "created = 2026-01-15T10:00:00Z\n"
+
+
+def moves_at(times_s: list[float], degC: list[float | None] | None = None) -> list[Move]:
+    """Moves of nothing at these times."""
+    rows = [Move(move=k, segment=0, time_s=t, pan_steps=0, tilt_steps=0) for k, t in enumerate(times_s)]
+    return rows if degC is None else [replace(m, temperature_degC=t) for m, t in zip(rows, degC, strict=True)]
+
+
+def header(text: str) -> dict[str, object]:
+    return parse_header(parse_toml((HEAD + text).encode(), "campaign.toml"))
+
+
+def test_minutes_since_the_first_move_or_since_switching_on():
+    moves = moves_at([120.0, 180.0, 3720.0])
+    np.testing.assert_array_equal(warm_minutes(moves), [0.0, 1.0, 60.0])
+    found = header(CREATED + "powered_on = 2026-01-15T09:30:00Z\n")
+    assert found["powered_on"] == datetime.datetime(2026, 1, 15, 9, 30, tzinfo=datetime.UTC)
+    np.testing.assert_array_equal(warm_minutes(moves, powered_on_s(found)), [32.0, 33.0, 92.0])
+    assert powered_on_s(header(CREATED)) is None
+
+
+@pytest.mark.parametrize("times_s", [[5.0, 5.0, 5.0], [0.0, 1.0, 2.0]])
+def test_moves_without_times_do_not_warm_up(times_s):
+    """All alike, or counted as an import does; then nothing tells of a creep."""
+    moves = moves_at(times_s)
+    assert not warm_minutes(moves).any()
+    assert set(unseen_shifts(moves, RIG_PRIORS)) == set(ZERO_SHIFT_NAMES)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "powered_on = 2026-01-15T09:30:00Z\n",
+        CREATED + "powered_on = 2026-01-15T10:30:00Z\n",
+        CREATED + "powered_on = 2026-01-15T09:30:00\n",
+        CREATED + "powered_on = 2026-01-15\n",
+    ],
+    ids=["no clock", "later", "no zone", "a day"],
+)
+def test_a_time_of_switching_on_that_fits_no_clock_is_refused(text):
+    with pytest.raises(InputError, match=r"powered_on.*`created`"):
+        header(text)
+
+
+def test_temperatures_are_interpolated_in_time_and_counted():
+    moves = moves_at([0.0, 10.0, 40.0, 50.0], [None, 20.0, None, 24.0])
+    np.testing.assert_allclose(kelvin(moves), [0.0, 0.0, 3.0, 4.0], rtol=1e-12)
+    assert interpolated(moves) == 2 and interpolated(moves_at([0.0, 1.0])) == 0
+    np.testing.assert_allclose(kelvin(moves_at([0.0, 0.0, 0.0], [20.0, None, 22.0])), [0.0, 1.0, 2.0], rtol=1e-12)
+    assert not kelvin(moves_at([0.0, 9.0], [20.0, None])).any()
+
+
+def test_the_column_is_read_and_written_where_there_is_one():
+    moves = moves_at([0.0, 7.0], [21.5, None])
+    moves[0] = replace(moves[0], pan_approach="left", tilt_approach="up")
+    assert list(parse_moves(MOVES.content(moves))) == moves
+    assert b"temperature" not in MOVES.content([replace(m, temperature_degC=None) for m in moves])
+
+
+def test_what_the_moves_tell_of():
+    warm, both = moves_at([0.0, 7.0]), moves_at([0.0, 7.0], [20.0, 21.0])
+    assert unseen_shifts(warm, RIG_PRIORS) == names_of("thermal_deg_per_K")
+    assert unseen_shifts(both, RIG_PRIORS) == ()
+    still = {**RIG_PRIORS, **dict.fromkeys(names_of("creep_deg"), Prior(0.0, 0.0))}
+    assert unseen_shifts(both, still) == ("creep_minutes",)
+    assert CREEP_NAMES == (*names_of("creep_deg"), "creep_minutes")
