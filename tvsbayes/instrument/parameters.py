@@ -137,7 +137,7 @@ _PARAMETERS = (
     *_block("drift_deg_per_root_hour", AXES, "deg", Prior(0.0, 0.02, "half-normal"), _SCALE, noise=True),
     *_block("harmonic_amplitude_deg", _AMPLITUDES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE, noise=True),
     *_block("look_scatter_deg", AXES, "deg", Prior(0.0, 0.01, "half-normal"), _SCALE, noise=True),
-    *_block("creep_deg", AXES, "deg", Prior(0.0, 0.05), (-10.0, 10.0, 10.0)),
+    *_block("creep_deg", AXES, "deg", Prior(0.0, 0.0), (-10.0, 10.0, 10.0)),
     *_block("creep_minutes", (), "min", Prior(20.0, 0.8, "log-normal"), (1e-3, 1e5, 5.0)),
     *_block("thermal_deg_per_K", AXES, "deg/K", Prior(0.0, 0.01), (-10.0, 10.0, 10.0)),
     *_cameras(),
