@@ -186,7 +186,7 @@ def test_frame_s_looks_along_x(mounted_rig):
 
 def test_every_name_has_its_unit():
     """A float that crosses a border says its unit; ratios and scales have none."""
-    units = ("_deg", "_mm", "_rad", "deg_per_step", "degrees_per_step")
+    units = ("_deg", "_mm", "_rad", "_minutes", "deg_per_step", "degrees_per_step")
     without = [n for n in NAMES if not any(u in n for u in units)]
     assert [n for n in without if not n.startswith("stereo.")] == ["pixel_scale", "focal_scale"]
 
