@@ -27,7 +27,7 @@ from experiments.common.rows import ROOT
 FOREIGN, DATA = ROOT / "tests" / "data" / "foreign", ROOT / "data"
 TWIN = DATA / "twins" / "grid_twin"
 SEED = 3
-WORM_S, WORM_ARCSEC = 480.0, 8.0
+WORM_S, WORM_ARCSEC = 240.0, 8.0
 """Period and amplitude of the drawn mount."""
 STEP_DEG, PLAY_DEG, SCATTER_DEG = 360 / 3200, 0.3, 0.01
 """Of the drawn stages."""
@@ -283,6 +283,7 @@ KINDS = (
         (
             Command("import PHD2_GuideLog.txt --axis --to mount"),
             Command("import PHD2_GuideLog.txt --axis --to mount --run 2 --yes"),
+            longer("fit mount --quick", 0),
         ),
         {"PHD2_GuideLog.txt": guide_log},
         7,
