@@ -8,17 +8,15 @@ driven with the table into `fresh.csv`, and once with its sign turned into `turn
 
 from __future__ import annotations
 
-import io
 import os
 import tempfile
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
 
 from experiments.common.command_line import print_only
+from experiments.common.console import console, quietly
 from experiments.compensation.drawn_axes import fresh_moves, read, stands, up_and_down
-from tvsbayes.cli.main import run
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.verification import stored_compensation
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, read_axis
@@ -61,17 +59,6 @@ class Stage:
         return log_bytes(read(asked, stands(self.truth, tuple(sent), self.rng), which, self.rng, u=U))
 
 
-def console(*line: str) -> None:
-    """A command and what it prints, on the page."""
-    out = io.StringIO()
-    with redirect_stdout(out), redirect_stderr(io.StringIO()):
-        run(list(line))
-    printed = [text.rstrip() for text in out.getvalue().splitlines()]
-    print("```console\n$ tvsbayes", " ".join(line))
-    print("\n".join(printed))
-    print("```\n")
-
-
 def main() -> None:
     """Print the page."""
     print_only(__doc__)
@@ -81,25 +68,24 @@ def main() -> None:
         Path("log.csv").write_bytes(stage.log(*up_and_down(TRAVEL, 9, 3)))
         print(BEGIN)
         print("```text\n" + "\n".join(Path("log.csv").read_text().splitlines()[:6]) + "\n...\n```\n")
-        console("import", "log.csv", "--axis", "--to", "stage", "--yes")
-        console("fit", "stage", "--quick")
+        print(console("import", "log.csv", "--axis", "--to", "stage", "--yes"))
+        print(console("fit", "stage", "--quick"))
         print(TABLE)
-        console("compensate", "stage", "--to", "linuxcnc", "-o", "stage.comp")
+        print(console("compensate", "stage", "--to", "linuxcnc", "-o", "stage.comp"))
         print(FILE)
         print("```text\n" + Path("stage.comp").read_text() + "```\n")
         print(FRESH)
-        console("plan", "stage", "--verify", "-o", "plan.csv")
+        print(console("plan", "stage", "--verify", "-o", "plan.csv"))
         by = Correction.of(stored_compensation(read_axis(Path("stage"))))
         asked, which = fresh_moves(12, TRAVEL, stage.rng)
         Path("fresh.csv").write_bytes(stage.log(asked, which, by))
         Path("turned.csv").write_bytes(stage.log(asked, which, by, -1.0))
         print(VERIFY)
-        console("import", "fresh.csv", "--axis", "--to", "fresh", "--yes")
-        console("verify", "stage", "fresh")
+        print(console("import", "fresh.csv", "--axis", "--to", "fresh", "--yes"))
+        print(console("verify", "stage", "fresh"))
         print(TURNED)
-        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-            run(["import", "turned.csv", "--axis", "--to", "turned", "--yes"])
-        console("verify", "stage", "turned")
+        quietly("import", "turned.csv", "--axis", "--to", "turned", "--yes")
+        print(console("verify", "stage", "turned"))
         print(END)
 
 
