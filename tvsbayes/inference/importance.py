@@ -42,6 +42,8 @@ from tvsbayes.statistics.weighted_draws import (
 ROUND = 1024
 PILOT_ROUNDS = 2
 """Rounds after each of which the proposal is fitted to all draws so far."""
+PILOT_EFFECTIVE = 200.0
+"""Draws that weighted pilot draws must be worth where their number is not fixed."""
 ROUNDS_MAX = 64
 """All rounds of all proposals: the budget."""
 ROUNDS_LEAST = 4
@@ -116,12 +118,24 @@ class Pool:
         return found
 
 
-def piloted(density: Density, generator: np.random.RandomState) -> Pool:
-    """Without draws, from the proposal that the pilot rounds arrive at."""
+def piloted(density: Density, generator: np.random.RandomState, rounds_max: int | None = None) -> Pool:
+    """Without draws, from the proposal that the pilot rounds arrive at.
+
+    Every round is fitted to all before it. They are `PILOT_ROUNDS`, or go on up to `rounds_max` until their weights are
+    worth `PILOT_EFFECTIVE` draws: a density of its own kind, which the first proposal does not know, is learnt in many.
+    """
     pilot = Pool.empty(density.first_proposal())
-    for _ in range(PILOT_ROUNDS):
+    for number in range(1, max(PILOT_ROUNDS, rounds_max or 0) + 1):
         pilot = pilot.extended(density, generator, fitted=True)
+        if number >= PILOT_ROUNDS and (number >= (rounds_max or 0) or _learnt(pilot)):
+            break
     return Pool.empty(pilot.next_proposal, pilot.invalid)
+
+
+def _learnt(pilot: Pool) -> bool:
+    log_weights = pilot.log_weights
+    smooth = smoothed_weights(log_weights[np.isfinite(log_weights)])
+    return smooth.pareto_k < K_MAX and effective_draws(smooth.weights) >= PILOT_EFFECTIVE
 
 
 @dataclass(frozen=True)
@@ -327,6 +341,7 @@ def weighted_run[D: Density](
     advance: Advance = unshown,
     rounds_max: int | None = None,
     rounds_least: int | None = None,
+    pilots_max: int | None = None,
 ) -> ImportanceRun[D]:
     """Draw rounds until the answer is accepted; where that would take too long, from a proposal fitted anew.
 
@@ -336,6 +351,7 @@ def weighted_run[D: Density](
         advance: told how far it is.
         rounds_max: of all proposals together, by default `ROUNDS_MAX`.
         rounds_least: of the proposal that gives the answer, by default `ROUNDS_LEAST`.
+        pilots_max: rounds from which the first proposal is learnt, as in `piloted`.
 
     Raises:
         NotConverged: the density is not finite around the mode.
@@ -344,7 +360,7 @@ def weighted_run[D: Density](
     generator = np.random.RandomState(seed)
     drawn = OpenEnded()
     try:
-        pool = piloted(density, generator)
+        pool = piloted(density, generator, pilots_max)
         wanted = ROUNDS_LEAST if rounds_least is None else rounds_least
         total, rounds, patience = PILOT_ROUNDS, 0, PATIENCE * wanted
         while True:

@@ -26,8 +26,11 @@ from tvsbayes.single_axis.period_search import waves_of
 MODE, WEIGHING, WALKING, TELLING = "mode", "weighted draws", "chain", "summarising"
 EQUAL_DRAWS = 2000
 """Kept of a sample, of equal weight."""
-ROUNDS_MAX = 16
+ROUNDS_MAX = 32
 """Of weighted draws: ends of an interval that is thin there take more draws than are worth the time of a chain."""
+PILOTS_MAX = 16
+"""Rounds from which its proposal is learnt: waves, creep and drifts bend what the Laplace approximation takes as
+straight."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -181,7 +184,8 @@ def fit_axis(
         mode, sample = find_mode(model), None
         if sampled and len(mode.w) and np.isfinite(mode.log_density):
             job.begin(WEIGHING)
-            run, began = weighted_run(AxisDensity(model, mode), seed, job.at, ROUNDS_MAX), time.monotonic()
+            run = weighted_run(AxisDensity(model, mode), seed, job.at, ROUNDS_MAX, pilots_max=PILOTS_MAX)
+            began = time.monotonic()
             sample = run.sample
             if tier == "emcee":
                 from tvsbayes.inference.ensemble import Run, better
