@@ -185,3 +185,11 @@ def test_periods_that_lie_apart_are_named():
     found = separate_periods(period)
     assert [(group.mean, group.share) for group in found] == [(pytest.approx(3.7), 0.7), (pytest.approx(12.4), 0.3)]
     assert found[1].between == (12.4, 12.4)
+
+
+def test_a_period_at_the_end_of_its_range_is_doubted():
+    """A wave of 240 s asked for below 228 s is given there, and said to lie at the end; one inside is not."""
+    for high, doubted in ((0.95 * PERIOD, True), (700.0, False)):
+        asked = AskedPeriods(between=((60.0, high),), in_seconds=True)
+        found = summarise_axis(fit_axis(drive(4, 5.0, asked), tier="importance"))
+        assert any("lies at the end of the range" in text for text in found.warnings) == doubted, (high, found.periods)

@@ -191,6 +191,23 @@ def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
     return found + _one_wave_twice(fit)
 
 
+def waves_at_an_end(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
+    """Warnings of periods that lie where the range ends that was asked for: the true one may lie beyond it."""
+    found = []
+    for sample in samples:
+        wave = sample.wave
+        if wave.known is not None or not sample.probability > 0.5:
+            continue
+        low, high = np.percentile(sample.period, TAILS_PERCENT)
+        if low < wave.low * (1 + ALIKE) or high > wave.high * (1 - ALIKE):
+            of = "s" if wave.clock == "seconds" else unit
+            found.append(
+                f"the period {np.mean(sample.period):.4g} {of} lies at the end of the range that was asked for "
+                f"({wave.low:.4g} to {wave.high:.4g} {of}): the true one may lie beyond; widen period_between"
+            )
+    return found
+
+
 def _one_wave_twice(fit: AxisFit) -> list[str]:
     """Gear and encoder with one period, which their readings hardly part."""
     found = []

@@ -37,7 +37,7 @@ from tvsbayes.single_axis.axis_density import blocks_of, line_weights
 from tvsbayes.single_axis.axis_doubts import data_doubts
 from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, kind_of, prior_sd
-from tvsbayes.single_axis.axis_periods import PeriodEstimate, period_estimate, wave_samples, weak_waves
+from tvsbayes.single_axis.axis_periods import PeriodEstimate, period_estimate, wave_samples, waves_at_an_end, weak_waves
 from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
 from tvsbayes.statistics.intervals import NORMAL_95
@@ -217,7 +217,11 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         readings=int(fit.rows.count.sum()),
         positions=len(fit.rows.positions),
         weak_directions=tuple([*_weak(fit), *weak_waves(fit, samples)]),
-        warnings=tuple([*axis_warnings(fit.campaign, fit.rows), *_reversed(fit)]),
+        warnings=(
+            *axis_warnings(fit.campaign, fit.rows),
+            *_reversed(fit),
+            *waves_at_an_end(samples, fit.campaign.unit),
+        ),
         sampling=_sampling(fit),
         prior_conflicts=tuple(conflict_text(conflict) for conflict in fit.conflicts),
         periods=tuple(period_estimate(each) for each in samples if each.wave.clock != "encoder"),
