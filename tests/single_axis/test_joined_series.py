@@ -129,3 +129,12 @@ def test_what_angle_calibrate_saves():
 def test_broken_logs_of_klipper_are_refused(data, found):
     with pytest.raises(InputError, match=found):
         klipper_table(data, "log")
+
+
+def test_a_command_logged_once_a_move_stands_until_the_next():
+    """Every 10 s a setpoint, the axis read 5 s later: nothing moved meanwhile."""
+    times = np.arange(0.0, 50.0, 10.0)
+    commands = Series(times, np.array([0.0, 10.0, 20.0, 10.0, 0.0]))
+    found, interpolated = command_at(commands, times + 5.0)
+    np.testing.assert_array_equal(found, commands.values)
+    assert interpolated == 0

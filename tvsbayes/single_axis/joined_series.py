@@ -163,6 +163,10 @@ def _joined(series: Mapping[str, Series], command: str, value: str, file: str, k
     return table_of(file, "; ".join(words), columns, range(1, len(times) + 1))
 
 
+POLLED_S = 2.0
+"""Longest time between two values of an axis in motion: a command that is logged once a move stands until the next one."""
+
+
 def command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]:
     """Commands at times between the first and the last of a series, and how many had to be interpolated.
 
@@ -175,7 +179,7 @@ def command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]:
     gap = commands.times_s[after] - commands.times_s[at]
     typical = float(np.median(np.diff(commands.times_s))) if len(commands.times_s) > 1 else 0.0
     share = np.where(gap > 0, (times_s - commands.times_s[at]) / np.where(gap > 0, gap, 1.0), 0.0)
-    moving = (gap <= STANDS * typical) & (share * gap > SAME_S)
+    moving = (gap <= min(STANDS * typical, POLLED_S)) & (share * gap > SAME_S)
     rise = commands.values[after] - commands.values[at]
     return commands.values[at] + np.where(moving, share * rise, 0.0), int(moving.sum())
 
