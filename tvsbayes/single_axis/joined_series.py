@@ -164,7 +164,7 @@ def _joined(series: Mapping[str, Series], command: str, value: str, file: str, k
 
 
 POLLED_S = 2.0
-"""Longest time between two values of an axis in motion: a command that is logged once a move stands until the next one."""
+"""Longest time between two values of an axis in motion: a command that is logged once a move stands until the next."""
 
 
 def command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]:
