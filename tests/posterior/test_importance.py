@@ -209,7 +209,7 @@ def too_narrow(sampled, monkeypatch):
         monkeypatch.setattr(f"tvsbayes.inference.proposal.{name}", 1e-12)
     arrived = importance.piloted
 
-    def piloted(target, generator):
+    def piloted(target, generator, rounds_max=None):
         return Pool.empty(narrowed(arrived(target, generator).next_proposal, 0.5))
 
     monkeypatch.setattr(importance, "piloted", piloted)
