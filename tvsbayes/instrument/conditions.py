@@ -66,18 +66,30 @@ def warm_minutes(moves: Sequence[TimedMove], switched_on_s: float | None = None)
 
 
 def kelvin(moves: Sequence[TimedMove]) -> np.ndarray:
-    """Temperatures less that of the first move, shape (moves,); linear in time between those recorded.
-
-    Before the first and after the last recorded one they stay. Zero where fewer than two were recorded.
-    """
-    warm = [(row, move.temperature_degC) for row, move in enumerate(moves) if move.temperature_degC is not None]
-    if len(warm) < 2:
-        return np.zeros(len(moves))
+    """Temperatures less that of the first move, shape (moves,); as `kelvin_at`, zero where it knows none."""
     times_s = np.array([move.time_s for move in moves], dtype=float)
     clock = times_s if np.ptp(times_s) > 0 else np.arange(len(moves), dtype=float)
-    known, degC = zip(*warm, strict=True)
-    found: np.ndarray = np.interp(clock, clock[list(known)], degC)
-    return found - found[0]
+    found = kelvin_at(moves, clock, clock)
+    return np.zeros(len(moves)) if found is None else found
+
+
+def kelvin_at(moves: Sequence[TimedMove], times: np.ndarray, clock: np.ndarray) -> np.ndarray | None:
+    """Temperatures at times (n,) less that of the first move, linear in time between those recorded.
+
+    Before the first and after the last recorded one they stay; None where fewer than two were recorded.
+
+    Args:
+        moves: with their temperatures.
+        times: shape (n,), on the same clock as the next.
+        clock: times of the moves.
+    """
+    recorded = [(at, move.temperature_degC) for at, move in zip(clock, moves, strict=True)]
+    known = [(at, degC) for at, degC in recorded if degC is not None]
+    if len(known) < 2:
+        return None
+    at, degC = np.array(known, dtype=float).T
+    found: np.ndarray = np.interp(times, at, degC)
+    return found - float(np.interp(clock[0], at, degC))
 
 
 def interpolated(moves: Sequence[TimedMove]) -> int:

@@ -30,6 +30,7 @@ from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.campaign import MOVES, SPOTS
 from tvsbayes.instrument.column_names import DEGREES, SPREAD
+from tvsbayes.instrument.conditions import check_power, powered_on_s
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, STATED_KEYS, AxisPrior
 from tvsbayes.single_axis.waves import AskedPeriods
 
@@ -172,10 +173,7 @@ class AxisCampaign(Shown):
     @property
     def powered_on_s(self) -> float | None:
         """When the machine was switched on, on the clock of `time_s`; None where nothing says it."""
-        on, created = self.header.get("powered_on"), self.header.get("created")
-        if not isinstance(on, datetime.datetime) or not isinstance(created, datetime.datetime):
-            return None
-        return (on - created).total_seconds()
+        return powered_on_s(self.header)
 
     def shown(self) -> View:
         """Counts, and the readings with the commands behind them."""
@@ -255,19 +253,8 @@ def _parse_header(keys: Keys) -> dict[str, object]:
                 allowed = "a date or time such as 2026-01-15T10:00:00Z"
                 raise keys.refuse(key, "date", allowed, "write it without quotes")
             header[key] = keys.values[key]
-    if "powered_on" in header:
-        _check_power(keys, header)
+    check_power(keys, header)
     return header
-
-
-def _check_power(keys: Keys, header: dict[str, object]) -> None:
-    """Refuses a `powered_on` that cannot be set against the clock of the moves."""
-    on, created = header["powered_on"], header.get("created")
-    allowed = "a time before `created`, which is the time of `time_s` = 0, both with or both without a time zone"
-    if not isinstance(on, datetime.datetime) or not isinstance(created, datetime.datetime):
-        raise keys.refuse("powered_on", "date", allowed, "write both with date and time, such as 2026-01-15T10:00:00Z")
-    if (on.tzinfo is None) != (created.tzinfo is None) or on > created:
-        raise keys.refuse("powered_on", "date", allowed, "correct one of them")
 
 
 def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:

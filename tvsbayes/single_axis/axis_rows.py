@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from tvsbayes.errors import InputError, NothingToEstimate, listed
+from tvsbayes.instrument.conditions import kelvin_at
 from tvsbayes.single_axis.axis_campaign import TURNS, AxisCampaign, AxisMove, Reading
 
 SIDES = {"forward": 1, "backward": -1, "unknown": 0}
@@ -267,7 +268,7 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         line=(float(line[0] - line[1] * command.mean()), float(line[1])),
         time_s=times_s[moves],
         warm_s=times_s[moves] - warm_from(campaign),
-        kelvin=kelvin_at(campaign, times_s[moves]),
+        kelvin=_kelvin(campaign, times_s[moves]),
         width_s=np.zeros(len(moves)),
         rate=None,
         reading_u=float(np.median(stated)) if stated else 0.0,
@@ -361,7 +362,7 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
         line=(float(line[0] - line[1] * rows_command.mean()), float(line[1])),
         time_s=rows_time,
         warm_s=rows_time - warm_from(campaign),
-        kelvin=kelvin_at(campaign, rows_time),
+        kelvin=_kelvin(campaign, rows_time),
         width_s=np.sqrt(12.0) * spread,
         rate=rate,
         reading_u=float(np.median(u)),
@@ -403,16 +404,8 @@ def warm_from(campaign: AxisCampaign) -> float:
     return campaign.moves[0].time_s if campaign.powered_on_s is None else campaign.powered_on_s
 
 
-def kelvin_at(campaign: AxisCampaign, times_s: np.ndarray) -> np.ndarray | None:
-    """Temperatures at times (n,) less that of the first move, linear between those recorded; None where fewer than two.
-
-    Before the first and after the last recorded one they stay as they are.
-    """
-    known = [(m.time_s, m.temperature_degC) for m in campaign.moves if m.temperature_degC is not None]
-    if len(known) < 2:
-        return None
-    at, kelvin = np.array(known, dtype=float).T
-    return np.interp(times_s, at, kelvin) - float(np.interp(campaign.moves[0].time_s, at, kelvin))
+def _kelvin(campaign: AxisCampaign, times_s: np.ndarray) -> np.ndarray | None:
+    return kelvin_at(campaign.moves, times_s, np.array([move.time_s for move in campaign.moves], dtype=float))
 
 
 def _hours(times_h: np.ndarray, legs: Legs, moves: np.ndarray) -> np.ndarray:
