@@ -88,7 +88,7 @@ def test_places_that_no_row_hangs_on_are_foretold_from_those_that_rows_do():
     w = 0.4 * np.random.default_rng(4).standard_normal((3, len(model.coordinates.names)))
     seen, found = plain.linear(w), model.linear(w)
     count, slope = len(plain.places.command), abs(plain.rows.line[1])
-    assert len(model.told) == plain.columns < model.columns == plain.columns + 2 * len(asked)
+    assert len(model.informed) == plain.columns < model.columns == plain.columns + 2 * len(asked)
     both = np.concatenate((plain.places.command, asked))
     for k, length in enumerate(model.coordinates.values(w)["transmission_error_length"]):
         scale = model.coordinates.values(w)["transmission_error"][k] ** 2

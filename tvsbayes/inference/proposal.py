@@ -72,7 +72,7 @@ class Regression:
 
     Attributes:
         slope, square: coefficients, shape (d,).
-        cross: of products, symmetric, nought where none was taken, shape (d, d).
+        cross: of products, symmetric, zero where none was taken, shape (d, d).
     """
 
     slope: np.ndarray

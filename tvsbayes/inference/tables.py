@@ -47,7 +47,7 @@ def between_cuts(log_density: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Tables:
-    """Densities of h coordinates whose logarithm is a broken line through `NODES`, shape (h, nodes), nought outside."""
+    """Densities of h coordinates whose logarithm is a broken line through `NODES`, shape (h, nodes), zero outside."""
 
     log_density: np.ndarray
 

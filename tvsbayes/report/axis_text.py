@@ -76,7 +76,7 @@ def parameter_table(summary: AxisSummary) -> TableView:
             said = "" if of.contraction is None else f"{100 * max(of.contraction, 0.0):.0f} %"
             rows.append([WHAT.get(name, name), *_row(name, of)[1:], said])
     caption = f"parameters, {escaped(summary.unit)}; 100 %: the readings tell it, 0 %: the prior does"
-    return TableView(caption, ["", "value(u)", "95 % interval", "told"], rows)
+    return TableView(caption, ["", "value(u)", "95 % interval", "data"], rows)
 
 
 def for_firmware(summary: AxisSummary) -> str:

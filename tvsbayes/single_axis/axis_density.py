@@ -50,7 +50,7 @@ def line_functionals(model: AxisModel) -> np.ndarray:
     of = model.head
     return np.array(
         [
-            # At command nought, where folders count from.
+            # At command zero, where folders count from.
             of(offset=1.0, slope=-model.middle),
             of(slope=1.0),
             of(contrast=1.0),

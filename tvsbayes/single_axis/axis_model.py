@@ -323,7 +323,7 @@ class AxisModel:
         return missing * (values["transmission_error"] ** 2 + 0.25 * values["play_variation"] ** 2)
 
     @cached_property
-    def told(self) -> np.ndarray:
+    def informed(self) -> np.ndarray:
         """Columns that any row hangs on; the others are places where the processes are foretold."""
         seen = np.any(self._weights != 0, axis=0)
         return np.flatnonzero(np.concatenate((np.ones(self.processes, bool), seen, seen)))
@@ -367,7 +367,7 @@ class AxisModel:
         return factor
 
     def _blocks(
-        self, w: np.ndarray, extra: np.ndarray | None = None, *, told: bool = False
+        self, w: np.ndarray, extra: np.ndarray | None = None, *, informed: bool = False
     ) -> Iterator[tuple[slice, _Block]]:
         """The draws w (n, d) in blocks that fit into memory; products of those columns alone that rows hang on."""
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
@@ -376,13 +376,13 @@ class AxisModel:
             part = slice(start, start + size)
             values = self.coordinates.values(w[part])
             columns = self._columns(w[part], values, extra)
-            if told:
-                columns = columns[:, :, np.concatenate(([0], 1 + self.told))]
+            if informed:
+                columns = columns[:, :, np.concatenate(([0], 1 + self.informed))]
             white, log_scatter = self._whitened(values, columns)
             scales = [each.scale for each in self.coordinates.wave_draws(w[part])]
             products = np.swapaxes(white, 1, 2) @ white
             spread = rows_log_density(self.rows, values["reading_scale"])
-            yield part, _Block(products, log_scatter - 2 * spread, self._factor(values, scales, told))
+            yield part, _Block(products, log_scatter - 2 * spread, self._factor(values, scales, informed))
 
     def white(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whitened readings and columns (rows, 1 + columns) at one draw w (1, d), and the factor of their prior."""
@@ -435,7 +435,7 @@ class AxisModel:
         return self.posterior(w, np.zeros((0, self.columns))).log_density
 
     def posterior(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
-        """The same with the prior of the coordinates; nought where it has no value."""
+        """The same with the prior of the coordinates; zero where it has no value."""
         wanted = len(functionals)
         found = Likelihood.nowhere(len(w), wanted)
         usable = np.flatnonzero(np.all(np.abs(w) < FARTHEST, axis=1))
@@ -462,14 +462,14 @@ class AxisModel:
     def linear(self, w: np.ndarray) -> LinearPosterior:
         """What is linear, given coordinates (n, d); means are whole, not deviations from the priors'."""
         means, covariances = np.empty((len(w), self.columns)), np.empty((len(w), self.columns, self.columns))
-        told, others = self.told, np.setdiff1d(np.arange(self.columns), self.told)
+        informed, others = self.informed, np.setdiff1d(np.arange(self.columns), self.informed)
         # Rows tell nothing of the units of places between them: a matrix of those that they hang on is inverted.
-        for part, block in self._blocks(w, told=len(others) > 0):
-            small = replace(block, factor=block.factor[:, told[:, None], told]) if len(others) else block
+        for part, block in self._blocks(w, informed=len(others) > 0):
+            small = replace(block, factor=block.factor[:, informed[:, None], informed]) if len(others) else block
             information, towards = _information(small, 0)
             _, scaled, scale = _equilibrated(information)
             inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
-            reach = block.factor[:, :, told] if len(others) else block.factor
+            reach = block.factor[:, :, informed] if len(others) else block.factor
             means[part] = np.einsum("nij,njk,nk->ni", reach, inverse, towards, optimize=True)
             covariances[part] = reach @ inverse @ np.swapaxes(reach, 1, 2)
             for own in (others[: len(others) // 2], others[len(others) // 2 :]):
@@ -482,7 +482,7 @@ class AxisModel:
         """What is foretold of some rows by all others, given the scales.
 
         A row with an unknown of its own and a flat prior counts as not read; the unknown is the reading less what the
-        others foretell.
+        others predict.
 
         Args:
             w: coordinates (n, d).

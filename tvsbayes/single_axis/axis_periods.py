@@ -17,7 +17,7 @@ from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.weighted_draws import systematic
 
 WITH_WAVE_MIN, WITH_WAVE = 200, 1000
-"""Draws with a wave that its numbers are told by; where the posterior has fewer, so many are drawn and weighted."""
+"""Draws with a wave that its numbers come from; where the posterior has fewer, so many are drawn and weighted."""
 TAILS_PERCENT = (2.5, 97.5)
 ALIKE = 0.02
 """Draws of a period that lie farther apart than this share of it belong to different waves that explain the same."""

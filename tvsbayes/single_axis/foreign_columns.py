@@ -173,8 +173,8 @@ def one_reading_a_row(table: ForeignTable, stated: Mapping[str, str]) -> tuple[F
         "reading" + f" ({unit})" * (unit is not None): [table.columns[name][row] for row, name, _ in rows],
         "cycle": [str(runs[name][0]) for _, name, _ in rows],
     }
-    told = f"runs: {len(runs)} columns ({named}), read one after the other; forward runs rise, backward runs fall"
-    return table_of(table.file, table.kind, columns, [table.lines[row] for row, _, _ in rows]), [told]
+    sentence = f"runs: {len(runs)} columns ({named}), read one after the other; forward runs rise, backward runs fall"
+    return table_of(table.file, table.kind, columns, [table.lines[row] for row, _, _ in rows]), [sentence]
 
 
 def deviation_columns(table: ForeignTable, columns: Mapping[str, str]) -> dict[str, str]:

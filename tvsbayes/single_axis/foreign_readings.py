@@ -340,8 +340,9 @@ def unwrapped(found: ForeignReadings, unit: str, counts_per_turn: float | None =
         turns -= round(jumps.get(row, 0.0))
         readings[k] = replace(readings[k], value=float(value[row]) + turn * turns)
     times = "once" if len(jumps) == 1 else f"{len(jumps)} times"
-    told = f"value: jumps by whole turns {times}, which are added: {turn:g} {unit} each; --counts-per-turn says another"
-    return replace(found, readings=tuple(readings), assumed=(*found.assumed, told))
+    sentence = f"value: jumps by whole turns {times}, which are added: {turn:g} {unit} each; "
+    sentence += "--counts-per-turn says another"
+    return replace(found, readings=tuple(readings), assumed=(*found.assumed, sentence))
 
 
 def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:

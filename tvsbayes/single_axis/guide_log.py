@@ -254,19 +254,19 @@ def _scale(run: GuideRun, stated: Mapping[str, float], file: str) -> _Scale:
     if not pixel > 0:
         raise InputError("usage", "--assume pixel_arcsec: allowed: above 0", remedy="state arcsec per pixel")
     cosine = math.cos(math.radians(declination))
-    told = [f"declination {declination:g} deg: distances on the sky over {cosine:.4f}; --assume declination_deg="]
-    told.append(f"pixel scale {pixel:g} arcsec/px; --assume pixel_arcsec=")
+    assumed = [f"declination {declination:g} deg: distances on the sky over {cosine:.4f}; --assume declination_deg="]
+    assumed.append(f"pixel scale {pixel:g} arcsec/px; --assume pixel_arcsec=")
     if "pulse_arcsec_per_s" in stated:
         pulse = stated["pulse_arcsec_per_s"]
-        told.append(f"pulses turn the axis by {pulse:g} arcsec/s, as stated")
+        assumed.append(f"pulses turn the axis by {pulse:g} arcsec/s, as stated")
     else:
-        pulse = _logged_pulse(run, known, need("rate_px_per_s", "xRate", "pulse_arcsec_per_s") * pixel, cosine, told)
+        pulse = _logged_pulse(run, known, need("rate_px_per_s", "xRate", "pulse_arcsec_per_s") * pixel, cosine, assumed)
     drive = stated.get("drive_arcsec_per_s", SIDEREAL_ARCSEC_PER_S)
-    told.append(f"the drive turns at {drive:.6g} arcsec/s; --assume drive_arcsec_per_s=")
-    return _Scale(pixel, cosine, pulse, drive, tuple(told))
+    assumed.append(f"the drive turns at {drive:.6g} arcsec/s; --assume drive_arcsec_per_s=")
+    return _Scale(pixel, cosine, pulse, drive, tuple(assumed))
 
 
-def _logged_pulse(run: GuideRun, known: Mapping[str, float], sky: float, cosine: float, told: list[str]) -> float:
+def _logged_pulse(run: GuideRun, known: Mapping[str, float], sky: float, cosine: float, assumed: list[str]) -> float:
     """What a pulse turns the axis by, arcsec/s: xRate is that of the run's declination or of the calibration's.
 
     Args:
@@ -274,7 +274,7 @@ def _logged_pulse(run: GuideRun, known: Mapping[str, float], sky: float, cosine:
         known: numbers of the header.
         sky: xRate times pixel scale, arcsec/s.
         cosine: of the declination.
-        told: sentences, to which the source is added.
+        assumed: sentences, to which the source is added.
     """
     calibration = known.get("calibration_deg")
     of_run, where = sky / cosine, "at the run's declination"
@@ -287,7 +287,7 @@ def _logged_pulse(run: GuideRun, known: Mapping[str, float], sky: float, cosine:
     text = f"pulses turn the axis by {pulse:.4g} arcsec/s: xRate {sky:.4g} arcsec/s on the sky, taken {where}"
     if (speed := known.get("guide_speed")) and abs(pulse / speed - 1) > RATES_DIFFER:
         text += f"; the mount's guide speed is {speed:g}, {100 * (speed / pulse - 1):+.0f} %"
-    told.append(f"{text}; --assume pulse_arcsec_per_s=")
+    assumed.append(f"{text}; --assume pulse_arcsec_per_s=")
     return pulse
 
 

@@ -23,7 +23,7 @@ from tvsbayes.statistics.intervals import NORMAL_95
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
 DRAWS, HELD_ROUNDS = 300, 2
-"""Draws that foretell, of every fit without a position, and its rounds of importance sampling at least."""
+"""Draws that predict, of every fit without a position, and its rounds of importance sampling at least."""
 POSITIONS_MIN, POSITIONS_MAX = 3, 200
 REFITTED_MAX, WEIGHED, WEIGHED_MIN = 30, 400, 80
 """Positions up to which each has a fit of its own; beyond, draws of one fit are weighted, as long as so many of them
@@ -179,7 +179,7 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
             job.at(number / len(positions), f"position {position:.10g}")
             out = rows.command == position
             if len(np.unique(rows.command[~out])) < 2 or (~out).sum() < 3:
-                warnings.append(f"position {position:.10g}: too few readings elsewhere to foretell it")
+                warnings.append(f"position {position:.10g}: too few readings elsewhere to predict it")
                 continue
             left, foretold = np.flatnonzero(out), None
             if len(positions) > REFITTED_MAX:
