@@ -125,9 +125,10 @@ def piloted(density: Density, generator: np.random.RandomState, rounds_max: int 
     worth `PILOT_EFFECTIVE` draws: a density of its own kind, which the first proposal does not know, is learnt in many.
     """
     pilot = Pool.empty(density.first_proposal())
-    for number in range(1, max(PILOT_ROUNDS, rounds_max or 0) + 1):
+    limit = max(PILOT_ROUNDS, rounds_max or 0)
+    for number in range(1, limit + 1):
         pilot = pilot.extended(density, generator, fitted=True)
-        if number >= PILOT_ROUNDS and (number >= (rounds_max or 0) or _learnt(pilot)):
+        if PILOT_ROUNDS <= number < limit and _learnt(pilot):
             break
     return Pool.empty(pilot.next_proposal, pilot.invalid)
 
