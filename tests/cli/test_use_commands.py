@@ -289,6 +289,9 @@ def test_exports_are_read_back(folder, ask, capsys, tmp_path):
     assert (tmp_path / "out.header").read_text() == header
     assert run(["compensate", str(folder), "--to", "header"]) == 0
     assert capsys.readouterr().out == header
+    before = (folder / "moves.csv").read_bytes()
+    code, _ = ask("compensate", folder, "--to", "header", "-o", folder / "moves.csv")
+    assert code == 2 and (folder / "moves.csv").read_bytes() == before
     code, document = ask("compensate", folder, "--to", "linuxcnc")
     assert code == 2 and "--to header" in document["error"]["remedy"]
     assert load_calibration(path).steps_for(point).as_json() == exported.steps_for(point).as_json()

@@ -82,6 +82,7 @@ def compensate(
     from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
     from tvsbayes.single_axis.axis_record import results_for
 
+    spared(out)
     if to == "header" and _is_scanner(campaign):
         # Counters of two axes follow from the calibration as a whole: it is the table.
         export_calibration(campaign, to, out, as_json)
@@ -89,7 +90,6 @@ def compensate(
     _refuse_scanner(campaign, f"compensate --to {escaped(to)}")
     _one_of("--applied-by", applied_by, APPLIERS)
     _one_of("--letter", letter, tuple(LETTERS))
-    spared(out)
     data = read_axis(campaign)
     wish = Wish(to, "host" if applied_by == "host" else "controller", per_command, resolution, in_force, letter, period)
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
