@@ -9,6 +9,7 @@ From a campaign folder to a robot:
     found = tvsbayes.locate(calibration, 100, 20, 70.0)  # counters and aperture reading -> mm, with covariance
     results = tvsbayes.calibrate(campaign, folder)       # all of it at once, and the files that `tvsbayes fit` writes
     calibration = tvsbayes.load_calibration("mine")      # the same from results/ after `tvsbayes fit mine`: NumPy alone
+    posterior = tvsbayes.load_posterior("mine")          # its draws, of a scanner or an axis: without JAX
 
 One axis: `compensate("stage", "linuxcnc")` makes a table for a controller, `verify("stage", "fresh")` says whether its
 promise is kept.
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from tvsbayes.errors import TvsError as TvsError
     from tvsbayes.estimators.joint_fit import JointFit as JointFit
     from tvsbayes.estimators.joint_fit import fit as fit
+    from tvsbayes.inference.stored_posterior import load_posterior as load_posterior
     from tvsbayes.instrument.campaign import Campaign as Campaign
     from tvsbayes.instrument.campaign import read_campaign as read_campaign
     from tvsbayes.instrument.model_choice import ModelChoice as ModelChoice
@@ -68,6 +70,7 @@ _HOME = {
     "compensate": "compensation.promise",
     "fit": "estimators.joint_fit",
     "load_calibration": "calibration.calibration_file",
+    "load_posterior": "inference.stored_posterior",
     "locate": "coordinates.location",
     "read_campaign": "instrument.campaign",
     "read_fit": "results.fit_record",
@@ -92,4 +95,4 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     """The public names, loaded or not."""
-    return sorted({*globals(), *__all__, "__version__"})
+    return sorted([*__all__, "__version__"])

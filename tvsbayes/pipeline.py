@@ -226,6 +226,7 @@ def _results(
     from tvsbayes.assessment.summary import equal_laplace_draws, summarise
     from tvsbayes.estimators.plausibility import misfit_causes
     from tvsbayes.instrument.campaign import input_hashes
+    from tvsbayes.posterior.draws import Draws
     from tvsbayes.results.fit_record import FitRecord, covariance_of_draws, provenance
     from tvsbayes.results.stored_draws import ResultDraws, write_results
 
@@ -234,7 +235,9 @@ def _results(
     calibration = calibration_of(found, posterior, seed=seed) if found.converged else None
     behind = equal_laplace_draws(found) if usable is None else usable.thinned(DRAWS_KEPT)
     physical, effective = np.asarray(behind.physical), np.asarray(behind.effective_deg_per_step)
-    draws = ResultDraws(found.names, physical, effective, found.reference_pose_rad)
+    derived = {name: values for name, values in Draws(behind).items() if name not in found.names}
+    columns = np.stack(list(derived.values()), axis=1)
+    draws = ResultDraws(found.names, physical, effective, found.reference_pose_rad, tuple(derived), columns)
     record = FitRecord(
         summary,
         covariance_of_draws(draws.names, draws.physical, summary.parameters),

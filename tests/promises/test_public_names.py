@@ -9,12 +9,12 @@ import sys
 
 import tvsbayes
 
-FIRST = {"calibration_of", "fit", "load_calibration", "locate", "read_campaign", "sample"}
+FIRST = {"calibration_of", "fit", "load_calibration", "load_posterior", "locate", "read_campaign", "sample"}
 
 
 def test_every_public_name_is_there_and_shown():
     assert FIRST | {"plots", "calibrate", "FitRecord", "JointFit", "Posterior", "Campaign"} <= set(tvsbayes.__all__)
-    assert set(tvsbayes.__all__) <= set(dir(tvsbayes))
+    assert set(dir(tvsbayes)) == {*tvsbayes.__all__, "__version__"}
     for name in tvsbayes.__all__:
         assert getattr(tvsbayes, name).__doc__, name
 

@@ -57,7 +57,8 @@ def whole_summary() -> FitSummary:
 def small_draws() -> ResultDraws:
     """Fifty draws of three parameters."""
     physical = np.random.default_rng(3).normal(size=(50, 3))
-    return ResultDraws(NAMES, physical, np.full((50, 4), 0.06), np.array([0.1, 0.0]))
+    ratios, pose = np.full((50, 4), 0.06), np.array([0.1, 0.0])
+    return ResultDraws(NAMES, physical, ratios, pose, ("effective_mirror_offset_mm",), 30 + physical[:, :1])
 
 
 def small_mode() -> StoredMode:

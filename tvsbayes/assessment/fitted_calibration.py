@@ -15,6 +15,7 @@ from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR, Cause
 from tvsbayes.assessment.gear_tables import DrawnGears, drawn_gears
 from tvsbayes.assessment.summary import equal_laplace_draws, seen_range
 from tvsbayes.calibration.drawn_looks import noise_of_a_look
+from tvsbayes.calibration.frames import extrinsics_of
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
@@ -90,6 +91,7 @@ def calibration_of_draws(
         inputs=inputs,
         noise=noise,
         gears=table,
+        extrinsics=extrinsics_of(names, physical),
     )
 
 

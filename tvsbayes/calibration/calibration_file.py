@@ -19,6 +19,7 @@ from typing import Any, NotRequired, TypedDict, cast
 
 import numpy as np
 
+from tvsbayes.calibration.frames import EXTRINSICS_NAMES, NO_POSE, extrinsics_of
 from tvsbayes.calibration.gear_table import NO_GEARS, table_of
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
@@ -274,6 +275,8 @@ def _shaped(calibration: Calibration) -> Calibration:
     """Refuse arrays of other shapes or with values that are not finite."""
     n, count = len(calibration.inputs), len(INPUT_NAMES) + calibration.gears.size
     shapes = {"mean": (count,), "covariance": (count, count), "range_steps": (2, 2), "inputs": (n, count)}
+    if len(calibration.extrinsics):
+        shapes["extrinsics"] = (n, len(EXTRINSICS_NAMES))
     shapes |= {"noise": (n, len(NOISE_NAMES)), "cause_covariance": (len(calibration.causes), count, count)}
     for name, shape in shapes.items():
         array = getattr(calibration, name)
@@ -326,6 +329,8 @@ def read_draws(path: Path) -> Calibration:
                 causes=tuple(tables["causes"]),
                 cause_covariance=file["cause_covariance"],
                 gears=NO_GEARS if str(file["format"]) == FORMATS[0] else table_of(tables["gear_steps"]),
+                # They stand among the draws behind `fit.json`, row by row with the inputs.
+                extrinsics=extrinsics_of(file["names"].tolist(), file["physical"]) if "names" in file else NO_POSE,
             )
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:

@@ -35,14 +35,17 @@ type Values = Mapping[str, Number]
 
 @dataclass(frozen=True)
 class Ray:
-    """A beam in frame T: it leaves the positioner at `origin_mm` along the unit vector `direction`; shape (3, ...).
+    """A beam: it leaves the positioner at `origin_mm` along the unit vector `direction`; shape (3, ...).
 
-    `extrapolated` tells that no look of the campaign reached its counters.
+    `extrapolated` says that no look of the campaign reached its counters, `frame` in which frame it is. `covariance`,
+    where it was asked for, is that of origin and direction of a single arrival, shape (6, 6): mm, and none.
     """
 
     origin_mm: np.ndarray
     direction: np.ndarray
     extrapolated: bool = False
+    frame: str = "T"
+    covariance: np.ndarray | None = None
 
 
 def _harmonic(values: Values, axis: str, angle_deg: Number, period_deg: float, m: ModuleType) -> Number:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tvsbayes.calibration.aiming import Direction, Drive, Point, Steps, mirror_angles
+from tvsbayes.calibration.frames import EXTRINSICS_NAMES, NO_POSE, P_INPUTS, camera_slopes, in_cameras, refuse_frame
 from tvsbayes.calibration.gear_table import NO_GEARS, GearTable
 from tvsbayes.calibration.located_point import Located, meets
 from tvsbayes.calibration.optics import (
@@ -45,6 +46,7 @@ INPUT_NAMES: tuple[str, ...] = (
     *names_of("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
 )
 """What a coordinate depends on. Contrasts do not enter: after homing a counter stands for its mean ratio."""
+NO_INPUTS: Values = {}
 NOISE_NAMES = names_of("stop_sd_deg", "aperture_sd_deg")
 """Noises of a look; those of stops hold the scatter of the look, see `drawn_looks.noise_of_a_look`."""
 UNIT_NOISES: dict[str, float] = {
@@ -95,6 +97,7 @@ class Calibration(Shown):
         causes: names of the causes of uncertainty behind `cause_covariance`; empty where unknown.
         cause_covariance: what each contributes to `covariance`, shape (causes, inputs, inputs).
         gears: counters at which errors of the gears are told; none where gears do not vary.
+        extrinsics: draws (n, 6) of `EXTRINSICS_NAMES`, row by row with `inputs`; none where only the moments were kept.
     """
 
     mean: np.ndarray
@@ -111,6 +114,7 @@ class Calibration(Shown):
     causes: tuple[str, ...] = ()
     cause_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, len(INPUT_NAMES), len(INPUT_NAMES))))
     gears: GearTable = NO_GEARS
+    extrinsics: np.ndarray = field(default_factory=NO_POSE.copy)
 
     def shown(self) -> View:
         """Estimates with their standard uncertainties, and the counters that looks reached."""
@@ -181,28 +185,83 @@ class Calibration(Shown):
         """Which of these counters lies outside those that looks reached, in words; "" where none does."""
         return unseen((pan_steps, tilt_steps), self.range_steps)
 
-    def beam_at(self, steps: Counters, sides: tuple[Number, Number], m: ModuleType = np) -> Components:
-        """The beam of the best estimates at counters and approach sides; `m` as in `output_deg`."""
+    def beam_at(
+        self, steps: Counters, sides: tuple[Number, Number], m: ModuleType = np, frame: Values = NO_INPUTS
+    ) -> Components:
+        """The beam of the best estimates at counters and approach sides; `m` as in `output_deg`.
+
+        In frame T, or with `P_INPUTS` as `frame` in P.
+        """
         values = self.estimates_at(steps)
         pan_deg, tilt_deg = (
             output_deg(values, axis, n, side, self.period_deg.get(axis), m)
             for axis, n, side in zip(AXES, steps, sides, strict=True)
         )
-        return beam_components(self.estimates, pan_deg, tilt_deg, m)
+        return beam_components({**self.estimates, **frame}, pan_deg, tilt_deg, m)
 
-    def ray(self, pan_steps: float, tilt_steps: float, approach: tuple[str, str] = HOME_APPROACH) -> Ray:
+    def ray(
+        self,
+        pan_steps: float,
+        tilt_steps: float,
+        approach: tuple[str, str] = HOME_APPROACH,
+        *,
+        frame: str = "T",
+        covariance: bool = False,
+    ) -> Ray:
         """The beam at counters that were reached from a side.
 
         Args:
             pan_steps: absolute counter.
             tilt_steps: absolute counter.
             approach: last move of (pan, tilt): left or right, up or down, or unknown.
+            frame: "T", "P", "S", or "camera" for OpenCV's axes of the left camera. S and camera stand where the fit
+                found the positioner before the cameras (its extrinsics).
+            covariance: also that of origin and direction, by the law of propagation (GUM 5.2): of every parameter, of
+                the extrinsics where the frame is the cameras', and of stop errors.
 
         Raises:
-            InputError: an approach that does not exist.
+            InputError: an approach or a frame that does not exist, or a calibration without extrinsics.
         """
-        beam = self.beam_at((pan_steps, tilt_steps), sides_of(approach), math)
-        return Ray(np.array(beam.origin), np.array(beam.direction), not self.covers(pan_steps, tilt_steps))
+        refuse_frame(frame, self.extrinsics)
+        steps, sides = (pan_steps, tilt_steps), sides_of(approach)
+        beam = self.beam_at(steps, sides, math, NO_INPUTS if frame == "T" else P_INPUTS)
+        ray, at = np.array([*beam.origin, *beam.direction]), (float(pan_steps), float(tilt_steps))
+        found = self._ray_covariance(ray, at, sides, frame) if covariance else None
+        if frame in ("S", "camera"):
+            ray = in_cameras(ray, self._pose, frame)
+        return Ray(ray[:3], ray[3:], not self.covers(pan_steps, tilt_steps), frame, found)
+
+    @cached_property
+    def _pose(self) -> np.ndarray:
+        """Best estimates of the extrinsics, shape (6,)."""
+        return self.extrinsics.mean(axis=0)
+
+    @cached_property
+    def _covariance_with_pose(self) -> np.ndarray:
+        """Covariance of `INPUT_NAMES`, the extrinsics, and the columns of the gears."""
+        first, pose = len(INPUT_NAMES), len(EXTRINSICS_NAMES)
+        drawn = np.column_stack([self.inputs[:, :first], self.extrinsics, self.inputs[:, first:]])
+        found = np.cov(drawn, rowvar=False)
+        own = np.r_[0:first, first + pose : len(found)]
+        found[np.ix_(own, own)] = self.covariance
+        return found
+
+    def _ray_covariance(self, ray: np.ndarray, steps: Counters, sides: Sides, frame: str) -> np.ndarray:
+        """Covariance (6, 6) of a ray (6,) that is in T where the frame is T, else in P."""
+        moved = self._moved_beam(steps, sides, NO_INPUTS if frame == "T" else P_INPUTS)
+        slopes = np.array([*moved.origin, *moved.direction]).imag / COMPLEX_STEP
+        if frame in ("T", "P"):
+            return slopes @ self.look_covariance(steps) @ slopes.T
+        first, pose = len(INPUT_NAMES), len(EXTRINSICS_NAMES)
+        at = self._covariance_with_pose
+        at = self.gears.look_covariance(at, steps) if self.gears.size else at
+        looks = np.r_[0:first, first + pose : len(at)]
+        by_ray, by_pose = np.split(camera_slopes(ray, self._pose, frame), 2, axis=1)
+        whole = np.zeros((6, len(at)))
+        whole[:, looks] = by_ray @ slopes[:, : len(looks)]
+        whole[:, first : first + pose] = by_pose
+        scatter = by_ray @ slopes[:, len(looks) :]
+        return whole @ at @ whole.T + scatter @ np.diag([*UNIT_NOISES.values()]) @ scatter.T
 
     def locate(
         self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = HOME_APPROACH
@@ -435,8 +494,8 @@ class Calibration(Shown):
         """95 % half widths of the beam's position at a range (3,), mm."""
         return self._u95(self._moved_beam(steps, sides).at(range_mm), steps)
 
-    def _moved_beam(self, steps: Counters, sides: Sides) -> Components:
-        values = {**self._moved.values, **self._moved_gears(steps)}
+    def _moved_beam(self, steps: Counters, sides: Sides, frame: Values = NO_INPUTS) -> Components:
+        values = {**self._moved.values, **self._moved_gears(steps), **frame}
         return self.noisy_beam(values, self._moved.noise, steps, sides)
 
     def _u95(self, moved: np.ndarray, steps: Counters) -> np.ndarray:

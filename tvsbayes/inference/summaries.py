@@ -5,7 +5,7 @@ Draws are ordered (chain, draw, ...); a chain is a walker. Weighted draws are in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +45,26 @@ class Propagated(Shown):
         columns = zip(mean, sd, low.tolist(), high.tolist(), error, strict=True)
         rows: list[tuple[Cell, ...]] = [(str(k), *row) for k, row in enumerate(columns)]
         return View("Propagated quantity", ("element", "mean", "sd", "2.5 %", "97.5 %", "Monte Carlo error"), rows)
+
+
+def carried(
+    function: Callable[[Mapping[str, np.ndarray]], np.ndarray], by_name: Mapping[str, np.ndarray], count: int
+) -> np.ndarray:
+    """Values (count, ...) that a function makes of all draws by name, one a draw.
+
+    Raises:
+        ValueError: another number of rows, or values that are not finite.
+    """
+    values = np.asarray(function(by_name), dtype=float)
+    if values.ndim == 0 or len(values) != count:
+        raise ValueError(
+            f"the function returned shape {values.shape}; its first axis must be the {count} draws it was given: "
+            "compute with whole arrays, not with their means"
+        )
+    if not np.all(np.isfinite(values)):
+        share = np.mean(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+        raise ValueError(f"the function has no finite value for {100 * share:.2g} % of the draws")
+    return values
 
 
 def reweighted(values: np.ndarray, weights: np.ndarray) -> Propagated:

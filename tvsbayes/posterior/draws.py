@@ -16,7 +16,7 @@ import numpy as np
 from tvsbayes.display import Shown, View
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import no_draw
-from tvsbayes.inference.summaries import Propagated, propagated, reweighted
+from tvsbayes.inference.summaries import Propagated, carried, propagated, reweighted
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS, SENSES
 from tvsbayes.instrument.parameters import BLOCKS, NAMES
 from tvsbayes.instrument.stops import legs_of
@@ -185,7 +185,7 @@ class Posterior(Shown):
         """Mean, sd, interval and errors of values (chain, draw, ...), one for every draw."""
         return reweighted(values, self.weights) if self.tier == "importance" else propagated(values)
 
-    def propagate(self, function: Callable[[Draws], np.ndarray]) -> Propagated:
+    def propagate(self, function: Callable[[Mapping[str, np.ndarray]], np.ndarray]) -> Propagated:
         """Carry the posterior into a quantity of your own.
 
         Args:
@@ -201,16 +201,8 @@ class Posterior(Shown):
         Raises:
             ValueError: the function returned another number of rows, or values that are not finite.
         """
-        values = np.asarray(function(self.by_name), dtype=float)
         chains, draws = self.z.shape[:2]
-        if values.ndim == 0 or len(values) != chains * draws:
-            raise ValueError(
-                f"the function returned shape {values.shape}; its first axis must be the {chains * draws} draws it was "
-                "given: compute with whole arrays, not with their means"
-            )
-        if not np.all(np.isfinite(values)):
-            share = np.mean(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
-            raise ValueError(f"the function has no finite value for {100 * share:.2g} % of the draws")
+        values = carried(function, self.by_name, chains * draws)
         return self.summarised(values.reshape(chains, draws, *values.shape[1:]))
 
     def local_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:

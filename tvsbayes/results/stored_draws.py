@@ -57,12 +57,16 @@ class ResultDraws:
         physical: shape (draws, names), in the units of the names.
         effective_deg_per_step: left, right, up, down, slopes of the lines through the looks, shape (draws, 4).
         reference_pose_rad: mean mirror angles (pan, tilt) of the looks used, shape (2,).
+        derived_names: columns of `derived`, quantities that are no parameters.
+        derived: shape (draws, derived names), in the units of the names.
     """
 
     names: tuple[str, ...]
     physical: np.ndarray
     effective_deg_per_step: np.ndarray
     reference_pose_rad: np.ndarray
+    derived_names: tuple[str, ...]
+    derived: np.ndarray
 
 
 _MODE_ARRAYS = ("z", "covariance", "prior", "valid", "weight")
@@ -72,7 +76,7 @@ def _draws_bytes(
     draws: ResultDraws, estimator: str, calibration: Calibration | None = None, mode: StoredMode | None = None
 ) -> bytes:
     """The content of `draws.npz`; without a calibration it holds draws that nothing must be calculated from."""
-    arrays = {**vars(draws), "names": np.array(draws.names)}
+    arrays = {**vars(draws), "names": np.array(draws.names), "derived_names": np.array(draws.derived_names)}
     if calibration is None:
         buffer = io.BytesIO()
         np.savez(buffer, estimator=np.array(estimator), **arrays)

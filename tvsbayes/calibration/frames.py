@@ -1,0 +1,73 @@
+"""The frames of a ray (formulation 2): T and P of the positioner, S of the stereo pair, the left camera's in OpenCV.
+
+S and camera stand to P by the extrinsics of the fit: rotation vector, rad, and translation, mm, of T_SP. NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from tvsbayes.errors import InputError
+from tvsbayes.instrument.parameters import names_of
+from tvsbayes.instrument.stereo_pair import rotation_matrix
+
+FRAMES = ("T", "P", "S", "camera")
+EXTRINSICS_NAMES = names_of("extrinsics.rotation_rad", "extrinsics.translation_mm")
+NO_POSE = np.zeros((0, len(EXTRINSICS_NAMES)))
+"""Draws of a calibration that keeps moments alone."""
+P_INPUTS: Mapping[str, float] = {"pan_zero_emission_deg": 90.0, "baseline_mm": 0.0}
+"""Of inputs with which frame T is frame P: p_T = Rz(C0 - 90 deg) p_P + (0, a/2, 0)."""
+OPENCV_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""From S to OpenCV's axes of the left camera, x right, y down, z along its view: X = z_cv, Y = -x_cv, Z = -y_cv."""
+ROTATION_STEP_RAD = 1e-5
+"""Of central differences of a rotation: cut off at 1e-11, rounding 1e-11."""
+
+
+def extrinsics_of(names: Sequence[str], physical: np.ndarray) -> np.ndarray:
+    """Those of draws (n, names), shape (n, 6); (0, 6) where they are not among the names."""
+    if not set(EXTRINSICS_NAMES) <= set(names):
+        return NO_POSE
+    return physical[:, [names.index(name) for name in EXTRINSICS_NAMES]]
+
+
+def refuse_frame(frame: str, extrinsics: np.ndarray) -> None:
+    """Refuses a frame that there is not, or that this calibration cannot give.
+
+    Raises:
+        InputError: either.
+    """
+    if frame not in FRAMES:
+        allowed = ", ".join(FRAMES)
+        raise InputError("frame", f"frame {frame!r}: unknown", allowed=allowed, remedy="name one of them")
+    if frame in ("S", "camera") and not len(extrinsics):
+        raise InputError(
+            "no-extrinsics",
+            f"frame {frame}: this calibration does not say where the cameras stand",
+            allowed="frame T or P",
+            remedy="load it from the results/ of its campaign: an exported JSON holds no pose of the cameras",
+        )
+
+
+def camera_rotation(extrinsics: np.ndarray, frame: str) -> np.ndarray:
+    """From P to S or to the camera's axes, shape (3, 3); `extrinsics` are a rotation vector and a translation, (6,)."""
+    rotation = rotation_matrix(extrinsics[:3])
+    return OPENCV_AXES @ rotation if frame == "camera" else rotation
+
+
+def in_cameras(ray: np.ndarray, extrinsics: np.ndarray, frame: str) -> np.ndarray:
+    """A ray of frame P, origin and direction (6,), in frame S or the camera's."""
+    turn, shift = camera_rotation(extrinsics, frame), extrinsics[3:]
+    return np.r_[turn @ ray[:3] + (OPENCV_AXES @ shift if frame == "camera" else shift), turn @ ray[3:]]
+
+
+def camera_slopes(ray: np.ndarray, extrinsics: np.ndarray, frame: str) -> np.ndarray:
+    """Derivatives of `in_cameras` by the ray, then by the extrinsics, shape (6, 12)."""
+    turn = camera_rotation(extrinsics, frame)
+    found = np.zeros((6, 12))
+    found[:3, :3] = found[3:, 3:6] = turn
+    for column, step in enumerate(ROTATION_STEP_RAD * np.eye(6)):
+        ends = [in_cameras(ray, extrinsics + sign * step, frame) for sign in (1, -1)]
+        found[:, 6 + column] = (ends[0] - ends[1]) / (2 * ROTATION_STEP_RAD)
+    return found

@@ -1,0 +1,161 @@
+"""A posterior read back from `results/`, of any instrument: draws by name, carried into any quantity.
+
+NumPy alone: no model, no fit. `fit.json` says what the draws are, `draws.npz` holds them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tvsbayes.display import Shown, View
+from tvsbayes.errors import NotConverged, escaped, refusal
+from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays, read_bytes
+from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
+from tvsbayes.inference.summaries import Propagated, carried, reweighted
+from tvsbayes.results.records import AnswerKind
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+AGAIN = "run `tvsbayes fit` on the folder again"
+FORMAT, OLDER = re.compile(r"tvsbayes-(?:[a-z]+-)?fit/1"), re.compile(r"tvsbayes-(?:[a-z]+-)?fit/[0-9]+")
+"""Formats of `fit.json` whose draws can be read, of whatever instrument; formats of any version."""
+ANSWERS: tuple[AnswerKind, ...] = ("accepted", "rough", "laplace")
+COLUMNS = (("names", "physical"), ("names", "draws"), ("derived_names", "derived"))
+"""Arrays of `draws.npz`: names, and the draws whose columns they name."""
+
+
+@dataclass(frozen=True, repr=False)
+class StoredPosterior(Shown):
+    """Draws of a posterior from `results/`.
+
+    Attributes:
+        by_name: draws of every quantity, each of shape (n,), in the unit that its name says; of an axis in the unit of
+            its readings.
+        weights: of the draws, sum 1, shape (n,). Draws that are repeats of one are one here, with their weight.
+        answer: "accepted"; with `anyway` also "rough", or "laplace" for the approximation at the mode.
+    """
+
+    by_name: Mapping[str, np.ndarray]
+    weights: np.ndarray
+    answer: AnswerKind
+
+    def shown(self) -> View:
+        """Means, sds and 95 % intervals."""
+        found = self.propagate(lambda p: np.stack(list(p.values()), axis=1))
+        columns = (each.tolist() for each in (found.mean, found.sd, *found.interval95))
+        rows = list(zip(self.by_name, *columns, strict=True))
+        title = f"Posterior of {len(self.weights)} stored draws, {self.answer}"
+        return View(title, ("quantity", "mean", "sd", "2.5 %", "97.5 %"), rows)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """All draws by name, one row each, with their `weight` (sum 1)."""
+        import pandas as pd
+
+        return pd.DataFrame({**self.by_name, "weight": self.weights})
+
+    def propagate(self, function: Callable[[Mapping[str, np.ndarray]], np.ndarray]) -> Propagated:
+        """Carry the posterior into a quantity of your own, as `Posterior.propagate` does.
+
+        Args:
+            function: is called once with all draws, a mapping from name to an array (n,), and returns one value per
+                draw: an array (n,) or (n, ...).
+
+        Returns:
+            Mean, sd, interval and their Monte Carlo errors, which take the stored draws as independent; `draws` and
+            `weights` with a first axis of one.
+
+        Raises:
+            ValueError: the function returned another number of rows, or values that are not finite.
+        """
+        values = carried(function, self.by_name, len(self.weights))
+        return reweighted(values[None], self.weights[None])
+
+
+def load_posterior(folder: Path | str, *, anyway: bool = False) -> StoredPosterior:
+    """Draws of the fit in a folder's `results/`, of any instrument, without JAX.
+
+    Args:
+        folder: of a campaign after `tvsbayes fit`, or its `results`.
+        anyway: also a rough answer or the Laplace approximation.
+
+    Returns:
+        Named draws with weights, `.propagate(f)` for quantities of them. Whether the campaign was changed since the fit
+        is not asked.
+
+    Raises:
+        InputError: there are no results, they are damaged or of a version that cannot be read.
+        NotConverged: the fit has no answer, or none that is accepted.
+    """
+    folder = Path(folder)
+    inner = folder / "results"
+    place = inner if inner.is_dir() or not (folder / "fit.json").exists() else folder
+    missing = [name for name in ("fit.json", "draws.npz") if not (place / name).exists()]
+    if missing:
+        allowed, remedy = "a folder with results/ that `tvsbayes fit` wrote", "run `tvsbayes fit` on the folder first"
+        name = escaped(str(folder), 200)
+        raise refusal("missing-file", file=name, found=f"no results/{missing[0]}", allowed=allowed, remedy=remedy)
+    keys = parse_json(read_bytes(place / "fit.json", JSON_BYTES_MAX), "results/fit.json")
+    kind = keys.text_value("format")
+    if not FORMAT.fullmatch(kind):
+        remedy = "read it with the tvsbayes that wrote it, or fit again" if OLDER.fullmatch(kind) else AGAIN
+        raise keys.refuse("format", "format", "a fit of version 1, such as tvsbayes-fit/1", remedy)
+    answer = _answer(keys)
+    if answer != "accepted" and not anyway:
+        what = "a rough answer" if answer == "rough" else "the Laplace approximation at the mode, no sample"
+        message = f"results/fit.json: the fit is {what}: its intervals are not accepted"
+        remedy = "run `tvsbayes fit` without --no-sample or --quick; or load it with anyway=True and say so"
+        raise NotConverged("unaccepted", message, remedy=remedy)
+    by_name = _draws(place / "draws.npz")
+    return StoredPosterior(*_weighted(by_name), answer)
+
+
+def _answer(keys: Keys) -> AnswerKind:
+    """What the draws are.
+
+    Raises:
+        NotConverged: they are of no mode that explains the data.
+    """
+    if not keys.flag("converged"):
+        remedy = "see what `tvsbayes fit` says of it, mend that and fit again"
+        raise NotConverged(
+            "not-converged", "results/fit.json: the fit has not converged: no draw of it counts", remedy=remedy
+        )
+    if keys.values.get("answer") is None:
+        # 0.2.0 and before: a sample that had converged was accepted.
+        return "accepted" if keys.word("estimator", ("posterior", "laplace")) == "posterior" else "laplace"
+    return ANSWERS[ANSWERS.index(keys.word("answer", ANSWERS))]
+
+
+def _draws(path: Path) -> dict[str, np.ndarray]:
+    """All named columns."""
+    found: dict[str, np.ndarray] = {}
+    try:
+        file = read_arrays(path, RESULTS_BYTES_MAX)
+        for names, values in COLUMNS:
+            if names in file and values in file:
+                columns = np.asarray(file[values], dtype=float)
+                if columns.ndim != 2 or len(columns) < 2 or not np.all(np.isfinite(columns)):
+                    raise ValueError(f"{values} of shape {columns.shape}")
+                found |= dict(zip(map(str, file[names].tolist()), columns.T, strict=True))
+        if not found or len({len(column) for column in found.values()}) > 1:
+            raise ValueError("no draws by name, or columns of other lengths")
+    except (KeyError, TypeError, ValueError) as error:
+        allowed, reason = "draws by name, finite, as `tvsbayes fit` writes them", escaped(str(error), 120)
+        raise refusal("damaged", file="results/draws.npz", found=reason, allowed=allowed, remedy=AGAIN) from error
+    return found
+
+
+def _weighted(by_name: dict[str, np.ndarray]) -> tuple[Mapping[str, np.ndarray], np.ndarray]:
+    """Draws and weights (n,); repeats, which systematic resampling leaves beside each other, are one."""
+    rows = np.stack(list(by_name.values()), axis=1)
+    first = np.flatnonzero(np.r_[True, np.any(rows[1:] != rows[:-1], axis=1)])
+    weights = np.diff(np.r_[first, len(rows)]) / len(rows)
+    return MappingProxyType({name: column[first] for name, column in by_name.items()}), weights
