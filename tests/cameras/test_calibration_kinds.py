@@ -104,7 +104,7 @@ def test_a_fisheye_is_fitted_or_refused_and_its_renaming_doubted(mounted):
     ours = cv2.projectPoints(points, still, still, stereo.M1, stereo.D1)[0].reshape(-1, 2)
     assert np.abs(theirs - ours).max() < 0.01
     wide = np.array([[240.0, 0, 320], [0, 240, 240], [0, 0, 1]])
-    assert fitted_to_five(wide, coefficients, (640, 480), True).error_px > 0.1
+    assert fitted_to_five(wide, coefficients, (640, 480), "fisheye").error_px > 0.1
 
 
 def plain(stereo: Stereo, names: str) -> dict[str, np.ndarray]:

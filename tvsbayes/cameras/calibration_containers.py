@@ -1,5 +1,7 @@
 """Files in which programs keep calibrations, by content: YAML, XML and JSON (OpenCV's too), TOML, .npz, MATLAB's .mat.
 
+What cameras' own programs print is text of other kinds: `maker_calibrations` knows it.
+
 Every container comes out as nested maps, lists and numbers, `Keys` that know file and line. OpenCV's matrices stay maps
 of rows, cols, data. OpenCV's FileStorage has had memory errors on hostile files (CVE-2019-5063, -5064; opencv #28619):
 libraries of the formats read instead, under caps: bytes, entries and depth; no aliases, entities or pickles.
@@ -21,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from tvsbayes.cameras.maker_calibrations import printed_values
 from tvsbayes.errors import InputError, escaped, refusal, shown
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.disk import decode
@@ -30,7 +33,10 @@ MATRIX_TAG = "!!opencv-matrix"
 CONTAINER_BYTES_MAX = 4 * 1024 * 1024
 ENTRIES_MAX = 200_000
 DEPTH_MAX = 12
-_ALLOWED = "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, or .mat of MATLAB up to version 7"
+_ALLOWED = (
+    "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, .mat of MATLAB up to version 7, a ZED's SN*.conf,"
+    " what rs-enumerate-devices -c prints"
+)
 MAT_SECONDS_MAX = 60.0
 _MAT_HEADER_BYTES, _MAT_COMPRESSED = 128, 15
 """Of MAT-file 5: the header, and the type of a compressed element (MATLAB MAT-File Format, 1-3, 1-6)."""
@@ -55,6 +61,12 @@ def read_container(data: bytes, file: str) -> Keys:
                 raise bad(file, None, "a damaged file", "write it again with its program") from e
             return Keys(_plain(values, file), file, "")
     text = decode(data, file)
+    try:
+        printed = printed_values(text)
+    except ValueError as error:
+        raise bad(file, None, str(error), "take the file as the camera's program wrote it") from error
+    if printed is not None:
+        return Keys(_plain(printed, file), file, text)
     first = text.lstrip()[:1]
     if first == "<":
         return Keys(_plain(_xml(text, file), file), file, "")

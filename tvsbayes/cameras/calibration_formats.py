@@ -18,7 +18,8 @@ import numpy as np
 from tvsbayes.cameras.assumed_covariance import GUESS_FACTOR, Known, with_assumed_covariance
 from tvsbayes.cameras.calibration_containers import CONTAINER_BYTES_MAX, read_container
 from tvsbayes.cameras.calibration_names import ROTATION_TOLERANCE, Entry, Found
-from tvsbayes.cameras.lens_models import ERROR_MAX_PX, FISHEYE, FIVE, RATIONAL, fitted_to_five
+from tvsbayes.cameras.lens_models import ERROR_MAX_PX, fitted_to_five, kind_of
+from tvsbayes.cameras.maker_calibrations import MakersPair, makers_pair
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import Keys
@@ -54,7 +55,8 @@ class Imported:
 
     Attributes:
         stereo: the pair, mm and px.
-        source: opencv (also any other program whose names are known), ros, kalibr, euroc, matlab or tvsbayes.
+        source: opencv (also any other program whose names are known), ros, kalibr, euroc, matlab, realsense, depthai,
+            zed, boofcv or tvsbayes.
         notes: what was assumed.
         warnings: what makes it implausible (`pair_doubts`).
     """
@@ -99,7 +101,10 @@ def read_calibration(
     if len(files) > 3:
         found, allowed = f"{len(files)} files", "one, two or three"
         raise refusal("usage", file=names[0], found=found, allowed=allowed, remedy="name those of one pair")
-    reader = _Reader(Found(files, keys or {}), size, unit_mm)
+    maker = makers_pair(files[0], size) if len(files) == 1 else None
+    reader = _Reader(Found([maker.keys] if maker else files, keys or {}), size, unit_mm)
+    if maker is not None:
+        reader.take(maker)
     bare = reader.pair()
     doubts = pair_doubts(bare, reader.places)
     try:
@@ -138,8 +143,14 @@ class _Reader:
     def __init__(self, found: Found, size: tuple[int, int] | None, unit_mm: float | None):
         self.found, self.stated_size, self.unit_mm = found, size, unit_mm
         self.source = "opencv"
+        self.unit: str | None = None
         self.notes: list[str] = []
         self.places: dict[str, str] = {}
+
+    def take(self, maker: MakersPair) -> None:
+        """Whose file it is, and in which unit, where a maker's format tells."""
+        self.source, self.unit = maker.source, maker.unit
+        self.notes += [f"{maker.keys.file}: {note}" for note in maker.notes]
 
     def pair(self) -> Stereo:
         """The pair, without a covariance, checked as `stereo.json` is."""
@@ -162,7 +173,7 @@ class _Reader:
     def _check_model(self, side: int) -> None:
         """Refuses a lens model that nothing here converts."""
         model = self.found.model(side)
-        if model not in (*FIVE, *RATIONAL, *FISHEYE, ""):
+        if kind_of(model) is None:
             raise refusal(
                 "lens-model",
                 file=", ".join(keys.file for keys in self.found.files),
@@ -213,7 +224,7 @@ class _Reader:
 
     def _distortion(self, side: int, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """k1 k2 p1 p2 k3, fitted where the file has another model."""
-        camera, model = self.found.cameras[side], self.found.model(side)
+        camera, kind = self.found.cameras[side], kind_of(self.found.model(side))
         found = self._coefficients(camera)
         if found is None:
             if {"M", "fx"} & set(camera):
@@ -221,14 +232,21 @@ class _Reader:
             return np.zeros(5)
         values, entry = found
         self.places[f"D{side + 1}"] = entry.place
-        fisheye = model in FISHEYE
-        if not fisheye and not values[5:].any():
+        if kind == "fisheye" and not values[4:].any():
+            values = values[:4]
+        if not values.any() and kind != "fisheye":
+            return np.zeros(5)
+        if kind in ("five", "rational") and not values[5:].any():
             return np.append(values[:5], np.zeros(max(0, 5 - values.size)))
-        if fisheye and values.size != 4:
-            found_here = f"{values.size} of a fisheye"
-            raise entry.refuse("lens-model", "four coefficients", "take the file as it was", found_here)
-        fitted = fitted_to_five(matrix, values, size, fisheye)
-        what = "a fisheye lens" if fisheye else f"a lens of {values.size} coefficients"
+        wanted = {"fisheye": 4, "inverse": 5}.get(str(kind), values.size)
+        if values.size != wanted:
+            found_here = f"{values.size} of a {kind} lens"
+            raise entry.refuse("lens-model", f"{wanted} coefficients", "take the file as it was", found_here)
+        assert kind is not None
+        fitted = fitted_to_five(matrix, values, size, "rational" if kind == "five" else kind)
+        what = {"fisheye": "a fisheye lens", "inverse": "a lens described from pixels to rays"}.get(
+            kind, f"a lens of {values.size} coefficients"
+        )
         if not fitted.error_px <= ERROR_MAX_PX:
             off = f"up to {fitted.error_px:.2g} px" if math.isfinite(fitted.error_px) else "more than any fit tells"
             allowed = f"what k1 k2 p1 p2 k3 describe to {ERROR_MAX_PX:g} px over the picture"
@@ -298,6 +316,8 @@ class _Reader:
             by_columns = turn.numbers.size == 9 and turn.shape == (9,) and _named(left.get("cx"), "ppx")
             if "R" not in pair or by_columns:
                 rotation, self.source = rotation.T, "matlab" if "R" not in pair else "realsense"
+                if by_columns:
+                    self.notes.append(f"{turn.place}: nine numbers, taken column by column as librealsense has them")
             return self._consistent(rotation, turn), pair["T"].numbers
         if (entry := pair.get("pose") or pair.get("pose_backwards")) is not None:
             self.places |= {"R": entry.place, "T": entry.place}
@@ -378,10 +398,10 @@ class _Reader:
                 allowed="a baseline",
                 remedy="T is 0: name the right one, --key T=NAME",
             )
-        metric = self.source in ("kalibr", "ros", "euroc", "realsense")
+        stated = self.unit or ("m" if self.source in ("kalibr", "ros", "euroc", "realsense") else "")
         if self.unit_mm is not None:
             return self.unit_mm
-        unit = "m" if metric else "mm"
+        unit = stated or "mm"
         low, high = BASELINES_MM
         if not low <= length * UNITS_MM[unit] <= high:
             fits = [
@@ -398,7 +418,7 @@ class _Reader:
                 allowed=f"{low:g} to {high:g} mm without a word",
                 remedy=remedy,
             )
-        if not metric:
+        if not stated:
             self.notes.append("T is taken in mm: the file does not state a unit")
         return UNITS_MM[unit]
 

@@ -6,19 +6,23 @@ then the five coefficients that bring them back to their pixels, the camera matr
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from tvsbayes.instrument.stereo_pair import distort
 
+Kind = Literal["five", "rational", "fisheye", "inverse"]
 FIVE: tuple[str, ...] = (
-    *("plumb_bob", "plumb bob", "radtan", "radial-tangential", "radial_tangential", "radialtangential", "standard"),
-    *("brown", "brown_conrady", "brown-conrady", "brown conrady", "distortion.brown_conrady", "opencv", "none"),
-    *("inverse_brown_conrady", "modified_brown_conrady", "pinhole", "perspective"),
+    *("plumb_bob", "radtan", "radial_tangential", "radialtangential", "standard", "brown", "brown_conrady"),
+    *("opencv", "none", "modified_brown_conrady", "pinhole", "perspective"),
 )
-RATIONAL = ("rational_polynomial", "rational", "rational polynomial", "thin_prism", "tilted")
+RATIONAL = ("rational_polynomial", "rational", "thin_prism", "tilted")
+INVERSE = ("inverse_brown_conrady",)
+"""librealsense's: five coefficients that bring pixels to rays, not rays to pixels (rs2_deproject_pixel_to_point)."""
 FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "kannalabrandt8", "kannala_brandt8", "equi")
 GRID = 25
 """Pixels each way over the picture."""
@@ -36,17 +40,28 @@ class FittedLens:
     error_px: float
 
 
-def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, int], fisheye: bool) -> FittedLens:
+def kind_of(model: str) -> Kind | None:
+    """The kind of a lens model by its name; "five" where none is stated, None where nothing here knows it."""
+    bare = re.sub(r"[ -]", "_", model.strip().lower()).removeprefix("distortion.")
+    names: dict[Kind, tuple[str, ...]] = {"five": (*FIVE, ""), "rational": RATIONAL, "fisheye": FISHEYE}
+    names["inverse"] = INVERSE
+    return next((kind for kind, known in names.items() if bare in known), None)
+
+
+def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, int], kind: Kind) -> FittedLens:
     """The five coefficients nearest to another model.
 
     Args:
         matrix: of the camera.
-        distortion: OpenCV's 8, 12 or 14, or the 4 of its fisheye model.
+        distortion: OpenCV's 8, 12 or 14, the 4 of its fisheye model, or the 5 of the inverse one.
         size: width and height of the picture, px.
-        fisheye: whether they are the latter.
+        kind: which of them.
     """
     grid = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 1, 2)
-    if fisheye:
+    if kind == "inverse":
+        rays: np.ndarray = distort((grid.reshape(-1, 2) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], distortion)
+        again: np.ndarray = grid.reshape(-1, 2)
+    elif kind == "fisheye":
         rays = cv2.fisheye.undistortPoints(grid, matrix, distortion.reshape(4, 1)).reshape(-1, 2)
         again = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), matrix, distortion.reshape(4, 1)).reshape(-1, 2)
     else:

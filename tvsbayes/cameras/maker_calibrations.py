@@ -1,0 +1,292 @@
+"""Calibrations as makers of stereo cameras and BoofCV write them, brought to the names of `calibration_names`.
+
+A name is not enough for them: cameras by the number of a socket and poses by a chain (DepthAI), one calibration for
+each size of the pictures (ZED, RealSense), a pose in components. Each becomes tables `left` and `right` and the pose
+between them; no number is changed but by the transformation that the format states.
+"""
+
+from __future__ import annotations
+
+import configparser
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tvsbayes.errors import escaped, listed, refusal
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.files.documents import Keys
+
+Size = tuple[int, int]
+Values = dict[str, Any]
+ZED_SIZES: dict[str, Size] = {
+    **{"2k": (2208, 1242), "fhd": (1920, 1080), "fhd1200": (1920, 1200), "hd": (1280, 720), "svga": (960, 600)},
+    **{"vga": (672, 376), "4k": (3840, 2160), "qhdplus": (3200, 1800)},
+}
+"""Pictures of one camera, px, by the end of a section's name (StereoLabs, zed-open-capture and zedx-one-capture)."""
+DEPTHAI_MODELS = {0: "perspective", 1: "equidistant"}
+"""`CameraModel` of depthai-core; its fisheye is OpenCV's of four coefficients."""
+_ZED_SECTION = re.compile(r"^\s*\[LEFT_CAM_\w+\]\s*$", re.MULTILINE | re.IGNORECASE)
+_PART = re.compile(r'(?=Intrinsic of "|Extrinsic from ")')
+_STREAM = re.compile(r'Intrinsic of "([^"\n]+)" / ([0-9]+)x([0-9]+)(.*)', re.DOTALL)
+_POSE = re.compile(r'Extrinsic from "([^"\n]+)"\s+To\s+"([^"\n]+)"\s*:(.*)', re.DOTALL)
+_STREAM_OBJECT = re.compile(
+    r"\[\s*([0-9]+)x([0-9]+)\s+p\[(\S+)\s+([^\]\s]+)\]\s+f\[(\S+)\s+([^\]\s]+)\]\s+"
+    r"([A-Za-z][\w ]*?)\s*\[([^\]]*)\]\s*\]"
+)
+_POSE_OBJECT = re.compile(r"rotation:\s*\[([^\]]*)\]\s*translation:\s*\[([^\]]*)\]")
+STEREO_STREAMS = ("Infrared 1", "Infrared 2")
+"""The left and the right camera of a RealSense D400."""
+
+
+@dataclass(frozen=True)
+class MakersPair:
+    """A calibration in names that are known.
+
+    Attributes:
+        keys: its tables, which refuse in the name of the file.
+        source: whose it is.
+        unit: of its translation: "m", "cm", "mm"; "" where the file does not tell.
+        notes: what was assumed.
+    """
+
+    keys: Keys
+    source: str
+    unit: str
+    notes: tuple[str, ...] = ()
+
+
+def printed_values(text: str) -> Values | None:
+    """The values of a ZED's settings file or of what RealSense's tools print; None where a text is neither."""
+    if _ZED_SECTION.search(text):
+        return _sections(text)
+    if _STREAM.search(text) or len(_STREAM_OBJECT.findall(text)) > 1:
+        return {"realsense": _streams(text)}
+    return None
+
+
+def makers_pair(keys: Keys, size: Size | None) -> MakersPair | None:
+    """A maker's file in known names; None where it is none.
+
+    Args:
+        keys: the file.
+        size: of the pictures, px, where the user states it.
+
+    Raises:
+        InputError: no pair in the file, or several sizes of pictures and none stated.
+    """
+    for recognised, read in _MAKERS:
+        if recognised(keys.values):
+            try:
+                return read(keys.values, keys, size)
+            except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+                raise refusal(
+                    "container",
+                    file=keys.file,
+                    found=f"entries that a file of this kind does not have, or lacks ({escaped(str(error), 60)})",
+                    allowed="the file as the camera's program writes it",
+                    remedy="take it again from there, whole",
+                ) from error
+    return None
+
+
+def _sections(text: str) -> Values:
+    """Sections of an ini file, keys in small letters."""
+    parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=(";", "#"))
+    try:
+        parser.read_string(text)
+    except configparser.Error as error:
+        raise ValueError(str(error).replace("\n", " ")) from error
+    return {
+        name.lower(): {key: float(word) if NUMBER.fullmatch(word) else word for key, word in section.items()}
+        for name, section in parser.items()
+        if name != parser.default_section
+    }
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(word) for word in re.split(r"[\s,]+", text) if NUMBER.fullmatch(word)]
+
+
+def _streams(text: str) -> Values:
+    """Streams and poses between them, of `rs-enumerate-devices -c` or of printed objects of pyrealsense2.
+
+    The tool prints R row by row (`print` in rs-enumerate-devices.cpp), an object has it column by column (rs_types.h).
+    """
+    streams, poses = [], []
+    parts = _PART.split(text)
+    for name, width, height, rest in (found.groups() for part in parts if (found := _STREAM.match(part))):
+        fields = {key.lower(): rest.partition(f"{key}:")[2].split("\n")[0] for key in ("PPX", "PPY", "Fx", "Fy")}
+        model, coefficients = (rest.partition(f"{key}:")[2].split("\n")[0] for key in ("Distortion", "Coeffs"))
+        streams.append(_stream(name, (width, height), fields, model, coefficients))
+    for one, other, rest in (found.groups() for part in parts if (found := _POSE.match(part))):
+        turn, _, shift = rest.partition("Translation Vector:")
+        shift = shift.strip().split("\n")[0]
+        poses.append({"from": one, "to": other, "R": _numbers(turn), "T": _numbers(shift)})
+    for number, (width, height, ppx, ppy, fx, fy, model, rest) in enumerate(_STREAM_OBJECT.findall(text)):
+        fields = {"ppx": ppx, "ppy": ppy, "fx": fx, "fy": fy}
+        streams.append(_stream(f"camera {number + 1}", (width, height), fields, model, rest))
+    for turn, shift in _POSE_OBJECT.findall(text):
+        rows = np.array(numbers).reshape(3, 3).T.ravel().tolist() if len(numbers := _numbers(turn)) == 9 else numbers
+        poses.append({"from": "camera 1", "to": "camera 2", "R": rows, "T": _numbers(shift)})
+    return {"streams": streams, "poses": poses}
+
+
+def _stream(name: str, size: Sequence[str], fields: Mapping[str, str], model: str, coefficients: str) -> Values:
+    numbers = {key: found[0] for key, word in fields.items() if (found := _numbers(word))}
+    inner = {**numbers, "distortion_model": model.strip(), "D": _numbers(coefficients)}
+    return {"name": name, "width": int(size[0]), "height": int(size[1]), **inner}
+
+
+def _chosen(sizes: Mapping[str, Size], size: Size | None, file: str) -> str:
+    """The name whose size the user states, or the only one."""
+    fitting = [name for name, own in sizes.items() if size in (None, own)]
+    if len(fitting) == 1:
+        return fitting[0]
+    each = listed([f"{width}x{height}" for width, height in sizes.values()], len(ZED_SIZES))
+    found = f"calibrations for pictures of {each} px" if sizes else "no calibration of both cameras for one size"
+    example = "x".join(map(str, next(iter(sizes.values()), (1280, 720))))
+    raise refusal(
+        "image-size",
+        file=file,
+        found=found,
+        allowed="the size of the pictures that the spots are in",
+        remedy=f"state it, for example --image-size {example}",
+    )
+
+
+def _zed(document: Values, keys: Keys, size: Size | None) -> MakersPair:
+    """SN*.conf: R of the vector RX, CV, RZ; T = (-Baseline, TY, TZ) mm.
+
+    As StereoLabs' zedx-one-capture writes it from cv2.stereoCalibrate (stereo_calibration/main.cpp).
+    """
+    sections = {name: table for name, table in document.items() if isinstance(table, dict)}
+    both = {
+        name: own
+        for name, own in ZED_SIZES.items()
+        if f"left_cam_{name}" in sections and f"right_cam_{name}" in sections
+    }
+    name = _chosen(both, size, keys.file)
+    stereo, notes = sections.get("stereo", {}), []
+
+    def number(table: Values, section: str, key: str, other: float | None = None) -> float:
+        value = table.get(f"{key}_{name}", table.get(key, other))
+        if not isinstance(value, float):
+            found = "nothing" if value is None else escaped(str(value), 40)
+            remedy = "take the file as the ZED's program wrote it"
+            column = f"{section}.{key}"
+            raise refusal("missing-key", file=keys.file, column=column, found=found, allowed="a number", remedy=remedy)
+        return value
+
+    values: Values = {}
+    for side in ("left", "right"):
+        section = f"{side}_cam_{name}"
+        lens = sections.get(f"{side}_disto", sections[section])
+        names = ("k1", "k2", "p1", "p2", "k3") + (("k4", "k5", "k6") if "k4" in lens else ())
+        values[side] = {key: number(sections[section], section, key) for key in ("fx", "fy", "cx", "cy")}
+        values[side] |= dict(zip(("width", "height"), both[name], strict=True))
+        values[side]["D"] = [number(lens, section, key, 0.0 if key in ("p1", "p2", "k3") else None) for key in names]
+    values["R"] = [number(stereo, "stereo", key) for key in ("rx", "cv", "rz")]
+    if not {"ty", f"ty_{name}"} & set(stereo):
+        notes.append("TY and TZ: none in the file, so 0")
+    aside = [number(stereo, "stereo", key, 0.0) for key in ("ty", "tz")]
+    values["T"] = [-number(stereo, "stereo", "baseline"), *aside]
+    return MakersPair(Keys(values, keys.file, keys.text), "zed", "mm", tuple(notes))
+
+
+def _depthai(document: Values, keys: Keys, size: Size | None) -> MakersPair:
+    """EEPROM of an OAK: x_to = R x_from + T along a chain of sockets, cm (`CalibrationHandler` of depthai-core)."""
+    del size
+    cameras = {one[0]: one[1] for one in document["cameraData"] if _is_socket(one)}
+    stated = document.get("stereoRectificationData", {})
+    sockets = [stated.get(f"{side}CameraSocket") for side in ("left", "right")]
+    if not all(socket in cameras for socket in sockets) or sockets[0] == sockets[1]:
+        # CAM_B and CAM_C, where the rectification was never stored.
+        sockets = [1, 2]
+    poses = [_to_base(cameras, socket) for socket in sockets if socket in cameras] + [None, None]
+    if poses[0] is None or poses[1] is None or poses[0][0] != poses[1][0]:
+        raise refusal(
+            "missing-key",
+            file=keys.file,
+            found=f"cameras at the sockets {listed([str(s) for s in cameras], 8) if cameras else 'none'}",
+            allowed="two cameras, and a chain of toCameraSocket between them",
+            remedy="take it from the device again: dai.CalibrationHandler.eepromToJsonFile()",
+        )
+    pose = np.linalg.inv(poses[1][1]) @ poses[0][1]
+    values: Values = {"R": pose[:3, :3].tolist(), "T": pose[:3, 3].tolist()}
+    for side, socket in zip(("left", "right"), sockets, strict=True):
+        camera = cameras[socket]
+        kind = camera.get("cameraType", 0)
+        kept = {key: camera[key] for key in ("intrinsicMatrix", "distortionCoeff", "width", "height") if key in camera}
+        values[side] = {**kept, "camera_model": DEPTHAI_MODELS.get(kind, f"cameraType {escaped(str(kind), 20)}")}
+    note = f"sockets {sockets[0]} (left) and {sockets[1]} (right)"
+    return MakersPair(Keys(values, keys.file, keys.text), "depthai", "cm", (note,))
+
+
+def _is_socket(one: object) -> bool:
+    return isinstance(one, list) and len(one) == 2 and isinstance(one[0], int) and isinstance(one[1], dict)
+
+
+def _to_base(cameras: Mapping[int, Values], socket: int) -> tuple[int, np.ndarray] | None:
+    """The socket at the end of a camera's chain, and the transformation (4, 4) to it; None where the chain breaks."""
+    whole = np.eye(4)
+    for _ in cameras:
+        outer = cameras[socket]["extrinsics"]
+        if outer["toCameraSocket"] not in cameras:
+            return socket, whole
+        step = np.eye(4)
+        step[:3, :3] = outer["rotationMatrix"]
+        step[:3, 3] = [outer["translation"][axis] for axis in "xyz"]
+        whole, socket = step @ whole, outer["toCameraSocket"]
+    return None
+
+
+def _realsense(document: Values, keys: Keys, size: Size | None) -> MakersPair:
+    """What rs-enumerate-devices -c prints, or printed objects of pyrealsense2: m."""
+    printed = document["realsense"]
+    names = list(dict.fromkeys(stream["name"] for stream in printed["streams"]))
+    pair = STEREO_STREAMS if set(STEREO_STREAMS) <= set(names) else tuple(names)
+    between = [p for p in printed["poses"] if (p["from"], p["to"]) == pair and len(p["R"]) == 9 and len(p["T"]) == 3]
+    if len(pair) != 2 or not between:
+        raise refusal(
+            "missing-key",
+            file=keys.file,
+            found=f"streams {listed([escaped(name, 30) for name in names], 8)}, and no pose between two of them alone",
+            allowed="the intrinsics of two cameras, and the extrinsics from the first to the second",
+            remedy="keep both Infrared streams, or those of your two cameras, and the extrinsics between them",
+        )
+    by_name = [{(s["width"], s["height"]): s for s in printed["streams"] if s["name"] == name} for name in pair]
+    sizes = {f"{width}x{height}": (width, height) for width, height in by_name[0] if (width, height) in by_name[1]}
+    own = sizes[_chosen(sizes, size, keys.file)]
+    values = {side: streams[own] for side, streams in zip(("left", "right"), by_name, strict=True)}
+    pose = {"R": np.reshape(between[0]["R"], (3, 3)).tolist(), "T": between[0]["T"]}
+    note = f"left is {escaped(pair[0], 30)}, right {escaped(pair[1], 30)}"
+    return MakersPair(Keys({**values, **pose}, keys.file, keys.text), "realsense", "m", (note,))
+
+
+def _boofcv(document: Values, keys: Keys, size: Size | None) -> MakersPair:
+    """`rightToLeft`: x_left = R x_right + t; unit of the board."""
+    del size
+    outer = document["rightToLeft"]
+    values: Values = {}
+    for side in ("left", "right"):
+        camera = document[side]
+        values[side] = dict(camera["pinhole"]) if "pinhole" in camera else {}
+        lens = camera.get("radial_tangential", {})
+        k1, k2, *others = [*lens.get("radial", ()), 0.0, 0.0][: max(2, len(lens.get("radial", ())))]
+        values[side]["D"] = [k1, k2, lens.get("t1", 0.0), lens.get("t2", 0.0), *others]
+        model = str(camera.get("model", ""))
+        values[side]["distortion_model"] = "radtan" if model in ("pinhole_radial_tangential", "pinhole") else model
+    turn = np.reshape(np.array(outer["rotation"], dtype=float), (3, 3))
+    shift = -turn.T @ np.array([outer["x"], outer["y"], outer["z"]], dtype=float)
+    return MakersPair(Keys({**values, "R": turn.T.tolist(), "T": shift.tolist()}, keys.file, keys.text), "boofcv", "")
+
+
+_MAKERS: tuple[tuple[Callable[[Values], bool], Callable[[Values, Keys, Size | None], MakersPair]], ...] = (
+    (lambda values: isinstance(values.get("cameraData"), list), _depthai),
+    (lambda values: isinstance(values.get("realsense"), dict) and "streams" in values["realsense"], _realsense),
+    (lambda values: any(str(name).lower().startswith("left_cam_") for name in values), _zed),
+    (lambda values: isinstance(values.get("rightToLeft"), dict), _boofcv),
+)
