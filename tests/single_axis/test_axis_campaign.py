@@ -6,7 +6,8 @@ import pytest
 from support.axes import campaign, runs
 
 from tvsbayes.errors import InputError
-from tvsbayes.single_axis.axis_campaign import axis_hashes, is_axis_folder, read_axis, write_axis
+from tvsbayes.instrument.campaign_header import mechanism_of
+from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis, write_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 
 TOML = 'format = "tvsbayes-axis/1"\nunit = "deg"\n'
@@ -28,7 +29,7 @@ def test_what_is_written_is_read_back(tmp_path):
     found = read_axis(tmp_path / "a")
     assert (found.moves, found.readings, found.stated, found.unit) == (made.moves, made.readings, made.stated, "deg")
     assert axis_hashes(found) == axis_hashes(made)
-    assert is_axis_folder(tmp_path / "a") and not is_axis_folder(tmp_path)
+    assert mechanism_of(tmp_path / "a") == "axis"
 
 
 def test_marks_line_ends_and_empty_cells_are_accepted(tmp_path):

@@ -1,6 +1,6 @@
 """What commands do with an axis folder: check, fit, calibrate, compare, report, plan, simulate, new.
 
-The commands themselves stand with their groups; they come here where `campaign.toml` says `tvsbayes-axis/1`.
+The commands themselves stand with their groups; `cli/instruments` sends them here by the folder.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from tvsbayes.cli.app import command_line, finish, keep, report_line, tell_part,
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, write_atomically
+from tvsbayes.pipeline import MAX_MINUTES
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
@@ -21,36 +22,10 @@ if TYPE_CHECKING:
     from tvsbayes.single_axis.axis_record import AxisSummary
 
 STORED = "results/ are missing or older than the axis folder: fitting first (weighted draws) ..."
-NOT_OF_AN_AXIS = "for a scanner, and this is an axis folder"
-FOR_AN_AXIS = "of an axis: check, classic, fit, calibrate, compare --by positions, report, plan --given"
 FITTING, PLANNING, PRINTING = "fit", "choosing stops", "printing to PDF"
 
 
-def is_axis(folder: Path | None) -> bool:
-    """Whether this is an axis folder."""
-    from tvsbayes.single_axis.axis_campaign import is_axis_folder
-
-    return folder is not None and (folder / "campaign.toml").is_file() and is_axis_folder(folder)
-
-
-def refuse_axis(folder: Path, command: str, remedy: str = FOR_AN_AXIS) -> None:
-    """A command that needs cameras does not take an axis folder, and says so.
-
-    Args:
-        folder: that it was given.
-        command: its name.
-        remedy: what to do instead.
-
-    Raises:
-        InputError: it is one.
-    """
-    # Looked at first, because it costs nothing: the folder of a scanner has its cameras.
-    if not (folder / "stereo.json").is_file() and is_axis(folder):
-        message = f"{command} is for a scanner, not an axis, and {escaped(str(folder), 200)} is an axis folder"
-        raise InputError("usage", message, remedy=remedy)
-
-
-def new_axis(out: Path, as_json: bool) -> None:
+def new(out: Path, as_json: bool) -> None:
     """An empty axis folder, explained in campaign.toml."""
     from tvsbayes.single_axis.axis_campaign import axis_templates
 
@@ -63,7 +38,7 @@ def new_axis(out: Path, as_json: bool) -> None:
     finish({"campaign": str(out), "files": names}, text, as_json)
 
 
-def axis_held(folder: Path) -> dict[str, Any]:
+def held(folder: Path) -> dict[str, Any]:
     """What `check` says of an axis folder."""
     from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_record import axis_warnings
@@ -166,7 +141,7 @@ def _fitted(data: AxisCampaign, place: Path, wish: Sampled) -> Kept:
     return Kept(summary, keep_fit(found, summary, place), found.error or uninformed(summary))
 
 
-def calibrate(folder: Path, *, issue: Issue, wish: Sampled, pdf: bool, as_json: bool) -> None:
+def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool, as_json: bool) -> None:
     """Check, classic, fit and report of an axis in one go."""
     from tvsbayes.report.axis_text import axis_fit_text, classic_text
     from tvsbayes.report.command_text import held_text
@@ -176,13 +151,13 @@ def calibrate(folder: Path, *, issue: Issue, wish: Sampled, pdf: bool, as_json: 
     from tvsbayes.single_axis.classic_line import classic_axis
 
     data = read_axis(folder)
-    documents: dict[str, Any] = {"check": axis_held(folder)}
+    documents: dict[str, Any] = {"check": held(folder)}
     tell_part(held_text(documents["check"]), as_json)
     line = classic_axis(rows_of(data))
     documents["classic"] = {"unit": data.unit, **plain(line)}
     tell_part(classic_text(line, data.unit), as_json)
-    kept = _fitted(data, output_place(folder, "results"), wish)
-    documents["fit"] = kept.as_json(wish.seed)
+    kept = _fitted(data, output_place(folder, "results"), Sampled(quick, no_sample, MAX_MINUTES, seed))
+    documents["fit"] = kept.as_json(seed)
     told = axis_fit_text(kept.summary, written=list(kept.files.values()))
     if kept.error is not None:
         finish({**documents, "report": None}, told, as_json, kept.error)
@@ -191,8 +166,11 @@ def calibrate(folder: Path, *, issue: Issue, wish: Sampled, pdf: bool, as_json: 
     finish(documents, f"next: open {', '.join(page['files'].values())} in a browser", as_json)
 
 
-def compare(folder: Path, *, by: str | None, seed: int, as_json: bool) -> None:
+def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_json: bool) -> None:
     """Every position left out in turn, beside the classic."""
+    if other is not None:
+        message = "B is a later campaign of a scanner; axes are compared one by one"
+        raise InputError("usage", message, remedy="leave out B")
     from tvsbayes.report.axis_text import axis_hold_out_text
     from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
     from tvsbayes.single_axis.held_out_positions import hold_out_positions
@@ -248,9 +226,12 @@ def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path |
 
 
 def plan(
-    folder: Path, *, target: str | None, minutes: float | None, output: Path | None, seed: int, as_json: bool
+    folder: Path, *, alone: bool, target: str | None, minutes: float | None, out: Path | None, seed: int, as_json: bool
 ) -> None:
-    """What to read next."""
+    """What to read next; `alone` where the folder is the only thing named, by --given."""
+    if not alone:
+        message, remedy = "an axis is planned from its folder alone", "give --given FOLDER without RIG"
+        raise InputError("usage", message, remedy=remedy)
     from tvsbayes.report.axis_text import axis_plan_text
     from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_record import results_for
@@ -268,18 +249,18 @@ def plan(
         found = plan_next(results.fit, wanted, minutes=minutes, progress=job.part(PLANNING))
     document, text = {**found.as_json(), "unit": data.unit, "seed": seed}, axis_plan_text(found, data.unit)
     document["u_unit"] = unit_of(found.target, data.unit)
-    if output is not None and found.next:
-        write_atomically(output, found.plan_bytes())
-        document["plan"] = str(output)
-        text += f"\nwritten: {escaped(str(output), 200)}"
-    elif output is not None:
-        text += f"\nnothing written to {escaped(str(output), 200)}"
+    if out is not None and found.next:
+        write_atomically(out, found.plan_bytes())
+        document["plan"] = str(out)
+        text += f"\nwritten: {escaped(str(out), 200)}"
+    elif out is not None:
+        text += f"\nnothing written to {escaped(str(out), 200)}"
     if keep(document, output_place(folder, "results") / "plan.json"):
         document["files"] = {"next": str(output_place(folder, "results") / "plan.json")}
     finish(document, text, as_json)
 
 
-def simulate(folder: Path, moves: Path | None, out: Path, *, seed: int, as_json: bool) -> None:
+def simulate(folder: Path, *, moves: Path | None, out: Path, seed: int, as_json: bool) -> None:
     """A drawn axis with the priors of a folder, moved as listed."""
     from tvsbayes.files.csv_table import CSV_BYTES_MAX
     from tvsbayes.files.disk import read_bytes

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import Json, finish, refuse_options
+from tvsbayes.cli.instruments import INSTRUMENTS
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, listed, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes
@@ -44,8 +44,7 @@ def new(
     if pictures is None:
         refuse_options("for pictures", "add --pictures FOLDER, or leave it out", pair=pair, swap=swap)
     if axis:
-        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", pictures=pictures)
-        axis_commands.new_axis(out, as_json)
+        INSTRUMENTS["axis"].carry_out("new", out, pictures=pictures, as_json=as_json)
         return
     if pictures is not None:
         _with_pictures(out, pictures, pair, swap, as_json)

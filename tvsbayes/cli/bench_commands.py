@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import Json, finish, finite, refuse_options, report_line
+from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import write_atomically
@@ -317,7 +317,8 @@ def export(
     as_json: Json = False,
 ) -> None:
     """A campaign with its journal as one file of another format. Replaces no file."""
-    axis_commands.refuse_axis(folder, "export")
+    if serve("export", folder, nexus=nexus, as_json=as_json):
+        return
     from tvsbayes.acquisition.nexus_file import write_nexus
 
     done = write_nexus(folder, nexus)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import (
     CampaignFolder,
     Json,
@@ -21,9 +20,9 @@ from tvsbayes.cli.app import (
     finite,
     in_order,
     is_part,
-    refuse_options,
     report_line,
 )
+from tvsbayes.cli.instruments import instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, typed
 from tvsbayes.files.disk import make_folder, output_place, shipped_data, write_atomically
@@ -104,10 +103,8 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """The digital twin runs a plan on a true rig that it draws. Writes the campaign and truth.json."""
-    if axis_commands.is_axis(rig):
-        given = {"aperture": aperture, "frames": frames, "unrecorded_sides": unrecorded_sides}
-        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **given)
-        axis_commands.simulate(rig, None if out is None else plan, out or plan, seed=seed, as_json=as_json)
+    given = {"aperture": aperture, "frames": frames, "unrecorded_sides": unrecorded_sides, "seed": seed}
+    if serve("simulate", rig, moves=None if out is None else plan, out=out or plan, as_json=as_json, **given):
         return
     if out is None:
         raise InputError("usage", "Missing argument 'OUT'.", remedy="see tvsbayes --help")
@@ -168,7 +165,8 @@ def detect(
     as_json: Json = False,
 ) -> None:
     """Find the laser spots in a campaign's frames. Writes centres and uncertainties into spots.csv, in place."""
-    axis_commands.refuse_axis(campaign, "detect")
+    if serve("detect", **locals()):
+        return
     finite(speckle_contrast=speckle_contrast)
     from tvsbayes.cameras.detection import detect as find
     from tvsbayes.instrument.campaign import read_campaign, spots_bytes
@@ -240,7 +238,8 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
     if kind == ".toml" and not path.is_dir():
         rig = read_rig(path)
         return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
-    return axis_commands.axis_held(path) if axis_commands.is_axis(path) else campaign_held(path)
+    instrument = instrument_of(path)
+    return campaign_held(path) if instrument is None else instrument.command("held")(path)
 
 
 def _refuse_other_than_rig(path: Path, plan_file: Path) -> None:
@@ -249,8 +248,9 @@ def _refuse_other_than_rig(path: Path, plan_file: Path) -> None:
     name = escaped(str(path), 200)
     if path.is_dir():
         rig_file = path / "rig.toml"
-        if axis_commands.is_axis(path):
-            found, remedy = "an axis folder, whose plan is not checked", f"leave out PLAN: tvsbayes check {typed(path)}"
+        if (instrument := instrument_of(path)) is not None:
+            found = f"{instrument.folder}, whose plan is not checked"
+            remedy = f"leave out PLAN: tvsbayes check {typed(path)}"
         elif rig_file.is_file():
             found, remedy = "a folder", f"name the rig file in it: {escaped(str(rig_file), 200)}"
         else:

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import typer
 
-from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import (
     TARGET_MISSED,
     CampaignFolder,
@@ -22,6 +21,8 @@ from tvsbayes.cli.app import (
     report_line,
     spared,
 )
+from tvsbayes.cli.axis_commands import STORED
+from tvsbayes.cli.instruments import instrument_of
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
@@ -33,7 +34,7 @@ LETTERS, APPLIERS = "XYZABC", ("controller", "host")
 
 
 def _is_scanner(folder: Path) -> bool:
-    return (folder / "campaign.toml").is_file() and not axis_commands.is_axis(folder)
+    return (folder / "campaign.toml").is_file() and instrument_of(folder) is None
 
 
 def _refuse_scanner(folder: Path, command: str) -> None:
@@ -95,7 +96,7 @@ def compensate(
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed)
         if not results.stored:
-            report_line(axis_commands.STORED)
+            report_line(STORED)
         made = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
     document = {"format": COMPENSATION_FORMAT, **made.as_json(), **plain(provenance(axis_hashes(data), seed))}
     files: dict[str, str] = {}

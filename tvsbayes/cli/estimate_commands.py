@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import (
     Anyway,
     CampaignFolder,
@@ -23,6 +22,7 @@ from tvsbayes.cli.app import (
     refuse_options,
     report_line,
 )
+from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import chain_kept, waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
@@ -62,8 +62,7 @@ def _warn_of(campaign: Campaign, *, stops: bool = False) -> None:
 
 def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
     """The paper's four-point estimator. Mean, sd, type A and GUM uncertainty per direction."""
-    if axis_commands.is_axis(campaign):
-        axis_commands.classic(campaign, as_json)
+    if serve("classic", **locals()):
         return
     from tvsbayes.estimators.four_point import classic as estimate
     from tvsbayes.instrument.campaign import read_campaign
@@ -112,13 +111,11 @@ def fit(
         refuse_options(
             "for a chain, and --quick makes none", "give one of them", max_minutes=max_minutes, resume=resume
         )
-    if axis_commands.is_axis(campaign):
-        choice = {"robust": robust, "per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
-        choice |= {"perfect_gears": perfect_gears, "resume": resume, "anyway": anyway}
-        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out, or state priors in [axis]", **choice)
-        minutes = MAX_MINUTES if max_minutes is None else max_minutes
-        ways = {"quick": quick, "no_sample": no_sample, "max_minutes": minutes}
-        axis_commands.fit(campaign, **ways, details=details, out=out, seed=seed, as_json=as_json)  # type: ignore[arg-type]
+    minutes = MAX_MINUTES if max_minutes is None else max_minutes
+    model = {"robust": robust, "per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
+    model["perfect_gears"] = perfect_gears
+    ways = {"quick": quick, "no_sample": no_sample, "max_minutes": minutes, "resume": resume, "anyway": anyway}
+    if serve("fit", campaign, **model, **ways, details=details, out=out, seed=seed, as_json=as_json):
         return
     from tvsbayes.instrument.campaign import read_campaign
 
@@ -133,16 +130,10 @@ def fit(
         results = calibrate(
             data,
             out or output_place(campaign, "results"),
-            model=ModelChoice(
-                robust=robust,
-                per_axis=per_axis,
-                harmonics=harmonics,
-                no_backlash=no_backlash,
-                perfect_gears=perfect_gears,
-            ),
+            model=ModelChoice(**model),
             sampled=not no_sample,
             tier="importance" if quick else "emcee",
-            max_minutes=MAX_MINUTES if max_minutes is None else max_minutes,
+            max_minutes=minutes,
             resume=resume,
             seed=seed,
             tell=report_line,
@@ -186,12 +177,7 @@ def compare(
 
     if other is not None:
         refuse_options("for one campaign: with B nothing is left out", "leave it out, or leave out B", by=by, seed=seed)
-    if axis_commands.is_axis(campaign):
-        if other is not None:
-            raise InputError(
-                "usage", "B is a later campaign of a scanner; axes are compared one by one", remedy="leave out B"
-            )
-        axis_commands.compare(campaign, by=by, seed=seed or 0, as_json=as_json)
+    if serve("compare", campaign, other=other, by=by, seed=seed or 0, as_json=as_json):
         return
     if by not in (None, "steps", "regions", "positions"):
         allowed = "steps, regions and positions"

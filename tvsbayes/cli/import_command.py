@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import Json, finish, refuse_options, report_line, somebody_there
 from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
+from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, closest, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
@@ -102,13 +102,13 @@ def import_(
         wish = replace(correction, pixels_from=pixels_from, relative=relative)
         _correct_campaign(file, to, wish, yes=yes, as_json=as_json)
         return
-    if axis or axis_commands.is_axis(to):
+    if axis or instrument_of(to) is INSTRUMENTS["axis"]:
         from tvsbayes.cli.axis_import import AxisNotation, import_readings
 
         unfit = {"pixels_from": pixels_from or None, "angles": angles, "sd_px": sd_px, "relative": relative}
         unfit |= {"flip": flip, "shift_moves": shift_moves, "swap": swap}
         sides = {f"{a}_approach": None if side == "unknown" else side for a, side in zip(AXES, approach, strict=True)}
-        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit, **sides)
+        refuse_options("for a scanner, and this is an axis folder", "leave it out", **unfit, **sides)
         meant = AxisNotation(_word(kind), run, deviations, counts_per_turn, dict(map(_assumption, assume or ())))
         import_readings(file, to, stated, sheet, meant, yes=yes, as_json=as_json)
         return
@@ -177,7 +177,8 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
     from tvsbayes.instrument.campaign import moves_bytes, read_campaign, spots_bytes
     from tvsbayes.instrument.corrections import Correction, corrected
 
-    axis_commands.refuse_axis(folder, "import")
+    if serve("import", folder, to=to, correction=correction, yes=yes, as_json=as_json):
+        return
     if correction == Correction():
         remedy = "say what to correct: --flip, --shift-moves, --swap, --pixels-from 1, --relative"
         raise InputError("usage", f"{escaped(str(folder), 200)} is a campaign already", remedy=remedy)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import (
     TARGET_MISSED,
     Anyway,
@@ -30,10 +29,11 @@ from tvsbayes.cli.app import (
 )
 from tvsbayes.cli.campaign_commands import campaign_held
 from tvsbayes.cli.estimate_commands import GO_ON
+from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import chain_kept, waiting
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import output_place, write_atomically
-from tvsbayes.pipeline import FITTING, MAX_MINUTES, compile_for, record_for
+from tvsbayes.pipeline import FITTING, compile_for, record_for
 from tvsbayes.pipeline import calibrate as calibrate_campaign
 from tvsbayes.progress import Job
 
@@ -94,11 +94,10 @@ def report(
         refuse_options("for a certificate", "add --dcc", country=country, customer_country=customer_country)
     issue = _issue(laboratory, customer)
     countries = _countries(country, customer_country)
-    if axis_commands.is_axis(campaign):
-        unfit = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm, "dcc": dcc, "dcc_schema": dcc_schema}
-        unfit["range_mm"] = range_mm if range_mm != RANGE_MM else None
-        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit)
-        axis_commands.report(campaign, issue=issue, pdf=pdf, out=out, as_json=as_json)
+    limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
+    limits["range_mm"] = range_mm if range_mm != RANGE_MM else None
+    certified = {"dcc": dcc, "dcc_schema": dcc_schema}
+    if serve("report", campaign, issue=issue, pdf=pdf, out=out, as_json=as_json, **limits, **certified):
         return
     data = read_campaign(campaign)
     wish = PageWish(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf, out)
@@ -270,12 +269,10 @@ def calibrate(
 
         # Before the fit, which takes minutes.
         find_browser()
-    if axis_commands.is_axis(campaign):
-        unfit = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm, "anyway": anyway}
-        unfit["range_mm"] = range_mm if range_mm != RANGE_MM else None
-        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **unfit)
-        wish = axis_commands.Sampled(quick, no_sample, MAX_MINUTES, seed)
-        axis_commands.calibrate(campaign, issue=issue, wish=wish, pdf=pdf, as_json=as_json)
+    limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm, "anyway": anyway}
+    limits["range_mm"] = range_mm if range_mm != RANGE_MM else None
+    ways = {"quick": quick, "no_sample": no_sample, "seed": seed}
+    if serve("calibrate", campaign, issue=issue, **ways, pdf=pdf, as_json=as_json, **limits):
         return
     from tvsbayes.estimators.findings import stop_at
     from tvsbayes.estimators.plausibility import implausible

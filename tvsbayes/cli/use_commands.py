@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import (
     TARGET_MISSED,
     CampaignFolder,
@@ -29,6 +28,7 @@ from tvsbayes.cli.app import (
     spared,
 )
 from tvsbayes.cli.compensation_commands import export_calibration, plan_verify
+from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
 from tvsbayes.errors import InputError, escaped
@@ -75,7 +75,8 @@ def locate(
     as_json: Json = False,
 ) -> None:
     """Where the scanner points, in millimetres. Frame T, with covariance and 95 % half widths."""
-    axis_commands.refuse_axis(campaign, "locate")
+    if serve("locate", **locals()):
+        return
     if points is not None:
         options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "budget": budget or None}
         counters = {"pan_steps": pan_steps, "tilt_steps": tilt_steps, "aperture_deg": aperture_deg}
@@ -173,7 +174,8 @@ def steps_for(
     as_json: Json = False,
 ) -> None:
     """Counters that send the beam to a point or along a direction. With the approach that removes backlash."""
-    axis_commands.refuse_axis(campaign, "steps-for")
+    if serve("steps-for", **locals()):
+        return
     finite(x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
     point = None if x_mm is None or y_mm is None or z_mm is None else (x_mm, y_mm, z_mm)
     direction = None if None in (azimuth_deg, elevation_deg) else (azimuth_deg, elevation_deg)
@@ -258,13 +260,9 @@ def plan(
         refuse_options("for targets, not for --watch", "leave it out", target=target, **spare, **onward)
         plan_watch(rig, given, minutes=minutes, out=out, seed=seed, as_json=as_json)
         return
-    if axis_commands.is_axis(given or rig):
-        refuse_options(axis_commands.NOT_OF_AN_AXIS, "leave it out", **spare, **onward)
-        if given is None or rig is not None:
-            raise InputError(
-                "usage", "an axis is planned from its folder alone", remedy="give --given FOLDER without RIG"
-            )
-        axis_commands.plan(given, target=target, minutes=minutes, output=out, seed=seed, as_json=as_json)
+    common = {"target": target, "minutes": minutes, "out": out, "seed": seed, "as_json": as_json}
+    alone = given is not None and rig is None
+    if serve("plan", given or rig, **common, alone=alone, **spare, **onward):
         return
     if rig is None:
         raise InputError("usage", "Missing argument 'RIG'.", remedy="see tvsbayes --help")

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import CampaignFolder, Json, finish, report_line, spared
+from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.files.disk import make_folder, output_place, write_atomically
 from tvsbayes.progress import Job
@@ -28,9 +28,9 @@ def view(
 
     Every look has its pictures and residuals. A double click opens the file in a browser, without a network.
     """
+    if serve("view", **locals()) or serve("view", beside):
+        return
     folders = [folder for folder in (campaign, beside) if folder is not None]
-    for folder in folders:
-        axis_commands.refuse_axis(folder, "view", "`tvsbayes report` makes the page of an axis")
     spared(out)
     from tvsbayes.view.gathering import look_at
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tvsbayes.cli import axis_commands
 from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, finish, report_line
+from tvsbayes.cli.instruments import instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.pipeline import FITTING, compile_for, fit_for
@@ -34,10 +34,10 @@ def watch(
 
     Exit 0, 1 or 3. What moved (cameras, positioner, ratio, play), by how much, and what the looks can see.
     """
+    if serve("watch", **locals()) or serve("watch", looks):
+        return
     from tvsbayes.instrument.campaign import read_campaign
 
-    for folder in (campaign, looks):
-        axis_commands.refuse_axis(folder, "watch", "use compare --by positions")
     known, new = read_campaign(campaign), read_campaign(looks)
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 1.0, WATCHING: 1.0}, progress) as job:
@@ -94,7 +94,7 @@ def plan_watch(
     from tvsbayes.instrument.rig import read_rig
 
     campaign = given or place
-    if campaign is None or axis_commands.is_axis(campaign):
+    if campaign is None or instrument_of(campaign) is not None:
         raise InputError(
             "usage",
             "--watch needs the campaign of a scanner",

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import datetime
+from pathlib import Path
 
-from tvsbayes.files.documents import Keys
+from tvsbayes.errors import InputError
+from tvsbayes.files.disk import read_bytes
+from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml
 from tvsbayes.instrument.conditions import check_power
 
+SCANNER = "two-mirror"
+"""Mechanism of a campaign that states none."""
 _TEXT_CHARS = {
     **dict.fromkeys(("name", "operator", "instrument", "serial", "method", "board_certificate"), 200),
     "notes": 4000,
@@ -56,3 +61,22 @@ def parse_header(keys: Keys) -> dict[str, object]:
             header[name] = {key: _header_value(table, key) for key in table.values}
     check_power(keys, header)
     return header
+
+
+def mechanism_of(folder: Path) -> str:
+    """Which instrument a campaign folder is of, by the `format` line of its `campaign.toml` and `mechanism` in `[rig]`.
+
+    What cannot be read is left to the strict reader of scanners, which says what is wrong with it.
+    """
+    values = header_values(folder)
+    kind = str(values.get("format", "")).partition("/")[0].removeprefix("tvsbayes-")
+    rig = values.get("rig")
+    return str(rig.get("mechanism", SCANNER) if isinstance(rig, dict) else SCANNER) if kind == "campaign" else kind
+
+
+def header_values(folder: Path) -> dict[str, object]:
+    """What `campaign.toml` holds, unchecked; nothing where it cannot be read."""
+    try:
+        return parse_toml(read_bytes(folder / "campaign.toml", TOML_BYTES_MAX, folder), "campaign.toml").values
+    except InputError:
+        return {}

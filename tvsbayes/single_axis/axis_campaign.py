@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_kind import (
     Column,
     CsvKind,
@@ -29,6 +29,7 @@ from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.campaign import MOVES, SPOTS
+from tvsbayes.instrument.campaign_header import header_values
 from tvsbayes.instrument.column_names import DEGREES, SPREAD
 from tvsbayes.instrument.conditions import check_power, powered_on_s
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, STATED_KEYS, AxisPrior
@@ -324,24 +325,10 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
     return AxisCampaign(unit, moves, readings, stated, header, periods, path)
 
 
-def _told(folder: Path, key: str) -> str | None:
-    """The text under a key of a folder's `campaign.toml`; None where it cannot be read."""
-    try:
-        keys = parse_toml(read_bytes(folder / "campaign.toml", TOML_BYTES_MAX, folder), "campaign.toml")
-    except InputError:
-        return None
-    found = keys.values.get(key)
-    return found if isinstance(found, str) else None
-
-
-def is_axis_folder(folder: Path) -> bool:
-    """Whether the `format` line of a folder's `campaign.toml` names an axis; False where it cannot be read."""
-    return (_told(folder, "format") or "").startswith("tvsbayes-axis/")
-
-
 def unit_of_folder(folder: Path) -> str | None:
     """The unit of readings in a folder's `campaign.toml`; None where it cannot be read."""
-    return _told(folder, "unit")
+    unit = header_values(folder).get("unit")
+    return unit if isinstance(unit, str) else None
 
 
 def read_axis(folder: Path | str) -> AxisCampaign:

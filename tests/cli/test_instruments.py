@@ -1,0 +1,42 @@
+"""The list of instruments: whose folder it is, and that their commands take what `tvsbayes` hands on."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+
+from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of
+from tvsbayes.cli.main import COMMANDS
+from tvsbayes.instrument.campaign_header import SCANNER, mechanism_of
+
+HANDED_ON = {"out", "issue", "moves", "alone"}
+"""What a command makes of its options before it hands them on."""
+
+
+@pytest.mark.parametrize(
+    ("text", "mechanism"),
+    [
+        ('format = "tvsbayes-campaign/1"\n', SCANNER),
+        ('format = "tvsbayes-campaign/1"\n[rig]\nmechanism = "pan-tilt"\n', "pan-tilt"),
+        ('format = "tvsbayes-axis/1"\n', "axis"),
+        ("format = 3\n", "3"),
+        ("no TOML", ""),
+    ],
+)
+def test_a_folder_says_whose_it_is(tmp_path, text, mechanism):
+    (tmp_path / "campaign.toml").write_text(text)
+    assert mechanism_of(tmp_path) == mechanism
+    assert instrument_of(tmp_path) is INSTRUMENTS.get(mechanism)
+    assert mechanism_of(tmp_path / "nowhere") == "" and instrument_of(None) is None
+
+
+@pytest.mark.parametrize("name", INSTRUMENTS)
+def test_commands_of_an_instrument_take_only_what_is_handed_on(name):
+    """A new option of such a function would raise TypeError at every user."""
+    commands = {command.__name__.rstrip("_"): set(inspect.signature(command).parameters) for command in COMMANDS}
+    for command, known in commands.items():
+        function = INSTRUMENTS[name].command(command)
+        if function is not None:
+            _, *options = inspect.signature(function).parameters
+            assert set(options) <= known | HANDED_ON, command
