@@ -27,8 +27,8 @@ from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.report.evidence import Criterion
-from tvsbayes.report.first_page import verdict_of
 from tvsbayes.report.fit_text import fit_text, validation_lines
+from tvsbayes.report.scanner_document import verdict_of
 from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.results.records import plain
 from tvsbayes.statistics.chances import log_chance

@@ -23,7 +23,7 @@ def no_page(monkeypatch):
         page.text = f"by {issue.laboratory}"
         return page
 
-    monkeypatch.setattr("tvsbayes.report.page.report_page", told)
+    monkeypatch.setattr("tvsbayes.report.scanner_document.report_document", told)
     monkeypatch.setattr("tvsbayes.report.page.page_html", lambda page: page.text.encode())
 
 

@@ -8,7 +8,7 @@ import pytest
 from msgspec import structs
 from support.axes import drawn, runs
 
-from tvsbayes.report.axis_text import (
+from tvsbayes.report.axis_document import (
     axis_fit_text,
     axis_plan_text,
     deviation_table,

@@ -11,7 +11,7 @@ from support.small_results import small_summary
 
 from tvsbayes.errors import InputError
 from tvsbayes.report.evidence import CANNOT_TELL, MET, NOT_MET, Criterion, criterion
-from tvsbayes.report.first_page import criteria_table, verdict_of
+from tvsbayes.report.scanner_document import criteria_table, verdict_of
 
 STORED = {"compare.json": "held_out", "plan.json": "planned"}
 

@@ -10,9 +10,9 @@ from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
 from tvsbayes.report.advice import steps_ahead
 from tvsbayes.report.evidence import Criterion
-from tvsbayes.report.first_page import verdict_of
 from tvsbayes.report.fit_text import classic_text, demo_text, fit_text
 from tvsbayes.report.result_tables import KEY_PARAMETERS
+from tvsbayes.report.scanner_document import verdict_of
 from tvsbayes.results.convergence import Importance, MonteCarloError, NamedValue, Sampling
 from tvsbayes.results.estimates import FitSummary, Validation, ValidationTest
 

@@ -12,8 +12,9 @@ from support.geared_rig import SD_DEG, geared
 from support.small_results import estimate
 
 from tvsbayes.report.evidence import gear_bands
+from tvsbayes.report.fit_sections import fit_sections, gear_section
 from tvsbayes.report.fit_text import fit_text
-from tvsbayes.report.gear_section import gear_errors, gear_section
+from tvsbayes.report.position_figures import gear_errors
 from tvsbayes.results.estimates import StopResidual
 
 
@@ -63,8 +64,9 @@ def test_stops_stand_on_the_error(bands):
 
 
 def test_the_section_states_scales_range_and_both_ratios(geared_evidence, evidence):
-    assert gear_section(replace(evidence, gears=())) == []
-    (section,) = gear_section(geared_evidence)
+    section = gear_section(geared_evidence)
+    titles = [[part.title for part in fit_sections(e)] for e in (replace(evidence, gears=()), geared_evidence)]
+    assert section.title not in titles[0] and section.title in titles[1]
     assert "pan -60 to 280, tilt -140 to 140 steps" in section.text[0] and len(section.figures) == 2
     scales, ratios = section.tables
     assert [row[0] for row in scales.rows[:2]] == [

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from msgspec import structs
-from support.reported_twin import PLANNED, Nodes, evidence_of
+from support.reported_twin import PLANNED, Nodes, evidence_of, report_html
 from support.small_results import estimate
 
 from tvsbayes.calibration.calibration_file import load_calibration
@@ -26,7 +26,7 @@ from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.parameters import PRIOR_GROUPS, RIG_NAMES
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
-from tvsbayes.report.first_page import _cells, answer_table
+from tvsbayes.report.document import Document, Issue, Section, Verdict
 from tvsbayes.report.fit_sections import _parameters
 from tvsbayes.report.page import (
     BROWSERS,
@@ -34,8 +34,6 @@ from tvsbayes.report.page import (
     print_to_pdf,
     prose,
     replace_page,
-    report_html,
-    report_page,
     typeset,
 )
 from tvsbayes.report.parameter_words import (
@@ -45,7 +43,8 @@ from tvsbayes.report.parameter_words import (
     share_in_words,
     source_in_words,
 )
-from tvsbayes.report.tables import Issue, Page, Section, TableView, chance_text
+from tvsbayes.report.scanner_document import _cells, answer_table, report_document
+from tvsbayes.report.tables import TableView, chance_text
 
 BYTES_MAX = 3_000_000
 
@@ -202,13 +201,13 @@ def test_no_two_reports_have_one_number(evidence, page, no_pictures):
     day = datetime.date(2026, 1, 15)
     campaign = replace(evidence.campaign, header={**evidence.campaign.header, "operator": "A. B."})
     pages = [
-        *(report_page(evidence, issue) for issue in (Issue(day), Issue(day, "A"), Issue(day, "", "A"))),
-        report_page(evidence, Issue(datetime.date(2026, 1, 16))),
-        report_page(replace(evidence, criteria=()), Issue(day)),
-        report_page(replace(evidence, campaign=campaign), Issue(day)),
+        *(report_document(evidence, issue) for issue in (Issue(day), Issue(day, "A"), Issue(day, "", "A"))),
+        report_document(evidence, Issue(datetime.date(2026, 1, 16))),
+        report_document(replace(evidence, criteria=()), Issue(day)),
+        report_document(replace(evidence, campaign=campaign), Issue(day)),
     ]
     numbers = [each.number for each in pages]
-    assert len(set(numbers)) == len(numbers) and report_page(evidence, Issue(day)).number == numbers[0]
+    assert len(set(numbers)) == len(numbers) and report_document(evidence, Issue(day)).number == numbers[0]
     for each in pages:
         assert page_html(each).decode().count(each.number) == 4  # title, head, foot of printed pages, end
 
@@ -453,10 +452,10 @@ def test_no_heading_stands_at_the_foot_of_a_printed_page(tmp_path):
     sections = [Section(f"heading {k}", [f"line {k}"], tables=[one]) for k, one in enumerate(table)]
     sections += [Section(f"heading {k}", [f"line {k}"]) for k in range(len(sections), 100)]
     about = TableView("about", [], [["measured", "today"]])
-    words = {"results": "R", "name": "n", "verdict": "v", "verdict_class": "met", "traceable": "t", "number": "N"}
-    none = {"numbers": [], "why": [], "answer": None, "picture": None, "steps": [], "criteria": None, "warnings": []}
-    page = Page(**words, **none, about=about, versions={"tvsbayes": "0"}, sections=sections)
-    (tmp_path / "report.html").write_bytes(page_html(page))
+    words = {"results": "R", "name": "n", "verdict": Verdict("v", "met"), "traceable": "t", "number": "N"}
+    none = {"answer": None, "picture": None, "steps": [], "warnings": []}
+    document = Document(**words, **none, about=about, versions={"tvsbayes": "0"}, sections=sections)
+    (tmp_path / "report.html").write_bytes(page_html(document))
     done = subprocess.run([reader, "-layout", print_to_pdf(tmp_path / "report.html"), "-"], capture_output=True)
     pages = [[line.strip() for line in text.split("\n") if line.strip()] for text in done.stdout.decode().split("\f")]
     # The last line of each is its footer; of a section without a table one line is all that there is.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.axes import campaign, drawn, random_moves, runs
 
-from tvsbayes.report.axis_text import axis_fit_text
+from tvsbayes.report.axis_document import axis_fit_text
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior

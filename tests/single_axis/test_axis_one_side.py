@@ -7,7 +7,7 @@ import pytest
 from msgspec import structs
 from support.axes import campaign
 
-from tvsbayes.report.axis_text import axis_fit_text, axis_plan_text, parameter_table
+from tvsbayes.report.axis_document import axis_fit_text, axis_plan_text, parameter_table
 from tvsbayes.single_axis.axis_campaign import AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior

@@ -12,9 +12,10 @@ from tvsbayes.calibration.calibration_file import load_calibration
 from tvsbayes.cli.main import run
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.report.document import Issue
 from tvsbayes.report.evidence import Evidence, gather
-from tvsbayes.report.page import report_html
-from tvsbayes.report.tables import FigureView
+from tvsbayes.report.page import page_html
+from tvsbayes.report.scanner_document import report_document
 from tvsbayes.results.fit_record import read_fit
 from tvsbayes.results.plan_record import PLAN_FORMAT
 
@@ -68,6 +69,10 @@ def evidence_of(place: Path) -> Evidence:
     return gather(read_campaign(place), record, load_calibration(place), **limits)
 
 
+def report_html(evidence: Evidence, issue: Issue | None = None) -> bytes:
+    return page_html(report_document(evidence, issue))
+
+
 @pytest.fixture(scope="session")
 def reported(tmp_path_factory) -> Path:
     """The paper twin with the results that the report command makes where there are none."""
@@ -90,8 +95,4 @@ def page(evidence) -> bytes:
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Pictures are not what is looked at, and take seconds."""
-    view = FigureView("data:image/svg+xml;base64,", "a picture that was left out", "left out", 1, 1)
-    monkeypatch.setattr("tvsbayes.report.tables.figure_view", lambda figure, alt, caption: view)
-    monkeypatch.setattr("tvsbayes.report.fit_sections.figure_view", lambda figure, alt, caption: view)
-    monkeypatch.setattr("tvsbayes.report.first_page.figure_view", lambda figure, alt, caption: view)
-    monkeypatch.setattr("tvsbayes.report.uncertainty_sections.figure_view", lambda figure, alt, caption: view)
+    monkeypatch.setattr("tvsbayes.report.document.svg", lambda figure: b"")

@@ -17,7 +17,7 @@ from tvsbayes.pipeline import MAX_MINUTES
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
-    from tvsbayes.report.tables import Issue
+    from tvsbayes.report.document import Issue
     from tvsbayes.single_axis.axis_campaign import AxisCampaign
     from tvsbayes.single_axis.axis_record import AxisSummary
 
@@ -65,7 +65,7 @@ def held(folder: Path) -> dict[str, Any]:
 
 def classic(folder: Path, as_json: bool) -> None:
     """The least-squares line with one reversal, and ISO 230-2."""
-    from tvsbayes.report.axis_text import classic_text
+    from tvsbayes.report.axis_document import classic_text
     from tvsbayes.results.records import plain
     from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_rows import rows_of
@@ -88,7 +88,7 @@ def fit(
     as_json: bool,
 ) -> None:
     """Fit an axis; results into its folder or `out`."""
-    from tvsbayes.report.axis_text import axis_fit_text
+    from tvsbayes.report.axis_document import axis_fit_text
     from tvsbayes.single_axis.axis_campaign import read_axis
 
     place = out or output_place(folder, "results")
@@ -143,7 +143,7 @@ def _fitted(data: AxisCampaign, place: Path, wish: Sampled) -> Kept:
 
 def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool, as_json: bool) -> None:
     """Check, classic, fit and report of an axis in one go."""
-    from tvsbayes.report.axis_text import axis_fit_text, classic_text
+    from tvsbayes.report.axis_document import axis_fit_text, classic_text
     from tvsbayes.report.command_text import held_text
     from tvsbayes.results.records import plain
     from tvsbayes.single_axis.axis_campaign import read_axis
@@ -171,7 +171,7 @@ def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_j
     if other is not None:
         message = "B is a later campaign of a scanner; axes are compared one by one"
         raise InputError("usage", message, remedy="leave out B")
-    from tvsbayes.report.axis_text import axis_hold_out_text
+    from tvsbayes.report.axis_document import axis_hold_out_text
     from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
     from tvsbayes.single_axis.held_out_positions import hold_out_positions
 
@@ -200,7 +200,7 @@ def report(folder: Path, *, issue: Issue, pdf: bool, out: Path | None, as_json: 
 
 def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path | None = None) -> dict[str, Any]:
     """Write the page of an axis, and print it where that is wanted: the document of `report --json`."""
-    from tvsbayes.report.axis_page import axis_page, curve_commands
+    from tvsbayes.report.axis_document import axis_document, curve_commands
     from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page
     from tvsbayes.single_axis.axis_record import results_for
     from tvsbayes.single_axis.axis_rows import rows_of
@@ -216,7 +216,7 @@ def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path |
         if not results.stored:
             report_line(STORED)
         job.begin("drawing the page")
-        page = axis_page(results, issue)
+        page = axis_document(results, issue)
         removed = replace_page(path, page_html(page), out)
         if pdf:
             job.begin(PRINTING)
@@ -232,7 +232,7 @@ def plan(
     if not alone:
         message, remedy = "an axis is planned from its folder alone", "give --given FOLDER without RIG"
         raise InputError("usage", message, remedy=remedy)
-    from tvsbayes.report.axis_text import axis_plan_text
+    from tvsbayes.report.axis_document import axis_plan_text
     from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_record import results_for
     from tvsbayes.single_axis.next_stops import TARGETS, plan_next, unit_of

@@ -39,8 +39,8 @@ from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Campaign
+    from tvsbayes.report.document import Issue
     from tvsbayes.report.evidence import Evidence
-    from tvsbayes.report.tables import Issue
     from tvsbayes.results.fit_record import FitRecord
 
 DCC_MESSAGES = 20
@@ -125,7 +125,7 @@ def report(
 
 
 def _issue(laboratory: str | None, customer: str | None) -> Issue:
-    from tvsbayes.report.tables import Issue
+    from tvsbayes.report.document import Issue
 
     return replace(Issue.today(), laboratory=_named("laboratory", laboratory), customer=_named("customer", customer))
 
@@ -159,7 +159,8 @@ class PageWish:
     def write(self, data: Campaign) -> WrittenPage:
         """Gather, draw and write it, and print it where that is wanted; fits first where results are missing."""
         from tvsbayes.calibration.calibration_file import load_calibration
-        from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page, report_page
+        from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page
+        from tvsbayes.report.scanner_document import report_document
 
         if self.pdf:
             find_browser()
@@ -176,7 +177,7 @@ class PageWish:
             calibration = load_calibration(self.campaign)
             evidence = gather(data, record, calibration, range_mm=self.range_mm, doubts=doubts, **asked)
             job.begin(DRAWING)
-            page = report_page(evidence, self.issue)
+            page = report_document(evidence, self.issue)
             html = page_html(page)
             removed = replace_page(path, html, self.out)
             if self.pdf:

@@ -8,7 +8,8 @@ from msgspec import structs
 
 from tvsbayes.compensation.verification import VerifyPlan
 from tvsbayes.errors import escaped
-from tvsbayes.report.tables import Section, TableView, two_digits
+from tvsbayes.report.document import Section
+from tvsbayes.report.tables import TableView, two_digits
 from tvsbayes.results.compensation_record import (
     APPLIED,
     BROKEN,

@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
@@ -24,8 +26,11 @@ BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE, GREY = (
 )
 OF_ESTIMATOR = {"nominal": (GREY, "s"), "classic": (RED, "^"), "joint": (BLUE, "o")}
 """Colour and marker of each estimator in every figure."""
-OF_DIRECTION = {"left": ("<", BLUE), "right": (">", RED), "up": ("^", GREEN), "down": ("v", ORANGE)}
-"""Marker and colour of each direction in figures of ratios."""
+OF_DIRECTION = {
+    **{"left": ("<", BLUE), "right": (">", RED), "up": ("^", GREEN), "down": ("v", ORANGE)},
+    **{"forward": (">", BLUE), "backward": ("<", RED), "": ("x", GREY)},
+}
+"""Marker and colour of each direction of a scanner and of an axis in every figure; "" where nobody knows it."""
 SMALLEST_SHARE = 0.005
 """Of a variance, that has a bar or a row of its own; what is below stands in fit.json alone."""
 DIVERGING, SEQUENTIAL = (BLUE, "#FFFFFF", RED), ("#FFFFFF", SKY, BLUE, "#00263E")
@@ -55,6 +60,15 @@ def drawing(height_in: float) -> Iterator[Figure]:
 
     with rc_context(STYLE):
         yield Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+
+
+def legend(figure: Figure, columns: int, of: Axes | None = None) -> None:
+    """What the marks mean, below the panels: of one of them, else of all, each name once."""
+    named: dict[object, Artist] = {}
+    for axes in figure.axes if of is None else [of]:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    figure.legend(list(named.values()), list(map(str, named)), loc="outside lower center", ncols=columns)
 
 
 def colour_map(stops: Sequence[str]) -> Colormap:

@@ -35,6 +35,7 @@ from tvsbayes.report.drawing import (
     STYLE,
     colour_map,
     drawing,
+    legend,
 )
 from tvsbayes.report.parameter_words import share_in_words
 
@@ -103,7 +104,7 @@ def trajectories(campaign: Campaign, experiment: int) -> Figure:
         axes.set(xlabel="X (depth), mm", ylabel=f"{'Y (left)' if across == 1 else 'Z (up)'}, mm", title=title)
         # Angles are those of the picture.
         axes.set_aspect("equal", adjustable="datalim")
-        figure.legend(loc="outside lower center", ncols=2)
+        legend(figure, 2)
     return figure
 
 
@@ -150,7 +151,7 @@ def direction_scatter(result: ClassicResult, direction: str, joint: Estimate | N
         axes = figure.add_subplot()
         _scatter(axes, result, direction, joint)
         axes.set(xlabel=EXPERIMENT)
-        figure.legend(loc="outside lower center", ncols=3)
+        legend(figure, 3)
     return figure
 
 
@@ -216,7 +217,7 @@ def setup(
             axes.set_aspect("equal", adjustable="datalim")
         panels[0].set_title("from above" + ("" if baseline_mm is None else f"; TVS baseline {baseline_mm:.4g} mm"))
         panels[1].set(xlabel="X (depth), mm", title="from the side")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        legend(figure, 2)
     return figure
 
 
@@ -240,7 +241,7 @@ def coverage(campaign: Campaign) -> Figure:
         panels[1].set(xlabel="u, px", ylabel="v, px", title="spots in the images; frame: the sensor")
         panels[1].set(xlim=(-0.02 * width, 1.02 * width), ylim=(1.02 * height, -0.02 * height))
         panels[1].set_aspect("equal")
-        figure.legend(loc="outside lower center", ncols=2)
+        legend(figure, 2)
     return figure
 
 
@@ -278,7 +279,7 @@ def intervals(
         axes.set(yticks=range(len(DIRECTIONS)), yticklabels=DIRECTIONS, xlabel="deg/step, 95 % intervals")
         axes.invert_yaxis()
         axes.tick_params(axis="x", labelrotation=30)
-        figure.legend(loc="outside lower center", ncols=2)
+        legend(figure, 2)
     return figure
 
 
@@ -306,7 +307,7 @@ def gap_terms(gaps: ComparisonRecord | Mapping[str, Gap | None]) -> Figure:
         axes.set(yticks=range(len(names)), yticklabels=wrapped, xlabel="classic - joint, deg/step, 95 % intervals")
         axes.invert_yaxis()
         axes.tick_params(axis="x", labelrotation=30)
-        figure.legend(loc="outside lower center", ncols=4)
+        legend(figure, 4)
     return figure
 
 
@@ -334,7 +335,7 @@ def residuals(stops: Sequence[StopResidual], axis: Axis) -> Figure:
     with drawing(4.6) as figure:
         panels = figure.subplots(2, 1, sharey=True)
         for direction in (*directions, ""):
-            marker, colour = OF_DIRECTION.get(direction, ("x", GREY))
+            marker, colour = OF_DIRECTION[direction]
             part = [stop for stop in mine if stop.direction == direction]
             if not part:
                 continue
@@ -351,7 +352,7 @@ def residuals(stops: Sequence[StopResidual], axis: Axis) -> Figure:
             axes.axhline(0.0, color=BLACK, linewidth=0.8)
             axes.set(xlabel=name, ylabel="deviation / u")
         panels[0].set_title(f"stops of the {axis} axis, {len(mine)}; band: 2 standard deviations")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        legend(figure, 3)
     return figure
 
 
@@ -447,5 +448,5 @@ def ratio_curves(curves: Curves) -> Figure:
                     place, value, yerr=bars, label=direction, fmt=f"{marker}-", color=colour, capsize=2, markersize=4
                 )
             axes.set(xlabel=f"{axis} angle, deg", ylabel="deg/step")
-        figure.legend(loc="outside lower center", ncols=4)
+        legend(figure, 4)
     return figure

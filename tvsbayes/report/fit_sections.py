@@ -5,6 +5,7 @@ Ratios in deg/step, other values in the unit of their name; frame S in mm for th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,15 +14,24 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.advice import asks_for_looks
+from tvsbayes.report.document import FigureView, Section
 from tvsbayes.report.fit_text import agreement_line, sampling_line
 from tvsbayes.report.parameter_words import name_in_words, sentence_in_words
-from tvsbayes.report.result_tables import gap_table, hold_out_table
+from tvsbayes.report.position_figures import gear_errors
+from tvsbayes.report.result_tables import (
+    ESTIMATE_COLUMNS,
+    estimate_row,
+    gap_table,
+    gears_table,
+    hold_out_table,
+    range_text,
+)
 from tvsbayes.report.spot_pictures import spot_gallery
-from tvsbayes.report.tables import FigureView, Section, TableView, concise, figure_view, interval_text, two_digits
-from tvsbayes.results.estimates import Cause, Validation
+from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
+from tvsbayes.results.estimates import Cause, StopResidual, Validation
 
 if TYPE_CHECKING:
-    from tvsbayes.report.evidence import Evidence
+    from tvsbayes.report.evidence import Evidence, GearBand
 
 
 CORRELATED = (
@@ -37,6 +47,12 @@ PRIORS_SHOWN = 8
 """Of those that a result is sensitive to, the strongest first; fit.json has all."""
 HEADER_SHOWN = ("method", "notes")
 """Keys of a campaign's header that the first page does not have."""
+
+
+def fit_sections(e: Evidence) -> list[Section]:
+    """In the order of the page."""
+    parts = (results_section, setup_section, gear_section, identifiability_section, residuals_section)
+    return [part(e) for part in (*parts, validation_section) if part is not gear_section or e.gears]
 
 
 def setup_section(e: Evidence) -> Section:
@@ -56,13 +72,13 @@ def setup_section(e: Evidence) -> Section:
     where = [summary.parameters[name].value for name in names] if known else None
     baseline = campaign.rig.priors["baseline_mm"].value
     views = [
-        figure_view(
+        FigureView(
             figures.setup(campaign, where, baseline),
             "Positions of cameras, positioner and spots from above and from the side; the coordinates are in spots.csv "
             "and in the table of results",
             "The rig as estimated, frame S: left camera at the origin, X depth, Y left, Z up.",
         ),
-        figure_view(
+        FigureView(
             figures.coverage(campaign),
             "Counters at which spots were seen, and where the spots lie in both images",
             "Data coverage. What lies outside of it is extrapolated.",
@@ -70,7 +86,7 @@ def setup_section(e: Evidence) -> Section:
     ]
     if e.crops:
         listed = ", ".join(dict.fromkeys(str(crop.spot) for crop in e.crops))
-        view = figure_view(
+        view = FigureView(
             spot_gallery(e.crops),
             f"Cut-outs of the pictures of spots {listed}, a cross at each centre",
             "Spots as the cameras saw them, by number; suspect ones first. Red cross: the centre that was used.",
@@ -90,7 +106,7 @@ def results_section(e: Evidence) -> Section:
     tables, views = [_parameters(e)], [*_one_experiment(e), *_scatters(e)]
     if e.shown.gap:
         tables.insert(0, gap_table(e.shown.gap))
-        view = figure_view(
+        view = FigureView(
             figures.gap_terms(e.shown.gap),
             "Terms of the difference between both estimators; values in the table above",
             "Why the classic differs from the joint.",
@@ -98,7 +114,7 @@ def results_section(e: Evidence) -> Section:
         views.insert(0, view)
     if e.fit.summary.curves is not None:
         views.append(
-            figure_view(
+            FigureView(
                 figures.ratio_curves(e.fit.summary.curves),
                 "Local ratios over the range of pan and tilt angles; values in fit.json",
                 "Local ratios over the range that was seen: gear ratio times the slope of the mirrors.",
@@ -112,7 +128,7 @@ def _one_experiment(e: Evidence) -> list[FigureView]:
     if e.classic is None or not e.classic.experiments:
         return []
     number = e.classic.experiments[0].experiment
-    beams = figure_view(
+    beams = FigureView(
         figures.trajectories(e.campaign, number),
         f"Beams of experiment {number} before and after its steps, with the angle of each",
         f"Experiment {number}: the beam before and after, in the plane of its angle.",
@@ -128,7 +144,7 @@ def _scatters(e: Evidence) -> list[FigureView]:
     means = ", ".join(f"{d} {r.mean_deg_per_step:.6f} deg/step of {r.n}" for d, r in told.items())
     figure = figures.direction_scatters(e.classic, e.fit.summary)
     return [
-        figure_view(
+        FigureView(
             figure,
             f"Experiments by direction with their means: {means}",
             "Experiments of the classic method, with the mean and bands of 1, 2 and 3 sigma; blue: joint.",
@@ -158,6 +174,32 @@ def _parameters(e: Evidence) -> TableView:
     return TableView(caption, columns, rows)
 
 
+def gear_section(e: Evidence) -> Section:
+    """What the gears repeat; of gears that are taken as perfect there is none."""
+    summary = e.fit.summary
+    rows = []
+    for direction in DIRECTIONS:
+        if summary.effective[direction] is not None:
+            rows.append(estimate_row(f"{direction}, line", summary.effective[direction], "deg/step"))
+            rows.append(estimate_row(f"{direction}, local", summary.local.get(direction), "deg/step"))
+    ratios = TableView("Line through the looks, and gear ratio times slope of the mirrors", ESTIMATE_COLUMNS, rows)
+    text = [
+        f"Effective ratios are slopes of lines through the looks, {range_text(summary)}, errors of the gears included; "
+        "over other counters these errors count anew. Local ratios are those of gears and mirrors without them, at the "
+        "mean angles of the looks.",
+        "Where no look reached (grey) nothing is known of the errors but their size: located points there are marked "
+        "as extrapolated, and their uncertainty grows.",
+    ]
+    views = [_view(band, [stop for stop in e.shown.residuals if stop.axis == band.axis]) for band in e.gears]
+    return Section("Gears: what repeats by position", text, tables=[gears_table(summary), ratios], figures=views)
+
+
+def _view(band: GearBand, stops: Sequence[StopResidual]) -> FigureView:
+    alt = f"Transmission error of the {band.axis} axis over its counters as a curve with a band, and stops as markers"
+    caption = f"{band.axis} axis: transmission error with its 95 % band, and the stops on it; grey: nothing was seen."
+    return FigureView(gear_errors(band, stops), alt, caption)
+
+
 def identifiability_section(e: Evidence) -> Section:
     """What the campaign cannot separate, which stops and priors it hangs on."""
     names, matrix = e.fit.covariance.names, e.fit.covariance.matrix
@@ -173,7 +215,7 @@ def identifiability_section(e: Evidence) -> Section:
                 if abs(correlation[i, j]) > 0.8:
                     rows.append([f"{name_in_words(kept[j])}; {name_in_words(kept[i])}", f"{correlation[i, j]:+.3f}"])
         views.append(
-            figure_view(
+            FigureView(
                 figures.correlations(kept, correlation),
                 "Correlation matrix; every cell holds its value in per cent",
                 "Correlations of the posterior.",
@@ -213,12 +255,12 @@ def residuals_section(e: Evidence) -> Section:
         # One group alone has nothing to be compared with, and no bar in the figure.
         if any(c.axis == axis and len(c.groups) > 1 for c in causes):
             alt = f"Mean deviation by group, {axis} axis; values in fit.json"
-            views.append(figure_view(figures.causes(causes, axis), alt, f"{axis} axis: mean deviation by group."))
+            views.append(FigureView(figures.causes(causes, axis), alt, f"{axis} axis: mean deviation by group."))
         stops = [stop for stop in e.shown.residuals if stop.axis == axis]
         if stops:
             alt = f"Deviations of {len(stops)} stops of the {axis} axis over time and counter"
             caption = f"Stops of the {axis} axis: observed minus fitted angle."
-            views.append(figure_view(figures.residuals(stops, axis), alt, caption))
+            views.append(FigureView(figures.residuals(stops, axis), alt, caption))
     tables = [_causes(causes)] if causes else []
     return Section("Residuals by cause", text, tables=tables, figures=views)
 

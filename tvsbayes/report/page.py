@@ -1,4 +1,4 @@
-"""The calibration report as one page: verdict, numbers and warnings at its top, the sections below; HTML and PDF.
+"""A document as one page: verdict, numbers and warnings at its top, the sections below; HTML and PDF.
 
 No script, nothing fetched. Text of a campaign reaches it through jinja2's autoescape only; pictures are SVG inside
 `data:` images, which browsers open without scripts and without network. Its policy (CSP) allows exactly its own style
@@ -14,46 +14,16 @@ import re
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from tvsbayes.errors import InputError, typed
-from tvsbayes.estimators.plausibility import misfit_causes
+from tvsbayes.errors import InputError
 from tvsbayes.files.disk import make_folder, read_bytes, shipped_data, write_atomically
-from tvsbayes.metrology.traceability import traceability
-from tvsbayes.report.advice import steps_ahead
-from tvsbayes.report.evidence import MET, Evidence
-from tvsbayes.report.first_page import (
-    about_table,
-    answer_table,
-    both_estimators,
-    criteria_table,
-    distances,
-    measured_days,
-    verdict_of,
-    warnings_of,
-    why_far,
-)
-from tvsbayes.report.fit_sections import (
-    identifiability_section,
-    residuals_section,
-    results_section,
-    setup_section,
-    validation_section,
-)
-from tvsbayes.report.gear_section import gear_section
-from tvsbayes.report.tables import Issue, Page
-from tvsbayes.report.uncertainty_sections import (
-    axes_section,
-    budgets_section,
-    limits_section,
-    maps_section,
-    method_section,
-    plan_section,
-)
+from tvsbayes.report.document import Document
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 NO_BROWSER = "leave --pdf out and print report.html from any browser (A4), or install Chromium"
@@ -104,21 +74,6 @@ def print_to_pdf(page: Path) -> Path:
     return target
 
 
-def report_page(evidence: Evidence, issue: Issue | None = None) -> Page:
-    """The report with its number.
-
-    Args:
-        evidence: computed beforehand; nothing is computed here.
-        issue: who issues it, for whom and when; None is today, by nobody.
-    """
-    return numbered(_page(evidence, issue or Issue.today()))
-
-
-def report_html(evidence: Evidence, issue: Issue | None = None) -> bytes:
-    """The report, UTF-8; arguments as of `report_page`."""
-    return page_html(report_page(evidence, issue))
-
-
 def certificate_place(page: Path, out: Path | None) -> Path:
     """Where the certificate of a page lies: `dcc.xml` in `results/`, beside a page elsewhere by its name."""
     return page.with_name("dcc.xml" if out is None else f"{page.stem}.dcc.xml")
@@ -154,10 +109,14 @@ def replace_page(page: Path, html: bytes, out: Path | None) -> list[str]:
     return removed
 
 
-def numbered(page: Page) -> Page:
-    """The page with its number: hexadecimal digits of a digest of all that it says, so that no other page has it."""
-    digest = hashlib.sha256(page_html(replace(page, number=""))).hexdigest()
-    return replace(page, number=digest[:NUMBER_DIGITS].upper())
+def numbered(document: Document) -> Document:
+    """The document with its number: digits of a digest of all that its page says, so that no other has it."""
+    return replace(document, number=digest_number(page_html(replace(document, number=""))))
+
+
+def digest_number(content: bytes) -> str:
+    """What tells results or reports apart: hexadecimal digits of a SHA-256."""
+    return hashlib.sha256(content).hexdigest()[:NUMBER_DIGITS].upper()
 
 
 MINUS, NOUGHT = re.compile(r"(?<![\w.)/-])-(?=\d)"), re.compile(r"(?<![\w.])[-\u2212](0(?:\.0+)?)(?![\d.(])")
@@ -180,76 +139,38 @@ def prose(text: str) -> Markup:
     return Markup("").join(told)
 
 
-def page_html(page: Page) -> bytes:
-    """A page by the template, UTF-8."""
-    folder = shipped_data() / "report"
+def page_html(document: Document) -> bytes:
+    """A document by the template, UTF-8; its policy allows its own style sheet and pictures alone."""
+    return rendered("report", "report.html", "report.css", document.number, r=document)
+
+
+def rendered(
+    folder: str, template: str, style: str, number: str = "", scripts: Sequence[str] = (), **held: object
+) -> bytes:
+    """A shipped template with its style and scripts in it, UTF-8; its policy (CSP) names exactly those, by hash.
+
+    Args:
+        folder: of the shipped data.
+        template: a file in it.
+        style: its style sheet.
+        scripts: in the order in which they run.
+        number: of the report, for the foot of its printed pages.
+        held: what the template shows.
+    """
+    place = shipped_data() / folder
+    css = (place / style).read_text(encoding="utf-8").replace("@ID@", number)
+    script = "\n".join((place / name).read_text(encoding="utf-8") for name in scripts)
+    policy = f"default-src 'none'; img-src data:; style-src {_source(css)}; base-uri 'none'; form-action 'none'"
+    policy += f"; script-src {_source(script)}" if scripts else ""
     environment = Environment(
-        loader=FileSystemLoader(str(folder)), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+        loader=FileSystemLoader(str(place)), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    css = (folder / "report.css").read_text(encoding="utf-8").replace("@ID@", page.number)
-    digest = base64.b64encode(hashlib.sha256(css.encode()).digest()).decode()
-    policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"
     environment.filters |= {"typeset": typeset, "prose": prose}
-    # The style sheet is ours; escaped quotes would change its hash.
-    html = environment.get_template("report.html").render(r=page, css=Markup(css), policy=policy)
-    return html.encode()
+    # Style sheet and scripts are ours; escaped quotes would change their hashes.
+    shown = environment.get_template(template).render(css=Markup(css), script=Markup(script), policy=policy, **held)
+    return shown.encode()
 
 
-def _page(e: Evidence, issue: Issue) -> Page:
-    verdict = verdict_of(e.fit.summary, e.criteria, e.doubts)
-    sections = [
-        results_section(e),
-        setup_section(e),
-        *gear_section(e),
-        identifiability_section(e),
-        residuals_section(e),
-        validation_section(e),
-        maps_section(e),
-        budgets_section(e),
-        axes_section(e),
-        plan_section(e),
-        method_section(e),
-        limits_section(e),
-    ]
-    return Page(
-        results=e.fit.results_id,
-        name=e.campaign.title,
-        about=about_table(e.campaign.header, measured_days(e.campaign, issue), issue),
-        verdict=verdict.text,
-        verdict_class=verdict.kind,
-        numbers=distances(e),
-        why=why_far(e),
-        answer=answer_table(e),
-        picture=both_estimators(e),
-        steps=_steps(e),
-        criteria=criteria_table(e.criteria),
-        traceable=traceability(e.campaign).statement,
-        warnings=warnings_of(e),
-        versions=e.fit.provenance.versions,
-        sections=sections,
-        issue=issue,
-    )
-
-
-def _steps(e: Evidence) -> list[str]:
-    """What to do next: what the fit asks for, then the best of a plan; the plan's own section has all of it."""
-    folder = "CAMPAIGN" if e.campaign.path is None else typed(e.campaign.path.resolve().name)
-    summary = e.fit.summary
-    failed = not summary.explained
-    causes = misfit_causes(e.campaign, summary.parameters["pixel_scale"].value) if failed else ()
-    found = steps_ahead(summary, folder, causes)
-    if e.planned is not None and not e.planned.stop.now and e.planned.next:
-        best = e.planned.next[0]
-        found.append(f"Look at {best.text} ({best.minutes:.1f} min): the best next four looks of the plan.")
-    unmet = next((c for c in e.criteria if c.verdict != MET), None)
-    if unmet is not None and e.planned is None and summary.explained:
-        limit = f"{unmet.limit:g} {unmet.unit}"
-        aim = f"u(worst) <= {limit}" if unmet.unit != "mm" else f"U95(x) at {e.range_mm:g},0,0 mm <= {limit}"
-        given = f"`tvsbayes plan {folder}/rig.toml --given {folder} --target '{aim}'`"
-        found.append(f"Add looks until the limit is met; the fewest: {given}.")
-    if not found:
-        found.append("Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped.")
-    if not e.criteria and e.fit.summary.converged:
-        limit = f"`tvsbayes report {folder} --limit-mm 5`, or `--limit-deg-per-step 0.0005`"
-        found.append(f"State the largest error that you can bear, and the page says whether it is kept: {limit}.")
-    return found
+def _source(text: str) -> str:
+    """How a policy names a text (Content Security Policy 3, 2.3.1)."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

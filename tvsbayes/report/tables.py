@@ -1,29 +1,18 @@
-"""What texts and pages are made of: numbers with their uncertainty, tables, figures, sections.
-
-A table is made once and printed by either: `text()` on a terminal, the template of the page in HTML.
-"""
+"""Numbers with their uncertainty, and tables of ready text: made once, printed on a terminal and on a page alike."""
 
 from __future__ import annotations
 
-import base64
-import datetime
 import io
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from decimal import Decimal
-from typing import TYPE_CHECKING
 
 from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
-
-from tvsbayes.report.drawing import svg
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 COLUMNS, GAP = 80, 2
 """Of a terminal; between two columns of a table."""
@@ -117,84 +106,3 @@ class TableView:
         # Plain text whatever FORCE_COLOR and the like say: it also goes into files. Nothing is folded here.
         Console(file=stream, width=1000, highlight=False, color_system=None, force_terminal=False).print(table)
         return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
-
-
-@dataclass(frozen=True)
-class FigureView:
-    """A picture with what it says in words."""
-
-    source: str
-    alt: str
-    caption: str
-    width: int
-    height: int
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of the report; `opened` ones are not folded on a screen."""
-
-    title: str
-    text: Sequence[str] = ()
-    items: Sequence[str] = ()
-    tables: Sequence[TableView | None] = ()
-    figures: Sequence[FigureView] = ()
-    opened: bool = False
-
-
-@dataclass(frozen=True)
-class Number:
-    """One of the numbers at the top."""
-
-    label: str
-    value: str
-    note: str
-
-
-@dataclass(frozen=True)
-class Issue:
-    """Who issues a report, for whom, and on which day (UTC); "" where nobody is stated."""
-
-    day: datetime.date
-    laboratory: str = ""
-    customer: str = ""
-
-    @classmethod
-    def today(cls) -> Issue:
-        """Of today, by nobody for nobody."""
-        return cls(datetime.datetime.now(datetime.UTC).date())
-
-
-@dataclass(frozen=True)
-class Page:
-    """What the template is filled with; `answer` is its first table, `picture` stands beside it.
-
-    `number` is the page's own, `results` that of the results behind it; `about` says what was measured, when and by
-    whom.
-    """
-
-    results: str
-    name: str
-    about: TableView
-    verdict: str
-    verdict_class: str
-    numbers: Sequence[Number]
-    why: Sequence[str]
-    answer: TableView | None
-    picture: FigureView | None
-    steps: Sequence[str]
-    criteria: TableView | None
-    traceable: str
-    warnings: Sequence[str]
-    versions: Mapping[str, str]
-    sections: Sequence[Section] = field(default_factory=tuple)
-    title: str = "Calibration of a laser positioner"
-    issue: Issue = field(default_factory=Issue.today)
-    number: str = ""
-
-
-def figure_view(figure: Figure, alt: str, caption: str) -> FigureView:
-    """A figure as SVG in a `data:` address; the same figure gives the same bytes."""
-    width, height = (round(96 * inch) for inch in figure.get_size_inches())
-    picture = base64.b64encode(svg(figure)).decode()
-    return FigureView(f"data:image/svg+xml;base64,{picture}", alt, caption, width, height)

@@ -15,10 +15,11 @@ from tvsbayes.instrument.axes import SENSES
 from tvsbayes.instrument.parameters import REGISTRY
 from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
+from tvsbayes.report.document import FigureView, Section, sentence
 from tvsbayes.report.drawing import SMALLEST_SHARE
 from tvsbayes.report.parameter_words import MADE_BY, name_in_words, share_in_words, source_in_words
 from tvsbayes.report.result_tables import point_budget_table
-from tvsbayes.report.tables import Section, TableView, concise, figure_view, interval_text, two_digits
+from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
 from tvsbayes.results.metrology_tables import FIGURES, BudgetRow, BudgetTable
 
 if TYPE_CHECKING:
@@ -31,6 +32,12 @@ END_SHIFT = 0.1
 """Of U: an end of the linear interval farther off is told; a quantile of a thousand draws scatters by half of it."""
 
 
+def uncertainty_sections(e: Evidence) -> list[Section]:
+    """In the order of the page."""
+    parts = (maps_section, budgets_section, axes_section, plan_section, method_section, limits_section)
+    return [part(e) for part in parts]
+
+
 def maps_section(e: Evidence) -> Section:
     """Where which estimator errs by how many millimetres."""
     pan, tilt = len(e.maps.pan_steps) // 2, len(e.maps.tilt_steps) // 2
@@ -40,7 +47,7 @@ def maps_section(e: Evidence) -> Section:
         rows.append([f"{reach:g}", *(_cell(values[k]) for values in at_middle.values())])
         if reach == e.range_mm:
             views.append(
-                figure_view(
+                FigureView(
                     figures.error_maps(e.maps, k),
                     f"Root mean square error over pan and tilt at {reach:g} mm; every cell holds its value in mm",
                     f"3D error at {reach:g} mm, root mean square over the rigs that the data allow.",
@@ -91,7 +98,7 @@ def budgets_section(e: Evidence) -> Section:
         point_budget_table(e.budget, f"Budget of a point {away}, by cause"),
         _gum_table(e.point, f"{away}: {_total(e.point)}"),
     ]
-    view = figure_view(
+    view = FigureView(
         figures.shares(e.budget),
         "Shares of the variance by cause; values at the bars and in the table above",
         f"What the uncertainty of a point {e.range_mm:g} mm away consists of.",
@@ -109,7 +116,7 @@ def _notes(e: Evidence) -> list[str]:
     """What the reader of a budget must know, each once."""
     found = list(dict.fromkeys(note for table in e.shown.budgets for note in table.notes))
     found += [f"a point {e.range_mm:g} mm away: {note}" for note in e.point.notes if note not in found]
-    return [f"{note[0].upper()}{note[1:]}." for note in found]
+    return [sentence(note) for note in found]
 
 
 def _pairs(tables: Sequence[BudgetTable]) -> list[tuple[BudgetTable, BudgetTable | None]]:

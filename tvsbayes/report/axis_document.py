@@ -1,24 +1,61 @@
-"""An axis in words: what `fit`, `compare`, `plan` and `check` print of one."""
+"""What is said of an axis: its tables, what commands print of them, and the document of its page.
+
+Commands and values in the axis' own units, `escaped` where a campaign names them.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 
-from tvsbayes.errors import escaped
+import numpy as np
+
+from tvsbayes.compensation.verification import compensation_in, verification_in
+from tvsbayes.errors import escaped, typed
+from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.advice import ROUGH, UNSAMPLED
+from tvsbayes.report.compensation_text import compensation_section
+from tvsbayes.report.document import (
+    Document,
+    FigureView,
+    Issue,
+    Number,
+    Section,
+    Verdict,
+    about_table,
+    sentence,
+    terminal,
+)
+from tvsbayes.report.page import digest_number, numbered
+from tvsbayes.report.position_figures import CURVE_POINTS, axis_errors, wave
 from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
 from tvsbayes.results.estimates import Estimate
+from tvsbayes.results.fit_record import provenance
+from tvsbayes.results.records import plain
+from tvsbayes.single_axis.axis_campaign import axis_hashes
+from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS
-from tvsbayes.single_axis.axis_record import AxisSummary, PositionDeviation
+from tvsbayes.single_axis.axis_periods import wave_samples
+from tvsbayes.single_axis.axis_record import AxisResults, AxisSummary, PositionDeviation, drawn_deviations
 from tvsbayes.single_axis.classic_line import ClassicAxis
 from tvsbayes.single_axis.held_out_positions import AxisHoldOut
 from tvsbayes.single_axis.next_stops import AxisPlan, unit_of
 
 DEVIATIONS_SHOWN = 40
+TABLE_ROWS = 60
+"""Positions on a terminal, and on the page."""
+LIKELY = 0.5
+"""Probability of a wave from which on its curve is drawn."""
 HARDLY = 0.95
 """Stops that leave more than this share of an uncertainty are not worth their time."""
 CONFLICTING = "the numbers hold only if the readings, not the priors, are wrong"
 """Of a fit whose priors the readings contradict."""
+METHOD = (
+    "Readings = offset + unit per command x command, play taken up on the side of arrival, an error and a play "
+    "that repeat by position (Matern processes), waves where periods are asked for, a zero that creeps and drifts, "
+    "an error of every stop, noise. What is linear is integrated out exactly; scales are sampled, never maximised.",
+    "The ratio of the gears holds beyond the range read; the line through the stops belongs to that range.",
+)
 WHAT = {
     **{name: key.what for name, key in AXIS_KEYS.items()},
     "stop_sd.forward": "scatter of stops, forward",
@@ -137,14 +174,18 @@ def iso230_table(classic: ClassicAxis, unit: str) -> TableView | None:
 
 def classic_text(classic: ClassicAxis, unit: str) -> str:
     """The classic of an axis in words."""
-    lines = [f"{concise(classic.per_command, classic.u_per_command)} {escaped(unit)} per command"]
+    named = escaped(unit)
+    play = None
     if classic.backlash is not None and classic.u_backlash is not None:
-        lines.append(f"backlash {concise(classic.backlash, classic.u_backlash)} {escaped(unit)}")
-    lines.append(
-        f"scatter about the line {two_digits(classic.residual_sd)} {escaped(unit)}; stops taken as independent"
-    )
+        play = f"backlash {concise(classic.backlash, classic.u_backlash)} {named}"
     table = iso230_table(classic, unit)
-    return "\n".join(lines) + ("" if table is None else f"\n\n{table.text()}")
+    return terminal(
+        f"{concise(classic.per_command, classic.u_per_command)} {named} per command",
+        play,
+        f"scatter about the line {two_digits(classic.residual_sd)} {named}; stops taken as independent",
+        None if table is None else "",
+        table,
+    )
 
 
 def _lines(title: str, texts: Sequence[str]) -> list[str]:
@@ -166,27 +207,26 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
         written: files that hold all of it.
     """
     how = {None: "Laplace approximation", "importance": "weighted draws", "emcee": "chain of emcee"}[summary.tier]
-    iso230 = iso230_table(summary.classic, summary.unit)
-    lines = []
+    more: list[str | TableView | None] = []
     if details:
-        if summary.deviations:
-            lines += [deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN).text()]
-        lines += [] if iso230 is None else [iso230.text()]
-        lines += _lines("weak (the readings leave it to the priors)", summary.weak_directions)
-    elif summary.weak_directions:
-        count = len(summary.weak_directions)
-        lines.append(f"--details and the report say more: {count} weak direction{'s' * (count > 1)}")
+        deviations = deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN)
+        more = [deviations if summary.deviations else None, iso230_table(summary.classic, summary.unit)]
+        more += _lines("weak (the readings leave it to the priors)", summary.weak_directions)
+    elif count := len(summary.weak_directions):
+        more = [f"--details and the report say more: {count} weak direction{'s' * (count > 1)}"]
     title = "not accepted" if summary.explained else "NOT CONVERGED"
-    lines += [*_lines(title, summary.problems), *_lines("warning", summary.warnings)]
-    lines += _lines("prior conflict", summary.prior_conflicts)
-    lines += [f"written: {', '.join(written)}"] if written else []
+    more += [*_lines(title, summary.problems), *_lines("warning", summary.warnings)]
+    more += _lines("prior conflict", summary.prior_conflicts)
+    more += [f"written: {', '.join(written)}"] if written else []
     counted = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}"
-    waves = period_table(summary)
-    parts = [counted, *([] if waves is None else [waves.text()])]
-    parts += [parameter_table(summary).text(), ratio_table(summary).text()]
-    if summary.explained:
-        parts += offered(summary)
-    return "\n".join([*lines, *[""] * bool(lines), *parts, f"verdict: {axis_verdict(summary)}"])
+    return terminal(
+        *more,
+        "" if any(part is not None for part in more) else None,
+        counted,
+        *(period_table(summary), parameter_table(summary), ratio_table(summary)),
+        *(offered(summary) if summary.explained else ()),
+        f"verdict: {axis_verdict(summary)}",
+    )
 
 
 def axis_verdict(summary: AxisSummary) -> str:
@@ -215,7 +255,7 @@ def axis_hold_out_text(found: AxisHoldOut, unit: str) -> str:
     """A hold-out in words."""
     told = f"RMS z {found.rms_z:.2f}, classic {found.classic_rms_z:.2f}; "
     told += f"{100 * found.inside_share:.0f} % of the left-out readings in their 95 % intervals"
-    return "\n".join([hold_out_table(found, unit).text(), told, *_lines("warning", found.warnings)])
+    return terminal(hold_out_table(found, unit), told, *_lines("warning", found.warnings))
 
 
 def next_table(plan: AxisPlan, unit: str) -> TableView:
@@ -234,7 +274,86 @@ def axis_plan_text(plan: AxisPlan, unit: str) -> str:
     """What next, in words."""
     if not plan.next:
         return "there is no time for a single stop"
-    told = f"{next_table(plan, unit).text()}\n{plan.minutes:.1f} minutes in all"
-    if plan.next[-1].u > HARDLY * plan.u_now:
-        told += f"\nthey hardly help: what is left of {plan.target} does not come from too few stops"
-    return told
+    hardly = f"they hardly help: what is left of {plan.target} does not come from too few stops"
+    idle = plan.next[-1].u > HARDLY * plan.u_now
+    return terminal(next_table(plan, unit), f"{plan.minutes:.1f} minutes in all", hardly if idle else None)
+
+
+def _wave_figures(fit: AxisFit) -> list[FigureView]:
+    """Every wave that is there more likely than not."""
+    alt, end = "A wave over one period as a curve with a band.", "over one period, both harmonics, with its 95 % band."
+    return [
+        FigureView(
+            wave(sample, fit.campaign.unit),
+            alt,
+            f"Wave of the {'encoder' if sample.wave.clock == 'encoder' else 'gear'} {end}",
+        )
+        for sample in wave_samples(fit)
+        if sample.probability > LIKELY
+    ]
+
+
+def curve_commands(low: float, high: float) -> np.ndarray:
+    """Where the figure's curve is wanted; `results_for` needs them beforehand."""
+    return np.linspace(low, high, CURVE_POINTS)
+
+
+def _error_figures(fit: AxisFit) -> list[FigureView]:
+    """The error by position; a drive read in motion has none."""
+    if fit.rows.in_motion:
+        return []
+    commands = curve_commands(float(fit.rows.command.min()), float(fit.rows.command.max()))
+    drawn = drawn_deviations(fit, commands, np.random.default_rng([fit.seed, 6]))
+    alt = "The error that repeats by position over the command as a curve with a band, and every stop as a marker."
+    caption = "Deviation from the line through the stops: what repeats by position with its 95 % band, and the stops."
+    return [FigureView(axis_errors(fit, commands, drawn), alt, caption)]
+
+
+def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[Section]:
+    """In the order of the page; `figures` are those that the first page has no room for."""
+    summary, campaign = results.summary, results.fit.campaign
+    unit, classic, waves = summary.unit, summary.classic, period_table(summary)
+    line = f"Least-squares line: {concise(classic.per_command, classic.u_per_command)} {unit} per command, stops "
+    line += f"independent, residual scatter {two_digits(classic.residual_sd)} {unit}."
+    parameters = [ratio_table(summary) if waves else None, parameter_table(summary)]
+    in_words = [sentence(text) for text in (offered(summary) if summary.explained else ())]
+    repeated = [deviation_table(summary.deviations, unit, TABLE_ROWS) if summary.deviations else None]
+    made = compensation_in(campaign)
+    applied = [] if made is None else [compensation_section(made, verification_in(campaign, made))]
+    return [
+        Section("Result", in_words, tables=parameters, figures=figures, opened=True),
+        Section("What repeats by position", tables=repeated),
+        *applied,
+        Section("What the readings cannot tell", items=summary.weak_directions or ["Nothing of note."]),
+        Section("Classic", [line], tables=[iso230_table(classic, unit)]),
+        Section("Method", METHOD),
+    ]
+
+
+def axis_document(results: AxisResults, issue: Issue) -> Document:
+    """The report of an axis with its number; `results.fit` holds `curve_commands` of its range."""
+    summary, fit = results.summary, results.fit
+    made = plain(provenance(axis_hashes(fit.campaign), fit.seed))
+    said = json.dumps([summary.as_json(), made["inputs"]], sort_keys=True)
+    header, play = fit.campaign.header, summary.parameters["backlash"]
+    verdict = sentence(axis_verdict(summary)) + " No limit was stated." * summary.explained
+    figures = [*_error_figures(fit), *_wave_figures(fit)]
+    folder = "AXIS" if fit.campaign.path is None else typed(fit.campaign.path.resolve().name)
+    return numbered(
+        Document(
+            results=digest_number(said.encode()),
+            name=title_of(header, fit.campaign.path),
+            about=about_table(header, str(header.get("created") or ""), issue),
+            verdict=Verdict(verdict, "cannot-tell" if summary.explained else "not-met"),
+            numbers=[Number("play", concise(play.value, play.sd), summary.unit)],
+            answer=period_table(summary) or ratio_table(summary),
+            picture=figures[0] if figures else None,
+            steps=[f"`tvsbayes plan --given {folder}` says which stops to read next."],
+            traceable="The readings are taken as stated.",
+            warnings=[*summary.problems, *summary.warnings, *_lines("Prior conflict", summary.prior_conflicts)],
+            versions=made["versions"],
+            sections=axis_sections(results, figures[1:]),
+            title="Calibration of an axis",
+            issue=issue,
+        )
+    )

@@ -1,56 +1,68 @@
-"""The first page of a report: verdict, the answer of both estimators, millimetres, warnings.
+"""The document of a scanner: verdict, the answer of both estimators, millimetres, warnings, what next; its sections.
 
 Ratios in deg/step, lost motion in deg, distances in mm.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 
+from tvsbayes.errors import typed
+from tvsbayes.estimators.plausibility import misfit_causes
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.metrology.traceability import NOT_STATED, performed
+from tvsbayes.metrology.traceability import performed, traceability
 from tvsbayes.report import figures
-from tvsbayes.report.advice import assumed_stereo, verdict_line
+from tvsbayes.report.advice import assumed_stereo, steps_ahead, verdict_line
+from tvsbayes.report.document import Document, FigureView, Issue, Number, Verdict, about_table, sentence
 from tvsbayes.report.drawing import OF_ESTIMATOR
 from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
+from tvsbayes.report.fit_sections import fit_sections
 from tvsbayes.report.fit_text import validation_lines
+from tvsbayes.report.page import numbered
 from tvsbayes.report.parameter_words import cause_in_words, sentence_in_words
-from tvsbayes.report.tables import (
-    FigureView,
-    Issue,
-    Number,
-    TableView,
-    chance_text,
-    concise,
-    figure_view,
-    interval_text,
-    two_digits,
-)
+from tvsbayes.report.tables import TableView, chance_text, concise, interval_text, two_digits
+from tvsbayes.report.uncertainty_sections import uncertainty_sections
 from tvsbayes.results.comparison_record import CANNOT_TELL
 from tvsbayes.results.estimates import Estimate, FitSummary
 
 CLASSIC_BLIND = "cannot see it"
-NOT_RECORDED = "not recorded"
-"""Of what `campaign.toml` may say and does not."""
 SYMMETRICAL = 1.5
 """Of the distances of an interval's ends from its value, up to which half of it stands for both."""
 CAUSES_TOLD = 3
 """Of the uncertainty of a point; the section on budgets has all."""
-RECORDED = (("instrument", "instrument"), ("serial", "serial number"), ("operator", "operator"))
-"""Keys of `campaign.toml` on the first page, and what they are called there."""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """One line, and the class that colours it: "met", "not-met" or "cannot-tell"."""
+def report_document(e: Evidence, issue: Issue | None = None) -> Document:
+    """The report of a scanner with its number.
 
-    text: str
-    kind: str
+    Args:
+        e: gathered beforehand; nothing is computed here.
+        issue: who issues it, for whom and when; None is today, by nobody.
+    """
+    issue = issue or Issue.today()
+    return numbered(
+        Document(
+            results=e.fit.results_id,
+            name=e.campaign.title,
+            about=about_table(e.campaign.header, measured_days(e.campaign, issue), issue),
+            verdict=verdict_of(e.fit.summary, e.criteria, e.doubts),
+            numbers=distances(e),
+            why=why_far(e),
+            answer=answer_table(e),
+            picture=both_estimators(e),
+            steps=_steps(e),
+            criteria=criteria_table(e.criteria),
+            traceable=traceability(e.campaign).statement,
+            warnings=warnings_of(e),
+            versions=e.fit.provenance.versions,
+            sections=[*fit_sections(e), *uncertainty_sections(e)],
+            issue=issue,
+        )
+    )
 
 
 def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Sequence[str] = ()) -> Verdict:
@@ -66,7 +78,7 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Seque
         return Verdict(f"{failed}No limit was stated", "cannot-tell")
     if not criteria:
         usable = verdict_line(summary).removeprefix("verdict: ") + "; mind what check warns of" * bool(doubts)
-        return Verdict(f"{usable[0].upper()}{usable[1:]}. No limit was stated", "cannot-tell")
+        return Verdict(f"{sentence(usable)} No limit was stated", "cannot-tell")
     told = []
     for verdict in (NOT_MET, CANNOT_TELL, MET):
         mine = [c for c in criteria if c.verdict == verdict]
@@ -98,15 +110,6 @@ def _chance(c: Criterion) -> str:
     """The probability; where it decides nothing, also how many of a hundred would be off by more."""
     text = chance_text(c.probability)
     return text if c.verdict != CANNOT_TELL else f"{text}: {100 - round(100 * c.probability)} of 100 are off by more"
-
-
-def about_table(header: Mapping[str, object], measured: str, issue: Issue) -> TableView:
-    """What was measured, when, by whom and for whom; `measured` is a date or "" where nobody wrote it down."""
-    recorded = [("measured", measured)]
-    recorded += [(label, str(header.get(key) or "")) for key, label in RECORDED]
-    stated = [("laboratory", issue.laboratory), ("customer", issue.customer)]
-    rows = [[label, text or NOT_RECORDED] for label, text in recorded]
-    return TableView("What was measured", [], rows + [[label, text or NOT_STATED] for label, text in stated])
 
 
 def measured_days(campaign: Campaign, issue: Issue) -> str:
@@ -171,8 +174,8 @@ def both_estimators(e: Evidence) -> FigureView:
     picture = figures.intervals(e.fit.summary, e.classic)
     if e.classic is None:
         told = "Effective ratios. The classic method needs four-point experiments: the campaign has none."
-        return figure_view(picture, "Ratios with 95 % intervals; values in the table beside it", told)
-    return figure_view(
+        return FigureView(picture, "Ratios with 95 % intervals; values in the table beside it", told)
+    return FigureView(
         picture,
         "Ratios of both estimators with 95 % intervals; values in the table beside it",
         "Effective ratios, joint (circles) and classic (triangles).",
@@ -216,7 +219,31 @@ def warnings_of(e: Evidence) -> list[str]:
     if e.campaign.header.get("synthetic"):
         found.append("The campaign is synthetic: made by the digital twin, not measured.")
     if (told := assumed_stereo(e.campaign.stereo, e.shown.budgets)) is not None:
-        found.append(f"{told[0].upper()}{told[1:]}.")
+        found.append(sentence(told))
     found += [f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts]
     found += [f"`check` warns: {sentence_in_words(text)}" for text in e.doubts]
+    return found
+
+
+def _steps(e: Evidence) -> list[str]:
+    """What to do next: what the fit asks for, then the best of a plan; the plan's own section has all of it."""
+    folder = "CAMPAIGN" if e.campaign.path is None else typed(e.campaign.path.resolve().name)
+    summary = e.fit.summary
+    failed = not summary.explained
+    causes = misfit_causes(e.campaign, summary.parameters["pixel_scale"].value) if failed else ()
+    found = steps_ahead(summary, folder, causes)
+    if e.planned is not None and not e.planned.stop.now and e.planned.next:
+        best = e.planned.next[0]
+        found.append(f"Look at {best.text} ({best.minutes:.1f} min): the best next four looks of the plan.")
+    unmet = next((c for c in e.criteria if c.verdict != MET), None)
+    if unmet is not None and e.planned is None and summary.explained:
+        limit = f"{unmet.limit:g} {unmet.unit}"
+        aim = f"u(worst) <= {limit}" if unmet.unit != "mm" else f"U95(x) at {e.range_mm:g},0,0 mm <= {limit}"
+        given = f"`tvsbayes plan {folder}/rig.toml --given {folder} --target '{aim}'`"
+        found.append(f"Add looks until the limit is met; the fewest: {given}.")
+    if not found:
+        found.append("Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped.")
+    if not e.criteria and e.fit.summary.converged:
+        limit = f"`tvsbayes report {folder} --limit-mm 5`, or `--limit-deg-per-step 0.0005`"
+        found.append(f"State the largest error that you can bear, and the page says whether it is kept: {limit}.")
     return found

@@ -1,0 +1,101 @@
+"""Figures of what repeats by position: an error with its band and the stops on it, a wave over its period.
+
+Of gears over their counters in deg, of an axis over its commands in its unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tvsbayes.instrument.axes import SENSES
+from tvsbayes.report.drawing import BLACK, BLUE, OF_DIRECTION, ORANGE, PURPLE, SKY, drawing, legend
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from tvsbayes.report.evidence import GearBand
+    from tvsbayes.results.estimates import StopResidual
+    from tvsbayes.single_axis.axis_fit import AxisFit
+    from tvsbayes.single_axis.axis_periods import WaveSample
+
+CURVE_POINTS = 81
+"""Of the error and of the waves of an axis."""
+PLAY_SHOWN = 0.1
+"""Of the width of the error's band: play that varies less has no band of its own."""
+
+
+def _banded(axes: Axes, at: np.ndarray, drawn: np.ndarray, name: str, light: str = SKY, dark: str = BLUE) -> None:
+    """A curve with its 95 % band; `drawn` has low, mean, high, shape (3, n)."""
+    axes.fill_between(at, drawn[0], drawn[2], color=light, alpha=0.4, linewidth=0, label=f"{name}, 95 %")
+    axes.plot(at, drawn[1], color=dark, linewidth=1.2, label="its mean")
+
+
+def band_of(drawn: np.ndarray) -> np.ndarray:
+    """Low, mean and high of 95 % of draws (draws, n), shape (3, n)."""
+    low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
+    return np.stack([low, drawn.mean(axis=0), high])
+
+
+def gear_errors(band: GearBand, stops: Sequence[StopResidual]) -> Figure:
+    """Transmission error of an axis over its counters with a 95 % band, the stops on it; the play, where it varies."""
+    play = np.ptp(band.play_deg, axis=0).max() > PLAY_SHOWN * np.ptp(band.error_deg, axis=0).max()
+    with drawing(4.6 if play else 3.2) as figure:
+        panels = np.atleast_1d(figure.subplots(1 + play, 1, sharex=True, height_ratios=[2, 1] if play else [1]))
+        shown = [(panels[0], band.error_deg, "transmission error", SKY, BLUE)]
+        shown += [(panels[1], band.play_deg, "change of play", ORANGE, PURPLE)] if play else []
+        for axes, drawn, name, light, dark in shown:
+            _banded(axes, band.steps, drawn, name, light, dark)
+            for side in ((band.steps[0], band.seen_steps[0]), (band.seen_steps[1], band.steps[-1])):
+                axes.axvspan(*side, color="#EEEEEE", zorder=0)
+            axes.axhline(0.0, color=BLACK, linewidth=0.6)
+            axes.set(ylabel=f"{name}, deg")
+        for direction in SENSES[band.axis]:
+            mine = [stop for stop in stops if stop.direction == direction]
+            marker, colour = OF_DIRECTION[direction]
+            at = np.array([stop.steps for stop in mine], dtype=float)
+            found = np.interp(at, band.steps, band.error_deg[1]) + [stop.deviation_deg for stop in mine]
+            label = f"stops, moving {direction}"
+            panels[0].plot(at, found, marker, color=colour, markersize=3.5, rasterized=True, label=label)
+        panels[-1].set_xlabel(f"{band.axis} counter, steps")
+        legend(figure, 2, panels[0])
+    return figure
+
+
+def axis_errors(fit: AxisFit, commands: np.ndarray, drawn: np.ndarray) -> Figure:
+    """The error of an axis by position with its 95 % band, and the stops on it, off the line through them.
+
+    Args:
+        fit: of the axis.
+        commands: shape (t,).
+        drawn: the error there, in the axis' unit, shape (draws, t).
+    """
+    rows = fit.rows
+    design = np.column_stack([np.ones(len(rows.value)), rows.command - fit.model.middle])
+    off = rows.value - design @ np.linalg.lstsq(design, rows.value, rcond=None)[0]
+    with drawing(3.2) as figure:
+        axes = figure.add_subplot()
+        _banded(axes, commands, band_of(drawn), "error by position")
+        for side, name in ((1, "forward"), (-1, "backward"), (0, "")):
+            mine, (marker, colour) = rows.side == side, OF_DIRECTION[name]
+            if mine.any():
+                label = f"stops, {name or 'side unknown'}"
+                axes.plot(rows.command[mine], off[mine], marker, color=colour, markersize=3.5, label=label)
+        axes.set(xlabel="command", ylabel=f"off the line, {fit.campaign.unit}")
+        legend(figure, 2)
+    return figure
+
+
+def wave(sample: WaveSample, unit: str) -> Figure:
+    """One wave over its mean period, with its 95 % band, given that it is there."""
+    turn = np.linspace(0.0, 1.0, CURVE_POINTS)
+    of = "s" if sample.wave.clock == "seconds" else unit
+    with drawing(2.4) as figure:
+        axes = figure.add_subplot()
+        _banded(axes, turn * float(np.mean(sample.period)), band_of(sample.curve(turn)), "wave")
+        axes.set(xlabel=f"{of}, from {sample.record.middle:.6g} on", ylabel=unit)
+        legend(figure, 2)
+    return figure
