@@ -277,9 +277,8 @@ def evidence_of(
         return FitEvidence(listed, causes)
     gaps = explain_gap(fit, posterior)
     parts = headline_causes(fit)
-    told = {**{f"effective_deg_per_step.{d}": e for d, e in summary.effective.items()}, **summary.parameters}
     # What a model holds fixed has no uncertainty to split.
-    known = {q: e for q in parts.quantities if (e := told[q]) is not None and e.sd > 0}
+    known = {q: e for q in parts.quantities if (e := summary.named[q]).sd > 0}
     budgets = tuple(headline_budget(parts, q, e) for q, e in known.items())
     axes = []
     for axis in AXES:

@@ -51,9 +51,10 @@ def demo(
             write_atomically(folder / part.name, part.read_bytes())
         report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
         from tvsbayes.estimators.four_point import classic as estimate_classic
+        from tvsbayes.instrument.axes import DIRECTIONS
         from tvsbayes.instrument.campaign import read_campaign
+        from tvsbayes.instrument.parameters import TARGETS
         from tvsbayes.report.fit_text import demo_text
-        from tvsbayes.twin.physics import effective_mirror_offset_mm
         from tvsbayes.twin.true_rig import read_truth
 
         compile_for(report_line)
@@ -68,13 +69,9 @@ def demo(
                 results = calibrate(campaign, out / "results", tier="importance", progress=progress)
                 summary = results.record.summary
     pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
-    true = rig.parameters
-    truth = {
-        **(rig.effective_deg_per_step(campaign) or {}),
-        "backlash_deg.pan": true["backlash_deg.pan"],
-        "backlash_deg.tilt": true["backlash_deg.tilt"],
-        "effective_mirror_offset_mm": effective_mirror_offset_mm(true, pose),
-    }
+    true = rig.headlines(campaign, pose) or {}
+    others = {of.name: true[of.name] for of in TARGETS.values() if not of.ratio}
+    truth = {direction: true[f"effective_deg_per_step.{direction}"] for direction in DIRECTIONS} | others
     document = {"classic": classic_result.as_json(), "fit": summary.as_json(), "truth": truth}
     finish(document, f"{demo_text(classic_result, summary, truth)}\n\n{DEMO_NOTE}", as_json, unusable(summary))
 

@@ -27,11 +27,11 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
 from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, ZERO_SHIFT_NAMES, Prior
+from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, TARGETS, ZERO_SHIFT_NAMES, Prior
 from tvsbayes.instrument.places import PLACES_MAX, line_share, seen_places
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import placed
-from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities, told_of
+from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.stored_draws import StoredMode
@@ -138,7 +138,12 @@ class JointFit(Shown):
         """Mode and Laplace sd of what a fit is for."""
         state = "converged" if self.converged else f"NOT CONVERGED: {'; '.join(self.problems)}"
         used = sum(spot.status == "ok" for spot in self.campaign.spots) - len(self.excluded_spots)
-        rows = told_of(self.mode, self.draws, set(legs_of(self.campaign.moves)))
+        moved = set(legs_of(self.campaign.moves))
+        rows = [
+            (f"{of.label}, {of.unit}", float(self.mode[of.name]), float(self.draws[of.name].std()))
+            for of in TARGETS.values()
+            if of.applies(moved)
+        ]
         return View(f"JointFit of {used} spots, {state}; mode and Laplace sd", ("quantity", "mode", "sd"), rows)
 
     @property

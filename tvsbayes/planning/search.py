@@ -13,8 +13,8 @@ from itertools import combinations
 
 import numpy as np
 
+from tvsbayes.instrument.parameters import TARGET_ROWS
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
-from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge
@@ -238,7 +238,7 @@ def _of_all_gears(knowledge: Knowledge, seen: Seen) -> Sensitivity:
     """Ratios and backlashes of both axes, in the middle of the looks."""
     pose_rad = seen.mirror_angles_rad.mean(axis=0)
     everything = np.asarray(knowledge.gears.headlines(knowledge.z, knowledge.space, pose_rad).gradient)
-    return Sensitivity(everything[[QUANTITIES.index(q) for q in ("left", "up", "backlash.pan", "backlash.tilt")]])
+    return Sensitivity(everything[[TARGET_ROWS[q] for q in ("left", "up", "backlash.pan", "backlash.tilt")]])
 
 
 @dataclass(frozen=True, order=True)

@@ -17,17 +17,18 @@ import numpy as np
 import xarray as xr
 
 from tvsbayes.files.disk import write_atomically
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import input_hashes, ordered_spots, pixels_of
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
     BLOCKS,
     HARMONIC_NAMES,
     NAMES,
+    QUANTITIES,
     RIG_NAMES,
     STEREO_PARAMETER_NAMES,
 )
-from tvsbayes.model.headlines import Derived
+from tvsbayes.model.headlines import DERIVED, Derived
 from tvsbayes.posterior.chain import fingerprint
 from tvsbayes.posterior.draws import Draws, Posterior
 from tvsbayes.posterior.predictive import PIXEL_LABELS, move_log_likelihood, predictive_pixels
@@ -56,9 +57,8 @@ class Variable:
     dim: str | None = None
 
 
-def _of_block(block: str) -> Variable:
-    """A block of parameters, whose dimension is the one with its labels; a block of one name has none."""
-    names = BLOCKS[block]
+def _of_block(block: str, names: tuple[str, ...]) -> Variable:
+    """Quantities of a block, whose dimension is the one with their labels; a single one has none."""
     if len(names) == 1:
         return Variable(names)
     labels = tuple(name.removeprefix(f"{block}.") for name in names)
@@ -68,14 +68,11 @@ def _of_block(block: str) -> Variable:
 _RIG_BLOCKS = sorted(
     (block for block, names in BLOCKS.items() if names[0] in RIG_NAMES), key=lambda b: len(BLOCKS[b]) > 1
 )
+_DERIVED = {block: tuple(n for n in names if n in DERIVED) for block, names in QUANTITIES.blocks.items()}
 VARIABLES: dict[str, Variable] = {
-    **{
-        ratio: Variable(tuple(f"{ratio}.{direction}" for direction in DIRECTIONS), "direction")
-        for ratio in ("effective_deg_per_step", "degrees_per_step")
-    },
-    "mean_degrees_per_step": _of_block("degrees_per_step"),
-    "effective_mirror_offset_mm": Variable(("effective_mirror_offset_mm",)),
-    **{block.replace(".", "_"): _of_block(block) for block in _RIG_BLOCKS if block != "degrees_per_step"},
+    **{block: _of_block(block, names) for block, names in _DERIVED.items() if names},
+    "mean_degrees_per_step": _of_block("degrees_per_step", BLOCKS["degrees_per_step"]),
+    **{b.replace(".", "_"): _of_block(b, BLOCKS[b]) for b in _RIG_BLOCKS if b != "degrees_per_step"},
     "stereo": Variable(STEREO_PARAMETER_NAMES, "stereo_parameter"),
 }
 """Variables of posterior.nc. `degrees_per_step` by direction; the mean ratio of an axis is `mean_degrees_per_step`."""
@@ -127,10 +124,10 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         posterior = posterior.resampled(*RESAMPLED)
     fit = posterior.fit
     shape = posterior.z.shape[:2]
-    varying = {NAMES[i] for i in np.flatnonzero(fit.free)} | {"effective_mirror_offset_mm"}
-    for axis, pair in SENSES.items():
-        if varying & {f"degrees_per_step.{axis}", f"ratio_contrast_deg_per_step.{axis}"}:
-            varying |= {f"degrees_per_step.{d}" for d in pair} | {f"effective_deg_per_step.{d}" for d in pair}
+    varying = {NAMES[i] for i in np.flatnonzero(fit.free)}
+    # By the gears of their axis, where they are of one.
+    of_axis = {a: {f"degrees_per_step.{a}", f"ratio_contrast_deg_per_step.{a}"} & varying for a in AXES}
+    varying |= {name for name in DERIVED if (axis := QUANTITIES[name].axis) is None or of_axis[axis]}
     prior_draws = jax.tree.map(lambda x: np.asarray(x)[None], fit.prior_draws)
     spots = ordered_spots(fit.campaign)
     coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}

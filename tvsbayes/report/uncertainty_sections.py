@@ -85,10 +85,8 @@ def _cell(value: float) -> str:
 def budgets_section(e: Evidence) -> Section:
     """What the uncertainty of results and of a point consists of."""
     summary, away = e.fit.summary, f"{e.range_mm:g} mm away"
-    ratios = {f"effective_deg_per_step.{direction}": estimate for direction, estimate in summary.effective.items()}
     totals = {
-        table.quantity: _total(table) + _apart(table, (summary.parameters | ratios).get(table.quantity))
-        for table in e.shown.budgets
+        table.quantity: _total(table) + _apart(table, summary.named.get(table.quantity)) for table in e.shown.budgets
     }
     tables = [
         _gum_table(one, totals[one.quantity]) if other is None else _pair_table(one, other, totals)

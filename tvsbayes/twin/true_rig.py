@@ -15,7 +15,7 @@ import numpy as np
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
-from tvsbayes.instrument.axes import AXES, SIDES
+from tvsbayes.instrument.axes import AXES, SENSES, SIDES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
@@ -30,8 +30,8 @@ from tvsbayes.instrument.parameters import (
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.twin.gear_errors import PERFECT, AxisErrors, GearErrors, Tabulated, draw_gear_errors
-from tvsbayes.twin.physics import effective_mirror_offset_mm, local_deg_per_step
-from tvsbayes.twin.true_headlines import effective_deg_per_step
+from tvsbayes.twin.physics import local_deg_per_step
+from tvsbayes.twin.true_headlines import AT_POSE, effective_deg_per_step
 
 TRUTH_FORMAT = "tvsbayes-truth/1"
 Pair = tuple[float, float]
@@ -47,7 +47,7 @@ class GearErrorTable(TypedDict):
 
 
 class TruthDocument(TypedDict):
-    """truth.json; see `Truth`."""
+    """truth.json; see `Truth`. What `AT_POSE` gives stands there under its names."""
 
     format: str
     note: str
@@ -62,7 +62,6 @@ class TruthDocument(TypedDict):
     gear_error: NotRequired[dict[str, GearErrorTable]]
     effective_deg_per_step: NotRequired[dict[str, float]]
     local_deg_per_step: NotRequired[dict[str, float]]
-    effective_mirror_offset_mm: NotRequired[float]
 
 
 @dataclass(frozen=True)
@@ -100,8 +99,21 @@ class Truth:
         return replace(self, parameters={**self.parameters, **scales}, gear_errors=errors)
 
     def effective_deg_per_step(self, campaign: Campaign) -> dict[str, float] | None:
-        """True headlines over the looks of a campaign of this rig, see `true_headlines`; None where it has no looks."""
+        """Of every direction over the looks of a campaign, see `true_headlines`; None where it has no looks."""
         return effective_deg_per_step(self.parameters, self.gear_errors or PERFECT, campaign)
+
+    def headlines(self, campaign: Campaign, pose_deg: Pair) -> dict[str, float] | None:
+        """Parameters and all that follows from them by contract name, over the looks of a campaign and at a pose."""
+        ratio = self.effective_deg_per_step(campaign)
+        if ratio is None:
+            return None
+        contrast = {axis: ratio[first] - ratio[second] for axis, (first, second) in SENSES.items()}
+        return {
+            **self.parameters,
+            **{f"effective_deg_per_step.{direction}": value for direction, value in ratio.items()},
+            **{f"effective_contrast_deg_per_step.{axis}": value for axis, value in contrast.items()},
+            **{name: formula(self.parameters, pose_deg) for name, formula in AT_POSE.items()},
+        }
 
     def as_json(self, campaign: Campaign) -> TruthDocument:
         """The document of truth.json of a campaign of this rig, with the effective ratios where there are looks."""
@@ -123,9 +135,8 @@ class Truth:
             document["effective_deg_per_step"] = effective
         if self.reference_pose_deg is not None:
             document["local_deg_per_step"] = local_deg_per_step(self.parameters, self.reference_pose_deg)
-            document["effective_mirror_offset_mm"] = effective_mirror_offset_mm(
-                self.parameters, self.reference_pose_deg
-            )
+            at_pose = {name: formula(self.parameters, self.reference_pose_deg) for name, formula in AT_POSE.items()}
+            document = cast("TruthDocument", document | at_pose)
         return document
 
     def _gear_error(self, axis: str, campaign: Campaign) -> GearErrorTable:

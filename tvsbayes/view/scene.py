@@ -287,11 +287,7 @@ def _parameters(campaign: Campaign, fitted: Fitted | None) -> tuple[ParameterRow
         stated = campaign.rig.priors
         return tuple(ParameterRow(n, unit_of(n), stated[n].value, stated[n].u, None) for n in RIG_NAMES)
     summary = fitted.record.summary
-    told = {f"effective_deg_per_step.{d}": e for d, e in summary.effective.items() if e is not None}
-    return tuple(
-        ParameterRow(name, unit_of(name), e.value, e.sd, e.contraction)
-        for name, e in (told | summary.parameters).items()
-    )
+    return tuple(ParameterRow(name, unit_of(name), e.value, e.sd, e.contraction) for name, e in summary.named.items())
 
 
 def _correlation(fitted: Fitted | None) -> tuple[tuple[str, ...], np.ndarray]:
