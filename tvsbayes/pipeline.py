@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -288,30 +289,91 @@ def evidence_of(
     return FitEvidence(listed, causes, gaps if any(gaps.values()) else None, budgets, tuple(axes))
 
 
-def calibration_for(folder: Path, tell: Tell = untold, progress: Show | None = None) -> Calibration:
-    """The calibration in `results/` where its hashes agree with the campaign; else fit first."""
-    from tvsbayes.calibration.calibration_file import stored_calibration
-    from tvsbayes.instrument.campaign import read_campaign
+@dataclass(frozen=True)
+class StoredOrFitted:
+    """Results of a campaign: those in `results/` that are of exactly its data and priors; else of a fit made first.
 
-    campaign = read_campaign(folder)
-    found = stored_calibration(campaign)
-    if found is not None:
-        return found
-    result = _converged_fit(campaign, tell, progress)
-    from tvsbayes.assessment.fitted_calibration import calibration_of
+    Each part is looked up by itself, since results of an older version may lack one; all that `results/` lack comes
+    from one fit (Laplace approximation), made when the first of them is needed.
 
-    return calibration_of(result)
+    Attributes:
+        campaign: from `read_campaign`.
+        tell: shows why a fit is made first.
+        progress: told how far it is.
+    """
 
+    campaign: Campaign
+    tell: Tell = untold
+    progress: Show | None = None
 
-def fit_for(campaign: Campaign, tell: Tell = untold, progress: Show | None = None) -> JointFit:
-    """The fit in `results/` where its hashes agree with the campaign; else fit first."""
-    from tvsbayes.estimators.joint_fit import restored
-    from tvsbayes.results.stored_draws import stored_mode
+    @cached_property
+    def stored_calibration(self) -> Calibration | None:
+        """What `locate` needs, None where `results/` lack it."""
+        from tvsbayes.calibration.calibration_file import stored_calibration
 
-    compile_for(tell)
-    stored = stored_mode(campaign)
-    found = None if stored is None else restored(campaign, stored)
-    return _converged_fit(campaign, tell, progress) if found is None else found
+        return stored_calibration(self.campaign)
+
+    @cached_property
+    def stored_fit(self) -> JointFit | None:
+        """Where the fit in `results/` ended, None where they do not say so or another version named its parameters."""
+        from tvsbayes.results.stored_draws import stored_mode
+
+        if (mode := stored_mode(self.campaign)) is None:
+            return None
+        from tvsbayes.estimators.joint_fit import restored
+
+        return restored(self.campaign, mode)
+
+    @cached_property
+    def stored_record(self) -> FitRecord | None:
+        """`fit.json`, None where it is not of these data: an old one beside new draws would be that of other data."""
+        from tvsbayes.instrument.campaign import input_hashes
+        from tvsbayes.results.fit_record import read_fit
+
+        if self.campaign.path is None or self.stored_calibration is None:
+            return None
+        path = self.campaign.path / "results" / "fit.json"
+        record = read_fit(path) if path.exists() else None
+        return record if record and record.provenance.inputs == input_hashes(self.campaign) else None
+
+    @cached_property
+    def fitted(self) -> JointFit:
+        """A fit for a command that needs one in passing.
+
+        Raises:
+            NotConverged: it did not converge.
+        """
+        return _converged_fit(self.campaign, self.tell, self.progress)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """What `locate` needs."""
+        if self.stored_calibration is not None:
+            return self.stored_calibration
+        fit = self.fitted
+        from tvsbayes.assessment.fitted_calibration import calibration_of
+
+        return calibration_of(fit)
+
+    @cached_property
+    def fit(self) -> JointFit:
+        """Mode and Laplace approximation."""
+        compile_for(self.tell)
+        return self.fitted if self.stored_fit is None else self.stored_fit
+
+    @cached_property
+    def record(self) -> FitRecord:
+        """`fit.json` with all that a report shows; a fit that is made first is kept in the campaign's folder.
+
+        Raises:
+            InputError: the folder takes no results.
+        """
+        if self.stored_record is not None and self.stored_record.evidence is not None:
+            return self.stored_record
+        place = None if self.campaign.path is None else output_place(self.campaign.path, "results")
+        if place is not None:
+            require_writable(place)
+        return _results(self.fitted, None, 0, place, {}, self.tell).record
 
 
 def _why_not_stored(campaign: Campaign) -> str:
@@ -350,21 +412,3 @@ def _converged_fit(campaign: Campaign, tell: Tell, progress: Show | None) -> Joi
     if not result.converged:
         raise NotConverged.of(result.problems, "see `tvsbayes fit`; this command needs a fit that has converged")
     return result
-
-
-def record_for(campaign: Campaign, folder: Path, tell: Tell = untold, progress: Show | None = None) -> FitRecord:
-    """`results/fit.json` where it was made from exactly this campaign and whole; else fit first."""
-    from tvsbayes.calibration.calibration_file import stored_calibration
-    from tvsbayes.instrument.campaign import input_hashes
-    from tvsbayes.results.fit_record import read_fit
-
-    path = folder / "results" / "fit.json"
-    if stored_calibration(campaign) is not None and path.exists():
-        record = read_fit(path)
-        # An old fit.json beside new draws would be the report of other data.
-        if record.evidence is not None and record.provenance.inputs == input_hashes(campaign):
-            return record
-    place = output_place(folder, "results")
-    require_writable(place)
-    found = _converged_fit(campaign, tell, progress)
-    return _results(found, None, 0, place, {}, tell).record

@@ -21,12 +21,11 @@ from tvsbayes.cli.app import (
     report_line,
     spared,
 )
-from tvsbayes.cli.axis_commands import STORED
 from tvsbayes.cli.instruments import instrument_of
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
-from tvsbayes.pipeline import calibration_for
+from tvsbayes.pipeline import StoredOrFitted
 from tvsbayes.progress import Job
 
 FITTING, MAKING = "fit", "compensation"
@@ -94,9 +93,7 @@ def compensate(
     data = read_axis(campaign)
     wish = Wish(to, "host" if applied_by == "host" else "controller", per_command, resolution, in_force, letter, period)
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
-        results = results_for(data, progress=job.part(FITTING), seed=seed)
-        if not results.stored:
-            report_line(STORED)
+        results = results_for(data, progress=job.part(FITTING), seed=seed, tell=report_line)
         made = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
     document = {"format": COMPENSATION_FORMAT, **made.as_json(), **plain(provenance(axis_hashes(data), seed))}
     files: dict[str, str] = {}
@@ -115,13 +112,14 @@ def compensate(
 
 def export_calibration(campaign: Path, kind: str, out: Path | None, as_json: bool) -> None:
     """The calibration for another language, printed or into a file."""
-    with waiting() as progress:
-        calibration = calibration_for(campaign, report_line, progress)
     from tvsbayes.calibration.c_header import calibration_header
     from tvsbayes.calibration.calibration_file import Origin, calibration_json
     from tvsbayes.instrument.campaign import read_campaign
 
-    origin = Origin.of(read_campaign(campaign))
+    data = read_campaign(campaign)
+    with waiting() as progress:
+        calibration = StoredOrFitted(data, report_line, progress).calibration
+    origin = Origin.of(data)
     stored = calibration_json(calibration, origin)
     text = calibration_header(calibration, origin) if kind == "header" else json.dumps(stored, indent=1)
     document: Mapping[str, Any] = {"header": text} if kind == "header" else stored

@@ -26,7 +26,7 @@ from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import chain_kept, waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
-from tvsbayes.pipeline import FITTING, MAX_MINUTES, calibrate, compile_for, fit_for
+from tvsbayes.pipeline import FITTING, MAX_MINUTES, StoredOrFitted, calibrate, compile_for
 from tvsbayes.progress import Job, Show
 
 if TYPE_CHECKING:
@@ -194,7 +194,8 @@ def compare(
     fitting = [f"{FITTING} of {escaped(str(folder), 60)}" for folder in folders]
     stages = dict.fromkeys(fitting, 1.0) | {HOLDING_OUT: 0.0 if other else 6.0}
     with waiting() as progress, Job(stages, progress) as job:
-        fits = [fit_for(each, report_line, job.part(stage)) for each, stage in zip(data, fitting, strict=True)]
+        parts = map(job.part, fitting)
+        fits = [StoredOrFitted(each, report_line, part).fit for each, part in zip(data, parts, strict=True)]
         record = None if other else _classic_against_joint(fits[0], by or "steps", seed or 0, job.part(HOLDING_OUT))
     if record is None:
         from tvsbayes.comparison.changes import compare as compare_fits
@@ -220,7 +221,7 @@ def _compare_positions(campaign: Path, as_json: bool) -> None:
 
     data = read_campaign(campaign)
     with waiting() as progress, Job({FITTING: 1.0, HOLDING_OUT: 6.0}, progress) as job:
-        fitted = fit_for(data, report_line, job.part(FITTING))
+        fitted = StoredOrFitted(data, report_line, job.part(FITTING)).fit
         found = hold_out_positions(fitted, progress=job.part(HOLDING_OUT))
     finish({**found.as_json(), "files": {}}, positions_text(found), as_json)
 

@@ -33,7 +33,7 @@ from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import output_place
-from tvsbayes.pipeline import FITTING, calibration_for, compile_for, fit_for
+from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
@@ -95,11 +95,12 @@ def locate(
         raise InputError("usage", message, allowed=", ".join(given), remedy=remedy)
     finite(pan_steps=pan_steps, tilt_steps=tilt_steps, aperture_deg=aperture_deg)
     from tvsbayes.instrument.axes import sides_of
+    from tvsbayes.instrument.campaign import read_campaign
 
     where = (pan_steps, tilt_steps, aperture_deg, (pan_approach or "left", tilt_approach or "up"))
     sides_of(where[-1])
     with waiting() as progress:
-        calibration = calibration_for(campaign, report_line, progress)
+        calibration = StoredOrFitted(read_campaign(campaign), report_line, progress).calibration
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import budget_text, locations_text
 
@@ -120,11 +121,12 @@ def locate(
 def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool) -> None:
     """Every point of a file, refused one by one."""
     from tvsbayes.coordinates.looks_file import read_looks
+    from tvsbayes.instrument.campaign import read_campaign
 
     points = read_looks(file)
     where = (points.pan_steps, points.tilt_steps, points.aperture_deg, points.approach)
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
-        calibration = calibration_for(campaign, report_line, job.part(FITTING))
+        calibration = StoredOrFitted(read_campaign(campaign), report_line, job.part(FITTING)).calibration
         from tvsbayes.coordinates.location import locate as locate_points
         from tvsbayes.report.command_text import locations_text
 
@@ -147,8 +149,8 @@ def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int,
 
     cloud_place(place, file)
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
-        calibration = calibration_for(campaign, report_line, job.part(FITTING))
         measured = read_campaign(campaign)
+        calibration = StoredOrFitted(measured, report_line, job.part(FITTING)).calibration
         simple = simple_calibrations(measured.rig.priors, classic_of(measured))
         job.begin(LOCATING)
         sample = EvenSample()
@@ -201,9 +203,11 @@ def steps_for(
         metres = " ".join(f"--{axis}-mm {1000 * v:g}" for axis, v in zip("xyz", point, strict=True))
         allowed = f"a point at least {NEAREST_POINT_MM:g} mm from the middle of the baseline"
         raise InputError("range", message, allowed=allowed, remedy=f"lengths are mm: {metres}")
+    from tvsbayes.instrument.campaign import read_campaign
+
     limits = None if rig is None else _limits(rig)
     with waiting() as progress:
-        calibration = calibration_for(campaign, report_line, progress)
+        calibration = StoredOrFitted(read_campaign(campaign), report_line, progress).calibration
     from tvsbayes.report.command_text import steps_text
 
     azimuth, elevation = direction or (None, None)
@@ -288,7 +292,7 @@ def plan(
         raise InputError("criterion", message, column="--criterion", allowed=allowed, remedy="name one of them")
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 0.0 if data is None else 1.0, PLANNING: 3.0}, progress) as job:
-        fitted = None if data is None else fit_for(data, report_line, job.part(FITTING))
+        fitted = None if data is None else StoredOrFitted(data, report_line, job.part(FITTING)).fit
         result = find_plan(
             instrument,
             wanted,
@@ -323,7 +327,7 @@ def _next_looks(
         raise InputError("usage", "--next goes on from a campaign", remedy="add --given CAMPAIGN")
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 1.0, PLANNING: 1.0}, progress) as job:
-        fitted = fit_for(data, report_line, job.part(FITTING))
+        fitted = StoredOrFitted(data, report_line, job.part(FITTING)).fit
         job.begin(PLANNING)
         from tvsbayes.planning.next_looks import next_looks
 
