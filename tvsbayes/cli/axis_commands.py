@@ -261,7 +261,7 @@ def simulate(folder: Path, *, moves: Path | None, out: Path, seed: int, as_json:
     from tvsbayes.files.csv_table import CSV_BYTES_MAX
     from tvsbayes.files.disk import read_bytes
     from tvsbayes.single_axis.axis_campaign import parse_axis_moves, read_axis
-    from tvsbayes.single_axis.simulated_axis import simulate_axis
+    from tvsbayes.twin.simulated_axis import simulate_axis
 
     template = read_axis(folder)
     listed = None if moves is None else parse_axis_moves(read_bytes(moves, CSV_BYTES_MAX), escaped(moves.name, 200))

@@ -26,6 +26,7 @@ from tvsbayes.twin.gear_errors import (
     PERFECT,
     draw_gear_errors,
     drift_deg,
+    kelvin_of,
     zero_shift_deg,
 )
 from tvsbayes.twin.physics import (
@@ -209,8 +210,7 @@ def _drive(
     start_draws = streams.stops.uniform(-0.5, 0.5, (len(moves), 2))
     drift_draws, time_s = streams.drift.standard_normal((len(moves), 2)), np.array([m.time_s for m in moves])
     warm_minutes = (time_s - (time_s[0] if on_s is None else on_s)) / 60.0
-    degC = np.array([0.0 if m.temperature_degC is None else m.temperature_degC for m in moves])
-    kelvin = degC - degC[0]
+    kelvin = kelvin_of(moves)
     resting, errors, drift = np.empty_like(counters), np.empty_like(counters), np.empty_like(counters)
     for i, (axis, (negative, positive)) in enumerate(SIDES.items()):
         approach = [getattr(m, f"{axis}_approach") for m in moves]
