@@ -55,7 +55,7 @@ REASONS = {
     "two-spots": "a second spot holds over a quarter of the light of the first",
     "too-small": "the bright area is that of a hot pixel",
     "too-large": "the bright area is no laser spot: a lamp or an overexposed frame",
-    "lamp": "a lamp or a window reaches in from the border, and no spot is beside it: shade it, or subtract with --dark",
+    "lamp": "a lamp or window reaches in from the border, and no spot is beside it: shade it, or subtract with --dark",
     "border": "the spot reaches the border of the picture",
     "clipped": "the clipped area is over half the bright area",
     "elongated": "the spot is over four times as long as wide",
