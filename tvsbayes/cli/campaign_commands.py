@@ -158,6 +158,12 @@ def detect(
         float | None,
         typer.Option("--speckle-contrast", min=0.0, max=2.0, help="Per pixel (default: learned; contour: 0.4)."),
     ] = None,
+    dark: Annotated[
+        Path | None,
+        typer.Option(
+            "--dark", help="Folder of pictures with the laser off, to subtract: as in frames/, or left.png ..."
+        ),
+    ] = None,
     overlay: Annotated[bool, typer.Option("--overlay", help="Pictures of every spot in results/overlay.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -172,7 +178,7 @@ def detect(
     pictures = output_place(campaign, "results", "overlay") if overlay else None
     data = read_campaign(campaign)
     with waiting() as progress:
-        found = find(data, method, speckle_contrast=speckle_contrast, overlay=pictures, progress=progress)
+        found = find(data, method, speckle_contrast=speckle_contrast, dark=dark, overlay=pictures, progress=progress)
     write_atomically(campaign / "spots.csv", spots_bytes(found.campaign.spots))
     document = {"campaign": str(campaign), **found.as_json()}
     text = detection_text(found) + f"\nwritten: {escaped(str(campaign / 'spots.csv'), 200)}"
