@@ -69,11 +69,6 @@ class CampaignCheck:
         return {"kind": "campaign", **asdict(self), "findings": findings, "warnings": list(self.warnings)}
 
 
-def _points_mm(campaign: Campaign) -> np.ndarray:
-    """The usable spots in frame S, (n, 3); not a number where no undistorted point is seen."""
-    return triangulate(campaign.stereo, pixels_of(s for s in campaign.spots if s.status == "ok"))
-
-
 def _can_stand(depths_mm: np.ndarray) -> np.ndarray:
     return (depths_mm > NEAREST_SHEET_MM) & (depths_mm < FARTHEST_SHEET_MM)
 
@@ -88,7 +83,7 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     Returns:
         Findings, certain ones and doubts; `Finding.sentence` is what is printed.
     """
-    points_mm = _points_mm(campaign) if points_mm is None else points_mm
+    points_mm = campaign.usable_points_mm if points_mm is None else points_mm
     few = partial(listed, most=SPOTS_LISTED)
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
     found = []
@@ -134,7 +129,7 @@ def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple
     """
     found = [*implausible(campaign)]
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
-    points_mm = _points_mm(campaign)
+    points_mm = campaign.usable_points_mm
     stands = _can_stand(points_mm[:, 0])
     if stands.sum() < 2 * SPOTS_MIN or stands.mean() <= 1 - ODD_SHARE:
         return tuple(found)
@@ -280,7 +275,7 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
     refused = Counter(spot.status for spot in campaign.spots if spot.status != "ok")
     selection = select_experiments(campaign)
-    points_mm = _points_mm(campaign)
+    points_mm = campaign.usable_points_mm
     # What is wrong first, then what follows from it.
     findings = implausible(campaign, points_mm)
     warnings = [*(finding.sentence for finding in findings), *_incomplete(selection.skipped)]

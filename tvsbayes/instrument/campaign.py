@@ -10,7 +10,7 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -38,7 +38,7 @@ from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign_header import parse_header
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.rig import RigTable, parse_rig_table, rig_table_toml
-from tvsbayes.instrument.stereo_pair import Stereo, parse_stereo, stereo_bytes
+from tvsbayes.instrument.stereo_pair import Stereo, parse_stereo, stereo_bytes, triangulate
 
 CAMERAS: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 """The two cameras, in the order of the columns of spots.csv."""
@@ -248,6 +248,23 @@ class Campaign(Shown):
     rig: RigTable = field(default_factory=RigTable)
     header: dict[str, object] = field(default_factory=dict)
     path: Path | None = None
+
+    @cached_property
+    def points_mm(self) -> np.ndarray:
+        """Where the stated cameras see each spot, a row each, frame S, shape (n, 3); triangulated once, read-only.
+
+        Not a number where there is no spot, and where the lens model does not reach.
+        """
+        found = np.full((len(self.spots), 3), np.nan)
+        usable = np.array([spot.status == "ok" for spot in self.spots], dtype=bool)
+        found[usable] = triangulate(self.stereo, pixels_of(spot for spot in self.spots if spot.status == "ok"))
+        found.flags.writeable = False
+        return found
+
+    @property
+    def usable_points_mm(self) -> np.ndarray:
+        """Rows of `points_mm` of the spots that may be used, in their order."""
+        return self.points_mm[[spot.status == "ok" for spot in self.spots]]
 
     @property
     def title(self) -> str:

@@ -16,7 +16,6 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import CAMERAS, PIXELS, Campaign, Spot, frame_name, ordered_spots, pixels_of
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES, unit_of
-from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.posterior.predictive import repeated_rad
@@ -219,7 +218,7 @@ def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> Look
         scale = fitted.record.summary.parameters["pixel_scale"].value
         suspect[[row_of[spot] for spot in (*fitted.fit.suspect_spots, *fitted.fit.excluded_spots)]] = True
     if used:
-        point[rows] = triangulate(campaign.stereo, pixels[rows])
+        point[rows] = campaign.points_mm[rows]
         noise = scale**2 * np.stack([pixel_covariance(spot) for spot in used])
         covariance[rows] = point_covariance_mm2(campaign.stereo, point[rows], noise)
     deviation, u = _deviations(row_of, () if fitted is None else fitted.stops)
