@@ -18,8 +18,8 @@ STEP = float(NODES[1] - NODES[0])
 FLOOR = -40.0
 """Of a tabulated log density below its largest: what lies lower is never drawn, and zero has no logarithm."""
 CUT_FLOOR = -1e5
-"""Of a cut below its largest value. SciPy takes slopes that differ by less than 1e-9 of the largest difference as equal:
-beside a fall by 1e15, which a cut may have, that is all of them."""
+"""Of a cut below its largest value. SciPy takes slopes that differ by less than 1e-9 of the largest difference as
+equal: beside a fall by 1e15, which a cut may have, that is all of them."""
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
