@@ -236,9 +236,12 @@ def _results(
     calibration = calibration_of(found, posterior, seed=seed) if found.converged else None
     behind = equal_laplace_draws(found) if usable is None else usable.thinned(DRAWS_KEPT)
     physical, effective = np.asarray(behind.physical), np.asarray(behind.effective_deg_per_step)
-    derived = {name: values for name, values in Draws(behind).items() if name not in found.names}
+    mechanism = found.space.mechanism
+    derived = {name: values for name, values in Draws(behind, mechanism).items() if name not in found.names}
     columns = np.stack(list(derived.values()), axis=1)
-    draws = ResultDraws(found.names, physical, effective, found.reference_pose_rad, tuple(derived), columns)
+    told = [column for column, name in enumerate(found.names) if name in mechanism.told]
+    names = tuple(found.names[column] for column in told)
+    draws = ResultDraws(names, physical[:, told], effective, found.reference_pose_rad, tuple(derived), columns)
     record = FitRecord(
         summary,
         covariance_of_draws(draws.names, draws.physical, summary.parameters),

@@ -17,7 +17,7 @@ from tvsbayes.calibration.pointing import INPUT_NAMES
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
-from tvsbayes.instrument.parameters import HEADLINES, INDEX, KINDS, NAMES, PRIOR_GROUPS, QUANTITIES, RIG_NAMES, unit_of
+from tvsbayes.instrument.parameters import HEADLINES, INDEX, KINDS, NAMES, QUANTITIES, unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
 from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD, physical_at
 from tvsbayes.results.estimates import Estimate, HeadlineCauses
@@ -51,6 +51,13 @@ class _Told:
     groups: dict[str, list[int]]
 
 
+def _noise_of(fit: JointFit, readings: bool) -> str:
+    """What limits single looks, in words."""
+    if fit.space.mechanism.sightings:
+        return "noise of sightings"
+    return "pixel and aperture noise" if readings else "pixel noise"
+
+
 def _told(fit: JointFit) -> _Told:
     readings = np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
     linear = linear_spots(
@@ -63,9 +70,10 @@ def _told(fit: JointFit) -> _Told:
     scattered *= np.sqrt(fit.linearised.scatter_variance)[:, :, None]
     by_looks = np.einsum("nap,naq->pq", scattered, scattered)
     own = len(NAMES) + np.arange(places)
-    groups = {**PRIOR_GROUPS, TRANSMISSION_ERROR: own.tolist(), PLAY_VARIATION: (own + places).tolist()}
+    groups = dict(fit.space.mechanism.prior_groups)
+    groups |= {TRANSMISSION_ERROR: own.tolist(), PLAY_VARIATION: (own + places).tolist()}
     return _Told(
-        "pixel and aperture noise" if readings else "pixel noise",
+        _noise_of(fit, bool(readings)),
         noise - by_looks,
         by_looks,
         found.fisher - noise,
@@ -202,8 +210,8 @@ def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
     """Every stated prior of the rig that a quantity hangs on."""
     found = []
     stated = (np.asarray(x).tolist() for x in (fit.space.value, fit.space.u, fit.space.kind))
-    for name, centre, u, kind in zip(RIG_NAMES, *stated, strict=True):
-        contribution, shape = spread[:, INDEX[name]], KINDS[kind]
+    for column, (name, centre, u, kind) in enumerate(zip(fit.space.mechanism.rig_names, *stated, strict=True)):
+        contribution, shape = spread[:, column], KINDS[kind]
         if u == 0 or not np.any(contribution):
             continue
         if shape == "log-normal":

@@ -138,7 +138,7 @@ def prior_sensitivity(
     else:
         quantities, sampled = sampled_headlines(fit, moved, posterior)
         normal = sampled.normal
-    names = np.array(NAMES)[rows]
+    names = np.array(fit.names)[rows]
     groups = {name: np.flatnonzero(names == name) for name in names if not name.startswith("stereo.")}
     groups["stereo calibration"] = np.flatnonzero(np.char.startswith(names, "stereo."))
     found = []

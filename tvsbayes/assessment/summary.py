@@ -20,6 +20,7 @@ from tvsbayes.assessment.weaknesses import (
     prior_conflicts,
     weak_directions,
 )
+from tvsbayes.estimators.campaign_arrays import components
 from tvsbayes.estimators.four_point import experiment_rows, four_point_ratios, ratio_slopes, select_experiments
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
@@ -28,7 +29,6 @@ from tvsbayes.instrument.parameters import (
     HARMONIC_NAMES,
     INDEX,
     LATE_NAMES,
-    NAMES,
     QUANTITIES,
     RECEIVER_NAMES,
     RIG_NAMES,
@@ -120,12 +120,13 @@ class _Source:
 
 
 def _absent(fit: JointFit) -> set[str]:
-    """What the model does not have of errors of the gears, scatter of looks and shifts of the zeros."""
-    value = dict(zip(NAMES, np.asarray(fit.mode.physical).tolist(), strict=True))
+    """What the model does not have of errors of the gears, scatter of looks and shifts of the zeros, or means not."""
+    value = dict(zip(fit.names, np.asarray(fit.mode.physical).tolist(), strict=True))
     none = {name for name in ABSENT_AT_NOUGHT if not fit.free[INDEX[name]] and value[name] == 0}
     for axis in AXES:
         if {f"transmission_error_deg.{axis}", f"play_variation_deg.{axis}"} <= none:
             none.add(f"transmission_error_length_deg.{axis}")
+    none |= set(fit.space.mechanism.held)
     return none | ({"creep_minutes"} if set(names_of("creep_deg")) <= none else set())
 
 
@@ -138,7 +139,7 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
     low, high = fit.ends95
     has_readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) > 0))
     estimates = {}
-    for index, name in enumerate(NAMES):
+    for index, name in enumerate(fit.names):
         if name in RECEIVER_NAMES and not has_readings:
             continue
         if name in _absent(fit):
@@ -265,7 +266,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     usable = posterior if posterior is not None and posterior.converged else None
     source = _Source(fit, usable)
     readings = np.sum(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
-    observations = 3 * float(np.asarray(fit.arrays.spots.valid).sum()) + float(readings)
+    observations = components(fit.campaign.rig) * float(np.asarray(fit.arrays.spots.valid).sum()) + float(readings)
     determined = float(np.trace(fit.information.fisher @ fit.covariance))
     pan, tilt = np.degrees(fit.reference_pose_rad).tolist()
     (a, b), (c, d) = np.asarray(source.centre.jacobian).tolist()

@@ -147,7 +147,7 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
         rest = _counters_direction(fit, axis), _scatter_direction(fit, axis)
         found += [one for one in (weak, *rest, *_shift_directions(fit, axis)) if one is not None]
     noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES, *names_of("creep_minutes")}
-    rows = np.array([i for i, name in enumerate(NAMES) if fit.free[i] and name not in noise])
+    rows = np.array([i for i, name in enumerate(fit.names) if fit.free[i] and name not in noise])
     if rows.size == 0:
         return tuple(found)
     eigenvalues, vectors = np.linalg.eigh(fit.covariance[np.ix_(rows, rows)])
@@ -155,9 +155,9 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
         if value < WEAK_VARIANCE or len(found) >= LISTED:
             break
         order = np.argsort(-np.abs(vector))
-        loadings = {NAMES[rows[i]]: float(vector[i]) for i in order if abs(vector[i]) > LOADING_LIMIT}
+        loadings = {fit.names[rows[i]]: float(vector[i]) for i in order if abs(vector[i]) > LOADING_LIMIT}
         if not loadings:
-            loadings = {NAMES[rows[order[0]]]: float(vector[order[0]])}
+            loadings = {fit.names[rows[order[0]]]: float(vector[order[0]])}
         names = list(loadings)
         # Rounding may leave a hair more than the prior's variance: more than 100 % is not a finding.
         left = f"{min(100.0, 100 * value):.0f} % of"
@@ -232,7 +232,7 @@ def prior_conflicts(fit: JointFit) -> tuple[str, ...]:
     found = []
     for index in np.flatnonzero(fit.free & (np.abs(fit.z) > CONFLICT_LIMIT)):
         value, distance = fit.mode.physical[index], abs(fit.z[index])
-        found.append(conflict_sentence(f"{NAMES[index]} = {value:.4g}", distance))
+        found.append(conflict_sentence(f"{fit.names[index]} = {value:.4g}", distance))
     return tuple(found)
 
 

@@ -22,6 +22,7 @@ from tvsbayes.cli.app import (
     is_part,
     report_line,
 )
+from tvsbayes.cli.head_commands import refuse_sightings
 from tvsbayes.cli.instruments import instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, typed
@@ -112,8 +113,9 @@ def simulate(
     from tvsbayes.twin.simulated_campaign import simulate as run_plan
 
     home_approach = None if unrecorded_sides else HOME_APPROACH
+    declared = read_rig(rig)
     result = run_plan(
-        *(read_rig(rig), read_plan(plan), seed),
+        *(declared, read_plan(plan, not declared.table.mechanism.sightings), seed),
         aperture=aperture,
         home_approach=home_approach,
         sides_recorded=not unrecorded_sides,
@@ -223,7 +225,9 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
 
     if plan_file is not None:
         _refuse_other_than_rig(path, plan_file)
-        rig, steps = read_rig(path), read_plan(plan_file)
+        rig = read_rig(path)
+        refuse_sightings("check of a plan", rig.table.mechanism.sightings)
+        steps = read_plan(plan_file)
         from tvsbayes.planning.plan_check import check_plan
 
         compile_for(report_line)
@@ -242,7 +246,8 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         rig = read_rig(path)
         return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
     instrument = instrument_of(path)
-    return campaign_held(path) if instrument is None else instrument.command("held")(path)
+    own = instrument is not None and "check" not in instrument.shared
+    return campaign_held(path) if instrument is None or not own else instrument.command("held")(path)
 
 
 def _refuse_other_than_rig(path: Path, plan_file: Path) -> None:

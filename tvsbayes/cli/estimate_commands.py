@@ -61,7 +61,7 @@ def _warn_of(campaign: Campaign, *, stops: bool = False) -> None:
 
 
 def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
-    """The paper's four-point estimator. Mean, sd, type A and GUM uncertainty per direction."""
+    """The paper's four-point estimator; of sightings a pointing model by least squares."""
     if serve("classic", **locals()):
         return
     from tvsbayes.estimators.four_point import classic as estimate
@@ -188,6 +188,10 @@ def compare(
         return
     folders = [campaign] if other is None else [campaign, other]
     data = [read_campaign(folder) for folder in folders]
+    if other is None and data[0].rig.mechanism.sightings:
+        refuse_options("for spots; of sightings positions are left out", "write --by positions", by=by, seed=seed)
+        _compare_pointing(data[0], as_json)
+        return
     if other is None and not len(select_experiments(data[0]).experiments):
         raise _no_experiments()
     results = output_place(campaign, "results")
@@ -224,6 +228,23 @@ def _compare_positions(campaign: Path, as_json: bool) -> None:
         fitted = StoredOrFitted(data, report_line, job.part(FITTING)).fit
         found = hold_out_positions(fitted, progress=job.part(HOLDING_OUT))
     finish({**found.as_json(), "files": {}}, positions_text(found), as_json)
+
+
+def _compare_pointing(data: Campaign, as_json: bool) -> None:
+    """Terms of a head by least squares, without gears, beside those of the fit."""
+    import numpy as np
+
+    from tvsbayes.head.pointing_model import pointing_model
+    from tvsbayes.report.command_text import pointing_text
+
+    model = pointing_model(data)
+    with waiting() as progress:
+        fitted = fit_for(data, report_line, progress)
+    centre, sd = np.asarray(fitted.mode.physical), np.asarray(fitted.draws.physical).std(axis=0)
+    joint = {n: (float(centre[k]), float(sd[k])) for k, n in enumerate(fitted.names) if n in model.names}
+    document = {**model.as_json(), "joint": {name: {"value": v, "sd": u} for name, (v, u) in joint.items()}}
+    text = f"{pointing_text(model, joint)}\nhow well sightings are predicted: --by positions"
+    finish({**document, "files": {}}, text, as_json)
 
 
 def _no_experiments() -> NothingToEstimate:

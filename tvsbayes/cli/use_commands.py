@@ -28,6 +28,7 @@ from tvsbayes.cli.app import (
     spared,
 )
 from tvsbayes.cli.compensation_commands import export_calibration, plan_verify
+from tvsbayes.cli.head_commands import refuse_head, refuse_sightings
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
@@ -104,6 +105,7 @@ def locate(
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import budget_text, locations_text
 
+    refuse_head("locate", calibration)
     found = locate_points(calibration, *where, draws=draws, seed=seed)
     if found.refused[0] is not None:
         raise found.refused[0]
@@ -130,6 +132,7 @@ def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool
         from tvsbayes.coordinates.location import locate as locate_points
         from tvsbayes.report.command_text import locations_text
 
+        refuse_head("locate", calibration)
         found = locate_points(calibration, *where, draws=draws, seed=seed, progress=job.part(LOCATING))
     entries = [found.as_json(k) for k in range(len(found.refused))]
     document = {"estimator": found.estimator, "draws": found.draws, "points": entries}
@@ -151,6 +154,7 @@ def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int,
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
         measured = read_campaign(campaign)
         calibration = StoredOrFitted(measured, report_line, job.part(FITTING)).calibration
+        refuse_head("locate", calibration)
         simple = simple_calibrations(measured.rig.priors, classic_of(measured))
         job.begin(LOCATING)
         sample = EvenSample()
@@ -275,6 +279,7 @@ def plan(
     from tvsbayes.instrument.rig import read_rig
 
     instrument, data = read_rig(rig), None if given is None else read_campaign(given)
+    refuse_sightings("plan", instrument.table.mechanism.sightings)
     from tvsbayes.planning.planner import plan as find_plan
     from tvsbayes.planning.search import CRITERIA
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
@@ -373,7 +378,9 @@ def study(
     if scheduler is not None:
         refuse_options("for a cluster that is started here", "leave it out, or leave out --scheduler", workers=workers)
     in_order(rig, plan_file)
-    instrument, steps = read_rig(rig), read_plan(plan_file)
+    instrument = read_rig(rig)
+    refuse_sightings("study", instrument.table.mechanism.sightings)
+    steps = read_plan(plan_file)
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import study_text
     from tvsbayes.statistics.chances import ASSURED

@@ -149,7 +149,7 @@ class JointFit(Shown):
     @property
     def names(self) -> tuple[str, ...]:
         """Contract names of the coordinates and of the columns of `draws.physical`."""
-        return NAMES
+        return self.space.mechanism.names
 
     @property
     def held(self) -> np.ndarray:
@@ -339,9 +339,10 @@ def _usable(campaign: Campaign, without: Collection[int]) -> Bool[np.ndarray, " 
 
 
 def priors_used(stated: Mapping[str, Prior], value: np.ndarray, u: np.ndarray) -> dict[str, Prior]:
-    """The priors of a fit, which its options may have changed from the stated ones; columns in order of `RIG_NAMES`."""
+    """The priors of a fit, which its options may have changed from the stated ones; columns in their order."""
     return {
-        name: replace(prior, value=float(value[INDEX[name]]), u=float(u[INDEX[name]])) for name, prior in stated.items()
+        name: replace(prior, value=float(value[column]), u=float(u[column]))
+        for column, (name, prior) in enumerate(stated.items())
     }
 
 
@@ -356,7 +357,7 @@ def restored(campaign: Campaign, stored: StoredMode, seed: int = 0) -> JointFit 
     Returns:
         The fit; None where another version of tvsbayes named its parameters otherwise.
     """
-    if stored.names != NAMES or stored.prior.shape[1] != len(RIG_NAMES):
+    if stored.names != campaign.rig.mechanism.names or stored.prior.shape[1] != len(RIG_NAMES):
         return None
     table = replace(campaign.rig, priors=priors_used(campaign.rig.priors, *stored.prior))
     valid = stored.valid > 0
@@ -407,7 +408,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
     lin = problem.linearised(mode.z)
     information = problem.information(lin)
     chi2_spots = leave_one_out_chi2(information, np.asarray(problem.arrays.spots.weight)[: len(problem.spots)])
-    readings = np.asarray(problem.arrays.spots.has_aperture)[: len(problem.spots)]
+    readings = problem.further
     suspect = used & (chi2_spots > chi2_quantile(readings, GATE_PROBABILITY))
     pose = lin.mirror_angles_rad[used].mean(axis=0)
     seen_at = seen_places(campaign.moves, [spot.move for spot in problem.spots], campaign.rig)

@@ -23,7 +23,7 @@ from tvsbayes.estimators.likelihood import FilterRows, filter_rows, place_column
 from tvsbayes.estimators.look_jacobian import look_jacobian
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import materialise
-from tvsbayes.model.parameter_space import ParameterSpace, model_of
+from tvsbayes.model.parameter_space import ParameterSpace
 
 
 class Linearised(eqx.Module):
@@ -93,7 +93,7 @@ def linearise(
         inflation: factor on pixel and aperture noise.
     """
     physical = materialise(space.physical(z))
-    model = model_of(physical, space.harmonic_period_deg)
+    model = space.model_at(physical)
     found = standing(model, arrays, inflation)
     looks, terms = found.looks, found.terms
     by_coordinates = look_jacobian(z, physical, space, looks, arrays)

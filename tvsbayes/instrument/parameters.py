@@ -156,6 +156,27 @@ _PARAMETERS = (
             "the shift of the zero per kelvin", "zero per kelvin, {0}"),
     *_cameras(),
 )  # fmt: skip
+_TURN, _TERM = Prior(0.0, 10.0), Prior(0.0, 0.5)
+_TERMS = (
+    *_block("elevation_zero_deg", (), "deg", _TURN, (-360.0, 360.0, 360.0),
+            "the elevation at counter 0", "elevation at counter 0"),
+    *_block("elevation_axis_offset_mm", (), "mm", _SMALL, (-1000.0, 1000.0, 1000.0),
+            "the elevation axis before the azimuth axis", "elevation axis ahead"),
+    *_block("axes_not_square_deg", (), "deg", _TERM, _ANGLE, "the axes not square to each other", "axes not square"),
+    *_block("beam_not_square_deg", (), "deg", _TERM, _ANGLE,
+            "the beam not square to the elevation axis", "beam not square"),
+    *_block("azimuth_axis_tilt_deg", ("north", "east"), "deg", _TERM, _ANGLE,
+            "the lean of the azimuth axis", "azimuth axis leans {0}"),
+    *_block("beam_offset_mm", ("y", "z"), "mm", _SMALL, _LENGTH, "the beam off the elevation axis",
+            "beam off axis, {0}"),
+    *_block("flexure_deg", (), "deg", UNSTATED, _ANGLE, "the flexure with cos(elevation)", "flexure, cos(elevation)"),
+    *_block("azimuth_zero_deg", (), "deg", _TURN, (-360.0, 360.0, 360.0),
+            "the azimuth at counter 0", "azimuth at counter 0"),
+    *_block("tangent_flexure_deg", (), "deg", UNSTATED, _ANGLE,
+            "the flexure with cot(elevation)", "flexure, cot(elevation)"),
+)  # fmt: skip
+"""Of a pan-tilt head. TPOINT's terms: elevation_zero IE, azimuth_zero -IA, azimuth_axis_tilt north AN and east -AW,
+axes_not_square NPAE, beam_not_square CA, flexure TF, tangent_flexure TX."""
 _many = Quantity.many
 _LINES = (
     *_many("effective_deg_per_step", DIRECTIONS, unit="deg/step", words="the effective ratio", label="effective {0}",
@@ -175,7 +196,13 @@ _DERIVED = (
 REGISTRY = Quantities(*_PARAMETERS)
 """Every parameter by its name, in the order of the coordinates, which stored draws and results keep."""
 NAMES: tuple[str, ...] = tuple(REGISTRY)
+_HEAD_SLOTS = NAMES[NAMES.index("tilt_zero_deg") : NAMES.index("tilt_axis_offset_mm.z") + 1]
+HEAD_TERMS: dict[str, Parameter] = dict(zip(_HEAD_SLOTS, _TERMS, strict=True))
+"""Geometry of a pan-tilt head, by the name of the scanner's parameter whose coordinate it takes (`mechanisms`)."""
+_OF_HEADS = {term.name: term for term in _TERMS}
 INDEX: dict[str, int] = {name: index for index, name in enumerate(NAMES)}
+COLUMNS: dict[str, int] = INDEX | {term.name: INDEX[name] for name, term in HEAD_TERMS.items()}
+"""Coordinates of parameters, those of heads among them."""
 BLOCKS = REGISTRY.blocks
 """Names by block; the parameters of a block follow each other."""
 RIG_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place != "stereo")
@@ -205,8 +232,8 @@ LATE_NAMES: tuple[str, ...] = (*LOOK_SCATTER_NAMES, *ZERO_SHIFT_NAMES)
 """Parameters that earlier versions did not know: files leave them out at their defaults."""
 NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
-QUANTITIES: Quantities[Quantity] = Quantities(*_LINES, *_PARAMETERS, *_DERIVED)
-"""What is said of a scanner: parameters and what follows from them. `HEADLINES` and `TARGETS` keep this order."""
+QUANTITIES: Quantities[Quantity] = Quantities(*_LINES, *_PARAMETERS, *_TERMS, *_DERIVED)
+"""What is said of scanner and head: parameters, what follows from them. `HEADLINES` and `TARGETS` keep this order."""
 HEADLINES = tuple(quantity for quantity in QUANTITIES.values() if quantity.headline)
 TARGETS = {quantity.target: quantity for quantity in HEADLINES if quantity.target}
 """Headlines that plans and studies are for, by the names that they have there."""
@@ -228,6 +255,11 @@ OPTICS_NAMES: tuple[str, ...] = names_of(
     *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
 )
 """What bends the beam's way through the positioner; all but the first are zero in the nominal rig."""
+
+
+def parameter_of(name: str) -> Parameter | None:
+    """The parameter of any mechanism with this name; None where there is none."""
+    return REGISTRY.get(name) or _OF_HEADS.get(name)
 
 
 def unit_of(name: str) -> str:

@@ -143,6 +143,14 @@ class Stereo:
         )
 
 
+NO_STEREO = Stereo(
+    *(1, 1, np.eye(3), np.zeros(5), np.eye(3), np.zeros(5), np.eye(3), np.zeros(3)),
+    parameter_covariance=np.zeros((len(STEREO_PARAMETER_NAMES),) * 2),
+    rms_px=0.0,
+)
+"""Stands for the cameras of an instrument that has none: exactly known, and seen by nothing."""
+
+
 def rotation_matrix(rotation_vector_rad: np.ndarray) -> np.ndarray:
     """Rodrigues' formula, smooth through zero. `rotation_vector_rad` (3,) -> (3, 3)."""
     x, y, z = rotation_vector_rad

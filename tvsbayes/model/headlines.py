@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.instrument.parameters import BLOCKS, INDEX, QUANTITIES, TARGETS
+from tvsbayes.instrument.parameters import BLOCKS, COLUMNS, INDEX, QUANTITIES, TARGETS
 from tvsbayes.instrument.quantities import Quantity
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.geometry import materialise
 from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles, trace
-from tvsbayes.model.parameter_space import Model, ParameterSpace, model_of
+from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 DEGREES = 180 / np.pi
 
@@ -148,8 +148,8 @@ class Derived(eqx.Module):
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Of a parameter or of `DERIVED`, with the leading axes of the fields."""
-        if name in INDEX:
-            return np.asarray(self.physical)[..., INDEX[name]]
+        if name in COLUMNS:
+            return np.asarray(self.physical)[..., COLUMNS[name]]
         if name in MODELLED:
             return np.asarray(self.modelled)[..., MODELLED[name]]
         quantity = QUANTITIES[name]
@@ -217,7 +217,7 @@ def derived_quantities(
 
     def one(z, errors):
         physical = materialise(space.physical(z))
-        model = model_of(physical, space.harmonic_period_deg)
+        model = space.model_at(physical)
         angles = beam_angles(model.optics, seen.pose_rad[0], seen.pose_rad[1])
         at = AtPose(model, angles, line_deg_per_step(model, seen, errors, angles))
         return Derived(physical, values_of(at, _MODELLED_BLOCKS), angles.jacobian, errors)

@@ -18,7 +18,8 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.inference.summaries import Propagated, carried, propagated, reweighted
 from tvsbayes.instrument.axes import DIRECTION_SIGNS, DIRECTIONS
-from tvsbayes.instrument.parameters import HEADLINES, INDEX, NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR, Mechanism
+from tvsbayes.instrument.parameters import HEADLINES, INDEX
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import DERIVED, Derived, derived_quantities
@@ -32,13 +33,18 @@ DERIVED_BATCH = 2049
 """The batch in which the fit computes its headlines: the compilation is shared."""
 
 
+def derived_names(mechanism: Mechanism) -> tuple[str, ...]:
+    """Of what follows from parameters, in a mechanism: a head has no mirrors to be off the pan axis."""
+    return tuple(name for name in DERIVED if not mechanism.terms or name != "effective_mirror_offset_mm")
+
+
 class Draws(Mapping[str, np.ndarray]):
     """Posterior draws by name: every parameter, and the derived quantities `DERIVED`, each of shape (n,)."""
 
-    names = (*NAMES, *DERIVED)
-
-    def __init__(self, draws: Derived):
+    def __init__(self, draws: Derived, mechanism: Mechanism = TWO_MIRROR):
         self.derived = draws
+        told = (name for name in mechanism.names if name in mechanism.told)
+        self.names = (*told, *derived_names(mechanism))
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Draws of one quantity."""
@@ -58,7 +64,8 @@ class Draws(Mapping[str, np.ndarray]):
 def headline_names(fit: JointFit) -> tuple[str, ...]:
     """Names in `Draws` of what a fit is for, as far as the campaign moved and priors leave it open."""
     moved = set(legs_of(fit.campaign.moves))
-    names = [quantity.name for quantity in HEADLINES if quantity.applies(moved)]
+    others = {"effective_mirror_offset_mm"} if fit.space.mechanism.terms else set()
+    names = [quantity.name for quantity in HEADLINES if quantity.applies(moved) and quantity.name not in others]
     return tuple(name for name in names if name not in INDEX or fit.free[INDEX[name]])
 
 
@@ -119,7 +126,7 @@ class Posterior(Shown):
     @property
     def by_name(self) -> Draws:
         """All draws by contract name, chains joined; their weights are `weights.ravel()`."""
-        return Draws(self.draws)
+        return Draws(self.draws, self.fit.space.mechanism)
 
     @property
     def joined(self) -> Derived:

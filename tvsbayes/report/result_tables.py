@@ -11,7 +11,7 @@ import numpy as np
 
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.parameters import HEADLINES, QUANTITIES, names_of
+from tvsbayes.instrument.parameters import HEAD_TERMS, HEADLINES, QUANTITIES, names_of
 from tvsbayes.metrology.look_budget import Budget
 from tvsbayes.report.parameter_words import share_in_words
 from tvsbayes.report.tables import TableView, concise, interval_text, signed
@@ -26,6 +26,7 @@ def _rows(*names: str) -> tuple[tuple[str, str, str], ...]:
 
 KEY_PARAMETERS = _rows(
     *(of.name for of in HEADLINES if of.label and not of.ratio),
+    *(term.name for term in HEAD_TERMS.values()),
     *names_of("stop_sd_deg", "look_scatter_deg", "pixel_scale"),
 )
 """Parameters of the table that ends a fit: name, label, unit."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.instrument.axes import SENSES
-from tvsbayes.instrument.parameters import REGISTRY
+from tvsbayes.instrument.parameters import parameter_of
 from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.document import FigureView, Section, sentence
@@ -198,7 +198,7 @@ def _apart(table: BudgetTable, result: Estimate | None) -> str:
     low, high = result.interval95
     half = 0.5 * (high - low)
     ends = table.estimate - table.expanded, table.estimate + table.expanded
-    parameter = REGISTRY.get(table.quantity)
+    parameter = parameter_of(table.quantity)
     never_below = parameter is not None and parameter.prior.distribution == "half-normal"
     told = ", which reaches below 0, where no value can be" * (never_below and ends[0] < 0 <= low)
     rounding = 10.0 ** (math.floor(math.log10(half)) - 1) if half > 0 else 0.0

@@ -60,7 +60,7 @@ type HomingSide = Annotated[str, Meta(extra_json_schema={"enum": (*DIRECTIONS, A
 type ParameterName = Annotated[str, Meta(pattern=r"^[a-z0-9_]+(\.[a-z0-9_]+)*$")]
 ALWAYS_ESTIMATED = (
     *("degrees_per_step.pan", "degrees_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
-    *("mirror_offset_mm", "effective_mirror_offset_mm", "pixel_scale"),
+    "pixel_scale",
 )
 """Parameters that every `fit.json` holds."""
 

@@ -22,7 +22,6 @@ from tvsbayes.instrument.parameters import (
     HARMONIC_NAMES,
     LATE_NAMES,
     REGISTRY,
-    RIG_NAMES,
     RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
     Prior,
@@ -117,11 +116,14 @@ class Truth:
 
     def as_json(self, campaign: Campaign) -> TruthDocument:
         """The document of truth.json of a campaign of this rig, with the effective ratios where there are looks."""
+        mechanism = campaign.rig.mechanism
+        held = mechanism.held
+        cameras = dict(zip(STEREO_PARAMETER_NAMES, map(float, self.stereo.vector), strict=True))
         document: TruthDocument = {
             "format": TRUTH_FORMAT,
             "note": self.note,
-            "parameters": {name: float(value) for name, value in self.parameters.items()},
-            "stereo": dict(zip(STEREO_PARAMETER_NAMES, map(float, self.stereo.vector), strict=True)),
+            "parameters": {name: float(v) for name, v in self.parameters.items() if name not in held},
+            "stereo": {} if mechanism.sightings else cameras,
             "mirror_angles_deg": self.mirror_angles_deg,
             "stop_errors_deg": self.stop_errors_deg,
             "home_offsets_deg": self.home_offsets_deg,
@@ -135,8 +137,9 @@ class Truth:
             document["effective_deg_per_step"] = effective
         if self.reference_pose_deg is not None:
             document["local_deg_per_step"] = local_deg_per_step(self.parameters, self.reference_pose_deg)
-            at_pose = {name: formula(self.parameters, self.reference_pose_deg) for name, formula in AT_POSE.items()}
-            document = cast("TruthDocument", document | at_pose)
+            if not mechanism.terms:
+                at_pose = {name: formula(self.parameters, self.reference_pose_deg) for name, formula in AT_POSE.items()}
+                document = cast("TruthDocument", document | at_pose)
         return document
 
     def _gear_error(self, axis: str, campaign: Campaign) -> GearErrorTable:
@@ -160,7 +163,9 @@ class Truth:
         side, tables = document.get("homing_side"), document.get("gear_error")
         return cls(
             parameters=parameters,
-            stereo=stated.with_vector(np.array([float(known[name]) for name in STEREO_PARAMETER_NAMES])),
+            stereo=stated.with_vector(np.array([float(known[name]) for name in STEREO_PARAMETER_NAMES]))
+            if known
+            else stated,
             mirror_angles_deg=pan_and_tilt(document["mirror_angles_deg"]),
             stop_errors_deg=pan_and_tilt(document["stop_errors_deg"]),
             home_offsets_deg=pan_and_tilt(document["home_offsets_deg"]),
@@ -224,8 +229,10 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
     def drawn(names: Iterable[str], stream: np.random.Generator) -> dict[str, float]:
         return {name: _draw(rig.truth.get(name, rig.table.priors[name]), stream) for name in names}
 
+    rig_names = rig.table.mechanism.rig_names
+
     late = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
-    parameters = drawn((n for n in RIG_NAMES if n not in late), rng)
+    parameters = drawn((n for n in rig_names if n not in late), rng)
     # Through the eigenvectors: fixed parameters give a semi-definite covariance that Cholesky refuses.
     variances, vectors = np.linalg.eigh(np.asarray(rig.stereo.parameter_covariance, float))
     offset = vectors @ (np.sqrt(np.clip(variances, 0.0, None)) * rng.standard_normal(len(variances)))

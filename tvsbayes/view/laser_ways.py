@@ -9,9 +9,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from tvsbayes.errors import InputError
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.looks import in_frame_s, nearest_range
-from tvsbayes.instrument.mirrors import Ray, Vectors
+from tvsbayes.instrument.mirrors import Optics, Ray, Vectors
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import image, rotation_matrix, transform
 from tvsbayes.model.laser_path import mirror_angles, reflections
@@ -53,6 +54,9 @@ def laser_ways(
     model = space.model(z)
     angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
     pan, tilt = angles.angle_rad[arrays.spots.move_index].T + turned_rad.T
+    if not isinstance(model.optics, Optics):
+        remedy = "`tvsbayes fit --details` has the terms of a head"
+        raise InputError("usage", "view draws the mirrors of a scanner, and this is a pan-tilt head", remedy=remedy)
     met = reflections(model.optics, pan, tilt)
     ray = Ray(met.second_mm, met.outgoing)
     reach = nearest_range(model.extrinsics, ray, Vectors.of(arrays.spots.triangulated_mm.T))
