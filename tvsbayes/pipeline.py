@@ -27,9 +27,11 @@ if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.posterior.draws import Posterior
+    from tvsbayes.results.compensation_record import Compensation, Verification
     from tvsbayes.results.estimates import FitSummary
     from tvsbayes.results.fit_record import FitEvidence, FitRecord
     from tvsbayes.results.stored_draws import ResultDraws
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign
 
 
 Tell = Callable[[str], None]
@@ -312,6 +314,55 @@ def fit_for(campaign: Campaign, tell: Tell = untold, progress: Show | None = Non
     stored = stored_mode(campaign)
     found = None if stored is None else restored(campaign, stored)
     return _converged_fit(campaign, tell, progress) if found is None else found
+
+
+def verify(
+    folder: Campaign | AxisCampaign | Path | str,
+    fresh: Campaign | AxisCampaign | Path | str,
+    *,
+    made: Compensation | None = None,
+    distance_mm: float = 1000.0,
+    seed: int = 0,
+    tell: Tell = untold,
+    progress: Show | None = None,
+) -> Verification:
+    """Whether an axis keeps the promise of its table, or a scanner that of its calibration.
+
+    Args:
+        folder: with the results that the table or the calibration in force is of.
+        fresh: of an axis readings with the table in force, commands as asked for, before the correction; of a scanner
+            looks whose moves have the counters that `steps_for` or the header gave.
+        made: table of an axis; None for the one in `results/compensation.json`.
+        distance_mm: along the beam of a scanner, at which errors of points are said.
+        seed: of what is drawn.
+        tell: shows what takes long.
+        progress: told how far it is.
+
+    Raises:
+        InputError: a folder cannot be used, or there is no table or calibration of these data.
+        NotConverged: the fit is not accepted.
+        NothingToEstimate: too few fresh readings or looks.
+    """
+    from tvsbayes.instrument.campaign import Campaign, read_campaign
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign, is_axis_folder
+
+    if isinstance(folder, AxisCampaign) or (not isinstance(folder, Campaign) and is_axis_folder(Path(folder))):
+        from tvsbayes.compensation.verification import verify_axis
+
+        if isinstance(fresh, Campaign):
+            raise TypeError("the readings of an axis are verified by readings of an axis, not by a scanner's looks")
+        return verify_axis(folder, fresh, made=made, seed=seed, progress=progress)
+    from tvsbayes.comparison.verified_looks import accepted_calibration, verify_looks
+
+    if isinstance(fresh, AxisCampaign):
+        raise TypeError("a scanner is verified by looks, not by readings of an axis")
+    campaign = folder if isinstance(folder, Campaign) else read_campaign(folder)
+    looks = fresh if isinstance(fresh, Campaign) else read_campaign(fresh)
+    calibration = accepted_calibration(campaign)
+    with Job({FITTING: 1.0, "verification": 2.0}, progress) as job:
+        found = fit_for(campaign, tell, job.part(FITTING))
+        job.begin("verification")
+        return verify_looks(found, calibration, looks, distance_mm=distance_mm, seed=seed)
 
 
 def _why_not_stored(campaign: Campaign) -> str:

@@ -17,6 +17,9 @@ from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
 from tvsbayes.single_axis.axis_record import keep_fit
 
 
+AT = ("--distance-mm", "500")
+
+
 @pytest.fixture
 def folder(tmp_path):
     """An axis with its fit."""
@@ -88,7 +91,6 @@ def test_too_few_readings_tell_nothing(ask, folder, tmp_path):
     "line",
     [
         ("compensate", PAPER_TWIN, "--to", "csv"),
-        ("verify", PAPER_TWIN, PAPER_TWIN),
         ("plan", PAPER_TWIN, "--verify"),
         ("plan", "--verify"),
     ],
@@ -97,6 +99,15 @@ def test_scanners_are_sent_elsewhere(ask, line):
     code, document = ask(*line)
     assert code == 2
     assert_error(document, "usage")
+
+
+def test_verify_wants_two_of_a_kind_and_results(ask, folder):
+    for line in (("verify", PAPER_TWIN, folder), ("verify", folder, PAPER_TWIN), ("verify", folder, folder, *AT)):
+        code, document = ask(*line)
+        assert code == 2
+        assert_error(document, "usage")
+    code, document = ask("verify", PAPER_TWIN, PAPER_TWIN, *AT)
+    assert code == 2 and "tvsbayes steps-for" in document["error"]["remedy"]
 
 
 @pytest.mark.parametrize(

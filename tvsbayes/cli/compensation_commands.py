@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -27,7 +27,11 @@ from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import calibration_for
+from tvsbayes.pipeline import verify as verified
 from tvsbayes.progress import Job
+
+if TYPE_CHECKING:
+    from tvsbayes.results.compensation_record import Verification
 
 FITTING, MAKING = "fit", "compensation"
 LETTERS, APPLIERS = "XYZABC", ("controller", "host")
@@ -45,7 +49,7 @@ def _refuse_scanner(folder: Path, command: str) -> None:
     """
     if _is_scanner(folder):
         message = f"{command} is for an axis, and {escaped(str(folder), 200)} is the campaign of a scanner"
-        remedy = "its compensation is `tvsbayes compensate CAMPAIGN --to header`, its verification `tvsbayes watch`"
+        remedy = "its compensation is `tvsbayes compensate CAMPAIGN --to header`"
         raise InputError("usage", message, remedy=remedy)
 
 
@@ -141,34 +145,67 @@ def _one_of(option: str, given: str, allowed: tuple[str, ...]) -> None:
 
 def verify(
     campaign: CampaignFolder,
-    fresh: Annotated[Path, typer.Argument(metavar="FRESH", help="Axis folder of readings with the table in force.")],
+    fresh: Annotated[
+        Path, typer.Argument(metavar="FRESH", help="Fresh readings or looks, with table or calibration in force.")
+    ],
+    distance_mm: Annotated[
+        float | None, typer.Option("--distance-mm", min=1.0, help="Of a scanner: errors of points there, mm (1000).")
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Whether a machine keeps the promise of its table.
+    """Whether a machine keeps the promise of its table or calibration.
 
-    KEPT, BROKEN or CANNOT TELL: exit 0, 1 or 3. FRESH lists the commands that were asked for, before the correction.
-    Which world fits: applied, not applied, applied twice, wrong sign, another machine.
+    KEPT, BROKEN or CANNOT TELL: exit 0, 1 or 3. Of an axis FRESH lists the commands that were asked for, before the
+    correction; of a scanner the counters that steps-for or the header gave, and the looks there. Which world fits:
+    applied, not applied, applied twice, wrong sign, another machine.
     """
-    from tvsbayes.compensation.verification import stored_compensation
-    from tvsbayes.compensation.verification import verify as verified
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
-    from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
 
-    for folder in (campaign, fresh):
-        _refuse_scanner(folder, "verify")
-    data = read_axis(campaign)
-    made = stored_compensation(data)
-    with waiting() as progress:
-        found = verified(data, fresh, made=made, seed=seed, progress=progress)
-    kept = {"format": VERIFICATION_FORMAT, "inputs": axis_hashes(data), "table": made.digest, **found.as_json()}
-    keep(kept, output_place(campaign, "results") / "verification.json")
+    scanner = _is_scanner(campaign)
+    if scanner != _is_scanner(fresh):
+        kind = "a scanner" if scanner else "an axis"
+        message = f"{escaped(str(campaign), 200)} is of {kind}, {escaped(str(fresh), 200)} is not"
+        raise InputError("usage", message, remedy="give fresh readings or looks of the same kind of machine")
+    if not scanner and distance_mm is not None:
+        raise InputError("usage", "--distance-mm is not for an axis", remedy="leave it out")
+    judge = _verified_scanner if scanner else _verified_axis
+    found, made_of = judge(campaign, fresh, seed, distance_mm)
+    keep(
+        {"format": VERIFICATION_FORMAT, **made_of, **found.as_json()},
+        output_place(campaign, "results") / "verification.json",
+    )
     for remark in found.remarks if as_json else ():
         report_line(f"warning: {remark}")
     finish(found.as_json(), verification_text(found), as_json)
     if found.verdict != KEPT:
         raise Ended(NothingToEstimate.exit_code if found.verdict == CANNOT_TELL else TARGET_MISSED)
+
+
+def _verified_axis(folder: Path, fresh: Path, seed: int, _: float | None) -> tuple[Verification, dict[str, object]]:
+    """Readings of an axis, and of which data and table that is."""
+    from tvsbayes.compensation.verification import stored_compensation, verify_axis
+    from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
+
+    data = read_axis(folder)
+    made = stored_compensation(data)
+    with waiting() as progress:
+        found = verify_axis(data, fresh, made=made, seed=seed, progress=progress)
+    return found, {"inputs": axis_hashes(data), "table": made.digest}
+
+
+def _verified_scanner(
+    folder: Path, fresh: Path, seed: int, distance_mm: float | None
+) -> tuple[Verification, dict[str, object]]:
+    """Looks of a scanner, and of which data and calibration that is."""
+    from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
+    from tvsbayes.instrument.campaign import input_hashes, read_campaign
+
+    data = read_campaign(folder)
+    with waiting() as progress:
+        found = verified(data, fresh, distance_mm=distance_mm or 1000.0, seed=seed, tell=report_line, progress=progress)
+    return found, {"inputs": input_hashes(data), "table": content_sha256(calibration_json(load_calibration(folder)))}
 
 
 def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bool) -> None:

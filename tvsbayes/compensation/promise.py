@@ -116,13 +116,12 @@ def _run(
     return predicted_stops(fit, moves, run.read.tolist(), np.full(len(run.read), u), seed), run
 
 
-def refuse_unaccepted(results: AxisResults) -> None:
+def refuse_answer(answer: str) -> None:
     """A table is made of an accepted answer alone: it moves a machine.
 
     Raises:
         NotConverged: the answer is rough, or a Laplace approximation.
     """
-    answer = results.summary.answer
     if answer != "accepted":
         what = "a rough answer" if answer == "rough" else "a Laplace approximation"
         message = f"the fit is {what}, not an accepted answer: the promise of a table made of it cannot be trusted"
@@ -361,7 +360,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         InputError: the format is unknown, or lacks a number.
         NotConverged: the fit is not accepted.
     """
-    refuse_unaccepted(results)
+    refuse_answer(results.summary.answer)
     fit, campaign = results.fit, results.fit.campaign
     rows, since = fit.rows, Since.of(campaign.moves)
     draws = fit.draws["effective_per_command"]

@@ -32,6 +32,15 @@ REMEDIES = {
     APPLIED: "readings lie farther off than the table allows: measure again, and compensate anew if that stays",
 }
 """By the world that fits best, where the promise is broken."""
+SCANNER_REMEDIES = {
+    NOT_APPLIED: "counters follow the nominal degrees per step, or come without the run-up that takes up the play: use "
+    "those of `tvsbayes steps-for` with `via_pan_steps` and `via_tilt_steps`, or the header's",
+    TWICE: "the calibration acts in the host and in the controller: take one of them out",
+    WRONG_SIGN: "the correction is taken off instead of added, or left and right, up and down are exchanged",
+    OTHER_MACHINE: "something moved, or the calibration is of another scanner: `tvsbayes watch CAMPAIGN FRESH` tells",
+    APPLIED: "looks lie farther off than the calibration allows: `tvsbayes watch CAMPAIGN FRESH` says what moved",
+}
+"""The same of a scanner."""
 HELPS = {
     "homing": "the scatter of homings; read after several homings, or verify without homing in between",
     "stops": "the scatter of single stops; no table takes that out",
@@ -59,7 +68,18 @@ def sizes_table(found: Verification) -> TableView:
         ["before (expected without the table)", two_digits(found.before.rms), two_digits(found.before.worst)],
         ["after (read)", two_digits(found.after.rms), two_digits(found.after.worst)],
     ]
-    return TableView(f"errors, {escaped(found.unit)}", ["", "RMS", "worst"], rows)
+    columns = ["", "RMS", "worst"]
+    if (at := found.millimetres) is not None:
+        columns += [f"RMS at {at.distance_mm:.10g} mm, mm", "worst, mm"]
+        for row, size in zip(rows, (at.before, at.after), strict=True):
+            row += [two_digits(size.rms), two_digits(size.worst)]
+    return TableView(f"errors, {escaped(found.unit)}{' of the mirrors, and of points' if at else ''}", columns, rows)
+
+
+def _promised(found: Verification) -> str:
+    at = found.millimetres
+    points = "" if at is None else f", of points at {at.distance_mm:.10g} mm {two_digits(at.promised95)} mm"
+    return f"promised: 95 % of errors at most {two_digits(found.promised95)} {escaped(found.unit)}{points}"
 
 
 def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
@@ -91,23 +111,29 @@ def verification_text(found: Verification) -> str:
     """A verification for people."""
     p = "< 0.0003" if found.p < 3e-4 else f"= {found.p:.2g}"
     rows = [[name, f"{100 * chance:.1f} %"] for name, chance in found.worlds.items()]
+    axis = found.millimetres is None
+    what = (
+        f"{found.readings} readings under the table" if axis else f"{found.readings} looks that the calibration aimed"
+    )
     lines = [
         f"{found.verdict}: {found.world} (p {p})",
         "",
-        TableView(f"{found.readings} readings under the table", ["the table was", "probability"], rows).text(),
+        TableView(what, [f"the {'table' if axis else 'calibration'} was", "probability"], rows).text(),
         "",
         sizes_table(found).text(),
-        f"promised: 95 % of errors at most {two_digits(found.promised95)} {escaped(found.unit)}",
+        _promised(found),
         *found.remarks,
     ]
     if found.verdict == BROKEN:
-        lines.append(f"what to do: {REMEDIES[found.world]}")
+        remedies = REMEDIES if found.millimetres is None else REMEDIES | SCANNER_REMEDIES
+        lines.append(f"what to do: {remedies[found.world]}")
     elif found.verdict == CANNOT_TELL and found.needed is None:
         lines.append(
             "no number of such readings tells: what the table corrects is lost in what homing and fit leave open"
         )
     elif found.verdict == CANNOT_TELL:
-        more = f"about {found.needed} readings of this kind" if found.needed else "some more readings"
+        kind = "readings" if axis else "looks"
+        more = f"about {found.needed} {kind} of this kind" if found.needed else f"some more {kind}"
         lines.append(f"what to do: {more} would tell; `tvsbayes plan --verify FOLDER` names those that tell soonest")
     return "\n".join(lines)
 
