@@ -16,7 +16,6 @@ from tvsbayes.compensation.verification import stored_compensation
 from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
 from tvsbayes.single_axis.axis_record import keep_fit
 
-
 AT = ("--distance-mm", "500")
 
 

@@ -255,4 +255,3 @@ def _remarks(campaign: Campaign, looks: Campaign, aimed: AimedLooks) -> tuple[st
     if named and known and named != known:
         found.append("the fresh looks name another machine than the campaign: is it the right one?")
     return tuple(found)
-
