@@ -2,7 +2,7 @@
 
 From a campaign folder to a robot:
 
-    campaign = tvsbayes.read_campaign("mine")            # moves, spots, cameras, what is known of the rig
+    campaign = tvsbayes.read_campaign("mine")            # of any instrument: moves, spots, cameras, what is known
     fit = tvsbayes.fit(campaign)                         # mode and Laplace approximation
     posterior = tvsbayes.sample(fit)                     # its posterior; .propagate carries it into any quantity
     calibration = tvsbayes.calibration_of(fit, posterior)
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import fit as fit
     from tvsbayes.inference.stored_posterior import load_posterior as load_posterior
     from tvsbayes.instrument.campaign import Campaign as Campaign
-    from tvsbayes.instrument.campaign import read_campaign as read_campaign
     from tvsbayes.instrument.model_choice import ModelChoice as ModelChoice
     from tvsbayes.pipeline import CampaignResults as CampaignResults
     from tvsbayes.pipeline import calibrate as calibrate
+    from tvsbayes.pipeline import read_campaign as read_campaign
     from tvsbayes.pipeline import verify as verify
     from tvsbayes.posterior.draws import Posterior as Posterior
     from tvsbayes.posterior.sampling import sample as sample
@@ -72,7 +72,7 @@ _HOME = {
     "load_calibration": "calibration.calibration_file",
     "load_posterior": "inference.stored_posterior",
     "locate": "coordinates.location",
-    "read_campaign": "instrument.campaign",
+    "read_campaign": "pipeline",
     "read_fit": "results.fit_record",
     "sample": "posterior.sampling",
     "verify": "pipeline",

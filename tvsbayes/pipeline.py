@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import MISFIT_REMEDY, NotConverged, NothingToEstimate, TvsError, escaped
+from tvsbayes.errors import MISFIT_REMEDY, InputError, NotConverged, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, require_writable
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
@@ -316,6 +316,26 @@ def fit_for(campaign: Campaign, tell: Tell = untold, progress: Show | None = Non
     return _converged_fit(campaign, tell, progress) if found is None else found
 
 
+def read_campaign(folder: Path | str) -> Campaign | AxisCampaign:
+    """Reads and checks a campaign folder of any instrument, by the `format` line of its `campaign.toml`.
+
+    Returns:
+        A `Campaign` of a scanner, input of `fit`, `classic` and the plots; of an axis an `AxisCampaign`, input of
+        `fit_axis`.
+
+    Raises:
+        InputError: anything that is missing, malformed or contradicts itself, with file, line and column.
+    """
+    from tvsbayes.instrument.campaign import read_campaign as read_scanner
+    from tvsbayes.instrument.campaign_header import mechanism_of
+
+    if mechanism_of(Path(folder)) == "axis":
+        from tvsbayes.single_axis.axis_campaign import read_axis
+
+        return read_axis(folder)
+    return read_scanner(folder)
+
+
 def verify(
     folder: Campaign | AxisCampaign | Path | str,
     fresh: Campaign | AxisCampaign | Path | str,
@@ -343,21 +363,19 @@ def verify(
         NotConverged: the fit is not accepted.
         NothingToEstimate: too few fresh readings or looks.
     """
-    from tvsbayes.instrument.campaign import Campaign, read_campaign
-    from tvsbayes.single_axis.axis_campaign import AxisCampaign, is_axis_folder
+    from tvsbayes.instrument.campaign import Campaign
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign
 
-    if isinstance(folder, AxisCampaign) or (not isinstance(folder, Campaign) and is_axis_folder(Path(folder))):
+    campaign, looks = (read_campaign(each) if isinstance(each, Path | str) else each for each in (folder, fresh))
+    if isinstance(campaign, AxisCampaign) and isinstance(looks, AxisCampaign):
         from tvsbayes.compensation.verification import verify_axis
 
-        if isinstance(fresh, Campaign):
-            raise TypeError("the readings of an axis are verified by readings of an axis, not by a scanner's looks")
-        return verify_axis(folder, fresh, made=made, seed=seed, progress=progress)
+        return verify_axis(campaign, looks, made=made, seed=seed, progress=progress)
+    if not (isinstance(campaign, Campaign) and isinstance(looks, Campaign)):
+        message = "an axis is verified by fresh readings of an axis, a scanner by fresh looks of a scanner"
+        raise InputError("usage", message, remedy="give two folders of the same kind of machine")
     from tvsbayes.comparison.verified_looks import accepted_calibration, verify_looks
 
-    if isinstance(fresh, AxisCampaign):
-        raise TypeError("a scanner is verified by looks, not by readings of an axis")
-    campaign = folder if isinstance(folder, Campaign) else read_campaign(folder)
-    looks = fresh if isinstance(fresh, Campaign) else read_campaign(fresh)
     calibration = accepted_calibration(campaign)
     with Job({FITTING: 1.0, "verification": 2.0}, progress) as job:
         found = fit_for(campaign, tell, job.part(FITTING))
