@@ -69,6 +69,12 @@ def test_from_a_fit_to_a_verified_machine(ask, say, folder, tmp_path):
     assert "No fresh readings have verified it" in (folder / "results" / "report.html").read_text()
 
 
+def test_a_second_file_stands_beside_the_first(ask, folder, tmp_path):
+    code, document = ask("compensate", folder, "--to", "urdf", "-o", tmp_path / "stage.xacro")
+    beside = tmp_path / "stage.xacro.yaml"
+    assert code == 0 and document["files"]["yaml"] == str(beside) and "covariance:" in beside.read_text()
+
+
 def test_without_a_file_nothing_is_written(say, folder):
     code, told, _ = say("compensate", folder, "--to", "csv")
     assert code == 0 and "nothing written" in told and "command,forward,backward" in told

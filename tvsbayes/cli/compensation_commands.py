@@ -79,7 +79,7 @@ def compensate(
     Nothing is applied. With -o the promise is kept in results/compensation.json, for `verify`. Of a scanner's campaign
     `--to header` gives its calibration for a microcontroller; its promise is that of `locate`.
     """
-    from tvsbayes.compensation.promise import Wish, compensation_of, file_text
+    from tvsbayes.compensation.promise import Wish, compensation_of, file_beside, file_text
     from tvsbayes.report.compensation_text import compensation_text
     from tvsbayes.results.compensation_record import COMPENSATION_FORMAT
     from tvsbayes.results.fit_record import provenance
@@ -107,6 +107,11 @@ def compensate(
     if out is not None:
         write_atomically(out, file_text(made, data).encode())
         files[to] = str(out)
+        if (beside := file_beside(made, data)) is not None:
+            second = out.with_name(f"{out.name}.yaml")
+            spared(second)
+            write_atomically(second, beside.encode())
+            files["yaml"] = str(second)
         if keep(document, kept := output_place(campaign, "results") / "compensation.json"):
             files["compensation"] = str(kept)
     text = compensation_text(made, list(files.values()))
