@@ -96,7 +96,6 @@ def test_too_few_readings_tell_nothing(ask, folder, tmp_path):
     "line",
     [
         ("compensate", PAPER_TWIN, "--to", "csv"),
-        ("plan", PAPER_TWIN, "--verify"),
         ("plan", "--verify"),
     ],
 )

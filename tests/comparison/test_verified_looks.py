@@ -9,13 +9,14 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-from support.aimed_looks import AIMS, aimed
 
+from experiments.compensation.aimed_scanners import AIMS, aimed
 from tvsbayes.assessment.fitted_calibration import calibration_of
-from tvsbayes.comparison.verified_looks import accepted_calibration, verify_looks
+from tvsbayes.comparison.verified_looks import accepted_calibration, plan_looks, verify_looks
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.instrument.protocols import four_point_protocol
-from tvsbayes.report.compensation_text import verification_text
+from tvsbayes.instrument.stops import rests_of
+from tvsbayes.report.compensation_text import aim_plan_text, verification_text
 from tvsbayes.results.compensation_record import (
     APPLIED,
     BROKEN,
@@ -82,6 +83,37 @@ def test_another_machine_is_none_of_the_worlds(mounted_rig, mixed_fit, truth, ca
     parameters["tilt_zero_deg"] += 0.7
     found = verify_looks(mixed_fit, calibration, aimed(mounted_rig, replace(truth, parameters=parameters), calibration))
     assert (found.verdict, found.world) == (BROKEN, OTHER_MACHINE), found.worlds
+
+
+def test_a_plan_reaches_its_stops_from_their_sides_and_tells(mounted_rig, mixed_fit, truth, calibration):
+    """Its looks are a plan that runs; under the calibration in force they are as many as tell."""
+    found = plan_looks(mixed_fit.campaign, calibration)
+    assert found.enough and len(found.stops) >= 6 and found.distance >= 5
+    (low, high), (down, up) = calibration.range_steps
+    for pan, tilt, pan_side, tilt_side in found.stops:
+        assert low <= pan <= high and down <= tilt <= up and {abs(pan_side), abs(tilt_side)} == {1}
+    assert {stop[2] for stop in found.stops} == {stop[3] for stop in found.stops} == {-1, 1}
+    looks = simulate(mounted_rig, found.steps("d1"), 8, truth).campaign
+    rests = {axis: rests_of(looks.moves, axis) for axis in ("pan", "tilt")}
+    for spot, (pan, tilt, pan_side, tilt_side) in zip(looks.spots, found.stops, strict=True):
+        reached = [(rests[axis][spot.move].steps, rests[axis][spot.move].sign) for axis in ("pan", "tilt")]
+        assert reached == [(pan, pan_side), (tilt, tilt_side)]
+    assert verify_looks(mixed_fit, calibration, looks).verdict == KEPT
+    assert "standard deviations" in aim_plan_text(found)
+    with pytest.raises(NothingToEstimate, match="nominal counters"):
+        plan_looks(mixed_fit.campaign, nominal_of(calibration, mounted_rig))
+
+
+def nominal_of(calibration, rig):
+    """A calibration that says what the nominal rig does."""
+    ratios = {
+        f"degrees_per_step.{axis}": rig.table.priors[f"degrees_per_step.{axis}"].value for axis in ("pan", "tilt")
+    }
+    known = dict.fromkeys(calibration.estimates, 0.0) | MIRRORS | ratios
+    return replace(calibration, mean=np.r_[list(known.values()), np.zeros(calibration.gears.size)])
+
+
+MIRRORS = {"mirror_offset_mm": 30.0, "baseline_mm": 200.0, "pan_zero_emission_deg": 90.0}
 
 
 def test_what_cannot_be_verified_is_refused(mounted_rig, mixed_fit, truth, calibration, tmp_path):

@@ -223,8 +223,10 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
 
     if folder is None:
         remedy = "write tvsbayes plan FOLDER --verify -o plan.csv"
-        raise InputError("usage", "--verify needs an axis folder", remedy=remedy)
-    _refuse_scanner(folder, "plan --verify")
+        raise InputError("usage", "--verify needs a folder with a table or a calibration in force", remedy=remedy)
+    if _is_scanner(folder):
+        _plan_looks(folder, out, as_json)
+        return
     data = read_axis(folder)
     made = stored_compensation(data)
     with waiting() as progress, Job({FITTING: 1.0, "choosing stops": 1.0}, progress) as job:
@@ -237,3 +239,24 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
         document["plan"] = str(out)
         text += f"\nwritten: {escaped(str(out), 200)}"
     finish({**document, "seed": seed}, text, as_json)
+
+
+def _plan_looks(folder: Path, out: Path | None, as_json: bool) -> None:
+    """The looks of a scanner that tell soonest, at the target that the campaign looked at most."""
+    from collections import Counter
+
+    from tvsbayes.comparison.verified_looks import accepted_calibration, plan_looks
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.plan import write_plan
+    from tvsbayes.report.compensation_text import aim_plan_text
+    from tvsbayes.results.records import plain
+
+    data = read_campaign(folder)
+    found = plan_looks(data, accepted_calibration(data))
+    document, text = plain(found), aim_plan_text(found)
+    if out is not None:
+        target = Counter(spot.target for spot in data.spots).most_common(1)[0][0]
+        write_plan(found.steps(target), out)
+        document["plan"] = str(out)
+        text += f"\nwritten: {escaped(str(out), 200)}"
+    finish(document, text, as_json)

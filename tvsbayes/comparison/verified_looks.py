@@ -14,17 +14,18 @@ import numpy as np
 
 from tvsbayes.calibration.calibration_file import stored_calibration
 from tvsbayes.calibration.optics import beam_components, output_deg
-from tvsbayes.calibration.pointing import Calibration
+from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.comparison.watched_looks import LOOKS_MIN, WatchedLooks
 from tvsbayes.compensation.promise import bound_of, refuse_answer
-from tvsbayes.compensation.verification import Trial, judged, other_axis, size_of
+from tvsbayes.compensation.verification import SEPARATE, TELLING, Trial, judged, other_axis, size_of, telling_visits
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.estimators.campaign_arrays import in_sight
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.noise_scales import noise_draws
-from tvsbayes.instrument.axes import AXES, SIDES
+from tvsbayes.instrument.axes import AXES, HOME_SD_DEG, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.compensation_record import Millimetres, Verification
@@ -35,6 +36,10 @@ from tvsbayes.statistics.weighted_draws import systematic
 
 NOISE_DRAWS = 32
 """Of the noise scales, geometry and cameras integrated out."""
+RUN_UP = 2
+"""Times the overshoot that takes up the play, in a plan."""
+CANDIDATES, DRAWS = 9, 1000
+"""Counters tried by axis, each from both sides; draws of the calibration behind their covariance."""
 DISTANCE_MM = 1000.0
 """At which errors are said in mm where nobody names another distance."""
 PROMISED_DRAWS = 4000
@@ -238,6 +243,94 @@ def verify_looks(
         needed=None if found.needed is None else -(-found.needed // 2),
         remarks=_remarks(fit.campaign, looks, aimed),
     )
+
+
+@dataclass(frozen=True)
+class AimPlan:
+    """Looks to be made with the calibration in force, in this order.
+
+    Attributes:
+        stops: counters of pan and tilt, and the sides (1 or -1) that they are reached from, of each look.
+        run_up: steps beyond a counter from which an axis comes back to it, pan and tilt.
+        enough: whether they tell the worlds apart in 95 of 100, by the axis that tells more.
+        distance: of the nearest two worlds, standard deviations.
+    """
+
+    stops: tuple[tuple[int, int, int, int], ...]
+    run_up: tuple[int, int]
+    enough: bool
+    distance: float
+
+    def steps(self, target: str) -> tuple[PlanStep, ...]:
+        """The plan, for looks at one target."""
+        plan = PlanBuilder()
+        plan.home()
+        plan.place(target)
+        for pan, tilt, pan_side, tilt_side in self.stops:
+            plan.move(pan=pan - pan_side * self.run_up[0], tilt=tilt - tilt_side * self.run_up[1])
+            plan.move(pan=pan, tilt=tilt)
+            plan.look()
+        return tuple(plan.steps)
+
+
+def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
+    """The fewest looks that tell what became of a calibration: stops of each axis by greedy choice, made together.
+
+    Raises:
+        NothingToEstimate: nominal counters are those of the calibration: nothing is to be verified.
+    """
+    run_up = tuple(RUN_UP * max(calibration.overshoot_steps[axis], 1) for axis in AXES)
+    axes = [_axis_stops(campaign, calibration, k, run_up[k]) for k in range(2)]
+    count = max(LOOKS_MIN, *(len(axis.stops) for axis in axes))
+    # The axis that needs fewer goes through its stops again: every look shows both.
+    pan, tilt = ([axis.stops[i % len(axis.stops)] for i in range(count)] for axis in axes)
+    stops = tuple((p, t, ps, ts) for (p, ps), (t, ts) in zip(pan, tilt, strict=True))
+    reached = max(axis.reached for axis in axes)
+    return AimPlan(stops, (run_up[0], run_up[1]), reached >= TELLING, float(np.sqrt(reached)))
+
+
+@dataclass(frozen=True)
+class _AxisStops:
+    """Counters and sides of one axis, and the squared distance of the nearest world that they reach."""
+
+    stops: list[tuple[int, int]]
+    reached: float
+
+
+def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: int) -> _AxisStops:
+    """Of one axis, the other in the middle of its range."""
+    low, high = calibration.range_steps[k]
+    if high - low > 4 * run_up:
+        low, high = low + run_up, high - run_up
+    counters = np.linspace(low, high, CANDIDATES).round()
+    steps = np.tile(calibration.range_steps.mean(axis=1).round(), (2 * CANDIDATES, 1))
+    steps[:, k] = np.repeat(counters, 2)
+    sides = np.ones_like(steps)
+    sides[1::2, k] = -1.0
+    aimed = AimedLooks(calibration, steps, sides)
+    nominal = aimed.nominal_steps({name: prior.value for name, prior in campaign.rig.priors.items()})
+    off = [aimed.off_deg(nominal, *factors)[:, k] for factors in ((0.0, 0.0), (1.0, 0.0))]
+    if not np.any(off[0]):
+        what = f"the nominal counters of {AXES[k]} are those of the calibration: nothing is applied that could be lost"
+        raise NothingToEstimate("no-correction", what, remedy="verify that nothing moved with `tvsbayes watch`")
+    noise = np.array([calibration.noise_variance[f"stop_sd_deg.{SIDES[AXES[k]][int(s > 0)]}"] for s in sides[:, k]])
+    common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + HOME_SD_DEG**2
+    # A play smaller than what every look leaves open is not told from its loss, and harms no promise.
+    seen = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
+    worlds = off if seen else off[:1]
+    spread = np.isin(np.arange(CANDIDATES), [0, CANDIDATES // 2, CANDIDATES - 1])
+    found = telling_visits(worlds, common, noise, np.repeat(spread, 2))
+    chosen = [i for i in range(2 * CANDIDATES) for _ in range(int(found.visits[i]))]
+    return _AxisStops([(int(steps[i, k]), int(sides[i, k])) for i in chosen], found.reached)
+
+
+def _drawn_angles(calibration: Calibration, aimed: AimedLooks, k: int) -> np.ndarray:
+    """Mirror angles (draws, m) of one axis by the draws of the calibration."""
+    own, gears = np.split(calibration.inputs[:DRAWS], [len(INPUT_NAMES)], axis=1)
+    values = dict(zip(INPUT_NAMES, own.T[..., None], strict=True))
+    values |= calibration.gears.at(gears, (aimed.steps[:, 0], aimed.steps[:, 1]))
+    axis = AXES[k]
+    return np.asarray(output_deg(values, axis, aimed.steps[:, k], aimed.sides[:, k], calibration.period_deg.get(axis)))
 
 
 def _remarks(campaign: Campaign, looks: Campaign, aimed: AimedLooks) -> tuple[str, ...]:

@@ -409,6 +409,35 @@ def _parting(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarra
     return min(_distance(o[used], scatter) for o in off)
 
 
+@dataclass(frozen=True)
+class TellingVisits:
+    """How often each candidate is visited, shape (m,), and the squared distance of the nearest world then."""
+
+    visits: np.ndarray
+    reached: float
+
+
+def telling_visits(
+    off: Sequence[np.ndarray], common: np.ndarray, noise: np.ndarray, first: np.ndarray
+) -> TellingVisits:
+    """The fewest visits that tell worlds apart, by greedy choice.
+
+    Args:
+        off: what each other world adds to the readings of candidates, shape (m,) each.
+        common: covariance (m, m) of what is the same at every visit.
+        noise: variances that every visit draws anew, shape (m,).
+        first: mask of candidates that are visited whatever they tell.
+    """
+    visits = first.astype(float)
+    reached = _parting(off, common, noise, visits)
+    while reached < TELLING and visits.sum() < PLANNED_MAX:
+        each = [_parting(off, common, noise, visits + row) for row in np.eye(len(visits))]
+        best = int(np.argmax(each))
+        visits[best] += 1
+        reached = each[best]
+    return TellingVisits(visits, reached)
+
+
 def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> VerifyPlan:
     """The fewest stops that tell the worlds apart, by greedy choice among the table's commands.
 
@@ -438,16 +467,10 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         off.append(play)
     if not np.any(off[0]):
         raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
-    visits = np.zeros(len(mean))
     # Over the range first: what befell a part of the table shows nowhere else.
     spread = np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)
-    visits[np.isin(run.index, spread)] = 1
-    reached = _parting(off, common, noise, visits)
-    while reached < TELLING and visits.sum() < PLANNED_MAX:
-        each = [_parting(off, common, noise, visits + row) for row in np.eye(len(mean))]
-        best = int(np.argmax(each))
-        visits[best] += 1
-        reached = each[best]
+    chosen = telling_visits(off, common, noise, np.isin(run.index, spread))
+    visits, reached = chosen.visits, chosen.reached
     order = [k for k in range(len(mean)) for _ in range(int(visits[k]))]
     stops = tuple((float(nodes[run.index[k]]), int(run.side[k])) for k in order)
     return VerifyPlan(stops, overrun, reached >= TELLING, float(np.sqrt(reached)))

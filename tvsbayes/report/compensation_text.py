@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from msgspec import structs
 
 from tvsbayes.compensation.verification import VerifyPlan
 from tvsbayes.errors import escaped
+from tvsbayes.instrument.axes import SIDES
 from tvsbayes.report.document import Section
 from tvsbayes.report.tables import TableView, two_digits
 from tvsbayes.results.compensation_record import (
@@ -22,6 +24,9 @@ from tvsbayes.results.compensation_record import (
     Compensation,
     Verification,
 )
+
+if TYPE_CHECKING:
+    from tvsbayes.comparison.verified_looks import AimPlan
 
 REMEDIES = {
     NOT_APPLIED: "the controller does not use the table, or not its play: is the file loaded, were the settings saved, "
@@ -162,8 +167,23 @@ def verify_plan_text(found: VerifyPlan) -> str:
     rows = [[f"{command:.10g}", words[side]] for command, side in found.stops]
     table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
     lines = [table.text(), f"to arrive on a side, come from at least {found.overrun:.4g} commands away"]
+    return "\n".join([*lines, _how_far(found)])
+
+
+def aim_plan_text(found: AimPlan) -> str:
+    """Looks that tell soonest what became of a calibration."""
+    rows = [[str(p), str(t), SIDES["pan"][ps > 0], SIDES["tilt"][ts > 0]] for p, t, ps, ts in found.stops]
+    columns = ["pan", "tilt", "arriving", ""]
+    table = TableView(
+        f"{len(rows)} looks with the calibration in force, in this order, from a homing on", columns, rows
+    )
+    pan, tilt = found.run_up
+    come = f"to arrive on a side, come from at least {pan} steps of pan and {tilt} of tilt away"
+    return "\n".join([table.text(), come, _how_far(found)])
+
+
+def _how_far(found: VerifyPlan | AimPlan) -> str:
+    """Whether a plan tells."""
     if found.enough:
-        lines.append(f"they tell the worlds apart in 95 of 100: {found.distance:.1f} standard deviations")
-    else:
-        lines.append(f"they hardly tell: the nearest two worlds are {found.distance:.1f} standard deviations apart")
-    return "\n".join(lines)
+        return f"they tell the worlds apart in 95 of 100: {found.distance:.1f} standard deviations"
+    return f"they hardly tell: the nearest two worlds are {found.distance:.1f} standard deviations apart"
