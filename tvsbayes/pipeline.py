@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import MISFIT_REMEDY, NotConverged, NothingToEstimate, TvsError, escaped
+from tvsbayes.errors import MISFIT_REMEDY, InputError, NotConverged, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, require_writable
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
@@ -28,9 +28,11 @@ if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.posterior.draws import Posterior
+    from tvsbayes.results.compensation_record import Compensation, Verification
     from tvsbayes.results.estimates import FitSummary
     from tvsbayes.results.fit_record import FitEvidence, FitRecord
     from tvsbayes.results.stored_draws import ResultDraws
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign
 
 
 Tell = Callable[[str], None]
@@ -377,6 +379,73 @@ class StoredOrFitted:
         if place is not None:
             require_writable(place)
         return _results(self.fitted, None, 0, place, {}, self.tell).record
+
+
+def read_campaign(folder: Path | str) -> Campaign | AxisCampaign:
+    """Reads and checks a campaign folder of any instrument, by the `format` line of its `campaign.toml`.
+
+    Returns:
+        A `Campaign` of a scanner, input of `fit`, `classic` and the plots; of an axis an `AxisCampaign`, input of
+        `fit_axis`.
+
+    Raises:
+        InputError: anything that is missing, malformed or contradicts itself, with file, line and column.
+    """
+    from tvsbayes.instrument.campaign import read_campaign as read_scanner
+    from tvsbayes.instrument.campaign_header import mechanism_of
+
+    if mechanism_of(Path(folder)) == "axis":
+        from tvsbayes.single_axis.axis_campaign import read_axis
+
+        return read_axis(folder)
+    return read_scanner(folder)
+
+
+def verify(
+    folder: Campaign | AxisCampaign | Path | str,
+    fresh: Campaign | AxisCampaign | Path | str,
+    *,
+    made: Compensation | None = None,
+    distance_mm: float = 1000.0,
+    seed: int = 0,
+    tell: Tell = untold,
+    progress: Show | None = None,
+) -> Verification:
+    """Whether an axis keeps the promise of its table, or a scanner that of its calibration.
+
+    Args:
+        folder: with the results that the table or the calibration in force is of.
+        fresh: of an axis readings with the table in force, commands as asked for, before the correction; of a scanner
+            looks whose moves have the counters that `steps_for` or the header gave.
+        made: table of an axis; None for the one in `results/compensation.json`.
+        distance_mm: along the beam of a scanner, at which errors of points are said.
+        seed: of what is drawn.
+        tell: shows what takes long.
+        progress: told how far it is.
+
+    Raises:
+        InputError: a folder cannot be used, or there is no table or calibration of these data.
+        NotConverged: the fit is not accepted.
+        NothingToEstimate: too few fresh readings or looks.
+    """
+    from tvsbayes.instrument.campaign import Campaign
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign
+
+    campaign, looks = (read_campaign(each) if isinstance(each, Path | str) else each for each in (folder, fresh))
+    if isinstance(campaign, AxisCampaign) and isinstance(looks, AxisCampaign):
+        from tvsbayes.compensation.verification import verify_axis
+
+        return verify_axis(campaign, looks, made=made, seed=seed, progress=progress)
+    if not (isinstance(campaign, Campaign) and isinstance(looks, Campaign)):
+        message = "an axis is verified by fresh readings of an axis, a scanner by fresh looks of a scanner"
+        raise InputError("usage", message, remedy="give two folders of the same kind of machine")
+    from tvsbayes.comparison.verified_looks import accepted_calibration, verify_looks
+
+    calibration = accepted_calibration(campaign)
+    with Job({FITTING: 1.0, "verification": 2.0}, progress) as job:
+        found = StoredOrFitted(campaign, tell, job.part(FITTING)).fit
+        job.begin("verification")
+        return verify_looks(found, calibration, looks, distance_mm=distance_mm, seed=seed)
 
 
 def _why_not_stored(campaign: Campaign) -> str:

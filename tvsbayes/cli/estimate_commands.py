@@ -239,7 +239,7 @@ def _compare_pointing(data: Campaign, as_json: bool) -> None:
 
     model = pointing_model(data)
     with waiting() as progress:
-        fitted = fit_for(data, report_line, progress)
+        fitted = StoredOrFitted(data, report_line, progress).fit
     centre, sd = np.asarray(fitted.mode.physical), np.asarray(fitted.draws.physical).std(axis=0)
     joint = {n: (float(centre[k]), float(sd[k])) for k, n in enumerate(fitted.names) if n in model.names}
     document = {**model.as_json(), "joint": {name: {"value": v, "sd": u} for name, (v, u) in joint.items()}}

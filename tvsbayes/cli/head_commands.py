@@ -12,7 +12,7 @@ from tvsbayes.cli.app import finish, report_line, tell_removed
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import output_place
-from tvsbayes.pipeline import record_for
+from tvsbayes.pipeline import StoredOrFitted
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def report(folder: Path, issue: Issue, pdf: bool, out: Path | None, as_json: boo
     data, path = read_campaign(folder), out or output_place(folder, "results") / "report.html"
     files = {"report": str(path)}
     with waiting() as progress, Job({FITTING: 3.0, DRAWING: 1.0}, progress) as job:
-        record = record_for(data, folder, report_line, job.part(FITTING))
+        record = StoredOrFitted(data, report_line, job.part(FITTING)).record
         job.begin(DRAWING)
         page = head_document(data, record, issue, check_campaign(data).warnings)
         removed = replace_page(path, page_html(page), out)

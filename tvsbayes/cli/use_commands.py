@@ -248,7 +248,9 @@ def plan(
         typer.Option("--confirm", min=0, help="With --next: sample the posterior where u is at most this, deg/step."),
     ] = None,
     watch: Annotated[bool, typer.Option("--watch", help="Fewest looks for `watch`: plan CAMPAIGN --watch.")] = False,
-    verify: Annotated[bool, typer.Option("--verify", help="Fewest readings for `verify`: plan AXIS --verify.")] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Fewest readings or looks for `verify`: plan FOLDER --verify.")
+    ] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
