@@ -8,7 +8,7 @@ from msgspec import structs
 
 from tvsbayes.compensation.verification import VerifyPlan
 from tvsbayes.errors import escaped
-from tvsbayes.report.document import Section
+from tvsbayes.report.document import Part, Section, terminal
 from tvsbayes.report.tables import TableView, two_digits
 from tvsbayes.results.compensation_record import (
     APPLIED,
@@ -67,11 +67,11 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
     unit, (low, high) = escaped(made.unit), made.range_command
     largest = max(CAUSES, key=lambda cause: max(left.causes[cause] for left in made.promise.values()))
     shift = ", but for one shift common to all" if made.zero_free else ""
-    lines = [
+    lines: list[Part] = [
         f"compensation for {made.target}: {len(made.table)} commands from {low:.10g} to {high:.10g}, in {unit}",
         f"aim: reading = {made.offset:.6g} + {made.per_command:.9g} x command{shift}",
         "",
-        promise_table(made).text(),
+        promise_table(made),
         "",
         f"the promise holds between these commands, within {two_digits(made.hours)} h and {made.travel_command:.4g} "
         "commands of travel since homing",
@@ -84,19 +84,19 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
     lines.append(
         "nothing is applied yet; apply it once, in one place, then take fresh readings and run tvsbayes verify"
     )
-    return "\n".join([*lines, *(f"written: {escaped(path, 200)}" for path in written)])
+    return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
 
 
 def verification_text(found: Verification) -> str:
     """A verification for people."""
     p = "< 0.0003" if found.p < 3e-4 else f"= {found.p:.2g}"
     rows = [[name, f"{100 * chance:.1f} %"] for name, chance in found.worlds.items()]
-    lines = [
+    lines: list[Part] = [
         f"{found.verdict}: {found.world} (p {p})",
         "",
-        TableView(f"{found.readings} readings under the table", ["the table was", "probability"], rows).text(),
+        TableView(f"{found.readings} readings under the table", ["the table was", "probability"], rows),
         "",
-        sizes_table(found).text(),
+        sizes_table(found),
         f"promised: 95 % of errors at most {two_digits(found.promised95)} {escaped(found.unit)}",
         *found.remarks,
     ]
@@ -109,7 +109,7 @@ def verification_text(found: Verification) -> str:
     elif found.verdict == CANNOT_TELL:
         more = f"about {found.needed} readings of this kind" if found.needed else "some more readings"
         lines.append(f"what to do: {more} would tell; `tvsbayes plan --verify FOLDER` names those that tell soonest")
-    return "\n".join(lines)
+    return terminal(*lines)
 
 
 def compensation_section(made: Compensation, found: Verification | None) -> Section:
@@ -135,9 +135,9 @@ def verify_plan_text(found: VerifyPlan) -> str:
     words = {1: "forward", -1: "backward"}
     rows = [[f"{command:.10g}", words[side]] for command, side in found.stops]
     table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
-    lines = [table.text(), f"to arrive on a side, come from at least {found.overrun:.4g} commands away"]
+    lines: list[Part] = [table, f"to arrive on a side, come from at least {found.overrun:.4g} commands away"]
     if found.enough:
         lines.append(f"they tell the worlds apart in 95 of 100: {found.distance:.1f} standard deviations")
     else:
         lines.append(f"they hardly tell: the nearest two worlds are {found.distance:.1f} standard deviations apart")
-    return "\n".join(lines)
+    return terminal(*lines)
