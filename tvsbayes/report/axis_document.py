@@ -20,6 +20,7 @@ from tvsbayes.report.document import (
     FigureView,
     Issue,
     Number,
+    Part,
     Section,
     Verdict,
     about_table,
@@ -227,7 +228,7 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
         written: files that hold all of it.
     """
     how = {None: "Laplace approximation", "importance": "weighted draws", "emcee": "chain of emcee"}[summary.tier]
-    more: list[str | TableView | None] = []
+    more: list[Part] = []
     if details:
         deviations = deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN)
         more = [deviations if summary.deviations else None, iso230_table(summary.classic, summary.unit)]

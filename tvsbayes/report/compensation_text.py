@@ -10,7 +10,7 @@ from msgspec import structs
 from tvsbayes.compensation.verification import VerifyPlan
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.axes import SIDES
-from tvsbayes.report.document import Section
+from tvsbayes.report.document import Part, Section, terminal
 from tvsbayes.report.tables import TableView, two_digits
 from tvsbayes.results.compensation_record import (
     APPLIED,
@@ -92,11 +92,11 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
     unit, (low, high) = escaped(made.unit), made.range_command
     largest = max(CAUSES, key=lambda cause: max(left.causes[cause] for left in made.promise.values()))
     shift = ", but for one shift common to all" if made.zero_free else ""
-    lines = [
+    lines: list[Part] = [
         f"compensation for {made.target}: {len(made.table)} commands from {low:.10g} to {high:.10g}, in {unit}",
         f"aim: reading = {made.offset:.6g} + {made.per_command:.9g} x command{shift}",
         "",
-        promise_table(made).text(),
+        promise_table(made),
         "",
         f"the promise holds between these commands, within {two_digits(made.hours)} h and {made.travel_command:.4g} "
         "commands of travel since homing",
@@ -109,7 +109,7 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
     lines.append(
         "nothing is applied yet; apply it once, in one place, then take fresh readings and run tvsbayes verify"
     )
-    return "\n".join([*lines, *(f"written: {escaped(path, 200)}" for path in written)])
+    return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
 
 
 def verification_text(found: Verification) -> str:
@@ -120,12 +120,12 @@ def verification_text(found: Verification) -> str:
     what = (
         f"{found.readings} readings under the table" if axis else f"{found.readings} looks that the calibration aimed"
     )
-    lines = [
+    lines: list[Part] = [
         f"{found.verdict}: {found.world} (p {p})",
         "",
-        TableView(what, [f"the {'table' if axis else 'calibration'} was", "probability"], rows).text(),
+        TableView(what, [f"the {'table' if axis else 'calibration'} was", "probability"], rows),
         "",
-        sizes_table(found).text(),
+        sizes_table(found),
         _promised(found),
         *found.remarks,
     ]
@@ -140,7 +140,7 @@ def verification_text(found: Verification) -> str:
         kind = "readings" if axis else "looks"
         more = f"about {found.needed} {kind} of this kind" if found.needed else f"some more {kind}"
         lines.append(f"what to do: {more} would tell; `tvsbayes plan --verify FOLDER` names those that tell soonest")
-    return "\n".join(lines)
+    return terminal(*lines)
 
 
 def compensation_section(made: Compensation, found: Verification | None) -> Section:
@@ -166,8 +166,7 @@ def verify_plan_text(found: VerifyPlan) -> str:
     words = {1: "forward", -1: "backward"}
     rows = [[f"{command:.10g}", words[side]] for command, side in found.stops]
     table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
-    lines = [table.text(), f"to arrive on a side, come from at least {found.overrun:.4g} commands away"]
-    return "\n".join([*lines, _how_far(found)])
+    return terminal(table, f"to arrive on a side, come from at least {found.overrun:.4g} commands away", _how_far(found))
 
 
 def aim_plan_text(found: AimPlan) -> str:
@@ -179,7 +178,7 @@ def aim_plan_text(found: AimPlan) -> str:
     )
     pan, tilt = found.run_up
     come = f"to arrive on a side, come from at least {pan} steps of pan and {tilt} of tilt away"
-    return "\n".join([table.text(), come, _how_far(found)])
+    return terminal(table, come, _how_far(found))
 
 
 def _how_far(found: VerifyPlan | AimPlan) -> str:

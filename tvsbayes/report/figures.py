@@ -428,7 +428,7 @@ def ratio_curves(curves: Curves) -> Figure:
         for axes, axis, shown in zip(panels, SENSES, SENSES.values(), strict=True):
             points = curves.ratios[axis]
             angle = np.array([point.pan_deg if axis == "pan" else point.tilt_deg for point in points])
-            for shift, direction in zip((-0.01, 0.01), shown, strict=True):
+            for shift, direction in zip((-0.02, 0.02), shown, strict=True):
                 if any(direction not in point.ratios for point in points):
                     continue
                 value = np.array([point.ratios[direction].value for point in points])
