@@ -166,7 +166,9 @@ def verify_plan_text(found: VerifyPlan) -> str:
     words = {1: "forward", -1: "backward"}
     rows = [[f"{command:.10g}", words[side]] for command, side in found.stops]
     table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
-    return terminal(table, f"to arrive on a side, come from at least {found.overrun:.4g} commands away", _how_far(found))
+    return terminal(
+        table, f"to arrive on a side, come from at least {found.overrun:.4g} commands away", _how_far(found)
+    )
 
 
 def aim_plan_text(found: AimPlan) -> str:
