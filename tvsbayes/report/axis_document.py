@@ -35,7 +35,7 @@ from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import axis_hashes
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_parameters import AXIS_KEYS
+from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 from tvsbayes.single_axis.axis_periods import wave_samples
 from tvsbayes.single_axis.axis_record import (
     AxisResults,
@@ -63,14 +63,6 @@ METHOD = (
     "an error of every stop, noise. What is linear is integrated out exactly; scales are sampled, never maximised.",
     "The ratio of the gears holds beyond the range read; the line through the stops belongs to that range.",
 )
-WHAT = {
-    **{name: key.what for name, key in AXIS_KEYS.items()},
-    "stop_sd.forward": "scatter of stops, forward",
-    "stop_sd.backward": "scatter of stops, backward",
-    "ratio_contrast": "forward less backward",
-    "offset": "reading at command 0",
-}
-"""Parameters in words."""
 
 
 def _row(name: str, of: Estimate) -> list[str]:
@@ -114,11 +106,11 @@ def ratio_table(summary: AxisSummary) -> TableView:
 
 def parameter_table(summary: AxisSummary) -> TableView:
     """All parameters but the ratio."""
-    rows = []
+    rows, labels = [], {name: quantity.label for name, quantity in AXIS_QUANTITIES.items()}
     for name, of in summary.parameters.items():
         if name != "per_command":
             said = "" if of.contraction is None else f"{100 * max(of.contraction, 0.0):.0f} %"
-            rows.append([WHAT.get(name, name), *_row(name, of)[1:], said])
+            rows.append([labels.get(name, name), *_row(name, of)[1:], said])
     caption = f"parameters, {escaped(summary.unit)}; 100 %: the readings tell it, 0 %: the prior does"
     return TableView(caption, ["", "value(u)", "95 % interval", "data"], rows)
 

@@ -32,7 +32,7 @@ from tvsbayes.instrument.campaign import MOVES, SPOTS
 from tvsbayes.instrument.campaign_header import header_values
 from tvsbayes.instrument.column_names import DEGREES, SPREAD
 from tvsbayes.instrument.conditions import check_power, powered_on_s
-from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, STATED_KEYS, AxisPrior
+from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
 from tvsbayes.single_axis.waves import AskedPeriods
 
 FORMAT = "tvsbayes-axis/1"
@@ -260,7 +260,7 @@ def _parse_header(keys: Keys) -> dict[str, object]:
 
 def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
     """Priors of `[axis]`; a half-normal entry has value 0, or u = 0 and the value that it is fixed at."""
-    keys.only((*STATED_KEYS, *PERIODS))
+    keys.only((*AXIS_KEYS, *PERIODS))
     stated: dict[str, AxisPrior] = {}
     for name in keys.values:
         if name in PERIODS:

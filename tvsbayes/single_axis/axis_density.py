@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from tvsbayes.inference.density import Points
 from tvsbayes.inference.students import StudentMixture
 from tvsbayes.single_axis.axis_mode import AxisMode
 from tvsbayes.single_axis.axis_model import AxisModel
+from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 
-HEADLINES = ("per_command.forward", "per_command.backward", "backlash")
-HEADLINE_DRAWS = (
-    *("offset", "per_command", "ratio_contrast", "backlash"),
-    *("per_command.forward", "per_command.backward", "effective_per_command"),
-)
+FUNCTIONALS: dict[str, Callable[[AxisModel], np.ndarray]] = {
+    # At command zero, where folders count from.
+    "offset": lambda model: model.head(offset=1.0, slope=-model.middle),
+    "per_command": lambda model: model.head(slope=1.0),
+    "ratio_contrast": lambda model: model.head(contrast=1.0),
+    "backlash": lambda model: model.head(backlash=1.0),
+    "per_command.forward": lambda model: model.head(slope=1.0, contrast=0.5),
+    "per_command.backward": lambda model: model.head(slope=1.0, contrast=-0.5),
+}
+"""Of the columns: quantities of `AXIS_QUANTITIES` that no draw changes."""
+HEADLINE_DRAWS = (*FUNCTIONALS, "effective_per_command")
 """Rows of `headline_functionals`."""
 
 
@@ -47,24 +56,13 @@ def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
 
 def line_functionals(model: AxisModel) -> np.ndarray:
     """Those of `HEADLINE_DRAWS` but the last, which no draw changes."""
-    of = model.head
-    return np.array(
-        [
-            # At command zero, where folders count from.
-            of(offset=1.0, slope=-model.middle),
-            of(slope=1.0),
-            of(contrast=1.0),
-            of(backlash=1.0),
-            of(slope=1.0, contrast=0.5),
-            of(slope=1.0, contrast=-0.5),
-        ]
-    )
+    return np.array([functional(model) for functional in FUNCTIONALS.values()])
 
 
 class AxisDensity:
     """A `Density`; the part `linear` (n, t) of its points is a draw of `HEADLINE_DRAWS` but the last."""
 
-    headlines = HEADLINES
+    headlines = tuple(name for name, quantity in AXIS_QUANTITIES.items() if quantity.headline)
     fixed: frozenset[str] = frozenset()
     walkers = 48
 

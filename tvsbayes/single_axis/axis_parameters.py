@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from tvsbayes.instrument.quantities import Quantities, Quantity
 from tvsbayes.single_axis.waves import Wave, WaveDraws, log_order, names_of, wave_draws
 
 Kind = Literal["normal", "half-normal", "log-normal"]
@@ -26,46 +27,57 @@ class AxisPrior:
     u: float
 
 
-@dataclass(frozen=True)
-class AxisKey:
-    """A key of `[axis]`.
+@dataclass(frozen=True, kw_only=True)
+class AxisKey(Quantity):
+    """A key of `[axis]`; in its unit, {unit} is that of the folder.
 
     Attributes:
         kind: of its prior.
         share: what the default's value (log-normal) or u is of the travel; None where it does not scale.
         u: sd of the log of a log-normal default.
-        what: in words, for tables.
         median: of a log-normal default that does not scale.
     """
 
     kind: Kind
     share: float | None
-    u: float
-    what: str
+    u: float = 0.0
     median: float = 1.0
 
 
-AXIS_KEYS = {
-    "per_command": AxisKey("normal", None, 1.0, "unit per command"),
-    "backlash": AxisKey("normal", 0.05, 0.0, "play lost in a reversal"),
-    "transmission_error": AxisKey("half-normal", 0.002, 0.0, "error by position, sd"),
-    "transmission_error_length": AxisKey("log-normal", 0.2, 0.7, "it changes over a way of"),
-    "play_variation": AxisKey("half-normal", 0.001, 0.0, "play over positions, sd"),
-    "drift_per_root_hour": AxisKey("half-normal", 0.0005, 0.0, "zero walks in a root hour"),
-    "stop_sd": AxisKey("log-normal", 0.0005, 1.5, "scatter of stops"),
-    "home_sd": AxisKey("log-normal", 0.001, 1.5, "scatter of homings"),
-    "reading_scale": AxisKey("log-normal", None, 0.5, "scatter of readings / u"),
-    "creep": AxisKey("normal", 0.0005, 0.0, "zero creeps while it warms up, in all"),
-    "creep_minutes": AxisKey("log-normal", None, 0.8, "time constant of the creep, minutes", 20.0),
-    "thermal_per_K": AxisKey("normal", 0.0001, 0.0, "zero shifts per kelvin"),
-    "seeing_scale": AxisKey("log-normal", None, 1.0, "seeing / u of a reading"),
-    "seeing_s": AxisKey("log-normal", None, 1.2, "seeing lasts, s", 10.0),
-}
+def _key(
+    name: str, kind: Kind, share: float | None, u: float, label: str, unit: str = "{unit}", **more: Any
+) -> AxisKey:
+    return AxisKey(name=name, block=name, kind=kind, share=share, u=u, label=label, unit=unit, **more)
+
+
+_SIDES, _PER_COMMAND = ("forward", "backward"), "{unit} per command"
+AXIS_QUANTITIES: Quantities[Quantity] = Quantities(
+    _key("per_command", "normal", None, 1.0, "unit per command", _PER_COMMAND, target="per_command"),
+    *Quantity.many("ratio_contrast", (), unit=_PER_COMMAND, label="forward less backward"),
+    *Quantity.many("per_command", _SIDES, unit=_PER_COMMAND, headline=True),
+    *Quantity.many("effective_per_command", (), unit=_PER_COMMAND, target="effective_per_command"),
+    _key("backlash", "normal", 0.05, 0.0, "play lost in a reversal", headline=True, target="backlash"),
+    _key("transmission_error", "half-normal", 0.002, 0.0, "error by position, sd"),
+    _key("transmission_error_length", "log-normal", 0.2, 0.7, "it changes over a way of"),
+    _key("play_variation", "half-normal", 0.001, 0.0, "play over positions, sd"),
+    _key("drift_per_root_hour", "half-normal", 0.0005, 0.0, "zero walks in a root hour"),
+    _key("stop_sd", "log-normal", 0.0005, 1.5, "scatter of stops"),
+    *Quantity.many("stop_sd", _SIDES, unit="{unit}", label="scatter of stops, {0}"),
+    _key("home_sd", "log-normal", 0.001, 1.5, "scatter of homings"),
+    _key("reading_scale", "log-normal", None, 0.5, "scatter of readings / u", "1"),
+    _key("creep", "normal", 0.0005, 0.0, "zero creeps while it warms up, in all"),
+    _key("creep_minutes", "log-normal", None, 0.8, "time constant of the creep, minutes", "min", median=20.0),
+    _key("thermal_per_K", "normal", 0.0001, 0.0, "zero shifts per kelvin", "{unit}/K"),
+    _key("seeing_scale", "log-normal", None, 1.0, "seeing / u of a reading", "1"),
+    _key("seeing_s", "log-normal", None, 1.2, "seeing lasts, s", "s", median=10.0),
+    *Quantity.many("offset", (), unit="{unit}", label="reading at command 0"),
+)
+"""What is said of an axis. How the linear ones follow from the model stands in `axis_density.FUNCTIONALS`."""
+AXIS_KEYS = {name: key for name, key in AXIS_QUANTITIES.items() if isinstance(key, AxisKey)}
 """Shares of the travel: half-normals and stop scatter by eleven stepper axes that others measured, on which the scales
 integrated out give left-out positions that lie within 1.96 u in 95 % of cases. Backlash: cheap gears lose up to some
 per cent; any reversal measures it well, so a wide prior costs nothing. Seeing: what readings in motion share for
 seconds, of air, of a guider's loop, of the reader; its sd in units of a reading's u."""
-STATED_KEYS = tuple(AXIS_KEYS)
 CONTRAST_SHARE = 1e-4
 """sd of the difference of both directions' ratios, of the ratio: gears and screws have one. Over a long path more would
 pass a warming frame off as two ratios."""

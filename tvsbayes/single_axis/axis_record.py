@@ -34,10 +34,10 @@ from tvsbayes.results.records import (
 )
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_conflicts import conflict_text
-from tvsbayes.single_axis.axis_density import blocks_of, line_weights
+from tvsbayes.single_axis.axis_density import FUNCTIONALS, blocks_of, line_weights
 from tvsbayes.single_axis.axis_doubts import data_doubts
 from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis, model_of
-from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, kind_of, prior_sd
+from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_SHARE, kind_of, prior_sd
 from tvsbayes.single_axis.axis_periods import PeriodEstimate, period_estimate, wave_samples, waves_at_an_end, weak_waves
 from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
@@ -196,7 +196,8 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
     effective, contrast = draws["effective_per_command"], draws["ratio_contrast"]
     sides = {"forward": 0.5, "backward": -0.5}
     sampled = [name for name in fit.free if not name.startswith("wave_")]
-    names = [*sampled, *fit.model.shifts, "per_command", "ratio_contrast", "backlash", "offset"]
+    linear = [name for name, quantity in AXIS_QUANTITIES.items() if name in FUNCTIONALS and not quantity.parts]
+    names = [*sampled, *fit.model.shifts, *linear]
     samples = wave_samples(fit)
     return AxisSummary(
         unit=fit.campaign.unit,

@@ -20,10 +20,11 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import AxisModel
+from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 from tvsbayes.single_axis.axis_record import deviation_functionals
 from tvsbayes.single_axis.axis_rows import AxisRows, reversal_of, rows_of
 
-TARGETS = ("per_command", "effective_per_command", "backlash", "position")
+TARGETS = (*(name for name, quantity in AXIS_QUANTITIES.items() if quantity.target), "position")
 """What may be made surer; "position" is the mean uncertainty of the error by position over the range."""
 CANDIDATES, AT_ONCE, DRAWS = 17, 8, 24
 """Places tried along the range, moves proposed, draws of the scales."""
@@ -35,7 +36,7 @@ OVERRUN = 0.05
 
 def unit_of(target: str, unit: str) -> str:
     """Of a target's uncertainty, in a folder of this unit."""
-    return f"{unit} per command" if target.endswith("per_command") else unit
+    return AXIS_QUANTITIES[target].unit.format(unit=unit) if target in AXIS_QUANTITIES else unit
 
 
 @dataclass(frozen=True)
