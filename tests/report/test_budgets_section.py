@@ -38,7 +38,7 @@ def section(*budgets: BudgetTable, **intervals: tuple[float, float]):
         linear = (table.estimate - table.expanded, table.estimate + table.expanded)
         interval = intervals.get(table.quantity.rpartition(".")[2], linear)
         parameters[table.quantity] = Estimate(table.estimate, table.u, interval, 0.3, 0.9)
-    fit = SimpleNamespace(summary=SimpleNamespace(parameters=parameters, effective={}))
+    fit = SimpleNamespace(summary=SimpleNamespace(named=parameters))
     causes = ("pixel noise", "stop errors of the campaign")
     even = np.full((2, 3), 0.5)
     budget = Budget(causes, np.array([0.5, 0.5]), even, (), np.zeros((0, 3)), np.zeros((0, 0)), np.eye(3), (0.0, 0.0))

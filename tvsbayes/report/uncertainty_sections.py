@@ -6,7 +6,7 @@ mm in frame T, deg for figures of an axis; budgets name their unit.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +20,8 @@ from tvsbayes.report.drawing import SMALLEST_SHARE
 from tvsbayes.report.parameter_words import MADE_BY, name_in_words, share_in_words, source_in_words
 from tvsbayes.report.result_tables import point_budget_table
 from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
-from tvsbayes.results.metrology_tables import FIGURES, BudgetRow, BudgetTable
+from tvsbayes.results.metrology_tables import FIGURES, BudgetRow, BudgetTable, Predicted
+from tvsbayes.statistics.intervals import NORMAL_95
 
 if TYPE_CHECKING:
     from tvsbayes.report.evidence import Evidence
@@ -88,13 +89,10 @@ def budgets_section(e: Evidence) -> Section:
     totals = {
         table.quantity: _total(table) + _apart(table, summary.named.get(table.quantity)) for table in e.shown.budgets
     }
-    tables = [
-        _gum_table(one, totals[one.quantity]) if other is None else _pair_table(one, other, totals)
-        for one, other in _pairs(e.shown.budgets)
-    ]
+    tables = [_gum_table(some, "; ".join(totals[one.quantity] for one in some)) for some in _pairs(e.shown.budgets)]
     tables += [
         point_budget_table(e.budget, f"Budget of a point {away}, by cause"),
-        _gum_table(e.point, f"{away}: {_total(e.point)}"),
+        _gum_table([e.point], f"{away}: {_total(e.point)}"),
     ]
     view = FigureView(
         figures.shares(e.budget),
@@ -117,17 +115,14 @@ def _notes(e: Evidence) -> list[str]:
     return [sentence(note) for note in found]
 
 
-def _pairs(tables: Sequence[BudgetTable]) -> list[tuple[BudgetTable, BudgetTable | None]]:
-    """Budgets of both directions, or of both axes, beside each other where the same kind of result has two."""
+def _pairs(tables: Sequence[BudgetTable]) -> list[list[BudgetTable]]:
+    """Budgets of both directions, or of both axes, together where the same kind of result has two; others alone."""
     kinds: dict[str, list[BudgetTable]] = {}
     for table in tables:
         kind, _, part = table.quantity.rpartition(".")
         axis = next((axis for axis, pair in SENSES.items() if part in pair), "")
         kinds.setdefault(f"{kind}.{axis}", []).append(table)
-    found: list[tuple[BudgetTable, BudgetTable | None]] = []
-    for each in kinds.values():
-        found += [(each[0], each[1])] if len(each) == 2 else [(table, None) for table in each]
-    return found
+    return [some for each in kinds.values() for some in ([each] if len(each) == 2 else [[one] for one in each])]
 
 
 def _mattering(table: BudgetTable) -> list[BudgetRow]:
@@ -149,29 +144,31 @@ def _others(table: BudgetTable, named: Collection[str]) -> tuple[str, str]:
     return two_digits(table.u * math.sqrt(share)), f"{100 * share:.1f}"
 
 
-def _pair_table(first: BudgetTable, second: BudgetTable, totals: Mapping[str, str]) -> TableView:
-    """Two budgets beside each other, every input that matters to either; `totals` by quantity head the table."""
-    pair = first, second
-    of_name = [{row.quantity: row for row in table.rows} for table in pair]
-
-    def mine(name: str) -> list[BudgetRow]:
-        return [rows[name] for rows in of_name if name in rows]
-
-    names = list(dict.fromkeys(row.quantity for table in pair for row in _mattering(table)))
-    names.sort(key=lambda name: -max(row.share for row in mine(name)))
+def _gum_table(tables: Sequence[BudgetTable], caption: str) -> TableView:
+    """Budgets beside each other, every input that matters to any of them; one alone in all columns of GUM 7.2.7."""
+    alone = len(tables) == 1
+    of_name = [{row.quantity: row for row in table.rows} for table in tables]
+    own = {name: [rows[name] for rows in of_name if name in rows] for rows in of_name for name in rows}
+    names = list(dict.fromkeys(row.quantity for table in tables for row in _mattering(table)))
+    names.sort(key=lambda name: -max(row.share for row in own[name]))
     rows = []
-    for name in (*names, first.rows[-1].quantity):
-        stated = [row for row in mine(name) if row.u is not None]
-        # One number for both where both have it.
+    for name in (*names, tables[0].rows[-1].quantity):
+        first, stated = own[name][0], [row for row in own[name] if row.u is not None]
+        # One number for all where all have it.
         told = ["; ".join(dict.fromkeys(two_digits(row.u) for row in stated if row.u is not None))]
         told.append("; ".join(dict.fromkeys(_freedom(row.dof) for row in stated)))
+        if alone:
+            told = [first.distribution, *told, "" if first.sensitivity is None else _digits(first.sensitivity)]
         parts = [cell for found in of_name for cell in _contributed(found.get(name))]
-        rows.append([_named(mine(name)[0]), mine(name)[0].kind, *told, *parts])
-    rows.insert(-1, [OTHERS, "", "", "", *(cell for table in pair for cell in _others(table, names))])
-    columns = ["source", "type", "u", "dof"]
-    parts_of = [table.quantity.rpartition(".")[2] for table in pair]
-    columns += [f"{word}{part}" for part in parts_of for word in ("contribution, ", "share %, ")]
-    return TableView(f"{totals[first.quantity]}; {totals[second.quantity]}", columns, rows)
+        rows.append([_named(first), first.kind, *told, *parts])
+    columns = ["source", "type", *(["distribution", "u", "dof", "sensitivity"] if alone else ["u", "dof"])]
+    rows.insert(-1, [OTHERS, *[""] * (len(columns) - 1), *(c for table in tables for c in _others(table, names))])
+    if alone and any(row.share > 1 for each in own.values() for row in each):
+        # GUM 5.2.2: with correlated inputs the cross terms are as real as the squares.
+        caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations takes them back"
+    parts_of = [""] if alone else [f", {table.quantity.rpartition('.')[2]}" for table in tables]
+    columns += [f"{word}{part}" for part in parts_of for word in ("contribution", "share %")]
+    return TableView(caption, columns, rows)
 
 
 def _contributed(row: BudgetRow | None) -> tuple[str, str]:
@@ -209,29 +206,6 @@ def _apart(table: BudgetTable, result: Estimate | None) -> str:
     return told
 
 
-def _gum_table(table: BudgetTable, caption: str) -> TableView:
-    """A budget as GUM 7.2.7 asks for it, headed by its result."""
-    shown = [*_mattering(table), table.rows[-1]]
-    rows = [
-        [
-            _named(row),
-            row.kind,
-            row.distribution,
-            "" if row.u is None else two_digits(row.u),
-            "" if row.u is None else _freedom(row.dof),
-            "" if row.sensitivity is None else _digits(row.sensitivity),
-            *_contributed(row),
-        ]
-        for row in shown
-    ]
-    rows.insert(-1, [OTHERS, "", "", "", "", "", *_others(table, [row.quantity for row in shown])])
-    if any(row.share > 1 for row in shown):
-        # GUM 5.2.2: with correlated inputs the cross terms are as real as the squares.
-        caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations takes them back"
-    columns = ["source", "type", "distribution", "u", "dof", "sensitivity", "contribution", "share %"]
-    return TableView(caption, columns, rows)
-
-
 def _digits(value: float) -> str:
     """Three digits, without an exponent where the number is large."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
@@ -254,18 +228,21 @@ def axes_section(e: Evidence) -> Section:
     for name, (symbol, term) in FIGURES.items():
         found = [(axis.predicted or {}).get(name) for axis in axes]
         if any(figure is not None for figure in found):
-            cells = [
-                cell
-                for f in found
-                for cell in (
-                    ("", "") if f is None else (f"{f.median:.4f}", f"[{f.interval95[0]:.4f}, {f.interval95[1]:.4f}]")
-                )
-            ]
+            cells = [cell for figure in found for cell in _figure_cells(figure)]
             rows.append([f"{_growing(term)} {_arrow(symbol)}", *cells])
     columns = ["figure", *(cell for axis in axes for cell in (f"{axis.axis}, median", f"{axis.axis}, 95 % interval"))]
     first = axes[0]
     caption = f"deg, predicted for {first.runs} runs per side at {len(first.target_steps)} targets"
     return Section("ISO 230-2-style figures", items=items, tables=[TableView(caption, columns, rows)])
+
+
+def _figure_cells(figure: Predicted | None) -> tuple[str, str]:
+    """Median and interval to the digits of the uncertainty that the interval has; empty where there is no figure."""
+    if figure is None:
+        return "", ""
+    low, high = figure.interval95
+    sd = (high - low) / (2 * NORMAL_95)
+    return concise(figure.median, sd).partition("(")[0], interval_text(low, high, sd)
 
 
 def _growing(term: str) -> str:
