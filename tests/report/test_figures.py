@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -10,6 +11,7 @@ from support.small_results import estimate
 
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.instrument.axes import SENSES
+from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.report import figures
 from tvsbayes.report.drawing import WIDTH_IN
 from tvsbayes.report.figures import (
@@ -57,6 +59,23 @@ def test_figures_take_what_the_estimators_return(evidence):
     assert alone == {0.0, 1.0, 2.0, 3.0} and not alone & both
     with pytest.raises(TypeError, match=r"record\.summary.* not a ClassicResult"):
         intervals(result)
+
+
+def test_spots_are_triangulated_once_for_classic_and_figures(evidence, monkeypatch):
+    """A copy of a campaign has not been triangulated yet; what it then holds nobody can change."""
+    calls = []
+    monkeypatch.setattr(
+        "tvsbayes.instrument.campaign.triangulate", lambda *told: calls.append(told) or triangulate(*told)
+    )
+    campaign = replace(evidence.campaign)
+    number = classic(campaign).experiments[0].experiment
+    figures.setup(campaign)
+    figures.coverage(campaign)
+    trajectories(campaign, number)
+    points_3d(campaign)
+    assert len(calls) == 1 and not hasattr(figures, "triangulate")
+    with pytest.raises(ValueError, match="read-only"):
+        campaign.points_mm[0] = 0.0
 
 
 def test_a_prompt_completes_figures_alone():
