@@ -61,7 +61,7 @@ def _warn_of(campaign: Campaign, *, stops: bool = False) -> None:
 
 
 def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
-    """The paper's four-point estimator; of sightings a pointing model by least squares."""
+    """The paper's four-point estimator; of a head, least squares."""
     if serve("classic", **locals()):
         return
     from tvsbayes.estimators.four_point import classic as estimate

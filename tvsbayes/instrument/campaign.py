@@ -502,7 +502,7 @@ def campaign_templates() -> dict[str, bytes]:
 def head_templates(sightings: bool) -> dict[str, bytes]:
     """The commented files of an empty campaign of a pan-tilt head, with its rig file."""
     files = templates("head_templates", MOVES, SIGHTINGS if sightings else SPOTS)
-    # A line that begins with #sightings or #spots is one of the other kind's, unless it is this one's.
+    # Lines that begin with #sightings or #spots belong to heads of that kind alone.
     own, other = (b"#sightings ", b"#spots ") if sightings else (b"#spots ", b"#sightings ")
     return {
         name: b"".join(line.removeprefix(own) for line in data.splitlines(keepends=True) if not line.startswith(other))

@@ -301,6 +301,8 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
             raise table.table("prior").refuse(name, "duplicate-key", "every name once", "remove one", found)
     _check_periods(table.table("prior"), prior, period_deg)
     key = "aperture_convention"
+    if key in table and mechanism is not TWO_MIRROR:
+        raise table.refuse(key, "unknown-key", "no aperture", "leave it out: a head has no receiver", f"the name {key}")
     azimuth = key in table and table.word(key, ("in-plane", "azimuth")) == "azimuth"
     return RigTable({**prior, **declared}, "azimuth" if azimuth else "in-plane", period_deg, mechanism)
 

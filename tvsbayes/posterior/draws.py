@@ -220,7 +220,9 @@ def derived_of(
 ) -> Derived:
     """Parameters and headlines of draws (..., p) with their errors at places (..., e), by default at the fit's pose."""
     seen = fit.seen_line if pose_rad is None else replace(fit.seen_line, pose_rad=pose_rad)
-    given = z.reshape(-1, z.shape[-1]), place_errors_rad.reshape(-1, place_errors_rad.shape[-1])
+    points = z.reshape(-1, z.shape[-1])
+    # Gears that repeat nothing have no places, and -1 divides by none.
+    given = points, place_errors_rad.reshape(len(points), place_errors_rad.shape[-1])
     flat = in_batches(lambda z, errors: derived_quantities(z, errors, fit.space, seen), *given, size=DERIVED_BATCH)
     return jax.tree.map(lambda x: x.reshape(*z.shape[:-1], *x.shape[1:]), flat)
 

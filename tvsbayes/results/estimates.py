@@ -239,7 +239,9 @@ class FitNoise(ClosedRecord, frozen=True):
 def fit_noise(chi2: float, dof: float, parameters: Mapping[str, Estimate]) -> FitNoise:
     """Of a fit with these estimates."""
     stops = {direction: parameters[f"stop_sd_deg.{direction}"].value for direction in DIRECTIONS}
-    looks: dict[str, float] = {axis: parameters[f"look_scatter_deg.{axis}"].value for axis in AXES}
+    # Where a rig states that looks do not scatter, there is no such parameter.
+    scatters = {axis: parameters.get(f"look_scatter_deg.{axis}") for axis in AXES}
+    looks: dict[str, float] = {axis: 0.0 if found is None else found.value for axis, found in scatters.items()}
     return FitNoise(chi2, dof, parameters["pixel_scale"].value, stops, looks)
 
 
