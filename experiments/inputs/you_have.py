@@ -249,7 +249,8 @@ KINDS = (
     Kind(
         "A calibration by a camera's maker",
         "DepthAI's EEPROM as JSON (`eepromToJsonFile`), a ZED's `SN*.conf`, what RealSense's\n"
-        "`rs-enumerate-devices -c` prints; BoofCV's `stereo.yaml` likewise. `--image-size` is that of the pictures with the spots.",
+        "`rs-enumerate-devices -c` prints; BoofCV's `stereo.yaml` likewise. `--image-size` is that of the\n"
+        "pictures that show the spots.",
         (
             Command("stereo --import calib.json -o oak.json", 7),
             Command("stereo --import SN1.conf --image-size 1280x720 -o zed.json", 6),
