@@ -247,9 +247,26 @@ KINDS = (
         },
     ),
     Kind(
+        "A calibration by a camera's maker",
+        "DepthAI's EEPROM as JSON (`eepromToJsonFile`), a ZED's `SN*.conf`, what RealSense's\n"
+        "`rs-enumerate-devices -c` prints; BoofCV's `stereo.yaml` likewise. `--image-size` is that of the\n"
+        "pictures that show the spots.",
+        (
+            Command("stereo --import calib.json -o oak.json", 7),
+            Command("stereo --import SN1.conf --image-size 1280x720 -o zed.json", 6),
+            Command("stereo --import enumerate.txt --image-size 640x480 -o realsense.json", 7),
+        ),
+        {
+            "calib.json": FOREIGN / "depthai" / "calib.json",
+            "SN1.conf": FOREIGN / "zed" / "SN1.conf",
+            "enumerate.txt": FOREIGN / "realsense" / "enumerate.txt",
+        },
+    ),
+    Kind(
         "Pictures of a checkerboard",
         "Eleven real pairs of a Bumblebee2 camera (`data/real/stereo`), named `left01.jpg` and `right01.jpg`. A board\n"
-        "of another size than stated is seen. Names that do not pair up: `--pair order`, or `--left` and `--right`.",
+        "of another size than stated is seen. Names that do not pair up: `--pair order`, or `--left` and `--right`. A\n"
+        "ChArUco board, which may be partly outside: `--charuco 15x10 --dictionary 5X5_100` in place of `--board`.",
         (
             longer("stereo pictures --board 7x5 --pitch-mm 30 -o stereo.json"),
             longer("stereo pictures --board 6x4 --pitch-mm 30 -o stereo.json"),

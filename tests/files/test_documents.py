@@ -46,6 +46,16 @@ def test_hostile_toml(name):
         assert caught.value.line == line
 
 
+def test_a_table_that_stands_twice_is_named_with_both_lines():
+    """A template has [rig.prior]; a second one below it is what people add."""
+    text = b"[rig]\nname = 'a'\n[rig.prior]\nx = 1\n[motion]\n[rig.prior]\ny = 1\n"
+    with pytest.raises(
+        InputError, match=r"line 6: found the table \[rig\.prior\] a second time, first in line 3"
+    ) as caught:
+        parse_toml(text, "campaign.toml")
+    assert "below the first header" in caught.value.remedy
+
+
 def test_toml_dots_in_text_and_comments_are_no_keys():
     keys = parse_toml(b'\xef\xbb\xbfa = "1.2.3.4.5.6.7.8.9.10" # 1.2.3.4.5.6.7.8.9.10\r\nb = [0.1, 0.2, 0.3]\n', "t")
     assert keys.values == {"a": "1.2.3.4.5.6.7.8.9.10", "b": [0.1, 0.2, 0.3]}

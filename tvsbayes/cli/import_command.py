@@ -142,8 +142,8 @@ def import_(
     written = _write_looks(to, looks) if yes else []
     document |= {"campaign": str(to), "files": written}
     said = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
-    place = escaped(str(to), 200)
-    after = "" if not written else f"\nnext: put stereo.json into {place}, then `tvsbayes check {typed(to)}`"
+    cameras = f"tvsbayes stereo --import CALIBRATION -o {typed(to / 'stereo.json')}"
+    after = f"\nnext: `{cameras}`, or of pictures of a board, then `tvsbayes check {typed(to)}`" * bool(written)
     if (to / "stereo.json").is_file():
         after = f"\nnext: `tvsbayes check {typed(to)}`" * bool(written)
     finish(document, f"{shown}\n{said}{after}".lstrip("\n"), as_json)

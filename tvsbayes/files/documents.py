@@ -254,6 +254,18 @@ def parse_toml(data: bytes, file: str) -> Keys:
         values = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         place = re.search(r"\(at line (\d+), column \d+\)", str(error))
+        twice = re.match(r"Cannot declare \((.*?),?\) twice", str(error))
+        if twice and place:
+            name = ".".join(re.findall(r"'([^']*)'", twice[1]))
+            first = _key_lines(text).get(name)
+            raise refusal(
+                "toml",
+                file=file,
+                line=int(place[1]),
+                found=f"the table [{escaped(name, 60)}] a second time" + (f", first in line {first}" if first else ""),
+                allowed="every table once",
+                remedy="put the entries below the first header, and remove the second",
+            ) from error
         raise refusal(
             "toml",
             file=file,

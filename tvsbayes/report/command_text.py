@@ -267,6 +267,10 @@ def locations_text(found: Locations) -> str:
     return terminal(table, *textwrap.wrap(LAW, COLUMNS), *told)
 
 
+LAW_SHARE = 0.95
+"""Of the points tried, at which the law of propagation must hold for its sds to be relied on."""
+
+
 def _points(count: int) -> str:
     return f"{count} point{'s' * (count != 1)}"
 
@@ -281,6 +285,10 @@ def cloud_text(found: CloudFile, law: LawChecked, calibration: Calibration) -> s
         told += f"; ends of 95 % intervals differ by {two_digits(law.off_mm)} mm at half of them, at most by "
         told += f"{two_digits(law.most_off_mm)} mm"
     lines.append(told)
+    if law.held < LAW_SHARE * law.points:
+        lines.append("do not rely on the sds of this cloud: `tvsbayes locate` --points without --cloud gives draws")
+    elif law.points:
+        lines.append("the sds may be relied on")
     if found.extrapolated:
         seen = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in calibration.seen_steps.items())
         lines.append(
