@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.gear_processes import Places
+from tvsbayes.model.gear_processes import Places, errors_at
 from tvsbayes.model.geometry import Scalar, materialise
 from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles, trace
 from tvsbayes.model.parameter_space import Model, ParameterSpace, model_of
@@ -128,14 +128,12 @@ def line_deg_per_step(
 
 
 @compiled(Derived)
-def derived_quantities(
+def _derived(
     z: Float[Array, "draws parameters"],
     place_errors_rad: Float[Array, "draws errors"],
     space: ParameterSpace,
     seen: SeenLine,
 ) -> Derived:
-    """Headlines of many points at once (formulation 3.2); every field has the leading axis `draws`."""
-
     def one(z, errors):
         physical = materialise(space.physical(z))
         model = model_of(physical, space.harmonic_period_deg)
@@ -150,6 +148,20 @@ def derived_quantities(
         )
 
     return jax.vmap(one)(z, place_errors_rad)
+
+
+def derived_quantities(z: np.ndarray, place_errors_rad: np.ndarray, space: ParameterSpace, seen: SeenLine) -> Derived:
+    """Headlines of many points at once (formulation 3.2), as NumPy arrays; every field has the leading axis `draws`.
+
+    Args:
+        z: coordinates, shape (draws, p).
+        place_errors_rad: transmission errors, then plays, at the first of the places, shape (draws, e).
+        space: priors.
+        seen: lines.
+    """
+    given = np.asarray(place_errors_rad)
+    found = _derived(z, errors_at(given, max(len(seen.places.steps), given.shape[1] // 2)), space, seen)
+    return eqx.tree_at(lambda of: of.place_errors_rad, jax.tree.map(np.asarray, found), given)
 
 
 def told_of(centre: Derived, draws: Derived, moved: Collection[str]) -> list[tuple[str, float, float]]:
