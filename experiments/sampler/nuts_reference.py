@@ -26,6 +26,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from experiments.common.command_line import parser
+from experiments.common.fits import without_padding
 from experiments.common.reference_samplers import AXES, Run, Setting, build_transport, nuts
 from experiments.common.rigs import twin_campaign
 from experiments.common.rows import ROOT
@@ -100,8 +101,10 @@ def hamiltonian(joint: JointFit, setting: Setting, shear: bool = True) -> Found:
     def z_of(w: jax.Array) -> jax.Array:
         return transport.z_of_y(transport.y_of_w(w) if shear else w)
 
+    arrays = without_padding(joint.arrays, len(joint.campaign.moves))
+
     def potential(w: jax.Array) -> jax.Array:
-        return joint.log_density - log_density(z_of(w), joint.space, joint.arrays)
+        return joint.log_density - log_density(z_of(w), joint.space, arrays)
 
     run = nuts(potential, size, setting, dense=not shear)
     return Found(run, {name: summary(values) for name, values in quantities(joint, z_of, run.draws).items()})

@@ -95,7 +95,9 @@ def descend(
         change = -_damped_step(here, trust)
         ahead, before = linearised(at + change), np.asarray(here.value)
         value = np.asarray(ahead.value)
-        gained = np.sum(value**2) - np.sum(before**2)
+        # Far out a model may overflow: such a step brings nothing.
+        with np.errstate(over="ignore", invalid="ignore"):
+            gained = np.sum(value**2) - np.sum(before**2)
         predicted = np.sum((np.asarray(here.jacobian) @ change + before) ** 2) - np.sum(before**2)
         if gained <= POOR * predicted:
             trust *= WIDENED if gained < GOOD * predicted else 1.0

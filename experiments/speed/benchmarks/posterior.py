@@ -11,6 +11,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from experiments.common.clock import timed
+from experiments.common.fits import without_padding
 from experiments.common.reference_samplers import (
     AXES,
     Run,
@@ -100,8 +101,10 @@ class Contenders:
             def z_of(w):
                 return route.z_of_y(route.y_of_w(w))
 
+            arrays = without_padding(self.joint.arrays, len(self.joint.campaign.moves))
+
             def potential(w):
-                return self.joint.log_density - log_density(z_of(w), self.joint.space, self.joint.arrays)
+                return self.joint.log_density - log_density(z_of(w), self.joint.space, arrays)
 
             run = sampler(potential, route.index.size, Setting(CHAINS, WARMUP, DRAWS, seed))
             shape = run.draws.shape
