@@ -68,8 +68,8 @@ class GearArrays(eqx.Module):
     """
 
     places: Places
-    error_share: Float[Array, "spots places"]
-    play_share: Float[Array, "spots places"]
+    error_share: Float[Array | np.ndarray, "spots places"]
+    play_share: Float[Array | np.ndarray, "spots places"]
 
     def first(self, count: int) -> GearArrays:
         """The first places alone."""
