@@ -2,7 +2,7 @@
 
 From a campaign folder to a robot:
 
-    campaign = tvsbayes.read_campaign("mine")            # moves, spots, cameras, what is known of the rig
+    campaign = tvsbayes.read_campaign("mine")            # of any instrument: moves, spots, cameras, what is known
     fit = tvsbayes.fit(campaign)                         # mode and Laplace approximation
     posterior = tvsbayes.sample(fit)                     # its posterior; .propagate carries it into any quantity
     calibration = tvsbayes.calibration_of(fit, posterior)
@@ -11,8 +11,8 @@ From a campaign folder to a robot:
     calibration = tvsbayes.load_calibration("mine")      # the same from results/ after `tvsbayes fit mine`: NumPy alone
     posterior = tvsbayes.load_posterior("mine")          # its draws, of a scanner or an axis: without JAX
 
-One axis: `compensate("stage", "linuxcnc")` makes a table for a controller, `verify("stage", "fresh")` says whether its
-promise is kept.
+One axis: `compensate("stage", "linuxcnc")` makes a table for a controller. `verify("stage", "fresh")`, also of a
+scanner, says whether the machine keeps what table or calibration promise.
 
 mm, px, and degrees where a name says `deg`; frames, signs and names are in `data/docs/conventions.md`, the map of all
 modules in `data/docs/architecture.md`, more examples in `data/docs/python.md`. Figures: `tvsbayes.plots`. Classic
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from tvsbayes.calibration.calibration_file import load_calibration as load_calibration
     from tvsbayes.calibration.pointing import Calibration as Calibration
     from tvsbayes.compensation.promise import compensate as compensate
-    from tvsbayes.compensation.verification import verify as verify
     from tvsbayes.coordinates.location import Locations as Locations
     from tvsbayes.coordinates.location import locate as locate
     from tvsbayes.errors import TvsError as TvsError
@@ -39,10 +38,11 @@ if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import fit as fit
     from tvsbayes.inference.stored_posterior import load_posterior as load_posterior
     from tvsbayes.instrument.campaign import Campaign as Campaign
-    from tvsbayes.instrument.campaign import read_campaign as read_campaign
     from tvsbayes.instrument.model_choice import ModelChoice as ModelChoice
     from tvsbayes.pipeline import CampaignResults as CampaignResults
     from tvsbayes.pipeline import calibrate as calibrate
+    from tvsbayes.pipeline import read_campaign as read_campaign
+    from tvsbayes.pipeline import verify as verify
     from tvsbayes.posterior.draws import Posterior as Posterior
     from tvsbayes.posterior.sampling import sample as sample
     from tvsbayes.progress import Progress as Progress
@@ -72,10 +72,10 @@ _HOME = {
     "load_calibration": "calibration.calibration_file",
     "load_posterior": "inference.stored_posterior",
     "locate": "coordinates.location",
-    "read_campaign": "instrument.campaign",
+    "read_campaign": "pipeline",
     "read_fit": "results.fit_record",
     "sample": "posterior.sampling",
-    "verify": "compensation.verification",
+    "verify": "pipeline",
 }
 __all__ = [*_HOME, "plots"]
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import MISFIT_REMEDY, NotConverged, NothingToEstimate, TvsError, escaped
+from tvsbayes.errors import MISFIT_REMEDY, InputError, NotConverged, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, require_writable
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
@@ -27,9 +28,11 @@ if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
     from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.posterior.draws import Posterior
+    from tvsbayes.results.compensation_record import Compensation, Verification
     from tvsbayes.results.estimates import FitSummary
     from tvsbayes.results.fit_record import FitEvidence, FitRecord
     from tvsbayes.results.stored_draws import ResultDraws
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign
 
 
 Tell = Callable[[str], None]
@@ -235,9 +238,12 @@ def _results(
     calibration = calibration_of(found, posterior, seed=seed) if found.converged else None
     behind = equal_laplace_draws(found) if usable is None else usable.thinned(DRAWS_KEPT)
     physical, effective = np.asarray(behind.physical), np.asarray(behind.effective_deg_per_step)
-    derived = {name: values for name, values in Draws(behind).items() if name not in found.names}
+    mechanism = found.space.mechanism
+    derived = {name: values for name, values in Draws(behind, mechanism).items() if name not in found.names}
     columns = np.stack(list(derived.values()), axis=1)
-    draws = ResultDraws(found.names, physical, effective, found.reference_pose_rad, tuple(derived), columns)
+    told = [column for column, name in enumerate(found.names) if name in mechanism.told]
+    names = tuple(found.names[column] for column in told)
+    draws = ResultDraws(names, physical[:, told], effective, found.reference_pose_rad, tuple(derived), columns)
     record = FitRecord(
         summary,
         covariance_of_draws(draws.names, draws.physical, summary.parameters),
@@ -277,9 +283,8 @@ def evidence_of(
         return FitEvidence(listed, causes)
     gaps = explain_gap(fit, posterior)
     parts = headline_causes(fit)
-    told = {**{f"effective_deg_per_step.{d}": e for d, e in summary.effective.items()}, **summary.parameters}
     # What a model holds fixed has no uncertainty to split.
-    known = {q: e for q in parts.quantities if (e := told[q]) is not None and e.sd > 0}
+    known = {q: e for q in parts.quantities if (e := summary.named[q]).sd > 0}
     budgets = tuple(headline_budget(parts, q, e) for q, e in known.items())
     axes = []
     for axis in AXES:
@@ -289,30 +294,158 @@ def evidence_of(
     return FitEvidence(listed, causes, gaps if any(gaps.values()) else None, budgets, tuple(axes))
 
 
-def calibration_for(folder: Path, tell: Tell = untold, progress: Show | None = None) -> Calibration:
-    """The calibration in `results/` where its hashes agree with the campaign; else fit first."""
-    from tvsbayes.calibration.calibration_file import stored_calibration
-    from tvsbayes.instrument.campaign import read_campaign
+@dataclass(frozen=True)
+class StoredOrFitted:
+    """Results of a campaign: those in `results/` that are of exactly its data and priors; else of a fit made first.
 
-    campaign = read_campaign(folder)
-    found = stored_calibration(campaign)
-    if found is not None:
-        return found
-    result = _converged_fit(campaign, tell, progress)
-    from tvsbayes.assessment.fitted_calibration import calibration_of
+    Each part is looked up by itself, since results of an older version may lack one; all that `results/` lack comes
+    from one fit (Laplace approximation), made when the first of them is needed.
 
-    return calibration_of(result)
+    Attributes:
+        campaign: from `read_campaign`.
+        tell: shows why a fit is made first.
+        progress: told how far it is.
+    """
+
+    campaign: Campaign
+    tell: Tell = untold
+    progress: Show | None = None
+
+    @cached_property
+    def stored_calibration(self) -> Calibration | None:
+        """What `locate` needs, None where `results/` lack it."""
+        from tvsbayes.calibration.calibration_file import stored_calibration
+
+        return stored_calibration(self.campaign)
+
+    @cached_property
+    def stored_fit(self) -> JointFit | None:
+        """Where the fit in `results/` ended, None where they do not say so or another version named its parameters."""
+        from tvsbayes.results.stored_draws import stored_mode
+
+        if (mode := stored_mode(self.campaign)) is None:
+            return None
+        from tvsbayes.estimators.joint_fit import restored
+
+        return restored(self.campaign, mode)
+
+    @cached_property
+    def stored_record(self) -> FitRecord | None:
+        """`fit.json`, None where it is not of these data: an old one beside new draws would be that of other data."""
+        from tvsbayes.instrument.campaign import input_hashes
+        from tvsbayes.results.fit_record import read_fit
+
+        if self.campaign.path is None or self.stored_calibration is None:
+            return None
+        path = self.campaign.path / "results" / "fit.json"
+        record = read_fit(path) if path.exists() else None
+        return record if record and record.provenance.inputs == input_hashes(self.campaign) else None
+
+    @cached_property
+    def fitted(self) -> JointFit:
+        """A fit for a command that needs one in passing.
+
+        Raises:
+            NotConverged: it did not converge.
+        """
+        return _converged_fit(self.campaign, self.tell, self.progress)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """What `locate` needs."""
+        if self.stored_calibration is not None:
+            return self.stored_calibration
+        fit = self.fitted
+        from tvsbayes.assessment.fitted_calibration import calibration_of
+
+        return calibration_of(fit)
+
+    @cached_property
+    def fit(self) -> JointFit:
+        """Mode and Laplace approximation."""
+        compile_for(self.tell)
+        return self.fitted if self.stored_fit is None else self.stored_fit
+
+    @cached_property
+    def record(self) -> FitRecord:
+        """`fit.json` with all that a report shows; a fit that is made first is kept in the campaign's folder.
+
+        Raises:
+            InputError: the folder takes no results.
+        """
+        if self.stored_record is not None and self.stored_record.evidence is not None:
+            return self.stored_record
+        place = None if self.campaign.path is None else output_place(self.campaign.path, "results")
+        if place is not None:
+            require_writable(place)
+        return _results(self.fitted, None, 0, place, {}, self.tell).record
 
 
-def fit_for(campaign: Campaign, tell: Tell = untold, progress: Show | None = None) -> JointFit:
-    """The fit in `results/` where its hashes agree with the campaign; else fit first."""
-    from tvsbayes.estimators.joint_fit import restored
-    from tvsbayes.results.stored_draws import stored_mode
+def read_campaign(folder: Path | str) -> Campaign | AxisCampaign:
+    """Reads and checks a campaign folder of any instrument, by the `format` line of its `campaign.toml`.
 
-    compile_for(tell)
-    stored = stored_mode(campaign)
-    found = None if stored is None else restored(campaign, stored)
-    return _converged_fit(campaign, tell, progress) if found is None else found
+    Returns:
+        A `Campaign` of a scanner, input of `fit`, `classic` and the plots; of an axis an `AxisCampaign`, input of
+        `fit_axis`.
+
+    Raises:
+        InputError: anything that is missing, malformed or contradicts itself, with file, line and column.
+    """
+    from tvsbayes.instrument.campaign import read_campaign as read_scanner
+    from tvsbayes.instrument.campaign_header import mechanism_of
+
+    if mechanism_of(Path(folder)) == "axis":
+        from tvsbayes.single_axis.axis_campaign import read_axis
+
+        return read_axis(folder)
+    return read_scanner(folder)
+
+
+def verify(
+    folder: Campaign | AxisCampaign | Path | str,
+    fresh: Campaign | AxisCampaign | Path | str,
+    *,
+    made: Compensation | None = None,
+    distance_mm: float = 1000.0,
+    seed: int = 0,
+    tell: Tell = untold,
+    progress: Show | None = None,
+) -> Verification:
+    """Whether an axis keeps the promise of its table, or a scanner that of its calibration.
+
+    Args:
+        folder: with the results that the table or the calibration in force is of.
+        fresh: of an axis readings with the table in force, commands as asked for, before the correction; of a scanner
+            looks whose moves have the counters that `steps_for` or the header gave.
+        made: table of an axis; None for the one in `results/compensation.json`.
+        distance_mm: along the beam of a scanner, at which errors of points are said.
+        seed: of what is drawn.
+        tell: shows what takes long.
+        progress: told how far it is.
+
+    Raises:
+        InputError: a folder cannot be used, or there is no table or calibration of these data.
+        NotConverged: the fit is not accepted.
+        NothingToEstimate: too few fresh readings or looks.
+    """
+    from tvsbayes.instrument.campaign import Campaign
+    from tvsbayes.single_axis.axis_campaign import AxisCampaign
+
+    campaign, looks = (read_campaign(each) if isinstance(each, Path | str) else each for each in (folder, fresh))
+    if isinstance(campaign, AxisCampaign) and isinstance(looks, AxisCampaign):
+        from tvsbayes.compensation.verification import verify_axis
+
+        return verify_axis(campaign, looks, made=made, seed=seed, progress=progress)
+    if not (isinstance(campaign, Campaign) and isinstance(looks, Campaign)):
+        message = "an axis is verified by fresh readings of an axis, a scanner by fresh looks of a scanner"
+        raise InputError("usage", message, remedy="give two folders of the same kind of machine")
+    from tvsbayes.comparison.verified_looks import accepted_calibration, verify_looks
+
+    calibration = accepted_calibration(campaign)
+    with Job({FITTING: 1.0, "verification": 2.0}, progress) as job:
+        found = StoredOrFitted(campaign, tell, job.part(FITTING)).fit
+        job.begin("verification")
+        return verify_looks(found, calibration, looks, distance_mm=distance_mm, seed=seed)
 
 
 def _why_not_stored(campaign: Campaign) -> str:
@@ -351,21 +484,3 @@ def _converged_fit(campaign: Campaign, tell: Tell, progress: Show | None) -> Joi
     if not result.converged:
         raise NotConverged.of(result.problems, "see `tvsbayes fit`; this command needs a fit that has converged")
     return result
-
-
-def record_for(campaign: Campaign, folder: Path, tell: Tell = untold, progress: Show | None = None) -> FitRecord:
-    """`results/fit.json` where it was made from exactly this campaign and whole; else fit first."""
-    from tvsbayes.calibration.calibration_file import stored_calibration
-    from tvsbayes.instrument.campaign import input_hashes
-    from tvsbayes.results.fit_record import read_fit
-
-    path = folder / "results" / "fit.json"
-    if stored_calibration(campaign) is not None and path.exists():
-        record = read_fit(path)
-        # An old fit.json beside new draws would be the report of other data.
-        if record.evidence is not None and record.provenance.inputs == input_hashes(campaign):
-            return record
-    place = output_place(folder, "results")
-    require_writable(place)
-    found = _converged_fit(campaign, tell, progress)
-    return _results(found, None, 0, place, {}, tell).record

@@ -16,14 +16,15 @@ def quietly(*line: str) -> tuple[int, str, str]:
     return code, out.getvalue(), err.getvalue()
 
 
-def console(*line: str, last: int = 0) -> str:
+def console(*line: str, last: int = 0, first: int | None = None) -> str:
     """A command and what it prints, as a block of Markdown; of a refusal the message.
 
     Args:
         line: what follows `tvsbayes`.
         last: how many of the last lines are shown; 0: all.
+        first: how many of the first ones are shown; None: all.
     """
     code, out, err = quietly(*line)
     printed = [text.rstrip() for text in (out if code < 2 else err).splitlines()]
-    shown = f" | tail -{last}" if last else ""
-    return "\n".join(["```console", f"$ tvsbayes {' '.join(line)}{shown}", *printed[-last:], "```", ""])
+    shown = f" | tail -{last}" if last else "" if first is None else f" | head -{first}"
+    return "\n".join(["```console", f"$ tvsbayes {' '.join(line)}{shown}", *printed[-last:][:first], "```", ""])

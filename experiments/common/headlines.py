@@ -22,7 +22,7 @@ HEADLINES = (
     *(f"effective {direction}" for direction in DIRECTIONS),
     *("contrast pan", "contrast tilt", "backlash pan", "backlash tilt", "effective mirror offset"),
 )
-"""In the order of `tvsbayes.model.headlines.QUANTITIES`."""
+"""In the order of `tvsbayes.instrument.parameters.TARGETS`."""
 MEAN_RATIOS = ("mean ratio pan", "mean ratio tilt")
 """Headlines too, in the tables that name them: the gears' own, without the mirrors."""
 SHRINK = 0.8
@@ -43,7 +43,7 @@ def headlines(draws) -> dict[str, np.ndarray]:
         ratio[..., 2] - ratio[..., 3],
         physical[..., INDEX["backlash_deg.pan"]],
         physical[..., INDEX["backlash_deg.tilt"]],
-        np.asarray(draws.effective_mirror_offset_mm),
+        draws["effective_mirror_offset_mm"],
         *(physical[..., INDEX[name]] for name in BLOCKS["degrees_per_step"]),
     )
     return dict(zip(HEADLINES + MEAN_RATIOS, each, strict=True))

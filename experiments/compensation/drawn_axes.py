@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
-from tvsbayes.single_axis.simulated_axis import AxisTruth, stops_of
+from tvsbayes.twin.simulated_axis import AxisTruth, stops_of
 
 
 def up_and_down(travel: float, positions: int, homings: int) -> tuple[tuple[AxisMove, ...], list[int]]:

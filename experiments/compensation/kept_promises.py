@@ -33,8 +33,8 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import results_for
 from tvsbayes.single_axis.predicted_stops import predicted_stops
-from tvsbayes.single_axis.simulated_axis import AxisTruth, draw_axis
 from tvsbayes.statistics.chances import binomial_bounds
+from tvsbayes.twin.simulated_axis import AxisTruth, draw_axis
 
 ROWS = output(__file__, "kept_promises.jsonl")
 WISHES = {

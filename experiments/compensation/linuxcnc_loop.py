@@ -33,7 +33,7 @@ from tvsbayes.results.compensation_record import TableRow
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import results_for
-from tvsbayes.single_axis.simulated_axis import draw_axis
+from tvsbayes.twin.simulated_axis import draw_axis
 
 TRAVEL, SEED = 160.0, 4
 HOME = AxisPrior(0.01, 0.0)

@@ -21,7 +21,7 @@ from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.verification import stored_compensation
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, read_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
-from tvsbayes.single_axis.simulated_axis import draw_axis
+from tvsbayes.twin.simulated_axis import draw_axis
 
 TRAVEL, SEED, U = 40.0, 11, 0.002
 TRUE = {

@@ -143,11 +143,13 @@ class Command:
     Attributes:
         line: what follows `tvsbayes`.
         last: how many of the last lines are shown; 0: all.
+        first: how many of the first ones; None: all.
         quick: whether the tests run it.
     """
 
     line: str
     last: int = 0
+    first: int | None = None
     quick: bool = True
 
 
@@ -192,12 +194,17 @@ class Kind:
         for command in self.commands:
             if quick and not command.quick:
                 return
-            yield console(*command.line.split(), last=command.last)
+            yield console(*command.line.split(), last=command.last, first=command.first)
 
 
-def longer(line: str, last: int = 4) -> Command:
+def longer(line: str, last: int = 0, first: int | None = None) -> Command:
     """What the tests leave out: its last digits may differ with the versions of libraries."""
-    return Command(line, last=last, quick=False)
+    return Command(line, last=last, first=first, quick=False)
+
+
+def answered(line: str) -> Command:
+    """The answer of an axis: what a fit prints first."""
+    return longer(line, first=2)
 
 
 KINDS = (
@@ -244,8 +251,8 @@ KINDS = (
         "Eleven real pairs of a Bumblebee2 camera (`data/real/stereo`), named `left01.jpg` and `right01.jpg`. A board\n"
         "of another size than stated is seen. Names that do not pair up: `--pair order`, or `--left` and `--right`.",
         (
-            longer("stereo pictures --board 7x5 --pitch-mm 30 -o stereo.json", 0),
-            longer("stereo pictures --board 6x4 --pitch-mm 30 -o stereo.json", 0),
+            longer("stereo pictures --board 7x5 --pitch-mm 30 -o stereo.json"),
+            longer("stereo pictures --board 6x4 --pitch-mm 30 -o stereo.json"),
         ),
         before=boards,
     ),
@@ -253,27 +260,27 @@ KINDS = (
         "Pictures of spots",
         "`left_003.png` and `right_003.png` show the spot after move 3. `mine` is from `tvsbayes new mine`, with the\n"
         "counters in `moves.csv` and with `stereo.json`.",
-        (longer("new mine --pictures pictures", 0), longer("detect mine", 0)),
+        (longer("new mine --pictures pictures"), longer("detect mine")),
         before=spots,
     ),
     Kind(
         "A dial gauge: runs side by side",
         "A sheet with a column for each run.",
-        (Command("import dial.csv --axis --to dial --yes"), longer("fit dial --quick")),
+        (Command("import dial.csv --axis --to dial --yes"), answered("fit dial --quick")),
         {"dial.csv": FOREIGN / "wide_forward_backward" / "dial.csv"},
         4,
     ),
     Kind(
         "An encoder that counts to 4096 and begins anew",
         "Whole turns are added; `--counts-per-turn` states another number, where it is no power of two.",
-        (Command("import log.csv --axis --to encoder --yes"), longer("fit encoder --quick")),
+        (Command("import log.csv --axis --to encoder --yes"), answered("fit encoder --quick")),
         {"log.csv": FOREIGN / "counts_wrap" / "log.csv"},
         4,
     ),
     Kind(
         "Target, actual and error",
         "A column that is actual less target is no uncertainty: it is set aside.",
-        (Command("import errors.csv --axis --to rotary --yes"), longer("fit rotary --quick")),
+        (Command("import errors.csv --axis --to rotary --yes"), answered("fit rotary --quick")),
         {"errors.csv": FOREIGN / "error_column_as_u" / "signed.csv"},
         4,
     ),
@@ -283,7 +290,7 @@ KINDS = (
         (
             Command("import PHD2_GuideLog.txt --axis --to mount"),
             Command("import PHD2_GuideLog.txt --axis --to mount --run 2 --yes"),
-            longer("fit mount --quick", 0),
+            longer("fit mount --quick"),
         ),
         {"PHD2_GuideLog.txt": guide_log},
         7,
@@ -292,7 +299,7 @@ KINDS = (
         "Series of EPICS",
         "What `camonitor` prints. Each reading gets the command of its time; where the names leave open which series\n"
         "is which, `--column command=NAME --column value=NAME`.",
-        (Command("import camonitor.log --axis --to stage --yes"), longer("fit stage --quick")),
+        (Command("import camonitor.log --axis --to stage --yes"), answered("fit stage --quick")),
         {"camonitor.log": camonitor},
         4,
     ),
@@ -300,7 +307,7 @@ KINDS = (
         "Klipper",
         "A log of `data_logger.py` with a stepper and an angle sensor, packed or not; what `ANGLE_CALIBRATE` saved in\n"
         "`printer.cfg` is read likewise.",
-        (Command("import klipper.json --axis --to stepper --yes"), longer("fit stepper --quick")),
+        (Command("import klipper.json --axis --to stepper --yes"), answered("fit stepper --quick")),
         {"klipper.json": data_logger},
     ),
 )
@@ -321,8 +328,8 @@ def main() -> None:
 BEGIN = """# You have ...
 
 Two commands for each kind of file, with what they print. `import` shows what it took for what, and asks before it
-writes; `--yes` is the answer. `| tail -4` shows the last lines only. The files are small ones of own numbers or drawn
-(`experiments.inputs.you_have` prints the page again); options and other kinds are those of
+writes; `--yes` is the answer. `| head -2` and `| tail -4` show the first or last lines only. The files are small ones
+of own numbers or drawn (`experiments.inputs.you_have` prints the page again); options and other kinds are those of
 [import](commands.md#import), [stereo](commands.md#stereo) and [new](commands.md#new). Afterwards: `tvsbayes calibrate`,
 the [report](commands.md#report), and for an axis [a table for its controller](compensation.md).
 """

@@ -3,7 +3,7 @@
     python -m experiments.intervals.axis_in_time run --n 200 --cores 0 1
     python -m experiments.intervals.axis_in_time table > experiments/intervals/axis_in_time.md
 
-Axes are drawn from the priors, half of the waves that are asked for are there (`single_axis/simulated_axis`, whose
+Axes are drawn from the priors, half of the waves that are asked for are there (`twin/simulated_axis`, whose
 formulas are its own), and fitted by weighted draws. A wave that is not there and is given a probability above 0.95 is a
 false one. Amplitude, period and phase are asked of the waves that are there, given that there is one.
 """
@@ -20,9 +20,9 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_periods import wave_samples
-from tvsbayes.single_axis.simulated_axis import simulate_axis
 from tvsbayes.single_axis.waves import AskedPeriods
 from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
+from tvsbayes.twin.simulated_axis import simulate_axis
 
 ROWS = output(__file__, "axis_in_time.jsonl")
 LEVELS = (0.5, 0.95)

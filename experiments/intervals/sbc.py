@@ -160,7 +160,7 @@ def ranks(simulated, result, z: np.ndarray, place_errors_rad: np.ndarray) -> dic
         effective = draws.effective_deg_per_step[0, :, k]
         values[f"effective_deg_per_step.{direction}"] = np.append(ratio[direction], effective)
     offset = effective_mirror_offset_mm(truth.parameters, tuple(np.degrees(pose)))
-    values["effective_mirror_offset_mm"] = np.append(offset, draws.effective_mirror_offset_mm[0])
+    values["effective_mirror_offset_mm"] = np.append(offset, draws["effective_mirror_offset_mm"][0])
     return {name: int(np.sum(v[1:] < v[0])) for name, v in values.items()}
 
 

@@ -26,9 +26,9 @@ from experiments.common.command_line import act, study_parser
 from experiments.common.headlines import SHRINK
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import output, read_rows, run_rows
+from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.instrument.plan import read_plan, write_plan
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.planner import plan
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
 from tvsbayes.statistics.chances import binomial_bounds, rms_bounds, share_interval95
@@ -101,7 +101,7 @@ def table(arguments: argparse.Namespace) -> None:
             end="",
         )
         print(f"| 95 % interval holds truth | verdict | with sd x {SHRINK} |\n|---|---|---|---|---|---|---|")
-        for quantity in QUANTITIES:
+        for quantity in TARGETS:
             h = result.headlines[quantity]
             verdict = "within" if low <= h.rms_predicted <= high else "OUTSIDE"
             shrunk = "fails" if not low <= h.rms_predicted / SHRINK <= high else "passes"

@@ -27,8 +27,8 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.held_out_positions import hold_out_positions
-from tvsbayes.single_axis.simulated_axis import simulate_axis
 from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
+from tvsbayes.twin.simulated_axis import simulate_axis
 
 HELD, DRAWN = output(__file__, "axes_held.jsonl"), output(__file__, "axes_drawn.jsonl")
 FIGURE = Path("data/docs/real_axes.png")

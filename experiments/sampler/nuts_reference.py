@@ -61,7 +61,7 @@ def quantities(joint: JointFit, z_of: Callable[[jax.Array], jax.Array], draws: n
     for kind in RATIOS:
         ratio = np.asarray(getattr(derived, kind)).reshape(*shape, len(DIRECTIONS))
         named |= {f"{kind}.{direction}": ratio[..., k] for k, direction in enumerate(DIRECTIONS)}
-    return named | {OFFSET: np.asarray(derived.effective_mirror_offset_mm).reshape(shape)}
+    return named | {OFFSET: derived["effective_mirror_offset_mm"].reshape(shape)}
 
 
 def summary(values: np.ndarray) -> dict[str, float]:

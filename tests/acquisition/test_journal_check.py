@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from tvsbayes.acquisition.journal import LOG, read_journal
+from tvsbayes.acquisition.journal import LOG, Journal, read_journal
 from tvsbayes.acquisition.journal_check import repair, verify
+from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.errors import InputError
 
 
@@ -49,7 +50,11 @@ def test_repair_keeps_what_is_whole_and_marks_the_gap(folder, tmp_path):
         *("created", "intent", "looked", "gap"),
         *("looked", "intent", "looked", "gap"),
     ]
-    assert events[0][1]["repaired"] is True and events[0][1]["id"] == "0123" and events[3][1] == {"before_line": 5}
+    assert (
+        events[0][1]["repaired"] is True
+        and events[0][1]["id"] == "0123"
+        and events[3][1] == {"before_line": 5, "motion_lost": False}
+    )
     assert verify(tmp_path / "new").frames == 5
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before, "the old one is untouched"
     with pytest.raises(InputError):
@@ -67,3 +72,46 @@ def test_repair_of_a_journal_without_its_first_line(folder, tmp_path):
     done = repair(folder, tmp_path / "new")
     assert done.lost_lines == [1]
     assert [r.event for r in read_journal(tmp_path / "new").records][:3] == ["created", "gap", "intent"]
+
+
+LOOK = {"experiment": None, "point": None, "target": "d1", "status": "undetected", "pixels_px": None, "sds_px": None}
+
+
+def moved_and_looked(place):
+    """A homing, then four moves with a look each; returns the lines of its log."""
+    journal = Journal.create(place, id="0123", plan_sha256="ab" * 32)
+    at = {"step": 0, "time_s": 0.0, "pan_steps": 0, "tilt_steps": 0}
+    journal.append("intent", step=0, action="home")
+    journal.append("homed", **at, boot=1, approach=["left", "up"])
+    for k in range(1, 5):
+        journal.append("intent", step=2 * k - 1, action="move", pan_steps=k, tilt_steps=0)
+        journal.append("moved", **{**at, "step": 2 * k - 1, "time_s": float(k), "pan_steps": k})
+        journal.append("looked", step=2 * k, spot=k - 1, **LOOK)
+    journal.append("stop", reason="done", exit_code=0)
+    journal.close()
+    return (place / LOG).read_bytes().splitlines(keepends=True)
+
+
+@pytest.mark.parametrize(
+    ("lost", "spots", "moves"),
+    [("looked", [0, 2, 3], 5), ("moved", [0], 2), ("intent", [0], 2)],
+)
+def test_what_follows_a_lost_look_counts_and_what_follows_a_lost_motion_does_not(tmp_path, lost, spots, moves):
+    """A motion has two lines: a single one that is missing between whole motions was none."""
+    lines = moved_and_looked(tmp_path / "run")
+    del lines[{"intent": 6, "moved": 7, "looked": 8}[lost]]
+    (tmp_path / "run" / LOG).write_bytes(b"".join(lines))
+    repair(tmp_path / "run", tmp_path / "new")
+    found = recorded(read_journal(tmp_path / "new").records)
+    assert [spot.spot for spot in found.spots] == spots and len(found.moves) == moves
+
+
+def test_lines_that_changed_places_are_put_back(tmp_path):
+    lines = moved_and_looked(tmp_path / "run")
+    lines[7], lines[8] = lines[8], lines[7]
+    (tmp_path / "run" / LOG).write_bytes(b"".join(lines))
+    done = repair(tmp_path / "run", tmp_path / "new")
+    assert done.lost_lines == [] and done.kept == len(lines)
+    found = recorded(read_journal(tmp_path / "new").records)
+    assert (len(found.spots), len(found.moves), found.ignored_lines) == (4, 5, ())
+    assert "gap" not in [record.event for record in read_journal(tmp_path / "new").records]

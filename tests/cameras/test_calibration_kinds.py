@@ -282,10 +282,10 @@ def test_bouguets_toolbox_and_caliscope(mounted, tmp_path):
 
 
 def test_matlab_structures(mounted, tmp_path):
-    """Transposed intrinsics and rotation, rows before columns in the image size, RMS as usual."""
+    """Transposed intrinsics and rotation, rows before columns in the image size, pixels counted from 1."""
     cameras = [
         {
-            "IntrinsicMatrix": m.T,
+            "IntrinsicMatrix": (m + np.outer([1, 1, 0], [0, 0, 1])).T,
             "RadialDistortion": d[[0, 1, 4]],
             "TangentialDistortion": d[2:4],
             "ImageSize": [mounted.image_height, mounted.image_width],
@@ -297,6 +297,7 @@ def test_matlab_structures(mounted, tmp_path):
     found = read_calibration([tmp_path / "s.mat"])
     same(found.stereo, mounted)
     assert found.source == "matlab" and any("rows, columns" in note for note in found.notes)
+    assert any("MATLAB counts pixels from 1" in note for note in found.notes)
 
 
 def test_one_file_each_and_one_between_them(mounted, tmp_path):
@@ -438,6 +439,31 @@ def test_absurd_pairs_are_named_by_file_and_key(mounted, tmp_path):
     )
     turned = replace(mounted, R=rotation_matrix(np.array([0, 1.0, 0])))
     assert any("R of stereo.json turns by 57 deg" in told for told in pair_doubts(turned))
+
+
+def test_what_would_pass_in_silence_is_said(mounted, tmp_path):
+    """Four coefficients that may be a fisheye's, poses in other axes or inverted."""
+    good = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()}
+    good["image_size"] = [1280, 720]
+    x, y, z = mounted.T
+    inverse = (-mounted.R.T @ mounted.T).tolist()
+    attacks = {
+        "four coefficients without the name": {"D1": [-0.02, 0.01, -0.005, 0.001], "D2": [-0.02, 0.01, -0.005, 0.001]},
+        "in axes of another frame": {"T": [z, x, y]},
+        "are left and right swapped?": {"T": inverse, "R": mounted.R.T.tolist()},
+        "--import-unit": {"T": (mounted.T / 25.4).tolist()},
+        "is that its size?": {"image_size": [640, 360]},
+        "a view of": {"M1": [[4.2, 0, 640], [0, 4.2, 360], [0, 0, 1]]},
+    }
+    for word, new in attacks.items():
+        path = tmp_path / "a.json"
+        path.write_text(json.dumps({**good, **new}))
+        try:
+            found = read_calibration([path])
+            said = " ".join([*found.notes, *found.warnings])
+        except InputError as error:
+            said = str(error)
+        assert word in said, word
 
 
 HOSTILE = {

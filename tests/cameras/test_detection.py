@@ -117,6 +117,39 @@ def test_what_is_learned_of_the_noise(found_plain, found_speckled):
         assert found_speckled.noise[side].speckle_contrast == pytest.approx(0.4, rel=0.25)
 
 
+@pytest.mark.parametrize("each", (True, False))
+def test_dark_pictures_are_subtracted(tmp_path, each):
+    """Bright things in the middle of both pictures, which pass for spots, with a picture of them or with one a look."""
+    folder, rng = Folder(tmp_path / "c", looks=6, peak_dn=150.0, seed=4), np.random.default_rng(4)
+    (folder.path / "dark").mkdir()
+    things = np.zeros((HEIGHT, WIDTH, 3))
+    for row, column in ((60, 90), (200, 300), (HEIGHT - 60, WIDTH - 90)):
+        things[row : row + 9, column : column + 9] = 90.0
+
+    def put(name: str, lit: np.ndarray) -> None:
+        noisy = np.clip(np.rint(lit + things + rng.normal(3, 1, lit.shape)), 0, 255)
+        (folder.path / name).write_bytes(png_bytes(noisy.astype(np.uint8)))
+
+    for look in range(6):
+        for side in ("left", "right"):
+            name = f"{10 * look:06d}_{side}.png"
+            frame = cv2.imread(str(folder.path / "frames" / name)).astype(float)
+            put(f"frames/{name}", frame)
+            if each or look == 0:
+                put(f"dark/{name if each else side + '.png'}", np.zeros_like(frame))
+    campaign = read_campaign(folder.path)
+    assert detect(campaign).statuses.get("ok", 0) < 6
+    found = detect(campaign, dark=folder.path / "dark")
+    assert found.statuses == {"ok": 6}
+    errors, stated = folder.errors(found)
+    # Noise of two pictures; 24 coordinates beyond four of their sds by chance: 1 in 600.
+    assert np.abs(errors / stated).max() < 4 and np.abs(errors).max() < 0.2
+    (folder.path / "dark" / ("000000_left.png" if each else "left.png")).unlink()
+    with pytest.raises(InputError, match="no dark picture of the left camera") as caught:
+        detect(campaign, dark=folder.path / "dark")
+    assert "laser off" in caught.value.remedy
+
+
 def test_deep_frames_are_detected_with_all_their_bits(tmp_path, monkeypatch):
     """The same light in 12 bits of 16, finer than 8 bits: also where most looks are so dim that they would fit 10."""
     folder = Folder(tmp_path / "c", looks=6)

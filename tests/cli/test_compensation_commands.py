@@ -16,6 +16,8 @@ from tvsbayes.compensation.verification import stored_compensation
 from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
 from tvsbayes.single_axis.axis_record import keep_fit
 
+AT = ("--distance-mm", "500")
+
 
 @pytest.fixture
 def folder(tmp_path):
@@ -67,6 +69,12 @@ def test_from_a_fit_to_a_verified_machine(ask, say, folder, tmp_path):
     assert "No fresh readings have verified it" in (folder / "results" / "report.html").read_text()
 
 
+def test_a_second_file_stands_beside_the_first(ask, folder, tmp_path):
+    code, document = ask("compensate", folder, "--to", "urdf", "-o", tmp_path / "stage.xacro")
+    beside = tmp_path / "stage.xacro.yaml"
+    assert code == 0 and document["files"]["yaml"] == str(beside) and "covariance:" in beside.read_text()
+
+
 def test_without_a_file_nothing_is_written(say, folder):
     code, told, _ = say("compensate", folder, "--to", "csv")
     assert code == 0 and "nothing written" in told and "command,forward,backward" in told
@@ -88,8 +96,6 @@ def test_too_few_readings_tell_nothing(ask, folder, tmp_path):
     "line",
     [
         ("compensate", PAPER_TWIN, "--to", "csv"),
-        ("verify", PAPER_TWIN, PAPER_TWIN),
-        ("plan", PAPER_TWIN, "--verify"),
         ("plan", "--verify"),
     ],
 )
@@ -97,6 +103,15 @@ def test_scanners_are_sent_elsewhere(ask, line):
     code, document = ask(*line)
     assert code == 2
     assert_error(document, "usage")
+
+
+def test_verify_wants_two_of_a_kind_and_results(ask, folder):
+    for line in (("verify", PAPER_TWIN, folder), ("verify", folder, PAPER_TWIN), ("verify", folder, folder, *AT)):
+        code, document = ask(*line)
+        assert code == 2
+        assert_error(document, "usage")
+    code, document = ask("verify", PAPER_TWIN, PAPER_TWIN, *AT)
+    assert code == 2 and "tvsbayes steps-for" in document["error"]["remedy"]
 
 
 @pytest.mark.parametrize(

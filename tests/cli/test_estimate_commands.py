@@ -358,8 +358,7 @@ def test_a_fit_that_did_not_converge_is_exit_4(ask, say, grid_folder, monkeypatc
 
 def test_a_report_for_a_browser_that_is_not_there_ends_at_once(ask, grid_folder, monkeypatch):
     monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
-    monkeypatch.setattr("tvsbayes.pipeline.record_for", None)
-    monkeypatch.setattr("tvsbayes.cli.report_commands.record_for", None)
+    monkeypatch.setattr("tvsbayes.cli.report_commands.StoredOrFitted", None)
     code, document = ask("report", grid_folder, "--pdf")
     assert (code, document["error"]["code"]) == (2, "no-browser")
 
@@ -379,6 +378,6 @@ def test_counters_of_a_scanner_are_left_out_and_foretold(ask, say, grid_folder, 
 
 
 def test_without_experiments_nothing_is_fitted_to_be_compared(ask, grid_folder, monkeypatch):
-    monkeypatch.setattr("tvsbayes.cli.estimate_commands.fit_for", None)
+    monkeypatch.setattr("tvsbayes.cli.estimate_commands.StoredOrFitted", None)
     code, document = ask("compare", grid_folder)
     assert code == 3 and "--by positions" in assert_error(document, "no-experiments")["remedy"]

@@ -19,7 +19,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import input_hashes, read_campaign
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.model.compiled import Traces
-from tvsbayes.pipeline import FITTING, SUMMARISING, calibrate, compile_for, fit_for, record_for
+from tvsbayes.pipeline import FITTING, SUMMARISING, StoredOrFitted, calibrate, compile_for
 
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
@@ -40,7 +40,7 @@ def test_what_a_fit_left_is_taken_up_again(grid_folder, monkeypatch):
     assert (back.converged, back.log_density, back.chi2) == (True, fresh.log_density, fresh.chi2)
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", None)
     monkeypatch.setattr("tvsbayes.studies.study_job.fit", None)
-    assert fit_for(campaign, report_line).converged
+    assert StoredOrFitted(campaign, report_line).fit.converged
     (grid_folder / "moves.csv").write_bytes((grid_folder / "moves.csv").read_bytes() + b"\n")
     assert stored_mode(read_campaign(grid_folder)) is not None, "a blank line changes nothing that was measured"
     spots = (grid_folder / "spots.csv").read_text().replace("d2", "d3")
@@ -56,7 +56,7 @@ def test_whoever_waits_for_a_fit_is_told_why(grid_folder, monkeypatch):
 
     def why() -> str:
         told.clear()
-        fit_for(read_campaign(grid_folder), told.append)
+        _ = StoredOrFitted(read_campaign(grid_folder), told.append).fit
         return told[0].removesuffix(": fitting first (Laplace approximation) ...")
 
     assert why() == "there are no results/ yet"
@@ -133,18 +133,21 @@ def test_no_sample_of_another_fit_stays_beside_a_record(grid_folder):
     results, told = grid_folder / "results", []
     results.mkdir()
     (results / "posterior.nc").write_bytes(b"of an earlier fit")
-    record = record_for(read_campaign(grid_folder), grid_folder, told.append)
+    record = StoredOrFitted(read_campaign(grid_folder), told.append).record
     assert record.summary.estimator == "laplace" and (results / "fit.json").is_file()
     assert not (results / "posterior.nc").exists()
     assert any("posterior.nc of an earlier fit is removed" in line for line in told)
 
 
-@pytest.mark.parametrize("made", [calibrate, record_for])
+@pytest.mark.parametrize(
+    "made",
+    [lambda c: calibrate(c, c.path / "results"), lambda c: StoredOrFitted(c).record],
+    ids=["calibrate", "record"],
+)
 def test_a_place_that_takes_no_results_is_refused_before_the_fit(grid_folder, monkeypatch, made):
     """As an immutable folder or a read-only disk are."""
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", None)
     (grid_folder / "results").touch()
-    place = grid_folder / "results" if made is calibrate else grid_folder
     with pytest.raises(InputError) as refused:
-        made(read_campaign(grid_folder), place)
+        made(read_campaign(grid_folder))
     assert refused.value.code == "write"

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from tvsbayes.files.disk import shipped_data
+from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.instrument.plan import read_plan
-from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning import planner
 
 pytestmark = pytest.mark.usefixtures("small_searches")
@@ -81,7 +81,7 @@ def test_bad_options_of_plan_are_refused(ask, options):
 def test_check_takes_a_rig_with_a_plan(ask):
     code, document = ask("check", MOUNTED / "rig.toml", MOUNTED / "grid.csv")
     assert code == 0 and document["kind"] == "rig with plan" and document["warnings"] == []
-    assert set(document["expected"]) == set(QUANTITIES)
+    assert set(document["expected"]) == set(TARGETS)
     code, document = ask("check", MOUNTED / "grid.csv", MOUNTED / "grid.csv")
     assert code == 2 and document["error"]["code"] == "usage"
 

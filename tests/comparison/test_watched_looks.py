@@ -141,7 +141,7 @@ def test_false_alarms_and_power_are_those_of_the_linear_model():
 
 
 def test_the_command_keeps_a_table(mounted_rig, mixed_fit, truth, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("tvsbayes.cli.watch_command.fit_for", lambda *_: mixed_fit)
+    monkeypatch.setattr("tvsbayes.pipeline.StoredOrFitted.fit", mixed_fit)
     for name, campaign in (
         ("old", mixed_fit.campaign),
         ("same", next_day(mounted_rig, truth)),

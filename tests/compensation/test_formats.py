@@ -8,13 +8,15 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
+import yaml
 from msgspec import structs
 from support.compensated import results, table
 
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.compensation.formats import CSV_COLUMNS, FORMATS
+from tvsbayes.compensation.formats import CSV_COLUMNS, FORMATS, Origin
 from tvsbayes.compensation.promise import Wish, compensation_of
 
+ORIGIN = Origin("tvsbayes of a test", "0123456789abcdef" * 4)
 WISHES = {
     "grbl": {"in_force": 250.0},
     "grblhal": {"in_force": 250.0, "letter": "Y"},
@@ -24,7 +26,7 @@ WISHES = {
 
 
 def written(target: str) -> str:
-    return FORMATS[target].write(table(target, **WISHES.get(target, {})), "tvsbayes of a test")
+    return FORMATS[target].write(table(target, **WISHES.get(target, {})), ORIGIN)
 
 
 def lines_of(text: str) -> list[str]:
@@ -62,7 +64,7 @@ def test_linuxcnc_of_counters_that_run_backwards_exchanges_the_sides():
     """The unit falls as the command rises: LinuxCNC's forward is the campaign's backward."""
     made = compensation_of(results(-1.002), Wish("linuxcnc"))
     assert made.per_command == -1.0
-    rows = np.array([[float(c) for c in line.split()] for line in lines_of(FORMATS["linuxcnc"].write(made, "x"))])
+    rows = np.array([[float(c) for c in line.split()] for line in lines_of(FORMATS["linuxcnc"].write(made, ORIGIN))])
     assert np.all(np.diff(rows[:, 0]) > 0)
     sent = Correction.of(made).sent(np.array([10.0]), np.array([1]))[0]
     at_unit = rows[np.argmin(np.abs(rows[:, 0] + 10.0))]
@@ -79,9 +81,27 @@ def test_settings_hold_ratio_and_play():
     assert klipper / 8.0 == pytest.approx(250 / ratio, rel=1e-4)
 
 
+def test_urdf_states_covariance_and_what_it_corrects():
+    """The YAML beside the xacro: the same numbers, their covariance, and the hash that keeps it from acting twice."""
+    beside = FORMATS["urdf"].beside
+    assert beside is not None and all(FORMATS[name].beside is None for name in FORMATS if name != "urdf")
+    made = table("urdf")
+    document = yaml.safe_load(beside(made, ORIGIN))
+    assert document["axis_corrects"] == ORIGIN.data_sha256 and document["applied"] is False
+    assert f'name="axis_corrects" value="{ORIGIN.data_sha256}"' in written("urdf")
+    joint = document["joint"]
+    assert joint["values"] == [made.settings["axis_zero"], made.settings["axis_reduction"]]
+    sd = np.sqrt(np.diag(joint["covariance"]))
+    np.testing.assert_allclose(sd, [made.settings["u_axis_zero"], made.settings["u_axis_reduction"]], rtol=1e-12)
+    assert joint["covariance"][0][1] == joint["covariance"][1][0] == made.settings["covariance_zero_reduction"]
+    assert set(document["left_after_applying_95"]) == {"forward", "backward"}
+
+
 def test_urdf_is_xml_with_zero_and_reduction():
     tree = ElementTree.fromstring(written("urdf"))
-    values = {node.get("name"): float(node.get("value", "")) for node in tree}
+    stated = {node.get("name"): node.get("value", "") for node in tree}
+    assert stated.pop("axis_corrects") == ORIGIN.data_sha256
+    values = {name: float(value) for name, value in stated.items()}
     assert values["axis_reduction"] == pytest.approx(1 / 1.002, rel=0.004) and values["u_axis_zero"] > 0
     bound = values["u_axis_zero"] * values["u_axis_reduction"]
     assert 0 < abs(values["covariance_zero_reduction"]) <= bound
@@ -91,7 +111,7 @@ def test_pec_repeats_and_names_cannot_end_a_comment():
     header, *rows = lines_of(written("pec"))
     assert header == "phase,add" and len(rows) == 64
     nasty = structs.replace(table("header"), machine="a */ int x; /* b\nc")
-    assert "*/ int" not in FORMATS["header"].write(nasty, "x")
+    assert "*/ int" not in FORMATS["header"].write(nasty, ORIGIN)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")

@@ -94,10 +94,10 @@ def test_no_table_is_made_of_what_is_not_accepted():
     campaign = results().fit.campaign
     fit = fit_axis(campaign, sampled=False)
     with pytest.raises(NotConverged, match="Laplace"):
-        compensation_of(AxisResults(summarise_axis(fit), fit, False), Wish())
+        compensation_of(AxisResults(summarise_axis(fit), fit), Wish())
     rough = structs.replace(results().summary, answer="rough")
     with pytest.raises(NotConverged, match="rough"):
-        compensation_of(AxisResults(rough, results().fit, False), Wish())
+        compensation_of(AxisResults(rough, results().fit), Wish())
 
 
 def test_python_makes_the_file_in_one_call():

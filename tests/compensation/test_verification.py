@@ -10,7 +10,7 @@ from msgspec import structs
 from support.compensated import driven, fresh, results, table, to_and_fro, true_axis
 
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.compensation.verification import plan_verification, stored_compensation, verify, verify_readings
+from tvsbayes.compensation.verification import plan_verification, stored_compensation, verify_axis, verify_readings
 from tvsbayes.errors import InputError
 from tvsbayes.results.compensation_record import (
     APPLIED,
@@ -97,7 +97,7 @@ def test_grblhal_may_begin_in_either_half_of_the_play():
 
 
 def test_python_verifies_in_one_call():
-    assert verify(FIT.campaign, fresh(3), made=table()).verdict == KEPT
+    assert verify_axis(FIT.campaign, fresh(3), made=table()).verdict == KEPT
 
 
 def test_plan_spreads_its_stops_and_knows_whether_they_tell():

@@ -64,8 +64,8 @@ def test_truth_is_found_within_its_uncertainty(simulated, fitted):
         error = fitted.mode.physical[index] - true.get(name, np.nan)
         assert abs(error) < FAR * fitted.draws.physical[:, index].std(), name
     offset = effective_mirror_offset_mm(true, pose)
-    spread = fitted.draws.effective_mirror_offset_mm.std()
-    assert abs(fitted.mode.effective_mirror_offset_mm - offset) < FAR * spread
+    spread = fitted.draws["effective_mirror_offset_mm"].std()
+    assert abs(fitted.mode["effective_mirror_offset_mm"] - offset) < FAR * spread
 
 
 def test_the_data_shrink_the_ratios_a_hundredfold(fitted):

@@ -184,3 +184,13 @@ def test_a_hole_between_cuts_swings_nothing_above_its_neighbours():
     # The inner one, at 2, is filled to the lower of its neighbours, at 3.
     at = np.argmin(np.abs(NODES - CUT_NODES[inner]))
     assert found[at] == pytest.approx(-0.5 * CUT_NODES[inner + 1] ** 2)
+
+
+def test_a_cliff_far_from_the_mode_leaves_the_density_beside_it_as_it_is():
+    """Where the map's steps diverge a target falls by 1e15: Akima's weights must not take all other slopes as equal."""
+    cuts = -0.5 * CUT_NODES**2
+    cuts[CUT_NODES >= 6] = [-7e2, -8e3, -2e4, -3e4, -5e15, -6e16, -3e15]
+    found = between_cuts(cuts[None])[0]
+    # Akima weighs the slope before a node by how far the two after it differ: those of the cliff by 700 against 1.
+    np.testing.assert_allclose(found[NODES < 5], -0.5 * NODES[NODES < 5] ** 2, atol=0.2)
+    assert np.all(found[NODES >= 5] <= cuts[CUT_NODES == 5])

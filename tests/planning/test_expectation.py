@@ -9,10 +9,9 @@ import pytest
 from support.coarse_planning import ROUNDING, with_priors
 from support.dozen_spots import dozen_plan
 
-from tvsbayes.instrument.parameters import INDEX, Prior
+from tvsbayes.instrument.parameters import INDEX, TARGETS, Prior
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, paper_protocol
-from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.model.parameter_space import half_normal_coordinate
 from tvsbayes.planning.drawn_rigs import instruments_in
 from tvsbayes.planning.expectation import (
@@ -38,7 +37,7 @@ def u_of(steps, knowledge, z=None) -> np.ndarray:
         sensitivity(
             Target("", q, 1.0, 1.0, ""), knowledge.z, knowledge.space, knowledge.rig.table, information.pose_rad
         )
-        for q in QUANTITIES
+        for q in TARGETS
     ]
     covariance = covariance_of(knowledge.precision + information.fisher)
     return np.array([s.value(covariance) for s in at])
@@ -134,7 +133,7 @@ def test_mirroring_a_counter_swaps_names(mounted_rig, knowledge):
     )
     turned = prior_knowledge(with_priors(mounted_rig, degrees_per_step__pan=Prior(-0.06, 0.01)))
     u, v = u_of(steps, knowledge), u_of(mirrored, turned)
-    names = list(QUANTITIES)
+    names = list(TARGETS)
     swapped = {"left": "right", "right": "left"}
     expected = [u[names.index(swapped.get(name, name))] for name in names]
     assert v == pytest.approx(expected, rel=1e-6)

@@ -123,7 +123,7 @@ def test_the_command_prints_them(begun_fit, mounted_rig, tmp_path, monkeypatch, 
     from tvsbayes.files.disk import shipped_data
 
     rig = str(shipped_data() / "rigs" / "mounted" / "rig.toml")
-    monkeypatch.setattr("tvsbayes.cli.use_commands.fit_for", lambda *_: begun_fit)
+    monkeypatch.setattr("tvsbayes.pipeline.StoredOrFitted.fit", begun_fit)
     monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", lambda _: begun_fit.campaign)
     assert run(["plan", rig, "--given", "mine", "--next", "8", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

@@ -15,7 +15,17 @@ from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.drawn_rigs import draw_instruments
 from tvsbayes.planning.expectation import PARAMETERS
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of, information_of_looks
-from tvsbayes.planning.search import CRITERIA, KNOWN, MEAN_WEIGHT, Scope, Search, scores, search_rows, smallest_design
+from tvsbayes.planning.search import (
+    CRITERIA,
+    KNOWN,
+    MEAN_WEIGHT,
+    Question,
+    Scope,
+    Search,
+    scores,
+    search_rows,
+    smallest_design,
+)
 from tvsbayes.planning.target import parse_target, sensitivity
 
 pytestmark = pytest.mark.usefixtures("small_searches")
@@ -107,7 +117,8 @@ def refine(knowledge, found, seen):
         at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
         assurance = Assurance(family, target, draw_instruments(knowledge, 10, 3), 3)
         plain = assurance.values([2])[2]
-        return plain, search.refine(family, seen, target, at, 2, Scope(minutes=minutes), assurance)
+        asked = Question(knowledge, found, seen, target, at)
+        return plain, search.refine(family, asked, 2, Scope(minutes=minutes), assurance)
 
     return run
 

@@ -114,7 +114,7 @@ def test_the_command_writes_the_plan(watched_fit, planned, tmp_path, monkeypatch
     monkeypatch.setattr(
         "tvsbayes.planning.watch_plan.watch_plan", lambda *rest, **named: asked.append((rest[1], named)) or planned
     )
-    monkeypatch.setattr("tvsbayes.cli.watch_command.fit_for", lambda *_: watched_fit)
+    monkeypatch.setattr("tvsbayes.pipeline.StoredOrFitted.fit", watched_fit)
     monkeypatch.setattr("tvsbayes.instrument.campaign.read_campaign", lambda _: watched_fit.campaign)
     out, rig = tmp_path / "looks.csv", read_rig(RIG)
     assert run(["plan", str(RIG), "--given", "mine", "--watch", "--minutes", "3", "-o", str(out), "--json"]) == 0

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+from support.drawn_quantities import drawn_quantities
 
 from tvsbayes.instrument.parameters import AMPLITUDE_NAMES, INDEX, NAMES
 from tvsbayes.posterior.arviz_tree import COORDS, VARIABLES, _dataset, _variables
@@ -18,13 +17,7 @@ SHAPE = 2, 3
 def draws():
     """Every parameter has values of its own in every draw."""
     physical = np.arange(np.prod(SHAPE) * len(NAMES), dtype=float).reshape(*SHAPE, len(NAMES))
-    ratios = np.zeros((*SHAPE, 4))
-    return SimpleNamespace(
-        physical=physical,
-        effective_deg_per_step=ratios,
-        local_deg_per_step=ratios,
-        effective_mirror_offset_mm=np.zeros(SHAPE),
-    )
+    return drawn_quantities(*SHAPE, physical=physical)
 
 
 @pytest.mark.parametrize("count", [1, 2, len(AMPLITUDE_NAMES)])

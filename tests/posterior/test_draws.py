@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+from support.drawn_quantities import drawn_quantities
 from support.two_parameters import autoregressive
 
 from tvsbayes.inference.summaries import propagated
@@ -45,13 +44,7 @@ def test_lost_motion_takes_ratio_and_backlash_of_its_own_axis():
     for name, value in values.items():
         physical[..., INDEX[name]] = value
     shape = physical.shape[:2]
-    ratios = np.zeros((*shape, 4))
-    draws = SimpleNamespace(
-        physical=physical,
-        effective_deg_per_step=ratios,
-        local_deg_per_step=ratios,
-        effective_mirror_offset_mm=np.zeros(shape),
-    )
+    draws = drawn_quantities(*shape, physical=physical)
     known = Posterior(None, physical, np.zeros(shape), draws, np.full(shape, 1 / 6), None, 0, 0.0)
     expected = {"left": (0.122, 0.3), "right": (0.118, 0.3), "up": (0.144, 0.5), "down": (0.136, 0.5)}
     for direction, lost in expected.items():

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.drawn_quantities import drawn_quantities
 from support.small_campaign import small_campaign
 
 from tvsbayes.estimators.joint_fit import Alternative
@@ -16,7 +15,6 @@ from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, names_of
-from tvsbayes.model.headlines import Derived
 from tvsbayes.posterior import predictive
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.importance import mixed
@@ -156,8 +154,7 @@ def posterior_of_two_ways() -> Posterior:
     parts = []
     for number, fit in enumerate((replace(one, alternatives=ways), other)):
         z = np.full((1, count, 1), float(number))
-        point = Derived(*(jnp.zeros(shape) for shape in ((len(NAMES),), (4,), (4,), (2, 2), (), (0,))))
-        draws = jax.tree.map(lambda x: np.zeros((1, count, *x.shape)), point)
+        draws = drawn_quantities(1, count)
         weights = np.full((1, count), 1 / count)
         parts.append(Posterior(fit, z, z[..., 0], draws, weights, found, 0, 0.0))
     return mixed(parts)

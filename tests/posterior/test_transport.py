@@ -22,6 +22,7 @@ from support.two_parameters import (
     play_near_zero,
     ridge,
     ridge_density,
+    ridge_residual,
     route,
 )
 
@@ -30,7 +31,7 @@ from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
 from tvsbayes.posterior.plays import Cut
 from tvsbayes.posterior.target import Target
-from tvsbayes.posterior.transport import BLOCK_ROWS, Transport, by_width
+from tvsbayes.posterior.transport import BLOCK_ROWS, Transport, bends, by_width
 
 STOP_NAMES = (("stop_sd_deg.right", "stop_sd_deg.left"), ("stop_sd_deg.down", "stop_sd_deg.up"))
 """By axis, in the order of `redraw_mix`."""
@@ -129,6 +130,20 @@ def test_centring_makes_a_curved_ridge_normal():
     apart = uncentred(path).mapped(w)
     assert np.std(ridge_density(apart.z) + apart.log_jacobian) > 100, "the ridge would be none"
     np.testing.assert_allclose(path.to_w(seen.z), w, atol=FLOOR)
+
+
+def test_a_kink_at_the_mode_turns_no_slope_over():
+    """As of a move as long as the play: it bends the residuals at once, not ever more with the distance."""
+    path, kink = replace(ridge(), bend=np.zeros((2, 1, 1))), 0.4
+    sd = path.root[1, 1]
+
+    def kinked(z: np.ndarray) -> np.ndarray:
+        found = ridge_residual(z)
+        found[:, 0] -= kink * np.abs(z[:, path.free[0]] - z[:, path.free[1]] / sd)
+        return found
+
+    # The slope along the narrow coordinate is 0.6 on one side of the kink and 1.4 on the other: never below zero.
+    assert np.abs(bends(replace(path, residuals=kinked))[0, 0, 0] - TURN) * 2 < 1
 
 
 def test_centring_straightens_the_posterior_of_a_campaign():

@@ -29,7 +29,7 @@ from tvsbayes.errors import DeviceFault, InputError, NotConverged
 from tvsbayes.files.disk import output_place, read_arrays
 from tvsbayes.files.images import decode_image
 from tvsbayes.instrument.campaign import input_hashes, read_campaign, write_campaign
-from tvsbayes.pipeline import record_for
+from tvsbayes.pipeline import StoredOrFitted
 
 FILES = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv")
 Edit = Callable[[bytes], bytes]
@@ -423,7 +423,7 @@ def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeyp
     """`fit.json` of other data beside `draws.npz` of these: fit again, never combine."""
     folder = place_of(good, tmp_path)
     data = read_campaign(folder)
-    assert record_for(data, folder, report_line).provenance.inputs == input_hashes(data)
+    assert StoredOrFitted(data, report_line).record.provenance.inputs == input_hashes(data)
     CRAFTED["fit.json of other data"].edit(folder)
 
     def fitted(campaign, tell, progress):
@@ -431,7 +431,7 @@ def test_a_report_is_not_made_from_the_fit_of_other_data(good, tmp_path, monkeyp
 
     monkeypatch.setattr("tvsbayes.pipeline._converged_fit", fitted)
     with pytest.raises(NotConverged, match="fitted anew"):
-        record_for(data, folder, report_line)
+        _ = StoredOrFitted(data, report_line).record
 
 
 @pytest.mark.parametrize(

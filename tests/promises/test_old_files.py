@@ -13,7 +13,7 @@ from support.refusals import refusal
 import tvsbayes
 from tvsbayes.acquisition.journal_check import verify
 from tvsbayes.instrument.campaign import input_hashes, read_campaign
-from tvsbayes.pipeline import fit_for
+from tvsbayes.pipeline import StoredOrFitted
 from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.results.comparison_record import stored_hold_out
 from tvsbayes.results.fit_record import read_fit
@@ -54,7 +54,7 @@ def test_results_are_read_and_a_new_fit_says_why(monkeypatch):
     monkeypatch.setattr("tvsbayes.pipeline.compile_for", lambda _: None)
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda *_, **__: SimpleNamespace(converged=True))
     told: list[str] = []
-    fit_for(read_campaign(OLD / "campaign"), told.append)
+    assert StoredOrFitted(read_campaign(OLD / "campaign"), told.append).fit.converged
     assert "results/ are of tvsbayes 0.1.0, which modelled less of the rig" in told[0]
     record = read_fit(OLD / "campaign" / "results" / "fit.json")
     assert record.summary.converged and record.summary.effective["left"].value == pytest.approx(0.0642, abs=1e-4)

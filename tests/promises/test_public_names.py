@@ -7,7 +7,13 @@ import pkgutil
 import subprocess
 import sys
 
+import pytest
+from support.axes import drawn, runs
+from support.commands import PAPER_TWIN
+
 import tvsbayes
+from tvsbayes.errors import InputError
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, write_axis
 
 FIRST = {"calibration_of", "fit", "load_calibration", "load_posterior", "locate", "read_campaign", "sample"}
 
@@ -23,6 +29,17 @@ def test_completion_and_figures_work_after_a_plain_import():
     code = "import tvsbayes; print('read_campaign' in dir(tvsbayes), callable(tvsbayes.plots.intervals))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["True", "True"]
+
+
+def test_a_campaign_of_any_kind_is_read(tmp_path):
+    """An axis by its format line; what is no campaign by the strict reader, which says what is missing."""
+    write_axis(drawn(4, runs(2)).campaign, tmp_path / "stage")
+    assert isinstance(tvsbayes.read_campaign(tmp_path / "stage"), AxisCampaign)
+    assert isinstance(tvsbayes.read_campaign(PAPER_TWIN), tvsbayes.Campaign)
+    with pytest.raises(InputError, match=r"campaign\.toml"):
+        tvsbayes.read_campaign(tmp_path)
+    with pytest.raises(InputError, match="a scanner by fresh looks"):
+        tvsbayes.verify(PAPER_TWIN, tmp_path / "stage")
 
 
 def test_no_public_name_is_that_of_a_package():

@@ -187,7 +187,7 @@ def test_headlines_of_a_fit(mounted_rig):
             found = jax.tree.map(lambda x: np.asarray(x)[0], derived_quantities(z, repeated, space, seen))
         local = local_deg_per_step(p, pose_deg)
         assert np.abs(found.local_deg_per_step - list(local.values())).max() < 1e-9 * 0.1
-        assert abs(found.effective_mirror_offset_mm - effective_mirror_offset_mm(p, pose_deg)) < LENGTH_MM
+        assert abs(found["effective_mirror_offset_mm"] - effective_mirror_offset_mm(p, pose_deg)) < LENGTH_MM
         line = np.array(list(truth.effective_deg_per_step(campaign).values()))
         pairs = found.effective_deg_per_step.reshape(2, 2)
         assert np.abs(pairs.mean(axis=1) - line.reshape(2, 2).mean(axis=1)).max() < 1e-9 * 0.1

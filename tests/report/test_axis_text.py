@@ -69,7 +69,7 @@ def test_a_fit_says_what_goes_into_firmware(clean):
         return for_firmware(structs.replace(clean, parameters={**clean.parameters, "backlash": play}))
 
     # 1/0.05 = 20, u 0.0005/0.05^2 = 0.2; 0.15/0.05 = 3, u 0.01/0.05 = 0.2.
-    begun = f"for firmware, from 0 to 1250000: -20.00(20) commands per {clean.unit}, "
+    begun = f"for your firmware, from 0 to 1250000: -20.00(20) commands per {clean.unit}, "
     assert said(0.15, 0.13, 0.17) == f"{begun}play of 3.00(20) commands"
     assert said(-0.15, -0.17, -0.13) == f"{begun}no play: a reversal overshoots by 3.00(20) commands"
     assert said(0.015, -0.01, 0.04) == f"{begun}play of 0.30(20) commands is not proved: its 95 % interval holds 0"
@@ -87,6 +87,7 @@ def test_a_fit_says_where_the_error_by_position_is_largest_and_whose_it_may_be(c
 
 
 def test_numbers_that_must_not_be_used_are_not_offered_to_firmware(clean):
-    assert "for firmware" in axis_fit_text(clean) and "largest at command" in axis_fit_text(clean)
+    first, second, *_ = axis_fit_text(clean).splitlines()
+    assert first.startswith("for your firmware, from ") and "largest at command" in second
     broken = axis_fit_text(structs.replace(clean, converged=False, sampling={}, problems=("no mode",)))
-    assert "for firmware" not in broken and "largest at command" not in broken
+    assert "for your firmware" not in broken and "largest at command" not in broken

@@ -78,10 +78,20 @@ def test_an_input_of_one_quantity_alone_has_its_row(budgets):
 def test_what_both_quantities_do_not_share_is_told_of_either():
     """Stop errors are those of the quantity: no number stands for another's."""
     rows = {row[0]: row for row in section(PAN, TILT).tables[0].rows}
-    assert rows["stop errors of the campaign"][2] == "0.015" and rows["play variation"][2] == "0.010"
+    assert rows["stop errors of the campaign, deg"][2] == "0.015" and rows["play variation, deg"][2] == "0.010"
     wider = made("backlash_deg.tilt", COMMON, u=0.034)
     rows = {row[0]: row for row in section(PAN, wider).tables[0].rows}
-    assert rows["stop errors of the campaign"][2] == "0.015; 0.030"
+    assert rows["stop errors of the campaign, deg"][2] == "0.015; 0.030"
+
+
+def test_every_row_with_a_u_names_its_unit():
+    """Effects of unit variance count in their standard deviations."""
+    source = Source("stop error pan", "1", 0.0, 1.0, "A", "normal", math.inf, 0.017)
+    (table, *_) = section(budget_table("backlash_deg.pan", "deg", 0.5, 0.017, [source])).tables
+    assert table.rows[0][0] == "stop error pan, in sds"
+    for table in section(PAN, TILT).tables[:1]:
+        stated = [row[0] for row in table.rows if row[2]]
+        assert len(stated) > 2 and all(name.endswith(", deg") for name in stated)
 
 
 def test_the_result_that_counts_is_named_once():

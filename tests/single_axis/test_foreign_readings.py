@@ -142,3 +142,18 @@ def test_statuses_are_such_as_our_own_reader_takes(tmp_path):
     assert [reading.status for reading in found.readings] == ["ok", "refused: -", "refused: + slipped"]
     assert "status: 2 readings left out by column ok: - 1, + slipped 1" in found.assumed
     assert parse_readings(readings_bytes(found.readings), "readings.csv", 3) == found.readings
+
+
+@pytest.mark.parametrize(
+    "name, cells", (("Temperature", (20.0, 21.5)), ("Temp (°F)", (68.0, 70.7)), ("temp_K", (293.15, 294.65)))
+)
+def test_temperatures_are_those_of_the_moves(tmp_path, name, cells):
+    """Of the row that ends a move, none where a cell is empty or a move is put in; deg C whatever the column says."""
+    rows = (f"0,0.1,{cells[0]},below", "10,1.1,,below", f"10,1.0,{cells[1]},above")
+    found = readings_of(*table(tmp_path, f"command,value,{name},direction", *rows))
+    assert [move.command for move in found.moves] == [0.0, 10.0, 10.5, 10.0]
+    warm = [move.temperature_degC for move in found.moves]
+    assert warm[1] is warm[2] is None
+    # Rounding of a difference of numbers of some hundreds.
+    np.testing.assert_allclose([warm[0], warm[3]], [20.0, 21.5], atol=1e-12 * 300)
+    assert any("turned into deg C" in said for said in found.assumed) == (name != "Temperature")

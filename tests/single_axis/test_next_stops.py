@@ -17,7 +17,7 @@ from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_rows import reversal_of, rows_of
 from tvsbayes.single_axis.next_stops import NextStop, _with_stop, plan_next
-from tvsbayes.single_axis.simulated_axis import draw_axis, simulate_axis
+from tvsbayes.twin.simulated_axis import draw_axis, simulate_axis
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import optimize
 from support.certified_problems import MODELS, descended, score
 
 from tvsbayes.cameras.bundle_adjustment import STATIONARY_SD
-from tvsbayes.statistics.least_squares import least_squares_covariance, newton_mode
+from tvsbayes.statistics.least_squares import KINK_FALL, least_squares_covariance, newton_mode
 
 PARAMETER_DIGITS, ERROR_DIGITS = 6.0, 5.0
 """Digits wanted of every parameter and of every standard error."""
@@ -93,3 +94,25 @@ def test_a_mode_on_a_kink_is_reached():
     assert found.problems == ()
     # A kink is found to the step of differences.
     np.testing.assert_allclose(found.z, 0.0, atol=0.05)
+
+
+@pytest.mark.parametrize("seed", [29, 31, 32, 34])
+def test_steps_to_and_fro_about_two_kinks_end(seed):
+    """A density of some thousand is rounded so that steps across a kink seem to lead down for ever."""
+    generator = np.random.default_rng(seed)
+    along, at = 0.5 * generator.standard_normal((2, 8)), 0.05 * generator.normal(size=2)
+    jump = 10 ** generator.uniform(-2, 0.3)
+
+    def objective(points):
+        return 2400 + 0.5 * np.sum(points**2, axis=1) + jump * np.abs(points @ along.T - at).sum(axis=1)
+
+    found = newton_mode(objective, 0.5 * generator.normal(size=8), np.ones(8, dtype=bool), np.eye(8))
+    assert found.problems == ()
+    # Its dual: the pull of each kink is at most its jump.
+    pull = optimize.minimize(
+        lambda u: 0.5 * np.sum((u @ along) ** 2) + u @ at, np.zeros(2), bounds=[(-jump, jump)] * 2, tol=1e-12
+    ).x
+    # Falls below `KINK_FALL` are left.
+    np.testing.assert_allclose(found.z, -pull @ along, atol=2 * np.sqrt(2 * KINK_FALL))
+    sd = np.sqrt(np.diag(found.covariance))
+    assert np.all((sd > 0.5) & (sd < 1.1)), "second differences straddle a kink"

@@ -11,7 +11,7 @@ from support.invented_studies import invented
 from support.waits import check_forward
 
 from tvsbayes.errors import NotConverged
-from tvsbayes.model.headlines import QUANTITIES
+from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.report.command_text import study_text
 from tvsbayes.studies.rows import HeadlineRow, StudyRow, StudyRows
 from tvsbayes.studies.study import study, study_result
@@ -78,7 +78,7 @@ def test_what_the_priors_hold_fixed_is_not_counted(job):
     fixed = dict.fromkeys(("contrast.pan", "contrast.tilt"), HeadlineRow(0.0, 0.0, 0.0, (0.0, 0.0), 0.0, 0.0))
     rows = [replace(row, headlines={**row.headlines, **fixed}) for row in (invented(job, i) for i in range(40))]
     result = study_result(job, rows)
-    assert set(QUANTITIES) - set(result.headlines) == {"contrast.pan", "contrast.tilt"}
+    assert set(TARGETS) - set(result.headlines) == {"contrast.pan", "contrast.tilt"}
     json.dumps(result.as_json(), allow_nan=False)
     assert "contrast" not in study_text(result)
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
+from support.drawn_quantities import drawn_quantities
 
 from tvsbayes.instrument.parameters import INDEX, NAMES
 
@@ -27,11 +29,9 @@ def test_estimates_of_a_posterior_go_by_its_weights():
     physical[0, :, INDEX["backlash_deg.pan"]] = [0.1, 0.3, 0.5]
     ratio = np.zeros((1, 3, 4))
     ratio[0, :, 0], ratio[0, :, 1] = [0.06, 0.07, 0.08], [0.05, 0.05, 0.09]
-    draws = SimpleNamespace(
-        physical=physical, effective_deg_per_step=ratio, effective_mirror_offset_mm=np.zeros((1, 3))
-    )
+    draws = drawn_quantities(1, 3, physical=physical, effective_deg_per_step=ratio)
     z = np.array([[[0.0, 1.0], [2.0, 1.0], [2.0, 5.0]]])
-    joined = SimpleNamespace(**{name: values[0] for name, values in vars(draws).items()})
+    joined = jax.tree.map(lambda x: x[0], draws)
     posterior = Posterior(None, z, np.zeros((1, 3)), draws, weights, None, 0, 0.0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Posterior, "joined", joined)

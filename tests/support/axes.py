@@ -8,7 +8,7 @@ import numpy as np
 
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_parameters import AxisPrior
-from tvsbayes.single_axis.simulated_axis import SimulatedAxis, simulate_axis
+from tvsbayes.twin.simulated_axis import SimulatedAxis, simulate_axis
 
 PLACES = (-2000.0, -1200.0, -500.0, 0.0, 700.0, 1300.0, 2000.0)
 OFF = AxisPrior(0.0, 0.0)

@@ -13,7 +13,7 @@ from tvsbayes.results.compensation_record import Compensation
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
-from tvsbayes.single_axis.simulated_axis import AxisTruth, draw_axis, stops_of
+from tvsbayes.twin.simulated_axis import AxisTruth, draw_axis, stops_of
 
 U, PLAY = 0.002, 0.3
 STATED = {"home_sd": AxisPrior(0.004, 0.3)}

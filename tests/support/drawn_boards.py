@@ -47,8 +47,12 @@ def true_corners(pose: np.ndarray, board: Board = BOARD) -> np.ndarray:
 def pictures(pose: np.ndarray, board: Board = BOARD) -> list[np.ndarray]:
     """Left and right picture of a board on a grey wall; no distortion."""
     margin = SQUARE_PX
-    squares = np.add.outer(np.arange(board.rows + 1), np.arange(board.columns + 1)) % 2
-    drawn = np.kron(40 + 180 * squares, np.ones((SQUARE_PX, SQUARE_PX))).astype(np.uint8)
+    if board.markers is None:
+        squares = np.add.outer(np.arange(board.rows + 1), np.arange(board.columns + 1)) % 2
+        drawn = np.kron(40 + 180 * squares, np.ones((SQUARE_PX, SQUARE_PX))).astype(np.uint8)
+    else:
+        size = SQUARE_PX * np.array(board.markers.squares)
+        drawn = (40 + 180 * (board.markers.board().generateImage(size.tolist()) > 127)).astype(np.uint8)
     drawn = cv2.copyMakeBorder(drawn, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=230)
     # Pixel centres are integers: the first inner corner lies half a pixel before the second square's first pixel.
     first = margin + SQUARE_PX - 0.5

@@ -30,13 +30,13 @@ def sweep(sheets: tuple[str, ...] = ("d1", "d3")) -> tuple[PlanStep, ...]:
 
 def invented(job: StudyJob, index: int) -> StudyRow:
     """A row as `study_row` makes it, of a perfect estimator: errors and sds are known."""
-    from tvsbayes.model.headlines import QUANTITIES
+    from tvsbayes.instrument.parameters import TARGETS
 
     error = float(np.random.default_rng([3, index]).standard_normal())
     pit = 0.5 * math.erfc(error / math.sqrt(2))
     one = HeadlineRow(0.06, 0.06 + 1e-4 * error, 1e-4, (0.0, 1.0), pit, 1e-4)
     target = 5e-4 if index % 4 else 2e-3
-    headlines = dict.fromkeys(QUANTITIES, one)
+    headlines = dict.fromkeys(TARGETS, one)
     return StudyRow(job.key, index, job.campaign_seed(index), True, 0, (), 1.0, headlines, target, job.estimator)
 
 

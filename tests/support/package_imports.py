@@ -9,7 +9,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tvsbayes"
 ORDER = (
-    *("errors", "progress", "display", "files", "statistics", "instrument"),
+    *("errors", "progress", "display", "files", "statistics", "instrument", "head"),
     *("calibration", "results", "inference", "metrology", "single_axis", "twin", "model"),
     *("estimators", "posterior", "assessment", "coordinates", "compensation", "comparison", "planning", "studies"),
     *("positioner", "cameras", "acquisition"),

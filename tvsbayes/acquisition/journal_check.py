@@ -145,11 +145,23 @@ class Repair:
     torn_bytes: int = 0
 
 
+IN_MOTION, ENDS_OF_MOTION = {"created", "gap", "intent", "verified"}, {"homed", "moved", "verified"}
+"""Events after which, and before which, a single lost line may be part of a motion: one has two lines at least."""
+
+
+def _in_written_order(events: list[tuple[int, Line]]) -> list[tuple[int, Line]]:
+    """Whole lines by their numbers, which their checksums hold; as they stand where two have one number."""
+    numbers = {line.number for _, line in events}
+    return sorted(events, key=lambda each: each[1].number) if len(numbers) == len(events) else events
+
+
 def repair(folder: Path, to: Path) -> Repair:
     """Copies what is whole into a new folder; the old one stays as it is.
 
-    Where lines are missing a `gap` event stands: what followed it without a new homing cannot be trusted, because
-    nobody knows which motion is missing. Frames that are not what their event says are left out and named.
+    Whole lines that stand in another order than they were written in are put back into it. Where lines are missing a
+    `gap` event stands: what followed it without a new homing cannot be trusted, because nobody knows which motion is
+    missing; one that says that it lost no motion leaves the rest its worth. Frames that
+    are not what their event says are left out and named.
 
     Raises:
         InputError: nothing whole, or `to` holds something.
@@ -158,7 +170,7 @@ def repair(folder: Path, to: Path) -> Repair:
     data = read_log(folder)
     lines = [parse_line(line) for line in data.split(b"\n")[:-1]]
     done = Repair(torn_bytes=len(data) - data.rfind(b"\n") - 1)
-    events = [(place, line) for place, line in enumerate(lines, start=1) if isinstance(line, Line)]
+    events = _in_written_order([(place, line) for place, line in enumerate(lines, start=1) if isinstance(line, Line)])
     done.lost_lines = [place for place, line in enumerate(lines, start=1) if isinstance(line, str)]
     if not events:
         allowed, remedy = "at least one whole line", "take the campaign again"
@@ -167,13 +179,14 @@ def repair(folder: Path, to: Path) -> Repair:
     first = events[0][1].data if events[0][1].event == "created" else {}
     created = {key: value for key, value in first.items() if key != "format"}
     journal = Journal.create(to, **{**created, "repaired": True})
-    expected, ended = 1 if first else 0, False
+    expected, ended, last = 1 if first else 0, False, "created"
     named: set[str] = set()
     try:
         for place, line in events[1:] if first else events:
             if line.number != expected:
-                journal.append("gap", before_line=place)
-            expected = line.number + 1
+                lost = line.number - expected != 1 or last in IN_MOTION or line.event in ENDS_OF_MOTION
+                journal.append("gap", before_line=place, **({} if lost else {"motion_lost": False}))
+            expected, last = line.number + 1, line.event
             kept = []
             for frame in frames_of(Record(line.number, line.event, line.data, place)):
                 twice = frame.name in named

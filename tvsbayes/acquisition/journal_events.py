@@ -222,6 +222,10 @@ class Stop(Event, frozen=True):
 
 
 class Gap(Event, frozen=True):
-    """Lines were lost before a line of the journal that was repaired."""
+    """Lines were lost before a line of the journal that was repaired.
+
+    `motion_lost` is false where what is missing can be no motion: what follows counts.
+    """
 
     before_line: int
+    motion_lost: bool = True

@@ -1,8 +1,8 @@
 """What a journal says happened: the campaign that its events hold, at any time.
 
 A segment begins with a homing and ends with the next one, which tells whether steps were lost in between: then no spot
-of the segment counts. After a gap that a repair left, nothing counts until the next homing, because nobody knows which
-motion is missing. Counters in motor steps, px and seconds as in moves.csv and spots.csv.
+of the segment counts. After a gap that a repair left, nothing counts until the next homing where a motion may be
+missing, because nobody knows which. Counters in motor steps, px and seconds as in moves.csv and spots.csv.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Recorder:
                 raise refused(record, "it stands before the first homing")
         match event:
             case Gap():
-                self._trusted = False
+                self._trusted &= not event.motion_lost
             case Start():
                 self.state = replace(self.state, starts=self.state.starts + 1, ended=None)
             case Stop():

@@ -27,6 +27,7 @@ from tvsbayes.positioner.firmware_model import DeviceModel
 from tvsbayes.positioner.mechanics import Mechanics
 from tvsbayes.positioner.protocol import SETTINGS, device_settings
 from tvsbayes.twin.gear_errors import PERFECT, SECONDS_PER_HOUR, draw_gear_errors, zero_shift_deg
+from tvsbayes.twin.head_physics import tilt_zero_deg
 from tvsbayes.twin.physics import Light, Sheet, harmonics_deg, light_on_sheet, project, take_up, wobble_deg
 from tvsbayes.twin.simulated_campaign import look_scatter_deg, placed_sheet
 from tvsbayes.twin.true_rig import Truth, draw_truth
@@ -265,7 +266,7 @@ class Instrument:
             self._y[i] + self._wobble_deg(i, self._y[i], wheel=True) + self._repeated_deg(i) + self._eta[i]
             for i in (0, 1)
         )
-        return psi, beta + self.truth.parameters["tilt_zero_deg"]
+        return psi, beta + tilt_zero_deg(self.truth.parameters)
 
     def light(self) -> Light:
         """What the laser does at this moment; changes nothing, so that a camera's thread may ask at any time.

@@ -16,8 +16,8 @@ from tvsbayes.assessment.weaknesses import moved_directions, whole_gradients
 from tvsbayes.calibration.pointing import INPUT_NAMES
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
-from tvsbayes.instrument.axes import DIRECTIONS, SENSES, Axis
-from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES, PRIOR_GROUPS, RIG_NAMES, unit_of
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
+from tvsbayes.instrument.parameters import HEADLINES, INDEX, KINDS, NAMES, QUANTITIES, unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
 from tvsbayes.model.parameter_space import HALF_NORMAL_MEAN, HALF_NORMAL_SD, physical_at
 from tvsbayes.results.estimates import Estimate, HeadlineCauses
@@ -51,6 +51,13 @@ class _Told:
     groups: dict[str, list[int]]
 
 
+def _noise_of(fit: JointFit, readings: bool) -> str:
+    """What limits single looks, in words."""
+    if fit.space.mechanism.sightings:
+        return "noise of sightings"
+    return "pixel and aperture noise" if readings else "pixel noise"
+
+
 def _told(fit: JointFit) -> _Told:
     readings = np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
     linear = linear_spots(
@@ -63,9 +70,10 @@ def _told(fit: JointFit) -> _Told:
     scattered *= np.sqrt(fit.linearised.scatter_variance)[:, :, None]
     by_looks = np.einsum("nap,naq->pq", scattered, scattered)
     own = len(NAMES) + np.arange(places)
-    groups = {**PRIOR_GROUPS, TRANSMISSION_ERROR: own.tolist(), PLAY_VARIATION: (own + places).tolist()}
+    groups = dict(fit.space.mechanism.prior_groups)
+    groups |= {TRANSMISSION_ERROR: own.tolist(), PLAY_VARIATION: (own + places).tolist()}
     return _Told(
-        "pixel and aperture noise" if readings else "pixel noise",
+        _noise_of(fit, bool(readings)),
         noise - by_looks,
         by_looks,
         found.fisher - noise,
@@ -155,14 +163,10 @@ def headline_causes(fit: JointFit) -> HeadlineCauses:
 
 
 def _headline_draws(fit: JointFit) -> dict[str, np.ndarray]:
-    """Draws of the effective ratios of directions that moved and the backlashes of their axes, by contract name."""
+    """Draws of judged headlines, as far as their directions moved, by contract name."""
     moved = moved_directions(fit)
-    ratios, physical = np.asarray(fit.draws.effective_deg_per_step), np.asarray(fit.draws.physical)
-    columns = {f"effective_deg_per_step.{d}": ratios[:, k] for k, d in enumerate(DIRECTIONS) if d in moved}
-    for axis, pair in SENSES.items():
-        if moved & set(pair):
-            columns[f"backlash_deg.{axis}"] = physical[:, INDEX[f"backlash_deg.{axis}"]]
-    return columns
+    names = [of.name for of in HEADLINES if of.judged and of.applies(moved) and moved & set(of.sides or DIRECTIONS)]
+    return {name: fit.draws[name] for name in names}
 
 
 def _noise_causes(fit: JointFit, told: _Told, quantities: tuple[str, ...], spread: np.ndarray) -> list[_Cause]:
@@ -178,18 +182,17 @@ def _noise_causes(fit: JointFit, told: _Told, quantities: tuple[str, ...], sprea
         spreads = [float(np.var(x)) for x in logs if np.ptp(x) > 1e-9]
         return min((0.5 / s for s in spreads), default=np.inf)
 
-    def axis_of(quantity: str) -> Axis:
-        """The axis that a quantity belongs to."""
-        of = quantity.split(".")[1]
-        return next(axis for axis, pair in SENSES.items() if of == axis or of in pair)
+    def sides(quantity: str) -> tuple[str, ...]:
+        return QUANTITIES[quantity].sides or DIRECTIONS
 
     def stop_freedom(quantity: str) -> float:
-        return freedom(f"stop_sd_deg.{d}" for d in SENSES[axis_of(quantity)] if d in moved)
+        return freedom(f"stop_sd_deg.{d}" for d in sides(quantity) if d in moved)
 
     def look_freedom(quantity: str) -> float:
         # A scale that may be 0 has no logarithm: by its relative sd.
-        sds = physical[:, INDEX[f"look_scatter_deg.{axis_of(quantity)}"]]
-        return 0.5 * (float(np.mean(sds)) / float(np.std(sds))) ** 2 if np.ptp(sds) > 0 else np.inf
+        drawn = [fit.draws[f"look_scatter_deg.{axis}"] for axis in AXES if set(SENSES[axis]) <= set(sides(quantity))]
+        known = [0.5 * (float(np.mean(sds)) / float(np.std(sds))) ** 2 for sds in drawn if np.ptp(sds) > 0]
+        return min(known, default=np.inf)
 
     return [
         _Cause(told.pixels, root(told.by_pixels), freedom(["pixel_scale"]) * every),
@@ -207,8 +210,8 @@ def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
     """Every stated prior of the rig that a quantity hangs on."""
     found = []
     stated = (np.asarray(x).tolist() for x in (fit.space.value, fit.space.u, fit.space.kind))
-    for name, centre, u, kind in zip(RIG_NAMES, *stated, strict=True):
-        contribution, shape = spread[:, INDEX[name]], KINDS[kind]
+    for column, (name, centre, u, kind) in enumerate(zip(fit.space.mechanism.rig_names, *stated, strict=True)):
+        contribution, shape = spread[:, column], KINDS[kind]
         if u == 0 or not np.any(contribution):
             continue
         if shape == "log-normal":

@@ -67,7 +67,8 @@ def calibration_of_draws(
             prior, off = campaign.rig.priors[name], standard()
             log = prior.distribution == "log-normal"
             column[name] = prior.value * np.exp(prior.u * off) if log else prior.value + prior.u * off
-    inputs = np.stack([column[name] for name in INPUT_NAMES], axis=1)
+    own = campaign.rig.mechanism.named(INPUT_NAMES)
+    inputs = np.stack([column[name] for name in own], axis=1)
     noise = noise_of_a_look(column)
     table = NO_GEARS if gears is None else gears.table
     if gears is not None:
@@ -92,6 +93,7 @@ def calibration_of_draws(
         noise=noise,
         gears=table,
         extrinsics=extrinsics_of(names, physical),
+        names=own,
     )
 
 

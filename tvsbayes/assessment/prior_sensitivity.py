@@ -13,8 +13,7 @@ import numpy as np
 
 from tvsbayes.assessment.weaknesses import headline_gradients
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.instrument.axes import AXES, DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX, KINDS, NAMES
+from tvsbayes.instrument.parameters import HEADLINES, KINDS, NAMES
 from tvsbayes.model.parameter_space import half_normal
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.estimates import PriorSensitivity
@@ -103,11 +102,9 @@ class SampledHeadlines:
 
 
 def sampled_headlines(fit: JointFit, moved: set[str], posterior: Posterior) -> tuple[list[str], SampledHeadlines]:
-    """Effective ratios and backlashes of a posterior's draws, with their names."""
+    """Judged headlines of a posterior's draws, with their labels."""
     draws, rows = posterior.joined, np.flatnonzero(fit.free)
-    ratios, physical = np.asarray(draws.effective_deg_per_step), np.asarray(draws.physical)
-    columns = {f"effective {d}": ratios[:, k] for k, d in enumerate(DIRECTIONS) if d in moved}
-    columns |= {f"backlash {axis}": physical[:, INDEX[f"backlash_deg.{axis}"]] for axis in AXES}
+    columns = {of.label: draws[of.name] for of in HEADLINES if of.judged and of.applies(moved)}
     columns = {name: values for name, values in columns.items() if np.ptp(values) > 1e-12 * np.max(np.abs(values))}
     half = np.zeros(len(NAMES), dtype=bool)
     half[: len(fit.space.kind)] = np.asarray(fit.space.kind) == KINDS.index("half-normal")
@@ -141,7 +138,7 @@ def prior_sensitivity(
     else:
         quantities, sampled = sampled_headlines(fit, moved, posterior)
         normal = sampled.normal
-    names = np.array(NAMES)[rows]
+    names = np.array(fit.names)[rows]
     groups = {name: np.flatnonzero(names == name) for name in names if not name.startswith("stereo.")}
     groups["stereo calibration"] = np.flatnonzero(np.char.startswith(names, "stereo."))
     found = []

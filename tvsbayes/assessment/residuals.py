@@ -131,7 +131,8 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
     lost a little to the fit and to these: they scatter by less than `u_deg`.
     """
     spots, moves = ordered_spots(fit.campaign), fit.campaign.moves
-    depth_mm = np.asarray(fit.arrays.spots.triangulated_mm)[:, 0]
+    # A direction has no depth.
+    depth_mm = np.asarray(fit.arrays.spots.triangulated_mm)[:, 0] * (not fit.space.mechanism.sightings)
     left, found = _left_to_stops(fit), list[StopResidual]()
     for index, axis in enumerate(AXES):
         for one in _seen_rests(fit, axis, left):
@@ -178,7 +179,9 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
             if value is not None
         ]
         depths = [depth for depth, _ in looks]
-        tested = {"depth": (_placed(depths), np.array([value for _, value in looks]))}
+        tested = (
+            {"depth": (_placed(depths), np.array([value for _, value in looks]))} if any(depths) or not looks else {}
+        )
         tested |= {n: (_binned([key(r) for r in mine], units.get(n, "")), scaled) for n, key in keys.items()}
         for name, (parts, measured) in tested.items():
             groups, members = [], []

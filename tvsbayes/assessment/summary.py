@@ -5,7 +5,6 @@ Works on a finished `JointFit`, and on a `Posterior` where there is one; compute
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -21,27 +20,29 @@ from tvsbayes.assessment.weaknesses import (
     prior_conflicts,
     weak_directions,
 )
+from tvsbayes.estimators.campaign_arrays import components
 from tvsbayes.estimators.four_point import experiment_rows, four_point_ratios, ratio_slopes, select_experiments
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
     INDEX,
     LATE_NAMES,
-    NAMES,
+    QUANTITIES,
     RECEIVER_NAMES,
     RIG_NAMES,
     names_of,
 )
 from tvsbayes.instrument.stops import legs_of
-from tvsbayes.model.headlines import Derived
+from tvsbayes.model.headlines import DERIVED, Derived
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.predictive import ideal_pixels
 from tvsbayes.results.estimates import CurvePoint, Curves, Estimate, FitSummary, LostMotion, RatioAt, fit_noise
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
 from tvsbayes.statistics.weighted_draws import TAILS, systematic, weighted_mean, weighted_quantiles
 
+EFFECTIVE = "effective_deg_per_step"
 CLASSIC_DRAWS = 256
 SEEN_SHARE = 0.5
 """Of the draws that must show an experiment, for it to count: one draw that went astray drops none."""
@@ -67,30 +68,6 @@ def _estimate(value: float, draws: np.ndarray, weights: np.ndarray, prior_draws:
     contraction = float(1 - (sd / prior_sd) ** 2) if prior_sd > 0 else None
     low, high = weighted_quantiles(draws, weights, TAILS)
     return Estimate(float(value), sd, (float(low), float(high)), prior_sd, contraction)
-
-
-type _Quantity = Callable[[Derived], np.ndarray]
-"""What is read off headlines and parameters, with or without a leading axis of draws."""
-
-
-def _ratio(index: int) -> _Quantity:
-    """Effective ratio of one of `DIRECTIONS`, deg/step."""
-    return lambda derived: np.asarray(derived.effective_deg_per_step)[..., index]
-
-
-def _local(index: int) -> _Quantity:
-    """Local ratio of one of `DIRECTIONS`, deg/step."""
-    return lambda derived: np.asarray(derived.local_deg_per_step)[..., index]
-
-
-def _parameter(name: str) -> _Quantity:
-    """A parameter, in the unit of its name."""
-    return lambda derived: np.asarray(derived.physical)[..., INDEX[name]]
-
-
-def _sum(first: _Quantity, factor: float, second: _Quantity) -> _Quantity:
-    """One and a multiple of another."""
-    return lambda derived: first(derived) + factor * second(derived)
 
 
 class LaplaceDraws(NamedTuple):
@@ -131,9 +108,9 @@ class _Source:
         else:
             self.centre, self.draws, self.weights = posterior.centre, posterior.joined, posterior.weights.ravel()
 
-    def estimate(self, name: str, of: _Quantity) -> Estimate:
-        """A quantity that is linear in the fields of `Derived`, with the sampler's diagnosis of `name`."""
-        plain = _estimate(float(of(self.centre)), of(self.draws), self.weights, of(self.prior))
+    def estimate(self, name: str) -> Estimate:
+        """A quantity that is linear in the fields of `Derived`, with the sampler's diagnosis of it."""
+        plain = _estimate(float(self.centre[name]), self.draws[name], self.weights, self.prior[name])
         if self.posterior is None:
             return plain
         found = self.posterior.convergence
@@ -143,12 +120,13 @@ class _Source:
 
 
 def _absent(fit: JointFit) -> set[str]:
-    """What the model does not have of errors of the gears, scatter of looks and shifts of the zeros."""
-    value = dict(zip(NAMES, np.asarray(fit.mode.physical).tolist(), strict=True))
+    """What the model does not have of errors of the gears, scatter of looks and shifts of the zeros, or means not."""
+    value = dict(zip(fit.names, np.asarray(fit.mode.physical).tolist(), strict=True))
     none = {name for name in ABSENT_AT_NOUGHT if not fit.free[INDEX[name]] and value[name] == 0}
     for axis in AXES:
         if {f"transmission_error_deg.{axis}", f"play_variation_deg.{axis}"} <= none:
             none.add(f"transmission_error_length_deg.{axis}")
+    none |= set(fit.space.mechanism.held)
     return none | ({"creep_minutes"} if set(names_of("creep_deg")) <= none else set())
 
 
@@ -161,12 +139,12 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
     low, high = fit.ends95
     has_readings = bool(np.any(np.asarray(fit.arrays.spots.has_aperture) > 0))
     estimates = {}
-    for index, name in enumerate(NAMES):
+    for index, name in enumerate(fit.names):
         if name in RECEIVER_NAMES and not has_readings:
             continue
         if name in _absent(fit):
             continue
-        estimate = source.estimate(name, _parameter(name))
+        estimate = source.estimate(name)
         if source.posterior is not None or len(fit.mixture) > 1:
             estimates[name] = estimate
             continue
@@ -179,17 +157,10 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
     return estimates
 
 
-def _derived(source: _Source) -> dict[str, Estimate]:
-    """Per-direction gear ratios and the effective mirror offset."""
-    estimates = {}
-    for axis, pair in SENSES.items():
-        ratio, contrast = _parameter(f"degrees_per_step.{axis}"), _parameter(f"ratio_contrast_deg_per_step.{axis}")
-        for direction, half in zip(pair, (0.5, -0.5), strict=True):
-            name = f"degrees_per_step.{direction}"
-            estimates[name] = source.estimate(name, _sum(ratio, half, contrast))
-    name = "effective_mirror_offset_mm"
-    estimates[name] = source.estimate(name, lambda derived: np.asarray(derived.effective_mirror_offset_mm))
-    return estimates
+def _by_part(source: _Source, block: str, moved: set[str]) -> dict[str, Estimate | None]:
+    """Quantities of a block by the last part of their names; None of directions that never moved."""
+    found = (QUANTITIES[name] for name in QUANTITIES.blocks[block])
+    return {of.parts[-1]: source.estimate(of.name) if of.applies(moved) else None for of in found}
 
 
 def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
@@ -272,19 +243,12 @@ def seen_range(fit: JointFit) -> dict[str, tuple[int, int]]:
     return {axis: (min(seen), max(seen)) for axis, seen in steps.items()}
 
 
-def _effective(source: _Source, moved: set[str]) -> dict[str, Estimate | None]:
-    """Effective ratios of the directions that moved."""
-    return {
-        d: source.estimate(f"effective_deg_per_step.{d}", _ratio(k)) if d in moved else None
-        for k, d in enumerate(DIRECTIONS)
-    }
-
-
 def worth_sampling(fit: JointFit) -> bool:
     """Whether a fit has converged and its data informed any effective ratio."""
     if not fit.converged:
         return False
-    return any(e is not None and e.informed for e in _effective(_Source(fit, None), moved_directions(fit)).values())
+    effective = _by_part(_Source(fit, None), EFFECTIVE, moved_directions(fit))
+    return any(e is not None and e.informed for e in effective.values())
 
 
 def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
@@ -301,14 +265,8 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     moved = moved_directions(fit)
     usable = posterior if posterior is not None and posterior.converged else None
     source = _Source(fit, usable)
-    effective = _effective(source, moved)
-    contrasts: dict[str, Estimate | None] = dict.fromkeys(AXES)
-    for k, (axis, pair) in enumerate(SENSES.items()):
-        if set(pair) <= moved:
-            difference = _sum(_ratio(2 * k), -1.0, _ratio(2 * k + 1))
-            contrasts[axis] = source.estimate(f"effective_contrast_deg_per_step.{axis}", difference)
     readings = np.sum(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
-    observations = 3 * float(np.asarray(fit.arrays.spots.valid).sum()) + float(readings)
+    observations = components(fit.campaign.rig) * float(np.asarray(fit.arrays.spots.valid).sum()) + float(readings)
     determined = float(np.trace(fit.information.fisher @ fit.covariance))
     pan, tilt = np.degrees(fit.reference_pose_rad).tolist()
     (a, b), (c, d) = np.asarray(source.centre.jacobian).tolist()
@@ -316,14 +274,16 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     if posterior is not None:
         lacks = {"accepted": "", "rough": "ROUGH", "laplace": "LAPLACE"}[posterior.convergence.answer]
         problems += tuple(f"{lacks}: {sentence}" for sentence in posterior.convergence.missing)
-    parameters = {**_parameters(source), **_derived(source)}
+    # What `fit.json` holds by direction has places of its own.
+    others = [name for name in DERIVED if not QUANTITIES[name].ratio]
+    parameters = {**_parameters(source), **{name: source.estimate(name) for name in others}}
     return FitSummary(
         converged=fit.converged and (posterior is None or posterior.converged),
         answer="laplace" if posterior is None else posterior.convergence.answer,
         monte_carlo_error={} if posterior is None else posterior.convergence.monte_carlo_error,
         problems=problems,
-        effective=effective,
-        contrasts=contrasts,
+        effective=_by_part(source, EFFECTIVE, moved),
+        contrasts=_by_part(source, "effective_contrast_deg_per_step", moved),
         reference_pose_deg={"pan": pan, "tilt": tilt},
         jacobian=((a, b), (c, d)),
         parameters=parameters,
@@ -341,10 +301,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         curves=None if usable is None else _curves(usable, moved),
         validation=validate(fit),
         few_stops=poorly_known_stops(fit),
-        local={
-            d: source.estimate(f"local_deg_per_step.{d}", _local(k)) if d in moved else None
-            for k, d in enumerate(DIRECTIONS)
-        },
+        local=_by_part(source, "local_deg_per_step", moved),
         range_steps=seen_range(fit),
         homing_side=fit.homing_side,
     )

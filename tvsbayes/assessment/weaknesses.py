@@ -13,7 +13,7 @@ from tvsbayes.estimators.joint_fit import JointFit, with_places
 from tvsbayes.estimators.linear_spots import standard_deviations_without
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES, Axis
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import INDEX, NAMES, NOISE_NAMES, STEREO_PARAMETER_NAMES, names_of
+from tvsbayes.instrument.parameters import HEADLINES, INDEX, NAMES, NOISE_NAMES, STEREO_PARAMETER_NAMES, names_of
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, SPACING_DEG, too_few_counters
 from tvsbayes.instrument.stops import few_stops, inseparable, legs_of, observed_stops, one_sided, rests_of, separation
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
@@ -147,7 +147,7 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
         rest = _counters_direction(fit, axis), _scatter_direction(fit, axis)
         found += [one for one in (weak, *rest, *_shift_directions(fit, axis)) if one is not None]
     noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES, *names_of("creep_minutes")}
-    rows = np.array([i for i, name in enumerate(NAMES) if fit.free[i] and name not in noise])
+    rows = np.array([i for i, name in enumerate(fit.names) if fit.free[i] and name not in noise])
     if rows.size == 0:
         return tuple(found)
     eigenvalues, vectors = np.linalg.eigh(fit.covariance[np.ix_(rows, rows)])
@@ -155,9 +155,9 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
         if value < WEAK_VARIANCE or len(found) >= LISTED:
             break
         order = np.argsort(-np.abs(vector))
-        loadings = {NAMES[rows[i]]: float(vector[i]) for i in order if abs(vector[i]) > LOADING_LIMIT}
+        loadings = {fit.names[rows[i]]: float(vector[i]) for i in order if abs(vector[i]) > LOADING_LIMIT}
         if not loadings:
-            loadings = {NAMES[rows[order[0]]]: float(vector[order[0]])}
+            loadings = {fit.names[rows[order[0]]]: float(vector[order[0]])}
         names = list(loadings)
         # Rounding may leave a hair more than the prior's variance: more than 100 % is not a finding.
         left = f"{min(100.0, 100 * value):.0f} % of"
@@ -172,12 +172,13 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
 
 
 def headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.ndarray]:
-    """Effective ratios and backlashes with d(quantity)/d(coordinates), shape (q, p)."""
-    ratios = np.asarray(fit.draws.effective_deg_per_step)
-    quantities = {f"effective {d}": ratios[:, k] for k, d in enumerate(DIRECTIONS) if d in moved}
-    for axis in AXES:
-        # In coordinates, where the backlash is Gaussian.
-        quantities[f"backlash {axis}"] = fit.draws_z[:, INDEX[f"backlash_deg.{axis}"]]
+    """Labels of judged headlines, and d(quantity)/d(coordinates), shape (q, p)."""
+    # Parameters in coordinates, where a backlash is Gaussian.
+    quantities = {
+        of.label: fit.draws_z[:, INDEX[of.name]] if of.name in INDEX else fit.draws[of.name]
+        for of in HEADLINES
+        if of.judged and of.applies(moved)
+    }
     # What the priors hold fixed scatters by roundings, which nothing may be measured by.
     quantities = {name: v for name, v in quantities.items() if np.ptp(v) > 1e-12 * np.max(np.abs(v))}
     return list(quantities), gradients(fit, np.stack(list(quantities.values()), axis=1))
@@ -231,7 +232,7 @@ def prior_conflicts(fit: JointFit) -> tuple[str, ...]:
     found = []
     for index in np.flatnonzero(fit.free & (np.abs(fit.z) > CONFLICT_LIMIT)):
         value, distance = fit.mode.physical[index], abs(fit.z[index])
-        found.append(conflict_sentence(f"{NAMES[index]} = {value:.4g}", distance))
+        found.append(conflict_sentence(f"{fit.names[index]} = {value:.4g}", distance))
     return tuple(found)
 
 

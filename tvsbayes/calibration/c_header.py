@@ -18,6 +18,7 @@ from tvsbayes.calibration.calibration_file import (
     gear_errors,
 )
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
+from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import AXES
 
@@ -30,7 +31,13 @@ def calibration_header(calibration: Calibration, origin: Origin | None = None) -
     """A C header with the estimates and the beam as a function of the counters, for a Teensy and its like.
 
     `origin` stands in its first lines, with the SHA-256 of the same calibration as JSON.
+
+    Raises:
+        InputError: the calibration is one of a head, whose line of sight the header does not know.
     """
+    if calibration.names != INPUT_NAMES:
+        remedy = "take --export json, whose estimates are the terms of the head"
+        raise InputError("usage", "the C header has the mirrors of a scanner, and this is a head", remedy=remedy)
     template = (shipped_data() / "export" / "tvs_calibration.h").read_text()
     error = expected_error(calibration)
     macro = {name: "TVS_" + name.replace(".", "_").upper() for name in INPUT_NAMES}

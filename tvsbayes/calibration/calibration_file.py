@@ -28,6 +28,7 @@ from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays, read_bytes
 from tvsbayes.files.documents import parse_json
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
+from tvsbayes.instrument.mechanisms import MECHANISMS
 
 CALIBRATION_FORMAT = "tvsbayes-calibration/2"
 FORMATS = ("tvsbayes-calibration/1", CALIBRATION_FORMAT)
@@ -101,7 +102,7 @@ def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
     np.savez(
         buffer,
         format=CALIBRATION_FORMAT,
-        input_names=np.array(INPUT_NAMES),
+        input_names=np.array(calibration.names),
         noise_names=np.array(NOISE_NAMES),
         estimator=calibration.estimator,
         azimuth=calibration.azimuth,
@@ -111,6 +112,8 @@ def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
+KNOWN_INPUTS = {each.named(INPUT_NAMES) for each in MECHANISMS.values()}
+"""Names of inputs that a stored calibration may have."""
 DIGITS = 15
 """Significant digits that a double keeps of any decimal number: one more would print what is only rounding."""
 
@@ -173,7 +176,7 @@ def _document(calibration: Calibration) -> CalibrationDocument:
         "harmonic_period_deg": dict(calibration.period_deg),
         "estimates": calibration.estimates,
         "covariance": {
-            "names": [*INPUT_NAMES, *calibration.gears.names],
+            "names": [*calibration.names, *calibration.gears.names],
             "matrix": calibration.covariance.tolist(),
         },
         "noise_variance_deg2": dict(calibration.noise_variance),
@@ -309,8 +312,9 @@ def read_draws(path: Path) -> Calibration:
                 file=escaped(path.name),
                 remedy="run `tvsbayes fit` on the campaign again",
             )
-        columns = (file["input_names"].tolist(), file["noise_names"].tolist())
-        if str(file["format"]) not in FORMATS or columns != (list(INPUT_NAMES), list(NOISE_NAMES)):
+        names = tuple(file["input_names"].tolist())
+        columns = names in KNOWN_INPUTS and file["noise_names"].tolist() == list(NOISE_NAMES)
+        if str(file["format"]) not in FORMATS or not columns:
             raise ValueError(f"format {str(file['format'])[:60]!r} or other columns")
         tables = _tables(str(file["tables"]), path)
         return _shaped(
@@ -331,6 +335,7 @@ def read_draws(path: Path) -> Calibration:
                 gears=NO_GEARS if str(file["format"]) == FORMATS[0] else table_of(tables["gear_steps"]),
                 # They stand among the draws behind `fit.json`, row by row with the inputs.
                 extrinsics=extrinsics_of(file["names"].tolist(), file["physical"]) if "names" in file else NO_POSE,
+                names=names,
             )
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -354,9 +359,11 @@ def _from_json(path: Path) -> Calibration:
         d = cast(CalibrationDocument, keys.values)
         errors = {} if known == FORMATS[0] else d["gear_errors"]
         gears = table_of({axis: errors[axis]["steps"] for axis in AXES}) if errors else NO_GEARS
-        if tuple(d["covariance"]["names"]) != (*INPUT_NAMES, *gears.names):
+        named = tuple(d["covariance"]["names"])
+        names = named[: len(INPUT_NAMES)]
+        if names not in KNOWN_INPUTS or named[len(names) :] != gears.names:
             raise ValueError("the covariance names other inputs")
-        mean = [d["estimates"][name] for name in INPUT_NAMES]
+        mean = [d["estimates"][name] for name in names]
         for name in gears.inputs:
             kind, axis = name.split(".")
             # Beyond the table no error is expected.
@@ -375,6 +382,7 @@ def _from_json(path: Path) -> Calibration:
                 inputs=np.zeros((0, len(mean))),
                 cause_covariance=np.zeros((0, len(mean), len(mean))),
                 gears=gears,
+                names=names,
             )
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:

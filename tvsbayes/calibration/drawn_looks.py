@@ -30,7 +30,7 @@ class Drawn:
 
     def values_at(self, calibration: Calibration, steps: Counters) -> dict[str, Number]:
         """Parameters by name of `look_inputs` and `NOISE_NAMES` at counters (n,), arrays (draws, 1) or (draws, n)."""
-        names = (*INPUT_NAMES, *NOISE_NAMES)
+        names = (*calibration.names, *NOISE_NAMES)
         return {**dict(zip(names, self.inputs.T[..., None], strict=True)), **calibration.gears.at(self.gears, steps)}
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tvsbayes.head.chain import HeadOptics
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
 from tvsbayes.instrument.mirrors import Optics, Turn, laser_way
 from tvsbayes.instrument.parameters import BLOCKS, HARMONIC_ORDERS
@@ -80,7 +81,12 @@ def output_deg(
         output = output + _harmonic(values, axis, output, period_deg, m)
     if (error := values.get(f"{ERROR_AT}.{axis}")) is not None:
         output = output + error - 0.5 * side * values[f"{PLAY_AT}.{axis}"]
-    return output if axis == "pan" else output + values["tilt_zero_deg"]
+    return output if axis == "pan" else output + values["elevation_zero_deg" if _is_head(values) else "tilt_zero_deg"]
+
+
+def _is_head(values: Values) -> bool:
+    """Whether these are the parameters of a pan-tilt head."""
+    return "azimuth_zero_deg" in values
 
 
 def ahead(x_mm: Number) -> bool | np.ndarray:
@@ -105,8 +111,10 @@ class Components(NamedTuple):
         return np.where(ahead(points[0]), points, complex(np.nan, np.nan) if np.iscomplexobj(points) else np.nan)
 
 
-def _optics(values: Values) -> Optics:
-    """Laser and mirrors of parameters by name."""
+def _optics(values: Values) -> Optics | HeadOptics:
+    """Laser and mirrors, or the terms of a head, of parameters by name."""
+    if _is_head(values):
+        return HeadOptics.of(lambda name: values[name] * (TO_RAD if "_deg" in name else 1.0))
 
     def block(name: str) -> Number | list[Number]:
         found = [values[entry] * TO_RAD if name.endswith("_deg") else values[entry] for entry in BLOCKS[name]]
@@ -117,10 +125,13 @@ def _optics(values: Values) -> Optics:
 
 def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: ModuleType = np) -> Components:
     """Origin and unit direction of the beam in frame T for mirror angles (formulation 3.2 and 2); see `output_deg`."""
-    psi = pan_deg * TO_RAD
-    beam = laser_way(_optics(values), psi, tilt_deg * TO_RAD, m).rays[-1]
-    # From Q to P and on to T in one turn.
-    turn = Turn.by(psi + (values["pan_zero_emission_deg"] - 90.0) * TO_RAD, m)
+    psi, beta, to_t = pan_deg * TO_RAD, tilt_deg * TO_RAD, (values["pan_zero_emission_deg"] - 90.0) * TO_RAD
+    optics = _optics(values)
+    if isinstance(optics, Optics):
+        # From Q to P and on to T in one turn.
+        beam, turn = laser_way(optics, psi, beta, m).rays[-1], Turn.by(psi + to_t, m)
+    else:
+        beam, turn = optics.leaving(psi, beta, m), Turn.by(to_t, m)
     x, y, z = turn.forward(beam.origin_mm)
     return Components((x, y + 0.5 * values["baseline_mm"], z), turn.forward(beam.direction))
 

@@ -98,6 +98,7 @@ class Calibration(Shown):
         cause_covariance: what each contributes to `covariance`, shape (causes, inputs, inputs).
         gears: counters at which errors of the gears are told; none where gears do not vary.
         extrinsics: draws (n, 6) of `EXTRINSICS_NAMES`, row by row with `inputs`; none where only the moments were kept.
+        names: of the inputs: `INPUT_NAMES`, or what a head has in their places.
     """
 
     mean: np.ndarray
@@ -115,6 +116,7 @@ class Calibration(Shown):
     cause_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, len(INPUT_NAMES), len(INPUT_NAMES))))
     gears: GearTable = NO_GEARS
     extrinsics: np.ndarray = field(default_factory=NO_POSE.copy)
+    names: tuple[str, ...] = INPUT_NAMES
 
     def shown(self) -> View:
         """Estimates with their standard uncertainties, and the counters that looks reached."""
@@ -127,12 +129,12 @@ class Calibration(Shown):
     @cached_property
     def estimates(self) -> dict[str, float]:
         """Best estimates by name, without the errors of the gears."""
-        return dict(zip(INPUT_NAMES, self.mean[: len(INPUT_NAMES)].tolist(), strict=True))
+        return dict(zip(self.names, self.mean[: len(INPUT_NAMES)].tolist(), strict=True))
 
     @property
     def look_inputs(self) -> tuple[str, ...]:
         """What the point of one look depends on besides its noises: `INPUT_NAMES`, then the gears' errors there."""
-        return (*INPUT_NAMES, *self.gears.inputs)
+        return (*self.names, *self.gears.inputs)
 
     def estimates_at(self, steps: Counters) -> dict[str, Any]:
         """Best estimates by name of `look_inputs`, floats, or for arrays of counters arrays of their shape."""

@@ -1,4 +1,4 @@
-"""Checkerboards in pictures: where the inner corners are, in an order both cameras share.
+"""Checkerboards in pictures, plain or with markers: where the inner corners are, in an order both cameras share.
 
 Corners are px with the integer at a pixel's centre, shape (corners, 2), row by row. The board's frame: origin in the
 middle, x along the columns, y along the rows, z away from the viewer, mm. Pictures pass the checks of `files` before
@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from tvsbayes.cameras.camera_marks import paired_pictures, unnamed_pictures
+from tvsbayes.cameras.marker_boards import MARKERS_MIN, Markers, as_seen, marker_board_corners, most_markers
 from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
 from tvsbayes.cameras.seen_boards import why_no_board
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
@@ -50,6 +51,9 @@ TRIED_MAX, TRIED_AT_ONCE = 12, 4
 """Pictures in which a board is looked for before all are searched; as soon as one shows it, all are."""
 
 
+_BOARD_SIZE = re.compile(r"([0-9]{1,3})\s*[xX*]\s*([0-9]{1,3})")
+
+
 @dataclass(frozen=True)
 class Board:
     """A checkerboard by its inner corners.
@@ -59,17 +63,20 @@ class Board:
         rows: inner corners along y.
         pitch_mm: side of a square.
         pitch_u_mm: standard uncertainty of the mean pitch (GUM type B: certificate, ruler, printer).
+        markers: of a ChArUco board, of which a picture may show a part; None of a plain checkerboard.
     """
 
     columns: int
     rows: int
     pitch_mm: float
     pitch_u_mm: float = 0.0
+    markers: Markers | None = None
 
     def __post_init__(self) -> None:
         if not (3 <= self.columns <= 100 and 3 <= self.rows <= 100):
+            option = "--board" if self.markers is None else "--charuco"
             found = f"{self.columns} x {self.rows} inner corners"
-            raise _bad_option("--board", found, "3 to 100 inner corners each way", "count where four squares meet")
+            raise _bad_option(option, found, "3 to 100 inner corners each way", "count where four squares meet")
         if not 0.01 <= self.pitch_mm <= 1e4:
             raise _bad_option("--pitch-mm", f"{self.pitch_mm:g} mm", "0.01 to 10000 mm", "give the side of a square")
         if not 0 <= self.pitch_u_mm < 0.1 * self.pitch_mm:
@@ -83,10 +90,27 @@ class Board:
         Raises:
             InputError: no such text, or impossible values.
         """
-        match = re.fullmatch(r"([0-9]{1,3})\s*[xX*]\s*([0-9]{1,3})", size.strip())
+        match = _BOARD_SIZE.fullmatch(size.strip())
         if match is None:
             raise _bad_option("--board", escaped(size), "COLUMNSxROWS of inner corners", "write for example 9x6")
         return cls(int(match[1]), int(match[2]), pitch_mm, pitch_u_mm)
+
+    @classmethod
+    def with_markers(
+        cls, squares: str, dictionary: str, pitch_mm: float, marker_mm: float | None = None, pitch_u_mm: float = 0.0
+    ) -> Board:
+        """A ChArUco board by its squares, such as "15x10", and its dictionary, such as "5X5_100".
+
+        Raises:
+            InputError: no such text, no such dictionary, or impossible values.
+        """
+        match = _BOARD_SIZE.fullmatch(squares.strip())
+        if match is None:
+            raise _bad_option("--charuco", escaped(squares), "COLUMNSxROWS of squares", "write for example 15x10")
+        columns, rows = int(match[1]), int(match[2])
+        share = None if marker_mm is None else marker_mm / pitch_mm
+        bare = dictionary.strip().removeprefix("DICT_")
+        return cls(columns - 1, rows - 1, pitch_mm, pitch_u_mm, Markers((columns, rows), bare, share))
 
     @property
     def corners(self) -> int:
@@ -113,7 +137,10 @@ def _bad_option(option: str, found: str, allowed: str, remedy: str) -> InputErro
 
 @dataclass(frozen=True)
 class View:
-    """Corners of the board at one pose: `left` and `right` of shape (corners, 2), px, row by row; None where unseen."""
+    """Corners of the board at one pose: `left` and `right` of shape (corners, 2), px, row by row; None where unseen.
+
+    Of a board with markers single corners may be unseen: NaN.
+    """
 
     name: str
     left: np.ndarray | None
@@ -155,13 +182,16 @@ def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> 
 
     Args:
         grey: (height, width) uint8.
-        board: what to look for.
+        board: what to look for; where it has markers, they are the finder.
         finder: which to try first.
 
     Returns:
         Corners (corners, 2), px, right-handed (x, then y, turn towards the image's own x, y), and whether the
         fallback found them; None where neither did.
     """
+    if board.markers is not None:
+        seen = marker_board_corners(grey, board.markers)
+        return None if seen is None else (seen, False)
     for attempt in (finder, "sector" if finder == "classic" else "classic"):
         corners = _find_classic(grey, board) if attempt == "classic" else _find_sector(grey, board)
         if corners is None or not np.isfinite(corners).all():
@@ -215,6 +245,8 @@ def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
 def corner_orders(board: Board) -> list[np.ndarray]:
     """Orders that a finder may give to corners: as they are, half turns, of square boards quarter turns."""
     index = np.arange(board.corners).reshape(board.rows, board.columns)
+    if board.markers is not None:
+        return [index.ravel()]
     quarters = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
     return [np.rot90(index, quarter).ravel() for quarter in quarters]
 
@@ -244,6 +276,8 @@ def _agreeing(left: _Detection, right: _Detection, board: Board) -> tuple[np.nda
     The colours decide where the board's turned image differs from it (one of columns and rows odd, one even).
     Otherwise the two cameras are taken to be turned by less than half of the board's symmetry against each other.
     """
+    if board.markers is not None:
+        return right.corners, False
     grids = [right.corners[turn].reshape(board.rows, board.columns, 2) for turn in corner_orders(board)]
     kept = [k for k, colour in enumerate(right.colours) if colour == left.colours[0]] or list(range(len(grids)))
     grid = left.corners.reshape(board.rows, board.columns, 2)
@@ -305,6 +339,9 @@ def find_views(
     size = max(counted, key=lambda s: (counted[s], s))
     used = [picture for picture, own in sizes.items() if own == size]
     spread = _spread(used)
+    if board.markers is not None:
+        greys = [part for picture in spread for part in _greys(picture, folder, size).values()]
+        board = replace(board, markers=as_seen(greys, board.markers))
     if len(used) > len(spread) and not _any_board(folder, spread, size, board, finder):
         raise _without_board(folder, spread, len(used), size, board)
     boards: dict[str, dict[str, _Detection]] = {}
@@ -367,6 +404,14 @@ def _without_board(
     """That pictures do not show the board, and what they show instead."""
     greys = [part for picture in tried for part in _greys(picture, folder, size).values()]
     reason, remedy = why_no_board(greys, board.columns, board.rows)
+    if board.markers is None:
+        name, markers = most_markers(greys)
+        if markers >= MARKERS_MIN * len(greys):
+            reason += f"; {markers} markers of {name.partition('_')[0]} are seen, as on a ChArUco board"
+            remedy = f"--charuco COLUMNSxROWS --dictionary {name} in place of --board, counting squares"
+    else:
+        reason = "of no view enough markers are seen"
+        remedy = "hold the board nearer, with at least three rows and columns of corners in the picture"
     where = f"{len(tried)} of {count} pictures" if len(tried) < count else f"{count} pictures"
     return NothingToEstimate(
         "no-board",
@@ -471,5 +516,7 @@ def _detection(grey: np.ndarray, board: Board, finder: Finder) -> _Detection | N
     if result is None:
         return None
     corners, by_fallback = result
+    if board.markers is not None:
+        return _Detection(corners, (True,), by_fallback)
     colours = tuple(_first_colour(grey, corners[turn], board) for turn in corner_orders(board))
     return _Detection(corners, colours, by_fallback)

@@ -267,8 +267,9 @@ def _padded(views: Sequence[View], board: Board, start: np.ndarray, poses: np.nd
     for k, view in enumerate(views):
         for side, found in enumerate((view.left, view.right)):
             if found is not None:
-                seen[k, 2 * side : 2 * side + 2, : board.corners] = found.T
-                weight[k, 2 * side : 2 * side + 2, : board.corners] = 1.0
+                there = np.isfinite(found.T)
+                seen[k, 2 * side : 2 * side + 2, : board.corners] = np.where(there, found.T, 0.0)
+                weight[k, 2 * side : 2 * side + 2, : board.corners] = there
     unit = np.diag(free.astype(float))
     return BoardArrays(*map(placed, (points, seen, weight, start_poses, np.asarray(start, float), unit)))
 

@@ -163,6 +163,9 @@ class _Reader:
             self._check_model(side)
         matrices = [self._matrix(side) for side in (0, 1)]
         size = self._size(matrices)
+        if self._of_matlab():
+            matrices = [matrix - np.outer([1, 1, 0], [0, 0, 1]) for matrix in matrices]
+            self.notes.append("MATLAB counts pixels from 1: 1 px is taken off cx and cy of both cameras")
         left, right = (_Camera(m, self._distortion(side, m, size)) for side, m in enumerate(matrices))
         rotation, translation = self._extrinsics()
         translation = translation * self._unit(float(np.linalg.norm(translation)))
@@ -181,6 +184,12 @@ class _Reader:
                 allowed="plumb_bob, radtan, rational or equidistant",
                 remedy="calibrate the pair again with five coefficients; renaming the model makes wrong rays",
             )
+
+    def _of_matlab(self) -> bool:
+        """Whether the fields are those of MATLAB's stereoParameters."""
+        pair = self.found.pair
+        structured = any("radial" in camera for camera in self.found.cameras) or "R_transposed" in pair
+        return structured or _named(pair.get("pose"), "a")
 
     def _exchange(self) -> None:
         """Files of one camera in the other order: the left projection alone has no shift."""
@@ -236,6 +245,11 @@ class _Reader:
             values = values[:4]
         if not values.any() and kind != "fisheye":
             return np.zeros(5)
+        if kind == "five" and values.size == 4 and not self.found.model(side):
+            said = (
+                "four coefficients without the name of a model, taken as k1 k2 p1 p2; of cv2.fisheye they are others:"
+            )
+            self.notes.append(f"{entry.place}: {said} then add distortion_model: equidistant")
         if kind in ("five", "rational") and not values[5:].any():
             return np.append(values[:5], np.zeros(max(0, 5 - values.size)))
         wanted = {"fisheye": 4, "inverse": 5}.get(str(kind), values.size)

@@ -27,10 +27,11 @@ import numpy as np
 
 from tvsbayes.cameras.alternate_lines import AlternateLines
 from tvsbayes.cameras.contour import Rectified, contour_of, epipolar_refused, rectified_pair
+from tvsbayes.cameras.picture_pairs import SUFFIXES
 from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skewness, widened, with_own_noise
 from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SHAPE_SPOTS_MIN, SpotNoise, learn_noise, mean_noise
 from tvsbayes.cameras.spot_overlay import overlay_of
-from tvsbayes.cameras.spot_window import CLIPPED_SHARE_MAX, WIDE_SD_PX, Patch, patch_around
+from tvsbayes.cameras.spot_window import CLIPPED_DN, CLIPPED_SHARE_MAX, WIDE_SD_PX, Patch, patch_around
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import (
@@ -54,7 +55,7 @@ REASONS = {
     "two-spots": "a second spot holds over a quarter of the light of the first",
     "too-small": "the bright area is that of a hot pixel",
     "too-large": "the bright area is no laser spot: a lamp or an overexposed frame",
-    "lamp": "a lamp or a window reaches in from the border, and no spot is beside it: shade it",
+    "lamp": "a lamp or window reaches in from the border, and no spot is beside it: shade it, or subtract with --dark",
     "border": "the spot reaches the border of the picture",
     "clipped": "the clipped area is over half the bright area",
     "elongated": "the spot is over four times as long as wide",
@@ -68,6 +69,8 @@ PILOTS_MAX = 24
 """Looks from which the weights of the fits are learned; uncertainties are stated from all."""
 LEARNING_ROUNDS = 3
 SKEW_SPOTS_MAX = 1000
+PEDESTAL_DN = 8.0
+"""Beside a difference of pictures, so that the noise of a dark background keeps both of its sides."""
 
 
 @dataclass(frozen=True)
@@ -145,12 +148,14 @@ def _row(spot: Spot, left: Centre, right: Centre) -> Spot:
 class _Frames:
     """Reads the frames of a campaign: names are fixed by the format, links out of the folder are refused.
 
-    `white` is the largest value of its cameras where they give more than 8 bits; None before it is known.
+    `white` is the largest value of its cameras where they give more than 8 bits; None before it is known. `dark` has
+    pictures with the laser off, of the same names or one for each camera.
     """
 
     folder: Path
     size: tuple[int, int]
     white: int | None = None
+    dark: Path | None = None
 
     def path(self, spot: Spot, side: str) -> Path:
         return self.folder / frame_name(spot.spot, side)
@@ -159,8 +164,35 @@ class _Frames:
         return all(os.path.lexists(self.path(spot, side)) for side in CAMERAS)
 
     def read(self, spot: Spot, side: str) -> np.ndarray:
-        """A picture (height, width, 3): uint8, or float32 grey levels of 8 bits (DN) where it is deeper."""
-        return in_grey_levels(decode_image(self._data(spot, side), self.path(spot, side).name), self.white)
+        """A picture (height, width, 3): uint8, or float32 grey levels of 8 bits (DN) where it is deeper.
+
+        Without its dark picture where there is one, beside `PEDESTAL_DN`; what is clipped stays as bright as it was.
+        """
+        lit = in_grey_levels(decode_image(self._data(spot, side), self.path(spot, side).name), self.white)
+        if self.dark is None:
+            return lit
+        place = self._dark_picture(spot, side)
+        data = read_bytes(place, IMAGE_BYTES_MAX, self.dark)
+        self._require_size(data, place)
+        dark = in_grey_levels(decode_image(data, place.name), self.white)
+        left = np.maximum(lit.astype(np.float32) - dark + PEDESTAL_DN, 0.0)
+        return np.where(lit >= CLIPPED_DN, lit.astype(np.float32), left)
+
+    def _dark_picture(self, spot: Spot, side: str) -> Path:
+        """That of a look, else of its camera."""
+        assert self.dark is not None
+        own = frame_name(spot.spot, side)
+        names = [Path(own).name, *(f"{side}{suffix}" for suffix in SUFFIXES)]
+        for name in names:
+            if os.path.lexists(self.dark / name):
+                return self.dark / name
+        raise refusal(
+            "missing-file",
+            file=escaped(str(self.dark), 200),
+            found=f"no dark picture of the {side} camera for {own}",
+            allowed=f"{Path(own).name}, or {side}.png for all looks",
+            remedy="take one with the laser off, at the exposure of the others",
+        )
 
     def deep(self, spot: Spot) -> bool:
         """Whether a picture of this look has more than 8 bits."""
@@ -184,6 +216,11 @@ class _Frames:
         path = self.path(spot, side)
         # Its size before it is decoded: a small file can hold 50 million pixels, on every thread.
         data = read_bytes(path, IMAGE_BYTES_MAX, self.folder)
+        self._require_size(data, path)
+        return data
+
+    def _require_size(self, data: bytes, path: Path) -> None:
+        """Refuse a picture of another size than that of the calibration."""
         size = image_size(data, escaped(path.name))
         if size != self.size:
             raise refusal(
@@ -193,7 +230,6 @@ class _Frames:
                 allowed=f"{self.size[0]} x {self.size[1]} as in stereo.json",
                 remedy="calibrate and observe at one image size",
             )
-        return data
 
 
 def _parallel[Item, Result](job: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[Result]:
@@ -210,6 +246,7 @@ def detect(
     method: str = "fit",
     *,
     speckle_contrast: float | None = None,
+    dark: Path | None = None,
     workers: int | None = None,
     overlay: Path | None = None,
     progress: Show | None = None,
@@ -221,6 +258,8 @@ def detect(
         method: "fit" or "contour".
         speckle_contrast: contrast per independent pixel, taken as known; by default `fit` learns it from the
             looks of each camera and `contour` takes 0.4.
+        dark: folder of pictures with the laser off, to be subtracted: named as the frames, or one for each camera,
+            left.png and right.png.
         workers: threads; default one per core.
         overlay: folder for one picture per look: outline of the bright area and centre.
         progress: told how far it is.
@@ -229,7 +268,7 @@ def detect(
         InputError: a frame that cannot be read safely, has another size, or a campaign without folder.
         NothingToEstimate: no row has both frames.
     """
-    frames = _frames_of(campaign, method)
+    frames = replace(_frames_of(campaign, method), dark=dark)
     rows = [row for row, spot in enumerate(campaign.spots) if _ours(spot.status)]
     present = [row for row in rows if frames.there(campaign.spots[row])]
     if not present:

@@ -26,6 +26,7 @@ from tvsbayes.cameras.stereo_start import (
     pairs_disagree,
     pixels_of,
     pose_of,
+    seen_in,
     start_of,
 )
 from tvsbayes.errors import TvsError, escaped
@@ -373,7 +374,8 @@ def _coverage(corners: Sequence[np.ndarray | None], size: tuple[int, int]) -> fl
     mask = np.zeros([max(1, round(s * scale)) for s in size[::-1]], np.uint8)
     for seen in corners:
         if seen is not None:
-            outline = cv2.convexHull(np.rint(seen * scale).astype(np.int32).reshape(-1, 1, 2))
+            there = seen[np.isfinite(seen).all(axis=1)]
+            outline = cv2.convexHull(np.rint(there * scale).astype(np.int32).reshape(-1, 1, 2))
             cv2.fillConvexPoly(mask, outline, 1)
     return float(mask.mean())
 
@@ -385,14 +387,20 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
     for view in views:
         if view.left is None or view.right is None:
             continue
+        both = seen_in(view.left, view.right)
+        if not both.any():
+            continue
         rays = [
-            cv2.undistortPoints(pixels_of(seen), M, D).reshape(-1, 2).T
+            cv2.undistortPoints(pixels_of(seen[both]), M, D).reshape(-1, 2).T
             for seen, M, D in ((view.left, stereo.M1, stereo.D1), (view.right, stereo.M2, stereo.D2))
         ]
         points = np.asarray(cv2.triangulatePoints(np.eye(3, 4), right, *rays))
-        grid = (points[:3] / points[3]).T.reshape(board.rows, board.columns, 3)
-        sides += [np.linalg.norm(np.diff(grid, axis=axis), axis=2).ravel() for axis in (0, 1)]
+        grid = np.full((board.corners, 3), np.nan)
+        grid[both] = (points[:3] / points[3]).T
+        by_row = grid.reshape(board.rows, board.columns, 3)
+        sides += [np.linalg.norm(np.diff(by_row, axis=axis), axis=2).ravel() for axis in (0, 1)]
     lengths = np.concatenate(sides)
+    lengths = lengths[np.isfinite(lengths)]
     return float(lengths.mean()), float(lengths.std(ddof=1))
 
 

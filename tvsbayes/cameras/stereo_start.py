@@ -26,6 +26,8 @@ START_VIEWS = 30
 MISMATCH_TIMES, MISMATCH_SHARE = 5.0, 0.01
 """A view is no pair if its right corners miss the place that the left ones and the relative pose of most pairs predict
 by more than five times the median view and by more than 1 % of the image width."""
+POSE_CORNERS_MIN = 6
+"""Corners that both cameras see in a pair, below which it does not enter OpenCV's start."""
 DOUBTFUL_START_PX = 0.6
 """A camera alone that misses by more may have ended in a local minimum: corners are found to 0.05 to 0.3 px."""
 DISAGREE_SHARE = 0.05
@@ -113,9 +115,15 @@ def opencv_start(start: Start, board: Board, size: tuple[int, int], fix_k3: bool
     """
     pairs = [k for k, view in enumerate(start.views) if view.left is not None and view.right is not None]
     pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, START_VIEWS).astype(int))]
-    left, right = ([np.asarray(getattr(start.views[k], side), np.float32) for k in pairs] for side in CAMERAS)
+    both = [seen_in(start.views[k].left, start.views[k].right) for k in pairs]
+    kept = [place for place, seen in enumerate(both) if seen.sum() >= POSE_CORNERS_MIN]
+    pairs, both = [pairs[place] for place in kept], [both[place] for place in kept]
+    left, right = (
+        [np.asarray(getattr(start.views[k], side)[seen], np.float32) for k, seen in zip(pairs, both, strict=True)]
+        for side in CAMERAS
+    )
     pair = Stereo(*size, *(np.zeros(1),) * 6, np.zeros((24, 24)), 0.0).with_vector(start.vector)
-    points = [board.points_mm.astype(np.float32)] * len(pairs)
+    points = [board.points_mm[seen].astype(np.float32) for seen in both]
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
     try:
         _, *inner, turn, shift, _, _, turns, shifts, _ = cv2.stereoCalibrateExtended(
@@ -160,15 +168,15 @@ def camera_start(
         )
     keys = sorted(corners)
     chosen = [keys[k] for k in np.unique(np.linspace(0, len(keys) - 1, START_VIEWS).astype(int))]
-    points = board.points_mm.astype(np.float32)
-    found = [np.ascontiguousarray(corners[k], np.float32) for k in chosen]
-    start = _zhang([points] * len(found), found, size, side, cv2.CALIB_FIX_K3 if fix_k3 else 0)
+    points = [board.points_mm[seen_in(corners[k])].astype(np.float32) for k in chosen]
+    found = [np.ascontiguousarray(corners[k][seen_in(corners[k])], np.float32) for k in chosen]
+    start = _zhang(points, found, size, side, cv2.CALIB_FIX_K3 if fix_k3 else 0)
     if start.rms_px > DOUBTFUL_START_PX:
         # Wide lenses have local minima: k1 alone first, then all from there.
         simple = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_PRINCIPAL_POINT
-        first = _zhang([points] * len(found), found, size, side, simple)
+        first = _zhang(points, found, size, side, simple)
         flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
-        start = min(start, _zhang([points] * len(found), found, size, side, flags, first), key=lambda one: one.rms_px)
+        start = min(start, _zhang(points, found, size, side, flags, first), key=lambda one: one.rms_px)
     matrix, distortion = start.matrix, start.distortion
     poses = {k: board_pose(corners[k], board, matrix, distortion) for k in keys}
     return replace(start, poses=poses)
@@ -271,16 +279,18 @@ def _misses(view: View, board: Board, pose: np.ndarray, relation: np.ndarray, ri
     pixels, _ = cv2.projectPoints(board.points_mm, *seen, right.matrix, right.distortion)
     assert view.right is not None
     ordered = np.stack([view.right[order] for order in corner_orders(board)])
-    return np.sqrt(np.mean(np.sum((ordered - np.reshape(pixels, (-1, 2))) ** 2, axis=2), axis=1))
+    return np.sqrt(np.nanmean(np.sum((ordered - np.reshape(pixels, (-1, 2))) ** 2, axis=2), axis=1))
 
 
 def board_pose(corners: np.ndarray, board: Board, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     """Board to camera, shape (6,), from one picture: IPPE (Collins and Bartoli 2014), then least squares in px."""
-    done, turn, shift = cv2.solvePnP(board.points_mm, pixels_of(corners), matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
+    seen = seen_in(corners)
+    points, pixels = board.points_mm[seen], pixels_of(corners[seen])
+    done, turn, shift = cv2.solvePnP(points, pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
     if not done or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
         raise undetermined("a board has no pose that OpenCV can find")
     # IPPE undistorts by a few iterations, which is not enough at the edge of a wide lens.
-    turn, shift = cv2.solvePnPRefineLM(board.points_mm, pixels_of(corners), matrix, distortion, turn, shift)
+    turn, shift = cv2.solvePnPRefineLM(points, pixels, matrix, distortion, turn, shift)
     return np.concatenate([np.ravel(turn), np.ravel(shift)])
 
 
@@ -296,6 +306,11 @@ def left_pose(right_pose: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np
     """Board to left camera from board to right camera; `turn` is R, `shift` T."""
     rotation = rotation_vector(turn.T @ rotation_matrix(right_pose[:3]))
     return np.concatenate([rotation, turn.T @ (right_pose[3:] - shift)])
+
+
+def seen_in(*corners: np.ndarray | None) -> np.ndarray:
+    """Which corners (corners,) all of some pictures show."""
+    return np.logical_and.reduce([np.isfinite(one).all(axis=1) for one in corners if one is not None])
 
 
 def pixels_of(corners: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from tvsbayes.cli.app import (
     refuse_options,
     report_line,
 )
+from tvsbayes.cli.head_commands import refuse_sightings
 from tvsbayes.errors import InputError, escaped
 
 if TYPE_CHECKING:
@@ -107,7 +108,9 @@ def acquire(
     if not live:
         refuse_options("for --live", "add --live, or leave it out", port=port, no_browser=no_browser)
     in_order(rig, plan)
-    instrument, steps = read_rig(rig), read_plan(plan)
+    instrument = read_rig(rig)
+    refuse_sightings("acquire", instrument.table.mechanism.sightings)
+    steps = read_plan(plan)
     if dry_run:
         unfit = {"live": live, "place_command": place_command}
         refuse_options("for a run, and --dry-run makes none", "leave out one of them", **unfit)

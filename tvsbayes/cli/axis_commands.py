@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from tvsbayes.single_axis.axis_campaign import AxisCampaign
     from tvsbayes.single_axis.axis_record import AxisSummary
 
-STORED = "results/ are missing or older than the axis folder: fitting first (weighted draws) ..."
 FITTING, PLANNING, PRINTING = "fit", "choosing stops", "printing to PDF"
 
 
@@ -212,9 +211,8 @@ def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path |
     read = rows_of(data).command
     stages = {FITTING: 3.0, "drawing the page": 1.5, PRINTING: 3.0 if pdf else 0.0}
     with waiting() as progress, Job(stages, progress) as job:
-        results = results_for(data, curve_commands(float(read.min()), float(read.max())), job.part(FITTING))
-        if not results.stored:
-            report_line(STORED)
+        shown = curve_commands(float(read.min()), float(read.max()))
+        results = results_for(data, shown, job.part(FITTING), tell=report_line)
         job.begin("drawing the page")
         page = axis_document(results, issue)
         removed = replace_page(path, page_html(page), out)
@@ -243,9 +241,7 @@ def plan(
         raise InputError("target", message, column="--target", allowed=allowed, remedy=f"name one of {allowed}")
     data = read_axis(folder)
     with waiting() as progress, Job({FITTING: 1.0, PLANNING: 3.0}, progress) as job:
-        results = results_for(data, progress=job.part(FITTING), seed=seed)
-        if not results.stored:
-            report_line(STORED)
+        results = results_for(data, progress=job.part(FITTING), seed=seed, tell=report_line)
         found = plan_next(results.fit, wanted, minutes=minutes, progress=job.part(PLANNING))
     document, text = {**found.as_json(), "unit": data.unit, "seed": seed}, axis_plan_text(found, data.unit)
     document["u_unit"] = unit_of(found.target, data.unit)
@@ -265,7 +261,7 @@ def simulate(folder: Path, *, moves: Path | None, out: Path, seed: int, as_json:
     from tvsbayes.files.csv_table import CSV_BYTES_MAX
     from tvsbayes.files.disk import read_bytes
     from tvsbayes.single_axis.axis_campaign import parse_axis_moves, read_axis
-    from tvsbayes.single_axis.simulated_axis import simulate_axis
+    from tvsbayes.twin.simulated_axis import simulate_axis
 
     template = read_axis(folder)
     listed = None if moves is None else parse_axis_moves(read_bytes(moves, CSV_BYTES_MAX), escaped(moves.name, 200))

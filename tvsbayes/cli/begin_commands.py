@@ -17,6 +17,7 @@ from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, listed, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.instrument.mechanisms import WORDS
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
@@ -31,6 +32,12 @@ NAMES_LISTED = 6
 def new(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to create; with --pictures also one of `new`.")],
     axis: Annotated[bool, typer.Option("--axis", help="One axis and its readings, no optics.")] = False,
+    mechanism: Annotated[
+        str, typer.Option("--mechanism", help="two-mirror (the scanner), or pan-tilt: a head, seen by a stereo pair.")
+    ] = "two-mirror",
+    sightings: Annotated[
+        bool, typer.Option("--sightings", help="With pan-tilt: the head's own camera says where it points.")
+    ] = False,
     pictures: Annotated[
         Path | None, typer.Option("--pictures", help="Folder of spot pictures, left and right or side by side.")
     ] = None,
@@ -43,8 +50,20 @@ def new(
     """An empty campaign, explained in campaign.toml, and a rig file. With --pictures: its looks and their frames."""
     if pictures is None:
         refuse_options("for pictures", "add --pictures FOLDER, or leave it out", pair=pair, swap=swap)
+    if mechanism not in WORDS:
+        found, allowed = f"--mechanism {escaped(mechanism)}", ", ".join(WORDS)
+        raise InputError("usage", f"{found}; allowed: {allowed}", allowed=allowed, remedy="name one of them")
+    head = mechanism != WORDS[0]
+    if sightings and not head:
+        raise InputError("usage", "--sightings are those of a head", remedy="add --mechanism pan-tilt")
     if axis:
-        INSTRUMENTS["axis"].carry_out("new", out, pictures=pictures, as_json=as_json)
+        INSTRUMENTS["axis"].carry_out(
+            "new", out, pictures=pictures, mechanism=head, sightings=sightings, as_json=as_json
+        )
+        return
+    if head:
+        refuse_options("for a scanner", "leave it out, and copy what `tvsbayes new` makes", pictures=pictures)
+        _new_head(out, sightings, as_json)
         return
     if pictures is not None:
         _with_pictures(out, pictures, pair, swap, as_json)
@@ -56,6 +75,20 @@ def new(
     text += "pictures of the spots: fill in moves.csv, then `tvsbayes new` this folder again with --pictures FOLDER\n"
     text += "a table of your own: `tvsbayes import FILE --to` this folder"
     finish({"campaign": str(out), "files": names}, text, as_json)
+
+
+def _new_head(out: Path, sightings: bool, as_json: bool) -> None:
+    """An empty campaign of a pan-tilt head and its rig file."""
+    from tvsbayes.instrument.campaign import head_templates
+
+    make_folder(out, empty=True)
+    files = head_templates(sightings)
+    for name, data in files.items():
+        write_atomically(out / name, data)
+    text = f"{escaped(str(out), 200)}: {', '.join(files)}\n"
+    wanted = "moves and sightings" if sightings else "put stereo.json beside them, log moves and spots"
+    text += f"next: {f'log {wanted}' if sightings else wanted}, then `tvsbayes check` this folder"
+    finish({"campaign": str(out), "files": list(files)}, text, as_json)
 
 
 def write_templates(out: Path) -> list[str]:

@@ -36,6 +36,15 @@ def stereo(
     pitch_u_mm: Annotated[
         float | None, typer.Option("--pitch-u-mm", help="Its standard uncertainty (mean of all; default 0).")
     ] = None,
+    charuco: Annotated[
+        str | None, typer.Option("--charuco", help="Squares of a ChArUco board, columns x rows, instead of --board.")
+    ] = None,
+    dictionary: Annotated[
+        str | None, typer.Option("--dictionary", help="Of its markers, as in OpenCV: 5X5_100.")
+    ] = None,
+    marker_mm: Annotated[
+        float | None, typer.Option("--marker-mm", help="Side of a marker; without, the pictures tell it.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="stereo.json to write.")] = None,
     imports: Annotated[
         list[Path] | None,
@@ -97,13 +106,14 @@ def stereo(
         raise InputError("usage", found, remedy="give FOLDER with --board and --pitch-mm, or --import FILE")
     uncertainties = {"u_focal_percent": u_focal_percent, "u_principal_px": u_principal_px}
     uncertainties |= {"u_rotation_mrad": u_rotation_mrad, "u_baseline_mm": u_baseline_mm}
-    finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, rms_px=rms_px, **uncertainties)
+    finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, marker_mm=marker_mm, rms_px=rms_px, **uncertainties)
     made_by = {"rms_px": rms_px, "views": views, "fixed_intrinsics": fixed_intrinsics, **uncertainties}
     form: Format | None = None if export is None else "ros" if export == "ros" else "opencv"
     places = _new_files(out, form)
     if folder is None:
         options: dict[str, object] = {"finder": finder, "swap": swap, "fix_k3": fix_k3, "robust": robust}
         options |= {"pair": pair, "left": left, "right": right}
+        options |= {"charuco": charuco, "dictionary": dictionary, "marker_mm": marker_mm}
         refuse_options("for pictures of a board", "leave out --import", **options)
         _positive(rms_px=rms_px, **uncertainties)
         known = _known(board, pitch_mm, pitch_u_mm, made_by)
@@ -116,7 +126,12 @@ def stereo(
             "key": bool(key),
         }
         refuse_options("for --import", "leave it out: pictures tell it", **given, **made_by)
-        pattern = _board(board, pitch_mm, pitch_u_mm or 0.0)
+        if charuco is not None:
+            refuse_options("of no use beside --charuco", "leave it out", board=board, finder=finder)
+            pattern = _marker_board(charuco, dictionary, pitch_mm, marker_mm, pitch_u_mm or 0.0)
+        else:
+            refuse_options("for --charuco", "add --charuco 15x10", dictionary=dictionary, marker_mm=marker_mm)
+            pattern = _board(board, pitch_mm, pitch_u_mm or 0.0)
         from tvsbayes.cameras.stereo_calibration import calibrate_folder
         from tvsbayes.report.command_text import stereo_calibration_text
 
@@ -181,6 +196,21 @@ def _board(board: str | None, pitch_mm: float | None, pitch_u_mm: float) -> Boar
         remedy = f"give {missing}: inner corners, columns x rows, and the side of a square: --board 9x6 --pitch-mm 25"
         raise InputError("usage", f"stereo FOLDER needs {missing}", remedy=remedy)
     return Board.named(board, pitch_mm, pitch_u_mm)
+
+
+def _marker_board(
+    squares: str, dictionary: str | None, pitch_mm: float | None, marker_mm: float | None, pitch_u_mm: float
+) -> Board:
+    """The ChArUco board in the pictures."""
+    from tvsbayes.cameras.boards import Board
+
+    if dictionary is None or pitch_mm is None:
+        missing = " and ".join(
+            name for name, given in {"--dictionary": dictionary, "--pitch-mm": pitch_mm}.items() if given is None
+        )
+        remedy = f"give {missing}, for example --charuco 15x10 --dictionary 5X5_100 --pitch-mm 45"
+        raise InputError("usage", f"stereo FOLDER --charuco needs {missing}", remedy=remedy)
+    return Board.with_markers(squares, dictionary, pitch_mm, marker_mm, pitch_u_mm)
 
 
 def _positive(**values: float | None) -> None:

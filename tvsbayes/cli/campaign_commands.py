@@ -22,6 +22,7 @@ from tvsbayes.cli.app import (
     is_part,
     report_line,
 )
+from tvsbayes.cli.head_commands import refuse_sightings
 from tvsbayes.cli.instruments import instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, typed
@@ -51,9 +52,10 @@ def demo(
             write_atomically(folder / part.name, part.read_bytes())
         report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
         from tvsbayes.estimators.four_point import classic as estimate_classic
+        from tvsbayes.instrument.axes import DIRECTIONS
         from tvsbayes.instrument.campaign import read_campaign
+        from tvsbayes.instrument.parameters import TARGETS
         from tvsbayes.report.fit_text import demo_text
-        from tvsbayes.twin.physics import effective_mirror_offset_mm
         from tvsbayes.twin.true_rig import read_truth
 
         compile_for(report_line)
@@ -68,13 +70,9 @@ def demo(
                 results = calibrate(campaign, out / "results", tier="importance", progress=progress)
                 summary = results.record.summary
     pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
-    true = rig.parameters
-    truth = {
-        **(rig.effective_deg_per_step(campaign) or {}),
-        "backlash_deg.pan": true["backlash_deg.pan"],
-        "backlash_deg.tilt": true["backlash_deg.tilt"],
-        "effective_mirror_offset_mm": effective_mirror_offset_mm(true, pose),
-    }
+    true = rig.headlines(campaign, pose) or {}
+    others = {of.name: true[of.name] for of in TARGETS.values() if not of.ratio}
+    truth = {direction: true[f"effective_deg_per_step.{direction}"] for direction in DIRECTIONS} | others
     document = {"classic": classic_result.as_json(), "fit": summary.as_json(), "truth": truth}
     finish(document, f"{demo_text(classic_result, summary, truth)}\n\n{DEMO_NOTE}", as_json, unusable(summary))
 
@@ -115,8 +113,9 @@ def simulate(
     from tvsbayes.twin.simulated_campaign import simulate as run_plan
 
     home_approach = None if unrecorded_sides else HOME_APPROACH
+    declared = read_rig(rig)
     result = run_plan(
-        *(read_rig(rig), read_plan(plan), seed),
+        *(declared, read_plan(plan, not declared.table.mechanism.sightings), seed),
         aperture=aperture,
         home_approach=home_approach,
         sides_recorded=not unrecorded_sides,
@@ -161,6 +160,12 @@ def detect(
         float | None,
         typer.Option("--speckle-contrast", min=0.0, max=2.0, help="Per pixel (default: learned; contour: 0.4)."),
     ] = None,
+    dark: Annotated[
+        Path | None,
+        typer.Option(
+            "--dark", help="Folder of pictures with the laser off, to subtract: as in frames/, or left.png ..."
+        ),
+    ] = None,
     overlay: Annotated[bool, typer.Option("--overlay", help="Pictures of every spot in results/overlay.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -175,7 +180,7 @@ def detect(
     pictures = output_place(campaign, "results", "overlay") if overlay else None
     data = read_campaign(campaign)
     with waiting() as progress:
-        found = find(data, method, speckle_contrast=speckle_contrast, overlay=pictures, progress=progress)
+        found = find(data, method, speckle_contrast=speckle_contrast, dark=dark, overlay=pictures, progress=progress)
     write_atomically(campaign / "spots.csv", spots_bytes(found.campaign.spots))
     document = {"campaign": str(campaign), **found.as_json()}
     text = detection_text(found) + f"\nwritten: {escaped(str(campaign / 'spots.csv'), 200)}"
@@ -220,7 +225,9 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
 
     if plan_file is not None:
         _refuse_other_than_rig(path, plan_file)
-        rig, steps = read_rig(path), read_plan(plan_file)
+        rig = read_rig(path)
+        refuse_sightings("check of a plan", rig.table.mechanism.sightings)
+        steps = read_plan(plan_file)
         from tvsbayes.planning.plan_check import check_plan
 
         compile_for(report_line)
@@ -239,7 +246,8 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         rig = read_rig(path)
         return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
     instrument = instrument_of(path)
-    return campaign_held(path) if instrument is None else instrument.command("held")(path)
+    own = instrument is not None and "check" not in instrument.shared
+    return campaign_held(path) if instrument is None or not own else instrument.command("held")(path)
 
 
 def _refuse_other_than_rig(path: Path, plan_file: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,13 +21,16 @@ from tvsbayes.cli.app import (
     report_line,
     spared,
 )
-from tvsbayes.cli.axis_commands import STORED
 from tvsbayes.cli.instruments import instrument_of
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
-from tvsbayes.pipeline import calibration_for
+from tvsbayes.pipeline import StoredOrFitted
+from tvsbayes.pipeline import verify as verified
 from tvsbayes.progress import Job
+
+if TYPE_CHECKING:
+    from tvsbayes.results.compensation_record import Verification
 
 FITTING, MAKING = "fit", "compensation"
 LETTERS, APPLIERS = "XYZABC", ("controller", "host")
@@ -45,7 +48,7 @@ def _refuse_scanner(folder: Path, command: str) -> None:
     """
     if _is_scanner(folder):
         message = f"{command} is for an axis, and {escaped(str(folder), 200)} is the campaign of a scanner"
-        remedy = "its compensation is `tvsbayes compensate CAMPAIGN --to header`, its verification `tvsbayes watch`"
+        remedy = "its compensation is `tvsbayes compensate CAMPAIGN --to header`"
         raise InputError("usage", message, remedy=remedy)
 
 
@@ -75,7 +78,7 @@ def compensate(
     Nothing is applied. With -o the promise is kept in results/compensation.json, for `verify`. Of a scanner's campaign
     `--to header` gives its calibration for a microcontroller; its promise is that of `locate`.
     """
-    from tvsbayes.compensation.promise import Wish, compensation_of, file_text
+    from tvsbayes.compensation.promise import Wish, compensation_of, file_beside, file_text
     from tvsbayes.report.compensation_text import compensation_text
     from tvsbayes.results.compensation_record import COMPENSATION_FORMAT
     from tvsbayes.results.fit_record import provenance
@@ -94,15 +97,18 @@ def compensate(
     data = read_axis(campaign)
     wish = Wish(to, "host" if applied_by == "host" else "controller", per_command, resolution, in_force, letter, period)
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
-        results = results_for(data, progress=job.part(FITTING), seed=seed)
-        if not results.stored:
-            report_line(STORED)
+        results = results_for(data, progress=job.part(FITTING), seed=seed, tell=report_line)
         made = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
     document = {"format": COMPENSATION_FORMAT, **made.as_json(), **plain(provenance(axis_hashes(data), seed))}
     files: dict[str, str] = {}
     if out is not None:
         write_atomically(out, file_text(made, data).encode())
         files[to] = str(out)
+        if (beside := file_beside(made, data)) is not None:
+            second = out.with_name(f"{out.name}.yaml")
+            spared(second)
+            write_atomically(second, beside.encode())
+            files["yaml"] = str(second)
         if keep(document, kept := output_place(campaign, "results") / "compensation.json"):
             files["compensation"] = str(kept)
     text = compensation_text(made, list(files.values()))
@@ -115,13 +121,14 @@ def compensate(
 
 def export_calibration(campaign: Path, kind: str, out: Path | None, as_json: bool) -> None:
     """The calibration for another language, printed or into a file."""
-    with waiting() as progress:
-        calibration = calibration_for(campaign, report_line, progress)
     from tvsbayes.calibration.c_header import calibration_header
     from tvsbayes.calibration.calibration_file import Origin, calibration_json
     from tvsbayes.instrument.campaign import read_campaign
 
-    origin = Origin.of(read_campaign(campaign))
+    data = read_campaign(campaign)
+    with waiting() as progress:
+        calibration = StoredOrFitted(data, report_line, progress).calibration
+    origin = Origin.of(data)
     stored = calibration_json(calibration, origin)
     text = calibration_header(calibration, origin) if kind == "header" else json.dumps(stored, indent=1)
     document: Mapping[str, Any] = {"header": text} if kind == "header" else stored
@@ -141,34 +148,67 @@ def _one_of(option: str, given: str, allowed: tuple[str, ...]) -> None:
 
 def verify(
     campaign: CampaignFolder,
-    fresh: Annotated[Path, typer.Argument(metavar="FRESH", help="Axis folder of readings with the table in force.")],
+    fresh: Annotated[
+        Path, typer.Argument(metavar="FRESH", help="Fresh readings or looks, with table or calibration in force.")
+    ],
+    distance_mm: Annotated[
+        float | None, typer.Option("--distance-mm", min=1.0, help="Of a scanner: errors of points there, mm (1000).")
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Whether a machine keeps the promise of its table.
+    """Whether a machine keeps the promise of its table or calibration.
 
-    KEPT, BROKEN or CANNOT TELL: exit 0, 1 or 3. FRESH lists the commands that were asked for, before the correction.
-    Which world fits: applied, not applied, applied twice, wrong sign, another machine.
+    KEPT, BROKEN or CANNOT TELL: exit 0, 1 or 3. Of an axis FRESH lists the commands that were asked for, before the
+    correction; of a scanner the counters that steps-for or the header gave, and the looks there. Which world fits:
+    applied, not applied, applied twice, wrong sign, another machine.
     """
-    from tvsbayes.compensation.verification import stored_compensation
-    from tvsbayes.compensation.verification import verify as verified
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
-    from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
 
-    for folder in (campaign, fresh):
-        _refuse_scanner(folder, "verify")
-    data = read_axis(campaign)
-    made = stored_compensation(data)
-    with waiting() as progress:
-        found = verified(data, fresh, made=made, seed=seed, progress=progress)
-    kept = {"format": VERIFICATION_FORMAT, "inputs": axis_hashes(data), "table": made.digest, **found.as_json()}
-    keep(kept, output_place(campaign, "results") / "verification.json")
+    scanner = _is_scanner(campaign)
+    if scanner != _is_scanner(fresh):
+        kind = "a scanner" if scanner else "an axis"
+        message = f"{escaped(str(campaign), 200)} is of {kind}, {escaped(str(fresh), 200)} is not"
+        raise InputError("usage", message, remedy="give fresh readings or looks of the same kind of machine")
+    if not scanner and distance_mm is not None:
+        raise InputError("usage", "--distance-mm is not for an axis", remedy="leave it out")
+    judge = _verified_scanner if scanner else _verified_axis
+    found, made_of = judge(campaign, fresh, seed, distance_mm)
+    keep(
+        {"format": VERIFICATION_FORMAT, **made_of, **found.as_json()},
+        output_place(campaign, "results") / "verification.json",
+    )
     for remark in found.remarks if as_json else ():
         report_line(f"warning: {remark}")
     finish(found.as_json(), verification_text(found), as_json)
     if found.verdict != KEPT:
         raise Ended(NothingToEstimate.exit_code if found.verdict == CANNOT_TELL else TARGET_MISSED)
+
+
+def _verified_axis(folder: Path, fresh: Path, seed: int, _: float | None) -> tuple[Verification, dict[str, object]]:
+    """Readings of an axis, and of which data and table that is."""
+    from tvsbayes.compensation.verification import stored_compensation, verify_axis
+    from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
+
+    data = read_axis(folder)
+    made = stored_compensation(data)
+    with waiting() as progress:
+        found = verify_axis(data, fresh, made=made, seed=seed, progress=progress)
+    return found, {"inputs": axis_hashes(data), "table": made.digest}
+
+
+def _verified_scanner(
+    folder: Path, fresh: Path, seed: int, distance_mm: float | None
+) -> tuple[Verification, dict[str, object]]:
+    """Looks of a scanner, and of which data and calibration that is."""
+    from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
+    from tvsbayes.instrument.campaign import input_hashes, read_campaign
+
+    data = read_campaign(folder)
+    with waiting() as progress:
+        found = verified(data, fresh, distance_mm=distance_mm or 1000.0, seed=seed, tell=report_line, progress=progress)
+    return found, {"inputs": input_hashes(data), "table": content_sha256(calibration_json(load_calibration(folder)))}
 
 
 def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bool) -> None:
@@ -181,8 +221,10 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
 
     if folder is None:
         remedy = "write tvsbayes plan FOLDER --verify -o plan.csv"
-        raise InputError("usage", "--verify needs an axis folder", remedy=remedy)
-    _refuse_scanner(folder, "plan --verify")
+        raise InputError("usage", "--verify needs a folder with a table or a calibration in force", remedy=remedy)
+    if _is_scanner(folder):
+        _plan_looks(folder, out, as_json)
+        return
     data = read_axis(folder)
     made = stored_compensation(data)
     with waiting() as progress, Job({FITTING: 1.0, "choosing stops": 1.0}, progress) as job:
@@ -195,3 +237,24 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
         document["plan"] = str(out)
         text += f"\nwritten: {escaped(str(out), 200)}"
     finish({**document, "seed": seed}, text, as_json)
+
+
+def _plan_looks(folder: Path, out: Path | None, as_json: bool) -> None:
+    """The looks of a scanner that tell soonest, at the target that the campaign looked at most."""
+    from collections import Counter
+
+    from tvsbayes.comparison.verified_looks import accepted_calibration, plan_looks
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.plan import write_plan
+    from tvsbayes.report.compensation_text import aim_plan_text
+    from tvsbayes.results.records import plain
+
+    data = read_campaign(folder)
+    found = plan_looks(data, accepted_calibration(data))
+    document, text = plain(found), aim_plan_text(found)
+    if out is not None:
+        target = Counter(spot.target for spot in data.spots).most_common(1)[0][0]
+        write_plan(found.steps(target), out)
+        document["plan"] = str(out)
+        text += f"\nwritten: {escaped(str(out), 200)}"
+    finish(document, text, as_json)

@@ -26,7 +26,7 @@ from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import chain_kept, waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
-from tvsbayes.pipeline import FITTING, MAX_MINUTES, calibrate, compile_for, fit_for
+from tvsbayes.pipeline import FITTING, MAX_MINUTES, StoredOrFitted, calibrate, compile_for
 from tvsbayes.progress import Job, Show
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def _warn_of(campaign: Campaign, *, stops: bool = False) -> None:
 
 
 def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
-    """The paper's four-point estimator. Mean, sd, type A and GUM uncertainty per direction."""
+    """The paper's four-point estimator; of sightings a pointing model by least squares."""
     if serve("classic", **locals()):
         return
     from tvsbayes.estimators.four_point import classic as estimate
@@ -188,13 +188,18 @@ def compare(
         return
     folders = [campaign] if other is None else [campaign, other]
     data = [read_campaign(folder) for folder in folders]
+    if other is None and data[0].rig.mechanism.sightings:
+        refuse_options("for spots; of sightings positions are left out", "write --by positions", by=by, seed=seed)
+        _compare_pointing(data[0], as_json)
+        return
     if other is None and not len(select_experiments(data[0]).experiments):
         raise _no_experiments()
     results = output_place(campaign, "results")
     fitting = [f"{FITTING} of {escaped(str(folder), 60)}" for folder in folders]
     stages = dict.fromkeys(fitting, 1.0) | {HOLDING_OUT: 0.0 if other else 6.0}
     with waiting() as progress, Job(stages, progress) as job:
-        fits = [fit_for(each, report_line, job.part(stage)) for each, stage in zip(data, fitting, strict=True)]
+        parts = map(job.part, fitting)
+        fits = [StoredOrFitted(each, report_line, part).fit for each, part in zip(data, parts, strict=True)]
         record = None if other else _classic_against_joint(fits[0], by or "steps", seed or 0, job.part(HOLDING_OUT))
     if record is None:
         from tvsbayes.comparison.changes import compare as compare_fits
@@ -220,9 +225,26 @@ def _compare_positions(campaign: Path, as_json: bool) -> None:
 
     data = read_campaign(campaign)
     with waiting() as progress, Job({FITTING: 1.0, HOLDING_OUT: 6.0}, progress) as job:
-        fitted = fit_for(data, report_line, job.part(FITTING))
+        fitted = StoredOrFitted(data, report_line, job.part(FITTING)).fit
         found = hold_out_positions(fitted, progress=job.part(HOLDING_OUT))
     finish({**found.as_json(), "files": {}}, positions_text(found), as_json)
+
+
+def _compare_pointing(data: Campaign, as_json: bool) -> None:
+    """Terms of a head by least squares, without gears, beside those of the fit."""
+    import numpy as np
+
+    from tvsbayes.head.pointing_model import pointing_model
+    from tvsbayes.report.command_text import pointing_text
+
+    model = pointing_model(data)
+    with waiting() as progress:
+        fitted = StoredOrFitted(data, report_line, progress).fit
+    centre, sd = np.asarray(fitted.mode.physical), np.asarray(fitted.draws.physical).std(axis=0)
+    joint = {n: (float(centre[k]), float(sd[k])) for k, n in enumerate(fitted.names) if n in model.names}
+    document = {**model.as_json(), "joint": {name: {"value": v, "sd": u} for name, (v, u) in joint.items()}}
+    text = f"{pointing_text(model, joint)}\nhow well sightings are predicted: --by positions"
+    finish({**document, "files": {}}, text, as_json)
 
 
 def _no_experiments() -> NothingToEstimate:

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.corrections import Correction
     from tvsbayes.instrument.foreign_looks import ForeignLooks, Notation
 
+POINTING = "pointing"
+"""Format of pointing tables of telescopes."""
+
 
 def import_(
     file: Annotated[
@@ -48,7 +51,8 @@ def import_(
     ] = None,
     axis: Annotated[bool, typer.Option("--axis", help="Of one axis: commands and readings.")] = False,
     kind: Annotated[
-        str, typer.Option("--format", help="Of an axis: auto, csv, phd2 (guide log), epics (camonitor), klipper.")
+        str,
+        typer.Option("--format", help="auto, pointing (telescope); of an axis csv, phd2, epics (camonitor), klipper."),
     ] = "auto",
     run: Annotated[int | None, typer.Option("--run", min=1, help="Of a guide log: run; without it a list.")] = None,
     deviations: Annotated[
@@ -102,6 +106,11 @@ def import_(
         wish = replace(correction, pixels_from=pixels_from, relative=relative)
         _correct_campaign(file, to, wish, yes=yes, as_json=as_json)
         return
+    if kind == POINTING:
+        others = {"column": column, "sheet": sheet, "angles": angles, "axis": axis, "relative": relative, "flip": flip}
+        refuse_options("for other tables", "leave it out", **others, shift_moves=shift_moves, swap=swap, sd_px=sd_px)
+        _import_pointing(file, to, yes=yes, as_json=as_json)
+        return
     if axis or instrument_of(to) is INSTRUMENTS["axis"]:
         from tvsbayes.cli.axis_import import AxisNotation, import_readings
 
@@ -140,6 +149,32 @@ def import_(
     finish(document, f"{shown}\n{said}{after}".lstrip("\n"), as_json)
 
 
+def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
+    """A pointing table of a telescope becomes a campaign of sightings."""
+    from tvsbayes.head.pointing_table import STEP_DEG, U_ARCSEC, campaign_of, read_stars
+    from tvsbayes.instrument.campaign import write_campaign
+
+    campaign = campaign_of(read_stars(file), file.stem)
+    moves, sightings = len(campaign.moves), len(campaign.spots)
+    assumed = [
+        f"counters are the encoders' degrees in steps of {STEP_DEG:g} deg, whose scale is known to 1e-6",
+        "the azimuth axis went the shorter way from star to star, and came to the first from an unknown side",
+        f"a star's place is known to {U_ARCSEC:g} arcsec; refraction is as the table has it",
+        "no transmission error and no play of more than arcseconds: state another scale in [rig.prior]",
+    ]
+    lines = [f"gives: {moves} moves, {sightings} sightings", *(f"assumed: {text}" for text in assumed)]
+    if not (yes or as_json) and somebody_there():
+        typer.echo("\n".join(lines))
+        yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
+        lines = []
+    said = "nothing written: add --yes"
+    if yes:
+        write_campaign(campaign, to)
+        said = f"written: {escaped(str(to), 200)}\nnext: `tvsbayes check {typed(to)}`"
+    document = {"campaign": str(to), "moves": moves, "sightings": sightings, "assumed": assumed, "written": yes}
+    finish(document, "\n".join([*lines, said]), as_json)
+
+
 def _field_and_column(text: str) -> tuple[str, str]:
     """The two sides of --column FIELD=NAME."""
     field, sign, name = text.partition("=")
@@ -150,7 +185,7 @@ def _field_and_column(text: str) -> tuple[str, str]:
 
 
 def _word(kind: str) -> str:
-    """The value of --format."""
+    """The value of --format for an axis."""
     from tvsbayes.cli.axis_import import KINDS
 
     if kind not in ("auto", *KINDS):

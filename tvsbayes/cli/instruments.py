@@ -26,6 +26,7 @@ class Instrument:
         commands: module of its commands.
         served: what to do instead of a command that it does not have.
         remedies: the same for single commands and for their options, by the name of the command.
+        shared: commands of the scanner that serve it as they are.
     """
 
     words: str
@@ -33,6 +34,7 @@ class Instrument:
     commands: str
     served: str
     remedies: dict[str, str] = field(default_factory=dict)
+    shared: tuple[str, ...] = ()
 
     def command(self, name: str) -> Any:
         """Its function for a command, None where it has none."""
@@ -72,6 +74,14 @@ INSTRUMENTS = {
             "watch": "use compare --by positions",
         },
     ),
+    "pan-tilt-sightings": Instrument(
+        "a head that says where it points",
+        "the folder of one",
+        "tvsbayes.cli.head_commands",
+        "of such a head: check, classic, fit, compare, report, steps-for --azimuth-deg --elevation-deg",
+        {"plan": "sight more directions, from both sides, and some of them twice", "calibrate": "fit, then report"},
+        ("check", "fit", "compare", "steps-for"),
+    ),
 }
 """By mechanism, as `campaign.toml` states it."""
 
@@ -92,7 +102,7 @@ def serve(command: str, campaign: Path | None, **options: object) -> bool:
         InputError: as `Instrument.carry_out`.
     """
     instrument = instrument_of(campaign)
-    if campaign is None or instrument is None:
+    if campaign is None or instrument is None or command in instrument.shared:
         return False
     instrument.carry_out(command, campaign, **options)
     return True

@@ -33,7 +33,7 @@ from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import chain_kept, waiting
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import output_place, write_atomically
-from tvsbayes.pipeline import FITTING, compile_for, record_for
+from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.pipeline import calibrate as calibrate_campaign
 from tvsbayes.progress import Job
 
@@ -171,7 +171,7 @@ class PageWish:
         files = {"report": str(path)}
         stages = {FITTING: 3.0, GATHERING: 1.5, DRAWING: 1.5, PRINTING: 3.0 if self.pdf else 0.0}
         with waiting() as progress, Job(stages, progress) as job:
-            record = record_for(data, self.campaign, report_line, job.part(FITTING))
+            record = StoredOrFitted(data, report_line, job.part(FITTING)).record
             job.begin(GATHERING)
             doubts = campaign_held(self.campaign, data)["warnings"]
             calibration = load_calibration(self.campaign)

@@ -28,12 +28,13 @@ from tvsbayes.cli.app import (
     spared,
 )
 from tvsbayes.cli.compensation_commands import export_calibration, plan_verify
+from tvsbayes.cli.head_commands import refuse_head, refuse_sightings
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.files.disk import output_place
-from tvsbayes.pipeline import FITTING, calibration_for, compile_for, fit_for
+from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
@@ -95,14 +96,16 @@ def locate(
         raise InputError("usage", message, allowed=", ".join(given), remedy=remedy)
     finite(pan_steps=pan_steps, tilt_steps=tilt_steps, aperture_deg=aperture_deg)
     from tvsbayes.instrument.axes import sides_of
+    from tvsbayes.instrument.campaign import read_campaign
 
     where = (pan_steps, tilt_steps, aperture_deg, (pan_approach or "left", tilt_approach or "up"))
     sides_of(where[-1])
     with waiting() as progress:
-        calibration = calibration_for(campaign, report_line, progress)
+        calibration = StoredOrFitted(read_campaign(campaign), report_line, progress).calibration
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import budget_text, locations_text
 
+    refuse_head("locate", calibration)
     found = locate_points(calibration, *where, draws=draws, seed=seed)
     if found.refused[0] is not None:
         raise found.refused[0]
@@ -120,14 +123,16 @@ def locate(
 def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool) -> None:
     """Every point of a file, refused one by one."""
     from tvsbayes.coordinates.looks_file import read_looks
+    from tvsbayes.instrument.campaign import read_campaign
 
     points = read_looks(file)
     where = (points.pan_steps, points.tilt_steps, points.aperture_deg, points.approach)
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
-        calibration = calibration_for(campaign, report_line, job.part(FITTING))
+        calibration = StoredOrFitted(read_campaign(campaign), report_line, job.part(FITTING)).calibration
         from tvsbayes.coordinates.location import locate as locate_points
         from tvsbayes.report.command_text import locations_text
 
+        refuse_head("locate", calibration)
         found = locate_points(calibration, *where, draws=draws, seed=seed, progress=job.part(LOCATING))
     entries = [found.as_json(k) for k in range(len(found.refused))]
     document = {"estimator": found.estimator, "draws": found.draws, "points": entries}
@@ -147,8 +152,9 @@ def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int,
 
     cloud_place(place, file)
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
-        calibration = calibration_for(campaign, report_line, job.part(FITTING))
         measured = read_campaign(campaign)
+        calibration = StoredOrFitted(measured, report_line, job.part(FITTING)).calibration
+        refuse_head("locate", calibration)
         simple = simple_calibrations(measured.rig.priors, classic_of(measured))
         job.begin(LOCATING)
         sample = EvenSample()
@@ -201,9 +207,11 @@ def steps_for(
         metres = " ".join(f"--{axis}-mm {1000 * v:g}" for axis, v in zip("xyz", point, strict=True))
         allowed = f"a point at least {NEAREST_POINT_MM:g} mm from the middle of the baseline"
         raise InputError("range", message, allowed=allowed, remedy=f"lengths are mm: {metres}")
+    from tvsbayes.instrument.campaign import read_campaign
+
     limits = None if rig is None else _limits(rig)
     with waiting() as progress:
-        calibration = calibration_for(campaign, report_line, progress)
+        calibration = StoredOrFitted(read_campaign(campaign), report_line, progress).calibration
     from tvsbayes.report.command_text import steps_text
 
     azimuth, elevation = direction or (None, None)
@@ -240,7 +248,9 @@ def plan(
         typer.Option("--confirm", min=0, help="With --next: sample the posterior where u is at most this, deg/step."),
     ] = None,
     watch: Annotated[bool, typer.Option("--watch", help="Fewest looks for `watch`: plan CAMPAIGN --watch.")] = False,
-    verify: Annotated[bool, typer.Option("--verify", help="Fewest readings for `verify`: plan AXIS --verify.")] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Fewest readings or looks for `verify`: plan FOLDER --verify.")
+    ] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -271,6 +281,7 @@ def plan(
     from tvsbayes.instrument.rig import read_rig
 
     instrument, data = read_rig(rig), None if given is None else read_campaign(given)
+    refuse_sightings("plan", instrument.table.mechanism.sightings)
     from tvsbayes.planning.planner import plan as find_plan
     from tvsbayes.planning.search import CRITERIA
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
@@ -288,7 +299,7 @@ def plan(
         raise InputError("criterion", message, column="--criterion", allowed=allowed, remedy="name one of them")
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 0.0 if data is None else 1.0, PLANNING: 3.0}, progress) as job:
-        fitted = None if data is None else fit_for(data, report_line, job.part(FITTING))
+        fitted = None if data is None else StoredOrFitted(data, report_line, job.part(FITTING)).fit
         result = find_plan(
             instrument,
             wanted,
@@ -323,7 +334,7 @@ def _next_looks(
         raise InputError("usage", "--next goes on from a campaign", remedy="add --given CAMPAIGN")
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 1.0, PLANNING: 1.0}, progress) as job:
-        fitted = fit_for(data, report_line, job.part(FITTING))
+        fitted = StoredOrFitted(data, report_line, job.part(FITTING)).fit
         job.begin(PLANNING)
         from tvsbayes.planning.next_looks import next_looks
 
@@ -369,7 +380,9 @@ def study(
     if scheduler is not None:
         refuse_options("for a cluster that is started here", "leave it out, or leave out --scheduler", workers=workers)
     in_order(rig, plan_file)
-    instrument, steps = read_rig(rig), read_plan(plan_file)
+    instrument = read_rig(rig)
+    refuse_sightings("study", instrument.table.mechanism.sightings)
+    steps = read_plan(plan_file)
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import study_text
     from tvsbayes.statistics.chances import ASSURED

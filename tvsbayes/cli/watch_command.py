@@ -11,7 +11,7 @@ from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, f
 from tvsbayes.cli.instruments import instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
-from tvsbayes.pipeline import FITTING, compile_for, fit_for
+from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def watch(
     known, new = read_campaign(campaign), read_campaign(looks)
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 1.0, WATCHING: 1.0}, progress) as job:
-        fitted = fit_for(known, report_line, job.part(FITTING))
+        fitted = StoredOrFitted(known, report_line, job.part(FITTING)).fit
         job.begin(WATCHING)
         from tvsbayes.comparison.watched_looks import POWER_MIN
         from tvsbayes.comparison.watched_looks import watch as watch_looks
@@ -103,7 +103,7 @@ def plan_watch(
     known, rig = read_campaign(campaign), None if given is None or place is None else read_rig(place)
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 1.0, PLANNING: 8.0}, progress) as job:
-        fitted = fit_for(known, report_line, job.part(FITTING))
+        fitted = StoredOrFitted(known, report_line, job.part(FITTING)).fit
         job.begin(PLANNING)
         from tvsbayes.planning.watch_plan import MINUTES, watch_plan
 

@@ -12,28 +12,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.comparison.gap import camera_influence
-from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import unit_of
+from tvsbayes.instrument.parameters import TARGETS, unit_of
 from tvsbayes.results.comparison_record import Change, Comparison
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
 
 
-QUANTITIES = (*(f"effective_deg_per_step.{d}" for d in DIRECTIONS), *(f"backlash_deg.{axis}" for axis in AXES))
+COMPARED = tuple(of.name for of in TARGETS.values() if of.judged)
 """What is compared, by the names that JSON gives it; the ratios are local ones."""
 
 
 def _draws_at(found: JointFit, pose_rad: np.ndarray) -> np.ndarray:
-    """`QUANTITIES` at a pose, shape (1 + draws, quantities): the estimate, then the Laplace draws."""
-    from tvsbayes.instrument.parameters import INDEX
-    from tvsbayes.posterior.draws import local_deg_per_step
+    """`COMPARED` at a pose, shape (1 + draws, quantities): the estimate, then the Laplace draws."""
+    from tvsbayes.posterior.draws import local_at
 
-    physical = np.vstack([found.mode.physical, found.draws.physical])
-    backlash = physical[:, [INDEX[f"backlash_deg.{axis}"] for axis in AXES]]
-    local = local_deg_per_step(found, np.vstack([found.z, found.draws_z]), pose_rad)
-    return np.concatenate([local, backlash], axis=1)
+    drawn = local_at(found, np.vstack([found.z, found.draws_z]), pose_rad)
+    return np.stack([drawn[name.replace("effective_deg_per_step", "local_deg_per_step")] for name in COMPARED], axis=1)
 
 
 def compare(first: JointFit, second: JointFit) -> Comparison:
@@ -56,13 +52,13 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
         and np.array_equal(cameras[0].parameter_covariance, cameras[1].parameter_covariance)
     )
     before, after = _draws_at(first, pose), _draws_at(second, pose)
-    limit = -float(special.ndtri(0.5 * (1 - 0.95 ** (1 / len(QUANTITIES)))))
+    limit = -float(special.ndtri(0.5 * (1 - 0.95 ** (1 / len(COMPARED)))))
     variance = before[1:].var(axis=0, ddof=1) + after[1:].var(axis=0, ddof=1)
     if shared:
         influence = camera_influence(first, before[1:]), camera_influence(second, after[1:])
         variance = variance - 2 * np.sum(influence[0] * influence[1], axis=1)
     changes = []
-    for k, name in enumerate(QUANTITIES):
+    for k, name in enumerate(COMPARED):
         a, b = float(before[0, k]), float(after[0, k])
         # What both hold fixed has changed if the statements differ; its variance is zero but for rounding.
         fixed = np.ptp(before[1:, k]) == np.ptp(after[1:, k]) == 0

@@ -223,14 +223,17 @@ class WatchedLooks:
         readings = sum(s.aperture_deg is not None for s, use in zip(later, used[self.first :], strict=True) if use)
         self.dof = 3 * self.looks + readings
 
-    def departure(self, z: np.ndarray) -> Departure:
-        """What the looks say beyond the first day, both linearised at z; its noise scales are held."""
-        linear, prior = self.linear(z), np.where(self.problem.held, 0.0, z)
+    def departure(self, z: np.ndarray, *, angles: bool = False) -> Departure:
+        """What the looks say beyond the first day, both linearised at z; its noise scales are held.
+
+        Of the shifts of `CHANGES`, or with `angles` of the mirror angles (pan, tilt) of every usable look, deg.
+        """
+        linear, prior = self.linear(z, angles=angles), np.where(self.problem.held, 0.0, z)
         both, before = (_Told.of(spots, prior) for spots in (linear, rows_of(linear, slice(self.first))))
         return Departure(both.chi2 - before.chi2, self.dof, both.score, both.information)
 
-    def linear(self, z: np.ndarray) -> LinearSpots:
-        """Both days at z, with columns for the coordinates and, behind them, for the changes.
+    def linear(self, z: np.ndarray, *, angles: bool = False) -> LinearSpots:
+        """Both days at z, with columns for the coordinates and, behind them, for the changes or the looks' angles.
 
         Linearised in physical values, not in coordinates: a change may shift what the fit holds fixed.
         """
@@ -248,9 +251,25 @@ class WatchedLooks:
         found = stage(still, plain, self.problem.arrays, fixed, NO_STEP)
         physical = -np.asarray(found.residual_jacobian)
         own = np.where(self.problem.held, 0.0, physical @ at.slope)
-        shifts = physical[:, :, _SHIFTED] * self._unit_sizes(at.value)
-        shifts[: self.first] = 0.0
+        if angles:
+            shifts = self._of_angles(np.asarray(found.slope))
+        else:
+            shifts = physical[:, :, _SHIFTED] * self._unit_sizes(at.value)
+            shifts[: self.first] = 0.0
         return linear_spots(found, self.problem.arrays, np.concatenate([own, shifts], axis=2))
+
+    @property
+    def usable(self) -> np.ndarray:
+        """Places of the usable new looks in the linearised campaign, shape (looks,)."""
+        used = np.asarray(self.problem.arrays.spots.valid)[: len(self.problem.spots)] > 0
+        return self.first + np.flatnonzero(used[self.first :])
+
+    def _of_angles(self, slope: np.ndarray) -> np.ndarray:
+        """Columns for the mirror angles of every usable new look, pan and tilt in turn, per degree."""
+        found = np.zeros((*slope.shape[:2], 2 * self.looks))
+        for k, place in enumerate(self.usable):
+            found[place, :, 2 * k : 2 * k + 2] = np.radians(1.0) * slope[place]
+        return found
 
     @staticmethod
     def _unit_sizes(value: np.ndarray) -> np.ndarray:

@@ -18,6 +18,16 @@ from tvsbayes.results.compensation_record import Compensation
 
 Holds = Literal["table", "ratio and play", "ratio", "period"]
 LINUXCNC_DECIMALS = 7
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a file was made from: `text` names program and folder, `data_sha256` is that of the folder's data."""
+
+    text: str
+    data_sha256: str
+
+
 _UNCOMMENTED = re.compile(r"[^A-Za-z0-9 .,:=_+%/$\[\]-]")
 """What a name from a file is not written with: the end of a comment, control characters, other than ASCII."""
 
@@ -32,12 +42,12 @@ def number(value: float, digits: int = 9) -> str:
     return f"{value + 0.0:.{digits}g}"
 
 
-def stated(made: Compensation, origin: str) -> list[str]:
+def stated(made: Compensation, origin: Origin) -> list[str]:
     """What every file says first: of what it is, in which sense it is added, what is left, what it cannot say."""
     low, high = made.range_command
     unit = plainly(made.unit)
     lines = [
-        f"compensation by {plainly(origin)}",
+        f"compensation by {plainly(origin.text)}, data {origin.data_sha256[:16]}",
         f"machine: {plainly(made.machine) or 'not named'}; unit {unit}",
         f"for commands from {number(low)} to {number(high)}",
         "state when this was written: applied to nothing; apply it once, in one place; then run tvsbayes verify",
@@ -55,14 +65,14 @@ def stated(made: Compensation, origin: str) -> list[str]:
     return lines + [plainly(text) for text in made.unsaid]
 
 
-def _commented(made: Compensation, origin: str, mark: str) -> list[str]:
+def _commented(made: Compensation, origin: Origin, mark: str) -> list[str]:
     return [f"{mark} {line}" for line in stated(made, origin)]
 
 
 CSV_COLUMNS = ("command", "forward", "backward", "u_forward", "u_backward")
 
 
-def _csv(made: Compensation, origin: str) -> str:
+def _csv(made: Compensation, origin: Origin) -> str:
     rows = [
         ",".join(number(getattr(row, name), 12 if name == "command" else 9) for name in CSV_COLUMNS)
         for row in made.table
@@ -72,7 +82,7 @@ def _csv(made: Compensation, origin: str) -> str:
     return "\n".join([*_commented(made, origin, "#"), says, ",".join(CSV_COLUMNS), *rows, ""])
 
 
-def _linuxcnc(made: Compensation, origin: str) -> str:
+def _linuxcnc(made: Compensation, origin: Origin) -> str:
     """Triplets nominal, forward, reverse, nominal rising: the controller subtracts what stands there less nominal.
 
     LinuxCNC counts in units: nominal = per_command x command. Where the unit falls as the command rises, forward and
@@ -91,17 +101,17 @@ def _linuxcnc(made: Compensation, origin: str) -> str:
     return "\n".join([*lines, *_commented(made, origin, "#"), says, ""])
 
 
-def _grbl(made: Compensation, origin: str) -> str:
+def _grbl(made: Compensation, origin: Origin) -> str:
     lines = [f"{name}={value:.3f}" for name, value in made.settings.items()]
     return "\n".join([*(f"; {line}" for line in stated(made, origin)), *lines, ""])
 
 
-def _klipper(made: Compensation, origin: str) -> str:
+def _klipper(made: Compensation, origin: Origin) -> str:
     lines = [f"rotation_distance: {made.settings['rotation_distance']:.6f}"]
     return "\n".join([*_commented(made, origin, "#"), "# in the section of the stepper:", *lines, ""])
 
 
-def _header(made: Compensation, origin: str) -> str:
+def _header(made: Compensation, origin: Origin) -> str:
     said = "\n".join(f" * {line}" for line in stated(made, origin))
     arrays = []
     for name, field in (("command", "command"), ("forward", "add_forward"), ("backward", "add_backward")):
@@ -140,7 +150,12 @@ static double axis_sent(double command, int side)
 """
 
 
-def _urdf(made: Compensation, origin: str) -> str:
+APPLIED_ONCE = (
+    "a model that states axis_corrects with this value is corrected already: the same correction is not added again"
+)
+
+
+def _urdf(made: Compensation, origin: Origin) -> str:
     values = "\n".join(f'  <xacro:property name="{n}" value="{number(v, 12)}"/>' for n, v in made.settings.items())
     said = "\n".join(f"  {line.replace('--', '- -')}" for line in stated(made, origin))
     return f"""<?xml version="1.0"?>
@@ -149,18 +164,45 @@ def _urdf(made: Compensation, origin: str) -> str:
   axis_zero: reading at command 0, to be taken off once, in the joint's origin or in the driver, not in both
   axis_reduction: commands per unit of reading, for <mechanicalReduction>
   axis_backlash: play between both sides, unit; u_...: standard uncertainties, covariance_...: of zero and reduction
+  axis_corrects: SHA-256 of the data that it corrects; {APPLIED_ONCE}
 -->
 <robot xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:property name="axis_corrects" value="{origin.data_sha256}"/>
 {values}
 </robot>
 """
+
+
+def _urdf_yaml(made: Compensation, origin: Origin) -> str:
+    """The same for programs: joint and its covariance, in the unit of readings."""
+    import yaml
+
+    found = made.settings
+    variances = [found["u_axis_zero"] ** 2, found["u_axis_reduction"] ** 2]
+    between = found["covariance_zero_reduction"]
+    document = {
+        "axis_corrects": origin.data_sha256,
+        "applied": False,
+        "machine": plainly(made.machine),
+        "unit": plainly(made.unit),
+        "range_command": list(made.range_command),
+        "joint": {
+            "names": ["zero", "reduction"],
+            "values": [found["axis_zero"], found["axis_reduction"]],
+            "covariance": [[variances[0], between], [between, variances[1]]],
+            "backlash": found["axis_backlash"],
+        },
+        "left_after_applying_95": {side: promise.error95 for side, promise in made.promise.items()},
+    }
+    said = [*_commented(made, origin, "#"), f"# axis_corrects: {APPLIED_ONCE}"]
+    return "\n".join([*said, yaml.safe_dump(document, sort_keys=False)])
 
 
 PHASES = 64
 """Lines of a period's table."""
 
 
-def _pec(made: Compensation, origin: str) -> str:
+def _pec(made: Compensation, origin: Origin) -> str:
     period, low = made.settings["period_command"], made.range_command[0]
     phase = np.arange(PHASES) / PHASES
     at = low + (phase * period - low) % period
@@ -180,13 +222,15 @@ class Format:
         zero_free: whether controllers leave open by which half of the play a first move is off.
         in_force: name of the setting whose value in force a new one is made from, "" of none.
         unsaid: what it cannot say, in words.
+        beside: content of a second file, for programs, YAML; None of most formats.
     """
 
     holds: Holds
-    write: Callable[[Compensation, str], str]
+    write: Callable[[Compensation, Origin], str]
     zero_free: bool = False
     in_force: str = ""
     unsaid: tuple[str, ...] = ()
+    beside: Callable[[Compensation, Origin], str] | None = None
 
 
 _NO_POSITION = "error by position stays: the format has no place for it"
@@ -211,6 +255,11 @@ FORMATS: Mapping[str, Format] = {
     "klipper": Format(
         "ratio", _klipper, in_force="rotation_distance", unsaid=("Klipper knows no play: all of it stays", _NO_POSITION)
     ),
-    "urdf": Format("ratio", _urdf, unsaid=("a URDF knows zero and ratio: play and error by position stay",)),
+    "urdf": Format(
+        "ratio",
+        _urdf,
+        unsaid=("a URDF knows zero and ratio: play and error by position stay",),
+        beside=_urdf_yaml,
+    ),
     "pec": Format("period", _pec, unsaid=("a period's table knows no play, and only what repeats with the period",)),
 }

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import structs
 
 from tvsbayes.compensation.correction import Correction, Cycles, cycles
-from tvsbayes.compensation.formats import FORMATS, LINUXCNC_DECIMALS, Format, number
+from tvsbayes.compensation.formats import FORMATS, LINUXCNC_DECIMALS, Format, Origin, number
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import AppliedBy, Compensation, SidePromise, TableRow
@@ -116,13 +116,12 @@ def _run(
     return predicted_stops(fit, moves, run.read.tolist(), np.full(len(run.read), u), seed), run
 
 
-def refuse_unaccepted(results: AxisResults) -> None:
+def refuse_answer(answer: str) -> None:
     """A table is made of an accepted answer alone: it moves a machine.
 
     Raises:
         NotConverged: the answer is rough, or a Laplace approximation.
     """
-    answer = results.summary.answer
     if answer != "accepted":
         what = "a rough answer" if answer == "rough" else "a Laplace approximation"
         message = f"the fit is {what}, not an accepted answer: the promise of a table made of it cannot be trusted"
@@ -361,7 +360,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         InputError: the format is unknown, or lacks a number.
         NotConverged: the fit is not accepted.
     """
-    refuse_unaccepted(results)
+    refuse_answer(results.summary.answer)
     fit, campaign = results.fit, results.fit.campaign
     rows, since = fit.rows, Since.of(campaign.moves)
     draws = fit.draws["effective_per_command"]
@@ -441,9 +440,18 @@ def compensate(
     return structs.replace(made, text=file_text(made, campaign))
 
 
-def file_text(made: Compensation, campaign: AxisCampaign) -> str:
-    """Content of the file."""
+def _origin(campaign: AxisCampaign) -> Origin:
     digest = hashlib.sha256("".join(sorted(axis_hashes(campaign).values())).encode()).hexdigest()
     name = campaign.path.name if campaign.path else "a campaign"
-    origin = f"tvsbayes {version('tvsbayes')} of {name}, data {digest[:16]}"
-    return FORMATS[made.target].write(made, origin)
+    return Origin(f"tvsbayes {version('tvsbayes')} of {name}", digest)
+
+
+def file_text(made: Compensation, campaign: AxisCampaign) -> str:
+    """Content of the file."""
+    return FORMATS[made.target].write(made, _origin(campaign))
+
+
+def file_beside(made: Compensation, campaign: AxisCampaign) -> str | None:
+    """Content of the second file, YAML; None where the format has none."""
+    beside = FORMATS[made.target].beside
+    return None if beside is None else beside(made, _origin(campaign))

@@ -7,14 +7,16 @@ shift, ratio, play and scatter of a size that nobody knows. Commands as the camp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.compensation.promise import Since, bound_of, reading_u, refuse_unaccepted
+from tvsbayes.compensation.promise import Since, bound_of, reading_u, refuse_answer
 from tvsbayes.errors import InputError, NothingToEstimate, refusal
 from tvsbayes.files.csv_table import csv_bytes
 from tvsbayes.progress import Job, Show
@@ -93,14 +95,15 @@ def _distance(off: np.ndarray, covariance: np.ndarray) -> float:
     return float(off @ np.linalg.solve(covariance, off))
 
 
-def _other_machine(fresh: _Fresh, found: PredictedStops, travel: float) -> list[np.ndarray]:
-    """Covariances (r, r) of what another machine adds, by size."""
-    centre = fresh.command - fresh.command.mean()
+def other_axis(command: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Shape (r, r) of the covariance of what another axis adds to stops at commands (r,), reached from sides (r,).
+
+    Shift and ratio, and half as large play and scatter.
+    """
+    centre = command - command.mean()
     span = centre / max(float(np.max(np.abs(centre))), 1e-300)
-    shape = np.ones((len(span), len(span))) + np.outer(span, span) + 0.25 * np.outer(fresh.side, fresh.side)
-    shape += 0.25 * np.eye(len(span))
-    least = OTHER_LEAST * float(np.sqrt(np.median(np.diag(found.pooled()[1]))))
-    return [size**2 * shape for size in np.geomspace(least, max(0.5 * travel, 2 * least), OTHERS)]
+    shape = np.ones((len(span), len(span))) + np.outer(span, span) + 0.25 * np.outer(side, side)
+    return shape + 0.25 * np.eye(len(span))
 
 
 def _shift(made: Compensation, travel: float, count: int) -> np.ndarray:
@@ -109,32 +112,68 @@ def _shift(made: Compensation, travel: float, count: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Worlds:
-    """Log density of the readings by world, and the predictions if the table is applied and if it is not."""
+class Trial:
+    """Fresh readings and what each world predicts of them, of an axis or of the two of a scanner.
 
-    logs: dict[str, float]
+    Attributes:
+        at: predicted readings where the common part and the play of the correction act so many times; a cached one.
+        value, aim: readings, and those aimed at, shape (r,).
+        other: shape (r, r) of the covariance of what another machine adds.
+        travel: of the readings.
+        shift: covariance (r, r) of one shift that the format leaves open.
+        noise: variances that every visit draws anew, shape (r,).
+    """
+
+    at: Callable[[float, float], PredictedStops]
+    value: np.ndarray
+    aim: np.ndarray
+    other: np.ndarray
+    travel: float
+    shift: np.ndarray
+    noise: np.ndarray
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What readings say: verdict, p, probabilities of the worlds, readings that would tell (as in `Verification`).
+
+    `promised` and `without` are the predictions if the correction is applied and if it is not.
+    """
+
+    verdict: Verdict
+    p: float
+    worlds: dict[str, float]
+    needed: int | None
     promised: PredictedStops
     without: PredictedStops
 
 
-def _worlds(fit: AxisFit, made: Compensation, fresh: _Fresh, seed: int) -> _Worlds:
-    applied = Correction.of(made)
-    shift = _shift(made, fit.rows.travel, len(fresh.value))
-
-    def at(common: float, play: float) -> PredictedStops:
-        return predicted_stops(fit, applied.moved(fresh.moves, common, play), fresh.read, fresh.u, seed)
-
-    known = {factors: at(*factors) for factors in ((1.0, 1.0), (0.0, 0.0), (1.0, 0.0))}
-    promised = known[1.0, 1.0]
+def _log_densities(trial: Trial) -> dict[str, float]:
+    """Of the readings, by world."""
+    promised = trial.at(1.0, 1.0)
     mean, covariance = promised.pooled()
-    play_matters = _distance(known[1.0, 0.0].pooled()[0] - mean, covariance + shift) > SEPARATE
+    play_matters = _distance(trial.at(1.0, 0.0).pooled()[0] - mean, covariance + trial.shift) > SEPARATE
     found = {}
     for world, factors in SCENARIOS.items():
         own = [f for f in factors if f[0] == f[1] or play_matters]
-        found[world] = _mean_density([(known.get(f) or at(*f)).log_density(fresh.value, shift) for f in own])
-    others = _other_machine(fresh, promised, fit.rows.travel)
-    found[OTHER_MACHINE] = _mean_density([promised.log_density(fresh.value, shift + more) for more in others])
-    return _Worlds(found, promised, known[0.0, 0.0])
+        found[world] = _mean_density([trial.at(*f).log_density(trial.value, trial.shift) for f in own])
+    least = OTHER_LEAST * float(np.sqrt(np.median(np.diag(covariance))))
+    sizes = np.geomspace(least, max(0.5 * trial.travel, 2 * least), OTHERS)
+    others = [promised.log_density(trial.value, trial.shift + size**2 * trial.other) for size in sizes]
+    return found | {OTHER_MACHINE: _mean_density(others)}
+
+
+def judged(trial: Trial, seed: int) -> Judged:
+    """Verdict over readings, by the probabilities of the worlds and by how far off the readings are."""
+    promised, without = trial.at(1.0, 1.0), trial.at(0.0, 0.0)
+    logs = _log_densities(trial)
+    total = float(np.logaddexp.reduce(list(logs.values())))
+    worlds = {name: float(np.exp(logs[name] - total)) for name in WORLDS}
+    p = _p_value(promised, trial.value, trial.shift, seed)
+    verdict, needed = _verdict(worlds, p), cast(int | None, 0)
+    if verdict == CANNOT_TELL:
+        needed = needed_readings(promised, promised.pooled()[0] - without.pooled()[0], trial.noise)
+    return Judged(verdict, p, worlds, needed, promised, without)
 
 
 def _mean_density(logs: Sequence[float]) -> float:
@@ -155,7 +194,7 @@ def _p_value(promised: PredictedStops, value: np.ndarray, shift: np.ndarray, see
     return float((1 + np.sum(squares(drawn) >= squares(value)[0])) / (REPLICATES + 1))
 
 
-def _size(error: np.ndarray, shift: bool) -> ErrorSize:
+def size_of(error: np.ndarray, shift: bool = False) -> ErrorSize:
     """Of errors (r,); but for their mean where a shift is free."""
     left = error - error.mean() if shift else error
     return ErrorSize(float(np.sqrt(np.mean(left**2))), float(np.max(np.abs(left))))
@@ -232,30 +271,35 @@ def verify_readings(
     if campaign.unit != made.unit:
         message = f"the fresh readings are in {campaign.unit[:20]!r}, the table is in {made.unit[:20]!r}"
         raise InputError("unit", message, remedy="give readings in the unit of the table")
-    fresh = _Fresh.of(campaign)
+    fresh, applied = _Fresh.of(campaign), Correction.of(made)
+    aim = made.offset + made.per_command * fresh.command
+
+    @cache
+    def at(common: float, play: float) -> PredictedStops:
+        return predicted_stops(fit, applied.moved(fresh.moves, common, play), fresh.read, fresh.u, seed)
+
     with Job({"worlds": 1.0}, progress) as job:
         job.begin("worlds")
-        found = _worlds(fit, made, fresh, seed)
-    total = float(np.logaddexp.reduce(list(found.logs.values())))
-    worlds = {name: float(np.exp(found.logs[name] - total)) for name in WORLDS}
-    promised, before = found.promised, found.without.pooled()[0]
-    shift = _shift(made, fit.rows.travel, len(fresh.value))
-    p = _p_value(promised, fresh.value, shift, seed)
-    aim = made.offset + made.per_command * fresh.command
-    verdict = _verdict(worlds, p)
-    needed: int | None = 0
-    if verdict == CANNOT_TELL:
-        needed = needed_readings(promised, promised.pooled()[0] - before, _visit_noise(promised, fresh.side, fresh.u))
+        trial = Trial(
+            at=at,
+            value=fresh.value,
+            aim=aim,
+            other=other_axis(fresh.command, fresh.side),
+            travel=fit.rows.travel,
+            shift=_shift(made, fit.rows.travel, len(fresh.value)),
+            noise=_visit_noise(at(1.0, 1.0), fresh.side, fresh.u),
+        )
+        found = judged(trial, seed)
     return Verification(
-        verdict=verdict,
-        p=p,
-        worlds=worlds,
-        before=_size(before - aim, made.zero_free),
-        after=_size(fresh.value - aim, made.zero_free),
-        promised95=bound_of(promised, aim, np.arange(len(aim)), made.zero_free),
+        verdict=found.verdict,
+        p=found.p,
+        worlds=found.worlds,
+        before=size_of(found.without.pooled()[0] - aim, made.zero_free),
+        after=size_of(fresh.value - aim, made.zero_free),
+        promised95=bound_of(found.promised, aim, np.arange(len(aim)), made.zero_free),
         readings=len(fresh.value),
         unit=campaign.unit,
-        needed=needed,
+        needed=found.needed,
         remarks=_remarks(made, fresh, campaign),
     )
 
@@ -298,7 +342,7 @@ def verification_in(campaign: AxisCampaign, made: Compensation) -> Verification 
     return read_record(Verification, keys, "run `tvsbayes verify` again")
 
 
-def verify(
+def verify_axis(
     folder: AxisCampaign | Path | str,
     fresh: AxisCampaign | Path | str,
     *,
@@ -325,7 +369,7 @@ def verify(
     table = stored_compensation(known) if made is None else made
     with Job({"fit": 1.0, "verification": 1.0}, progress) as job:
         results = results_for(known, progress=job.part("fit"), seed=seed)
-        refuse_unaccepted(results)
+        refuse_answer(results.summary.answer)
         return verify_readings(results.fit, table, new, seed=seed, progress=job.part("verification"))
 
 
@@ -365,6 +409,35 @@ def _parting(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarra
     return min(_distance(o[used], scatter) for o in off)
 
 
+@dataclass(frozen=True)
+class TellingVisits:
+    """How often each candidate is visited, shape (m,), and the squared distance of the nearest world then."""
+
+    visits: np.ndarray
+    reached: float
+
+
+def telling_visits(
+    off: Sequence[np.ndarray], common: np.ndarray, noise: np.ndarray, first: np.ndarray
+) -> TellingVisits:
+    """The fewest visits that tell worlds apart, by greedy choice.
+
+    Args:
+        off: what each other world adds to the readings of candidates, shape (m,) each.
+        common: covariance (m, m) of what is the same at every visit.
+        noise: variances that every visit draws anew, shape (m,).
+        first: mask of candidates that are visited whatever they tell.
+    """
+    visits = first.astype(float)
+    reached = _parting(off, common, noise, visits)
+    while reached < TELLING and visits.sum() < PLANNED_MAX:
+        each = [_parting(off, common, noise, visits + row) for row in np.eye(len(visits))]
+        best = int(np.argmax(each))
+        visits[best] += 1
+        reached = each[best]
+    return TellingVisits(visits, reached)
+
+
 def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> VerifyPlan:
     """The fewest stops that tell the worlds apart, by greedy choice among the table's commands.
 
@@ -394,16 +467,10 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         off.append(play)
     if not np.any(off[0]):
         raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
-    visits = np.zeros(len(mean))
     # Over the range first: what befell a part of the table shows nowhere else.
     spread = np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)
-    visits[np.isin(run.index, spread)] = 1
-    reached = _parting(off, common, noise, visits)
-    while reached < TELLING and visits.sum() < PLANNED_MAX:
-        each = [_parting(off, common, noise, visits + row) for row in np.eye(len(mean))]
-        best = int(np.argmax(each))
-        visits[best] += 1
-        reached = each[best]
+    chosen = telling_visits(off, common, noise, np.isin(run.index, spread))
+    visits, reached = chosen.visits, chosen.reached
     order = [k for k in range(len(mean)) for _ in range(int(visits[k]))]
     stops = tuple((float(nodes[run.index[k]]), int(run.side[k])) for k in order)
     return VerifyPlan(stops, overrun, reached >= TELLING, float(np.sqrt(reached)))

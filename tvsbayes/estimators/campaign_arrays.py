@@ -19,6 +19,7 @@ from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pi
 from tvsbayes.instrument.conditions import kelvin, powered_on_s, warm_minutes
 from tvsbayes.instrument.places import PLACES_MAX, SeenPlaces, gears_vary, seen_places
 from tvsbayes.instrument.rig import RigTable
+from tvsbayes.instrument.sightings import Sighting, sighted_deg, sightings_of, tangent_frames
 from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import redraws
 from tvsbayes.model.compiled import placed
@@ -31,6 +32,8 @@ are what a density costs: the paper's protocol has these six counters."""
 SMALLEST_BUCKET = 4096
 """Spots and moves are padded to this size or the next power of two above it: campaigns up to it share their compiled
 functions, and cost what their own rows need."""
+SIGHTED = (1, 2)
+"""Columns of the pixels in which sightings have their two angles: the first column is where ranges are taken out."""
 NOWHERE_MM = np.array([500.0, 0.0, 0.0])
 """Stands for the point of a look that counts for nothing: finite, and in front of the cameras."""
 
@@ -43,6 +46,10 @@ class SpotArrays(eqx.Module):
     stop error of the axis was drawn anew since the previous spot, with variance
     `redraw_mix[axis] @ (sd_right^2, sd_left^2)` (or down, up). `hours` have passed since the spot before, or since the
     homing that came after it.
+
+    Of sightings `triangulated_mm` is the direction in which the head was found to point, a unit vector of frame P, and
+    `tangents` are those along azimuth and elevation there; None where a stereo pair sees spots. The pixels are then
+    angles on the sphere about that direction, rad: none in the left image, two in the columns of `SIGHTED`.
     """
 
     move_index: Int[Array, " spots"]
@@ -58,6 +65,7 @@ class SpotArrays(eqx.Module):
     new_segment: Bool[Array, " spots"]
     homed: Bool[Array, " spots"]
     hours: Float[Array, " spots"]
+    tangents: Float[Array, "spots 2 3"] | None = None
 
 
 class GearArrays(eqx.Module):
@@ -178,8 +186,12 @@ def gear_arrays(seen: SeenPlaces, size: int) -> GearArrays:
     return GearArrays(places, *(padded(np.pad(share, wider), size) for share in (seen.error_share, seen.play_share)))
 
 
-def pixel_covariance(spot: Spot) -> np.ndarray:
-    """Stated covariance of (u_left, v_left, u_right, v_right), px^2."""
+def pixel_covariance(spot: Spot | Sighting) -> np.ndarray:
+    """Stated covariance of (u_left, v_left, u_right, v_right), px^2; of a sighting rad^2, 1 where it has none."""
+    if isinstance(spot, Sighting):
+        covariance = np.eye(4)
+        covariance[SIGHTED, SIGHTED] = np.radians(spot.u_deg or 1.0) ** 2
+        return covariance
     sd = np.array([spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px], dtype=float)
     covariance = np.diag(sd**2)
     covariance[0, 1] = covariance[1, 0] = spot.ruv_left * sd[0] * sd[1]
@@ -199,7 +211,8 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
     """
     spots = ordered_spots(campaign)
     size = bucket(len(spots))
-    pixels = pixels_of(spots)
+    frames = tangent_frames(sighted_deg(sightings_of(spots))) if campaign.rig.mechanism.sightings else None
+    pixels = pixels_of(spots) if frames is None else np.zeros((len(spots), 4))
     covariance = np.stack([pixel_covariance(s) for s in spots])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     looks = [s.move for s in spots]
@@ -208,7 +221,7 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
     places = seen_places(campaign.moves, looks, priors)
     gears = gear_arrays(places if gears_vary(priors) else places.none, size)
     aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
-    points_mm = triangulate(campaign.stereo, pixels)
+    points_mm = triangulate(campaign.stereo, pixels) if frames is None else frames[:, 2]
     seen = np.isfinite(points_mm).all(axis=1)
     points_mm[~seen] = NOWHERE_MM
     spot_arrays = SpotArrays(
@@ -225,22 +238,32 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
         new_segment=padded(new.new_segment, size, False, bool),
         homed=padded(new.homed, size, False, bool),
         hours=padded(new.hours, size),
+        tangents=None if frames is None else padded(frames[:, :2], size, np.eye(3)[1:]),
     )
     azimuth = placed(campaign.rig.aperture_convention == "azimuth")
     moves = move_arrays(campaign.moves, powered_on_s=powered_on_s(campaign.header))
     return CampaignArrays(moves, spot_arrays, gears, azimuth, placed(np.int32(len(spots))))
 
 
+def components(rig: RigTable) -> int:
+    """Independent residuals of a look besides the aperture's: four pixels less their range, or two angles."""
+    return len(SIGHTED) if rig.mechanism.sightings else 3
+
+
 def in_sight(campaign: Campaign) -> np.ndarray:
     """Whether each ordered spot has a triangulated point: one beyond the reach of the lens model has none."""
+    if campaign.rig.mechanism.sightings:
+        return np.ones(len(ordered_spots(campaign)), dtype=bool)
     return np.isfinite(triangulate(campaign.stereo, pixels_of(ordered_spots(campaign)))).all(axis=1)
 
 
 def spot_constants(campaign: Campaign) -> np.ndarray:
     """Terms of each ordered spot's log likelihood that no parameter changes: 2 pi and its stated covariance."""
+    own = components(campaign.rig)
     return np.array(
         [
-            -0.5 * ((3 + (s.aperture_deg is not None)) * np.log(2 * np.pi) + np.linalg.slogdet(pixel_covariance(s))[1])
+            -0.5
+            * ((own + (s.aperture_deg is not None)) * np.log(2 * np.pi) + np.linalg.slogdet(pixel_covariance(s))[1])
             for s in ordered_spots(campaign)
         ]
     )

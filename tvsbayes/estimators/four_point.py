@@ -295,7 +295,7 @@ def classic(campaign: Campaign) -> ClassicResult:
         NothingToEstimate: no experiment is complete.
     """
     selection = select_experiments(campaign)
-    points = triangulate(campaign.stereo, selection.pixels.reshape(-1, 4)).reshape(-1, 4, 3)
+    points = campaign.points_mm[selection.spot_rows]
     angles = four_point_angle_deg(points, selection.axis)
     ratios = np.asarray(ratio_deg_per_step(angles.theta_i_deg, angles.theta_f_deg, selection.steps))
     finite = np.isfinite(ratios)

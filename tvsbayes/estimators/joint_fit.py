@@ -27,11 +27,11 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
 from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, ZERO_SHIFT_NAMES, Prior
+from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, TARGETS, ZERO_SHIFT_NAMES, Prior
 from tvsbayes.instrument.places import line_share, seen_places
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import placed
-from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities, told_of
+from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities
 from tvsbayes.model.parameter_space import ParameterSpace
 from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.stored_draws import StoredMode
@@ -138,13 +138,18 @@ class JointFit(Shown):
         """Mode and Laplace sd of what a fit is for."""
         state = "converged" if self.converged else f"NOT CONVERGED: {'; '.join(self.problems)}"
         used = sum(spot.status == "ok" for spot in self.campaign.spots) - len(self.excluded_spots)
-        rows = told_of(self.mode, self.draws, set(legs_of(self.campaign.moves)))
+        moved = set(legs_of(self.campaign.moves))
+        rows = [
+            (f"{of.label}, {of.unit}", float(self.mode[of.name]), float(self.draws[of.name].std()))
+            for of in TARGETS.values()
+            if of.applies(moved)
+        ]
         return View(f"JointFit of {used} spots, {state}; mode and Laplace sd", ("quantity", "mode", "sd"), rows)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Contract names of the coordinates and of the columns of `draws.physical`."""
-        return NAMES
+        return self.space.mechanism.names
 
     @property
     def held(self) -> np.ndarray:
@@ -334,9 +339,10 @@ def _usable(campaign: Campaign, without: Collection[int]) -> Bool[np.ndarray, " 
 
 
 def priors_used(stated: Mapping[str, Prior], value: np.ndarray, u: np.ndarray) -> dict[str, Prior]:
-    """The priors of a fit, which its options may have changed from the stated ones; columns in order of `RIG_NAMES`."""
+    """The priors of a fit, which its options may have changed from the stated ones; columns in their order."""
     return {
-        name: replace(prior, value=float(value[INDEX[name]]), u=float(u[INDEX[name]])) for name, prior in stated.items()
+        name: replace(prior, value=float(value[column]), u=float(u[column]))
+        for column, (name, prior) in enumerate(stated.items())
     }
 
 
@@ -351,7 +357,7 @@ def restored(campaign: Campaign, stored: StoredMode, seed: int = 0) -> JointFit 
     Returns:
         The fit; None where another version of tvsbayes named its parameters otherwise.
     """
-    if stored.names != NAMES or stored.prior.shape[1] != len(RIG_NAMES):
+    if stored.names != campaign.rig.mechanism.names or stored.prior.shape[1] != len(RIG_NAMES):
         return None
     table = replace(campaign.rig, priors=priors_used(campaign.rig.priors, *stored.prior))
     valid = stored.valid > 0
@@ -402,7 +408,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
     lin = problem.linearised(mode.z)
     information = problem.information(lin)
     chi2_spots = leave_one_out_chi2(information, np.asarray(problem.arrays.spots.weight)[: len(problem.spots)])
-    readings = np.asarray(problem.arrays.spots.has_aperture)[: len(problem.spots)]
+    readings = problem.further
     suspect = used & (chi2_spots > chi2_quantile(readings, GATE_PROBABILITY))
     pose = lin.mirror_angles_rad[used].mean(axis=0)
     seen_at = seen_places(campaign.moves, [spot.move for spot in problem.spots], campaign.rig)

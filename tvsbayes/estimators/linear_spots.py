@@ -23,7 +23,7 @@ from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.likelihood import filter_rows, place_columns, root_at_places, standing
 from tvsbayes.estimators.look_jacobian import look_jacobian
 from tvsbayes.model.geometry import materialise
-from tvsbayes.model.parameter_space import ParameterSpace, model_of
+from tvsbayes.model.parameter_space import ParameterSpace
 
 
 class Linearised(eqx.Module):
@@ -105,7 +105,7 @@ def linearise(
         inflation: factor on pixel and aperture noise.
     """
     physical = materialise(space.physical(z))
-    model = model_of(physical, space.harmonic_period_deg)
+    model = space.model_at(physical)
     found = standing(model, arrays, inflation)
     looks, terms = found.looks, found.terms
     by_coordinates = look_jacobian(z, physical, space, looks, arrays)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.estimators.looks import Looks, Numbers, aperture_reading, in_frame_s, spot_angles
+from tvsbayes.estimators.looks import Looks, Numbers, aperture_reading, in_frame_s, seen, spot_angles
 from tvsbayes.instrument.parameters import (
     INDEX,
     NAMES,
@@ -25,9 +25,9 @@ from tvsbayes.instrument.parameters import (
     STEREO_PARAMETER_NAMES,
     names_of,
 )
-from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
+from tvsbayes.model.geometry import materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import trace
-from tvsbayes.model.parameter_space import Model, ParameterSpace, model_of
+from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 
 def _columns(*blocks: str) -> np.ndarray:
@@ -63,21 +63,20 @@ def look_jacobian(
         looks: at these coordinates.
         arrays: the campaign.
     """
-    period_deg = space.harmonic_period_deg
 
     def moved(columns: np.ndarray, part: Callable[[Model], PyTree]) -> PyTree:
         """How a part of the model moves with some parameters in the units of their names, columns first."""
 
         def along(direction: Float[Array, " parameters"]) -> PyTree:
-            return jax.jvp(lambda at: part(model_of(at, period_deg)), (physical,), (direction,))[1]
+            return jax.jvp(lambda at: part(space.model_at(at)), (physical,), (direction,))[1]
 
         return materialise(jax.vmap(along)(jnp.asarray(np.eye(len(NAMES))[columns])))
 
-    turn = rotation_matrix(model_of(physical, period_deg).extrinsics.rotation_rad)
+    turn = rotation_matrix(space.model_at(physical).extrinsics.rotation_rad)
     pan, tilt = jnp.moveaxis(moved(GEARS, lambda m: spot_angles(m, arrays).angle_rad), 2, 0)
     ways_p = moved(OPTICS, lambda m: trace(m.optics, looks.pan_rad, looks.tilt_rad)).at(looks.range_mm)
     ways_s = moved(FRAMES, lambda m: in_frame_s(m.extrinsics, looks.points_p_mm))
-    pixels = moved(CAMERAS, lambda m: image(m.cameras, looks.points_s_mm))
+    pixels = moved(CAMERAS, lambda m: seen(m, looks.points_s_mm, arrays.spots))
     reading = moved(RECEIVER, lambda m: aperture_reading(m.receiver, looks.points_p_mm, arrays.azimuth_convention))
 
     by_gears = tuple(p * pan + t * tilt for p, t in zip(looks.by_pan, looks.by_tilt, strict=True))

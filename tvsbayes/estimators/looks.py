@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays
 from tvsbayes.instrument.mirrors import Ray, Turn, Vectors
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
@@ -74,6 +74,28 @@ def nearest_range(extrinsics: Extrinsics, ray: Ray, points_s_mm: Vectors) -> Flo
     return (points_p - ray.origin_mm).dot(ray.direction)
 
 
+def angles_seen(points_mm: Vectors, spots: SpotArrays) -> tuple[Float[Array, "..."], ...]:
+    """Where points stand on the sphere about the directions sighted, along azimuth and elevation, in four columns.
+
+    Angles on the great circle, rad: no pole and no wrap is special.
+    """
+    assert spots.tangents is not None
+    across, above = (points_mm.dot(Vectors.of(spots.tangents[:, k].T)) for k in range(2))
+    along = points_mm.dot(Vectors.of(spots.triangulated_mm.T))
+    square = across**2 + above**2
+    # The angle over its sine, by its series where they are equal.
+    small = square < 1e-8 * along**2
+    off = jnp.sqrt(jnp.where(small, 1.0, square))
+    stretch = jnp.where(small & (along > 0), 1 / along * (1 - square / along**2 / 3), jnp.arctan2(off, along) / off)
+    none = jnp.zeros_like(across)
+    return none, across * stretch, above * stretch, none
+
+
+def seen(model: Model, points_s_mm: Vectors, spots: SpotArrays) -> tuple[Float[Array, "..."], ...]:
+    """What is seen of points of frame S: pixels of a stereo pair, or angles on the sphere."""
+    return image(model.cameras, points_s_mm) if spots.tangents is None else angles_seen(points_s_mm, spots)
+
+
 class Looks(eqx.Module):
     """Ideal looks at the ranges where the beams pass closest to the triangulated points, and how they move.
 
@@ -114,14 +136,17 @@ def looks_at(model: Model, pan_rad: Array, tilt_rad: Array, arrays: CampaignArra
     ray, by_pan = jax.jvp(lambda angle: trace(optics, angle, tilt_rad), (pan_rad,), (unit,))
     _, by_tilt = jax.jvp(lambda angle: trace(optics, pan_rad, angle), (tilt_rad,), (unit,))
     ray, by_pan, by_tilt = materialise((ray, by_pan, by_tilt))
-    range_mm = materialise(nearest_range(extrinsics, ray, triangulated))
+    sightings = arrays.spots.tangents is not None
+    range_mm = unit if sightings else materialise(nearest_range(extrinsics, ray, triangulated))
     points_p = ray.at(range_mm)
-    ways_p = by_pan.at(range_mm), by_tilt.at(range_mm), ray.direction
+    # A direction has no range.
+    along = ray.direction * 0.0 if sightings else ray.direction
+    ways_p = by_pan.at(range_mm), by_tilt.at(range_mm), along
     turn = rotation_matrix(extrinsics.rotation_rad)
     points_s = in_frame_s(extrinsics, points_p)
     ways_s = [transform(turn, way) for way in ways_p]
     points_p, points_s, ways_p, ways_s = materialise((points_p, points_s, ways_p, ways_s))
-    pixels, pixels_along = jax.linearize(lambda points: image(model.cameras, points), points_s)
+    pixels, pixels_along = jax.linearize(lambda points: seen(model, points, arrays.spots), points_s)
     reading, reading_along = jax.linearize(
         lambda points: aperture_reading(receiver, points, arrays.azimuth_convention), points_p
     )
@@ -162,11 +187,14 @@ def _observed(
     first: Int[Array, ""],
 ) -> Float[Array, "batch spots 5"]:
     part = arrays.of_spots(first, turned_rad.shape[1])
-    triangulated = Vectors.of(part.spots.triangulated_mm.T)
 
     def one(z, turned):
         model = space.model(z)
         pan, tilt = spot_angles(model, part).angle_rad.T + turned.T
+        if part.spots.tangents is not None:
+            angles_rad = angles_seen(trace(model.optics, pan, tilt).direction, part.spots)
+            return jnp.stack([*angles_rad, jnp.zeros_like(pan)], axis=1)
+        triangulated = Vectors.of(part.spots.triangulated_mm.T)
         ranges_mm = nearest_range(model.extrinsics, trace(model.optics, pan, tilt), triangulated)
         return observe(model, jnp.stack([pan, tilt, ranges_mm]), part.azimuth_convention).T
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool
 from scipy import optimize
 
 from tvsbayes.estimators.annealed_stage import NO_STEP, STAGE_TOLERANCE, Fixed, linear_part, stage
-from tvsbayes.estimators.campaign_arrays import campaign_arrays
+from tvsbayes.estimators.campaign_arrays import campaign_arrays, components
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import (
     Linearised,
@@ -124,6 +124,11 @@ class Problem:
         self.noise = np.flatnonzero(np.isin(NAMES, NOISE_NAMES) & self.free)
         self.held = held_by(self.free)
         self.repeated = np.isin(NAMES, GEAR_ERROR_NAMES) & self.free
+
+    @property
+    def further(self) -> np.ndarray:
+        """Residuals of each spot beyond the three that a stereo pair gives: aperture readings; a sighting lacks one."""
+        return np.asarray(self.arrays.spots.has_aperture)[: len(self.spots)] + components(self.table) - 3
 
     def compile_aside(self, executor: ThreadPoolExecutor) -> None:
         """Start the compilation that later steps need while the first stage runs on the other core."""
@@ -282,7 +287,7 @@ class Problem:
         spots = self.arrays.spots
         count = len(self.spots)
         valid, weight = np.array(spots.valid)[:count], np.array(spots.weight)[:count]
-        readings = np.asarray(spots.has_aperture)[:count]
+        readings = self.further
         chi2 = leave_one_out_chi2(self.information(self.linearised(z)), weight)
         used = valid > 0
         # The noise scales were fitted with the outliers in: the median restores the scale of the clean spots.

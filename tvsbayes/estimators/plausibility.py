@@ -18,6 +18,7 @@ from tvsbayes.errors import listed
 from tvsbayes.estimators.counter_pattern import counter_findings
 from tvsbayes.estimators.findings import Finding, doubts, line_of, mending_command
 from tvsbayes.estimators.four_point import SkippedExperiment, select_experiments
+from tvsbayes.estimators.sighting_pattern import sighting_findings
 from tvsbayes.estimators.spot_pattern import (
     MISMATCH_PX,
     SPOTS_LISTED,
@@ -69,11 +70,6 @@ class CampaignCheck:
         return {"kind": "campaign", **asdict(self), "findings": findings, "warnings": list(self.warnings)}
 
 
-def _points_mm(campaign: Campaign) -> np.ndarray:
-    """The usable spots in frame S, (n, 3); not a number where no undistorted point is seen."""
-    return triangulate(campaign.stereo, pixels_of(s for s in campaign.spots if s.status == "ok"))
-
-
 def _can_stand(depths_mm: np.ndarray) -> np.ndarray:
     return (depths_mm > NEAREST_SHEET_MM) & (depths_mm < FARTHEST_SHEET_MM)
 
@@ -88,7 +84,9 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     Returns:
         Findings, certain ones and doubts; `Finding.sentence` is what is printed.
     """
-    points_mm = _points_mm(campaign) if points_mm is None else points_mm
+    if campaign.rig.mechanism.sightings:
+        return sighting_findings(campaign)
+    points_mm = campaign.usable_points_mm if points_mm is None else points_mm
     few = partial(listed, most=SPOTS_LISTED)
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
     found = []
@@ -134,7 +132,7 @@ def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple
     """
     found = [*implausible(campaign)]
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
-    points_mm = _points_mm(campaign)
+    points_mm = campaign.usable_points_mm
     stands = _can_stand(points_mm[:, 0])
     if stands.sum() < 2 * SPOTS_MIN or stands.mean() <= 1 - ODD_SHARE:
         return tuple(found)
@@ -228,7 +226,8 @@ def _reading_findings(ok: Sequence[Spot]) -> list[Finding]:
 
 def _metres(campaign: Campaign) -> list[str]:
     """Lengths that are stated in metres where the name says mm."""
-    stated = {"mirror_offset_mm": campaign.rig.priors["mirror_offset_mm"].value}
+    lengths = [name for name in campaign.rig.mechanism.told if name == "mirror_offset_mm"]
+    stated = {name: campaign.rig.priors[name].value for name in lengths}
     origin = [campaign.rig.priors[name].value for name in names_of("extrinsics.translation_mm")]
     stated["extrinsics.translation_mm"] = max(origin, key=abs)
     traceability = campaign.header.get("traceability")
@@ -280,12 +279,13 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
     refused = Counter(spot.status for spot in campaign.spots if spot.status != "ok")
     selection = select_experiments(campaign)
-    points_mm = _points_mm(campaign)
+    sightings = campaign.rig.mechanism.sightings
+    points_mm = np.zeros((0, 3)) if sightings else campaign.usable_points_mm
     # What is wrong first, then what follows from it.
     findings = implausible(campaign, points_mm)
     warnings = [*(finding.sentence for finding in findings), *_incomplete(selection.skipped)]
     if not ok:
-        warnings.append("no spot has status ok: there is nothing to estimate from")
+        warnings.append(f"no {'sighting' if sightings else 'spot'} has status ok: there is nothing to estimate from")
     if count := interpolated(campaign.moves):
         warnings.append(f"{count} of {len(campaign.moves)} moves have no temperature_degC: interpolated in time")
     observed = {spot.move for spot in ok}
@@ -300,11 +300,11 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
         )
         warnings.append(f"{begin} with an unknown approach: the first reversal tells less")
     depths_mm = points_mm[:, 0]
-    if ok and np.all(_can_stand(depths_mm)) and depths_mm.max() < SHALLOW * depths_mm.min():
+    if len(depths_mm) and np.all(_can_stand(depths_mm)) and depths_mm.max() < SHALLOW * depths_mm.min():
         warnings.append("all spots lie at one depth: a second sheet position sharpens ratios threefold")
     if campaign.stereo.assumed:
         warnings.append("the stereo covariance is assumed, not estimated: uncertainties are only as good as it is")
-    if not np.any(campaign.stereo.parameter_covariance):
+    if not sightings and not np.any(campaign.stereo.parameter_covariance):
         warnings.append(
             "the stereo covariance is zero: its error (0.3 to 0.5 % of a ratio) is missing from every interval"
         )

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.estimators.campaign_arrays import SpotArrays
+from tvsbayes.estimators.campaign_arrays import SIGHTED, SpotArrays
 from tvsbayes.estimators.looks import Looks, Numbers
 from tvsbayes.model.geometry import materialise
 from tvsbayes.model.parameter_space import Model
@@ -107,6 +107,9 @@ def spot_residuals(looks: Looks, noise: NoiseScales, model: Model, spots: SpotAr
     )
     range_out = Reflection.of(by_range)
     residual, by_pan, by_tilt = (range_out.of_many(numbers)[1:] for numbers in (misfit, by_pan, by_tilt))
+    if spots.tangents is not None:
+        log_scale = -len(SIGHTED) * jnp.log(model.noise.pixel_scale) * spots.valid
+        return SpotResiduals(residual, by_pan, by_tilt, log_scale, range_out)
     # Four pixels give s^-4, their range integral s; the aperture's noise takes part in that integral.
     pixel_part = _dot(by_range[:4], by_range[:4])
     log_scale = -3 * jnp.log(model.noise.pixel_scale) - 0.5 * jnp.log1p(

@@ -380,6 +380,7 @@ def weighted_run[D: Density](
                 rounds, wanted, patience = 0, min(2 * rounds, left), 2 * patience
             else:
                 # Few draws do not say well how many more it takes.
-                wanted = min(rounds + left, max(rounds + 1, int(min(np.ceil(1.1 * needed), 2 * rounds))))
+                more = max(rounds + 1, rounds * 9 // 8, int(min(np.ceil(1.1 * needed), 2 * rounds)))
+                wanted = min(rounds + left, more)
     except FloatingPointError as error:
         raise NotConverged("no-density", str(error), remedy="see the weak directions of --no-sample") from error

@@ -1,6 +1,6 @@
 """A posterior read back from `results/`, of any instrument: draws by name, carried into any quantity.
 
-NumPy alone: no model, no fit. `fit.json` says what the draws are, `draws.npz` holds them.
+No model, no fit, no JAX. `fit.json` says what the draws are, `draws.npz` holds them.
 """
 
 from __future__ import annotations

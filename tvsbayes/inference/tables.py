@@ -17,6 +17,9 @@ CUT_NODES = NODES[::2]
 STEP = float(NODES[1] - NODES[0])
 FLOOR = -40.0
 """Of a tabulated log density below its largest: what lies lower is never drawn, and zero has no logarithm."""
+CUT_FLOOR = -1e5
+"""Of a cut below its largest value. SciPy takes slopes that differ by less than 1e-9 of the largest difference as
+equal: beside a fall by 1e15, which a cut may have, that is all of them."""
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
@@ -39,7 +42,7 @@ def between_cuts(log_density: np.ndarray) -> np.ndarray:
     none = ~np.isfinite(log_density)
     least = np.min(np.where(none, np.inf, log_density), axis=-1, keepdims=True)
     seen = np.where(none, np.where(np.isfinite(least), least, 0.0), log_density)
-    seen = _filled(seen)
+    seen = np.maximum(_filled(seen), seen.max(axis=-1, keepdims=True) + CUT_FLOOR)
     beside = np.zeros((*none.shape[:-1], len(NODES)), dtype=bool)
     beside[..., ::2], beside[..., 1::2] = none, none[..., :-1] | none[..., 1:]
     return np.where(beside, -np.inf, Akima1DInterpolator(CUT_NODES, seen, axis=-1)(NODES))

@@ -10,9 +10,9 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import numpy as np
 
@@ -38,7 +38,8 @@ from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign_header import parse_header
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.rig import RigTable, parse_rig_table, rig_table_toml
-from tvsbayes.instrument.stereo_pair import Stereo, parse_stereo, stereo_bytes
+from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, parse_sightings
+from tvsbayes.instrument.stereo_pair import NO_STEREO, Stereo, parse_stereo, stereo_bytes, triangulate
 
 CAMERAS: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 """The two cameras, in the order of the columns of spots.csv."""
@@ -240,7 +241,10 @@ def title_of(header: Mapping[str, object], path: Path | None) -> str:
 
 @dataclass(frozen=True, repr=False)
 class Campaign(Shown):
-    """A campaign folder, checked. `header` holds the keys of `campaign.toml` outside `[rig]`."""
+    """A campaign folder, checked. `header` holds the keys of `campaign.toml` outside `[rig]`.
+
+    `spots` are sightings, and `stereo` is `NO_STEREO`, where the mechanism says so.
+    """
 
     moves: tuple[Move, ...]
     spots: tuple[Spot, ...]
@@ -248,6 +252,23 @@ class Campaign(Shown):
     rig: RigTable = field(default_factory=RigTable)
     header: dict[str, object] = field(default_factory=dict)
     path: Path | None = None
+
+    @cached_property
+    def points_mm(self) -> np.ndarray:
+        """Where the stated cameras see each spot, a row each, frame S, shape (n, 3); triangulated once, read-only.
+
+        Not a number where there is no spot, and where the lens model does not reach.
+        """
+        found = np.full((len(self.spots), 3), np.nan)
+        usable = np.array([spot.status == "ok" for spot in self.spots], dtype=bool)
+        found[usable] = triangulate(self.stereo, pixels_of(spot for spot in self.spots if spot.status == "ok"))
+        found.flags.writeable = False
+        return found
+
+    @property
+    def usable_points_mm(self) -> np.ndarray:
+        """Rows of `points_mm` of the spots that may be used, in their order."""
+        return self.points_mm[[spot.status == "ok" for spot in self.spots]]
 
     @property
     def title(self) -> str:
@@ -257,9 +278,10 @@ class Campaign(Shown):
     def shown(self) -> View:
         """Counts, and the looks with the counters behind them."""
         ok = sum(spot.status == "ok" for spot in self.spots)
-        title = f"Campaign {self.title!r}: {len(self.moves)} moves, {len(self.spots)} spots ({ok} ok)"
+        kind, word = (SIGHTINGS, "sightings") if self.rig.mechanism.sightings else (SPOTS, "spots")
+        title = f"Campaign {self.title!r}: {len(self.moves)} moves, {len(self.spots)} {word} ({ok} ok)"
         at = {move.move: (move.pan_steps, move.tilt_steps) for move in self.moves}
-        others = SPOTS.required[2:]
+        others = kind.required[2:]
         rows = [
             (s.spot, s.move, *at.get(s.move, (None, None)), *(getattr(s, column) for column in others))
             for s in self.spots
@@ -390,22 +412,49 @@ _FILES = {
     "spots.csv": CSV_BYTES_MAX,
     "campaign.toml": TOML_BYTES_MAX,
 }
+_FILES_OF_SIGHTINGS = {
+    "moves.csv": CSV_BYTES_MAX,
+    SIGHTINGS.file: CSV_BYTES_MAX,
+    "campaign.toml": TOML_BYTES_MAX,
+}
 
 
 def _parse_files(files: dict[str, bytes], path: Path | None) -> Campaign:
     keys = parse_toml(files["campaign.toml"], "campaign.toml")
-    header, rig = parse_header(keys), parse_rig_table(keys.table("rig"))
+    sightings = SIGHTINGS.file in files
+    header, rig = parse_header(keys), parse_rig_table(keys.table("rig"), sightings)
+    if sightings:
+        moves = parse_moves(files["moves.csv"])
+        sightings_read = parse_sightings(files[SIGHTINGS.file], SIGHTINGS.file, len(moves))
+        return sighted_campaign(moves, sightings_read, rig, header, path)
     stereo = parse_stereo(files["stereo.json"], "stereo.json")
     moves = parse_moves(files["moves.csv"])
     spots = parse_spots(files["spots.csv"], "spots.csv", len(moves), stereo)
     return Campaign(moves, spots, stereo, rig, header, path)
 
 
+def sighted_campaign(
+    moves: Sequence[Move],
+    sightings: Sequence[Sighting],
+    rig: RigTable,
+    header: dict[str, object] | None = None,
+    path: Path | None = None,
+) -> Campaign:
+    """A campaign of a head that says where it points: sightings stand where those of a stereo pair have spots.
+
+    What every look has (`spot`, `move`, `target`, `status`, ...) a sighting has too; pixels are asked for by nobody who
+    has asked the mechanism.
+    """
+    looks = cast(tuple[Spot, ...], tuple(sightings))
+    return Campaign(tuple(moves), looks, NO_STEREO, rig, header or {}, path)
+
+
 def read_campaign(folder: Path | str) -> Campaign:
     """Reads and checks a campaign folder (data/docs/campaign-files.md). Never `truth.json`, frames or results.
 
     Args:
-        folder: holds `campaign.toml`, `stereo.json`, `moves.csv` and `spots.csv`.
+        folder: holds `campaign.toml`, `stereo.json`, `moves.csv` and `spots.csv`; of a head that says where it points
+            `campaign.toml`, `moves.csv` and `sightings.csv`.
 
     Returns:
         Moves in time order, spots in the order of the file, the stereo pair and the `[rig]` table; input of `fit`,
@@ -421,8 +470,15 @@ def read_campaign(folder: Path | str) -> Campaign:
         raise refusal("missing-file", file=place, found=found, allowed=allowed, remedy=remedy)
     if not os.path.lexists(folder / "campaign.toml"):
         raise _no_campaign(folder)
-    files = {name: read_bytes(folder / name, cap, folder) for name, cap in _FILES.items()}
-    return _parse_files(files, folder)
+    sightings = os.path.lexists(folder / SIGHTINGS.file)
+    if sightings and os.path.lexists(folder / SPOTS.file):
+        found, allowed = f"{SPOTS.file} and {SIGHTINGS.file}", "one of them"
+        remedy = (
+            "make a campaign of each: a stereo pair sees the spots of the one, the head says where the other pointed"
+        )
+        raise refusal("two-tables", file=SIGHTINGS.file, found=found, allowed=allowed, remedy=remedy)
+    wanted = _FILES_OF_SIGHTINGS if sightings else _FILES
+    return _parse_files({name: read_bytes(folder / name, cap, folder) for name, cap in wanted.items()}, folder)
 
 
 def _no_campaign(folder: Path) -> InputError:
@@ -443,6 +499,17 @@ def campaign_templates() -> dict[str, bytes]:
     return templates("templates", MOVES, SPOTS)
 
 
+def head_templates(sightings: bool) -> dict[str, bytes]:
+    """The commented files of an empty campaign of a pan-tilt head, with its rig file."""
+    files = templates("head_templates", MOVES, SIGHTINGS if sightings else SPOTS)
+    # A line that begins with #sightings or #spots is one of the other kind's, unless it is this one's.
+    own, other = (b"#sightings ", b"#spots ") if sightings else (b"#spots ", b"#sightings ")
+    return {
+        name: b"".join(line.removeprefix(own) for line in data.splitlines(keepends=True) if not line.startswith(other))
+        for name, data in files.items()
+    }
+
+
 def moves_bytes(moves: Iterable[Move]) -> bytes:
     """The content of `moves.csv`."""
     return MOVES.content(moves)
@@ -451,6 +518,13 @@ def moves_bytes(moves: Iterable[Move]) -> bytes:
 def spots_bytes(spots: Iterable[Spot]) -> bytes:
     """The content of `spots.csv`; the correlations appear only where one is not zero."""
     return SPOTS.content(spots)
+
+
+def looks_bytes(campaign: Campaign, ordered: bool = False) -> bytes:
+    """The content of `spots.csv` or `sightings.csv`; `ordered` by id."""
+    rows = sorted(campaign.spots, key=lambda row: row.spot) if ordered else campaign.spots
+    kind: CsvKind = SIGHTINGS if campaign.rig.mechanism.sightings else SPOTS
+    return kind.content(rows)
 
 
 def campaign_toml(campaign: Campaign) -> bytes:
@@ -469,8 +543,11 @@ def campaign_bytes(campaign: Campaign) -> dict[str, bytes]:
     Raises:
         InputError: `campaign` holds what `read_campaign` would refuse.
     """
-    tables = moves_bytes(campaign.moves), spots_bytes(campaign.spots)
-    files = dict(zip(_FILES, (stereo_bytes(campaign.stereo), *tables, campaign_toml(campaign)), strict=True))
+    tables = moves_bytes(campaign.moves), looks_bytes(campaign)
+    sightings = campaign.rig.mechanism.sightings
+    cameras = () if sightings else (stereo_bytes(campaign.stereo),)
+    wanted = _FILES_OF_SIGHTINGS if sightings else _FILES
+    files = dict(zip(wanted, (*cameras, *tables, campaign_toml(campaign)), strict=True))
     _parse_files(files, None)
     return files
 
@@ -494,19 +571,19 @@ def input_hashes(campaign: Campaign) -> dict[str, str]:
     Taken over the values in canonical text, spots in order of id: line endings, digits beyond double
     precision, the order of columns, the campaign's name and its notes do not count.
     """
-    spots = sorted(campaign.spots, key=lambda spot: spot.spot)
     contents = {
         "moves": moves_bytes(campaign.moves),
-        "spots": spots_bytes(spots),
-        "stereo": stereo_bytes(campaign.stereo),
+        "spots": looks_bytes(campaign, ordered=True),
+        "stereo": b"" if campaign.rig.mechanism.sightings else stereo_bytes(campaign.stereo),
         "rig": rig_table_toml(campaign.rig).encode(),
     }
     return {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
 
 
 def ordered_spots(campaign: Campaign) -> list[Spot]:
-    """Spots with status ok in the order in which the filter meets them."""
-    return sorted((s for s in campaign.spots if s.status == "ok"), key=lambda s: (s.move, s.spot))
+    """Spots, or sightings, with status ok in the order in which the filter meets them."""
+    ok = [s for s in campaign.spots if s.status == "ok"]
+    return sorted(ok, key=lambda s: (s.move, s.spot))
 
 
 def pixels_of(spots: Iterable[Spot]) -> np.ndarray:

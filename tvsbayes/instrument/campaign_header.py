@@ -66,12 +66,15 @@ def parse_header(keys: Keys) -> dict[str, object]:
 def mechanism_of(folder: Path) -> str:
     """Which instrument a campaign folder is of, by the `format` line of its `campaign.toml` and `mechanism` in `[rig]`.
 
+    A head that says where it points has sightings in place of spots.
+
     What cannot be read is left to the strict reader of scanners, which says what is wrong with it.
     """
     values = header_values(folder)
     kind = str(values.get("format", "")).partition("/")[0].removeprefix("tvsbayes-")
     rig = values.get("rig")
-    return str(rig.get("mechanism", SCANNER) if isinstance(rig, dict) else SCANNER) if kind == "campaign" else kind
+    word = str(rig.get("mechanism", SCANNER) if isinstance(rig, dict) else SCANNER) if kind == "campaign" else kind
+    return f"{word}-sightings" if (folder / "sightings.csv").is_file() else word
 
 
 def header_values(folder: Path) -> dict[str, object]:

@@ -33,7 +33,7 @@ from tvsbayes.instrument.campaign import (
     Spot,
     next_move,
 )
-from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, unit_of_name
+from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, unit_of_name, words_of
 
 SD_PX = 0.1
 """Standard uncertainty of a centroid where a table states none; the fit scales it by what the spots show."""
@@ -163,6 +163,20 @@ def looks_of(
     return ForeignLooks(moves, spots, tuple(assumed))
 
 
+def temperatures_of(cells: FieldCells, assumed: list[str]) -> list[float | None]:
+    """Temperature of every row, deg C, from degrees Fahrenheit or kelvins where the column's name says so."""
+    if "temperature_degC" not in cells:
+        return [None] * len(cells.table)
+    words = set(words_of(cells.columns["temperature_degC"]))
+    unit = "Fahrenheit" if words & {"f", "fahrenheit"} else "kelvin" if words & {"k", "kelvin"} else ""
+    found = cells.read(MOVES["temperature_degC"])
+    if unit:
+        factor, zero = (1 / 1.8, 32.0) if unit == "Fahrenheit" else (1.0, 273.15)
+        found = [None if value is None else factor * (value - zero) for value in found]
+        assumed.append(f"temperature: degrees of {unit}, as the column's name says, turned into deg C")
+    return found
+
+
 def _listed_moves(cells: FieldCells, listed: Sequence[Move]) -> list[int]:
     """The move of every row of a table without counters."""
     table, count = cells.table, len(cells.table)
@@ -187,7 +201,7 @@ def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[t
     numbers = cells.text("move") if "move" in cells else None
     homings = homings_of(cells, assumed)
     times_s = seconds_of(cells, assumed)
-    warm = cells.read(MOVES["temperature_degC"]) if "temperature_degC" in cells else [None] * count
+    warm = temperatures_of(cells, assumed)
     approaches = [_approaches(cells, axis, notation.approach[k]) for k, axis in enumerate(AXES)]
     moves: list[Move] = []
     of_row: list[int] = []

@@ -19,6 +19,11 @@ type Materialise = Callable[[Any], Any]
 """Has a compiler compute a tree of arrays once, see `model.geometry.materialise`."""
 
 
+def unchanged(tree: Any) -> Any:
+    """Where no compiler is."""
+    return tree
+
+
 class Vectors(NamedTuple):
     """Many vectors by their components; a single one broadcasts against them."""
 
@@ -124,6 +129,13 @@ class Optics(NamedTuple):
         """From the values, in mm and rad, of a block of `instrument.parameters` by its name."""
         return cls(*(block(field.replace("_rad", "_deg")) for field in cls._fields))
 
+    def leaving(
+        self, pan_rad: Numbers, tilt_rad: Numbers, functions: ModuleType, materialise: Materialise = unchanged
+    ) -> Ray:
+        """The beam behind the last mirror, in P; arguments as of `laser_way`."""
+        way = laser_way(self, pan_rad, tilt_rad, functions, materialise)
+        return Ray(*map(way.pan.forward, way.rays[-1]))
+
 
 class Way(NamedTuple):
     """The laser's way in frame Q: the turn from Q to P, the mirrors in order, and the rays that leave each of them."""
@@ -143,11 +155,7 @@ def intersect_plane(origin: Vectors, direction: Vectors, point: Vectors, normal:
     return origin + direction * ((point - origin).dot(normal) / direction.dot(normal))
 
 
-def _unchanged(tree: Any) -> Any:
-    return tree
-
-
-def reflected(ray: Ray, mirrors: Iterable[Mirror], materialise: Materialise = _unchanged) -> tuple[Ray, ...]:
+def reflected(ray: Ray, mirrors: Iterable[Mirror], materialise: Materialise = unchanged) -> tuple[Ray, ...]:
     """Rays that leave one mirror after the other: each starts where the one before it meets the mirror."""
     rays = []
     for mirror in mirrors:
@@ -193,7 +201,7 @@ def laser_way(
     pan_rad: Numbers,
     tilt_rad: Numbers,
     functions: ModuleType,
-    materialise: Materialise = _unchanged,
+    materialise: Materialise = unchanged,
 ) -> Way:
     """Follow the laser over all mirrors; the signs are part of the contract.
 

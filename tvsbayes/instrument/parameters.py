@@ -6,15 +6,15 @@ Units are those of the names: degrees where one says `deg`, radians where it say
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
-from itertools import groupby
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.quantities import Quantities, Quantity, Unit
 
 Distribution = Literal["normal", "half-normal", "log-normal"]
 KINDS: tuple[Distribution, ...] = get_args(Distribution)
-Unit = Literal["deg/step", "deg/K", "deg", "rad", "mm", "px", "min", "1"]
 Place = Literal["rig", "rig.prior", "stereo"]
 HARMONIC_ORDERS = (1, 2)
 """Of a transmission error with a stated shape: turns per period."""
@@ -38,14 +38,11 @@ class Prior:
 UNSTATED = Prior(0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
+@dataclass(frozen=True, kw_only=True)
+class Parameter(Quantity):
     """One parameter of the instrument.
 
     Attributes:
-        name: in files, results and draws.
-        block: the array of the model that it is an entry of: its name without the last part, or all of it.
-        unit: of value and u.
         place: the table `[rig]` or `[rig.prior]` of a file, or the stereo calibration.
         prior: default; that of the cameras is the covariance of their calibration.
         low, high, u_max: lowest and highest value and highest standard uncertainty that a file may state. Wide: they
@@ -54,9 +51,6 @@ class Parameter:
         receiver: observable only through aperture readings.
     """
 
-    name: str
-    block: str
-    unit: Unit
     place: Place
     prior: Prior = UNSTATED
     low: float = -math.inf
@@ -75,18 +69,18 @@ class Parameter:
 
 def _block(
     block: str,
-    parts: tuple[str, ...],
+    parts: Collection[str],
     unit: Unit,
     prior: Prior,
     limits: tuple[float, float, float],
+    words: str,
+    label: str = "",
     place: Place = "rig.prior",
-    *,
-    noise: bool = False,
-    receiver: bool = False,
-) -> tuple[Parameter, ...]:
-    """Parameters that differ in nothing but the last part of their names; a scalar has no parts."""
-    names = [f"{block}.{part}" for part in parts] or [block]
-    return tuple(Parameter(name, block, unit, place, prior, *limits, noise, receiver) for name in names)
+    **more: Any,
+) -> list[Parameter]:
+    """Parameters that differ in nothing but their parts; limits are `low`, `high` and `u_max`."""
+    more |= {"unit": unit, "prior": prior, "words": words, "label": label, "place": place}
+    return Parameter.many(block, parts, **more, **dict(zip(("low", "high", "u_max"), limits, strict=True)))
 
 
 def _cameras() -> tuple[Parameter, ...]:
@@ -96,7 +90,7 @@ def _cameras() -> tuple[Parameter, ...]:
     found = {f"stereo.{side}": units for side in ("left", "right")}
     found |= {"stereo.rotation_rad": dict.fromkeys("xyz", "rad"), "stereo.translation_mm": dict.fromkeys("xyz", "mm")}
     return tuple(
-        Parameter(f"{block}.{part}", block, unit, "stereo")
+        Parameter(name=f"{block}.{part}", block=block, unit=unit, place="stereo")
         for block, own in found.items()
         for part, unit in own.items()
     )
@@ -107,49 +101,109 @@ _RATIO, _ANGLE, _LENGTH, _SD = (1e-6, 10.0, 10.0), (-30.0, 30.0, 30.0), (-100.0,
 _SCALE, _REACH = (0.0, 0.0, 10.0), (0.1, 360.0, 5.0)
 _AMPLITUDES = tuple(f"{axis}.{number}" for axis in AXES for number in range(1, PERIODS_MAX + 1))
 _HARMONICS = tuple(f"{axis}.{order}.{part}" for axis in AXES for order in HARMONIC_ORDERS for part in ("cos", "sin"))
+_OF_GEARS = "the ratio of the gears"
 _PARAMETERS = (
-    Parameter("degrees_per_step.pan", "degrees_per_step", "deg/step", "rig.prior", Prior(0.06, 0.01), *_RATIO),
-    Parameter("degrees_per_step.tilt", "degrees_per_step", "deg/step", "rig.prior", Prior(0.07, 0.01), *_RATIO),
-    *_block("ratio_contrast_deg_per_step", AXES, "deg/step", Prior(0.0, 2e-4), (-1.0, 1.0, 1.0)),
-    *_block("backlash_deg", AXES, "deg", Prior(0.0, 0.5, "half-normal"), (0.0, 0.0, 45.0)),
-    *_block("tilt_zero_deg", (), "deg", Prior(0.0, 2.0), (-90.0, 90.0, 180.0)),
-    *_block("mirror_offset_mm", (), "mm", Prior(30.0, 5.0), (-1000.0, 1000.0, 1000.0)),
-    *_block("mirror1_error_deg", (), "deg", _SMALL, _ANGLE),
-    *_block("mirror2_error_deg", (), "deg", _SMALL, _ANGLE),
-    *_block("laser_tilt_deg", ("x", "y"), "deg", _SMALL, _ANGLE),
-    *_block("laser_offset_mm", ("x", "y"), "mm", _SMALL, _LENGTH),
-    *_block("tilt_axis_skew_deg", (), "deg", _SMALL, _ANGLE),
-    *_block("tilt_axis_offset_mm", ("x", "z"), "mm", _SMALL, _LENGTH),
-    *_block("extrinsics.rotation_rad", _XYZ, "rad", Prior(0.0, 0.5), (-3.15, 3.15, 3.15)),
-    *_block("extrinsics.translation_mm", _XYZ, "mm", Prior(0.0, 100.0), (-1e5, 1e5, 1e5)),
-    *_block("stop_sd_deg", DIRECTIONS, "deg", Prior(0.04, 1.0, "log-normal"), _SD, noise=True),
-    *_block("pixel_scale", (), "1", Prior(1.0, 0.5, "log-normal"), (1e-3, 1e3, 5.0), noise=True),
-    *_block("focal_scale", (), "1", Prior(1.0, 0.002), (0.5, 2.0, 0.5), "rig"),
-    *_block("baseline_mm", (), "mm", Prior(200.0, 0.1), (1.0, 1e5, 1e4), "rig", receiver=True),
-    *_block("pan_zero_emission_deg", (), "deg", Prior(90.0, 0.2), (0.0, 180.0, 180.0), "rig", receiver=True),
-    *_block("aperture_zero_deg", (), "deg", Prior(0.0, 0.1), (-180.0, 180.0, 180.0), "rig", receiver=True),
-    *_block("aperture_sd_deg", (), "deg", Prior(0.02, 0.0, "log-normal"), _SD, "rig", noise=True, receiver=True),
+    *_block("degrees_per_step", ("pan",), "deg/step", Prior(0.06, 0.01), _RATIO, _OF_GEARS, headline=True),
+    *_block("degrees_per_step", ("tilt",), "deg/step", Prior(0.07, 0.01), _RATIO, _OF_GEARS, headline=True),
+    *_block("ratio_contrast_deg_per_step", AXES, "deg/step", Prior(0.0, 2e-4), (-1.0, 1.0, 1.0),
+            "the difference of the ratios of both directions"),
+    *_block("backlash_deg", AXES, "deg", Prior(0.0, 0.5, "half-normal"), (0.0, 0.0, 45.0),
+            "the backlash", "backlash {0}", headline=True, judged=True, target="backlash.{0}"),
+    *_block("tilt_zero_deg", (), "deg", Prior(0.0, 2.0), (-90.0, 90.0, 180.0), "the tilt mirror at counter 0"),
+    *_block("mirror_offset_mm", (), "mm", Prior(30.0, 5.0), (-1000.0, 1000.0, 1000.0),
+            "the mirror offset", "mirror offset L"),
+    *_block("mirror1_error_deg", (), "deg", _SMALL, _ANGLE, "the angle of mirror 1"),
+    *_block("mirror2_error_deg", (), "deg", _SMALL, _ANGLE, "the angle of mirror 2"),
+    *_block("laser_tilt_deg", ("x", "y"), "deg", _SMALL, _ANGLE, "the laser's direction"),
+    *_block("laser_offset_mm", ("x", "y"), "mm", _SMALL, _LENGTH, "the laser's place"),
+    *_block("tilt_axis_skew_deg", (), "deg", _SMALL, _ANGLE, "the skew of the tilt axis"),
+    *_block("tilt_axis_offset_mm", ("x", "z"), "mm", _SMALL, _LENGTH, "the place of the tilt axis"),
+    *_block("extrinsics.rotation_rad", _XYZ, "rad", Prior(0.0, 0.5), (-3.15, 3.15, 3.15),
+            "the positioner's attitude", "positioner turned about {0}"),
+    *_block("extrinsics.translation_mm", _XYZ, "mm", Prior(0.0, 100.0), (-1e5, 1e5, 1e5),
+            "the positioner's place", "positioner at {0}"),
+    *_block("stop_sd_deg", DIRECTIONS, "deg", Prior(0.04, 1.0, "log-normal"), _SD,
+            "the scatter of stops", "stop scatter {0}", noise=True),
+    *_block("pixel_scale", (), "1", Prior(1.0, 0.5, "log-normal"), (1e-3, 1e3, 5.0),
+            "the pixel noise over the stated one", "pixel noise / stated", noise=True),
+    *_block("focal_scale", (), "1", Prior(1.0, 0.002), (0.5, 2.0, 0.5), "the focal scale", place="rig"),
+    *_block("baseline_mm", (), "mm", Prior(200.0, 0.1), (1.0, 1e5, 1e4), "the baseline", place="rig", receiver=True),
+    *_block("pan_zero_emission_deg", (), "deg", Prior(90.0, 0.2), (0.0, 180.0, 180.0),
+            "the emission angle at pan 0", place="rig", receiver=True),
+    *_block("aperture_zero_deg", (), "deg", Prior(0.0, 0.1), (-180.0, 180.0, 180.0),
+            "the aperture's zero", place="rig", receiver=True),
+    *_block("aperture_sd_deg", (), "deg", Prior(0.02, 0.0, "log-normal"), _SD,
+            "the scatter of aperture readings", place="rig", noise=True, receiver=True),
     # No transmission error unless a rig states one or a fit is asked to free it.
-    *_block("harmonic_deg", _HARMONICS, "deg", UNSTATED, (-10.0, 10.0, 10.0)),
-    *_block("transmission_error_deg", AXES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE, noise=True),
-    *_block("transmission_error_length_deg", AXES, "deg", Prior(8.0, 0.7, "log-normal"), _REACH, noise=True),
-    *_block("play_variation_deg", AXES, "deg", Prior(0.0, 0.02, "half-normal"), _SCALE, noise=True),
-    *_block("drift_deg_per_root_hour", AXES, "deg", Prior(0.0, 0.02, "half-normal"), _SCALE, noise=True),
-    *_block("harmonic_amplitude_deg", _AMPLITUDES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE, noise=True),
-    *_block("look_scatter_deg", AXES, "deg", Prior(0.0, 0.01, "half-normal"), _SCALE, noise=True),
-    *_block("creep_deg", AXES, "deg", Prior(0.0, 0.0), (-10.0, 10.0, 10.0)),
-    *_block("creep_minutes", (), "min", Prior(20.0, 0.8, "log-normal"), (1e-3, 1e5, 5.0)),
-    *_block("thermal_deg_per_K", AXES, "deg/K", Prior(0.0, 0.01), (-10.0, 10.0, 10.0)),
+    *_block("harmonic_deg", _HARMONICS, "deg", UNSTATED, (-10.0, 10.0, 10.0), "the periodic error of the gears"),
+    *_block("transmission_error_deg", AXES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE,
+            "the transmission error, sd", "transmission error sd, {0}", noise=True),
+    *_block("transmission_error_length_deg", AXES, "deg", Prior(8.0, 0.7, "log-normal"), _REACH,
+            "the angle over which the transmission error changes", "over an angle of, {0}", noise=True),
+    *_block("play_variation_deg", AXES, "deg", Prior(0.0, 0.02, "half-normal"), _SCALE,
+            "the variation of play, sd", "play variation sd, {0}", noise=True),
+    *_block("drift_deg_per_root_hour", AXES, "deg", Prior(0.0, 0.02, "half-normal"), _SCALE,
+            "the drift in a root hour, sd", "drift in a root hour, {0}", noise=True),
+    *_block("harmonic_amplitude_deg", _AMPLITUDES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE,
+            "the amplitude of a periodic error", "period {1}, amplitude sd, {0}", noise=True),
+    *_block("look_scatter_deg", AXES, "deg", Prior(0.0, 0.01, "half-normal"), _SCALE,
+            "the scatter of looks, sd", "look scatter {0}", noise=True),
+    *_block("creep_deg", AXES, "deg", Prior(0.0, 0.0), (-10.0, 10.0, 10.0),
+            "the creep of the zero while the machine warms up, in all", "creep of the zero, {0}"),
+    *_block("creep_minutes", (), "min", Prior(20.0, 0.8, "log-normal"), (1e-3, 1e5, 5.0),
+            "the time constant of the creep"),
+    *_block("thermal_deg_per_K", AXES, "deg/K", Prior(0.0, 0.01), (-10.0, 10.0, 10.0),
+            "the shift of the zero per kelvin", "zero per kelvin, {0}"),
     *_cameras(),
-)
+)  # fmt: skip
+_TURN, _TERM = Prior(0.0, 10.0), Prior(0.0, 0.5)
+_TERMS = (
+    *_block("elevation_zero_deg", (), "deg", _TURN, (-360.0, 360.0, 360.0),
+            "the elevation at counter 0", "elevation at counter 0"),
+    *_block("elevation_axis_offset_mm", (), "mm", _SMALL, (-1000.0, 1000.0, 1000.0),
+            "the elevation axis before the azimuth axis", "elevation axis ahead"),
+    *_block("axes_not_square_deg", (), "deg", _TERM, _ANGLE, "the axes not square to each other", "axes not square"),
+    *_block("beam_not_square_deg", (), "deg", _TERM, _ANGLE,
+            "the beam not square to the elevation axis", "beam not square"),
+    *_block("azimuth_axis_tilt_deg", ("north", "east"), "deg", _TERM, _ANGLE,
+            "the lean of the azimuth axis", "azimuth axis leans {0}"),
+    *_block("beam_offset_mm", ("y", "z"), "mm", _SMALL, _LENGTH, "the beam off the elevation axis",
+            "beam off axis, {0}"),
+    *_block("flexure_deg", (), "deg", UNSTATED, _ANGLE, "the flexure with cos(elevation)", "flexure, cos(elevation)"),
+    *_block("azimuth_zero_deg", (), "deg", _TURN, (-360.0, 360.0, 360.0),
+            "the azimuth at counter 0", "azimuth at counter 0"),
+    *_block("tangent_flexure_deg", (), "deg", UNSTATED, _ANGLE,
+            "the flexure with cot(elevation)", "flexure, cot(elevation)"),
+)  # fmt: skip
+"""Of a pan-tilt head. TPOINT's terms: elevation_zero IE, azimuth_zero -IA, azimuth_axis_tilt north AN and east -AW,
+axes_not_square NPAE, beam_not_square CA, flexure TF, tangent_flexure TX."""
+_many = Quantity.many
+_LINES = (
+    *_many("effective_deg_per_step", DIRECTIONS, unit="deg/step", words="the effective ratio", label="effective {0}",
+           headline=True, judged=True, ratio=True, target="{0}", stated="degrees_per_step.{axis}"),
+    *_many("effective_contrast_deg_per_step", AXES, unit="deg/step", label="{sides}",
+           words="the difference of the effective ratios", headline=True, ratio=True, target="contrast.{0}"),
+)  # fmt: skip
+_DERIVED = (
+    *_many("degrees_per_step", DIRECTIONS, unit="deg/step", words=_OF_GEARS),
+    *_many("effective_mirror_offset_mm", (), unit="mm", words="beam off the pan axis", label="beam off the pan axis",
+           headline=True, target="mirror_offset", stated="mirror_offset_mm"),
+    *_many("local_deg_per_step", DIRECTIONS, unit="deg/step", words="the local ratio", ratio=True),
+    *_many("transmission_error_at_deg", (), unit="deg", words="the transmission error"),
+    *_many("play_variation_at_deg", (), unit="deg", words="the variation of play"),
+)  # fmt: skip
 
-REGISTRY: dict[str, Parameter] = {parameter.name: parameter for parameter in _PARAMETERS}
+REGISTRY = Quantities(*_PARAMETERS)
 """Every parameter by its name, in the order of the coordinates, which stored draws and results keep."""
 NAMES: tuple[str, ...] = tuple(REGISTRY)
+_HEAD_SLOTS = NAMES[NAMES.index("tilt_zero_deg") : NAMES.index("tilt_axis_offset_mm.z") + 1]
+HEAD_TERMS: dict[str, Parameter] = dict(zip(_HEAD_SLOTS, _TERMS, strict=True))
+"""Geometry of a pan-tilt head, by the name of the scanner's parameter whose coordinate it takes (`mechanisms`)."""
+_OF_HEADS = {term.name: term for term in _TERMS}
 INDEX: dict[str, int] = {name: index for index, name in enumerate(NAMES)}
-BLOCKS: dict[str, tuple[str, ...]] = {
-    block: tuple(parameter.name for parameter in own) for block, own in groupby(_PARAMETERS, lambda p: p.block)
-}
+COLUMNS: dict[str, int] = INDEX | {term.name: INDEX[name] for name, term in HEAD_TERMS.items()}
+"""Coordinates of parameters, those of heads among them."""
+BLOCKS = REGISTRY.blocks
 """Names by block; the parameters of a block follow each other."""
 RIG_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place != "stereo")
 """What has a prior of its own; they come first."""
@@ -178,13 +232,12 @@ LATE_NAMES: tuple[str, ...] = (*LOOK_SCATTER_NAMES, *ZERO_SHIFT_NAMES)
 """Parameters that earlier versions did not know: files leave them out at their defaults."""
 NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
-DERIVED_UNITS: dict[str, Unit] = {
-    **dict.fromkeys(("degrees_per_step", "effective_deg_per_step", "effective_contrast_deg_per_step"), "deg/step"),
-    "local_deg_per_step": "deg/step",
-    "effective_mirror_offset_mm": "mm",
-    **dict.fromkeys(("transmission_error_at_deg", "play_variation_at_deg"), "deg"),
-}
-"""Of quantities that follow from parameters, by the first part of their names: ratios by direction, for instance."""
+QUANTITIES: Quantities[Quantity] = Quantities(*_LINES, *_PARAMETERS, *_TERMS, *_DERIVED)
+"""What is said of scanner and head: parameters, what follows from them. `HEADLINES` and `TARGETS` keep this order."""
+HEADLINES = tuple(quantity for quantity in QUANTITIES.values() if quantity.headline)
+TARGETS = {quantity.target: quantity for quantity in HEADLINES if quantity.target}
+"""Headlines that plans and studies are for, by the names that they have there."""
+TARGET_ROWS = {target: row for row, target in enumerate(TARGETS)}
 PRIOR_GROUPS: dict[str, list[int]] = {
     cause: [INDEX[parameter.name] for parameter in _PARAMETERS if parameter.cause == cause]
     for cause in dict.fromkeys(REGISTRY[name].cause for name in (*STEREO_PARAMETER_NAMES, *RIG_NAMES))
@@ -204,6 +257,14 @@ OPTICS_NAMES: tuple[str, ...] = names_of(
 """What bends the beam's way through the positioner; all but the first are zero in the nominal rig."""
 
 
-def unit_of(name: str) -> Unit:
+def parameter_of(name: str) -> Parameter | None:
+    """The parameter of any mechanism with this name; None where there is none."""
+    return REGISTRY.get(name) or _OF_HEADS.get(name)
+
+
+def unit_of(name: str) -> str:
     """Unit of a parameter or a derived quantity: `backlash_deg.pan` -> deg; "1" where it has none."""
-    return REGISTRY[name].unit if name in REGISTRY else DERIVED_UNITS[name.split(".")[0]]
+    found = QUANTITIES.of(name)
+    if found is None:
+        raise KeyError(name)
+    return found.unit

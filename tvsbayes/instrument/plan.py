@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -62,8 +63,8 @@ _PLAN_ACTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def _actions(table: Table, values: Values) -> None:
-    """Refuses an action without its columns or with another's, and a look before a place."""
+def _actions(table: Table, values: Values, sheets: bool = True) -> None:
+    """Refuses an action without its columns or with another's, and a look before a place where there are sheets."""
     check_experiments(table, values["experiment"], values["point"], [True] * len(table))
     targets, placed = values["target"], ""
     for row, action in enumerate(values["action"]):
@@ -77,27 +78,31 @@ def _actions(table: Table, values: Values) -> None:
                 raise table.refuse(row, column, "action", allowed, "give each action its own columns only")
         if action == "place":
             placed = targets[row]
-        elif action == "look" and (not placed or targets[row] not in ("", placed)):
+        elif action == "look" and sheets and (not placed or targets[row] not in ("", placed)):
             allowed = f"an empty cell or {placed}, placed last" if placed else "a place before the look"
             raise table.refuse(row, "target", "target", allowed, "place the target first")
 
 
-def parse_plan(data: bytes, file: str = PLANS.file) -> tuple[PlanStep, ...]:
+def parse_plan(data: bytes, file: str = PLANS.file, sheets: bool = True) -> tuple[PlanStep, ...]:
     """The checked rows of `plan.csv`; see `read_plan`."""
-    steps = PLANS.parse(data, file, _actions)
+    steps = PLANS.parse(data, file, partial(_actions, sheets=sheets))
     return tuple(
         replace(step, pan_steps=step.pan_steps or 0, tilt_steps=step.tilt_steps or 0) if step.action == "home" else step
         for step in steps
     )
 
 
-def read_plan(path: Path) -> tuple[PlanStep, ...]:
+def read_plan(path: Path, sheets: bool = True) -> tuple[PlanStep, ...]:
     """Reads `plan.csv`: home (counters default to 0), place, move and look steps in order.
+
+    Args:
+        path: of the file.
+        sheets: looks are at sheets, which must be placed; a head that says where it points has none.
 
     Raises:
         InputError: wrong order, an action without its columns or with another's, a look before a place.
     """
-    return parse_plan(read_bytes(path, CSV_BYTES_MAX), escaped(Path(path).name))
+    return parse_plan(read_bytes(path, CSV_BYTES_MAX), escaped(Path(path).name), sheets)
 
 
 def write_plan(steps: Sequence[PlanStep], path: Path) -> None:
@@ -191,6 +196,9 @@ def run_plan(
         InputError: a look before a target is placed, or a target that the rig does not have.
     """
     log, time_s, segment = PlanLog(), 0.0, -1
+    if rig.table.mechanism.sightings:
+        # No sheet is asked for.
+        log.targets.append("")
     for step in plan:
         if step.action == "home" or (not log.moves and step.action in ("move", "look")):
             segment += 1

@@ -15,21 +15,24 @@ from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
 from tvsbayes.instrument.counter_limits import COUNTER_MAX, HOME_KEYS, LIMIT_KEYS, CounterLimits
+from tvsbayes.instrument.mechanisms import HEAD, MECHANISMS, TWO_MIRROR, WORDS, Mechanism, mechanism_of
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
     HARMONIC_NAMES,
     LATE_NAMES,
-    NAMES,
     PERIODS_MAX,
     REGISTRY,
-    RIG_NAMES,
     RIG_PRIORS,
+    Place,
     Prior,
+    parameter_of,
 )
-from tvsbayes.instrument.stereo_pair import Stereo, read_stereo
+from tvsbayes.instrument.stereo_pair import NO_STEREO, Stereo, read_stereo
 
 SPOT_SD_PX = 0.08
 """Standard uncertainty stated for a spot centre where nobody names one."""
+SIGHTING_SD_DEG = 0.005
+"""The same for a sighting."""
 PERIODIC_NAMES = (*HARMONIC_NAMES, *AMPLITUDE_NAMES)
 """Parameters that mean nothing on an axis without their period."""
 Setting = str | int | float
@@ -40,8 +43,8 @@ Setting = str | int | float
 class RigTable:
     """The `[rig]` table of a campaign or rig file: every prior the estimators use.
 
-    `priors` maps every name of `RIG_PRIORS` to its `Prior`; names left out take the default. Where the axis lacks the
-    period that a name needs, its default is 0, fixed.
+    `priors` maps every name of the mechanism's `priors` to its `Prior`; names left out take the default. Where the
+    axis lacks the period that a name needs, its default is 0, fixed.
     `harmonic_period_deg` maps "pan" and "tilt", where declared, to the periods of the transmission error in
     degrees of the output, 1 to `PERIODS_MAX` different ones: `FULL_TURN_DEG` for the wheel, less for pinion and teeth.
     `harmonic_deg` is an error of the first one's, `harmonic_amplitude_deg.<axis>.<number>` of each.
@@ -53,9 +56,10 @@ class RigTable:
     priors: dict[str, Prior] = field(default_factory=dict)
     aperture_convention: Literal["in-plane", "azimuth"] = "in-plane"
     harmonic_period_deg: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    mechanism: Mechanism = TWO_MIRROR
 
     def __post_init__(self) -> None:
-        priors = {**RIG_PRIORS, **self.priors}
+        priors = {**self.mechanism.priors, **self.priors}
         for name in PERIODIC_NAMES:
             if priors[name] == RIG_PRIORS[name] and not _has_period(name, self.harmonic_period_deg):
                 priors[name] = replace(priors[name], value=0.0, u=0.0)
@@ -95,16 +99,26 @@ class Rig:
         return float(self.cameras.get("spot_sd_px", SPOT_SD_PX))
 
     @property
+    def sighting_sd_deg(self) -> float:
+        """Standard uncertainty stated for simulated sightings."""
+        return float(self.cameras.get("sighting_sd_deg", SIGHTING_SD_DEG))
+
+    @property
     def limits(self) -> CounterLimits:
         """Lowest and highest counters, where `[positioner]` states them."""
         return CounterLimits.of(self.positioner)
 
 
-_PRIOR_NAMES = tuple(p.name for p in REGISTRY.values() if p.place == "rig.prior")
-_DECLARED_NAMES = tuple(p.name for p in REGISTRY.values() if p.place == "rig")
 _PERIOD_NAMES = {f"harmonic_period_deg.{axis}": axis for axis in AXES}
 _PERIOD_MIN_DEG = 1e-6
-_GROUPS = {name.rsplit(".", n)[0] for name in (*NAMES, *_PERIOD_NAMES) for n in (1, 2, 3)}
+_GROUPS = {
+    name.rsplit(".", n)[0] for each in MECHANISMS.values() for name in (*each.names, *_PERIOD_NAMES) for n in (1, 2, 3)
+}
+
+
+def _names_at(place: Place, mechanism: Mechanism) -> tuple[str, ...]:
+    """What may stand in a table of a mechanism's file."""
+    return tuple(p.name for p in mechanism.parameters.values() if p.place == place and p.name in mechanism.told)
 
 
 def _period_number(name: str) -> int:
@@ -153,8 +167,11 @@ def _explanation(name: str, allowed: tuple[str, ...]) -> str:
     stem, _, last = name.partition(".")
     if name in _PERIOD_NAMES:
         return "it belongs into [rig] itself: tooth counts fix it, so it has no prior and no other truth"
-    if name in _PRIOR_NAMES:
-        return "it belongs into [rig.prior]"
+    parameter = parameter_of(name)
+    if parameter is not None and parameter.place != "stereo":
+        elsewhere = parameter.place == "rig.prior" and "backlash_deg.pan" not in allowed
+        other = "it means nothing to this mechanism: leave it out, or correct `mechanism` in [rig]"
+        return "it belongs into [rig.prior]" if elsewhere else other
     if stem == "degrees_per_step" and last in DIRECTION_SIGNS:
         axis, _ = DIRECTION_SIGNS[last]
         return f"it is derived: state degrees_per_step.{axis} and ratio_contrast_deg_per_step.{axis}"
@@ -179,7 +196,8 @@ def _in_blocks(names: Iterable[str]) -> str:
     """Names in short: those of a block in one word, as `harmonic_deg.pan|tilt.1|2.cos|sin`."""
     blocks: dict[str, list[list[str]]] = {}
     for name in names:
-        block = REGISTRY[name].block if name in REGISTRY else name.split(".")[0]
+        parameter = parameter_of(name)
+        block = name.split(".")[0] if parameter is None else parameter.block
         blocks.setdefault(block, []).append(name.removeprefix(block).split(".")[1:])
     return ", ".join(
         ".".join([block, *("|".join(dict.fromkeys(part)) for part in zip(*parts, strict=True))])
@@ -193,7 +211,7 @@ def _named_entries(table: Keys, allowed: tuple[str, ...]) -> dict[str, tuple[Key
     for keys, key, name in _entries(table):
         if name not in allowed:
             # Keys of [rig] itself that are no priors are read before.
-            more = () if "rig" not in table.path or "prior" in table.path else ("aperture_convention", "prior")
+            more = () if "rig" not in table.path or "prior" in table.path else _OWN_KEYS
             names = "only " + _in_blocks((*allowed, *more))
             stands = f"the name {escaped(name)}"
             raise keys.refuse(key, "unknown-key", names, _explanation(name, allowed), stands)
@@ -207,7 +225,8 @@ def _parse_priors(entries: Mapping[str, tuple[Keys, str]]) -> dict[str, Prior]:
     """The priors that stand there, checked."""
     priors: dict[str, Prior] = {}
     for name, (keys, key) in entries.items():
-        parameter = REGISTRY[name]
+        parameter = parameter_of(name)
+        assert parameter is not None
         stated = keys.values.get(key)
         if parameter.prior.distribution == "half-normal" and isinstance(stated, dict) and stated.get("value", 0) != 0:
             remedy = "write value = 0: it is the size of something that has no sign, a half-normal whose scale is u"
@@ -240,22 +259,42 @@ def _check_periods(table: Keys, priors: Mapping[str, Prior], period_deg: Mapping
         raise table.refuse(name, "missing-period", allowed, _period_remedy(name), found)
 
 
-def parse_rig_table(table: Keys) -> RigTable:
+_OWN_KEYS = ("aperture_convention", "mechanism", "prior")
+"""Of `[rig]`, besides what has a value and a u."""
+
+
+def _mechanism(table: Keys, sightings: bool) -> Mechanism:
+    """What carries the beam, by the key `mechanism`."""
+    word = table.word("mechanism", WORDS) if "mechanism" in table else TWO_MIRROR.word
+    if sightings and word == TWO_MIRROR.word:
+        remedy = 'write mechanism = "pan-tilt" into [rig]; a scanner needs stereo.json and spots.csv instead'
+        allowed = "a pan-tilt head where there are sightings and no stereo pair"
+        raise table.refuse("mechanism", "mechanism", allowed, remedy, f"a {word} instrument")
+    return mechanism_of(word, sightings)
+
+
+def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
     """The `[rig]` table with its `[rig.prior]`; absent entries take their defaults.
+
+    Args:
+        table: of a campaign or rig file.
+        sightings: a head says where it was found to point: there are no spots and no stereo pair.
 
     Raises:
         InputError: unknown or misplaced names, entries that are not { value, u }, values out of range,
             a half-normal with a value other than 0, harmonics or amplitudes without a period, a period with u > 0.
     """
-    own = {k: v for k, v in table.values.items() if k not in ("aperture_convention", "prior")}
+    mechanism = _mechanism(table, sightings)
+    declared_names, prior_names = (_names_at(place, mechanism) for place in ("rig", "rig.prior"))
+    own = {k: v for k, v in table.values.items() if k not in _OWN_KEYS}
     own_keys = Keys(own, table.file, table.text, table.path)
-    own_entries = _named_entries(own_keys, (*_DECLARED_NAMES, *_PERIOD_NAMES))
+    own_entries = _named_entries(own_keys, (*declared_names, *_PERIOD_NAMES))
     period_deg: dict[str, tuple[float, ...]] = {
         axis: _parse_periods(*own_entries.pop(n)) for n, axis in _PERIOD_NAMES.items() if n in own_entries
     }
     declared = _parse_priors(own_entries)
     # Any parameter may stand in [rig.prior], also one that has its place in [rig].
-    prior = _parse_priors(_named_entries(table.table("prior"), (*_PRIOR_NAMES, *_DECLARED_NAMES)))
+    prior = _parse_priors(_named_entries(table.table("prior"), (*prior_names, *declared_names)))
     for name in declared:
         if name in prior:
             found = f"{name} in [rig] and in [rig.prior]"
@@ -263,7 +302,7 @@ def parse_rig_table(table: Keys) -> RigTable:
     _check_periods(table.table("prior"), prior, period_deg)
     key = "aperture_convention"
     azimuth = key in table and table.word(key, ("in-plane", "azimuth")) == "azimuth"
-    return RigTable({**prior, **declared}, "azimuth" if azimuth else "in-plane", period_deg)
+    return RigTable({**prior, **declared}, "azimuth" if azimuth else "in-plane", period_deg, mechanism)
 
 
 def rig_table_toml(table: RigTable) -> str:
@@ -278,15 +317,19 @@ def rig_table_toml(table: RigTable) -> str:
         prior = table.priors[name]
         return toml_line(name, {"value": float(prior.value), "u": float(prior.u)})
 
-    convention = toml_line("aperture_convention", table.aperture_convention)
+    kind = table.mechanism
+    scanner = kind is TWO_MIRROR
+    convention = toml_line(
+        *(("aperture_convention", table.aperture_convention) if scanner else ("mechanism", kind.word))
+    )
     stated = {name: table.harmonic_period_deg.get(axis, ()) for name, axis in _PERIOD_NAMES.items()}
     periods = [
         toml_line(name, {"value": own[0] if len(own) == 1 else own, "u": 0.0}) for name, own in stated.items() if own
     ]
     periodic = [entry(name) for name in PERIODIC_NAMES if _has_period(name, table.harmonic_period_deg)]
-    declared = map(entry, _DECLARED_NAMES)
+    declared = map(entry, _names_at("rig", kind))
     silent = {name for name in LATE_NAMES if table.priors[name] == REGISTRY[name].prior}
-    priors = (entry(name) for name in _PRIOR_NAMES if name not in {*PERIODIC_NAMES, *silent})
+    priors = (entry(name) for name in _names_at("rig.prior", kind) if name not in {*PERIODIC_NAMES, *silent})
     return "\n".join(["[rig]", *declared, *periods, convention, "[rig.prior]", *priors, *periodic]) + "\n"
 
 
@@ -343,7 +386,8 @@ def _parse_positioner(table: Keys) -> dict[str, Setting]:
 
 def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, Setting]:
     """`[cameras]`: driver, devices, size (that of the calibration), exposure, spot uncertainty, `options`."""
-    table.only(("driver", "source", "left", "right", "width", "height", "exposure", "spot_sd_px", "options"))
+    numbers = {"exposure": (-100.0, 1e9), "spot_sd_px": (1e-4, 100.0), "sighting_sd_deg": (1e-7, 30.0)}
+    table.only(("driver", "source", "left", "right", "width", "height", *numbers, "options"))
     values: dict[str, Setting] = {"spot_sd_px": SPOT_SD_PX, **_parse_options(table)}
     if "driver" in table:
         values["driver"] = table.text_value("driver")
@@ -357,9 +401,7 @@ def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, Setting]:
             if values[key] != calibrated:
                 remedy = "calibrate and observe at one image size"
                 raise table.refuse(key, "image-size", f"{calibrated} px, as in the stereo file", remedy)
-    for key, low, high in (("exposure", -100.0, 1e9), ("spot_sd_px", 1e-4, 100.0)):
-        if key in table:
-            values[key] = table.number(key, low, high)
+    values |= {key: table.number(key, *ends) for key, ends in numbers.items() if key in table}
     return values
 
 
@@ -386,15 +428,17 @@ def read_rig(path: Path) -> Rig:
     tables = ("rig", "truth", "sheets", "positioner", "cameras", "costs")
     keys.only(("format", "name", "notes", "stereo", *tables))
     header = {key: keys.text_value(key, cap) for key, cap in (("name", 200), ("notes", 2000)) if key in keys}
-    stereo = read_stereo(_beside(keys, "stereo", path.parent), folder=path.parent)
-    table = parse_rig_table(keys.table("rig"))
+    sightings = "stereo" not in keys and keys.table("rig").values.get("mechanism") == HEAD.word
+    table = parse_rig_table(keys.table("rig"), sightings)
+    stereo = NO_STEREO if sightings else read_stereo(_beside(keys, "stereo", path.parent), folder=path.parent)
     sheets = keys.table("sheets")
     for name in sheets.values:
         if not (name.isprintable() and 0 < len(name) <= 100):
             raise sheets.refuse(name, "text", "a printable name of 1 to 100 characters", "rename the sheet")
     costs = keys.table("costs")
     costs.only(COSTS_S)
-    truth = {**table.priors, **_parse_priors(_named_entries(keys.table("truth"), RIG_NAMES))}
+    told = tuple(name for name in table.mechanism.rig_names if name in table.mechanism.told)
+    truth = {**table.priors, **_parse_priors(_named_entries(keys.table("truth"), told))}
     _check_periods(keys.table("truth"), truth, table.harmonic_period_deg)
     return Rig(
         table=table,

@@ -143,6 +143,14 @@ class Stereo:
         )
 
 
+NO_STEREO = Stereo(
+    *(1, 1, np.eye(3), np.zeros(5), np.eye(3), np.zeros(5), np.eye(3), np.zeros(3)),
+    parameter_covariance=np.zeros((len(STEREO_PARAMETER_NAMES),) * 2),
+    rms_px=0.0,
+)
+"""Stands for the cameras of an instrument that has none: exactly known, and seen by nothing."""
+
+
 def rotation_matrix(rotation_vector_rad: np.ndarray) -> np.ndarray:
     """Rodrigues' formula, smooth through zero. `rotation_vector_rad` (3,) -> (3, 3)."""
     x, y, z = rotation_vector_rad
@@ -188,6 +196,8 @@ ASSUMED_REMEDY = (
 _ENTRY_MAX = 1e12
 _ROTATION_TOLERANCE = 1e-6
 _EIGENVALUE_TOLERANCE = 1e-8
+BESIDE_SHARE = 0.5
+"""Of the distance of two cameras that stand beside each other, what lies along the columns of the first at least."""
 PRINCIPAL_SHARE_MAX = 0.25
 """Share of the image's width or height by which a principal point may miss its middle before it is worth a word."""
 ASPECT_SHARE_MAX = 0.05
@@ -402,6 +412,13 @@ def pair_doubts(stereo: Stereo, places: Mapping[str, str] | None = None) -> tupl
         doubts.append(
             f"the second camera stands {-right_mm:.4g} mm to the left of the first (x_right = R x_left + T with T_x = "
             f"{stereo.T[0]:+.4g} mm): are left and right swapped?"
+        )
+    apart_mm = float(np.linalg.norm(stereo.T))
+    if abs(right_mm) < BESIDE_SHARE * apart_mm:
+        below_mm, before_mm = (-float(stereo.R[:, k] @ stereo.T) for k in (1, 2))
+        doubts.append(
+            f"{place['T']} puts the second camera {below_mm:+.4g} mm below and {before_mm:+.4g} mm before the first, "
+            f"and only {right_mm:+.4g} mm to the right: is it in axes of another frame, or the inverse of a pose?"
         )
     size_px = stereo.image_width, stereo.image_height
     for side, matrix in (("left", stereo.M1), ("right", stereo.M2)):

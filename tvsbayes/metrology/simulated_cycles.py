@@ -94,7 +94,7 @@ def simulated_runs(
         Arrays of shape (tests, m, runs).
     """
     rows = np.linspace(0, len(calibration.inputs) - 1, tests).astype(int)
-    values: dict[str, Number] = {name: calibration.inputs[rows, k, None, None] for k, name in enumerate(INPUT_NAMES)}
+    values: dict[str, Number] = {n: calibration.inputs[rows, k, None, None] for k, n in enumerate(calibration.names)}
     noise = {name: calibration.noise[rows, k, None, None] for k, name in enumerate(NOISE_NAMES)}
     contrast = 0.0 if contrast_deg_per_step is None else np.asarray(contrast_deg_per_step)[rows, None, None]
     steps = np.asarray(targets, dtype=float)[:, None]

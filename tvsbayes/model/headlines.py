@@ -1,4 +1,4 @@
-"""Headlines of a point of parameter space at a pose: effective ratios, contrasts, backlash, mirror offset.
+"""Quantities of `instrument/parameters` at a point of parameter space and a pose: how each follows from the model.
 
 deg/step of the beam's azimuth and elevation in frame P; deg; mm. The pose is the pair of mirror angles (pan, tilt),
 rad. With derivatives by the coordinates for planning, or for many points at once for draws.
@@ -6,7 +6,7 @@ rad. With derivatives by the coordinates for planning, or for many points at onc
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Iterable
 
 import equinox as eqx
 import jax
@@ -14,26 +14,36 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.instrument.axes import AXES, DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.parameters import BLOCKS, COLUMNS, INDEX, QUANTITIES, TARGETS
+from tvsbayes.instrument.quantities import Quantity
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.gear_processes import Places, errors_at
-from tvsbayes.model.geometry import Scalar, materialise
+from tvsbayes.model.geometry import materialise
 from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles, trace
-from tvsbayes.model.parameter_space import Model, ParameterSpace, model_of
+from tvsbayes.model.parameter_space import Model, ParameterSpace
 
-QUANTITIES = (*DIRECTIONS, *(f"{kind}.{axis}" for kind in ("contrast", "backlash") for axis in AXES), "mirror_offset")
-"""Headlines in the order of `headlines`: effective deg/step, their differences, lost motion (deg), offset (mm)."""
+DEGREES = 180 / np.pi
 
 
 class Headlines(eqx.Module):
-    """Values of `QUANTITIES` and d/d(coordinates)."""
+    """Values of `TARGETS` and d/d(coordinates)."""
 
-    value: Float[Array, " quantities"]
-    gradient: Float[Array, "quantities parameters"]
+    value: Float[Array, " targets"]
+    gradient: Float[Array, "targets parameters"]
 
 
-DEGREES = 180 / np.pi
+class AtPose(eqx.Module):
+    """A point of parameter space and a pose of the mirrors: what `FORMULAS` are of.
+
+    Attributes:
+        model: gears, mirrors, cameras.
+        mirrors: the beam at the pose.
+        effective: deg/step by direction: slopes of the lines through the looks, or those at the pose.
+    """
+
+    model: Model
+    mirrors: BeamAngles
+    effective: Float[Array, "4"]
 
 
 def effective_deg_per_step(gears: Transmission, angles: BeamAngles) -> Float[Array, "4"]:
@@ -43,6 +53,32 @@ def effective_deg_per_step(gears: Transmission, angles: BeamAngles) -> Float[Arr
     return jnp.stack([(ratio + half) * slope, (ratio - half) * slope], axis=1).ravel() * DEGREES
 
 
+def _contrast(at: AtPose) -> Array:
+    """By parameters of its own: what priors hold fixed shall hang on nothing, not even by rounding."""
+    gears = at.model.transmission
+    return gears.contrast_rad_per_step / gears.ratio_rad_per_step * (at.effective[::2] + at.effective[1::2]) / 2
+
+
+FORMULAS: dict[str, Callable[[AtPose], Array]] = {
+    "effective_deg_per_step": lambda at: at.effective,
+    "local_deg_per_step": lambda at: effective_deg_per_step(at.model.transmission, at.mirrors),
+    "effective_contrast_deg_per_step": _contrast,
+    "backlash_deg": lambda at: at.model.transmission.backlash_rad * DEGREES,
+    "effective_mirror_offset_mm": lambda at: at.mirrors.effective_mirror_offset_mm,
+}
+"""Values of all quantities of a block."""
+
+
+def values_of(at: AtPose, blocks: Iterable[str]) -> Float[Array, " quantities"]:
+    """Of quantities block by block."""
+    return jnp.concatenate([jnp.ravel(FORMULAS[block](at)) for block in blocks])
+
+
+def target_values(at: AtPose) -> Float[Array, " targets"]:
+    """Of `TARGETS`, in their order."""
+    return values_of(at, dict.fromkeys(quantity.block for quantity in TARGETS.values()))
+
+
 @compiled(Headlines)
 def headlines(z: Float[Array, " parameters"], space: ParameterSpace, pose_rad: Float[Array, "2"]) -> Headlines:
     """Headlines at one pose (formulation 3.2) with their derivatives."""
@@ -50,11 +86,7 @@ def headlines(z: Float[Array, " parameters"], space: ParameterSpace, pose_rad: F
     def values(z):
         model = space.model(z)
         angles = beam_angles(model.optics, pose_rad[0], pose_rad[1])
-        gears = model.transmission
-        effective = effective_deg_per_step(gears, angles)
-        contrast = gears.contrast_rad_per_step * jnp.diagonal(angles.jacobian) * DEGREES
-        lost = gears.backlash_rad * DEGREES
-        return jnp.concatenate([effective, contrast, lost, angles.effective_mirror_offset_mm[None]])
+        return target_values(AtPose(model, angles, effective_deg_per_step(model.transmission, angles)))
 
     return Headlines(values(z), jax.jacfwd(values)(z))
 
@@ -74,21 +106,68 @@ class SeenLine(eqx.Module):
     share: Float[Array | np.ndarray, " places"]
 
 
-class Derived(eqx.Module):
-    """Headlines of one point of parameter space, in the units of data/docs/conventions.md.
+def _by_direction(of: Derived, quantity: Quantity) -> np.ndarray:
+    ratio, contrast = of[f"degrees_per_step.{quantity.axis}"], of[f"ratio_contrast_deg_per_step.{quantity.axis}"]
+    half = 0.5 if quantity.parts[0] == quantity.sides[0] else -0.5
+    return np.asarray(ratio + half * contrast)
 
-    Ratios are ordered left, right, up, down. `effective_deg_per_step` are slopes of the lines through the looks,
-    transmission error included; `local_deg_per_step` gear ratio times the slope of the mirrors at the reference pose,
-    without it. `jacobian` is d(azimuth, elevation)/d(pan, tilt) there. `place_errors_rad`: transmission errors, then
-    plays, at the places; empty where gears do not vary.
+
+def _difference(of: Derived, quantity: Quantity) -> np.ndarray:
+    first, second = (of[f"effective_deg_per_step.{direction}"] for direction in quantity.sides)
+    return np.asarray(first - second)
+
+
+COMBINED: dict[str, Callable[[Derived, Quantity], np.ndarray]] = {
+    "degrees_per_step": _by_direction,
+    "effective_contrast_deg_per_step": _difference,
+}
+"""How quantities of a block follow from others."""
+_MODELLED_BLOCKS = tuple(block for block in FORMULAS if block not in COMBINED and block not in BLOCKS)
+MODELLED = {name: k for k, name in enumerate(name for block in _MODELLED_BLOCKS for name in QUANTITIES.blocks[block])}
+"""Columns of what neither is a parameter nor follows from others."""
+DERIVED = tuple(
+    name for name, of in QUANTITIES.items() if name not in INDEX and (name in MODELLED or of.block in COMBINED)
+)
+"""Everything but parameters that has draws."""
+
+
+class Derived(eqx.Module):
+    """Quantities of one point of parameter space by name, in the units of data/docs/conventions.md.
+
+    Attributes:
+        physical: parameters.
+        modelled: quantities of the model at the reference pose, by the columns `MODELLED`.
+        jacobian: d(azimuth, elevation)/d(pan, tilt) there.
+        place_errors_rad: transmission errors, then plays, at the places; empty where gears do not vary.
     """
 
     physical: Float[Array, " parameters"]
-    effective_deg_per_step: Float[Array, "4"]
-    local_deg_per_step: Float[Array, "4"]
+    modelled: Float[Array, " modelled"]
     jacobian: Float[Array, "2 2"]
-    effective_mirror_offset_mm: Scalar
     place_errors_rad: Float[Array, " errors"]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Of a parameter or of `DERIVED`, with the leading axes of the fields."""
+        if name in COLUMNS:
+            return np.asarray(self.physical)[..., COLUMNS[name]]
+        if name in MODELLED:
+            return np.asarray(self.modelled)[..., MODELLED[name]]
+        quantity = QUANTITIES[name]
+        return COMBINED[quantity.block](self, quantity)
+
+    def block(self, name: str) -> np.ndarray:
+        """Of all quantities of a block, along the last axis."""
+        return np.stack([self[each] for each in QUANTITIES.blocks[name]], axis=-1)
+
+    @property
+    def effective_deg_per_step(self) -> np.ndarray:
+        """Slopes of the lines through the looks by direction, transmission error included."""
+        return self.block("effective_deg_per_step")
+
+    @property
+    def local_deg_per_step(self) -> np.ndarray:
+        """Gear ratio times the slope of the mirrors at the reference pose by direction, without transmission error."""
+        return self.block("local_deg_per_step")
 
 
 def line_deg_per_step(
@@ -136,16 +215,10 @@ def _derived(
 ) -> Derived:
     def one(z, errors):
         physical = materialise(space.physical(z))
-        model = model_of(physical, space.harmonic_period_deg)
+        model = space.model_at(physical)
         angles = beam_angles(model.optics, seen.pose_rad[0], seen.pose_rad[1])
-        return Derived(
-            physical,
-            line_deg_per_step(model, seen, errors, angles),
-            effective_deg_per_step(model.transmission, angles),
-            angles.jacobian,
-            angles.effective_mirror_offset_mm,
-            errors,
-        )
+        at = AtPose(model, angles, line_deg_per_step(model, seen, errors, angles))
+        return Derived(physical, values_of(at, _MODELLED_BLOCKS), angles.jacobian, errors)
 
     return jax.vmap(one)(z, place_errors_rad)
 
@@ -162,24 +235,3 @@ def derived_quantities(z: np.ndarray, place_errors_rad: np.ndarray, space: Param
     given = np.asarray(place_errors_rad)
     found = _derived(z, errors_at(given, max(len(seen.places.steps), given.shape[1] // 2)), space, seen)
     return eqx.tree_at(lambda of: of.place_errors_rad, jax.tree.map(np.asarray, found), given)
-
-
-def told_of(centre: Derived, draws: Derived, moved: Collection[str]) -> list[tuple[str, float, float]]:
-    """Name with unit, value and sd of what a fit is for, of the directions that moved.
-
-    Args:
-        centre: of one set of parameters, fields without leading axis.
-        draws: fields with one leading axis.
-        moved: directions.
-    """
-    effective, physical = np.asarray(draws.effective_deg_per_step), np.asarray(draws.physical)
-    rows = [
-        (f"effective {name}, deg/step", float(centre.effective_deg_per_step[k]), float(effective[:, k].std()))
-        for k, name in enumerate(DIRECTIONS)
-        if name in moved
-    ]
-    for axis in AXES:
-        k = INDEX[f"backlash_deg.{axis}"]
-        rows.append((f"backlash {axis}, deg", float(centre.physical[k]), float(physical[:, k].std())))
-    offset = float(np.asarray(draws.effective_mirror_offset_mm).std())
-    return [*rows, ("effective mirror offset, mm", float(centre.effective_mirror_offset_mm), offset)]

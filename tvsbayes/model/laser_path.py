@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from tvsbayes.head.chain import HeadOptics
 from tvsbayes.instrument.mirrors import Optics, Ray, Vectors, laser_way
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 from tvsbayes.model.geometry import Scalar, materialise
@@ -253,19 +254,18 @@ class Reflections(eqx.Module):
     outgoing: Vectors
 
 
-def trace(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Ray:
-    """Trace the laser over both mirrors (formulation 3.2; the signs are part of the contract).
+def trace(optics: Optics | HeadOptics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Ray:
+    """Trace the beam to where it leaves (formulation 3.2; the signs are part of the contract).
 
     Args:
-        optics: laser and mirrors.
+        optics: laser and mirrors, or the terms of a head.
         pan_rad: angles psi of the pan stage.
         tilt_rad: angles beta of the tilt stage.
 
     Returns:
         The rays in frame P.
     """
-    way = laser_way(optics, pan_rad, tilt_rad, jnp, materialise)
-    return Ray(*map(way.pan.forward, way.rays[-1]))
+    return optics.leaving(pan_rad, tilt_rad, jnp, materialise)
 
 
 def reflections(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Reflections:
@@ -290,7 +290,7 @@ class BeamAngles(eqx.Module):
     effective_mirror_offset_mm: Scalar
 
 
-def beam_angles(optics: Optics, pan_rad: Scalar, tilt_rad: Scalar) -> BeamAngles:
+def beam_angles(optics: Optics | HeadOptics, pan_rad: Scalar, tilt_rad: Scalar) -> BeamAngles:
     """Direction of the beam and its local slope against the mirror angles at one pose (formulation 3.2)."""
 
     def azimuth_elevation(angles):

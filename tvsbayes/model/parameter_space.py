@@ -21,17 +21,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy import special
 
+from tvsbayes.head.chain import HeadOptics
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SIDES
+from tvsbayes.instrument.mechanisms import MECHANISMS, TWO_MIRROR, Mechanism
 from tvsbayes.instrument.mirrors import Optics
 from tvsbayes.instrument.parameters import (
     BLOCKS,
     INDEX,
     KINDS,
     LOOK_SCATTER_NAMES,
-    NAMES,
     PERIODS_MAX,
     RECEIVER_NAMES,
-    REGISTRY,
     RIG_NAMES,
 )
 from tvsbayes.instrument.rig import RigTable
@@ -73,7 +73,7 @@ class Model(eqx.Module):
     """Everything that the forward model and the likelihood need, in rad and mm."""
 
     transmission: Transmission
-    optics: Optics
+    optics: Optics | HeadOptics
     tilt_zero_rad: Scalar
     extrinsics: Extrinsics
     cameras: StereoCameras
@@ -147,7 +147,7 @@ class ParameterSpace(eqx.Module):
     """Priors of one rig as arrays; an argument of the jitted functions, never a constant in them.
 
     `harmonic_period_deg` holds the periods of the transmission errors of (pan, tilt), as `NO_PERIOD_DEG` where none
-    or fewer are stated.
+    or fewer are stated. `key` is that of the mechanism in `MECHANISMS`.
     """
 
     value: Float[Array, " rig"]
@@ -156,6 +156,12 @@ class ParameterSpace(eqx.Module):
     stereo_mean: Float[Array, "24"]
     stereo_root: Float[Array, "24 24"]
     harmonic_period_deg: Float[Array, "2 3"]
+    key: str = eqx.field(static=True, default=TWO_MIRROR.key)
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """What the coordinates stand for."""
+        return MECHANISMS[self.key]
 
     def physical(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """Coordinates -> values in the units of `NAMES`."""
@@ -167,7 +173,11 @@ class ParameterSpace(eqx.Module):
 
     def model(self, z: Float[Array, " parameters"]) -> Model:
         """Coordinates -> model."""
-        return model_of(materialise(self.physical(z)), self.harmonic_period_deg)
+        return self.model_at(materialise(self.physical(z)))
+
+    def model_at(self, physical: Float[Array, " parameters"]) -> Model:
+        """Values in the units of the names -> model."""
+        return model_of(physical, self.harmonic_period_deg, self.mechanism)
 
 
 def _values(space: ParameterSpace, z: Any, functions: ModuleType, half_normal: Callable[[Any], Any]) -> Any:
@@ -194,8 +204,11 @@ def _slopes(space: ParameterSpace, z: Any, values: Any, functions: ModuleType) -
     return space.u * functions.where(half, of_half, functions.where(log, own, 1.0))
 
 
-SCALE = np.array([np.pi / 180 if REGISTRY[name].unit.startswith("deg") else 1.0 for name in NAMES])
-"""Contract units -> rad and mm."""
+def scale_of(mechanism: Mechanism) -> np.ndarray:
+    """Contract units -> rad and mm, shape (p,)."""
+    return np.array([np.pi / 180 if p.unit.startswith("deg") else 1.0 for p in mechanism.parameters.values()])
+
+
 STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{side}"] for side in SIDES[axis]] for axis in AXES])
 SCATTER_COLUMNS = np.array([INDEX[name] for name in LOOK_SCATTER_NAMES])
 """Coordinates of the stop sds by axis and approach side, (right, left) and (down, up): shape (2, 2)."""
@@ -209,7 +222,9 @@ def _camera_columns(*parts: str) -> slice | np.ndarray:
 
 
 def model_of(
-    physical: Float[Array, " parameters"], harmonic_period_deg: Float[Array | np.ndarray, "2 3"] = NO_PERIOD_DEG
+    physical: Float[Array, " parameters"],
+    harmonic_period_deg: Float[Array | np.ndarray, "2 3"] = NO_PERIOD_DEG,
+    mechanism: Mechanism = TWO_MIRROR,
 ) -> Model:
     """Assemble the model (deg -> rad happens here and nowhere else).
 
@@ -217,11 +232,12 @@ def model_of(
         physical: values in the units of `NAMES`.
         harmonic_period_deg: periods of the transmission error by axis, see `ParameterSpace`; the first of each axis is
             that of the harmonics of known shape.
+        mechanism: whose values they are.
 
     Returns:
         The model in rad and mm.
     """
-    values = physical * SCALE
+    values = physical * scale_of(mechanism)
     period_deg = jnp.asarray(harmonic_period_deg)
 
     def block(name: str):
@@ -241,7 +257,7 @@ def model_of(
             ),
             zero_shift=ZeroShift(block("creep_deg"), block("creep_minutes"), block("thermal_deg_per_K")),
         ),
-        optics=Optics.of(block),
+        optics=HeadOptics.of(lambda name: values[mechanism.names.index(name)]) if mechanism.terms else Optics.of(block),
         tilt_zero_rad=block("tilt_zero_deg"),
         extrinsics=Extrinsics(block("extrinsics.rotation_rad"), block("extrinsics.translation_mm")),
         cameras=StereoCameras(
@@ -277,7 +293,7 @@ def model_of(
 
 def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
     """Priors of `[rig]` and of the stereo calibration as arrays."""
-    priors = [table.priors[name] for name in RIG_NAMES]
+    priors = [table.priors[name] for name in table.mechanism.rig_names]
     covariance = np.asarray(stereo.parameter_covariance, dtype=np.float64)
     scale = np.sqrt(np.diag(covariance))
     # Standard deviations span 1e-5 (rad) to 1 (px): the root is taken of the correlation matrix. Zero rows
@@ -293,6 +309,7 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
         stereo_mean=placed(stereo.vector),
         stereo_root=placed(root),
         harmonic_period_deg=placed(np.stack([_periods_deg(table, axis) for axis in AXES])),
+        key=table.mechanism.key,
     )
 
 

@@ -17,15 +17,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import linalg
 
-from tvsbayes.instrument.axes import AXES, SENSES
+from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Move
-from tvsbayes.instrument.parameters import KINDS, NAMES
+from tvsbayes.instrument.parameters import KINDS, NAMES, TARGETS
 from tvsbayes.instrument.places import SPACING_DEG, interpolation
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.gear_kriging import KnownPlaces, scales_at
 from tvsbayes.model.gear_processes import GearScales, Places
-from tvsbayes.model.headlines import DEGREES, QUANTITIES, Headlines, SeenLine, headlines, line_deg_per_step
+from tvsbayes.model.headlines import AtPose, Headlines, SeenLine, headlines, line_deg_per_step, target_values
 from tvsbayes.model.laser_path import beam_angles
 from tvsbayes.model.parameter_space import ParameterSpace, physical_at
 
@@ -131,9 +131,8 @@ class GearPlaces(KnownPlaces):
 
 NO_PLACES = GearPlaces(np.zeros(0), np.zeros(0, dtype=bool), np.zeros(2), None, np.zeros(0))
 """Of gears that repeat no error."""
-_LINED = {name: k for k, (axis, sides) in enumerate(SENSES.items()) for name in (*sides, f"contrast.{axis}")}
-LINED_AXIS = np.array([_LINED.get(name, -1) for name in QUANTITIES])
-"""The axis over whose places each of `QUANTITIES` is a line, -1 for none."""
+LINED_AXIS = np.array([AXES.index(of.axis) if of.ratio and of.axis else -1 for of in TARGETS.values()])
+"""The axis over whose places each of `TARGETS` is a line, -1 for none."""
 
 
 @compiled(Headlines)
@@ -157,12 +156,7 @@ def place_headlines(
             model = space.model(point[: len(NAMES)])
             mirrors = beam_angles(model.optics, pose_rad[0], pose_rad[1])
             slopes = line_deg_per_step(model, seen, root @ point[len(NAMES) :], mirrors)
-            gears = model.transmission
-            # By their own parameters: what priors hold fixed shall hang on nothing, not even by rounding.
-            contrast = gears.contrast_rad_per_step / gears.ratio_rad_per_step * (slopes[::2] + slopes[1::2]) / 2
-            lost = gears.backlash_rad * DEGREES
-            offset = mirrors.effective_mirror_offset_mm[None]
-            return jnp.concatenate([slopes, contrast, lost, offset])
+            return target_values(AtPose(model, mirrors, slopes))
 
         point = jnp.concatenate([z, jnp.zeros(len(root))])
         return Headlines(values(point), jax.jacfwd(values)(point))

@@ -12,10 +12,9 @@ from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR
 from tvsbayes.instrument.parameters import NAMES, PRIOR_GROUPS, RIG_NAMES
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, described
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.expectation import Knowledge
-from tvsbayes.planning.looks import Seen, arrange, covariance_of, information_of_looks
-from tvsbayes.planning.search import search_designs
+from tvsbayes.planning.looks import covariance_of
+from tvsbayes.planning.search import Question
 from tvsbayes.planning.target import GEARS_AT_POINT, Sensitivity, Target
 from tvsbayes.results.plan_record import Advice, Batch
 
@@ -162,31 +161,19 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target:
     return Limit(floor, cause, shares, False, "no single input stands in the way: widen the limits or add sheets")
 
 
-def next_experiments(
-    knowledge: Knowledge,
-    found: Candidates,
-    seen: Seen,
-    target: Target,
-    at_centre: Sensitivity,
-    now: float,
-) -> tuple[Batch, ...]:
+def next_experiments(asked: Question) -> tuple[Batch, ...]:
     """Four looks at every sheet, chosen from all candidates and from those a full turn away, by gain per minute."""
-    search = search_designs(knowledge, seen, at_centre)
+    search, found, rig, now = asked.search(), asked.found, asked.knowledge.rig, asked.now
     batches = []
-    for number in range(len(knowledge.sheets)):
+    for number in range(len(asked.knowledge.sheets)):
         for turned in (False, True):
             here = (found.looks.sheet == number) & (found.turned | (not turned))
             if not here.any():
                 continue
-            picks = np.array(search.among(here).greedy(LOOKS_PER_EXPERIMENT))
-            design = arrange(found.looks[picks], knowledge.sheets, found.overshoot)
-            way = design.path, knowledge.space, knowledge.after_data, design.warm_minutes(knowledge.rig)
-            information = information_of_looks(seen, picks, *way)
-            after = at_centre.value(covariance_of(knowledge.precision + information), target.factor)
-            minutes = design.minutes(knowledge.rig)
-            text = f"{'a full turn of pan away, ' if turned else ''}{described(knowledge.rig, design.steps)}"
-            gain = max(now - after, 0.0)
-            batches.append(Batch(design.steps, minutes, gain, gain / max(minutes, 1e-9), text))
+            best = asked.chosen(search, here, LOOKS_PER_EXPERIMENT)
+            steps, minutes, gain = best.design.steps, best.design.minutes(rig), max(now - best.value, 0.0)
+            text = f"{'a full turn of pan away, ' if turned else ''}{described(rig, steps)}"
+            batches.append(Batch(steps, minutes, gain, gain / max(minutes, 1e-9), text))
     unique = {batch.actions: batch for batch in batches}.values()
     return tuple(sorted(unique, key=lambda b: -b.gain_per_minute)[:NEXT_LISTED])
 

@@ -19,9 +19,8 @@ from tvsbayes.instrument.conditions import powered_on_s, warm_minutes
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.expectation import knowledge_of
-from tvsbayes.planning.looks import Arranged, arrange, covariance_of, information_of_looks
-from tvsbayes.planning.planner import Question, question
-from tvsbayes.planning.search import search_designs
+from tvsbayes.planning.planner import question
+from tvsbayes.planning.search import Chosen, Question
 from tvsbayes.planning.target import Target
 from tvsbayes.posterior.sampling import sample
 
@@ -92,24 +91,6 @@ class NextLooks:
         }
 
 
-@dataclass(frozen=True)
-class _Choice:
-    """Looks on some sheets: numbers of the candidates, their arrangement, minutes and the target's value after them."""
-
-    picks: np.ndarray
-    design: Arranged
-    steps: tuple[PlanStep, ...]
-    minutes: float
-    value: float
-
-
-def _with_run_up(design: Arranged, side: np.ndarray, overshoot: np.ndarray) -> Arranged:
-    """The first look reached by a run-up of its own: nobody knows where the axes stand when the looks begin."""
-    via = design.via.copy()
-    via[0] = design.goal[0] - side * overshoot
-    return replace(design, via=via)
-
-
 def confirmation(fit: JointFit, seed: int = 0) -> Confirmation:
     """The effective ratios of a converged fit by importance sampling: with rough scales Laplace's sds are short."""
     drawn = sample(fit, "importance", seed=seed)
@@ -138,63 +119,44 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
     on_s = powered_on_s(fit.campaign.header)
     warm = replace(knowledge_of(fit, rig), warm_minutes=float(warm_minutes(fit.campaign.moves, on_s)[-1]))
     asked = question(warm, target, fit.reference_pose_rad, False)
-    # The segment goes on: no home offset is drawn anew.
-    asked = replace(asked, knowledge=replace(asked.knowledge, after_data=False))
+    # The segment goes on: no home offset is drawn anew, and the creep so far is in what the looks show.
+    asked = replace(asked, knowledge=replace(asked.knowledge, after_data=False), warming=False)
     last, sheet = fit.campaign.moves[-1], ordered_spots(fit.campaign)[-1].target
-    choices = _choices(asked, rig, target, count, (last.pan_steps, last.tilt_steps), sheet)
-    best = max(choices, key=lambda choice: (asked.now - choice.value) / max(choice.minutes, 1e-9))
+
+    def minutes(choice: Chosen) -> float:
+        steps = choice.design.steps_onwards
+        return plan_seconds(rig, steps[1:] if choice.design.sheet[0] == sheet else steps) / 60
+
+    choices = _choices(asked, count, (last.pan_steps, last.tilt_steps))
+    best = max(choices, key=lambda choice: (asked.now - choice.value) / max(minutes(choice), 1e-9))
     sds = np.asarray(fit.draws.effective_deg_per_step).std(axis=0)
     confirmed = confirmation(fit) if confirm_below is not None and sds.max() <= confirm_below else None
     places, wanted = ", ".join(dict.fromkeys(best.design.sheet)), target.text.split("<=")[0].strip()
     return NextLooks(
         target=target,
-        steps=best.steps,
-        minutes=best.minutes,
+        steps=best.design.steps_onwards,
+        minutes=minutes(best),
         now=asked.now,
         expected=best.value,
-        after_each=_after_each(asked, target, best),
+        after_each=_after_each(asked, best),
         deg_per_step=dict(zip(DIRECTIONS, map(float, np.asarray(fit.mode.effective_deg_per_step)), strict=True)),
         u_deg_per_step=dict(zip(DIRECTIONS, map(float, sds), strict=True)),
         why=(
             f"{count} looks at {places} lower {wanted} most per minute: from {asked.now:.3g} to {best.value:.3g} "
-            f"{target.unit} in {best.minutes:.1f} minutes"
+            f"{target.unit} in {minutes(best):.1f} minutes"
         ),
         confirmed=confirmed,
     )
 
 
-def _choices(asked: Question, rig: Rig, target: Target, count: int, at: tuple[int, int], sheet: str) -> list[_Choice]:
+def _choices(asked: Question, count: int, at: tuple[int, int]) -> list[Chosen]:
     """The best looks on every sheet and on every pair of sheets."""
-    search, found, names = (
-        search_designs(asked.knowledge, asked.seen, asked.at_centre),
-        asked.found,
-        asked.knowledge.sheets,
-    )
-    choices = []
-    for size in (1, 2):
-        for chosen in combinations(range(len(names)), size):
-            here = np.isin(found.looks.sheet, chosen)
-            if not here.any():
-                continue
-            picks = np.array(search.among(here).greedy(count))
-            looks = found.looks[picks]
-            design = arrange(looks, names, found.overshoot, home=at)
-            design = _with_run_up(design, looks.side[design.order[0]], found.overshoot)
-            steps = design.steps_onwards
-            spared = steps[1:] if design.sheet[0] == sheet else steps
-            value = _value(asked, target, picks, design.path)
-            choices.append(_Choice(picks, design, steps, plan_seconds(rig, spared) / 60, value))
-    return choices
+    search, of_look = asked.search(), asked.found.looks.sheet
+    subsets = [s for size in (1, 2) for s in combinations(range(len(asked.knowledge.sheets)), size)]
+    candidates = (np.isin(of_look, subset) for subset in subsets)
+    return [asked.chosen(search, here, count, at) for here in candidates if here.any()]
 
 
-def _value(asked: Question, target: Target, picks: np.ndarray, path: np.ndarray) -> float:
-    """The target's value after looks, paths in steps since the campaign ended."""
-    information = information_of_looks(asked.seen, picks, path, asked.knowledge.space, homed=False)
-    return asked.at_centre.value(covariance_of(asked.knowledge.precision + information), target.factor)
-
-
-def _after_each(asked: Question, target: Target, choice: _Choice) -> tuple[float, ...]:
-    order, path = choice.design.order, choice.design.path
-    return tuple(
-        _value(asked, target, choice.picks[order[:done]], path[order[:done]]) for done in range(1, len(order) + 1)
-    )
+def _after_each(asked: Question, best: Chosen) -> tuple[float, ...]:
+    order = best.design.order
+    return tuple(asked.value(best.picks, best.design, order[:done]) for done in range(1, len(order) + 1))

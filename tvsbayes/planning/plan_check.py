@@ -16,12 +16,11 @@ from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, SENSES, Axis
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.counter_limits import CounterLimits
-from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.parameters import INDEX, TARGET_ROWS
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, too_few_counters
 from tvsbayes.instrument.plan import PlanStep, described, run_plan, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
-from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.candidates import Candidates, candidates
 from tvsbayes.planning.expectation import (
     Knowledge,
@@ -108,7 +107,7 @@ class Judged:
 
     def rows(self, axis: Axis) -> list[int]:
         """Rows of the ratio and of the backlash of an axis."""
-        return [QUANTITIES.index(SENSES[axis][0]), QUANTITIES.index(f"backlash.{axis}")]
+        return [TARGET_ROWS[SENSES[axis][0]], TARGET_ROWS[f"backlash.{axis}"]]
 
     def exchange(self, axis: Axis) -> float:
         """Correlation of ratio and backlash of an axis: its square is the share of variance that they exchange."""
@@ -120,7 +119,7 @@ class Judged:
 
     def u(self, axis: Axis) -> float:
         """Of the worse effective ratio of an axis, deg/step."""
-        rows = [QUANTITIES.index(direction) for direction in SENSES[axis]]
+        rows = [TARGET_ROWS[direction] for direction in SENSES[axis]]
         return float(np.sqrt(np.diag(self.covariance)[rows].max()))
 
     def contraction(self) -> np.ndarray:
@@ -320,9 +319,9 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = N
         looks=looks,
         seen=seen,
         minutes=information.minutes,
-        expected=dict(zip(QUANTITIES, map(float, u), strict=True)),
+        expected=dict(zip(TARGET_ROWS, map(float, u), strict=True)),
         contraction={
-            name: None if math.isnan(share) else float(share) for name, share in zip(QUANTITIES, shares, strict=True)
+            name: None if math.isnan(share) else float(share) for name, share in zip(TARGET_ROWS, shares, strict=True)
         },
         faults=faults,
         warnings=tuple(warnings),

@@ -22,7 +22,7 @@ from tvsbayes.instrument.protocols import grid_protocol, mixed_protocol, paper_p
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import FEW_STOPS, inseparable, too_few
 from tvsbayes.planning.assurance import Assurance, Family
-from tvsbayes.planning.candidates import Candidates, candidates
+from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.drawn_rigs import draw_instruments
 from tvsbayes.planning.expectation import (
     Expectation,
@@ -40,10 +40,10 @@ from tvsbayes.planning.forecast import (
     value_of_classic,
 )
 from tvsbayes.planning.limits import Limit, limit_of, next_experiments, split_of, stop_now
-from tvsbayes.planning.looks import LookArrays, Looks, Seen, covariance_of, information_of_looks, looks_wait
+from tvsbayes.planning.looks import LookArrays, Looks, covariance_of, looks_wait
 from tvsbayes.planning.plan_check import JUDGING, judge, judging_seconds
-from tvsbayes.planning.search import LADDER, Scope, design_family, refine, smallest_design
-from tvsbayes.planning.target import Sensitivity, Target, sensitivity
+from tvsbayes.planning.search import LADDER, Question, Scope, design_family, refine, smallest_design
+from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.plan_record import Advice, Batch
 from tvsbayes.statistics.chances import ASSURED, share_error
@@ -260,25 +260,6 @@ def few_looks(looks: Looks, target: Target) -> list[str]:
     return notes
 
 
-@dataclass(frozen=True)
-class Question:
-    """What is asked of a search: the candidates, what they show at the most probable instrument, and the target there.
-
-    Attributes:
-        knowledge: with the errors of the gears at places over all candidates.
-        found: candidates.
-        seen: what they show.
-        at_centre: how the target hangs on the coordinates.
-        now: the target's value before any further look.
-    """
-
-    knowledge: Knowledge
-    found: Candidates
-    seen: Seen
-    at_centre: Sensitivity
-    now: float
-
-
 def question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, aperture: bool) -> Question:
     """The candidates of an instrument as it is known, and a target there.
 
@@ -290,8 +271,8 @@ def question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, 
     seen = LookArrays(found.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
     pose = seen.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
     at_centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
-    now = at_centre.value(knowledge.covariance, target.factor)
-    if now == 0:
+    asked = Question(knowledge, found, seen, target, at_centre)
+    if asked.now == 0:
         raise InputError(
             "target",
             f"{target.quantity} is held fixed by the rig (u = 0): its uncertainty is 0 whatever is measured",
@@ -300,7 +281,7 @@ def question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, 
             allowed="a quantity that is to be estimated",
             remedy="state u > 0 for it in [rig.prior], or another target",
         )
-    return Question(knowledge, found, seen, at_centre, now)
+    return asked
 
 
 def _durations(family: Family, scope: Scope) -> dict[int, float]:
@@ -388,25 +369,23 @@ def _planned(
     asked = question(knowledge, target, pose_rad, scope.aperture)
     knowledge = asked.knowledge
     job.begin(CHOOSING)
-    family = design_family(knowledge, asked.found, asked.seen, target, asked.at_centre, scope, job.at)
+    family = design_family(asked, scope, job.at)
     durations = _durations(family, scope)
     job.begin(COUNTING)
     assurance = Assurance(family, target, draw_instruments(knowledge, draws, seed), seed)
     forecast = classic_forecast(knowledge, assurance.instruments)
     size = _size(assurance, forecast, durations, job.at)
     job.begin(EXCHANGING)
-    refined = refine(family, asked.seen, target, asked.at_centre, size.experiments, scope, assurance, job.at)
+    refined = refine(family, asked, size.experiments, scope, assurance, job.at)
     job.begin(JUDGING)
     steps = refined.family.arranged(size.experiments).steps
     exact = judge(steps, knowledge, aperture=scope.aperture)
     chosen = judged("planned", exact.information, knowledge, target, pose_rad)
     share = float(np.mean(refined.reported <= target.limit))
-    largest = family.arranged(family.largest)
-    way = largest.path, knowledge.space, knowledge.after_data, largest.warm_minutes(knowledge.rig)
-    most = information_of_looks(asked.seen, family.picks, *way)
+    most = asked.information(family.picks, family.arranged(family.largest))
     limit = limit_of(knowledge, most, asked.at_centre, target)
     pixels = _pixel_part(exact.information.expectation)
-    batches = next_experiments(knowledge, asked.found, asked.seen, target, asked.at_centre, asked.now)
+    batches = next_experiments(asked)
     done = knowledge.after_data and asked.now <= target.limit
     notes = few_looks(refined.family.looks(size.experiments), target)
     notes += [exact.together(axis) for axis in AXES if inseparable(exact.exchange(axis))]

@@ -9,16 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 
+from tvsbayes.instrument.parameters import TARGET_ROWS
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
-from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge
-from tvsbayes.planning.looks import CONTRAST_COLUMNS, Seen, covariance_of, information_of_looks
+from tvsbayes.planning.looks import CONTRAST_COLUMNS, Arranged, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
 from tvsbayes.progress import Advance, unshown
 
@@ -226,19 +227,91 @@ def _sheet_subsets(count: int) -> list[tuple[int, ...]]:
     return sorted(found, key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
 
 
-def search_designs(knowledge: Knowledge, seen: Seen, at_centre: Sensitivity, criterion: str = "c") -> Search:
-    """A search for the target's sensitivities among looks; contrasts count as known, see `KNOWN`."""
-    rows, precision = search_rows(seen, knowledge)
-    wide = np.zeros((len(at_centre.gradient), rows.shape[2]))
-    wide[:, : knowledge.size] = at_centre.gradient
-    return Search(rows, precision, wide, at_centre.own_variance, criterion)
+@dataclass(frozen=True)
+class Chosen:
+    """Looks that a search chose.
+
+    Attributes:
+        picks: numbers of the candidates, shape (k,).
+        design: their plan.
+        value: of the target after it, in the target's unit.
+    """
+
+    picks: np.ndarray
+    design: Arranged
+    value: float
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked of a search: the candidates, what they show at the most probable instrument, and the target there.
+
+    Attributes:
+        knowledge: with the errors of the gears at places over all candidates.
+        found: candidates.
+        seen: what they show.
+        target: what is wanted.
+        at_centre: how the target hangs on the coordinates.
+        warming: the zeros creep while the looks are taken; False where `seen` has the creep of the whole session.
+    """
+
+    knowledge: Knowledge
+    found: Candidates
+    seen: Seen
+    target: Target
+    at_centre: Sensitivity
+    warming: bool = True
+
+    @cached_property
+    def now(self) -> float:
+        """The target's value before any further look."""
+        return self.at_centre.value(self.knowledge.covariance, self.target.factor)
+
+    def search(self, sought: Sensitivity | None = None, criterion: str = "c") -> Search:
+        """A search among the looks, for the target or what is `sought` instead; contrasts count as known (`KNOWN`)."""
+        rows, precision = search_rows(self.seen, self.knowledge)
+        aim = self.at_centre if sought is None else sought
+        wide = np.zeros((len(aim.gradient), rows.shape[2]))
+        wide[:, : self.knowledge.size] = aim.gradient
+        return Search(rows, precision, wide, aim.own_variance, criterion)
+
+    def information(self, picks: np.ndarray, design: Arranged, taken: np.ndarray | None = None) -> np.ndarray:
+        """Of the looks `picks` (k,) of a design, or of those `taken`, by places in `picks`; shape (p + e, p + e)."""
+        rows = np.arange(len(picks)) if taken is None else taken
+        warm = design.warm_minutes(self.knowledge.rig)[rows] if self.warming else None
+        way = self.knowledge.space, self.knowledge.after_data, warm
+        return information_of_looks(self.seen, picks[rows], design.path[rows], *way)
+
+    def value(self, picks: np.ndarray, design: Arranged, taken: np.ndarray | None = None) -> float:
+        """Of the target after looks, see `information`; in its unit."""
+        precision = self.knowledge.precision + self.information(picks, design, taken)
+        return self.at_centre.value(covariance_of(precision), self.target.factor)
+
+    def chosen(self, search: Search, here: np.ndarray, count: int, at: tuple[int, int] | None = None) -> Chosen:
+        """The best looks among some candidates.
+
+        Args:
+            search: for the target.
+            here: candidates to choose from, shape (m,); one at least.
+            count: looks.
+            at: where the axes stand; None for a plan that begins with a homing.
+        """
+        picks = np.array(search.among(here).greedy(count))
+        looks = self.found.looks[picks]
+        design = arrange(looks, self.knowledge.sheets, self.found.overshoot, at or (0, 0))
+        if at is not None:
+            # A run-up of its own for the first look: nobody knows where the axes stand when the looks begin.
+            via = design.via.copy()
+            via[0] = design.goal[0] - looks.side[design.order[0]] * self.found.overshoot
+            design = replace(design, via=via)
+        return Chosen(picks, design, self.value(picks, design))
 
 
 def _of_all_gears(knowledge: Knowledge, seen: Seen) -> Sensitivity:
     """Ratios and backlashes of both axes, in the middle of the looks."""
     pose_rad = seen.mirror_angles_rad.mean(axis=0)
     everything = np.asarray(knowledge.gears.headlines(knowledge.z, knowledge.space, pose_rad).gradient)
-    return Sensitivity(everything[[QUANTITIES.index(q) for q in ("left", "up", "backlash.pan", "backlash.tilt")]])
+    return Sensitivity(everything[[TARGET_ROWS[q] for q in ("left", "up", "backlash.pan", "backlash.tilt")]])
 
 
 @dataclass(frozen=True, order=True)
@@ -249,38 +322,26 @@ class _Reached:
     value: float = math.inf
 
 
-def _reached(family: Family, seen: Seen, target: Target, at_centre: Sensitivity, scope: Scope) -> _Reached:
-    knowledge, best = family.knowledge, _Reached()
+def _reached(family: Family, asked: Question, scope: Scope) -> _Reached:
+    best = _Reached()
     for n in (n for n in LADDER if n <= scope.largest):
         design = family.arranged(n)
-        duration = design.minutes(knowledge.rig)
+        duration = design.minutes(asked.knowledge.rig)
         if scope.minutes is not None and duration > scope.minutes:
             break
-        chosen = family.picks[: LOOKS_PER_EXPERIMENT * n]
-        way = design.path, knowledge.space, knowledge.after_data, design.warm_minutes(knowledge.rig)
-        information = information_of_looks(seen, chosen, *way)
-        value = at_centre.value(covariance_of(knowledge.precision + information), target.factor)
-        best = min(best, _Reached(duration if value <= target.limit else math.inf, value))
+        value = asked.value(family.picks[: LOOKS_PER_EXPERIMENT * n], design)
+        best = min(best, _Reached(duration if value <= asked.target.limit else math.inf, value))
     return best
 
 
-def design_family(
-    knowledge: Knowledge,
-    found: Candidates,
-    seen: Seen,
-    target: Target,
-    at_centre: Sensitivity,
-    scope: Scope | None = None,
-    advance: Advance = unshown,
-) -> Family:
+def design_family(asked: Question, scope: Scope | None = None, advance: Advance = unshown) -> Family:
     """The choice of sheets and the order of looks that reach the target soonest.
 
     For every choice of sheets looks are added greedily; the choice that first meets the target, counted in minutes,
     is kept, or the best after the largest number of experiments (or minutes) if none does.
     """
-    scope = scope or Scope()
-    sought = at_centre if scope.criterion == "c" else _of_all_gears(knowledge, seen)
-    search = search_designs(knowledge, seen, sought, scope.criterion)
+    scope, knowledge, found = scope or Scope(), asked.knowledge, asked.found
+    search = asked.search(None if scope.criterion == "c" else _of_all_gears(knowledge, asked.seen), scope.criterion)
     families = []
     subsets = list(_sheet_subsets(len(knowledge.sheets)))
     for number, subset in enumerate(subsets):
@@ -289,7 +350,7 @@ def design_family(
         if here.any():
             picks = search.among(here).greedy(LOOKS_PER_EXPERIMENT * scope.largest)
             families.append(Family(knowledge, found, np.array(picks), scope.aperture))
-    return min(families, key=lambda family: _reached(family, seen, target, at_centre, scope))
+    return min(families, key=lambda family: _reached(family, asked, scope))
 
 
 def smallest_design(meets: Callable[[int], bool], sizes: Sequence[int]) -> int | None:
@@ -314,9 +375,7 @@ class Refined:
 
 def refine(
     family: Family,
-    seen: Seen,
-    target: Target,
-    at_centre: Sensitivity,
+    asked: Question,
     experiments: int,
     scope: Scope,
     assurance: Assurance,
@@ -331,9 +390,8 @@ def refine(
     plain = Refined(replace(family, picks=picks), assurance.values([experiments])[experiments])
     if scope.criterion != "c":
         return plain
-    search = search_designs(knowledge, seen, at_centre, scope.criterion)
     here = np.isin(found.looks.sheet, found.looks.sheet[picks])
-    exchanged = replace(family, picks=np.array(search.among(here).exchange(picks.tolist())))
+    exchanged = replace(family, picks=np.array(asked.search().among(here).exchange(picks.tolist())))
     duration = exchanged.arranged(experiments).minutes(knowledge.rig)
     if scope.minutes is not None and duration > scope.minutes:
         return plain
@@ -341,6 +399,6 @@ def refine(
     other = Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])
 
     def merit(of: Refined) -> tuple[float, float]:
-        return float(np.mean(of.reported <= target.limit)), -float(np.median(of.reported))
+        return float(np.mean(of.reported <= asked.target.limit)), -float(np.median(of.reported))
 
     return other if merit(other) > merit(plain) else plain

@@ -16,18 +16,16 @@ from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.calibration.pointing import NOISE_NAMES as CALIBRATION_NOISE
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.axes import APPROACH_SIGN, DIRECTIONS
-from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.instrument.parameters import INDEX, NAMES, TARGET_ROWS, TARGETS
 from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.headlines import QUANTITIES
 from tvsbayes.model.parameter_space import ParameterSpace, physical_at
 from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces
 from tvsbayes.statistics.intervals import NORMAL_95
 
 UNITS = {
-    **dict.fromkeys((*DIRECTIONS, "worst", "contrast.pan", "contrast.tilt"), "deg/step"),
-    **dict.fromkeys(("backlash.pan", "backlash.tilt"), "deg"),
-    **dict.fromkeys(("mirror_offset", "x", "y", "z", "xyz"), "mm"),
+    **{name: of.unit for name, of in TARGETS.items()},
+    **{"worst": "deg/step", "x": "mm", "y": "mm", "z": "mm", "xyz": "mm"},
 }
 COORDINATES = {"x": (0,), "y": (1,), "z": (2,), "xyz": (0, 1, 2)}
 DEFAULT_TARGET = "u(worst) <= 2e-4 deg/step"
@@ -59,7 +57,7 @@ class Target:
         """Rows of the headlines, or of x, y, z, whose worst is meant."""
         if self.quantity in COORDINATES:
             return COORDINATES[self.quantity]
-        return tuple(range(len(DIRECTIONS))) if self.quantity == "worst" else (QUANTITIES.index(self.quantity),)
+        return tuple(range(len(DIRECTIONS))) if self.quantity == "worst" else (TARGET_ROWS[self.quantity],)
 
     @property
     def of_ratios(self) -> bool:
@@ -88,10 +86,13 @@ _TARGET = re.compile(
 )
 SMALLEST_LIMIT, LARGEST_NUMBER = 1e-12, 1e9
 """Limits and coordinates of a target: beyond these a number is a slip of the pen, and squares of it overflow."""
+_NAMED = {
+    unit: ", ".join(name for name in (*DIRECTIONS, "worst", *TARGETS) if UNITS[name] == unit) for unit in UNITS.values()
+}
 TARGET_FORMS = (
-    "u(NAME) <= NUMBER UNIT or U95(NAME) <= NUMBER UNIT with NAME left, right, up, down, worst, contrast.pan, "
-    "contrast.tilt (deg/step), backlash.pan, backlash.tilt (deg), mirror_offset (mm); or u or U95 of x, y, z or xyz "
-    "at X,Y,Z mm <= NUMBER mm"
+    "u(NAME) <= NUMBER UNIT or U95(NAME) <= NUMBER UNIT with NAME "
+    + ", ".join(f"{names} ({unit})" for unit, names in _NAMED.items())
+    + "; or u or U95 of x, y, z or xyz at X,Y,Z mm <= NUMBER mm"
 )
 
 

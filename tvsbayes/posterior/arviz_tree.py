@@ -17,19 +17,20 @@ import numpy as np
 import xarray as xr
 
 from tvsbayes.files.disk import write_atomically
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.campaign import input_hashes, ordered_spots, pixels_of
+from tvsbayes.instrument.mechanisms import TWO_MIRROR, Mechanism
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
     BLOCKS,
     HARMONIC_NAMES,
-    NAMES,
+    QUANTITIES,
     RIG_NAMES,
     STEREO_PARAMETER_NAMES,
 )
-from tvsbayes.model.headlines import Derived
+from tvsbayes.model.headlines import DERIVED, Derived
 from tvsbayes.posterior.chain import fingerprint
-from tvsbayes.posterior.draws import Draws, Posterior
+from tvsbayes.posterior.draws import Draws, Posterior, derived_names
 from tvsbayes.posterior.predictive import PIXEL_LABELS, move_log_likelihood, predictive_pixels
 from tvsbayes.results.convergence import Convergence
 
@@ -56,9 +57,8 @@ class Variable:
     dim: str | None = None
 
 
-def _of_block(block: str) -> Variable:
-    """A block of parameters, whose dimension is the one with its labels; a block of one name has none."""
-    names = BLOCKS[block]
+def _of_block(block: str, names: tuple[str, ...]) -> Variable:
+    """Quantities of a block, whose dimension is the one with their labels; a single one has none."""
     if len(names) == 1:
         return Variable(names)
     labels = tuple(name.removeprefix(f"{block}.") for name in names)
@@ -68,24 +68,29 @@ def _of_block(block: str) -> Variable:
 _RIG_BLOCKS = sorted(
     (block for block, names in BLOCKS.items() if names[0] in RIG_NAMES), key=lambda b: len(BLOCKS[b]) > 1
 )
+_DERIVED = {block: tuple(n for n in names if n in DERIVED) for block, names in QUANTITIES.blocks.items()}
 VARIABLES: dict[str, Variable] = {
-    **{
-        ratio: Variable(tuple(f"{ratio}.{direction}" for direction in DIRECTIONS), "direction")
-        for ratio in ("effective_deg_per_step", "degrees_per_step")
-    },
-    "mean_degrees_per_step": _of_block("degrees_per_step"),
-    "effective_mirror_offset_mm": Variable(("effective_mirror_offset_mm",)),
-    **{block.replace(".", "_"): _of_block(block) for block in _RIG_BLOCKS if block != "degrees_per_step"},
+    **{block: _of_block(block, names) for block, names in _DERIVED.items() if names},
+    "mean_degrees_per_step": _of_block("degrees_per_step", BLOCKS["degrees_per_step"]),
+    **{b.replace(".", "_"): _of_block(b, BLOCKS[b]) for b in _RIG_BLOCKS if b != "degrees_per_step"},
     "stereo": Variable(STEREO_PARAMETER_NAMES, "stereo_parameter"),
 }
 """Variables of posterior.nc. `degrees_per_step` by direction; the mean ratio of an axis is `mean_degrees_per_step`."""
 
 
-def _variables(draws: Derived, varying: set[str], shape: tuple[int, int]) -> dict[str, xr.DataArray]:
+def variables_of(mechanism: Mechanism) -> dict[str, Variable]:
+    """Variables of posterior.nc of a mechanism; each term of a head's geometry is one."""
+    shared = {name: spec for name, spec in VARIABLES.items() if not mechanism.terms.keys() & set(spec.names)}
+    return shared | {term.name.replace(".", "_"): Variable((term.name,)) for term in mechanism.terms.values()}
+
+
+def _variables(
+    draws: Derived, varying: set[str], shape: tuple[int, int], mechanism: Mechanism = TWO_MIRROR
+) -> dict[str, xr.DataArray]:
     """All variables that vary, with named dimensions; fixed entries of a dimension are left out."""
-    columns = Draws(draws)
+    columns = Draws(draws, mechanism)
     result = {}
-    for variable, spec in VARIABLES.items():
+    for variable, spec in variables_of(mechanism).items():
         chosen = np.array([name in varying for name in spec.names])
         if not chosen.any():
             continue
@@ -127,10 +132,11 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         posterior = posterior.resampled(*RESAMPLED)
     fit = posterior.fit
     shape = posterior.z.shape[:2]
-    varying = {NAMES[i] for i in np.flatnonzero(fit.free)} | {"effective_mirror_offset_mm"}
-    for axis, pair in SENSES.items():
-        if varying & {f"degrees_per_step.{axis}", f"ratio_contrast_deg_per_step.{axis}"}:
-            varying |= {f"degrees_per_step.{d}" for d in pair} | {f"effective_deg_per_step.{d}" for d in pair}
+    mechanism = fit.space.mechanism
+    varying = {fit.names[i] for i in np.flatnonzero(fit.free)}
+    # By the gears of their axis, where they are of one.
+    of_axis = {a: {f"degrees_per_step.{a}", f"ratio_contrast_deg_per_step.{a}"} & varying for a in AXES}
+    varying |= {name for name in derived_names(mechanism) if (axis := QUANTITIES[name].axis) is None or of_axis[axis]}
     prior_draws = jax.tree.map(lambda x: np.asarray(x)[None], fit.prior_draws)
     spots = ordered_spots(fit.campaign)
     coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
@@ -141,11 +147,13 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         stats["acceptance_rate"] = xr.DataArray(found.acceptance, {"chain": coords["chain"]}, ("chain",))
         lengths = {"steps": found.steps, "discarded": found.discarded, "thin": found.thin}
     places = {"spot": [s.spot for s in spots], "pixel": list(PIXEL_LABELS)}
-    observed = xr.DataArray(pixels_of(spots), places, tuple(places), name="pixels")
+    seen = np.zeros((len(spots), len(PIXEL_LABELS))) if mechanism.sightings else pixels_of(spots)
+    # Of sightings angles about the direction sighted, rad, in the columns of `campaign_arrays.SIGHTED`.
+    observed = xr.DataArray(seen, places, tuple(places), name="pixels")
     tree = xr.DataTree.from_dict(
         {
-            "posterior": _dataset(_variables(posterior.draws, varying, shape)),
-            "prior": _dataset(_variables(prior_draws, varying, prior_draws.physical.shape[:2])),
+            "posterior": _dataset(_variables(posterior.draws, varying, shape, mechanism)),
+            "prior": _dataset(_variables(prior_draws, varying, prior_draws.physical.shape[:2], mechanism)),
             "posterior_predictive": predictive_pixels(posterior).to_dataset(name="pixels"),
             "log_likelihood": move_log_likelihood(posterior).to_dataset(name="pixels"),
             "observed_data": observed.to_dataset(),

@@ -17,11 +17,12 @@ from tvsbayes.display import Shown, View
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import no_draw
 from tvsbayes.inference.summaries import Propagated, carried, propagated, reweighted
-from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS, SENSES
-from tvsbayes.instrument.parameters import BLOCKS, NAMES
+from tvsbayes.instrument.axes import DIRECTION_SIGNS, DIRECTIONS
+from tvsbayes.instrument.mechanisms import TWO_MIRROR, Mechanism
+from tvsbayes.instrument.parameters import HEADLINES, INDEX
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import in_batches
-from tvsbayes.model.headlines import Derived, derived_quantities
+from tvsbayes.model.headlines import DERIVED, Derived, derived_quantities
 from tvsbayes.results.convergence import Convergence, Reweighted
 from tvsbayes.statistics.weighted_draws import systematic, weighted_mean
 
@@ -32,56 +33,40 @@ DERIVED_BATCH = 2049
 """The batch in which the fit computes its headlines: the compilation is shared."""
 
 
+def derived_names(mechanism: Mechanism) -> tuple[str, ...]:
+    """Of what follows from parameters, in a mechanism: a head has no mirrors to be off the pan axis."""
+    return tuple(name for name in DERIVED if not mechanism.terms or name != "effective_mirror_offset_mm")
+
+
 class Draws(Mapping[str, np.ndarray]):
-    """Posterior draws by name: every parameter, and derived quantities, each of shape (n,).
+    """Posterior draws by name: every parameter, and the derived quantities `DERIVED`, each of shape (n,)."""
 
-    Derived: `degrees_per_step.left|right|up|down`, `effective_deg_per_step.left|right|up|down`,
-    `effective_contrast_deg_per_step.pan|tilt` (left - right, up - down), `local_deg_per_step.left|right|up|down`,
-    `effective_mirror_offset_mm`.
-    """
-
-    def __init__(self, draws: Derived):
+    def __init__(self, draws: Derived, mechanism: Mechanism = TWO_MIRROR):
         self.derived = draws
-        physical = np.asarray(draws.physical).reshape(-1, len(NAMES))
-        self._columns: dict[str, np.ndarray] = dict(zip(NAMES, physical.T, strict=True))
-        for axis, (positive, negative) in SENSES.items():
-            ratio = self._columns[f"degrees_per_step.{axis}"]
-            half = self._columns[f"ratio_contrast_deg_per_step.{axis}"] / 2
-            self._columns[f"degrees_per_step.{positive}"] = ratio + half
-            self._columns[f"degrees_per_step.{negative}"] = ratio - half
-        effective = np.asarray(draws.effective_deg_per_step).reshape(-1, len(DIRECTIONS))
-        self._columns |= {f"effective_deg_per_step.{d}": effective[:, k] for k, d in enumerate(DIRECTIONS)}
-        local = np.asarray(draws.local_deg_per_step).reshape(-1, len(DIRECTIONS))
-        self._columns |= {f"local_deg_per_step.{d}": local[:, k] for k, d in enumerate(DIRECTIONS)}
-        contrast = effective[:, ::2] - effective[:, 1::2]
-        self._columns |= {f"effective_contrast_deg_per_step.{a}": contrast[:, k] for k, a in enumerate(AXES)}
-        self._columns["effective_mirror_offset_mm"] = np.asarray(draws.effective_mirror_offset_mm).ravel()
+        told = (name for name in mechanism.names if name in mechanism.told)
+        self.names = (*told, *derived_names(mechanism))
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Draws of one quantity."""
-        if name not in self._columns:
-            raise KeyError(f"no quantity {name!r}; there are: {', '.join(self._columns)}")
-        return self._columns[name]
+        if name not in self.names:
+            raise KeyError(f"no quantity {name!r}; there are: {', '.join(self.names)}")
+        return self.derived[name].ravel()
 
     def __iter__(self) -> Iterator[str]:
         """Names."""
-        return iter(self._columns)
+        return iter(self.names)
 
     def __len__(self) -> int:
         """Number of quantities."""
-        return len(self._columns)
+        return len(self.names)
 
 
 def headline_names(fit: JointFit) -> tuple[str, ...]:
-    """Names in `Draws` of what a fit is for, as far as the campaign moved and priors leave it open.
-
-    Effective ratios and contrasts of directions that moved, mean ratios, backlashes, effective mirror offset.
-    """
+    """Names in `Draws` of what a fit is for, as far as the campaign moved and priors leave it open."""
     moved = set(legs_of(fit.campaign.moves))
-    ratios = [f"effective_deg_per_step.{d}" for d in DIRECTIONS if d in moved]
-    contrasts = [f"effective_contrast_deg_per_step.{axis}" for axis, pair in SENSES.items() if set(pair) <= moved]
-    names = [*ratios, *contrasts, *BLOCKS["degrees_per_step"], *BLOCKS["backlash_deg"], "effective_mirror_offset_mm"]
-    return tuple(name for name in names if name not in NAMES or fit.free[NAMES.index(name)])
+    others = {"effective_mirror_offset_mm"} if fit.space.mechanism.terms else set()
+    names = [quantity.name for quantity in HEADLINES if quantity.applies(moved) and quantity.name not in others]
+    return tuple(name for name in names if name not in INDEX or fit.free[INDEX[name]])
 
 
 @dataclass(frozen=True, repr=False)
@@ -141,7 +126,7 @@ class Posterior(Shown):
     @property
     def by_name(self) -> Draws:
         """All draws by contract name, chains joined; their weights are `weights.ravel()`."""
-        return Draws(self.draws)
+        return Draws(self.draws, self.fit.space.mechanism)
 
     @property
     def joined(self) -> Derived:
@@ -207,7 +192,7 @@ class Posterior(Shown):
 
     def local_deg_per_step(self, pan_deg: float, tilt_deg: float) -> Propagated:
         """Gear ratio times the slope of the mirrors (left, right, up, down) at any pose (formulation 3.2)."""
-        return self.summarised(local_deg_per_step(self.fit, self.z, np.radians([pan_deg, tilt_deg])))
+        return self.summarised(local_at(self.fit, self.z, np.radians([pan_deg, tilt_deg])).local_deg_per_step)
 
     def lost_motion_deg(self, direction: str, steps: np.ndarray) -> Propagated:
         """Mirror angle that a move of `steps` loses after a reversal: min(k N, b) (play operator, formulation 3.1).
@@ -230,25 +215,17 @@ class Posterior(Shown):
         )
 
 
-def derived_of(fit: JointFit, z: np.ndarray, place_errors_rad: np.ndarray) -> Derived:
-    """Parameters and headlines of draws (chain, draw, p) with their errors at places (chain, draw, e)."""
-    shape = z.shape[:2]
-    count = shape[0] * shape[1]
-    given = z.reshape(count, -1), place_errors_rad.reshape(count, place_errors_rad.shape[-1])
-    flat = in_batches(
-        lambda z, errors: derived_quantities(z, errors, fit.space, fit.seen_line), *given, size=DERIVED_BATCH
-    )
-    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), flat)
+def derived_of(
+    fit: JointFit, z: np.ndarray, place_errors_rad: np.ndarray, pose_rad: np.ndarray | None = None
+) -> Derived:
+    """Parameters and headlines of draws (..., p) with their errors at places (..., e), by default at the fit's pose."""
+    seen = fit.seen_line if pose_rad is None else replace(fit.seen_line, pose_rad=pose_rad)
+    given = z.reshape(-1, z.shape[-1]), place_errors_rad.reshape(-1, place_errors_rad.shape[-1])
+    flat = in_batches(lambda z, errors: derived_quantities(z, errors, fit.space, seen), *given, size=DERIVED_BATCH)
+    return jax.tree.map(lambda x: x.reshape(*z.shape[:-1], *x.shape[1:]), flat)
 
 
-def local_deg_per_step(fit: JointFit, z: np.ndarray, pose_rad: np.ndarray) -> np.ndarray:
-    """Gear ratio times the slope of the mirrors at a pose (pan, tilt), by direction, of draws (..., p)."""
-    seen = replace(fit.seen_line, pose_rad=pose_rad)
-    points = z.reshape(-1, z.shape[-1])
-    none = no_draw(len(points), fit.arrays)
-    flat = in_batches(
-        lambda z, errors: derived_quantities(z, errors, fit.space, seen).local_deg_per_step,
-        *(points, none),
-        size=DERIVED_BATCH,
-    )
-    return np.reshape(flat, (*z.shape[:-1], len(DIRECTIONS)))
+def local_at(fit: JointFit, z: np.ndarray, pose_rad: np.ndarray) -> Derived:
+    """Parameters and local headlines of draws (..., p) at a pose (pan, tilt), of gears that repeat no error."""
+    none = np.asarray(no_draw(z[..., 0].size, fit.arrays))
+    return derived_of(fit, z, none.reshape(*z.shape[:-1], -1), pose_rad)

@@ -17,7 +17,6 @@ from tvsbayes.inference.density import Points
 from tvsbayes.inference.importance import Sample
 from tvsbayes.inference.proposal import Independence, first_proposal
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
 from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names
 from tvsbayes.posterior.transport import Mapped, Transport
@@ -59,7 +58,7 @@ class Target:
     @cached_property
     def fixed(self) -> frozenset[str]:
         """Parameters that priors hold."""
-        return frozenset(NAMES[i] for i in np.flatnonzero(~self.fit.free))
+        return frozenset(self.fit.names[i] for i in np.flatnonzero(~self.fit.free))
 
     @cached_property
     def log_constant(self) -> float:
@@ -108,7 +107,8 @@ class Target:
 
     def quantities(self, points: Points) -> Draws:
         """Parameters and headlines."""
-        return Draws(derived_of(self.fit, points.parts["z"][None], points.parts["place_errors_rad"][None]))
+        found = derived_of(self.fit, points.parts["z"][None], points.parts["place_errors_rad"][None])
+        return Draws(found, self.fit.space.mechanism)
 
     def first_proposal(self) -> Independence:
         """Standard normal but for heavy and coupled coordinates."""

@@ -60,8 +60,9 @@ it, it is known so well that a step of Gauss and Newton is as good as exact."""
 
 CENTRINGS = 2
 """Gauss-Newton steps of the narrow coordinates at every draw."""
-BEND_STEP = 0.5
-"""Step of second differences in posterior sds: they should hold over +-2 sd, not only at the mode."""
+BEND_STEP = 2.0
+"""Step of second differences in posterior sds: they should hold over +-2 sd, not only at the mode. A move as
+long as the play bends the residuals by a kink, whose second difference grows as the step gets shorter."""
 HEAVY_NAMES = (
     *(*NOISE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y", "mirror_offset_mm"),
     *CREEP_NAMES,

@@ -20,6 +20,7 @@ from tvsbayes.report.document import (
     FigureView,
     Issue,
     Number,
+    Part,
     Section,
     Verdict,
     about_table,
@@ -36,7 +37,13 @@ from tvsbayes.single_axis.axis_campaign import axis_hashes
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS
 from tvsbayes.single_axis.axis_periods import wave_samples
-from tvsbayes.single_axis.axis_record import AxisResults, AxisSummary, PositionDeviation, drawn_deviations
+from tvsbayes.single_axis.axis_record import (
+    AxisResults,
+    AxisSummary,
+    PeriodEstimate,
+    PositionDeviation,
+    drawn_deviations,
+)
 from tvsbayes.single_axis.classic_line import ClassicAxis
 from tvsbayes.single_axis.held_out_positions import AxisHoldOut
 from tvsbayes.single_axis.next_stops import AxisPlan, unit_of
@@ -121,7 +128,7 @@ def for_firmware(summary: AxisSummary) -> str:
     sides = tuple(summary.effective_per_command.values())
     ratio, u_ratio = sum(of.value for of in sides) / len(sides), max(of.sd for of in sides)
     low, high = summary.range_command
-    said = f"for firmware, from {low:.10g} to {high:.10g}: {concise(1 / ratio, u_ratio / ratio**2)} commands per "
+    said = f"for your firmware, from {low:.10g} to {high:.10g}: {concise(1 / ratio, u_ratio / ratio**2)} commands per "
     said += f"{escaped(summary.unit)}, "
     play = summary.parameters["backlash"]
     in_commands = concise(play.value / abs(ratio), play.sd / abs(ratio))
@@ -134,10 +141,24 @@ def for_firmware(summary: AxisSummary) -> str:
 
 
 def offered(summary: AxisSummary) -> list[str]:
-    """What an owner takes from a converged fit: the worst place, numbers for firmware. Neither of a drive in motion."""
+    """What an owner takes from a converged fit: numbers for firmware, the worst place, waves. Of a drive the last."""
+    waves = [*_waves(summary.periods, summary, summary.periods_in), *_waves(summary.encoder_periods, summary, "")]
     if "seeing_s" in summary.parameters:
-        return []
-    return [*([worst_place(summary)] if summary.deviations else []), for_firmware(summary)]
+        return waves
+    return [for_firmware(summary), *([worst_place(summary)] if summary.deviations else []), *waves]
+
+
+def _waves(found: Sequence[PeriodEstimate], summary: AxisSummary, periods_in: str) -> list[str]:
+    """Waves that are likely, in words."""
+    unit = escaped(summary.unit)
+    said = []
+    for one in found:
+        if one.probability >= LIKELY:
+            period = f"{one.period.value:.10g}" if one.source == "stated" else concise(one.period.value, one.period.sd)
+            amplitude = concise(one.amplitude.value, one.amplitude.sd)
+            of = "s" if periods_in == "seconds" else unit
+            said.append(f"a wave of {amplitude} {unit} every {period} {of}, probability {percent(one.probability)}")
+    return said
 
 
 def worst_place(summary: AxisSummary) -> str:
@@ -199,7 +220,7 @@ def reserved(summary: AxisSummary) -> str:
 
 
 def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence[str] = ()) -> str:
-    """What the reader must know, then the tables, then one line of verdict.
+    """The answer, what the reader must know, then the tables, then one line of verdict.
 
     Args:
         summary: the fit.
@@ -207,7 +228,7 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
         written: files that hold all of it.
     """
     how = {None: "Laplace approximation", "importance": "weighted draws", "emcee": "chain of emcee"}[summary.tier]
-    more: list[str | TableView | None] = []
+    more: list[Part] = []
     if details:
         deviations = deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN)
         more = [deviations if summary.deviations else None, iso230_table(summary.classic, summary.unit)]
@@ -219,12 +240,13 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     more += _lines("prior conflict", summary.prior_conflicts)
     more += [f"written: {', '.join(written)}"] if written else []
     counted = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}"
+    answer = offered(summary) if summary.explained else []
     return terminal(
+        *answer,
         *more,
-        "" if any(part is not None for part in more) else None,
+        "" if answer or any(part is not None for part in more) else None,
         counted,
         *(period_table(summary), parameter_table(summary), ratio_table(summary)),
-        *(offered(summary) if summary.explained else ()),
         f"verdict: {axis_verdict(summary)}",
     )
 

@@ -11,6 +11,7 @@ import numpy as np
 from tvsbayes.calibration.pointing import Steps
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
+from tvsbayes.report.document import Part, terminal
 from tvsbayes.report.parameter_words import MADE_BY, name_in_words
 from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
 from tvsbayes.report.tables import COLUMNS, TableView, concise, two_digits
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from tvsbayes.coordinates.cloud import LawChecked
     from tvsbayes.coordinates.cloud_files import CloudFile
     from tvsbayes.coordinates.location import Locations
+    from tvsbayes.head.pointing_model import PointingModel
     from tvsbayes.instrument.stereo_pair import Stereo
     from tvsbayes.metrology.look_budget import Budget
     from tvsbayes.planning.planner import CurvePoint, PlanResult
@@ -60,16 +62,16 @@ def held_text(document: Mapping[str, Any]) -> str:
     """What `check` found in a campaign, rig, plan, axis or journal: a table, and warnings."""
     left_out = ("kind", "findings", "warnings", "faults", "expected", "contraction", "journal")
     rows = [[HELD_WORDS.get(key, key), _held_value(value)] for key, value in document.items() if key not in left_out]
-    parts = [TableView(document["kind"], [], rows).text()]
+    parts: list[Part] = [TableView(document["kind"], [], rows)]
     if "expected" in document:
-        parts.append(_foreseen_table(document["expected"], document["contraction"]).text())
+        parts.append(_foreseen_table(document["expected"], document["contraction"]))
     if (journal := document.get("journal")) is not None:
         rows = [[key, _held_value(value)] for key, value in journal.items() if key != "kind"]
-        parts.append(TableView("journal of the run", [], rows).text())
+        parts.append(TableView("journal of the run", [], rows))
     parts += [f"warning: {warning}" for warning in document["warnings"]]
     certain = sum(finding["certain"] for finding in document.get("findings", ()))
     parts += [f"certain: {certain} of them; `fit` and `calibrate` stop there, --anyway goes on"] * bool(certain)
-    return "\n".join(parts)
+    return terminal(*parts)
 
 
 def _held_value(value: Any) -> str:
@@ -164,9 +166,9 @@ def stereo_text(stereo: Stereo) -> str:
     units = ("px",) * 4 + ("",) * 5
     rows = [[name, cells[k], cells[9 + k], unit] for k, (name, unit) in enumerate(zip(names, units, strict=True))]
     title = f"stereo pair, {stereo.image_width} x {stereo.image_height} px"
-    cameras = TableView(title, ["", "left(u)", "right(u)", "unit"], rows).text()
+    cameras = TableView(title, ["", "left(u)", "right(u)", "unit"], rows)
     rows = [[axis, cells[18 + k], cells[21 + k]] for k, axis in enumerate("xyz")]
-    return f"{cameras}\n{TableView('x_right = R x_left + T', ['', 'rotation, rad', 'T, mm'], rows).text()}"
+    return terminal(cameras, TableView("x_right = R x_left + T", ["", "rotation, rad", "T, mm"], rows))
 
 
 def stereo_calibration_text(result: StereoCalibration) -> str:
@@ -181,9 +183,9 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
         rows.append([escaped(view.name) or "-", *cells, "OUTLIER" if view.outlier else ""])
     columns = ["view", "left rms px", "right rms px", "distance mm", "tilt deg", ""]
     board, mean_sd = result.board, result.triangulated_pitch_mm
-    lines = [
+    lines: list[Part] = [
         stereo_text(result.stereo),
-        TableView(f"{result.pairs} pairs, {len(result.views) - result.pairs} single views", columns, rows).text(),
+        TableView(f"{result.pairs} pairs, {len(result.views) - result.pairs} single views", columns, rows),
         f"rms over corners: both {result.stereo.rms_px:.3f}, left {px(result.left_rms_px)}, right "
         f"{px(result.right_rms_px)} px; one coordinate: sd {result.noise_sd_px:.3f} px, dof {result.dof}",
         "uncertainties hold for corner errors that the corners of a picture share: variances "
@@ -208,7 +210,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
     if result.excluded:
         lines.append(f"left out: {escaped(', '.join(result.excluded), 400)}")
     lines += [f"warning: {warning}" for warning in result.warnings]
-    return "\n".join(lines)
+    return terminal(*lines)
 
 
 def detection_text(found: Detection) -> str:
@@ -227,7 +229,7 @@ def detection_text(found: Detection) -> str:
         else f"median standard uncertainty of a coordinate {found.median_sd_px:.3f} px; "
     )
     title = f"{found.processed} looks"
-    table = TableView(title, ["status", "looks", "meaning"], rows).text()
+    table = TableView(title, ["status", "looks", "meaning"], rows)
     lines = [
         f"{side} camera: odd and even {one.lines} of {one.spots} spot{'s' * (one.spots != 1)} show the beam "
         f"{one.apart_px:.2g} px apart, more than their noise: an interlaced readout, or a beam that moved or flickered "
@@ -236,7 +238,7 @@ def detection_text(found: Detection) -> str:
         for side, found_there in found.lines.items()
         for one in found_there
     ]
-    return "\n".join([table, f"method {found.method}; {sd}noise: {noise}", *lines])
+    return terminal(table, f"method {found.method}; {sd}noise: {noise}", *lines)
 
 
 def locations_text(found: Locations) -> str:
@@ -262,7 +264,7 @@ def locations_text(found: Locations) -> str:
     told = [extrapolated_text(words) for words in list(beyond)[:UNSEEN_SHOWN]]
     if len(beyond) > UNSEEN_SHOWN:
         told.append(f"and {len(beyond) - UNSEEN_SHOWN} more counters that no look reached")
-    return "\n".join([table.text(), *textwrap.wrap(LAW, COLUMNS), *told])
+    return terminal(table, *textwrap.wrap(LAW, COLUMNS), *told)
 
 
 def _points(count: int) -> str:
@@ -302,7 +304,7 @@ def budget_text(budget: Budget) -> str:
     ]
     title = "by parameter, one standard uncertainty each (correlated: they do not add up)"
     parts = TableView(title, ["parameter", "x mm", "y mm", "z mm"], rows)
-    return f"{point_budget_table(budget).text()}\n\n{parts.text()}"
+    return terminal(point_budget_table(budget), "", parts)
 
 
 def steps_text(steps: Steps) -> str:
@@ -326,17 +328,17 @@ def steps_text(steps: Steps) -> str:
 
 def gap_text(gaps: Mapping[str, Gap | None]) -> str:
     """The gap between both estimators by its terms."""
-    return gap_table(gaps).text()
+    return terminal(gap_table(gaps))
 
 
 def hold_out_text(held: HoldOut) -> str:
     """Who foretells left-out angles better, and what no hold-out can see."""
-    scores = hold_out_table(held)
-    lines = [] if scores is None else [scores.text()]
-    lines.append(f"held-out angles: {held.verdict}: {held.reason}")
     common = ", ".join(f"{d} {u:.1e}" for d, u in held.unseen.items())
-    lines.append(f"not seen by any hold-out, common to all spots: u by stereo and focal scale, deg/step: {common}")
-    return "\n".join(lines)
+    return terminal(
+        hold_out_table(held),
+        f"held-out angles: {held.verdict}: {held.reason}",
+        f"not seen by any hold-out, common to all spots: u by stereo and focal scale, deg/step: {common}",
+    )
 
 
 def positions_text(found: PositionHoldOut) -> str:
@@ -346,9 +348,23 @@ def positions_text(found: PositionHoldOut) -> str:
         z = f"{(p.mean - p.predicted) / p.u:+.1f}"
         rows.append([p.axis, str(p.position), p.direction, str(p.n), f"{p.mean:.4f}", concise(p.predicted, p.u), z])
     caption = "counters left out and foretold, mirror angles in deg; z in stated uncertainties"
-    table = TableView(caption, ["axis", "counter", "direction", "n", "mean", "predicted(u)", "z"], rows).text()
+    table = TableView(caption, ["axis", "counter", "direction", "n", "mean", "predicted(u)", "z"], rows)
     told = [] if found.rms_z is None else [f"RMS z {found.rms_z:.2f}"]
-    return "\n".join([table, *told, *(f"warning: {text}" for text in found.warnings)])
+    return terminal(table, *told, *(f"warning: {text}" for text in found.warnings))
+
+
+def pointing_text(model: PointingModel, joint: Mapping[str, tuple[float, float]] | None = None) -> str:
+    """The terms of a head by least squares, with what a fit says of each, value and sd, where there is one."""
+    rows = []
+    for name, value, error in zip(model.names, model.value.tolist(), model.standard_error.tolist(), strict=True):
+        row = [name_in_words(name), concise(value, error)]
+        if joint is not None:
+            row += [concise(*joint[name]), f"{error / joint[name][1]:.2g}" if joint[name][1] > 0 else ""]
+        rows.append(row)
+    columns = ["term", "least squares (se)", *(["joint (sd)", "se / sd"] if joint is not None else [])]
+    caption = f"pointing model without gears, {len(model.residual_deg)} sightings"
+    end = f"RMS on the sphere {two_digits(model.rms_deg)} deg = {two_digits(3600 * model.rms_deg)} arcsec"
+    return f"{TableView(caption, columns, rows).text()}\n{end}"
 
 
 def changes_text(comparison: Comparison) -> str:
@@ -360,18 +376,18 @@ def changes_text(comparison: Comparison) -> str:
         rows.append([*cells, normalised, "yes" if c.significant else "no"])
     pan, tilt = comparison.reference_pose_deg
     title = f"A and B at pan {pan:.2f} deg, tilt {tilt:.2f} deg"
-    table = TableView(title, ["quantity", "A", "B", "B - A (u)", "unit", "normalised", "significant"], rows).text()
+    table = TableView(title, ["quantity", "A", "B", "B - A (u)", "unit", "normalised", "significant"], rows)
     days = "" if comparison.days is None else f" in {comparison.days:.1f} days"
     cameras = "the same stereo calibration: its error is left out of u" if comparison.shared_cameras else "two cameras"
-    found = f"{table}\n{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
+    verdict = f"{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
     ratios = [c for c in comparison.changes if c.unit == "deg/step" and c.u > 0]
     if ratios and not any(c.significant for c in comparison.changes):
         hidden = max(comparison.limit * c.u / abs(c.first) for c in ratios)
-        found += (
+        verdict += (
             f"\nthat is no proof of none: a ratio may have changed by {100 * hidden:.2g} % unseen; "
             "`tvsbayes watch A B` holds the looks of B against A and sees smaller changes"
         )
-    return found
+    return terminal(table, verdict)
 
 
 def study_text(result: StudyResult) -> str:
@@ -386,7 +402,7 @@ def study_text(result: StudyResult) -> str:
         rows.append([name, *numbers, "within" if h.within else "OUTSIDE"])
     columns = ["quantity", "median sd", "RMS z", "predicted", *(f"{100 * x:g} %" for x in LEVELS), "power", ""]
     title = f"{result.campaigns} simulated campaigns, {n} fits converged ({MADE_BY[result.estimator]}); "
-    lines = [TableView(f"{title}{result.seconds:.1f} s each", columns, rows).text()]
+    lines: list[Part] = [TableView(f"{title}{result.seconds:.1f} s each", columns, rows)]
     a, b = result.assurance_interval95
     share = f"{100 * result.assurance:.1f} % of fits ({100 * a:.1f} to {100 * b:.1f} %)"
     lines.append(f"{t.text}: reported as met by {share}")
@@ -399,4 +415,4 @@ def study_text(result: StudyResult) -> str:
     if result.reported is not None:
         lines.append("reported: {:.3g}, {:.3g}, {:.3g}".format(*result.reported) + f" {t.unit} (5, 50, 95 % of fits)")
     lines += [f"failed: {p}" for p in result.problems[:5]]
-    return "\n".join(lines)
+    return terminal(*lines)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from msgspec import structs
 
 from tvsbayes.compensation.verification import VerifyPlan
 from tvsbayes.errors import escaped
-from tvsbayes.report.document import Section
+from tvsbayes.instrument.axes import SIDES
+from tvsbayes.report.document import Part, Section, terminal
 from tvsbayes.report.tables import TableView, two_digits
 from tvsbayes.results.compensation_record import (
     APPLIED,
@@ -23,6 +25,9 @@ from tvsbayes.results.compensation_record import (
     Verification,
 )
 
+if TYPE_CHECKING:
+    from tvsbayes.comparison.verified_looks import AimPlan
+
 REMEDIES = {
     NOT_APPLIED: "the controller does not use the table, or not its play: is the file loaded, were the settings saved, "
     "does compensation start only after homing?",
@@ -32,6 +37,15 @@ REMEDIES = {
     APPLIED: "readings lie farther off than the table allows: measure again, and compensate anew if that stays",
 }
 """By the world that fits best, where the promise is broken."""
+SCANNER_REMEDIES = {
+    NOT_APPLIED: "counters follow the nominal degrees per step, or come without the run-up that takes up the play: use "
+    "those of `tvsbayes steps-for` with `via_pan_steps` and `via_tilt_steps`, or the header's",
+    TWICE: "the calibration acts in the host and in the controller: take one of them out",
+    WRONG_SIGN: "the correction is taken off instead of added, or left and right, up and down are exchanged",
+    OTHER_MACHINE: "something moved, or the calibration is of another scanner: `tvsbayes watch CAMPAIGN FRESH` tells",
+    APPLIED: "looks lie farther off than the calibration allows: `tvsbayes watch CAMPAIGN FRESH` says what moved",
+}
+"""The same of a scanner."""
 HELPS = {
     "homing": "the scatter of homings; read after several homings, or verify without homing in between",
     "stops": "the scatter of single stops; no table takes that out",
@@ -59,7 +73,18 @@ def sizes_table(found: Verification) -> TableView:
         ["before (expected without the table)", two_digits(found.before.rms), two_digits(found.before.worst)],
         ["after (read)", two_digits(found.after.rms), two_digits(found.after.worst)],
     ]
-    return TableView(f"errors, {escaped(found.unit)}", ["", "RMS", "worst"], rows)
+    columns = ["", "RMS", "worst"]
+    if (at := found.millimetres) is not None:
+        columns += [f"RMS at {at.distance_mm:.10g} mm, mm", "worst, mm"]
+        for row, size in zip(rows, (at.before, at.after), strict=True):
+            row += [two_digits(size.rms), two_digits(size.worst)]
+    return TableView(f"errors, {escaped(found.unit)}{' of the mirrors, and of points' if at else ''}", columns, rows)
+
+
+def _promised(found: Verification) -> str:
+    at = found.millimetres
+    points = "" if at is None else f", of points at {at.distance_mm:.10g} mm {two_digits(at.promised95)} mm"
+    return f"promised: 95 % of errors at most {two_digits(found.promised95)} {escaped(found.unit)}{points}"
 
 
 def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
@@ -67,11 +92,11 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
     unit, (low, high) = escaped(made.unit), made.range_command
     largest = max(CAUSES, key=lambda cause: max(left.causes[cause] for left in made.promise.values()))
     shift = ", but for one shift common to all" if made.zero_free else ""
-    lines = [
+    lines: list[Part] = [
         f"compensation for {made.target}: {len(made.table)} commands from {low:.10g} to {high:.10g}, in {unit}",
         f"aim: reading = {made.offset:.6g} + {made.per_command:.9g} x command{shift}",
         "",
-        promise_table(made).text(),
+        promise_table(made),
         "",
         f"the promise holds between these commands, within {two_digits(made.hours)} h and {made.travel_command:.4g} "
         "commands of travel since homing",
@@ -84,32 +109,38 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
     lines.append(
         "nothing is applied yet; apply it once, in one place, then take fresh readings and run tvsbayes verify"
     )
-    return "\n".join([*lines, *(f"written: {escaped(path, 200)}" for path in written)])
+    return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
 
 
 def verification_text(found: Verification) -> str:
     """A verification for people."""
     p = "< 0.0003" if found.p < 3e-4 else f"= {found.p:.2g}"
     rows = [[name, f"{100 * chance:.1f} %"] for name, chance in found.worlds.items()]
-    lines = [
+    axis = found.millimetres is None
+    what = (
+        f"{found.readings} readings under the table" if axis else f"{found.readings} looks that the calibration aimed"
+    )
+    lines: list[Part] = [
         f"{found.verdict}: {found.world} (p {p})",
         "",
-        TableView(f"{found.readings} readings under the table", ["the table was", "probability"], rows).text(),
+        TableView(what, [f"the {'table' if axis else 'calibration'} was", "probability"], rows),
         "",
-        sizes_table(found).text(),
-        f"promised: 95 % of errors at most {two_digits(found.promised95)} {escaped(found.unit)}",
+        sizes_table(found),
+        _promised(found),
         *found.remarks,
     ]
     if found.verdict == BROKEN:
-        lines.append(f"what to do: {REMEDIES[found.world]}")
+        remedies = REMEDIES if found.millimetres is None else REMEDIES | SCANNER_REMEDIES
+        lines.append(f"what to do: {remedies[found.world]}")
     elif found.verdict == CANNOT_TELL and found.needed is None:
         lines.append(
             "no number of such readings tells: what the table corrects is lost in what homing and fit leave open"
         )
     elif found.verdict == CANNOT_TELL:
-        more = f"about {found.needed} readings of this kind" if found.needed else "some more readings"
+        kind = "readings" if axis else "looks"
+        more = f"about {found.needed} {kind} of this kind" if found.needed else f"some more {kind}"
         lines.append(f"what to do: {more} would tell; `tvsbayes plan --verify FOLDER` names those that tell soonest")
-    return "\n".join(lines)
+    return terminal(*lines)
 
 
 def compensation_section(made: Compensation, found: Verification | None) -> Section:
@@ -135,9 +166,25 @@ def verify_plan_text(found: VerifyPlan) -> str:
     words = {1: "forward", -1: "backward"}
     rows = [[f"{command:.10g}", words[side]] for command, side in found.stops]
     table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
-    lines = [table.text(), f"to arrive on a side, come from at least {found.overrun:.4g} commands away"]
+    return terminal(
+        table, f"to arrive on a side, come from at least {found.overrun:.4g} commands away", _how_far(found)
+    )
+
+
+def aim_plan_text(found: AimPlan) -> str:
+    """Looks that tell soonest what became of a calibration."""
+    rows = [[str(p), str(t), SIDES["pan"][ps > 0], SIDES["tilt"][ts > 0]] for p, t, ps, ts in found.stops]
+    columns = ["pan", "tilt", "arriving", ""]
+    table = TableView(
+        f"{len(rows)} looks with the calibration in force, in this order, from a homing on", columns, rows
+    )
+    pan, tilt = found.run_up
+    come = f"to arrive on a side, come from at least {pan} steps of pan and {tilt} of tilt away"
+    return terminal(table, come, _how_far(found))
+
+
+def _how_far(found: VerifyPlan | AimPlan) -> str:
+    """Whether a plan tells."""
     if found.enough:
-        lines.append(f"they tell the worlds apart in 95 of 100: {found.distance:.1f} standard deviations")
-    else:
-        lines.append(f"they hardly tell: the nearest two worlds are {found.distance:.1f} standard deviations apart")
-    return "\n".join(lines)
+        return f"they tell the worlds apart in 95 of 100: {found.distance:.1f} standard deviations"
+    return f"they hardly tell: the nearest two worlds are {found.distance:.1f} standard deviations apart"

@@ -139,6 +139,10 @@ def sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def terminal(*parts: str | TableView | None) -> str:
-    """Sentences and tables below each other, as a terminal shows them; None is left out."""
+type Part = str | TableView | None
+"""Of what a terminal shows; None is left out."""
+
+
+def terminal(*parts: Part) -> str:
+    """Sentences and tables below each other, as a terminal shows them."""
     return "\n".join(part.text() if isinstance(part, TableView) else part for part in parts if part is not None)

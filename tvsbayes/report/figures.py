@@ -17,8 +17,6 @@ import numpy as np
 from tvsbayes.errors import listed
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES, Axis
-from tvsbayes.instrument.campaign import pixels_of
-from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.report.drawing import (
     BLACK,
     BLUE,
@@ -44,7 +42,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tvsbayes.coordinates.error_map import ErrorMap
-    from tvsbayes.instrument.campaign import Campaign, Spot
+    from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.metrology.look_budget import Budget
     from tvsbayes.results.comparison_record import ComparisonRecord, Gap
     from tvsbayes.results.estimates import Cause, Curves, Estimate, FitSummary, StopResidual
@@ -62,12 +60,6 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def _measured(campaign: Campaign) -> tuple[list[Spot], np.ndarray]:
-    """The usable spots and where the stated cameras see them, shape (n, 3), mm in frame S."""
-    spots = [spot for spot in campaign.spots if spot.status == "ok"]
-    return spots, triangulate(campaign.stereo, pixels_of(spots))
-
-
 def _experiment(campaign: Campaign, experiment: int) -> tuple[np.ndarray, str, int]:
     """Points 1 to 4 (4, 3) of a complete experiment, its axis and N."""
     selection = select_experiments(campaign)
@@ -76,8 +68,7 @@ def _experiment(campaign: Campaign, experiment: int) -> tuple[np.ndarray, str, i
         known = listed(selection.experiments.tolist(), 10)
         raise ValueError(f"experiment {experiment} is not complete; complete are {known or 'none'}")
     row = rows[0]
-    points = triangulate(campaign.stereo, selection.pixels[row])
-    return points, str(selection.axis[row]), int(selection.steps[row])
+    return campaign.points_mm[selection.spot_rows[row]], str(selection.axis[row]), int(selection.steps[row])
 
 
 def trajectories(campaign: Campaign, experiment: int) -> Figure:
@@ -115,7 +106,7 @@ def points_3d(campaign: Campaign, experiment: int | None = None) -> Figure:
         ValueError: the experiment is not complete.
     """
     if experiment is None:
-        _, points = _measured(campaign)
+        points = campaign.usable_points_mm
     else:
         points = _experiment(campaign, experiment)[0]
     with drawing(4.0) as figure:
@@ -196,7 +187,7 @@ def setup(
         translation_mm: origin of the positioner's frame P in S, (3,), as estimated; None leaves it out.
         baseline_mm: of the TVS, for the caption of the positioner.
     """
-    _, points = _measured(campaign)
+    points = campaign.usable_points_mm
     right = -campaign.stereo.R.T @ campaign.stereo.T
     right_s = np.array([right[2], -right[0], -right[1]])
     with drawing(5.4) as figure:
@@ -225,7 +216,7 @@ def coverage(campaign: Campaign) -> Figure:
     """Where the data lie: counters seen, and spots in both images."""
     from matplotlib.patches import Rectangle
 
-    spots, _ = _measured(campaign)
+    spots = [spot for spot in campaign.spots if spot.status == "ok"]
     moves = {move.move: move for move in campaign.moves}
     counters = np.array([(moves[s.move].pan_steps, moves[s.move].tilt_steps) for s in spots]).reshape(-1, 2)
     with drawing(5.6) as figure:
@@ -437,7 +428,7 @@ def ratio_curves(curves: Curves) -> Figure:
         for axes, axis, shown in zip(panels, SENSES, SENSES.values(), strict=True):
             points = curves.ratios[axis]
             angle = np.array([point.pan_deg if axis == "pan" else point.tilt_deg for point in points])
-            for shift, direction in zip((-0.01, 0.01), shown, strict=True):
+            for shift, direction in zip((-0.02, 0.02), shown, strict=True):
                 if any(direction not in point.ratios for point in points):
                     continue
                 value = np.array([point.ratios[direction].value for point in points])

@@ -10,6 +10,7 @@ from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.report.advice import SPOTS_LISTED, factor_told, failed, noise_line, remedy, verdict_line
+from tvsbayes.report.document import Part, terminal
 from tvsbayes.report.result_tables import (
     KEY_PARAMETERS,
     MORE_PARAMETERS,
@@ -29,7 +30,7 @@ PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 def classic_text(result: ClassicResult) -> str:
     """The classic estimator's table, and which experiments it had to leave out."""
     skipped = [f"experiment {s.experiment} skipped: {s.reason}" for s in result.skipped]
-    return "\n".join([classic_table(result).text(), *skipped])
+    return terminal(classic_table(result), *skipped)
 
 
 def fit_text(
@@ -45,7 +46,7 @@ def fit_text(
     """
     if not summary.explained:
         return astray_text(summary, causes)
-    lines = detail_lines(summary) if details else []
+    lines: list[Part] = detail_lines(summary) if details else []
     validation = failed(summary)
     if validation is not None:
         # Above and below the table: who reads either end of the text must meet it.
@@ -67,8 +68,7 @@ def fit_text(
         lines.append(f"written: {', '.join(written)}")
     if not details and (more := more_line(summary)):
         lines.append(more)
-    gap = [""] if lines else []
-    return "\n".join([*lines, *gap, headline_table(summary).text(), verdict_line(summary)])
+    return terminal(*lines, "" if lines else None, headline_table(summary), verdict_line(summary))
 
 
 def more_line(summary: FitSummary) -> str:
@@ -86,12 +86,11 @@ def more_line(summary: FitSummary) -> str:
     return f"--details and the report say more: {', '.join(named)}" if named else ""
 
 
-def detail_lines(summary: FitSummary) -> list[str]:
+def detail_lines(summary: FitSummary) -> list[Part]:
     """What else a fit says: the positioner, the gears, what was tested, priors that matter, what stays unknown."""
-    lines = [details_table(summary).text()]
-    gears = gears_table(summary)
-    if gears is not None:
-        lines += [gears.text(), *gear_lines(summary)]
+    lines: list[Part] = [details_table(summary)]
+    if (gears := gears_table(summary)) is not None:
+        lines += [gears, *gear_lines(summary)]
     lines.append(f"chi2 {summary.noise.chi2:.1f} for {summary.noise.dof:.1f} degrees of freedom")
     if summary.validation is not None and summary.validation.passed:
         lines += validation_lines(summary.validation)
@@ -136,10 +135,9 @@ def astray_text(summary: FitSummary, causes: Sequence[Finding] = ()) -> str:
     there = (row for row in PARAMETERS if row[0] in summary.parameters)
     rows = [[label, f"{summary.parameters[name].value:.4g}", unit] for name, label, unit in there]
     table = TableView("where the fit stopped: NOT results", ["quantity", "value", "unit"], rows)
-    lines = [NotConverged.of(summary.problems, "").message, table.text()]
-    if summary.suspect_spots:
-        lines.append(suspect_line(summary.suspect_spots))
-    return "\n".join([*lines, *(f"cause: {finding.message}" for finding in causes)])
+    suspects = suspect_line(summary.suspect_spots) if summary.suspect_spots else None
+    said = NotConverged.of(summary.problems, "").message
+    return terminal(said, table, suspects, *(f"cause: {finding.message}" for finding in causes))
 
 
 def suspect_line(spots: Sequence[int]) -> str:
@@ -234,7 +232,7 @@ def first_text(summary: FitSummary) -> str:
         return ""
     if not sampling.converged:
         return f"importance sampling has no answer: {'; '.join(sampling.missing)}; emcee goes on ..."
-    return f"{headline_table(summary).text()}\n{importance_line(sampling.importance)}; emcee goes on ..."
+    return terminal(headline_table(summary), f"{importance_line(sampling.importance)}; emcee goes on ...")
 
 
 def lost_motion_lines(lost: Mapping[str, Sequence[LostMotion]]) -> list[str]:
@@ -265,10 +263,10 @@ def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[st
         cells = [direction, shown, holds(c.interval95_type_a, true), concise(j.value, j.sd)]
         rows.append([*cells, holds(j.interval95, true), f"{true:.6f}"])
     columns = ["deg/step", "classic, type A", "holds truth", "joint", "holds truth", "truth"]
-    ratios = TableView("degrees of beam per motor step, value(u)", columns, rows).text()
+    ratios = TableView("degrees of beam per motor step, value(u)", columns, rows)
     rows = []
     for name, label, unit in (row for row in KEY_PARAMETERS if row[0] in truth):
         e, true = summary.parameters[name], truth[name]
         rows.append([f"{label}, {unit}", concise(e.value, e.sd), holds(e.interval95, true), f"{true:.4f}"])
-    others = TableView("what the classic estimator cannot see", ["", "joint", "holds truth", "truth"], rows).text()
-    return f"{ratios}\n\n{others}"
+    others = TableView("what the classic estimator cannot see", ["", "joint", "holds truth", "truth"], rows)
+    return terminal(ratios, "", others)

@@ -10,28 +10,27 @@ from collections.abc import Mapping
 import numpy as np
 
 from tvsbayes.estimators.four_point import ClassicResult
-from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
-from tvsbayes.instrument.parameters import PERIODS_MAX
+from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.parameters import HEAD_TERMS, HEADLINES, QUANTITIES, names_of
 from tvsbayes.metrology.look_budget import Budget
 from tvsbayes.report.parameter_words import share_in_words
 from tvsbayes.report.tables import TableView, concise, interval_text, signed
 from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
 from tvsbayes.results.estimates import Estimate, FitSummary
 
-KEY_PARAMETERS = (
-    ("backlash_deg.pan", "backlash pan", "deg"),
-    ("backlash_deg.tilt", "backlash tilt", "deg"),
-    ("effective_mirror_offset_mm", "beam off the pan axis", "mm"),
-    *((f"stop_sd_deg.{direction}", f"stop scatter {direction}", "deg") for direction in DIRECTIONS),
-    *((f"look_scatter_deg.{axis}", f"look scatter {axis}", "deg") for axis in AXES),
-    ("pixel_scale", "pixel noise / stated", ""),
+
+def _rows(*names: str) -> tuple[tuple[str, str, str], ...]:
+    rows = (QUANTITIES[name] for name in names)
+    return tuple((of.name, of.label, "" if of.unit == "1" else of.unit) for of in rows)
+
+
+KEY_PARAMETERS = _rows(
+    *(of.name for of in HEADLINES if of.label and not of.ratio),
+    *(term.name for term in HEAD_TERMS.values()),
+    *names_of("stop_sd_deg", "look_scatter_deg", "pixel_scale"),
 )
 """Parameters of the table that ends a fit: name, label, unit."""
-MORE_PARAMETERS = (
-    ("mirror_offset_mm", "mirror offset L", "mm"),
-    *((f"extrinsics.rotation_rad.{axis}", f"positioner turned about {axis}", "rad") for axis in "xyz"),
-    *((f"extrinsics.translation_mm.{axis}", f"positioner at {axis}", "mm") for axis in "xyz"),
-)
+MORE_PARAMETERS = _rows(*names_of("mirror_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm"))
 """Those of its details."""
 SHARE_SHOWN = 5e-4
 """Of a variance: smaller ones print as 0.0 %."""
@@ -71,10 +70,9 @@ def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
 def headline_table(summary: FitSummary) -> TableView:
     """Ratios, contrasts and key parameters of the joint estimator: what ends a fit."""
     pose = summary.reference_pose_deg
-    rows = [estimate_row(f"effective {d}", summary.effective[d], "deg/step") for d in DIRECTIONS]
-    for axis, pair in SENSES.items():
-        if summary.contrasts[axis] is not None:
-            rows.append(estimate_row(" - ".join(pair), summary.contrasts[axis], "deg/step"))
+    told = {f"effective_deg_per_step.{part}": e for part, e in summary.effective.items()}
+    told |= {f"effective_contrast_deg_per_step.{part}": e for part, e in summary.contrasts.items() if e is not None}
+    rows = [estimate_row(label, told[name], unit) for name, label, unit in _rows(*told)]
     there = (row for row in KEY_PARAMETERS if row[0] in summary.parameters)
     rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in there]
     kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
@@ -93,28 +91,19 @@ def range_text(summary: FitSummary) -> str:
     return ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in summary.range_steps.items()) + " steps"
 
 
-GEAR_SCALES = (
-    ("transmission_error_deg", "transmission error sd", "deg"),
-    ("transmission_error_length_deg", "over an angle of", "deg"),
-    ("play_variation_deg", "play variation sd", "deg"),
-    ("drift_deg_per_root_hour", "drift in a root hour", "deg"),
-    ("creep_deg", "creep of the zero", "deg"),
-    ("thermal_deg_per_K", "zero per kelvin", "deg/K"),
-    *((f"harmonic_amplitude_deg.{{axis}}.{n}", f"period {n}, amplitude sd", "deg") for n in range(1, PERIODS_MAX + 1)),
+GEAR_SCALES = names_of(
+    *("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"),
+    *("creep_deg", "thermal_deg_per_K", "harmonic_amplitude_deg"),
 )
-"""Scales of what gears repeat and how zeros drift: block, or name with its axis, label and unit."""
+"""Scales of what gears repeat and how zeros drift."""
 
 
 def gears_table(summary: FitSummary) -> TableView | None:
     """Scales of the gears' errors of both axes; None where they are taken as perfect."""
-    rows = []
-    for block, label, unit in GEAR_SCALES:
-        for axis in AXES:
-            name = block.format(axis=axis) if "{axis}" in block else f"{block}.{axis}"
-            if name in summary.parameters:
-                rows.append(estimate_row(f"{label}, {axis}", summary.parameters[name], unit))
-    if not any(row[0].startswith(("transmission", "play", "period")) for row in rows):
+    there = [name for name in GEAR_SCALES if name in summary.parameters]
+    if not any(name.startswith(("transmission", "play", "harmonic")) for name in there):
         return None
+    rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in _rows(*there)]
     return TableView("gears: what repeats by position", ESTIMATE_COLUMNS, rows)
 
 

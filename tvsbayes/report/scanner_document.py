@@ -139,7 +139,7 @@ def answer_table(e: Evidence) -> TableView:
         rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), *[told] * applicable])
     for axis, pair in SENSES.items():
         if (contrast := summary.contrasts[axis]) is not None:
-            rows.append([f"{' - '.join(pair)}, \u00b5deg/step", *_cells(scaled(contrast, 1e6))])
+            rows.append([f"{' - '.join(pair)}, \u00b5deg/step", *_cells(scaled(contrast, 1e6)), *[""] * applicable])
     for axis in AXES:
         play = _cells(summary.parameters[f"backlash_deg.{axis}"])
         rows.append([f"backlash {axis}, deg", *play, *[CLASSIC_BLIND] * applicable])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.instrument.axes import SENSES
-from tvsbayes.instrument.parameters import REGISTRY
+from tvsbayes.instrument.parameters import parameter_of
 from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.document import FigureView, Section, sentence
@@ -85,10 +85,8 @@ def _cell(value: float) -> str:
 def budgets_section(e: Evidence) -> Section:
     """What the uncertainty of results and of a point consists of."""
     summary, away = e.fit.summary, f"{e.range_mm:g} mm away"
-    ratios = {f"effective_deg_per_step.{direction}": estimate for direction, estimate in summary.effective.items()}
     totals = {
-        table.quantity: _total(table) + _apart(table, (summary.parameters | ratios).get(table.quantity))
-        for table in e.shown.budgets
+        table.quantity: _total(table) + _apart(table, summary.named.get(table.quantity)) for table in e.shown.budgets
     }
     tables = [
         _gum_table(one, totals[one.quantity]) if other is None else _pair_table(one, other, totals)
@@ -137,6 +135,14 @@ def _mattering(table: BudgetTable) -> list[BudgetRow]:
     return [row for row in table.rows[:-1] if row.u is not None and row.share >= SMALLEST_SHARE]
 
 
+def _named(row: BudgetRow) -> str:
+    """The source of a row in words, with the unit of its u; standardised effects count in their sds."""
+    words = source_in_words(row.quantity)
+    standardised = row.unit == "1" and row.quantity.removeprefix("prior of ") not in REGISTRY
+    unit = "in sds" if standardised else row.unit.removesuffix("1")
+    return words if row.u is None or not unit or words.endswith(f", {unit}") else f"{words}, {unit}"
+
+
 def _others(table: BudgetTable, named: Collection[str]) -> tuple[str, str]:
     """Contribution and share of all inputs without a row of their own: with it a column of shares makes 100 %."""
     share = sum(row.share for row in table.rows[:-1] if row.quantity not in named)
@@ -160,7 +166,7 @@ def _pair_table(first: BudgetTable, second: BudgetTable, totals: Mapping[str, st
         told = ["; ".join(dict.fromkeys(two_digits(row.u) for row in stated if row.u is not None))]
         told.append("; ".join(dict.fromkeys(_freedom(row.dof) for row in stated)))
         parts = [cell for found in of_name for cell in _contributed(found.get(name))]
-        rows.append([source_in_words(name), mine(name)[0].kind, *told, *parts])
+        rows.append([_named(mine(name)[0]), mine(name)[0].kind, *told, *parts])
     rows.insert(-1, [OTHERS, "", "", "", *(cell for table in pair for cell in _others(table, names))])
     columns = ["source", "type", "u", "dof"]
     parts_of = [table.quantity.rpartition(".")[2] for table in pair]
@@ -192,7 +198,7 @@ def _apart(table: BudgetTable, result: Estimate | None) -> str:
     low, high = result.interval95
     half = 0.5 * (high - low)
     ends = table.estimate - table.expanded, table.estimate + table.expanded
-    parameter = REGISTRY.get(table.quantity)
+    parameter = parameter_of(table.quantity)
     never_below = parameter is not None and parameter.prior.distribution == "half-normal"
     told = ", which reaches below 0, where no value can be" * (never_below and ends[0] < 0 <= low)
     rounding = 10.0 ** (math.floor(math.log10(half)) - 1) if half > 0 else 0.0
@@ -208,7 +214,7 @@ def _gum_table(table: BudgetTable, caption: str) -> TableView:
     shown = [*_mattering(table), table.rows[-1]]
     rows = [
         [
-            source_in_words(row.quantity),
+            _named(row),
             row.kind,
             row.distribution,
             "" if row.u is None else two_digits(row.u),

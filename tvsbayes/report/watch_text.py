@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from tvsbayes.report.document import terminal
 from tvsbayes.report.tables import TableView, concise
 from tvsbayes.results.watch_record import CANNOT_TELL, LOOKS_MAX, MOVED, MovedPart, PlannedChange, Watch, WatchPlan
 
@@ -68,7 +69,7 @@ def watch_text(found: Watch, power_min: float) -> str:
         lines += [f"cannot see {c.size:g} {c.unit} of {c.what}: {HELPS[c.what]}" for c in unseen]
     if found.verdict != MOVED and found.p_all < found.false_alarm_rate:
         lines.append(f"warning: the looks scatter more than the calibration says (p = {found.p_all:.2g})")
-    return "\n".join([*lines, "", table.text()])
+    return terminal(*lines, "", table)
 
 
 def _need(change: PlannedChange) -> str:
@@ -104,4 +105,4 @@ def watch_plan_text(plan: WatchPlan) -> str:
                 enough = f": add about {c.looks_to_add} looks to it like those of this plan, homed as often (others, "
                 enough += "after one homing, tell less), and take as many at every watch"
             lines.append(f"{missed}, and no number of looks does better: the campaign knows too little of it{enough}")
-    return "\n".join([*lines, "", table.text()])
+    return terminal(*lines, "", table)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
@@ -130,8 +130,22 @@ class ErrorSize(Record, frozen=True):
     worst: NotNegative
 
 
+class Millimetres(Record, frozen=True):
+    """Errors of the points of a scanner, at a distance along the beam.
+
+    Attributes:
+        distance_mm: along the beam.
+        before, after, promised95: as in the verification, mm across all directions.
+    """
+
+    distance_mm: Positive
+    before: ErrorSize
+    after: ErrorSize
+    promised95: Positive
+
+
 class Verification(Shown, Record, frozen=True, kw_only=True):
-    """Fresh readings under a table in force.
+    """Fresh readings of an axis under a table in force, or fresh looks of a scanner that its calibration aimed.
 
     Attributes:
         verdict: `KEPT`, `BROKEN` or `CANNOT_TELL`.
@@ -140,7 +154,8 @@ class Verification(Shown, Record, frozen=True, kw_only=True):
         before: errors that the same stops would have without the table, as the campaign expects them.
         after: errors of the fresh readings.
         promised95: 95 % of errors are at most so large, of these stops, by the promise.
-        readings: how many were used.
+        readings: how many were used; of a scanner looks, each of which shows both axes.
+        millimetres: the same of points; of a scanner alone.
         unit: of errors; with `needed` and `remarks` no part of the document.
         needed: readings that would tell; None where no number does, 0 where these do.
         remarks: what else is to be said, in sentences.
@@ -153,10 +168,15 @@ class Verification(Shown, Record, frozen=True, kw_only=True):
     after: ErrorSize
     promised95: Positive
     readings: Count
+    millimetres: Millimetres | None = None
     unit: str = ""
     needed: int | None = 0
     remarks: tuple[str, ...] = ()
     beside: ClassVar = ("unit", "needed", "remarks")
+
+    def as_json(self) -> dict[str, Any]:
+        """The document; an axis has no points."""
+        return {key: value for key, value in super().as_json().items() if key != "millimetres" or value is not None}
 
     @property
     def world(self) -> str:

@@ -60,7 +60,7 @@ type HomingSide = Annotated[str, Meta(extra_json_schema={"enum": (*DIRECTIONS, A
 type ParameterName = Annotated[str, Meta(pattern=r"^[a-z0-9_]+(\.[a-z0-9_]+)*$")]
 ALWAYS_ESTIMATED = (
     *("degrees_per_step.pan", "degrees_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
-    *("mirror_offset_mm", "effective_mirror_offset_mm", "pixel_scale"),
+    "pixel_scale",
 )
 """Parameters that every `fit.json` holds."""
 
@@ -320,13 +320,18 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
         if self.validation is not None and not self.validation.passed:
             title += f"; VALIDATION FAILED: {self.validation.cause}"
             title += f", u times {self.validation.inflation:.2f}" * self.validation.widens
-        named = {f"effective_deg_per_step.{d}": e for d, e in self.effective.items()} | self.parameters
         rows = [
             (name, e.value, e.sd, *e.interval95, None if e.contraction is None else round(100 * e.contraction, 1))
-            for name, e in named.items()
-            if e is not None and not name.startswith("stereo.")
+            for name, e in self.named.items()
+            if not name.startswith("stereo.")
         ]
         return View(title, ("quantity", "value", "sd", "2.5 %", "97.5 %", "set by the data, %"), rows)
+
+    @property
+    def named(self) -> dict[str, Estimate]:
+        """Effective ratios of directions that moved, then parameters, by contract name."""
+        ratios = {f"effective_deg_per_step.{d}": e for d, e in self.effective.items() if e is not None}
+        return ratios | self.parameters
 
     @property
     def explained(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -419,11 +420,10 @@ def keep_fit(fit: AxisFit, summary: AxisSummary, folder: Path) -> dict[str, str]
 
 @dataclass(frozen=True, repr=False)
 class AxisResults(Shown):
-    """A fit and what is said of it; `stored` where both were taken from `results/`."""
+    """A fit and what is said of it."""
 
     summary: AxisSummary
     fit: AxisFit
-    stored: bool
 
     def shown(self) -> View:
         """Its summary."""
@@ -449,8 +449,15 @@ def _stored_w(folder: Path, names: int, again: str) -> np.ndarray:
     return w
 
 
+FITTING_FIRST = "results/ are missing or older than the axis folder: fitting first (weighted draws) ..."
+
+
 def results_for(
-    campaign: AxisCampaign, more: np.ndarray | None = None, progress: Show | None = None, seed: int = 0
+    campaign: AxisCampaign,
+    more: np.ndarray | None = None,
+    progress: Show | None = None,
+    seed: int = 0,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> AxisResults:
     """Those in `results/` if they are of these data and converged; else of a fit by weighted draws.
 
@@ -459,6 +466,7 @@ def results_for(
         more: further commands at which the error will be asked for, shape (n,).
         progress: told how far the fit is.
         seed: of that fit.
+        tell: shows that a fit is made first.
 
     Raises:
         InputError: stored results are damaged.
@@ -472,8 +480,9 @@ def results_for(
         made = read_record(Provenance, document, again, held=True)
         model = model_of(campaign, more)
         w = _stored_w(campaign.path, len(model.coordinates.names), again)
-        return AxisResults(summary, AxisFit.of_draws(campaign, model, w, made.seed), True)
+        return AxisResults(summary, AxisFit.of_draws(campaign, model, w, made.seed))
+    tell(FITTING_FIRST)
     fit = fit_axis(campaign, tier="importance", seed=seed, more=more, progress=progress)
     if fit.error is not None:
         raise fit.error
-    return AxisResults(summarise_axis(fit), fit, False)
+    return AxisResults(summarise_axis(fit), fit)

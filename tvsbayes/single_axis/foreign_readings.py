@@ -31,6 +31,7 @@ from tvsbayes.instrument.foreign_looks import (
     left_out,
     refused_status,
     seconds_of,
+    temperatures_of,
     word_of,
 )
 from tvsbayes.single_axis.axis_campaign import AXIS_MOVES, READINGS, TURNS, Approach, AxisMove, Reading
@@ -174,7 +175,7 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: boo
     times, homings, statuses = seconds_of(cells, assumed), homings_of(cells, assumed), cells.text("status")
     if times is None:
         assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
-    stops = _Stops(cells, commands, values, homings)
+    stops = _Stops(cells, commands, values, homings, assumed)
     readings: list[Reading] = []
     for row, (command, value) in enumerate(zip(commands, values, strict=True)):
         stops.go(row, command, None if times is None else times[row])
@@ -212,9 +213,11 @@ class _Stops:
         commands: Sequence[float],
         values: Sequence[float | None],
         homings: Sequence[bool],
+        assumed: list[str],
     ) -> None:
         self._cells, self._commands, self._values, self._homings = cells, commands, values, homings
         self._sides = _sides(cells)
+        self._temperatures = temperatures_of(cells, assumed)
         again = [name for name in cells.table.columns if _AGAIN.intersection(words_of(name))]
         self._counts = cells.table.columns[again[0]] if again else None
         self._reach = BEYOND * (max(commands) - min(commands)) or 1.0
@@ -267,7 +270,7 @@ class _Stops:
             self._put_in += 1
             step = command - via
         if homed or step:
-            self._add(command, at_s, homed=homed, side=side)
+            self._add(command, at_s, homed=homed, side=side, temperature_degC=self._temperatures[row])
         else:
             self._again += 1
 
@@ -279,11 +282,20 @@ class _Stops:
             )
         return self._overshoots
 
-    def _add(self, command: float, at_s: float | None, *, homed: bool, side: int = 0) -> None:
+    def _add(
+        self,
+        command: float,
+        at_s: float | None,
+        *,
+        homed: bool,
+        side: int = 0,
+        temperature_degC: float | None = None,
+    ) -> None:
         segment = 0 if not self.moves else self.moves[-1].segment + homed
         words: dict[int, Approach] = {1: "forward", -1: "backward", 0: "unknown"}
         time_s = float(len(self.moves)) if at_s is None else at_s
-        self.moves.append(AxisMove(len(self.moves), segment, time_s, command, words[side] if homed else ""))
+        approach = words[side] if homed else ""
+        self.moves.append(AxisMove(len(self.moves), segment, time_s, command, approach, temperature_degC))
 
     def remarks(self) -> list[str]:
         """What was assumed of moves."""

@@ -35,6 +35,10 @@ WIDENED, NARROWED = 10.0, 0.2
 KINK_STEP = 0.25
 """Newton step, in posterior sds, that may be left where the density falls nowhere along it: on a kink, where a move is
 as long as the play that it takes up, or where the rounding of a thousand looks hides the rest."""
+KINK_FALL = 1e-4
+"""Of the negative log density, by which steps fell that go to and fro about a kink: all of them are worth 0.014 sd."""
+KINK_CURVATURE = 4.0
+"""Largest curvature, by the expected one, that second differences may show there: beyond it they straddle the kink."""
 NEWTON_SETTLED = 1e-8
 """Squared Newton step, in posterior sds, at which the mode is reached."""
 HESSIAN_KEPT = 2e-3
@@ -193,22 +197,34 @@ def _nearly_there(begin: _Surroundings) -> _Surroundings:
     return replace(begin, z=begin.z + begin.ways @ found.x) if found.fun < before else begin
 
 
-def _descended(here: _Surroundings, inverse: np.ndarray) -> tuple[_Surroundings, bool]:
-    """Newton steps with one inverse curvature; whether the last would have been too short to matter."""
-    value = here.at(np.zeros((1, len(inverse))))[0]
+@dataclass(frozen=True)
+class _Descended:
+    """Where Newton steps ended, whether the next would be too short to matter, whether they went about a kink."""
+
+    here: _Surroundings
+    settled: bool
+    kinked: bool = False
+
+
+def _descended(begin: _Surroundings, inverse: np.ndarray) -> _Descended:
+    """Newton steps with one inverse curvature; where they end whence they came, that place itself."""
+    here, first = begin, begin.at(np.zeros((1, len(inverse))))[0]
+    value = first
     shortened = 0.5 ** np.arange(12)[:, None]
     for _ in range(12):
         step = -inverse @ here.slope()
         if step @ step < NEWTON_SETTLED:
-            return here, True
+            return _Descended(here, True)
         trials = here.at(shortened * step)
         lower = np.isfinite(trials) & (trials < value + 1e-9 * abs(value))
         if not lower.any():
-            return here, bool(step @ step < KINK_STEP**2)
+            return _Descended(here, bool(step @ step < KINK_STEP**2), kinked=True)
         chosen = int(np.argmax(lower))
         value = trials[chosen]
         here = replace(here, z=here.z + here.ways @ (shortened[chosen] * step))
-    return here, False
+    if step @ step < KINK_STEP**2 and first - value < KINK_FALL:
+        return _Descended(begin, True, kinked=True)
+    return _Descended(here, False)
 
 
 def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curvature: np.ndarray) -> Mode:
@@ -232,7 +248,7 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
     rows = np.flatnonzero(free)
     ways = np.zeros((start.size, len(rows)))
     ways[rows] = np.linalg.inv(np.linalg.cholesky(curvature[np.ix_(rows, rows)])).T
-    here = _nearly_there(_Surroundings(objective, start, ways))
+    here, expected = _nearly_there(_Surroundings(objective, start, ways)), ways
     problems: list[str] = []
     for _ in range(6):
         begin = here.z
@@ -241,12 +257,15 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
             raise np.linalg.LinAlgError("the density is not finite about the mode")
         eigenvalues, vectors = np.linalg.eigh(hessian)
         # Far from the mode the density may be flat or convex along a direction: step by the expected scale.
-        here, settled = _descended(here, (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T)
-        if settled and np.linalg.norm(np.linalg.solve(here.ways[rows], (here.z - begin)[rows])) < HESSIAN_KEPT:
+        found = _descended(here, (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T)
+        here = found.here
+        if found.settled and np.linalg.norm(np.linalg.solve(here.ways[rows], (here.z - begin)[rows])) < HESSIAN_KEPT:
             break
         here = replace(here, ways=here.ways @ (vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 0.1))) @ vectors.T)
     else:
         problems.append("the Newton steps on the full density did not settle")
+    if found.kinked and found.settled and not 0 < eigenvalues[0] <= eigenvalues[-1] < KINK_CURVATURE:
+        here, eigenvalues, vectors = replace(here, ways=expected), np.ones(len(rows)), np.eye(len(rows))
     if eigenvalues[0] <= 0:
         problems.append("the density has no maximum here: its Hessian is not negative definite")
     covariance = np.eye(start.size)

@@ -15,8 +15,7 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged
-from tvsbayes.instrument.axes import DIRECTION_SIGNS
-from tvsbayes.model.headlines import QUANTITIES
+from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.planning.target import Target
 from tvsbayes.progress import Job, Show
 from tvsbayes.statistics.chances import LEVELS, binomial_bounds, rms_bounds, share_interval95
@@ -118,9 +117,8 @@ def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
         message = "no fit of the study converged" + (f"; {problems[0]}" if problems else "")
         raise NotConverged("not-converged", message, remedy="check the plan with `tvsbayes check RIG PLAN`")
     n = len(good)
-    stated = {d: job.rig.table.priors[f"degrees_per_step.{axis}"].value for d, (axis, _) in DIRECTION_SIGNS.items()}
     found = {}
-    for name in QUANTITIES:
+    for name, quantity in TARGETS.items():
         entries = [row.headlines[name] for row in good]
         if all(e.interval95[0] == e.interval95[1] for e in entries):
             continue
@@ -128,7 +126,7 @@ def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
             [(e.truth, e.value, e.sd, e.pit, e.predicted_sd) for e in entries]
         ).T
         error = value - truth
-        null = stated.get(name, job.rig.table.priors["mirror_offset_mm"].value if name == "mirror_offset" else 0.0)
+        null = job.rig.table.priors[quantity.stated].value if quantity.stated else 0.0
         found[name] = HeadlineStudy(
             coverage={f"{100 * level:g}": float(np.mean(np.abs(pit - 0.5) < level / 2)) for level in LEVELS},
             bounds={f"{100 * level:g}": binomial_bounds(n, level) for level in LEVELS},

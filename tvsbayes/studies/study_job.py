@@ -18,13 +18,12 @@ import numpy as np
 
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError
 from tvsbayes.estimators.joint_fit import JointFit, fit
-from tvsbayes.instrument.axes import DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import BLOCKS
+from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.rig import Rig, rig_table_toml
 from tvsbayes.instrument.stereo_pair import stereo_bytes
-from tvsbayes.model.headlines import QUANTITIES, Derived
+from tvsbayes.model.headlines import Derived
 from tvsbayes.model.parameter_space import half_normal_sd, half_normal_slope
 from tvsbayes.planning.candidates import BACKLASH_COLUMNS
 from tvsbayes.planning.drawn_rigs import instruments_in
@@ -36,7 +35,6 @@ from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
 from tvsbayes.studies.rows import STUDY_FORMAT, HeadlineRow, StudyRow
-from tvsbayes.twin.physics import effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth
 
@@ -82,23 +80,16 @@ class StudyJob:
 
 
 def true_headlines(truth: Truth, campaign: Campaign, pose_rad: np.ndarray) -> np.ndarray:
-    """`QUANTITIES` of a true rig by the twin's formulas: ratios over the looks of a campaign, the offset at a pose.
+    """`TARGETS` of a true rig by the twin's formulas: ratios over the looks of a campaign, others at a pose.
 
     Raises:
         NothingToEstimate: a campaign without looks.
     """
-    parameters, pose = truth.parameters, (float(np.degrees(pose_rad[0])), float(np.degrees(pose_rad[1])))
-    ratio = truth.effective_deg_per_step(campaign)
-    if ratio is None:
+    pan_deg, tilt_deg = np.degrees(pose_rad).tolist()
+    true = truth.headlines(campaign, (pan_deg, tilt_deg))
+    if true is None:
         raise NothingToEstimate("no-looks", "no look of this campaign has a spot: it has no ratios")
-    return np.array(
-        [
-            *(ratio[d] for d in DIRECTIONS),
-            *(ratio[positive] - ratio[negative] for positive, negative in SENSES.values()),
-            *(parameters[name] for name in BLOCKS["backlash_deg"]),
-            effective_mirror_offset_mm(parameters, pose),
-        ]
-    )
+    return np.array([true[quantity.name] for quantity in TARGETS.values()])
 
 
 def study_row(job: StudyJob, index: int) -> StudyRow:
@@ -141,7 +132,7 @@ class Estimates:
     Attributes:
         z: centre of the coordinates, shape (p,).
         covariance: theirs, shape (p, p).
-        value: of `QUANTITIES`, shape (9,).
+        value: of `TARGETS`, shape (9,).
         draws: of them, shape (n, 9).
         weights: of the draws, sum 1, shape (n,).
     """
@@ -211,7 +202,7 @@ def _compared(job: StudyJob, result: JointFit, found: Estimates, true: Truth) ->
             pit=float(found.weights @ (found.draws[:, k] < values[k])),
             predicted_sd=float(predicted[k]),
         )
-        for k, name in enumerate(QUANTITIES)
+        for k, name in enumerate(TARGETS)
     }
 
 
@@ -241,7 +232,5 @@ def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray
 
 
 def _headline_draws(draws: Derived) -> np.ndarray:
-    """`QUANTITIES` of draws, shape (draws, 9)."""
-    ratio, offset_mm = np.asarray(draws.effective_deg_per_step), draws.effective_mirror_offset_mm
-    backlash = np.asarray(draws.physical)[:, BACKLASH_COLUMNS]
-    return np.column_stack([ratio, ratio[:, ::2] - ratio[:, 1::2], backlash, offset_mm])
+    """`TARGETS` of draws, shape (draws, 9)."""
+    return np.column_stack([draws[quantity.name] for quantity in TARGETS.values()])

@@ -7,12 +7,13 @@ elsewhere, so that an error in one of them shows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.conditions import TimedMove
 from tvsbayes.instrument.parameters import PERIODS_MAX
 
 FEATURES = 200
@@ -151,10 +152,28 @@ def zero_shift_deg(
         warm_minutes: since switching on, any shape.
         kelvin: temperature less that at which the zero holds.
     """
-    still = np.exp(np.asarray(warm_minutes, float) / -parameters.get("creep_minutes", 1.0))
-    crept = parameters.get(f"creep_deg.{axis}", 0.0) * (1.0 - still)
-    shift: np.ndarray = crept + parameters.get(f"thermal_deg_per_K.{axis}", 0.0) * kelvin
+    creep = parameters.get(f"creep_deg.{axis}", 0.0), parameters.get("creep_minutes", 1.0)
+    return zero_shift(*creep, warm_minutes, parameters.get(f"thermal_deg_per_K.{axis}", 0.0), kelvin)
+
+
+def zero_shift(
+    creep: float, creep_minutes: float, warm_minutes: np.ndarray | float, per_kelvin: float, kelvin: np.ndarray | float
+) -> np.ndarray:
+    """The same of any axis, in the unit of its `creep`: what has crept so far, and what the temperature adds."""
+    still = np.exp(np.asarray(warm_minutes, float) / -creep_minutes)
+    shift: np.ndarray = creep * (1.0 - still) + per_kelvin * kelvin
     return shift
+
+
+def kelvin_of(moves: Sequence[TimedMove]) -> np.ndarray:
+    """Temperatures less the first, interpolated in time; 0 where fewer than two are recorded."""
+    known = [m for m in moves if m.temperature_degC is not None]
+    if len(known) < 2:
+        return np.zeros(len(moves))
+    degC = np.array([m.temperature_degC for m in known], float)
+    if len(known) < len(moves):
+        degC = np.interp([m.time_s for m in moves], [m.time_s for m in known], degC)
+    return degC - degC[0]
 
 
 def drift_deg(

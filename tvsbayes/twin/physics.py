@@ -17,6 +17,7 @@ import numpy as np
 from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, DIRECTION_SIGNS, FULL_TURN_DEG
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
+from tvsbayes.twin.head_physics import head_beam
 
 
 def take_up(output_deg: float, driving_deg: float, backlash_deg: float) -> float:
@@ -113,11 +114,13 @@ def stop_errors(
 def mirror_chain(
     psi_rad: np.ndarray | float, beta_rad: np.ndarray | float, geometry: Mapping[str, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Beam leaving mirror 2 for mirror angles psi, beta: origin (..., 3) mm and direction (..., 3) in P.
+    """The beam for angles psi, beta of both axes: origin (..., 3) mm and direction (..., 3) in P.
 
     True reflections at true intersections (formulation 3.2). The laser is turned into the pan stage Q instead
-    of the mirrors out of it. `geometry` maps contract names to values.
+    of the mirrors out of it. `geometry` maps contract names to values; a head's are those of `head_beam`.
     """
+    if "azimuth_zero_deg" in geometry:
+        return head_beam(psi_rad, beta_rad, geometry)
     psi, beta = np.broadcast_arrays(np.asarray(psi_rad, float), np.asarray(beta_rad, float))
     tx, ty = (np.tan(np.radians(geometry[f"laser_tilt_deg.{axis}"])) for axis in "xy")
     ox, oy = geometry["laser_offset_mm.x"], geometry["laser_offset_mm.y"]

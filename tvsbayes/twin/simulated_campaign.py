@@ -17,17 +17,20 @@ import numpy as np
 from tvsbayes.display import Shown, View
 from tvsbayes.files.disk import make_folder, write_atomically
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
-from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Move, Spot, campaign_bytes, with_pixels
+from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Move, Spot, campaign_bytes, sighted_campaign, with_pixels
 from tvsbayes.instrument.conditions import powered_on_s
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
 from tvsbayes.instrument.rig import PERIODIC_NAMES, Rig, require_periods
+from tvsbayes.instrument.sightings import Sighting
 from tvsbayes.twin.gear_errors import (
     PERFECT,
     draw_gear_errors,
     drift_deg,
+    kelvin_of,
     zero_shift_deg,
 )
+from tvsbayes.twin.head_physics import sighted_angles, tilt_zero_deg
 from tvsbayes.twin.physics import (
     Light,
     Sheet,
@@ -35,6 +38,7 @@ from tvsbayes.twin.physics import (
     harmonics_deg,
     inside_images,
     light_on_sheet,
+    mirror_chain,
     project,
     stop_errors,
     to_tvs,
@@ -152,6 +156,15 @@ def simulate(
         log.moves = [replace(move, temperature_degC=one) for move, one in zip(log.moves, measured, strict=True)]
     driven = _drive(log.moves, truth, rig.table.first_period_deg, streams, powered_on_s(full_header))
     truth = replace(driven.truth, homing_side=home_approach)
+    if rig.table.mechanism.sightings:
+        sightings = _sightings(log, rig, truth, streams)
+        ok = [row.move for row in sightings]
+        pan, tilt = driven.resting_deg[ok].mean(axis=0) if ok else (0.0, 0.0)
+        truth = replace(truth, reference_pose_deg=(float(pan), float(tilt)) if ok else None)
+        moves = log.moves if sides_recorded else [_unrecorded(move) for move in log.moves]
+        none = np.zeros((0, 3))
+        campaign = sighted_campaign(moves, sightings, rig.table, full_header)
+        return SimulatedCampaign(campaign, truth, Light(none, none, none, none))
     light = _light(log, rig, truth, streams)
     pixels = project(light.points_mm, truth.stereo, truth.parameters["focal_scale"])
     noise_px = truth.parameters["pixel_scale"] * sd_px * streams.pixels.standard_normal(pixels.shape)
@@ -209,8 +222,7 @@ def _drive(
     start_draws = streams.stops.uniform(-0.5, 0.5, (len(moves), 2))
     drift_draws, time_s = streams.drift.standard_normal((len(moves), 2)), np.array([m.time_s for m in moves])
     warm_minutes = (time_s - (time_s[0] if on_s is None else on_s)) / 60.0
-    degC = np.array([0.0 if m.temperature_degC is None else m.temperature_degC for m in moves])
-    kelvin = degC - degC[0]
+    kelvin = kelvin_of(moves)
     resting, errors, drift = np.empty_like(counters), np.empty_like(counters), np.empty_like(counters)
     for i, (axis, (negative, positive)) in enumerate(SIDES.items()):
         approach = [getattr(m, f"{axis}_approach") for m in moves]
@@ -235,7 +247,7 @@ def _drive(
         resting[:, i] += zero_shift_deg(p, axis, warm_minutes, kelvin)
         sds = {"+": p[f"stop_sd_deg.{positive}"], "-": p[f"stop_sd_deg.{negative}"]}
         errors[:, i] = stop_errors(counters[:, i], first, approach, stop_draws[:, i], sds)
-    resting[:, 1] += p["tilt_zero_deg"]
+    resting[:, 1] += tilt_zero_deg(p)
     realised = replace(
         truth,
         mirror_angles_deg=pan_and_tilt((resting + errors).tolist()),
@@ -266,6 +278,20 @@ def _light(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> Light:
     off_deg = look_scatter_deg(truth.parameters, streams.looks.standard_normal((len(log.looks), 2)))
     psi, beta = np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move] + off_deg).T
     return light_on_sheet(psi, beta, truth.parameters, Sheet(sheets.depth_mm[placement], sheets.normal[placement]))
+
+
+def _sightings(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> tuple[Sighting, ...]:
+    """Where the head is found to point at each look; the noise is that of `[cameras] sighting_sd_deg`."""
+    move = np.array([look.move for look in log.looks], int)
+    off_deg = look_scatter_deg(truth.parameters, streams.looks.standard_normal((len(move), 2)))
+    psi, beta = np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move] + off_deg).T
+    directions = mirror_chain(psi, beta, truth.parameters)[1]
+    noise = truth.parameters["pixel_scale"] * rig.sighting_sd_deg * streams.pixels.standard_normal((len(move), 2))
+    angles, u_deg = sighted_angles(directions, noise).tolist(), rig.sighting_sd_deg
+    return tuple(
+        Sighting(sighting=k, move=look.move, azimuth_deg=azimuth, elevation_deg=elevation, u_deg=u_deg)
+        for k, (look, (azimuth, elevation)) in enumerate(zip(log.looks, angles, strict=True))
+    )
 
 
 def _aperture_deg(light: Light, p: Mapping[str, float], rig: Rig, rng: np.random.Generator) -> list[float]:

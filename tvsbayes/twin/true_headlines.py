@@ -7,17 +7,22 @@ other axis at its mean. Written for the twin alone; the estimators have formulas
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, SENSES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.twin.gear_errors import GearErrors
-from tvsbayes.twin.physics import harmonics_deg, mirror_chain, wobble_deg
+from tvsbayes.twin.head_physics import tilt_zero_deg
+from tvsbayes.twin.physics import effective_mirror_offset_mm, harmonics_deg, mirror_chain, wobble_deg
 
 SLOPE_STEP_RAD = 1e-5
 """Of central differences of the mirrors: truncation 1e-10, rounding 1e-11."""
+AT_POSE: dict[str, Callable[[Mapping[str, float], tuple[float, float]], float]] = {
+    "effective_mirror_offset_mm": effective_mirror_offset_mm,
+}
+"""True headlines of parameters and a pose (psi, beta), deg, by contract name."""
 
 
 def looks_steps(campaign: Campaign) -> np.ndarray:
@@ -67,7 +72,7 @@ def _mirror_deg(
     """Mirror angle (n,) of an axis by mean ratio and transmission error alone."""
     angle_deg = parameters[f"degrees_per_step.{axis}"] * counters
     error_deg = errors[axis].error_deg(angle_deg) + wobble_deg(angle_deg, harmonics_deg(parameters, axis), period_deg)
-    return angle_deg + error_deg + (parameters["tilt_zero_deg"] if axis == "tilt" else 0.0)
+    return angle_deg + error_deg + (tilt_zero_deg(parameters) if axis == "tilt" else 0.0)
 
 
 def _beam_deg(parameters: Mapping[str, float], axis: int, angle_deg: np.ndarray, others_deg: float) -> np.ndarray:

@@ -15,14 +15,13 @@ import numpy as np
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, parse_json
-from tvsbayes.instrument.axes import AXES, SIDES
+from tvsbayes.instrument.axes import AXES, SENSES, SIDES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import (
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
     LATE_NAMES,
     REGISTRY,
-    RIG_NAMES,
     RIG_PRIORS,
     STEREO_PARAMETER_NAMES,
     Prior,
@@ -30,8 +29,8 @@ from tvsbayes.instrument.parameters import (
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.twin.gear_errors import PERFECT, AxisErrors, GearErrors, Tabulated, draw_gear_errors
-from tvsbayes.twin.physics import effective_mirror_offset_mm, local_deg_per_step
-from tvsbayes.twin.true_headlines import effective_deg_per_step
+from tvsbayes.twin.physics import local_deg_per_step
+from tvsbayes.twin.true_headlines import AT_POSE, effective_deg_per_step
 
 TRUTH_FORMAT = "tvsbayes-truth/1"
 Pair = tuple[float, float]
@@ -47,7 +46,7 @@ class GearErrorTable(TypedDict):
 
 
 class TruthDocument(TypedDict):
-    """truth.json; see `Truth`."""
+    """truth.json; see `Truth`. What `AT_POSE` gives stands there under its names."""
 
     format: str
     note: str
@@ -62,7 +61,6 @@ class TruthDocument(TypedDict):
     gear_error: NotRequired[dict[str, GearErrorTable]]
     effective_deg_per_step: NotRequired[dict[str, float]]
     local_deg_per_step: NotRequired[dict[str, float]]
-    effective_mirror_offset_mm: NotRequired[float]
 
 
 @dataclass(frozen=True)
@@ -100,16 +98,32 @@ class Truth:
         return replace(self, parameters={**self.parameters, **scales}, gear_errors=errors)
 
     def effective_deg_per_step(self, campaign: Campaign) -> dict[str, float] | None:
-        """True headlines over the looks of a campaign of this rig, see `true_headlines`; None where it has no looks."""
+        """Of every direction over the looks of a campaign, see `true_headlines`; None where it has no looks."""
         return effective_deg_per_step(self.parameters, self.gear_errors or PERFECT, campaign)
+
+    def headlines(self, campaign: Campaign, pose_deg: Pair) -> dict[str, float] | None:
+        """Parameters and all that follows from them by contract name, over the looks of a campaign and at a pose."""
+        ratio = self.effective_deg_per_step(campaign)
+        if ratio is None:
+            return None
+        contrast = {axis: ratio[first] - ratio[second] for axis, (first, second) in SENSES.items()}
+        return {
+            **self.parameters,
+            **{f"effective_deg_per_step.{direction}": value for direction, value in ratio.items()},
+            **{f"effective_contrast_deg_per_step.{axis}": value for axis, value in contrast.items()},
+            **{name: formula(self.parameters, pose_deg) for name, formula in AT_POSE.items()},
+        }
 
     def as_json(self, campaign: Campaign) -> TruthDocument:
         """The document of truth.json of a campaign of this rig, with the effective ratios where there are looks."""
+        mechanism = campaign.rig.mechanism
+        held = mechanism.held
+        cameras = dict(zip(STEREO_PARAMETER_NAMES, map(float, self.stereo.vector), strict=True))
         document: TruthDocument = {
             "format": TRUTH_FORMAT,
             "note": self.note,
-            "parameters": {name: float(value) for name, value in self.parameters.items()},
-            "stereo": dict(zip(STEREO_PARAMETER_NAMES, map(float, self.stereo.vector), strict=True)),
+            "parameters": {name: float(v) for name, v in self.parameters.items() if name not in held},
+            "stereo": {} if mechanism.sightings else cameras,
             "mirror_angles_deg": self.mirror_angles_deg,
             "stop_errors_deg": self.stop_errors_deg,
             "home_offsets_deg": self.home_offsets_deg,
@@ -123,9 +137,9 @@ class Truth:
             document["effective_deg_per_step"] = effective
         if self.reference_pose_deg is not None:
             document["local_deg_per_step"] = local_deg_per_step(self.parameters, self.reference_pose_deg)
-            document["effective_mirror_offset_mm"] = effective_mirror_offset_mm(
-                self.parameters, self.reference_pose_deg
-            )
+            if not mechanism.terms:
+                at_pose = {name: formula(self.parameters, self.reference_pose_deg) for name, formula in AT_POSE.items()}
+                document = cast("TruthDocument", document | at_pose)
         return document
 
     def _gear_error(self, axis: str, campaign: Campaign) -> GearErrorTable:
@@ -149,7 +163,9 @@ class Truth:
         side, tables = document.get("homing_side"), document.get("gear_error")
         return cls(
             parameters=parameters,
-            stereo=stated.with_vector(np.array([float(known[name]) for name in STEREO_PARAMETER_NAMES])),
+            stereo=stated.with_vector(np.array([float(known[name]) for name in STEREO_PARAMETER_NAMES]))
+            if known
+            else stated,
             mirror_angles_deg=pan_and_tilt(document["mirror_angles_deg"]),
             stop_errors_deg=pan_and_tilt(document["stop_errors_deg"]),
             home_offsets_deg=pan_and_tilt(document["home_offsets_deg"]),
@@ -213,8 +229,10 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
     def drawn(names: Iterable[str], stream: np.random.Generator) -> dict[str, float]:
         return {name: _draw(rig.truth.get(name, rig.table.priors[name]), stream) for name in names}
 
+    rig_names = rig.table.mechanism.rig_names
+
     late = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
-    parameters = drawn((n for n in RIG_NAMES if n not in late), rng)
+    parameters = drawn((n for n in rig_names if n not in late), rng)
     # Through the eigenvectors: fixed parameters give a semi-definite covariance that Cholesky refuses.
     variances, vectors = np.linalg.eigh(np.asarray(rig.stereo.parameter_covariance, float))
     offset = vectors @ (np.sqrt(np.clip(variances, 0.0, None)) * rng.standard_normal(len(variances)))

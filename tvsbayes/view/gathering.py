@@ -8,12 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from tvsbayes.calibration.calibration_file import stored_calibration
-from tvsbayes.instrument.campaign import Campaign, input_hashes, read_campaign
-from tvsbayes.pipeline import Tell, compile_for, untold
+from tvsbayes.instrument.campaign import Campaign, read_campaign
+from tvsbayes.pipeline import StoredOrFitted, Tell, compile_for, untold
 from tvsbayes.report.evidence import gear_bands
-from tvsbayes.results.fit_record import read_fit
-from tvsbayes.results.stored_draws import stored_mode
 from tvsbayes.view.scene import Fitted, Looked, scene
 
 NOT_FITTED = "no results: the rig is drawn as campaign.toml states it; `tvsbayes fit` adds residuals and the fitted rig"
@@ -39,16 +36,14 @@ def found_in(folder: Path) -> Found:
         InputError: no campaign, or damaged results.
     """
     campaign = read_campaign(folder)
-    mode, path = stored_mode(campaign), Path(folder) / "results" / "fit.json"
-    if mode is None or not path.exists():
-        return Found(campaign, None, NOT_OF_THESE if path.exists() else NOT_FITTED)
-    record, calibration = read_fit(path), stored_calibration(campaign)
+    results = StoredOrFitted(campaign)
+    record, calibration = results.stored_record, results.stored_calibration
+    fit = None if record is None else results.stored_fit
+    if record is None or calibration is None or fit is None:
+        stored = (Path(folder) / "results" / "fit.json").exists()
+        return Found(campaign, None, NOT_OF_THESE if stored else NOT_FITTED)
     from tvsbayes.assessment.residuals import stop_residuals
-    from tvsbayes.estimators.joint_fit import restored
 
-    fit = None if record.provenance.inputs != input_hashes(campaign) else restored(campaign, mode)
-    if fit is None or calibration is None:
-        return Found(campaign, None, NOT_OF_THESE)
     return Found(campaign, Fitted(fit, record, stop_residuals(fit), gear_bands(calibration)), None)
 
 

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from tvsbayes.errors import InputError
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.looks import WINDOW, in_frame_s, nearest_range, spot_angles
-from tvsbayes.instrument.mirrors import Ray, Vectors
+from tvsbayes.instrument.mirrors import Optics, Ray, Vectors
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import image, rotation_matrix, transform
 from tvsbayes.model.laser_path import reflections
@@ -52,6 +53,9 @@ def _window(
 ) -> Ways:
     model, arrays = space.model(z), arrays.of_spots(first, len(turned_rad))
     pan, tilt = spot_angles(model, arrays).angle_rad.T + turned_rad.T
+    if not isinstance(model.optics, Optics):
+        remedy = "`tvsbayes fit --details` has the terms of a head"
+        raise InputError("usage", "view draws the mirrors of a scanner, and this is a pan-tilt head", remedy=remedy)
     met = reflections(model.optics, pan, tilt)
     ray = Ray(met.second_mm, met.outgoing)
     reach = nearest_range(model.extrinsics, ray, Vectors.of(arrays.spots.triangulated_mm.T))

@@ -16,7 +16,6 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import CAMERAS, PIXELS, Campaign, Spot, frame_name, ordered_spots, pixels_of
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES, unit_of
-from tvsbayes.instrument.stereo_pair import triangulate
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.posterior.predictive import repeated_rad
@@ -219,7 +218,7 @@ def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> Look
         scale = fitted.record.summary.parameters["pixel_scale"].value
         suspect[[row_of[spot] for spot in (*fitted.fit.suspect_spots, *fitted.fit.excluded_spots)]] = True
     if used:
-        point[rows] = triangulate(campaign.stereo, pixels[rows])
+        point[rows] = campaign.points_mm[rows]
         noise = scale**2 * np.stack([pixel_covariance(spot) for spot in used])
         covariance[rows] = point_covariance_mm2(campaign.stereo, point[rows], noise)
     deviation, u = _deviations(row_of, () if fitted is None else fitted.stops)
@@ -287,11 +286,7 @@ def _parameters(campaign: Campaign, fitted: Fitted | None) -> tuple[ParameterRow
         stated = campaign.rig.priors
         return tuple(ParameterRow(n, unit_of(n), stated[n].value, stated[n].u, None) for n in RIG_NAMES)
     summary = fitted.record.summary
-    told = {f"effective_deg_per_step.{d}": e for d, e in summary.effective.items() if e is not None}
-    return tuple(
-        ParameterRow(name, unit_of(name), e.value, e.sd, e.contraction)
-        for name, e in (told | summary.parameters).items()
-    )
+    return tuple(ParameterRow(name, unit_of(name), e.value, e.sd, e.contraction) for name, e in summary.named.items())
 
 
 def _correlation(fitted: Fitted | None) -> tuple[tuple[str, ...], np.ndarray]:

@@ -220,7 +220,7 @@ FAULTS = (
           "test_both_sides_are_linear_between_lines_and_constant_beyond"),
     Fault("LinuxCNC's table has the wrong sign", "formats._linuxcnc",
           Reads("added", "{k: -v for k, v in value.items()}"), "test_linuxcnc_sends_the_corrected_command_by_its_rule"),
-    Fault("a table is made of a fit that is not accepted", "refuse_unaccepted", Never("answer"),
+    Fault("a table is made of a fit that is not accepted", "refuse_answer", Never("answer"),
           "test_no_table_is_made_of_what_is_not_accepted"),
     Fault("a fault of the play alone goes for a kept promise", "verification.SEPARATE", Constant("1e12"),
           "test_every_world_is_named"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,10 @@ import numpy as np
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import write_atomically
-from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, write_axis
 from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, AxisPrior, axis_priors, kind_of
 from tvsbayes.single_axis.waves import SECOND, WANDER, AskedPeriods
+from tvsbayes.twin.gear_errors import kelvin_of, zero_shift
 
 READING_SHARE = 5e-5
 """Stated u of simulated readings, of the travel, where nothing else is known."""
@@ -83,7 +83,7 @@ class AxisTruth:
         """The content of `truth.json`."""
         curves = {"command": self.command, "error": self.error, "play_variation": self.play_variation}
         lists = {name: values.tolist() for name, values in curves.items()}
-        waves = [plain(wave) for wave in self.waves]
+        waves = [asdict(wave) for wave in self.waves]
         return {"format": TRUTH_FORMAT, "parameters": self.parameters, **lists, **({"waves": waves} if waves else {})}
 
 
@@ -205,9 +205,8 @@ def _encoder_reads(truth: AxisTruth, stand: float) -> float:
 def _time_shift(truth: AxisTruth, warm_s: float, kelvin: float, time_s: float) -> float:
     """What the zero has shifted by creep, temperature and waves of time."""
     true = truth.parameters
-    creep = true["creep"] * (1.0 - math.exp(-warm_s / (60.0 * true["creep_minutes"])))
-    waves = sum(wave.at(time_s) for wave in truth.waves if wave.of == "seconds")
-    return creep + true["thermal_per_K"] * kelvin + waves
+    shift = zero_shift(true["creep"], true["creep_minutes"], warm_s / 60.0, true["thermal_per_K"], kelvin)
+    return float(shift) + sum(wave.at(time_s) for wave in truth.waves if wave.of == "seconds")
 
 
 def stops_of(
@@ -221,7 +220,7 @@ def stops_of(
     side = 0
     last: AxisMove | None = None
     since = moves[0].time_s if powered_on_s is None else powered_on_s
-    kelvin = _kelvin(moves)
+    kelvin = kelvin_of(moves)
     for row, move in enumerate(moves):
         if last is None or move.segment != last.segment:
             home = 0.0 if last is None else true["home_sd"] * float(rng.standard_normal())
@@ -249,16 +248,6 @@ def stops_of(
         found[row] += _time_shift(truth, move.time_s - since, kelvin[row], move.time_s)
         last = move
     return found
-
-
-def _kelvin(moves: Sequence[AxisMove]) -> np.ndarray:
-    """Temperatures less the first, interpolated in time; 0 where fewer than two are recorded."""
-    known = [m for m in moves if m.temperature_degC is not None]
-    if len(known) < 2:
-        return np.zeros(len(moves))
-    at = [m.time_s for m in known]
-    found = np.interp([m.time_s for m in moves], at, [m.temperature_degC or 0.0 for m in known])
-    return found - found[0]
 
 
 def drive_of(

@@ -1,0 +1,166 @@
+"""Do the intervals hold the truth of drawn pan-tilt heads, seen by a stereo pair or by their own camera?
+
+    python -m experiments.intervals.heads run --n 30 --cores 0        # of each kind, 10 to 40 CPU s a head, resumable
+    python -m experiments.intervals.heads table > experiments/intervals/heads.md
+
+Head i is drawn with seed i, every prior quantity anew: gears with errors by position, play, drift and scatter, all
+terms of the geometry. One with sightings turns to 24 directions twice, in an order of its own; one that carries the
+laser runs the shipped grid before a stereo pair. Each is simulated by the twin's own optics, fitted and sampled by
+importance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from experiments.common.command_line import act, study_parser
+from experiments.common.fits import compile_for
+from experiments.common.rigs import mounted_rig, shipped_plan
+from experiments.common.rows import output, read_rows, run_rows
+from tvsbayes.errors import TvsError
+from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
+from tvsbayes.instrument.parameters import HEAD_TERMS, Prior, names_of
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep
+from tvsbayes.instrument.rig import Rig, RigTable
+from tvsbayes.instrument.stereo_pair import NO_STEREO
+from tvsbayes.posterior.sampling import sample
+from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
+from tvsbayes.twin.simulated_campaign import simulate
+
+ROWS = output(__file__, "heads.jsonl")
+KINDS = ("sightings", "spots")
+SMALLEST_BUCKET = 96
+PAN_STEPS, TILT_STEPS = (-1500, -800, -200, 400, 900, 1500), (100, 400, 800, 1200)
+LEVEL = 0.95
+SETTLED = 0.1
+"""Share of a prior's variance that the data must take away for a quantity to be judged."""
+
+
+def head_of(kind: str) -> Rig:
+    """What is believed of a head, and drawn from: sightings of 0.005 deg, or the stereo pair of the mounted rig."""
+    if kind == "sightings":
+        ratios = dict.fromkeys(names_of("degrees_per_step"), Prior(0.05, 0.002))
+        table = RigTable(ratios, mechanism=SIGHTING_HEAD)
+        return Rig(
+            table, NO_STEREO, dict(table.priors), {}, {}, {"sighting_sd_deg": 0.005}, {"move_s": 20.0, "look_s": 5.0}
+        )
+    mounted = mounted_rig()
+    stated = {n: p for n, p in mounted.table.priors.items() if n in HEAD.told}
+    table = RigTable(stated, mechanism=HEAD)
+    small = {"elevation_zero_deg": Prior(0.0, 2.0)}
+    table = replace(table, priors={**table.priors, **small})
+    return replace(mounted, table=table, truth=dict(table.priors))
+
+
+def plan_of(kind: str, seed: int) -> tuple[PlanStep, ...]:
+    """The grid of the mounted rig, or directions in an order of their own, every one twice."""
+    if kind == "spots":
+        return shipped_plan("grid")
+    rng, plan = np.random.default_rng([seed, 12]), PlanBuilder()
+    plan.home()
+    places = [(pan, tilt) for pan in PAN_STEPS for tilt in TILT_STEPS]
+    for _ in range(2):
+        for place in rng.permutation(len(places)).tolist():
+            plan.move(*places[place])
+            plan.look()
+    return tuple(plan.steps)
+
+
+def one_head(task: tuple[str, int]) -> dict[str, object]:
+    """One head; whatever fails is recorded as a failure."""
+    kind, seed = task
+    compile_for(SMALLEST_BUCKET)
+    simulated = simulate(head_of(kind), plan_of(kind, seed), seed)
+    campaign, began = simulated.campaign, time.process_time()
+    row: dict[str, object] = {"kind": kind, "seed": seed, "answer": "none", "problems": []}
+    try:
+        found = fit(campaign)
+        row["problems"] = list(found.problems)
+        if found.converged:
+            posterior = sample(found, "importance")
+            row |= {"answer": posterior.convergence.answer, "quantities": _quantities(found, posterior, simulated)}
+    except TvsError as error:
+        row["problems"] = [error.message]
+    return {**row, "cpu_s": time.process_time() - began}
+
+
+def _quantities(found, posterior, simulated) -> dict[str, dict[str, float]]:
+    """Of headlines and terms: z of the truth, share of the draws below it, share of the prior's variance taken away."""
+    draws, weights = posterior.by_name, posterior.weights.ravel()
+    true = dict(simulated.truth.parameters)
+    headline = simulated.truth.effective_deg_per_step(simulated.campaign) or {}
+    true |= {f"effective_deg_per_step.{direction}": value for direction, value in headline.items()}
+    for axis, (one, other) in {"pan": ("left", "right"), "tilt": ("up", "down")}.items():
+        true[f"effective_contrast_deg_per_step.{axis}"] = headline[one] - headline[other]
+    terms = [term.name for term in HEAD_TERMS.values()]
+    others = (*terms, *names_of("backlash_deg"))
+    names = [name for name in (*draws, *terms) if name.startswith("effective_") or name in others]
+    prior = {name: np.asarray(found.prior_draws.physical)[:, k].var() for k, name in enumerate(found.names)}
+    result = {}
+    for name in dict.fromkeys(names):
+        if name not in draws or (name in terms and prior[name] == 0):
+            continue
+        values = draws[name]
+        mean = weights @ values
+        variance = weights @ (values - mean) ** 2
+        result[name] = {
+            "z": float((mean - true[name]) / np.sqrt(variance)),
+            "pit": float(weights @ (values < true[name])),
+            "taken": float(1 - variance / prior[name]) if name in prior else 1.0,
+        }
+    return result
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """So many heads of each kind."""
+    tasks = [(kind, seed) for seed in range(arguments.n) for kind in KINDS]
+    run_rows(one_head, tasks, arguments.rows, ("kind", "seed"), arguments.cores)
+
+
+TEXT = """# Coverage over drawn pan-tilt heads
+
+Made by `python -m experiments.intervals.heads`. Heads drawn from the default priors of their kind (ratios 0.05(2)
+deg/step of heads with sightings), simulated with the twin's optics, fitted and sampled by importance. Coverage of the
+95 % interval and RMS z of the truth, of heads whose answer was accepted or rough; *prior*: the data take away less than
+a tenth of the prior's variance in the median head, which is not judged. Bounds are two-sided at 1e-4."""
+
+
+def table(arguments: argparse.Namespace) -> None:
+    """A table for each kind."""
+    print(TEXT)
+    for kind in KINDS:
+        rows = [row for row in read_rows(arguments.rows) if row["kind"] == kind]
+        good = [row for row in rows if "quantities" in row]
+        if not good:
+            continue
+        answers = Counter(row["answer"] for row in rows)
+        told = ", ".join(f"{count} {word}" for word, count in answers.most_common())
+        cpu = np.median([row["cpu_s"] for row in rows])
+        low, high = (100 * share for share in binomial_bounds(len(good), LEVEL))
+        least, most = rms_bounds(len(good))
+        print(f"\n## Heads with {kind}\n\n{len(rows)} heads: {told}; median {cpu:.0f} CPU s. ", end="")
+        print(f"Bounds {low:.0f} to {high:.0f} % and {least:.2f} to {most:.2f}.\n")
+        print("| quantity | 95 % interval holds | RMS z | prior's variance taken away |\n|---|---|---|---|")
+        every = []
+        for name in good[0]["quantities"]:
+            own = [row["quantities"][name] for row in good]
+            taken = float(np.median([q["taken"] for q in own]))
+            inside = np.array([abs(q["pit"] - 0.5) < LEVEL / 2 for q in own])
+            rms = float(np.sqrt(np.mean([q["z"] ** 2 for q in own])))
+            share = f"{100 * inside.mean():.1f} %" + ("" if low <= 100 * inside.mean() <= high else " **!**")
+            score = f"{rms:.2f}" + ("" if least <= rms <= most else " **!**")
+            every += inside.tolist() if taken >= SETTLED else []
+            cells = (share, score) if taken >= SETTLED else ("*prior*", "")
+            print(f"| `{name}` | {cells[0]} | {cells[1]} | {100 * taken:.0f} % |")
+        print(f"| all judged | {100 * np.mean(every):.1f} % of {len(every)} | | |")
+
+
+if __name__ == "__main__":
+    made = study_parser(__doc__, ROWS, 30)
+    act(made, run=run, table=table)

@@ -1,0 +1,96 @@
+"""The chain of a pan-tilt head: TPOINT's terms are its first order, the twin's rotation matrices are all of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tvsbayes.calibration.optics import beam_components
+from tvsbayes.head.chain import HeadOptics
+from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
+from tvsbayes.instrument.parameters import HEAD_TERMS, Prior
+from tvsbayes.instrument.rig import Rig, RigTable
+from tvsbayes.instrument.stereo_pair import NO_STEREO
+from tvsbayes.model.laser_path import trace
+from tvsbayes.model.parameter_space import model_of
+from tvsbayes.twin.physics import mirror_chain
+from tvsbayes.twin.true_rig import draw_truth
+
+SMALL_RAD = np.radians(10 / 3600)
+"""Ten arcseconds: its square is 5e-4 arcsec."""
+AZIMUTH, ELEVATION = np.radians(np.meshgrid([-160.0, -50.0, 0.0, 35.0, 120.0], [15.0, 40.0, 65.0])).reshape(2, -1)
+SQUARES = 3.0
+"""Second-order terms have factors up to tan(65 deg)^2 / 2."""
+POINTING = {
+    "azimuth_zero_deg": lambda a, e: (1.0, 0.0),
+    "azimuth_axis_tilt_deg.north": lambda a, e: (-np.sin(a) * np.tan(e), -np.cos(a)),
+    "azimuth_axis_tilt_deg.east": lambda a, e: (np.cos(a) * np.tan(e), -np.sin(a)),
+    "axes_not_square_deg": lambda a, e: (-np.tan(e), 0.0),
+    "beam_not_square_deg": lambda a, e: (-1 / np.cos(e), 0.0),
+    "flexure_deg": lambda a, e: (0.0, -np.cos(e)),
+    "tangent_flexure_deg": lambda a, e: (0.0, -1 / np.tan(e)),
+}
+"""TPOINT's -IA, AN, -AW, NPAE, CA, TF, TX: what they add to azimuth and elevation."""
+ROUNDING = 1e-11
+"""Of unit vectors; mm of origins are a hundred times longer."""
+
+
+def optics_of(values: dict[str, float]) -> HeadOptics:
+    """A head of terms in rad and mm; those that are not named are 0."""
+    return HeadOptics.of(lambda name: values.get(name, 0.0))
+
+
+@pytest.mark.parametrize("name", POINTING)
+def test_first_order_is_tpoint(name):
+    direction = optics_of({name: SMALL_RAD}).leaving(AZIMUTH, ELEVATION, np).direction
+    turned = np.angle(np.exp(1j * (np.arctan2(direction.y, direction.x) - AZIMUTH)))
+    raised = np.arctan2(direction.z, np.hypot(direction.x, direction.y)) - ELEVATION
+    by_azimuth, by_elevation = POINTING[name](AZIMUTH, ELEVATION)
+    # Near the horizon the cotangent is held: a 1e-5th of it at 15 deg.
+    held = 2e-5 * SMALL_RAD / np.tan(ELEVATION) if name.startswith("tangent") else 0.0
+    allowed = SQUARES * (SMALL_RAD / np.cos(ELEVATION)) ** 2 + held
+    assert np.all(np.abs(turned - SMALL_RAD * by_azimuth) <= allowed)
+    assert np.all(np.abs(raised - SMALL_RAD * by_elevation) <= allowed)
+
+
+@pytest.fixture(scope="module")
+def truths():
+    """Heads with terms of degrees and offsets of centimetres."""
+    wide = {term.name: Prior(0.0, 15.0 if term.unit == "mm" else 3.0) for term in HEAD_TERMS.values()}
+    table = RigTable(mechanism=SIGHTING_HEAD)
+    rig = Rig(table, NO_STEREO, {**table.priors, **wide}, {}, {}, {}, {})
+    rng = np.random.default_rng(50)
+    drawn = [draw_truth(rig, rng) for _ in range(40)]
+    # The twin's cotangent is not held at the horizon.
+    return [replace(truth, parameters={**truth.parameters, "tangent_flexure_deg": 0.0}) for truth in drawn]
+
+
+@pytest.mark.usefixtures("x64")
+def test_twin_and_model_are_the_same_optics(truths):
+    rng = np.random.default_rng(51)
+    poses = rng.uniform([-np.pi, -0.5], [np.pi, 1.7], (len(truths), 6, 2))
+    values = np.array([[*(t.parameters[n] for n in HEAD.rig_names), *np.zeros(24)] for t in truths])
+
+    def rays(v, p):
+        return trace(model_of(v, mechanism=HEAD).optics, p[:, 0], p[:, 1])
+
+    with jax.enable_x64(True):
+        found = jax.jit(jax.vmap(rays))(jnp.asarray(values), jnp.asarray(poses))
+    for k, truth in enumerate(truths):
+        expected = mirror_chain(*poses[k].T, truth.parameters)
+        # The NumPy side of a robot, frame T of a head being frame P.
+        robot = beam_components(truth.parameters, *np.degrees(poses[k]).T)
+        for seen, own, wanted in zip(found, robot, expected, strict=True):
+            assert np.abs(np.stack([x[k] for x in seen], axis=1) - wanted).max() < 100 * ROUNDING
+            assert np.abs(np.stack(np.broadcast_arrays(*own), axis=1) - wanted).max() < 100 * ROUNDING
+
+
+def test_offsets_by_hand():
+    """Axis 20 mm ahead, beam 3 mm aside and 5 mm over it, azimuth 90, elevation 90 deg: over has become backwards."""
+    optics = optics_of({"elevation_axis_offset_mm": 20.0, "beam_offset_mm.y": 3.0, "beam_offset_mm.z": 5.0})
+    ray = optics.leaving(np.pi / 2, np.pi / 2, np)
+    assert np.allclose([*ray.origin_mm, *ray.direction], [-3.0, 15.0, 0.0, 0.0, 0.0, 1.0], atol=100 * ROUNDING)

@@ -1,0 +1,123 @@
+"""Campaigns of a head that says where it was found to point: files, refusals, what `check` says of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tvsbayes.errors import InputError
+from tvsbayes.estimators.plausibility import check_campaign
+from tvsbayes.files.documents import parse_toml
+from tvsbayes.instrument.campaign import read_campaign, write_campaign
+from tvsbayes.instrument.mechanisms import MECHANISMS, SIGHTING_HEAD, TWO_MIRROR
+from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.instrument.plan import PlanBuilder
+from tvsbayes.instrument.rig import Rig, RigTable, parse_rig_table, rig_table_toml
+from tvsbayes.instrument.sightings import Sighting, tangent_frames
+from tvsbayes.instrument.stereo_pair import NO_STEREO
+from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.true_rig import read_truth
+
+PLACES = [(-900, 200), (-400, 900), (100, 500), (600, 1200), (1100, 300), (-1300, 700), (300, 1000), (900, 600)]
+
+
+def head_rig() -> Rig:
+    """A head with gears of 0.05 deg a step and axes some degrees from where it is believed to point."""
+    table = RigTable(mechanism=SIGHTING_HEAD)
+    return Rig(table, NO_STEREO, dict(table.priors), {}, {}, {}, {"move_s": 1.0, "look_s": 1.0})
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    plan = PlanBuilder()
+    plan.home(0, 0)
+    for pan, tilt in PLACES:
+        plan.move(pan, tilt)
+        plan.look()
+    return simulate(head_rig(), plan.steps, 7)
+
+
+def test_folder_there_and_back(simulated, tmp_path):
+    simulated.write(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "campaign.toml",
+        "moves.csv",
+        "sightings.csv",
+        "truth.json",
+    ]
+    found = read_campaign(tmp_path)
+    assert found.spots == simulated.campaign.spots
+    assert found.rig == simulated.campaign.rig
+    text = (tmp_path / "campaign.toml").read_text() + (tmp_path / "truth.json").read_text()
+    scanners = set(NAMES) - SIGHTING_HEAD.told
+    assert not [name for name in scanners if f'"{name}"' in text]
+    truth = read_truth(tmp_path / "truth.json", found.stereo)
+    assert truth.parameters["azimuth_zero_deg"] == simulated.truth.parameters["azimuth_zero_deg"]
+    assert not check_campaign(found).findings
+
+
+def test_two_tables_of_looks_are_refused(simulated, tmp_path):
+    write_campaign(simulated.campaign, tmp_path)
+    (tmp_path / "spots.csv").write_text("spot\n")
+    with pytest.raises(InputError, match="one of them"):
+        read_campaign(tmp_path)
+
+
+def test_sightings_of_a_scanner_are_refused(simulated, tmp_path):
+    write_campaign(simulated.campaign, tmp_path)
+    (tmp_path / "campaign.toml").write_text('format = "tvsbayes-campaign/1"\n[rig]\n')
+    with pytest.raises(InputError, match='mechanism = "pan-tilt"'):
+        read_campaign(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["mirror_offset_mm", "extrinsics.translation_mm.x", "focal_scale", "baseline_mm"])
+def test_terms_of_others_are_refused(name):
+    text = f'[rig]\nmechanism = "pan-tilt"\n[rig.prior]\n"{name}" = {{ value = 1.0, u = 1.0 }}\n'
+    with pytest.raises(InputError, match="means nothing to this mechanism"):
+        parse_rig_table(parse_toml(text.encode(), "campaign.toml").table("rig"), sightings=True)
+
+
+@pytest.mark.parametrize("key", MECHANISMS)
+def test_tables_there_and_back(key):
+    table = RigTable(mechanism=MECHANISMS[key])
+    text = rig_table_toml(table)
+    assert parse_rig_table(parse_toml(text.encode(), "campaign.toml").table("rig"), table.mechanism.sightings) == table
+    assert ("mechanism" in text) == (table.mechanism is not TWO_MIRROR), "files of scanners keep their text and hash"
+
+
+@pytest.mark.parametrize(
+    ("mended", "code"),
+    [
+        (
+            lambda s: Sighting(
+                sighting=s.sighting,
+                move=s.move,
+                azimuth_deg=-s.azimuth_deg,
+                elevation_deg=s.elevation_deg,
+                u_deg=s.u_deg,
+            ),
+            "counter-sign",
+        ),
+        (
+            lambda s: Sighting(
+                sighting=s.sighting,
+                move=s.move,
+                azimuth_deg=s.elevation_deg,
+                elevation_deg=s.azimuth_deg,
+                u_deg=s.u_deg,
+            ),
+            "exchanged",
+        ),
+    ],
+)
+def test_wrong_tables_are_named(simulated, mended, code):
+    wrong = tuple(map(mended, simulated.campaign.spots))
+    campaign = type(simulated.campaign)(simulated.campaign.moves, wrong, NO_STEREO, simulated.campaign.rig)
+    findings = check_campaign(campaign).findings
+    assert next(f.code for f in findings if f.certain) == code
+
+
+def test_tangent_frames_are_right_angled_at_the_pole_too():
+    frames = tangent_frames(np.array([[0.0, 0.0], [400.0, 89.9999], [-30.0, 90.0], [10.0, -90.0]]))
+    assert np.allclose(frames @ np.swapaxes(frames, 1, 2), np.eye(3), atol=1e-15)
+    assert np.allclose(frames[0], [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])

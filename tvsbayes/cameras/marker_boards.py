@@ -1,0 +1,200 @@
+"""ChArUco boards: a checkerboard with a marker in each white square, so that a picture of a part of it is enough.
+
+Squares are counted, as OpenCV's CharucoBoard does; inner corners are one less each way. Corners are px with the integer
+at a pixel's centre, row by row, NaN where unseen. No JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from tvsbayes.errors import InputError, NothingToEstimate, closest, escaped
+
+DICTIONARIES = sorted(name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_"))
+WIDEST_DICTIONARIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", "APRILTAG_36h11")
+"""Each holds the smaller ones of its bits as its first markers."""
+CORNERS_MIN, LINES_MIN = 8, 3
+"""Corners of a view, and different rows and columns among them: fewer leave the tilt of the board open."""
+MISFIT_SQUARES = 0.2
+"""Centres of markers may miss the plane of the board by so much: lenses bend it by less over a picture."""
+MARKERS_MIN = 6
+"""A homography has eight parameters: four markers fit any arrangement."""
+SQUARES_MAX = 60
+GAP_SHARE = 0.9
+"""Half the window of cornerSubPix over the gap between a corner and the markers beside it, which must stay outside."""
+SHARE_USUAL = 0.75
+"""Of a marker's side in a square's, where no picture shows markers enough to tell."""
+
+
+@dataclass(frozen=True)
+class Markers:
+    """The markers of a ChArUco board.
+
+    Attributes:
+        squares: columns and rows of squares.
+        dictionary: name in OpenCV without DICT_.
+        share: side of a marker over that of a square; None before pictures told it.
+        legacy: the first square is white, on boards of an even number of rows (OpenCV before 4.6, calib.io).
+    """
+
+    squares: tuple[int, int]
+    dictionary: str
+    share: float | None = None
+    legacy: bool = False
+
+    def __post_init__(self) -> None:
+        if self.dictionary not in DICTIONARIES:
+            raise InputError(
+                "usage",
+                f"--dictionary {escaped(self.dictionary)}: no such dictionary of markers",
+                allowed=", ".join(DICTIONARIES),
+                remedy=closest(self.dictionary, DICTIONARIES) or "name one of OpenCV's: 5X5_100",
+            )
+        if self.share is not None and not 0.2 <= self.share < 1:
+            found = f"--marker-mm: {self.share:.3g} of the side of a square"
+            remedy = "give the side of the black square with the marker, without white; it is smaller than --pitch-mm"
+            raise InputError("usage", found, allowed="0.2 to 1", remedy=remedy)
+
+    def board(self, squares: tuple[int, int] | None = None) -> cv2.aruco.CharucoBoard:
+        """OpenCV's board, in units of a square."""
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
+        made = cv2.aruco.CharucoBoard(squares or self.squares, 1.0, self.share or SHARE_USUAL, dictionary)
+        made.setLegacyPattern(self.legacy)
+        return made
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Markers of a picture: corners (n, 4, 2) px and numbers (n,)."""
+
+    corners_px: np.ndarray
+    numbers: np.ndarray
+
+
+def _markers(grey: np.ndarray, dictionary: str) -> _Seen:
+    found = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
+    corners, numbers, _ = cv2.aruco.ArucoDetector(found).detectMarkers(grey)
+    if numbers is None or not len(numbers):
+        return _Seen(np.zeros((0, 4, 2)), np.zeros(0, int))
+    return _Seen(np.array(corners, float).reshape(-1, 4, 2), np.ravel(numbers))
+
+
+def _plane_of(seen: _Seen, board: cv2.aruco.CharucoBoard) -> tuple[float, float] | None:
+    """How far the centres of markers miss those on a board, and their side, in squares; None where too few are seen."""
+    places = np.array([np.asarray(four, float)[:, :2] for four in board.getObjPoints()])
+    kept = seen.numbers < len(places)
+    if kept.sum() < MARKERS_MIN:
+        return None
+    centres, corners = places[seen.numbers[kept]].mean(axis=1), seen.corners_px[kept]
+    # From pixels to squares, by the centres alone.
+    plane, _ = cv2.findHomography(corners.mean(axis=1), centres)
+    if plane is None or not np.isfinite(plane).all():
+        return None
+    ways = (cv2.perspectiveTransform(part.reshape(-1, 1, 2), plane) for part in (corners.mean(axis=1), corners))
+    back, flat = (np.reshape(way, (-1, 2)) for way in ways)
+    missed = float(np.sqrt(np.mean(np.sum((back - centres) ** 2, axis=1))))
+    sides = np.linalg.norm(flat.reshape(-1, 4, 2) - np.roll(flat.reshape(-1, 4, 2), 1, axis=1), axis=2)
+    return missed, float(np.median(sides))
+
+
+def as_seen(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
+    """The markers with the size and the first square that pictures show.
+
+    Args:
+        pictures: some of a camera, grey, uint8.
+        markers: as stated.
+
+    Raises:
+        NothingToEstimate: the markers stand otherwise than on that board, or are of another dictionary.
+    """
+    seen = [_markers(grey, markers.dictionary) for grey in pictures]
+    tried = {}
+    for legacy in (markers.legacy, not markers.legacy):
+        board = replace(markers, legacy=legacy).board()
+        tried[legacy] = [fit for one in seen if (fit := _plane_of(one, board)) is not None]
+    best = min(tried, key=lambda legacy: np.median([fit[0] for fit in tried[legacy]] or [np.inf]))
+    if not tried[best]:
+        _refuse_other_markers(pictures, markers, sum(len(one.numbers) for one in seen))
+        return replace(markers, share=markers.share or SHARE_USUAL)
+    if np.median([fit[0] for fit in tried[best]]) > MISFIT_SQUARES:
+        raise _other_board(seen, markers)
+    share = markers.share or float(np.clip(np.median([fit[1] for fit in tried[best]]), 0.2, 0.98))
+    return replace(markers, legacy=best, share=share)
+
+
+def _other_board(seen: Sequence[_Seen], markers: Markers) -> NothingToEstimate:
+    """The refusal of a board whose markers are arranged otherwise, with the number of squares that fits."""
+    wanted = f"{markers.squares[0]}x{markers.squares[1]}"
+    misfits: dict[int, float] = {}
+    for across in range(3, SQUARES_MAX + 1):
+        down = -(-2 * (1 + max(int(one.numbers.max(initial=0)) for one in seen)) // across)
+        for legacy in (False, True):
+            board = replace(markers, legacy=legacy).board((across, max(3, down + down % 2)))
+            fits = [fit[0] for one in seen if (fit := _plane_of(one, board)) is not None]
+            misfits[across] = min(misfits.get(across, np.inf), float(np.median(fits)) if fits else np.inf)
+    best = min(misfits, key=lambda across: misfits[across])
+    remedy = "count squares, columns x rows, with the first marker at the upper left"
+    if misfits[best] <= MISFIT_SQUARES:
+        remedy = f"markers stand as on a board of {best} squares across: --charuco {best}xROWS; {remedy}"
+    return NothingToEstimate(
+        "no-board",
+        f"the markers do not stand as on a board of {wanted} squares",
+        allowed="the board in the pictures",
+        remedy=remedy,
+    )
+
+
+def most_markers(pictures: Sequence[np.ndarray]) -> tuple[str, int]:
+    """The dictionary of which pictures show the most markers, and how many."""
+    counted = {name: sum(len(_markers(grey, name).numbers) for grey in pictures) for name in WIDEST_DICTIONARIES}
+    name = max(counted, key=lambda one: counted[one])
+    return name, counted[name]
+
+
+def _refuse_other_markers(pictures: Sequence[np.ndarray], markers: Markers, own: int) -> None:
+    """Refuse pictures that show none of the `own` dictionary's markers, or more of another's.
+
+    Of few bits some are seen where none is.
+    """
+    name, count = most_markers(pictures)
+    if own >= max(1, count):
+        return
+    remedy = "see that light is even and the pictures sharp; is it a checkerboard without markers: --board?"
+    found = f"no board of markers of {markers.dictionary} in {len(pictures)} pictures"
+    if count > own + len(pictures):
+        found += f"; {count} markers of {name.partition('_')[0]} are seen"
+        remedy = f"--dictionary {name}?"
+    raise NothingToEstimate("no-board", found, allowed="pictures of the board that is named", remedy=remedy)
+
+
+def marker_board_corners(grey: np.ndarray, markers: Markers) -> np.ndarray | None:
+    """Inner corners of a board in a picture, ((columns - 1) (rows - 1), 2), NaN where unseen; None where too few are.
+
+    Args:
+        grey: (height, width) uint8.
+        markers: with their size, of `as_seen`.
+    """
+    columns, rows = markers.squares[0] - 1, markers.squares[1] - 1
+    found, numbers, *_ = cv2.aruco.CharucoDetector(markers.board()).detectBoard(grey)
+    if numbers is None or len(numbers) < CORNERS_MIN:
+        return None
+    corners = np.full((rows * columns, 2), np.nan)
+    corners[np.ravel(numbers)] = np.asarray(found, float).reshape(-1, 2)
+    grid = corners.reshape(rows, columns, 2)
+    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2) for axis in (0, 1)]
+    if not any(np.isfinite(step).any() for step in steps):
+        return None
+    nearest = min(float(np.nanmin(step)) for step in steps if np.isfinite(step).any())
+    gap = nearest * (1 - (markers.share or SHARE_USUAL)) / 2
+    half = int(np.clip(round(GAP_SHARE * gap), 2, 11))
+    at = np.isfinite(corners[:, 0])
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+    start = corners[at].astype(np.float32).reshape(-1, 1, 2)
+    corners[at] = np.reshape(cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), criteria), (-1, 2))
+    seen_rows, seen_columns = np.nonzero(np.isfinite(corners[:, 0]).reshape(rows, columns))
+    enough = len(seen_rows) >= CORNERS_MIN and min(len(set(seen_rows)), len(set(seen_columns))) >= LINES_MIN
+    return corners if enough else None

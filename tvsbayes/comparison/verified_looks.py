@@ -1,0 +1,350 @@
+"""Looks at counters that `steps-for` or the header gave: whether a scanner points where its calibration says.
+
+Every look says where both mirror angles were, seen less predicted, with the covariance of `watched_looks`: a scanner's
+angles are two axes, and `compensation.verification` judges them as the readings of one. Not applied means counters by
+the nominal degrees per step without play; what is applied is the rest. Mirror angles in degrees, points in mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from tvsbayes.calibration.calibration_file import stored_calibration
+from tvsbayes.calibration.optics import beam_components, output_deg
+from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
+from tvsbayes.comparison.watched_looks import LOOKS_MIN, WatchedLooks
+from tvsbayes.compensation.promise import bound_of, refuse_answer
+from tvsbayes.compensation.verification import SEPARATE, TELLING, Trial, judged, other_axis, size_of, telling_visits
+from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.estimators.campaign_arrays import in_sight
+from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.estimators.noise_scales import noise_draws
+from tvsbayes.instrument.axes import AXES, HOME_SD_DEG, SIDES
+from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep
+from tvsbayes.instrument.stops import rests_of
+from tvsbayes.model.parameter_space import physical_at
+from tvsbayes.results.compensation_record import Millimetres, Verification
+from tvsbayes.results.fit_record import FIT_FORMATS
+from tvsbayes.results.records import stored_document
+from tvsbayes.single_axis.predicted_stops import PredictedStops
+from tvsbayes.statistics.weighted_draws import systematic
+
+NOISE_DRAWS = 32
+"""Of the noise scales, geometry and cameras integrated out."""
+RUN_UP = 2
+"""Times the overshoot that takes up the play, in a plan."""
+CANDIDATES, DRAWS = 9, 1000
+"""Counters tried by axis, each from both sides; draws of the calibration behind their covariance."""
+DISTANCE_MM = 1000.0
+"""At which errors are said in mm where nobody names another distance."""
+PROMISED_DRAWS = 4000
+"""Of errors, behind what 95 % of points do not exceed."""
+
+
+def accepted_calibration(campaign: Campaign) -> Calibration:
+    """The calibration in force: that of `results/`, of these data and of an accepted fit.
+
+    Raises:
+        InputError: there is none of these data, or it is damaged.
+        NotConverged: the fit is not accepted.
+    """
+    document = stored_document(campaign, "fit.json", FIT_FORMATS, input_hashes(campaign))
+    found = stored_calibration(campaign)
+    if document is None or found is None:
+        raise InputError(
+            "missing-file",
+            "results/ hold no calibration of these data: nothing can have been aimed with it",
+            file="results/fit.json",
+            remedy="run `tvsbayes fit`, aim by `tvsbayes steps-for` or the header, and look there",
+        )
+    old = "accepted" if document.values.get("estimator") == "posterior" else "laplace"
+    refuse_answer(str(document.values.get("answer") or old))
+    return found
+
+
+@dataclass(frozen=True)
+class AimedLooks:
+    """Where looks were aimed at, m of them: `steps` and `sides`, each (m, 2), pan and tilt."""
+
+    calibration: Calibration
+    steps: np.ndarray
+    sides: np.ndarray
+
+    @classmethod
+    def of(cls, calibration: Calibration, looks: Campaign, used: np.ndarray) -> AimedLooks:
+        """Of the usable looks of a campaign; `used` is a mask of its ordered spots."""
+        rests = {
+            axis: dict(zip((m.move for m in looks.moves), rests_of(looks.moves, axis), strict=True)) for axis in AXES
+        }
+        seen = [spot.move for spot, use in zip(ordered_spots(looks), used, strict=True) if use]
+        steps = [[rests[axis][move].steps for axis in AXES] for move in seen]
+        sides = [[rests[axis][move].sign for axis in AXES] for move in seen]
+        return cls(calibration, np.array(steps, dtype=float), np.array(sides, dtype=float))
+
+    def angles_deg(self, sides: np.ndarray) -> np.ndarray:
+        """Mirror angles (m, 2) at the counters, reached from sides (m, 2)."""
+        found = []
+        for k, axis in enumerate(AXES):
+            values = self.calibration.estimates_at((self.steps[:, 0], self.steps[:, 1]))
+            period = self.calibration.period_deg.get(axis)
+            found.append(output_deg(values, axis, self.steps[:, k], sides[:, k], period))
+        return np.stack(found, axis=1)
+
+    def nominal_steps(self, nominal: dict[str, float]) -> np.ndarray:
+        """Counters (m, 2) that the nominal degrees per step send to the same directions (formulation 5)."""
+        values, (pan, tilt) = self.calibration.estimates, self.angles_deg(self.sides).T
+        x, y, z = beam_components(values, pan, tilt).direction
+        azimuth = np.degrees(np.arctan2(y, x)) + 90.0 - nominal["pan_zero_emission_deg"]
+        both = azimuth / nominal["degrees_per_step.pan"], np.degrees(np.arcsin(z)) / nominal["degrees_per_step.tilt"]
+        return np.stack(both, axis=1)
+
+    @property
+    def ratios(self) -> np.ndarray:
+        """Degrees per step (pan, tilt) of the gears."""
+        return np.array([self.calibration.estimates[f"degrees_per_step.{axis}"] for axis in AXES])
+
+    def off_deg(self, nominal: np.ndarray, common: float, play: float) -> np.ndarray:
+        """How far mirror angles (m, 2) are off the aim where the correction acts so many times.
+
+        Args:
+            nominal: counters without it, shape (m, 2).
+            common: factor of what both sides of an axis have in common.
+            play: factor of what they differ by.
+        """
+        # What the sides of one counter differ by in angle, they differ by in counters for one angle.
+        half = (self.angles_deg(-self.sides) - self.angles_deg(self.sides)) / (2 * self.ratios)
+        middle = self.steps - half
+        sent = np.round(nominal + common * (middle - nominal) + play * half)
+        return self.ratios * (sent - self.steps)
+
+    def slopes_mm(self, distance_mm: float) -> np.ndarray:
+        """How points at a distance along the beams move by the mirror angles, mm/deg, shape (m, 3, 2)."""
+        values, angles, step = self.calibration.estimates, self.angles_deg(self.sides), 1e-4
+        columns = []
+        for off in step * np.eye(2):
+            ends = [beam_components(values, *(angles + sign * off).T).at(distance_mm) for sign in (1, -1)]
+            columns.append((ends[0] - ends[1]).T / (2 * step))
+        return np.stack(columns, axis=2)
+
+
+@dataclass(frozen=True)
+class SeenAngles:
+    """What looks say of both mirror angles, pan and tilt of each look in turn.
+
+    Attributes:
+        value: seen less predicted, deg, shape (2 m,).
+        covariance: of the prediction and of seeing it, by draws of the noise scales, deg^2, shape (n, 2 m, 2 m).
+        noise: of it what every visit draws anew, shape (2 m,).
+    """
+
+    value: np.ndarray
+    covariance: np.ndarray
+    noise: np.ndarray
+
+    @classmethod
+    def of(cls, fit: JointFit, watched: WatchedLooks, sides: np.ndarray, seed: int) -> SeenAngles:
+        """Generalised least squares of the looks' angles; `sides` (m, 2) of their arrivals."""
+        noise = noise_draws(fit, NOISE_DRAWS, seed)
+        centre = watched.departure(noise.centre, angles=True)
+        covariance = np.linalg.inv(centre.information)
+        places = systematic(noise.weights, len(noise.z), 0.5)
+        each = {k: np.linalg.inv(watched.departure(noise.z[k], angles=True).information) for k in set(places.tolist())}
+        spots = watched.linear(noise.centre, angles=True)
+        values = physical_at(noise.centre, watched.problem.space).value
+        visit = []
+        for k, place in enumerate(watched.usable):
+            seen = spots.jacobian[place, :, -2 * watched.looks :][:, 2 * k : 2 * k + 2]
+            stops = []
+            for axis, side in zip(AXES, sides[k], strict=True):
+                ends = [float(values[INDEX[f"stop_sd_deg.{name}"]]) ** 2 for name in SIDES[axis]]
+                stops.append(ends[1] if side > 0 else ends[0] if side < 0 else 0.5 * sum(ends))
+            visit.append(np.diag(np.linalg.inv(seen.T @ seen)) + stops)
+        return cls(covariance @ centre.score, np.array([each[k] for k in places.tolist()]), np.ravel(visit))
+
+
+def _other(aimed: AimedLooks) -> np.ndarray:
+    """Shape (2 m, 2 m) of the covariance of what another scanner adds: two other axes."""
+    count = len(aimed.steps)
+    found = np.zeros((2 * count, 2 * count))
+    for k in range(2):
+        found[k::2, k::2] = other_axis(aimed.ratios[k] * aimed.steps[:, k], aimed.sides[:, k])
+    return found
+
+
+def _millimetres(aimed: AimedLooks, seen: SeenAngles, before: np.ndarray, distance_mm: float, seed: int) -> Millimetres:
+    """Errors of points at a distance, beside what 95 % of them are promised not to exceed."""
+    slopes = aimed.slopes_mm(distance_mm)
+
+    def lengths(angles: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(np.einsum("mxa,...ma->...mx", slopes, angles.reshape(*angles.shape[:-1], -1, 2)), axis=-1)
+
+    promised = PredictedStops(np.zeros((len(seen.covariance), len(seen.value))), seen.covariance, {})
+    drawn = lengths(promised.drawn(PROMISED_DRAWS, np.random.default_rng([seed, 24])))
+    return Millimetres(
+        distance_mm=distance_mm,
+        before=size_of(lengths(before)),
+        after=size_of(lengths(seen.value)),
+        promised95=float(np.quantile(drawn, 0.95)),
+    )
+
+
+def verify_looks(
+    fit: JointFit, calibration: Calibration, looks: Campaign, *, distance_mm: float = DISTANCE_MM, seed: int = 0
+) -> Verification:
+    """Fresh looks of a scanner that was aimed with its calibration.
+
+    Args:
+        fit: that the calibration was made of.
+        calibration: in force.
+        looks: a campaign whose moves have the counters that `steps-for` or the header gave, with those on the way.
+        distance_mm: along the beams, at which errors are said in mm.
+        seed: of what is drawn.
+
+    Raises:
+        NothingToEstimate: fewer than `LOOKS_MIN` usable looks.
+    """
+    used = in_sight(looks) if ordered_spots(looks) else np.zeros(0, dtype=bool)
+    if used.sum() < LOOKS_MIN:
+        raise NothingToEstimate(
+            "too-few-looks",
+            f"spots.csv: {int(used.sum())} fresh looks can be used; a scanner is verified with at least {LOOKS_MIN}",
+            file="spots.csv",
+            remedy="aim at more points; `tvsbayes plan CAMPAIGN --verify` names them",
+        )
+    aimed = AimedLooks.of(calibration, looks, used)
+    nominal = aimed.nominal_steps({name: prior.value for name, prior in fit.campaign.rig.priors.items()})
+    seen = SeenAngles.of(fit, WatchedLooks(fit, looks), aimed.sides, seed)
+
+    @cache
+    def at(common: float, play: float) -> PredictedStops:
+        off = aimed.off_deg(nominal, common, play).ravel()
+        return PredictedStops(np.tile(off, (len(seen.covariance), 1)), seen.covariance, {})
+
+    aim = np.zeros(len(seen.value))
+    travel = float(np.max(np.ptp(aimed.ratios * aimed.steps, axis=0)))
+    trial = Trial(at, seen.value, aim, _other(aimed), travel, np.zeros((len(aim), len(aim))), seen.noise)
+    found = judged(trial, seed)
+    before = found.without.pooled()[0]
+    return Verification(
+        verdict=found.verdict,
+        p=found.p,
+        worlds=found.worlds,
+        before=size_of(before),
+        after=size_of(seen.value),
+        promised95=bound_of(found.promised, aim, np.arange(len(aim))),
+        readings=len(aimed.steps),
+        millimetres=_millimetres(aimed, seen, before, distance_mm, seed),
+        unit="deg",
+        needed=None if found.needed is None else -(-found.needed // 2),
+        remarks=_remarks(fit.campaign, looks, aimed),
+    )
+
+
+@dataclass(frozen=True)
+class AimPlan:
+    """Looks to be made with the calibration in force, in this order.
+
+    Attributes:
+        stops: counters of pan and tilt, and the sides (1 or -1) that they are reached from, of each look.
+        run_up: steps beyond a counter from which an axis comes back to it, pan and tilt.
+        enough: whether they tell the worlds apart in 95 of 100, by the axis that tells more.
+        distance: of the nearest two worlds, standard deviations.
+    """
+
+    stops: tuple[tuple[int, int, int, int], ...]
+    run_up: tuple[int, int]
+    enough: bool
+    distance: float
+
+    def steps(self, target: str) -> tuple[PlanStep, ...]:
+        """The plan, for looks at one target."""
+        plan = PlanBuilder()
+        plan.home()
+        plan.place(target)
+        for pan, tilt, pan_side, tilt_side in self.stops:
+            plan.move(pan=pan - pan_side * self.run_up[0], tilt=tilt - tilt_side * self.run_up[1])
+            plan.move(pan=pan, tilt=tilt)
+            plan.look()
+        return tuple(plan.steps)
+
+
+def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
+    """The fewest looks that tell what became of a calibration: stops of each axis by greedy choice, made together.
+
+    Raises:
+        NothingToEstimate: nominal counters are those of the calibration: nothing is to be verified.
+    """
+    run_up = tuple(RUN_UP * max(calibration.overshoot_steps[axis], 1) for axis in AXES)
+    axes = [_axis_stops(campaign, calibration, k, run_up[k]) for k in range(2)]
+    count = max(LOOKS_MIN, *(len(axis.stops) for axis in axes))
+    # The axis that needs fewer goes through its stops again: every look shows both.
+    pan, tilt = ([axis.stops[i % len(axis.stops)] for i in range(count)] for axis in axes)
+    stops = tuple((p, t, ps, ts) for (p, ps), (t, ts) in zip(pan, tilt, strict=True))
+    reached = max(axis.reached for axis in axes)
+    return AimPlan(stops, (run_up[0], run_up[1]), reached >= TELLING, float(np.sqrt(reached)))
+
+
+@dataclass(frozen=True)
+class _AxisStops:
+    """Counters and sides of one axis, and the squared distance of the nearest world that they reach."""
+
+    stops: list[tuple[int, int]]
+    reached: float
+
+
+def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: int) -> _AxisStops:
+    """Of one axis, the other in the middle of its range."""
+    low, high = calibration.range_steps[k]
+    if high - low > 4 * run_up:
+        low, high = low + run_up, high - run_up
+    counters = np.linspace(low, high, CANDIDATES).round()
+    steps = np.tile(calibration.range_steps.mean(axis=1).round(), (2 * CANDIDATES, 1))
+    steps[:, k] = np.repeat(counters, 2)
+    sides = np.ones_like(steps)
+    sides[1::2, k] = -1.0
+    aimed = AimedLooks(calibration, steps, sides)
+    nominal = aimed.nominal_steps({name: prior.value for name, prior in campaign.rig.priors.items()})
+    off = [aimed.off_deg(nominal, *factors)[:, k] for factors in ((0.0, 0.0), (1.0, 0.0))]
+    if not np.any(off[0]):
+        what = f"the nominal counters of {AXES[k]} are those of the calibration: nothing is applied that could be lost"
+        raise NothingToEstimate("no-correction", what, remedy="verify that nothing moved with `tvsbayes watch`")
+    noise = np.array([calibration.noise_variance[f"stop_sd_deg.{SIDES[AXES[k]][int(s > 0)]}"] for s in sides[:, k]])
+    common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + HOME_SD_DEG**2
+    # A play smaller than what every look leaves open is not told from its loss, and harms no promise.
+    seen = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
+    worlds = off if seen else off[:1]
+    spread = np.isin(np.arange(CANDIDATES), [0, CANDIDATES // 2, CANDIDATES - 1])
+    found = telling_visits(worlds, common, noise, np.repeat(spread, 2))
+    chosen = [i for i in range(2 * CANDIDATES) for _ in range(int(found.visits[i]))]
+    return _AxisStops([(int(steps[i, k]), int(sides[i, k])) for i in chosen], found.reached)
+
+
+def _drawn_angles(calibration: Calibration, aimed: AimedLooks, k: int) -> np.ndarray:
+    """Mirror angles (draws, m) of one axis by the draws of the calibration."""
+    own, gears = np.split(calibration.inputs[:DRAWS], [len(INPUT_NAMES)], axis=1)
+    values = dict(zip(INPUT_NAMES, own.T[..., None], strict=True))
+    values |= calibration.gears.at(gears, (aimed.steps[:, 0], aimed.steps[:, 1]))
+    axis = AXES[k]
+    return np.asarray(output_deg(values, axis, aimed.steps[:, k], aimed.sides[:, k], calibration.period_deg.get(axis)))
+
+
+def _remarks(campaign: Campaign, looks: Campaign, aimed: AimedLooks) -> tuple[str, ...]:
+    """What else is to be said."""
+    found = []
+    outside = sum(not aimed.calibration.covers(*steps) for steps in aimed.steps.tolist())
+    if outside:
+        found.append(
+            f"{outside} of {len(aimed.steps)} looks lie outside the counters of the campaign: less is promised there"
+        )
+    if input_hashes(campaign)["stereo"] != input_hashes(looks)["stereo"]:
+        found.append("the fresh looks state other cameras; those of the campaign are used")
+    named = looks.header.get("serial") or looks.header.get("instrument")
+    known = campaign.header.get("serial") or campaign.header.get("instrument")
+    if named and known and named != known:
+        found.append("the fresh looks name another machine than the campaign: is it the right one?")
+    return tuple(found)

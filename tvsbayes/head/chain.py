@@ -1,0 +1,89 @@
+"""The line of sight of a head on two geared axes, once for Python floats, NumPy and JAX, by exact rotations.
+
+Lengths in mm, angles in rad. The frame is P of `instrument.mirrors`: z up, azimuth counted from x towards y, as pan
+counts. The azimuth axis stands in it as two small angles say; elevation axis and beam hang on it. To first order what
+is added to the angles of the axes are TPOINT's terms (P. T. Wallace, TPOINT - Telescope Pointing Analysis System,
+terms IA IE AN AW NPAE CA TF TX), with their signs, A the azimuth from north (x) through east (y) and E the elevation:
+
+    dA = -IA - AN sin A tan E - AW cos A tan E - CA sec E - NPAE tan E
+    dE = IE - AN cos A + AW sin A - TF cos E - TX cot E
+
+where azimuth_zero = -IA, elevation_zero = IE, azimuth_axis_tilt = (AN, -AW), axes_not_square = NPAE,
+beam_not_square = CA, flexure = TF, tangent_flexure = TX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import NamedTuple
+
+from tvsbayes.instrument.mirrors import Materialise, Numbers, Ray, Turn, Vectors, unchanged
+from tvsbayes.instrument.parameters import HEAD_TERMS
+
+LEAST_ELEVATION = 1e-3
+"""Sine of the elevation below which the cotangent is held: nothing near the horizon follows a law in tan z."""
+
+
+class HeadOptics(NamedTuple):
+    """What the line of sight of a head differs by from two angles; fields are the names of its terms, in rad and mm.
+
+    The zero of elevation is not among them: it belongs to the angle of that axis, as the scanner's tilt zero does.
+    """
+
+    elevation_axis_offset_mm: Numbers
+    axes_not_square_rad: Numbers
+    beam_not_square_rad: Numbers
+    azimuth_axis_tilt_rad: Numbers
+    beam_offset_mm: Numbers
+    flexure_rad: Numbers
+    azimuth_zero_rad: Numbers
+    tangent_flexure_rad: Numbers
+
+    @classmethod
+    def of(cls, value: Callable[[str], Numbers]) -> HeadOptics:
+        """From the value, in mm and rad, of each term by its name; those of two parts become pairs."""
+        found: dict[str, tuple[Numbers, ...]] = {}
+        for term in list(HEAD_TERMS.values())[1:]:
+            found[term.block] = (*found.get(term.block, ()), value(term.name))
+        return cls(*(own if len(own) > 1 else own[0] for own in found.values()))
+
+    def leaving(
+        self, pan_rad: Numbers, tilt_rad: Numbers, functions: ModuleType, materialise: Materialise = unchanged
+    ) -> Ray:
+        """The line of sight in P for angles of both axes.
+
+        Args:
+            pan_rad: angles of the azimuth axis, from its counter's zero.
+            tilt_rad: angles of the elevation axis, the zero of elevation included.
+            functions: see `instrument.mirrors`.
+            materialise: applied to the turns of the axes and to the ray.
+        """
+        cos, sin = functions.cos, functions.sin
+        above = sin(tilt_rad)
+        # No branch: one cotangent for all, held where it would outgrow every telescope.
+        held = above / (above * above + LEAST_ELEVATION**2)
+        bent = tilt_rad - self.flexure_rad * cos(tilt_rad) - self.tangent_flexure_rad * cos(tilt_rad) * held
+        azimuth, elevation = materialise(
+            (Turn.by(pan_rad + self.azimuth_zero_rad, functions), Turn.by(bent, functions))
+        )
+        sin_skew, cos_skew = sin(self.axes_not_square_rad), cos(self.axes_not_square_rad)
+        axis = Vectors(0.0, cos_skew, sin_skew)
+        up = Vectors(0.0, -sin_skew, cos_skew)
+        ahead = Vectors(elevation.cosine, up.y * elevation.sine, up.z * elevation.sine)
+        over = Vectors(-elevation.sine, up.y * elevation.cosine, up.z * elevation.cosine)
+        aside_mm, over_mm = self.beam_offset_mm
+        origin = Vectors(self.elevation_axis_offset_mm, 0.0, 0.0) + axis * aside_mm + over * over_mm
+        sight = ahead * cos(self.beam_not_square_rad) + axis * -sin(self.beam_not_square_rad)
+        return Ray(*materialise(tuple(self._leaning(azimuth.forward(v), functions) for v in (origin, sight))))
+
+    def _leaning(self, v: Vectors, functions: ModuleType) -> Vectors:
+        """Turned about the horizontal axis about which z leans as far as the azimuth axis does (Rodrigues)."""
+        north, east = self.azimuth_axis_tilt_rad
+        square = north * north + east * east
+        # sin(a)/a and (1 - cos a)/a^2 by their series: an axis that leans by 30 degrees keeps 11 digits.
+        sinc = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72 * (1 - square / 110))))
+        versine = 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90 * (1 - square / 132))))
+        axis = Vectors(-east, north, 0.0)
+        once = axis.cross(v)
+        return v + once * sinc + axis.cross(once) * versine

@@ -1,0 +1,148 @@
+"""The classic estimator of a head: a pointing model by least squares, ratios and terms, gears without any error.
+
+Every sighting counts alike; its two residuals are angles on the sphere. Degrees, degrees a step. No JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.display import Shown, View
+from tvsbayes.errors import NothingToEstimate, refusal
+from tvsbayes.head.chain import HeadOptics
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.parameters import HEAD_TERMS
+from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, sighted_deg, sightings_of, tangent_frames
+
+STEPS_MAX = 50
+SETTLED = 1e-9
+"""Change of every parameter, in its standard errors or as a share of itself, at which Gauss and Newton's steps end."""
+COMPLEX_STEP = 1e-20
+RATIO_KNOWN = 1e-4
+"""Relative u of a ratio that is held: of an encoder on the axis. Elevation zero and both flexures bend like a ratio."""
+RATIOS = tuple(f"degrees_per_step.{axis}" for axis in AXES)
+
+
+@dataclass(frozen=True, repr=False)
+class PointingModel(Shown):
+    """What least squares say of a head.
+
+    Attributes:
+        names: of ratios and terms that priors leave open.
+        value: of them, units of the names.
+        standard_error: of each, by the residuals' own scatter.
+        residual_deg: seen less predicted along azimuth and elevation on the sphere, shape (n, 2), in order of time.
+        known: ratios and terms that were held.
+    """
+
+    names: tuple[str, ...]
+    value: np.ndarray
+    standard_error: np.ndarray
+    residual_deg: np.ndarray
+    known: dict[str, float]
+
+    @property
+    def rms_deg(self) -> float:
+        """Of the distance on the sphere."""
+        return float(np.sqrt(np.mean(np.sum(self.residual_deg**2, axis=1))))
+
+    def shown(self) -> View:
+        """Ratios and terms."""
+        title = f"Pointing model by least squares, {len(self.residual_deg)} sightings, RMS {self.rms_deg:.3g} deg"
+        rows = zip(self.names, self.value.tolist(), self.standard_error.tolist(), strict=True)
+        return View(title, ("term", "value", "standard error"), list(rows))
+
+    def off_deg(self, campaign: Campaign, rows: Sequence[Sighting]) -> np.ndarray:
+        """Seen less predicted of any sightings, shape (n, 2)."""
+        values = self.known | dict(zip(self.names, self.value.tolist(), strict=True))
+        return _off_deg(values, _steps(campaign, rows), tangent_frames(sighted_deg(rows))).real
+
+    def as_json(self) -> dict[str, object]:
+        """The document of `classic --json`."""
+        terms = {
+            name: {"value": float(value), "standard_error": float(error)}
+            for name, value, error in zip(self.names, self.value, self.standard_error, strict=True)
+        }
+        return {"kind": "pointing-model", "terms": terms, "sightings": len(self.residual_deg), "rms_deg": self.rms_deg}
+
+
+def _steps(campaign: Campaign, rows: Sequence[Sighting]) -> np.ndarray:
+    moves = [campaign.moves[row.move] for row in rows]
+    return np.array([(move.pan_steps, move.tilt_steps) for move in moves], float).reshape(-1, 2)
+
+
+def _off_deg(values: dict[str, float | complex], steps: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Seen less predicted on the sphere, shape (n, 2); complex where a value is."""
+    pan, tilt = (np.radians(1.0) * values[name] * steps[:, k] for k, name in enumerate(RATIOS))
+    optics = HeadOptics.of(lambda name: values[name] * np.radians(1.0))
+    sight = optics.leaving(pan, tilt + np.radians(1.0) * values["elevation_zero_deg"], np).direction
+    seen = np.stack(np.broadcast_arrays(*sight), axis=1)
+    across, above, along = (np.sum(frames[:, k] * seen, axis=1) for k in range(3))
+    # Of small angles tangent and angle are one; far away the tangent plane keeps the way home.
+    return -np.degrees(1.0) * np.stack([across, above], axis=1) / np.maximum(along.real, 0.5)[:, None]
+
+
+def pointing_model(campaign: Campaign, without: Sequence[int] = ()) -> PointingModel:
+    """Fit ratios and terms by least squares.
+
+    Args:
+        campaign: of a head, with sightings.
+        without: ids of sightings that are left out.
+
+    Raises:
+        InputError: a campaign without sightings.
+        NothingToEstimate: fewer residuals than unknowns.
+    """
+    mechanism, priors = campaign.rig.mechanism, campaign.rig.priors
+    if not mechanism.sightings:
+        remedy = "`tvsbayes classic` of spots needs four-point experiments"
+        raise refusal(
+            "no-sightings",
+            file="spots.csv",
+            found="spots",
+            allowed="a campaign of a head with sightings",
+            remedy=remedy,
+        )
+    rows = sightings_of([row for row in ordered_spots(campaign) if row.spot not in without])
+    terms = [term.name for term in HEAD_TERMS.values()]
+    values: dict[str, float | complex] = {name: priors[name].value for name in (*RATIOS, *terms)}
+    names = tuple(n for n in values if priors[n].u > (RATIO_KNOWN * abs(priors[n].value) if n in RATIOS else 0.0))
+    steps, angles = _steps(campaign, rows), sighted_deg(rows)
+    # One counter of an axis tells its zero and no ratio.
+    names = tuple(n for n in names if n not in RATIOS or np.ptp(steps[:, RATIOS.index(n)]) > 0)
+    if 2 * len(rows) <= len(names):
+        raise NothingToEstimate(
+            "too-few-sightings",
+            f"{len(rows)} sightings are fewer than {len(names)} unknowns ask for",
+            file=SIGHTINGS.file,
+            remedy="sight more directions",
+        )
+    frames = tangent_frames(angles)
+    turned = np.exp(1j * np.radians(angles[:, 0] - float(np.real(values[RATIOS[0]])) * steps[:, 0]))
+    if "azimuth_zero_deg" in names:
+        values["azimuth_zero_deg"] = float(np.degrees(np.angle(turned.mean())))
+    errors = np.ones(len(names))
+    for _ in range(STEPS_MAX):
+        off = _off_deg(values, steps, frames).real.ravel()
+        slope = np.stack(
+            [_off_deg(values | {n: values[n] + 1j * COMPLEX_STEP}, steps, frames).imag.ravel() for n in names], axis=1
+        )
+        slope = slope / COMPLEX_STEP
+        # Scaled: a ratio turns by thousands of steps, a term by its own angle.
+        size = np.linalg.norm(slope, axis=0)
+        change = np.linalg.lstsq(slope / size, -off, rcond=None)[0]
+        change = change / size
+        values |= {n: values[n] + c for n, c in zip(names, change.tolist(), strict=True)}
+        scatter = float(np.sum((off + slope @ change) ** 2)) / (len(off) - len(names))
+        inverse = np.linalg.pinv((slope / size).T @ (slope / size)) / np.outer(size, size)
+        errors = np.sqrt(scatter * np.diag(inverse))
+        if np.all(np.abs(change) <= SETTLED * np.maximum(errors, np.abs([values[n] for n in names]))):
+            break
+    residual = _off_deg(values, steps, frames).real
+    found = np.array([float(np.real(values[n])) for n in names])
+    known = {n: float(np.real(v)) for n, v in values.items() if n not in names}
+    return PointingModel(names, found, errors, residual, known)

@@ -1,0 +1,145 @@
+"""Pointing tables of telescopes: blocks of lines a star, with what both encoders read and where the star stood.
+
+A block begins with `CAT:`. `RAA:` holds elevation and azimuth of the encoders, `TAA:` those of the star as computed
+from catalogue and time; degrees, azimuth as 180 deg less what counts from north through east. `LST:` is the local
+sidereal time, the only clock. Other lines are not used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tvsbayes.errors import escaped, refusal
+from tvsbayes.files.csv_table import CSV_BYTES_MAX
+from tvsbayes.files.disk import read_bytes
+from tvsbayes.instrument.campaign import Campaign, Move, sighted_campaign
+from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
+from tvsbayes.instrument.parameters import Prior, names_of
+from tvsbayes.instrument.rig import RigTable
+from tvsbayes.instrument.sightings import Sighting
+
+STEP_DEG = 1e-5
+"""Of a counter: encoders are read in degrees, and 0.04 arcsec is far below what a telescope is pointed to."""
+ARCSEC = 1 / 3600
+U_ARCSEC = 0.5
+"""Stated for a star's place where nobody names one: what is left is estimated as the scatter of stops."""
+SIDEREAL_S = 86164.0905 / 86400
+"""Of mean solar time in a second of sidereal time (IERS conventions)."""
+DAY_S = 86400.0
+AZIMUTH_FROM_DEG = 180.0
+
+
+def encoder_priors() -> dict[str, Prior]:
+    """What is believed of a telescope whose encoders stand on its axes: no gears but what bearings may do."""
+    halves = names_of("transmission_error_deg", "play_variation_deg", "look_scatter_deg")
+    return {
+        **dict.fromkeys(names_of("degrees_per_step"), Prior(STEP_DEG, 1e-6 * STEP_DEG)),
+        **dict.fromkeys(names_of("ratio_contrast_deg_per_step"), Prior(0.0, 0.0)),
+        **dict.fromkeys(names_of("backlash_deg"), Prior(0.0, 2 * ARCSEC, "half-normal")),
+        **dict.fromkeys(names_of("stop_sd_deg"), Prior(ARCSEC, 0.7, "log-normal")),
+        **dict.fromkeys(halves, Prior(0.0, 0.0, "half-normal")),
+        **dict.fromkeys(names_of("drift_deg_per_root_hour"), Prior(0.0, ARCSEC, "half-normal")),
+        **dict.fromkeys(names_of("thermal_deg_per_K"), Prior(0.0, 0.0)),
+        **dict.fromkeys(("azimuth_zero_deg", "elevation_zero_deg"), Prior(0.0, 2.0)),
+        **dict.fromkeys(("axes_not_square_deg", "beam_not_square_deg", "flexure_deg"), Prior(0.0, 60 * ARCSEC)),
+        **dict.fromkeys(("azimuth_axis_tilt_deg.north", "azimuth_axis_tilt_deg.east"), Prior(0.0, 60 * ARCSEC)),
+        "tangent_flexure_deg": Prior(0.0, 20 * ARCSEC),
+    }
+
+
+@dataclass(frozen=True)
+class Star:
+    """One pointing: elevation and azimuth, deg, by the encoders and of the star, and the sidereal time, s."""
+
+    encoder_deg: tuple[float, float]
+    true_deg: tuple[float, float]
+    sidereal_s: float
+
+
+def _blocks(text: str) -> Iterator[tuple[int, dict[str, str]]]:
+    """Lines of each star by their tags, with the number of the line that begins it."""
+    block: dict[str, str] = {}
+    begin = 0
+    for number, line in enumerate(text.splitlines(), 1):
+        tag, _, rest = line.partition(":")
+        if tag == "CAT" and block:
+            yield begin, block
+            block = {}
+        begin = number if tag == "CAT" else begin
+        block[tag] = rest
+    if block:
+        yield begin, block
+
+
+def _numbers(text: str, count: int) -> tuple[float, ...]:
+    """So many finite numbers of a line."""
+    found = tuple(map(float, text.replace(":", " ").split()))
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise ValueError(f"{len(found)} numbers where {count} are expected")
+    return found
+
+
+def read_stars(path: Path) -> tuple[Star, ...]:
+    """The stars of a pointing table, in the order of the file.
+
+    Raises:
+        InputError: a file that is none, with the line where it fails.
+    """
+    text = read_bytes(path, CSV_BYTES_MAX).decode("utf-8", "replace")
+    stars = []
+    for line, block in _blocks(text):
+        try:
+            (el, az), (true_el, true_az) = (_numbers(block[tag], 2) for tag in ("RAA", "TAA"))
+            hours, minutes, seconds = _numbers(block["LST"], 3)
+        except (KeyError, ValueError) as error:
+            raise refusal(
+                "pointing-table",
+                file=escaped(path.name),
+                line=line,
+                found=f"a block without what is needed: {escaped(str(error))}",
+                allowed="blocks that begin with CAT: and hold RAA: and TAA: (elevation, azimuth) and LST: (h:m:s)",
+                remedy="give a pointing table as the MMT writes it",
+            ) from error
+        stars.append(Star((el, az), (true_el, true_az), 3600 * hours + 60 * minutes + seconds))
+    return tuple(stars)
+
+
+def campaign_of(stars: tuple[Star, ...], name: str, u_arcsec: float = U_ARCSEC) -> Campaign:
+    """The campaign of a night: encoders as counters of `STEP_DEG`, stars as sightings.
+
+    The azimuth axis is taken to have gone the shorter way from star to star.
+    """
+    elevation, azimuth = np.array([star.encoder_deg for star in stars]).T
+    azimuth = np.unwrap(AZIMUTH_FROM_DEG - azimuth, period=360.0)
+    sidereal = np.unwrap([star.sidereal_s for star in stars], period=DAY_S)
+    time_s = (sidereal - sidereal[0]) * SIDEREAL_S
+    pan, tilt = (np.rint(angle / STEP_DEG).astype(int).tolist() for angle in (azimuth, elevation))
+    moves = tuple(
+        Move(
+            move=k,
+            segment=0,
+            time_s=float(time_s[k]),
+            pan_steps=pan[k],
+            tilt_steps=tilt[k],
+            pan_approach="" if k else "unknown",
+            tilt_approach="" if k else "unknown",
+        )
+        for k in range(len(stars))
+    )
+    sightings = tuple(
+        Sighting(
+            sighting=k,
+            move=k,
+            azimuth_deg=float((AZIMUTH_FROM_DEG - star.true_deg[1]) % 360.0),
+            elevation_deg=star.true_deg[0],
+            u_deg=u_arcsec * ARCSEC,
+        )
+        for k, star in enumerate(stars)
+    )
+    table = RigTable(encoder_priors(), mechanism=SIGHTING_HEAD)
+    return sighted_campaign(moves, sightings, table, {"name": name})

@@ -1,0 +1,119 @@
+"""The list of instruments with two axes: what carries the beam, what sees it, and the names that its geometry has.
+
+Vectors of parameters have one layout (`parameters.NAMES`). A mechanism other than the scanner takes the coordinates of
+the mirrors for terms of its own: the gears' coordinates, and every array, are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+from tvsbayes.instrument.parameters import (
+    HEAD_TERMS,
+    NAMES,
+    RECEIVER_NAMES,
+    REGISTRY,
+    RIG_NAMES,
+    STEREO_PARAMETER_NAMES,
+    Parameter,
+    Prior,
+    names_of,
+)
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """A kind of instrument.
+
+    Attributes:
+        key: its name in the program.
+        word: in rig and campaign files.
+        sightings: it says where it was found to point; else a stereo pair sees its spots.
+        terms: of its geometry, by the scanner's parameter whose coordinate they take.
+        held: values of parameters that mean nothing to it; documents do not name them.
+        freed: priors other than the registry's.
+    """
+
+    key: str
+    word: str
+    sightings: bool = False
+    terms: Mapping[str, Parameter] = field(default_factory=dict)
+    held: Mapping[str, float] = field(default_factory=dict)
+    freed: Mapping[str, Prior] = field(default_factory=dict)
+
+    @cached_property
+    def parameters(self) -> dict[str, Parameter]:
+        """Every parameter by its name, in the order of the coordinates."""
+        return {(own := self.terms.get(name, REGISTRY[name])).name: own for name in NAMES}
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of all coordinates."""
+        return tuple(self.parameters)
+
+    def named(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Its own names of the coordinates with these names of the scanner's; other names as they are."""
+        return tuple(self.terms[name].name if name in self.terms else name for name in names)
+
+    @cached_property
+    def prior_groups(self) -> dict[str, list[int]]:
+        """Coordinates of every prior that can be a cause of uncertainty, the stereo calibration first."""
+        every = list(enumerate(self.parameters.values()))
+        found: dict[str, list[int]] = {}
+        for column, parameter in (*every[len(RIG_NAMES) :], *every[: len(RIG_NAMES)]):
+            found.setdefault(parameter.cause, []).append(column)
+        return found
+
+    @cached_property
+    def rig_names(self) -> tuple[str, ...]:
+        """Of those with a prior of their own, which come first."""
+        return self.names[: len(RIG_NAMES)]
+
+    @cached_property
+    def told(self) -> frozenset[str]:
+        """Names that files and documents may have."""
+        return frozenset(self.names) - frozenset(self.held)
+
+    @cached_property
+    def priors(self) -> dict[str, Prior]:
+        """Defaults; what means nothing is fixed."""
+
+        def prior(name: str) -> Prior:
+            stated = self.freed.get(name, self.parameters[name].prior)
+            return replace(stated, value=self.held[name], u=0.0) if name in self.held else stated
+
+        return {name: prior(name) for name in self.rig_names}
+
+
+_LASER = dict.fromkeys(("azimuth_zero_deg", "azimuth_axis_tilt_deg.north", "azimuth_axis_tilt_deg.east"), 0.0)
+"""Gauge of a head whose spots a stereo pair sees: its frame P hangs on the azimuth axis, and its pose is fitted."""
+_RECEIVER = {name: REGISTRY[name].prior.value for name in RECEIVER_NAMES} | {"baseline_mm": 0.0}
+"""No receiver: frame T is frame P."""
+_SIGHT = {
+    **dict.fromkeys(("elevation_axis_offset_mm", "beam_offset_mm.y", "beam_offset_mm.z"), 0.0),
+    **dict.fromkeys(names_of("extrinsics.rotation_rad", "extrinsics.translation_mm"), 0.0),
+    **dict.fromkeys(STEREO_PARAMETER_NAMES, 0.0),
+    "focal_scale": 1.0,
+}
+"""Of a head that looks at directions there are neither cameras nor lengths."""
+TWO_MIRROR = Mechanism("two-mirror", "two-mirror")
+HEAD = Mechanism("pan-tilt", "pan-tilt", terms=HEAD_TERMS, held=_LASER | _RECEIVER)
+SIGHTING_HEAD = Mechanism(
+    "pan-tilt-sightings",
+    "pan-tilt",
+    True,
+    HEAD_TERMS,
+    _SIGHT | _RECEIVER,
+    {"flexure_deg": Prior(0.0, 0.1)},
+)
+MECHANISMS: dict[str, Mechanism] = {each.key: each for each in (TWO_MIRROR, HEAD, SIGHTING_HEAD)}
+"""By key."""
+WORDS: tuple[str, ...] = tuple(dict.fromkeys(each.word for each in MECHANISMS.values()))
+"""Of the key `mechanism` in files, the default first."""
+
+
+def mechanism_of(word: str, sightings: bool) -> Mechanism:
+    """By its word in files, and whether there are sightings instead of spots; the scanner has none."""
+    return next(each for each in MECHANISMS.values() if (each.word, each.sightings) == (word, sightings))

@@ -1,0 +1,109 @@
+"""What a quantity is, of any instrument: one entry says its name, unit and words, what it serves and where it applies.
+
+Every instrument has a list of its own. How a quantity follows from draws stands beside the model, how it follows from a
+true instrument in the twin, both under the name of the entry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, Self
+
+from tvsbayes.instrument.axes import AXES, SENSES, Axis
+
+Unit = Literal["deg/step", "deg/K", "deg", "rad", "mm", "px", "min", "1"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantity:
+    """One quantity of an instrument.
+
+    Attributes:
+        name: in JSON, draws, `posterior.nc` and tables.
+        block: all of the name but its part, which quantities that differ in nothing else share.
+        unit: of its values; one unit only where all instruments of the kind have it.
+        words: of the block, in a sentence.
+        label: in tables.
+        headline: what a fit is for: a posterior is judged by it.
+        target: what plans and studies call a headline that a measurement may be for.
+        judged: a headline whose budget, leverage and sensitivity to priors are reported.
+        ratio: degrees of the beam per step: of directions that moved.
+        stated: the parameter whose stated value studies hold it against; 0 where there is none.
+    """
+
+    name: str
+    block: str
+    unit: str
+    words: str = ""
+    label: str = ""
+    headline: bool = False
+    target: str = ""
+    judged: bool = False
+    ratio: bool = False
+    stated: str = ""
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Of the name, behind the block."""
+        return tuple(self.name.removeprefix(self.block).split("."))[1:]
+
+    @property
+    def in_words(self) -> str:
+        """Words, part and unit: "laser's direction, x, deg"."""
+        unit = "" if self.unit == "1" else self.unit
+        return ", ".join(filter(None, (self.words.removeprefix("the "), " ".join(self.parts), unit)))
+
+    @property
+    def axis(self) -> Axis | None:
+        """The axis that it belongs to; None where that is none alone."""
+        return next((axis for axis in AXES if {axis, *SENSES[axis]} & set(self.parts)), None)
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """Both directions of its axis."""
+        return () if self.axis is None else SENSES[self.axis]
+
+    def applies(self, moved: Collection[str]) -> bool:
+        """Whether a campaign that moved in these directions has it."""
+        directions = set(self.sides).intersection(self.parts) or set(self.sides)
+        return not self.ratio or directions <= set(moved)
+
+    @classmethod
+    def many(cls, block: str, parts: Collection[str], **more: Any) -> list[Self]:
+        """Quantities that differ in nothing but their parts; a scalar has none.
+
+        Texts may name parts as {0}, {1} ..., the axis as {axis}, and both of its directions as {sides}.
+        """
+        found = []
+        for name in [f"{block}.{part}" for part in parts] or [block]:
+            bare = cls(name=name, block=block, **more)
+            named = {"axis": bare.axis, "sides": " - ".join(bare.sides)}
+            texts = {key: getattr(bare, key).format(*bare.parts, **named) for key in ("label", "target", "stated")}
+            found.append(replace(bare, **texts))
+        return found
+
+
+class Quantities[Q: Quantity](dict[str, Q]):
+    """Entries by name, in the order of vectors and files."""
+
+    def __init__(self, *entries: Q) -> None:
+        super().__init__((entry.name, entry) for entry in entries)
+
+    @cached_property
+    def blocks(self) -> dict[str, tuple[str, ...]]:
+        """Names by block."""
+        found: dict[str, tuple[str, ...]] = {}
+        for entry in self.values():
+            found[entry.block] = (*found.get(entry.block, ()), entry.name)
+        return found
+
+    @cached_property
+    def words(self) -> dict[str, str]:
+        """Words by block."""
+        return {entry.block: entry.words for entry in self.values() if entry.words}
+
+    def of(self, name: str) -> Q | None:
+        """The entry of a name; of one whose parts are counters, the entry of all of them."""
+        return self.get(name) or self.get(name.split(".", maxsplit=1)[0])

@@ -1,0 +1,120 @@
+"""The document of a head that says where it points: ratios, terms, stops, what is left open.
+
+Nothing is computed here but the pointing model beside the fit. deg, deg/step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tvsbayes.head.pointing_model import pointing_model
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import Campaign
+from tvsbayes.instrument.parameters import HEAD_TERMS
+from tvsbayes.report import figures
+from tvsbayes.report.document import Document, FigureView, Issue, Section, about_table
+from tvsbayes.report.fit_text import validation_lines
+from tvsbayes.report.page import numbered
+from tvsbayes.report.parameter_words import name_in_words, sentence_in_words
+from tvsbayes.report.result_tables import ESTIMATE_COLUMNS, estimate_row, headline_table
+from tvsbayes.report.scanner_document import measured_days, verdict_of
+from tvsbayes.report.tables import TableView, concise, two_digits
+from tvsbayes.results.fit_record import FitRecord
+
+METHOD = (
+    "The line of sight is that of two geared axes by exact rotations: the azimuth axis leans, the elevation axis is "
+    "not square to it, nor the line of sight to the elevation axis, and it sags. To first order these are TPOINT's "
+    "terms.",
+    "Counters drive gears with a ratio, a difference of both directions, play, errors that repeat by position, a zero "
+    "that drifts; every stop has an error of its own. Each sighting gives two residuals on the sphere.",
+    "Refraction is as the table of sightings has it.",
+)
+
+
+def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: Sequence[str] = ()) -> Document:
+    """The document with its number.
+
+    Args:
+        campaign: of a head, with sightings.
+        record: its `fit.json`.
+        issue: who issues it, for whom and when.
+        doubts: what `check` warns of.
+    """
+    summary = record.summary
+    open_ends = [weak.text for weak in summary.weak_directions] + [entry.text for entry in summary.leverage]
+    warnings = [*summary.problems, *(f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts)]
+    warnings += [f"`check` warns: {sentence_in_words(text)}" for text in doubts]
+    if summary.estimator == "laplace":
+        warnings.append("Intervals are those of the Laplace approximation: too short for a backlash seen at few stops.")
+    validation = [] if summary.validation is None else validation_lines(summary.validation)
+    sections = [
+        Section(
+            "Result", tables=[headline_table(summary), term_table(record), beside_table(campaign, record)], opened=True
+        ),
+        Section("Stops", text=_noise_text(record), figures=_stops(record)),
+        Section(
+            "What the sightings cannot tell",
+            items=[sentence_in_words(text) for text in open_ends] or ["Nothing of note."],
+        ),
+        Section("Signs of model errors", items=validation or ["Not asked."]),
+        Section("Method", text=METHOD),
+    ]
+    return numbered(
+        Document(
+            results=record.results_id,
+            name=campaign.title,
+            about=about_table(campaign.header, measured_days(campaign, issue), issue),
+            verdict=verdict_of(summary, (), doubts),
+            answer=term_table(record),
+            picture=None,
+            steps=["`tvsbayes compare CAMPAIGN --by positions` says how well the fit predicts sightings left out."],
+            traceable="The sightings are taken as stated.",
+            warnings=warnings,
+            versions=record.provenance.versions,
+            sections=sections,
+            title="Calibration of a pan-tilt head",
+            issue=issue,
+        )
+    )
+
+
+def term_table(record: FitRecord) -> TableView:
+    """The terms of the head's geometry, as a fit has them."""
+    parameters = record.summary.parameters
+    rows = [
+        estimate_row(name_in_words(term.name), parameters[term.name], "")
+        for term in HEAD_TERMS.values()
+        if term.name in parameters
+    ]
+    return TableView("terms of the line of sight", ESTIMATE_COLUMNS, rows)
+
+
+def beside_table(campaign: Campaign, record: FitRecord) -> TableView:
+    """Least squares without gears, beside the fit."""
+    model, parameters = pointing_model(campaign), record.summary.parameters
+    rows = []
+    for name, value, error in zip(model.names, model.value.tolist(), model.standard_error.tolist(), strict=True):
+        joint = parameters[name]
+        rows.append([name_in_words(name), concise(value, error), concise(joint.value, joint.sd)])
+    caption = f"pointing model without gears, RMS {two_digits(model.rms_deg)} deg on the sphere"
+    return TableView(caption, ["term", "least squares (se)", "joint (sd)"], rows)
+
+
+def _noise_text(record: FitRecord) -> list[str]:
+    noise, scale = record.summary.noise, record.summary.parameters["pixel_scale"].value
+    return [
+        f"chi-square {noise.chi2:.1f} for {noise.dof:.1f} degrees of freedom; sightings scatter by {scale:.2f} times "
+        "their stated u."
+    ]
+
+
+def _stops(record: FitRecord) -> list[FigureView]:
+    """Deviations of the stops of each axis."""
+    views = []
+    for axis in AXES:
+        shown = () if record.evidence is None else record.evidence.residuals
+        stops = [stop for stop in shown if stop.axis == axis]
+        if stops:
+            alt = f"Deviations of {len(stops)} stops of the {axis} axis over time and counter"
+            views.append(FigureView(figures.residuals(stops, axis), alt, f"{axis} axis: observed minus fitted angle."))
+    return views
