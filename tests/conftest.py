@@ -1,7 +1,7 @@
 """Shared by the tests of the model: float64, one small campaign, and compiled functions that many tests use.
 
 Compile time rules the run time of these tests: whatever needs the whole optical chain goes through the fixture
-`evaluate` or through `likelihood.evaluate`, which are compiled once per session for the one bucket of 96 spots.
+`evaluate` or through `likelihood.evaluate`, which are compiled once per session for campaigns of any size.
 pyproject.toml has every array checked against its annotation (jaxtyping's import hook, at trace time).
 """
 
@@ -82,12 +82,9 @@ def shared_traces():
 
 @pytest.fixture(scope="session", autouse=True)
 def shared_lengths():
-    """Lengths that many tests share. Filled up to 96 spots a fit costs a third of what it costs with 512.
-
-    The paper's 384 spots fill two doublings of it exactly.
-    """
+    """Lengths that many tests share: no campaign here has more spots, and functions of tests look at padding too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 96)
+        patch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 512)
         # Boards of 24 and of 54 corners fill one length.
         patch.setattr("tvsbayes.cameras.bundle_adjustment.CORNERS_PER_BUCKET", 64)
         yield
@@ -143,11 +140,11 @@ class Evaluated:
 
 @pytest.fixture(scope="session")
 def evaluate():
-    """(z, space, arrays) -> Evaluated, compiled once per bucket."""
+    """(z, space, arrays) -> Evaluated, compiled once."""
     import jax
     import jax.numpy as jnp
 
-    from tvsbayes.estimators.likelihood import innovations, standing
+    from tvsbayes.estimators.likelihood import blocks_filled, innovations, standing
     from tvsbayes.model.laser_path import mirror_angles
 
     @jax.jit
@@ -162,7 +159,7 @@ def evaluate():
             "predicted": jnp.stack(found.looks.predicted, axis=1),
         }
         still = jnp.zeros(2 * len(arrays.gears.places.steps))
-        return model, angles, terms, innovations(model, arrays, still)
+        return model, angles, terms, innovations(model, arrays, still, blocks_filled(arrays))
 
     def run(z, space, arrays) -> Evaluated:
         with jax.enable_x64(True):

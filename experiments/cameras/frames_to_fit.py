@@ -28,7 +28,6 @@ import numpy as np
 from scipy import stats
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.headlines import marked
 from experiments.common.rigs import mounted_rig, pixels_of, shipped_plan, shipped_twin
 from experiments.common.rows import output, read_rows, run_rows
@@ -39,6 +38,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign, read_campaign
 from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.results.estimates import Estimate, FitSummary
 from tvsbayes.statistics.chances import BOUND, rms_bounds
 from tvsbayes.twin.frames import write_frames
@@ -89,7 +89,7 @@ def observed(source: str, seed: int) -> Observed:
 def one_campaign(task: tuple[str, int]) -> dict[str, object]:
     """Observe and fit; whatever fails is recorded, never dropped."""
     # 64 looks.
-    compile_for(96)
+    use_compilation_cache()
     source, seed = task
     seen = observed(source, seed)
     errors, stated = seen.errors_px, seen.stated_px

@@ -74,7 +74,7 @@ def pivoted(covariance: np.ndarray) -> np.ndarray:
 @jax.jit
 def whitened(z, space, arrays):
     """Standardised innovations and errors at places of many points, shape (n, residuals)."""
-    still, blocks = jnp.zeros(2 * len(arrays.gears.places.steps)), blocks_filled(arrays.spots)
+    still, blocks = jnp.zeros(2 * len(arrays.gears.places.steps)), blocks_filled(arrays)
 
     def one(z):
         seen = innovations(space.model(z), arrays, still, blocks)

@@ -21,7 +21,6 @@ import time
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.headlines import (
     HEADLINES,
     judged,
@@ -42,6 +41,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.inference import importance
 from tvsbayes.inference.importance import K_MAX
 from tvsbayes.instrument.model_choice import ModelChoice
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
@@ -52,7 +52,6 @@ WORLDS = (("pinion", 0.05), ("pinion", 0.1), ("pinion", 0.2), ("tooth", 0.05), (
 ROUNDS = 8
 WITHIN = 8
 RANGE_MM = 250.0, 1200.0
-SMALLEST_BUCKET = 96
 PLACES = "inside", "outside"
 MODELS = {"repeating": ModelChoice(), "perfect": ModelChoice(perfect_gears=True)}
 BESIDE = 60
@@ -100,7 +99,7 @@ def located(calibration, looks: TrueLooks, seed: int) -> dict[str, object]:
 def one_rig(task: tuple[str, float, str, int]) -> dict[str, object]:
     """Simulate, fit the models, judge headlines and points."""
     world, size_deg, protocol, seed = task
-    compile_for(SMALLEST_BUCKET)
+    use_compilation_cache()
     importance.ROUNDS_MAX = ROUNDS
     simulated = simulated_in(world, size_deg, protocol, seed)
     row: dict[str, object] = {"world": world, "size_deg": size_deg, "protocol": protocol, "seed": seed}

@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.headlines import (
     HEADLINES,
     judged,
@@ -33,6 +32,7 @@ from experiments.common.rigs import PIXELS, drawn_truth, mounted_rig, pixels_of,
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.model_choice import ModelChoice
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -86,7 +86,7 @@ def broken_campaign(condition: str, seed: int):
 def broken_rig(task: tuple[str, int]) -> dict[str, object]:
     """One broken campaign, fitted plain and robust."""
     condition, seed = task
-    compile_for(128)
+    use_compilation_cache()
     campaign, truth = broken_campaign(condition, seed)
     row: dict[str, object] = {"condition": condition, "seed": seed, "unseen": unseen(campaign)}
     for name, robust in (("plain", False), ("robust", True)):

@@ -18,7 +18,6 @@ import time
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.headlines import (
     HEADLINES,
     MEAN_RATIOS,
@@ -36,6 +35,7 @@ from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.statistics.chances import LEVELS
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -46,7 +46,7 @@ ROWS = output(__file__, "laplace_coverage.jsonl")
 def one_rig(task: tuple[str, int]) -> dict[str, object]:
     """Simulate and refit one rig; whatever fails is recorded as a failure, never dropped."""
     protocol, seed = task
-    compile_for(96)
+    use_compilation_cache()
     simulated = simulate(drawn_rig(), shipped_plan(protocol), seed, aperture=protocol == "grid")
     campaign, truth = simulated.campaign, simulated.truth
     row: dict[str, object] = {"protocol": protocol, "seed": seed, "unseen": unseen(campaign)}

@@ -22,7 +22,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.headlines import (
     HEADLINES,
     MEAN_RATIOS,
@@ -43,6 +42,7 @@ from experiments.intervals.sbc import CLEAN, FEW
 from experiments.intervals.sbc import ROWS as SBC_ROWS
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.sampling import TIERS, sample
 from tvsbayes.results.records import plain
 from tvsbayes.statistics.chances import LEVELS, binomial_bounds
@@ -53,8 +53,6 @@ PROTOCOLS = ("paper", "mixed", "grid")
 TITLES = {TIERS[0]: "Tier 1, importance sampling", TIERS[1]: "Tier 2, emcee"}
 ALL = HEADLINES + MEAN_RATIOS
 MAX_MINUTES = 10.0
-SMALLEST_BUCKET = 96
-"""Padding counts nothing: 384, 384 and 192 rows for the three protocols instead of 512."""
 SMALL = {CLEAN: "60 spots, about 30 stops in every direction", FEW: "48 spots, twelve stops in every direction"}
 SMALL_HEADLINES = (
     *(f"effective_deg_per_step.{d}" for d in DIRECTIONS),
@@ -66,7 +64,7 @@ SMALL_HEADLINES = (
 def one_rig(task: tuple[str, str, int]) -> dict[str, object]:
     """One rig of a shipped protocol, by Laplace and by a tier; whatever fails is recorded as a failure."""
     tier, protocol, seed = task
-    compile_for(SMALLEST_BUCKET)
+    use_compilation_cache()
     simulated = simulate(drawn_rig(), shipped_plan(protocol), seed, aperture=protocol == "grid")
     row: dict[str, object] = {"tier": tier, "protocol": protocol, "seed": seed, "converged": False, "sampled": False}
     row["unseen"] = unseen(simulated.campaign)

@@ -39,7 +39,7 @@ from scipy import stats
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.figures import page_figure, title_and_figure
-from experiments.common.fits import compile_for, physical_of
+from experiments.common.fits import physical_of
 from experiments.common.headlines import SHRINK
 from experiments.common.rigs import dense_plan, drawn_rig, small_plan, unseen
 from experiments.common.rows import output, read_rows, run_rows
@@ -49,6 +49,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.parameter_space import coordinates_of, parameter_space
 from tvsbayes.posterior.draws import Posterior, derived_of
@@ -89,7 +90,7 @@ def faulty(campaign, variant: str):
 def one_simulation(task: tuple[str, str, int]) -> dict[str, object]:
     """Simulate, fit, sample, rank; whatever fails is recorded as a failure."""
     tier, variant, seed = task
-    compile_for(64)
+    use_compilation_cache()
     simulated = simulate(drawn_rig(), small_plan(SHEETS) if variant == FEW else dense_plan(SHEETS), seed)
     row: dict[str, object] = {"tier": tier, "variant": variant, "seed": seed, "converged": False, "problems": []}
     row["unseen"] = unseen(simulated.campaign)

@@ -21,7 +21,6 @@ import time
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.headlines import marked
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import output, read_rows, run_rows
@@ -30,6 +29,7 @@ from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.coordinates.location import locate
 from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.statistics.chances import BOUND, binomial_bounds
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
@@ -57,7 +57,7 @@ def looks_at(simulated: SimulatedCampaign, calibration: Calibration, seed: int) 
 def one_rig(task: tuple[int]) -> dict[str, object]:
     """Simulate, fit, look at points, locate them."""
     (seed,) = task
-    compile_for(96)
+    use_compilation_cache()
 
     start = time.perf_counter()
     simulated = simulate(mounted_rig(), shipped_plan(PROTOCOL), seed, aperture=True)

@@ -24,13 +24,13 @@ import numpy as np
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.figures import page_figure, title_and_figure
-from experiments.common.fits import compile_for
 from experiments.common.rigs import TWINS, mounted_rig, shipped_plan, shipped_twin
 from experiments.common.rows import output, read_rows, run_rows
 from experiments.common.true_looks import ELLIPSOID, ESTIMATORS, TrueLooks, or_none, squared_distance
 from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.coordinates.location import locate_linear, settings_of
 from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.report.drawing import BLACK, OF_ESTIMATOR
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
@@ -44,7 +44,7 @@ CELLS = 5
 
 def one_row(task: tuple[str, int]) -> dict[str, object]:
     """Fit a shipped twin (seed -1) or a drawn rig's campaign; errors at all counters and ranges."""
-    compile_for(96)
+    use_compilation_cache()
     name, seed = task
     start = time.process_time()
     if name in TWINS:

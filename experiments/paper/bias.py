@@ -20,13 +20,14 @@ import numpy as np
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.figures import page_figure, title_and_figure
-from experiments.common.fits import compile_for, fit_from_truth
+from experiments.common.fits import fit_from_truth
 from experiments.common.headlines import true_headlines
 from experiments.common.rigs import drawn_truth, mounted_rig
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.estimators.four_point import classic
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.report.drawing import OF_ESTIMATOR
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -86,7 +87,7 @@ def one_campaign(task: tuple[str, float, int, bool]) -> dict[str, object]:
                 if r is not None
             }
         }
-    compile_for(64)
+    use_compilation_cache()
 
     try:
         fit = fit_from_truth(campaign, truth)

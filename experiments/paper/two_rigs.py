@@ -36,7 +36,6 @@ from scipy import stats
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.figures import page_figure, title_and_figure
-from experiments.common.fits import compile_for
 from experiments.common.rigs import mounted_rig, unseen
 from experiments.common.rows import output, read_rows, run_rows
 from experiments.paper.table1 import paper_values
@@ -100,7 +99,7 @@ def effective_ratios(found: JointFit) -> dict[str, list[float]]:
 
 def one_row(task: tuple[str, str, int]) -> dict[str, object]:
     """Simulate one campaign of one machine and fit the three models."""
-    compile_for(96)
+    use_compilation_cache()
     kind, name, seed = task
     start = time.process_time()
     truth = solved(kind, mounted_rig(), seed)

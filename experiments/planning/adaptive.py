@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.acquisition import session
@@ -44,6 +43,7 @@ from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign, ordered_spots, read_campaign
 from tvsbayes.instrument.plan import PlanStep, plan_seconds
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.next_looks import Confirmation, confirmation, next_looks
 from tvsbayes.planning.target import parse_target
 from tvsbayes.statistics.chances import share_interval95
@@ -180,7 +180,7 @@ def fixed(seed: int, folder: Path, plan: tuple[PlanStep, ...]) -> dict[str, obje
 def one_run(task: tuple[str, int]) -> dict[str, object]:
     """One plan on one drawn rig."""
     name, seed = task
-    compile_for(BUCKET)
+    use_compilation_cache()
     start = time.process_time()
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "run"

@@ -26,7 +26,6 @@ import numpy as np
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.figures import page_figure, title_and_figure
-from experiments.common.fits import compile_for
 from experiments.common.headlines import marked
 from experiments.common.rigs import mounted_rig
 from experiments.common.rows import output, read_rows, run_rows
@@ -79,7 +78,7 @@ def plan_and_rig(name: str) -> tuple[tuple[PlanStep, ...], Rig]:
 
 def one_row(task: tuple[str, int]) -> dict[str, object]:
     """A row of `tvsbayes study` with the point's name."""
-    compile_for(96)
+    use_compilation_cache()
 
     name, index = task
     steps, rig = plan_and_rig(name)

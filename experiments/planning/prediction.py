@@ -23,7 +23,6 @@ import numpy as np
 from scipy import stats
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.headlines import SHRINK
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import output, read_rows, run_rows
@@ -71,7 +70,7 @@ def job_of(name: str) -> StudyJob:
 
 def one_row(task: tuple[str, int]) -> dict[str, object]:
     """A row of `tvsbayes study` with the design's name."""
-    compile_for(96)
+    use_compilation_cache()
 
     name, index = task
     return {"name": name, **study_row(job_of(name), index).as_json()}

@@ -23,7 +23,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for, fit_from_truth
+from experiments.common.fits import fit_from_truth
 from experiments.common.headlines import judged, true_headlines
 from experiments.common.rigs import PIXELS, mounted_rig, pixels_of, shipped_plan, unseen, with_pixels
 from experiments.common.rows import output, read_rows, run_rows
@@ -32,6 +32,7 @@ from tvsbayes.assessment.residuals import residual_causes, stop_residuals
 from tvsbayes.assessment.score_tests import validate
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.stereo_pair import rotation_matrix
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.results.records import plain
 from tvsbayes.twin.physics import inside_images, mirror_chain, project
 from tvsbayes.twin.simulated_campaign import simulate
@@ -114,7 +115,7 @@ def broken_campaign(defect: str, size: float, seed: int):
 def one_campaign(task: tuple[str, float, int]) -> dict[str, object]:
     """Break, fit, validate."""
     defect, size, seed = task
-    compile_for(144)
+    use_compilation_cache()
 
     campaign, truth = broken_campaign(defect, size, seed)
     row: dict[str, object] = {"defect": defect, "size": size, "seed": seed, "unseen": unseen(campaign)}

@@ -25,7 +25,6 @@ import jax
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.reference_samplers import Setting
 from experiments.common.rigs import TWINS, dense_plan, mounted_rig, small_plan, twin_campaign
 from experiments.common.rows import output, read_rows, run_rows
@@ -33,6 +32,7 @@ from experiments.sampler.nuts_reference import hamiltonian
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.campaign import Campaign, read_campaign
 from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.draws import Posterior, headline_names
 from tvsbayes.posterior.sampling import TIERS, sample
 from tvsbayes.results.records import plain
@@ -76,7 +76,7 @@ def one_case(task: tuple[str, str]) -> dict[str, object]:
     """One posterior by one tier."""
     tier, case = task
     campaign = campaign_of(case)
-    compile_for(64 if case in SHEETS else 96)
+    use_compilation_cache()
     joint = fit(campaign)
     if tier == NUTS:
         return {"tier": tier, "case": case, **by_nuts(joint, SETTINGS[case])}

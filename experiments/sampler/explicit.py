@@ -21,7 +21,6 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from experiments.common.command_line import print_only
-from experiments.common.fits import compile_for
 from experiments.common.reference_samplers import AXES
 from experiments.common.rigs import mounted_rig, numbered
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
@@ -31,6 +30,7 @@ from tvsbayes.estimators.looks import nearest_range, observe
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.mirrors import Vectors
 from tvsbayes.instrument.parameters import NAMES, Prior
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.model.laser_path import mirror_angles, trace
 from tvsbayes.model.parameter_space import parameter_space
 from tvsbayes.posterior.sampling import sample
@@ -136,7 +136,7 @@ def main() -> None:
     print_only(__doc__)
     from numpyro.infer import MCMC, NUTS
 
-    compile_for(16)
+    use_compilation_cache()
     campaign = dozen()
     joint = fit(campaign)
     posterior = sample(joint, seed=0)

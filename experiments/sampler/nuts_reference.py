@@ -26,16 +26,17 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from experiments.common.command_line import parser
-from experiments.common.fits import compile_for
+from experiments.common.fits import without_padding
 from experiments.common.reference_samplers import AXES, Run, Setting, build_transport, nuts
 from experiments.common.rigs import twin_campaign
 from experiments.common.rows import ROOT
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.likelihood import evaluate, log_density, no_draw
 from tvsbayes.instrument.axes import DIRECTIONS
-from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.campaign import Campaign, input_hashes
 from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import NAMES
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import derived_quantities
 
@@ -100,8 +101,10 @@ def hamiltonian(joint: JointFit, setting: Setting, shear: bool = True) -> Found:
     def z_of(w: jax.Array) -> jax.Array:
         return transport.z_of_y(transport.y_of_w(w) if shear else w)
 
+    arrays = without_padding(joint.arrays, len(joint.campaign.moves))
+
     def potential(w: jax.Array) -> jax.Array:
-        return joint.log_density - log_density(z_of(w), joint.space, joint.arrays)
+        return joint.log_density - log_density(z_of(w), joint.space, arrays)
 
     run = nuts(potential, size, setting, dense=not shear)
     return Found(run, {name: summary(values) for name, values in quantities(joint, z_of, run.draws).items()})
@@ -151,7 +154,7 @@ def main() -> None:
 
     jax.config.update("jax_enable_x64", True)
     campaign = twin_campaign(f"{options.twin}_twin")
-    compile_for(8 * -(-max(len(ordered_spots(campaign)), len(campaign.moves)) // 8))
+    use_compilation_cache()
     # What the tests ask importance sampling about; gears that repeat their errors are `agreement.py`'s.
     joint = fit(campaign, model=ModelChoice(perfect_gears=True))
     setting = Setting(options.chains, options.warmup, options.draws, options.seed, options.limit)

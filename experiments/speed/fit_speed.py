@@ -76,7 +76,7 @@ def warm_and_peers() -> None:
     with jax.enable_x64(True):
         stage = last_stage(campaign)
         cases = {
-            "optimistix Levenberg-Marquardt": lambda: stage.ours(1e-3, STAGE_STEPS),
+            "Levenberg-Marquardt": lambda: stage.ours(1e-3, STAGE_STEPS),
             "scipy lm, same Jacobian": lambda: stage.peer("lm"),
             "scipy lm, finite differences": lambda: stage.peer("lm", differences=True),
         }
@@ -114,7 +114,7 @@ def second_campaign() -> None:
     fewer = compilations(replace(first, spots=first.spots[:200]))
     more_places = compilations(twin_campaign("grid_twin"))
     print(f"Compilations caused by a second campaign: {fewer} by 200 of the 384 spots, {more_places} by the grid twin,")
-    print("whose gears are seen at more places: their errors are padded to 6, 12, 24 ... of both axes.\n")
+    print("whose gears are seen at more places.\n")
 
 
 def one_size(spots: int) -> dict[str, float]:

@@ -14,8 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
+from experiments.common.fits import without_padding
 from tvsbayes.estimators.annealed_stage import Fixed, innovations, stage
+from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.likelihood import innovations as exact_innovations
+from tvsbayes.estimators.likelihood import no_belief
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
@@ -45,12 +48,14 @@ def exact_residuals(z, args) -> LinearResidual:
 def stage_residuals(z, args) -> LinearResidual:
     """With the Jacobian of the fit's stage, which holds slopes and projections."""
     space, arrays, fixed = args
-    columns = innovations(linearise(jnp.where(fixed.held, fixed.value, z), space, arrays), arrays)
+    lin = linearise(jnp.where(fixed.held, fixed.value, z), space, arrays)
+    places = len(lin.place_root)
+    columns = innovations(lin, arrays, no_belief(1 + z.size + places)).standardised.reshape(-1, 1 + z.size + places)
     prior = jnp.where(fixed.held, z - fixed.value, z)
     # The errors at places are least squares in every step.
-    places = columns.shape[1] - 1 - z.size
     own = jnp.concatenate([columns[:, : 1 + z.size], jnp.zeros((places, 1 + z.size))])
-    across = jnp.linalg.qr(jnp.concatenate([columns[:, 1 + z.size :], jnp.eye(places)]))[0]
+    repeated = columns[:, 1 + z.size :] @ lin.place_root
+    across = jnp.linalg.qr(jnp.concatenate([repeated, jnp.eye(places)]))[0]
     own = own - across @ (across.T @ own)
     jacobian = jnp.where(fixed.held, 0.0, own[:, 1:])
     return LinearResidual(jnp.append(own[:, 0], prior), jnp.concatenate([jacobian, jnp.eye(z.size)]))
@@ -62,13 +67,15 @@ class LastStage:
 
     Attributes:
         start: coordinates (p,).
-        args: of the residual functions.
+        args: of the residual functions, whose campaign has no padding.
+        arrays: the campaign as the fit's stage takes it.
         compiling_s: CPU seconds of the first stage of the annealing, compilation included.
         calls: of `residuals` and `jacobian`, counted.
     """
 
     start: np.ndarray
     args: tuple
+    arrays: CampaignArrays
     compiling_s: float
     calls: dict[str, int]
 
@@ -92,10 +99,9 @@ class LastStage:
     def ours(self, tolerance: float, steps: int, kind: Linear = stage_residuals) -> np.ndarray:
         """Where our solver ends: the compiled stage, or Levenberg-Marquardt with the exact Jacobian."""
         if kind is stage_residuals:
-            return np.asarray(stage(self.start, *self.args, np.array(tolerance)).z)
-        return np.asarray(
-            levenberg_marquardt(exact_values, jnp.asarray(self.start), self.args, jnp.asarray(tolerance), steps)
-        )
+            space, _, fixed = self.args
+            return stage(self.start, space, self.arrays, fixed, tolerance).z
+        return levenberg_marquardt(exact_values, self.start, self.args, tolerance, steps)
 
     def peer(self, method: str, differences: bool = False, kind: Linear = stage_residuals) -> np.ndarray:
         """Where `scipy.optimize.least_squares` ends, with the same Jacobian or with finite differences."""
@@ -112,5 +118,6 @@ def last_stage(campaign: Campaign) -> LastStage:
     compiling_s = time.process_time() - begun
     for inflation in ANNEALING[1:]:
         start = problem.least_squares(start, inflation)
-    args = problem.space, problem.arrays, Fixed(problem.held, start, np.array(1.0))
-    return LastStage(start, args, compiling_s, {"residuals": 0, "Jacobians": 0})
+    own = without_padding(problem.arrays, len(campaign.moves))
+    args = problem.space, own, Fixed(problem.held, start, np.array(1.0))
+    return LastStage(start, args, problem.arrays, compiling_s, {"residuals": 0, "Jacobians": 0})

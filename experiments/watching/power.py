@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.rigs import mounted_rig
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.comparison import watched_looks
@@ -40,6 +39,7 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, PlanStep
 from tvsbayes.instrument.protocols import four_point_protocol
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.watch_plan import watch_plan
 from tvsbayes.statistics.chances import share_interval95
 from tvsbayes.twin.simulated_campaign import simulate
@@ -82,7 +82,7 @@ def classic_alarm(first: Campaign, second: Campaign, direction: str) -> bool:
 
 def one_rig(seed: int) -> dict[str, object]:
     """All second days of a rig."""
-    compile_for(BUCKET)
+    use_compilation_cache()
     rig = mounted_rig()
     first = simulate(rig, FIRST_DAY, seed)
     found = fit(first.campaign)

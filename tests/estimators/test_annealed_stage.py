@@ -12,6 +12,7 @@ from support.varying_gears import perfect_gears
 
 from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, innovations, stage
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
+from tvsbayes.estimators.likelihood import no_belief
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, NAMES
 
@@ -35,9 +36,11 @@ def found(dozen):
 
 def test_innovations_are_those_of_the_density(dozen, found):
     """The same filter as the density's: its standardised errors, at the mean errors of the gears' places."""
-    columns = np.asarray(jax.jit(innovations)(found.reduced.also, dozen.arrays))
-    own = columns[:, 0] + columns[:, 1 + len(NAMES) :] @ found.seen.places[0]
-    expected = found.seen.standardised[0].ravel()
+    lin, size, filled = found.reduced.also, len(dozen.campaign.spots), dozen.arrays.gears.errors_filled
+    before = no_belief(1 + len(NAMES) + len(filled))
+    columns = np.asarray(jax.jit(innovations)(lin, dozen.arrays.of_spots(0, size), before).standardised)
+    own = columns[..., 0] + columns[..., 1 + len(NAMES) :] @ lin.place_root @ found.seen.places[0][filled]
+    expected = found.seen.standardised[0][:size]
     np.testing.assert_allclose(own, expected, atol=ALGEBRA * np.abs(expected).max())
 
 
@@ -60,7 +63,7 @@ def test_reduced_residuals_have_length_slope_and_curvature_of_all(dozen, found):
 def test_a_stage_without_a_step_is_the_linearisation(dozen, found):
     """Of gears that repeat no error, for which fits compile the stage: they leave residuals and derivatives alone."""
     arrays = campaign_arrays(dozen.campaign, perfect_gears(dozen.campaign.rig))
-    stayed = stage(found.z, dozen.space, arrays, Fixed(NOISE, found.z, np.array(1.0)), np.array(NO_STEP))
+    stayed = stage(found.z, dozen.space, arrays, Fixed(NOISE, found.z, np.array(1.0)), NO_STEP)
     assert np.array_equal(stayed.z, found.z)
     for name in ("residual", "slope", "residual_jacobian", "predicted_jacobian", "stop_variance"):
         expected = getattr(found.reduced.also, name)

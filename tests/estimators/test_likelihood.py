@@ -111,7 +111,7 @@ def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch, size):
     still = jnp.zeros(2 * len(dozen.arrays.gears.places.steps))
     monkeypatch.setattr(density, "BLOCK", size)
     cut = jax.jit(
-        lambda z, space, arrays: density.innovations(space.model(z), arrays, still, density.blocks_filled(arrays.spots))
+        lambda z, space, arrays: density.innovations(space.model(z), arrays, still, density.blocks_filled(arrays))
     )(jnp.asarray(dozen.z), dozen.space, dozen.arrays)
     assert float(cut.log_density) == pytest.approx(float(whole.log_density), abs=FINE_UNIT, rel=1e-12)
     np.testing.assert_allclose(cut.standardised, whole.standardised, atol=1e-8)
@@ -135,17 +135,16 @@ def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
 
 
 def test_padding_changes_nothing(grid_campaign, monkeypatch):
-    """Of six places or fewer: fits of such compile the density for both lengths."""
+    """Against the length that users have."""
     space = parameter_space(grid_campaign.rig, grid_campaign.stereo)
     short = campaign_arrays(grid_campaign)
-    monkeypatch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 384)
+    monkeypatch.setattr("tvsbayes.estimators.campaign_arrays.SMALLEST_BUCKET", 4096)
     long = campaign_arrays(grid_campaign)
-    assert long.spots.pixels.shape == (384, 4) and short.spots.pixels.shape == (96, 4)
+    assert long.spots.pixels.shape == (4096, 4) and short.spots.pixels.shape == (512, 4)
     z = np.repeat(0.3 * np.random.default_rng(31).standard_normal((1, len(NAMES))), BATCH, axis=0)
     one, two = (density.evaluate(z, no_draw(BATCH, arrays), space, arrays) for arrays in (short, long))
     assert two.log_density[0] == pytest.approx(float(one.log_density[0]), abs=FINE_UNIT, rel=1e-12)
-    places = len(short.gears.places.steps)
-    assert places and len(long.gears.places.steps) == places
+    assert short.gears.filled and long.gears.filled == short.gears.filled
     np.testing.assert_allclose(two.place_errors_rad, one.place_errors_rad, atol=FINE_UNIT * 1e-3)
     moves = len(grid_campaign.moves)
     assert np.all(long.moves.steps[moves:] == long.moves.steps[moves - 1])

@@ -20,9 +20,8 @@ SCATTER = [INDEX[name] for name in LOOK_SCATTER_NAMES]
 
 def dense_density(fit, z: np.ndarray) -> float:
     """Log density of the looks at noise scales, up to a constant: one Gaussian of all their residuals."""
-    count = len(fit.linearised.residual)
-    fixed = Fixed(fit.held, z, np.array(1.0))
-    lin = stage(z, fit.space, fit.arrays, fixed, np.array(NO_STEP)).of_spots(count)
+    count, fixed = len(fit.linearised.residual), Fixed(fit.held, z, np.array(1.0))
+    lin = stage(z, fit.space, fit.arrays, fixed, NO_STEP)
     own = np.where(fit.held, 0.0, -np.asarray(lin.residual_jacobian))
     spots = linear_spots(lin, fit.arrays, own)
     columns = own.reshape(4 * count, -1)

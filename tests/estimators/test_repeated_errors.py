@@ -190,7 +190,7 @@ def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying,
 def test_scales_of_nought_are_perfect_gears(varying, dozen, evaluate):
     """With all scales nought the density is that of a campaign that has no places at all."""
     table = perfect_gears(dozen.campaign.rig)
-    assert not len(campaign_arrays(dozen.campaign, table).gears.places.steps)
+    assert not campaign_arrays(dozen.campaign, table).gears.filled
     with jax.enable_x64(True):
         arrays = jax.tree.map(jnp.asarray, campaign_arrays(dozen.campaign, table))
         space = jax.tree.map(jnp.asarray, parameter_space(table, dozen.campaign.stereo))

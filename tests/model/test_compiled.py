@@ -161,9 +161,28 @@ def test_other_code_has_other_traces(traces, tmp_path, monkeypatch):
     monkeypatch.setattr(subject, "PACKAGE", package)
     first = Traces(tmp_path).name("key")
     (package / "one.py").write_text("x = 2\n")
+    subject.sources_of.cache_clear()
     second = Traces(tmp_path).name("key")
     monkeypatch.setattr(subject, "version", lambda library: "0")
     assert len({name, first, second, Traces(tmp_path).name("key")}) == 4
+
+
+def test_code_is_what_a_module_imports(tmp_path):
+    """Whatever way it is written; what nobody imports from there is other code."""
+    package = tmp_path / "tvsbayes"
+    texts = {"a/one": "from tvsbayes.b.two import (\n    x,\n)\n", "b/two": "def f():\n    import tvsbayes.b.three\n"}
+    texts |= {"b/three": "from tvsbayes.b import four\n", "b/four": "", "b/five": "from tvsbayes.a.one import y\n"}
+    for name, text in texts.items():
+        path = (package / name).with_suffix(".py")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+    def found(module: str) -> set[str]:
+        paths = subject.sources_of(module, package)
+        return {path.relative_to(package).with_suffix("").as_posix() for path in paths}
+
+    assert found("tvsbayes.a.one") == {"a/one", "b/two", "b/three", "b/four"}
+    assert found("tvsbayes.b.four") == {"b/four"} and found("elsewhere") == set(texts)
 
 
 def test_source_written_since_the_start_is_not_what_runs(traces, tmp_path, monkeypatch):

@@ -46,7 +46,7 @@ def test_the_line_through_the_looks_is_found_and_the_local_slope_knows_less(gear
     assert np.all(np.abs(fitted.mode.effective_deg_per_step - true) < 5 * sd)
     # The gear's mean ratio is known by no more than the error's place-to-place change allows.
     assert np.all(fitted.draws.local_deg_per_step.std(axis=0) > 1.05 * sd)
-    places = len(fitted.arrays.gears.places.steps)
+    places = fitted.arrays.gears.filled
     assert fitted.draws_places.shape == (len(fitted.draws_z), 2 * places)
     assert fitted.draws.place_errors_rad.shape == fitted.draws_places.shape
 

@@ -16,10 +16,11 @@ from support.dense_likelihood import angle_covariances, drawn_at_every_move, res
 from support.small_posterior import ROUNDING, play_priors
 from support.varying_gears import PERIODS_DEG, coordinates_with, varying_gears
 
+from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
-from tvsbayes.estimators.linear_spots import linear_spots, linearise, stop_information
+from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import Campaign, ordered_spots
+from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, NOISE_NAMES, names_of
 from tvsbayes.model.parameter_space import coordinates_of, free_mask, parameter_space, physical_at
 from tvsbayes.posterior.transport import Transport, transport
@@ -42,7 +43,6 @@ FLOOR = 1e-8
 def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str, ...], redraw: bool) -> SimpleNamespace:
     """What the map reads of a fit, at values; `redraw`: every look has stop errors of its own."""
     table = varying_gears(campaign.rig)
-    count = len(ordered_spots(campaign))
     with jax.enable_x64(True):
         space = jax.tree.map(jnp.asarray, parameter_space(table, campaign.stereo))
         arrays = jax.tree.map(jnp.asarray, campaign_arrays(campaign, table))
@@ -50,7 +50,7 @@ def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str,
             arrays = drawn_at_every_move(campaign, arrays)
         z = coordinates_of(space, physical_at(dozen.z, dozen.space).value)
         z = coordinates_with(space, z, values)
-        lin = jax.jit(linearise)(jnp.asarray(z), space, arrays).of_spots(count)
+        lin = stage(z, space, arrays, Fixed(np.zeros(len(NAMES), bool), z, np.array(1.0)), NO_STEP)
         information = stop_information(linear_spots(lin, arrays, -lin.residual_jacobian))
     free = free_mask(space, has_aperture=True)
     free[[INDEX[name] for name in held]] = False

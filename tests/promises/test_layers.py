@@ -94,6 +94,18 @@ def test_no_cycles(inner):
     assert not [name for name in inner if name in reachable(inner, name)]
 
 
+def test_traces_belong_to_all_that_a_module_imports(inner):
+    """Of whatever is compiled: what decides a trace decides its name in the cache."""
+    from tvsbayes.model.compiled import sources_of
+
+    for name in ("estimators.likelihood", "estimators.annealed_stage", "model.headlines", "planning.looks"):
+        found = {
+            path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", ".")
+            for path in sources_of(f"tvsbayes.{name}", PACKAGE)
+        }
+        assert found == {name} | reachable(inner, name) and len(found) < len(MODULES) / 2
+
+
 def test_hardware_is_imported_by_those_who_drive_it(inner):
     for name, others in inner.items():
         hardware = {room(other) for other in others} & set(HARDWARE) - {room(name)}

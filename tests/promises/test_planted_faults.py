@@ -84,7 +84,7 @@ def test_a_name_of_two_definitions_is_refused(sources, tmp_path):
 
 def test_a_fault_is_planted_in_a_copy_and_taken_out_again(tmp_path):
     """In a package of one module, which has the place of an entry of the list."""
-    fault = next(fault for fault in FAULTS if fault.place == "laser_path.mirror_angles")
+    fault = next(fault for fault in FAULTS if fault.place == "laser_path.followed")
     (tmp_path / "tvsbayes" / "model").mkdir(parents=True)
     copy = tmp_path / "tvsbayes" / "model" / "laser_path.py"
     whole = (ROOT / copy.relative_to(tmp_path)).read_text(encoding="utf-8")

@@ -127,7 +127,7 @@ class End:
 
 
 def descended(residual, start: np.ndarray, args, steps: int = STEPS) -> End:
-    value = levenberg_marquardt(residual, jnp.asarray(start), args, jnp.asarray(TOLERANCE), steps)
+    value = levenberg_marquardt(residual, np.asarray(start), args, TOLERANCE, steps)
     found = residuals_and_jacobian(residual, value, args)
     residuals, jacobian = np.asarray(found.value), np.asarray(found.jacobian)
     sd = np.linalg.norm(residuals) / np.sqrt(max(residuals.size - value.size, 1))

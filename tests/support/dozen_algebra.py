@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tvsbayes.estimators.annealed_stage import Fixed, reduced_residuals
-from tvsbayes.estimators.likelihood import innovations, no_draw, standing
+from tvsbayes.estimators.annealed_stage import Fixed, linear_campaign
+from tvsbayes.estimators.likelihood import blocks_filled, innovations, standing
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 
 NOISE = np.isin(NAMES, NOISE_NAMES)
 
 
 @jax.jit
-def _found(z, normals, space, arrays, fixed):
+def _found(z, normals, space, arrays):
     model = space.model(z)
     found = standing(model, arrays)
     terms = {
@@ -25,8 +25,9 @@ def _found(z, normals, space, arrays, fixed):
         "slope": jnp.stack([jnp.stack(found.terms.by_pan, 1), jnp.stack(found.terms.by_tilt, 1)], axis=2),
         "log_scale": found.terms.log_scale,
     }
-    seen = jax.vmap(lambda normal: innovations(model, arrays, normal))(normals)
-    return model, terms, seen, reduced_residuals(z, (space, arrays, fixed))
+    blocks = blocks_filled(arrays)
+    seen = jax.vmap(lambda normal: innovations(model, arrays, normal, blocks))(normals)
+    return model, terms, seen
 
 
 def found_at(spots: Any, z: np.ndarray) -> SimpleNamespace:
@@ -37,8 +38,8 @@ def found_at(spots: Any, z: np.ndarray) -> SimpleNamespace:
         z: coordinates, of which the noise scales are held.
     """
     size = 2 * len(spots.arrays.gears.places.steps)
-    normals = np.concatenate([no_draw(1, spots.arrays), np.eye(size)])
-    fixed = Fixed(jnp.asarray(NOISE), jnp.asarray(z), jnp.asarray(1.0))
-    arguments = jnp.asarray(z), jnp.asarray(normals), spots.space, spots.arrays, fixed
-    model, terms, seen, reduced = jax.tree.map(np.asarray, _found(*arguments))
+    normals = np.concatenate([np.zeros((1, size)), np.eye(size)])
+    arguments = jnp.asarray(z), jnp.asarray(normals), spots.space, spots.arrays
+    model, terms, seen = jax.tree.map(np.asarray, _found(*arguments))
+    reduced = linear_campaign(np.asarray(z), spots.space, spots.arrays, Fixed(NOISE, np.asarray(z), np.array(1.0)))
     return SimpleNamespace(model=model, terms=SimpleNamespace(**terms), seen=seen, reduced=reduced)

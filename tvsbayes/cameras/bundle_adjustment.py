@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -28,7 +27,7 @@ from tvsbayes.errors import NotConverged, NothingToEstimate
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.geometry import CV_FROM_S, StereoCameras, project, rotation_matrix
-from tvsbayes.statistics.least_squares import damped_solver, descend, least_squares_covariance, linear_residual
+from tvsbayes.statistics.least_squares import LinearResidual, descend, least_squares_covariance, linear_residual
 
 VIEWS_PER_BUCKET, CORNERS_PER_BUCKET = 16, 32
 """Padding: calibrations of like size share one compilation."""
@@ -149,14 +148,7 @@ class _Linear(eqx.Module):
 @compiled(_Linear)
 def _linearised(z: Float[Array, "24"], arrays: BoardArrays) -> _Linear:
     found = linear_residual(reduced_residuals, z, arrays)
-    return _Linear(found.value, found.jacobian)
-
-
-@compiled(jax.Array)
-def _descent(z: Float[Array, "24"], arrays: BoardArrays, tolerance: Float[Array, ""]) -> Float[Array, "24"]:
-    """Where Levenberg-Marquardt ends; whitened coordinates keep the condition of its normal equations harmless."""
-    solver = damped_solver(tolerance, normal_equations=True)
-    return descend(partial(linear_residual, reduced_residuals), solver, z, arrays, STEPS_MAX).value
+    return _Linear(jnp.asarray(found.value), jnp.asarray(found.jacobian))
 
 
 @dataclass(frozen=True)
@@ -336,9 +328,13 @@ def _repeated(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> _En
 
 def _descended(z: np.ndarray, arrays: BoardArrays) -> _End:
     """Where Levenberg-Marquardt ends."""
-    end = np.asarray(_descent(z, arrays, TOLERANCE))
-    found = _linearised(end, arrays)
-    return _End(end, np.asarray(found.residuals), np.asarray(found.jacobian))
+
+    def linearised(at: np.ndarray) -> LinearResidual:
+        found = _linearised(at, arrays)
+        residuals, jacobian = np.asarray(found.residuals), np.asarray(found.jacobian)
+        return LinearResidual(residuals, jacobian, _End(at, residuals, jacobian))
+
+    return descend(linearised, z, TOLERANCE, STEPS_MAX).also
 
 
 def undetermined(reason: str) -> NothingToEstimate:

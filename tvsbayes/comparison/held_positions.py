@@ -77,8 +77,7 @@ def _of_all_looks(fit_of_all: JointFit, taught: JointFit) -> Linearised:
     """All looks linearised at the mode that some of them taught."""
     held = fit_of_all.held
     fixed = Fixed(held, taught.z, np.array(1.0))
-    at_mode = stage(taught.z, fit_of_all.space, fit_of_all.arrays, fixed, np.array(NO_STEP))
-    return at_mode.of_spots(len(ordered_spots(fit_of_all.campaign)))
+    return stage(taught.z, fit_of_all.space, fit_of_all.arrays, fixed, NO_STEP)
 
 
 def foretold(

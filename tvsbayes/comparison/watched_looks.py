@@ -248,7 +248,7 @@ class WatchedLooks:
         )
         still = np.zeros(len(NAMES))
         fixed = Fixed(np.zeros(len(NAMES), dtype=bool), still, np.array(1.0))
-        found = stage(still, plain, self.problem.arrays, fixed, np.array(NO_STEP)).of_spots(len(self.problem.spots))
+        found = stage(still, plain, self.problem.arrays, fixed, NO_STEP)
         physical = -np.asarray(found.residual_jacobian)
         own = np.where(self.problem.held, 0.0, physical @ at.slope)
         if angles:

@@ -7,24 +7,28 @@ order in the residual), so that it is the linearisation that all diagnoses use, 
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
+from scipy import linalg
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.estimators.likelihood import filter_rows, filtered
+from tvsbayes.estimators.likelihood import STATES, Belief, Seen, filter_rows, filtered
 from tvsbayes.estimators.linear_spots import Linearised, linearise
 from tvsbayes.estimators.spot_residuals import ToStates
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.parameter_space import ParameterSpace
-from tvsbayes.statistics.least_squares import LinearResidual, damped_solver, descend
+from tvsbayes.statistics.least_squares import LinearResidual, descend
 
 STAGE_TOLERANCE = 1e-2
 STAGE_STEPS = 12
 """Levenberg-Marquardt only has to reach the basin: its frozen Jacobian is not exact at the level of the noise, where it
 would stall; the Newton steps on the full density finish the work."""
+PART = 128
+"""Spots that are linearised in one call: a campaign of any size takes as many calls as its spots need."""
 NO_STEP = 1e300
 """The tolerance that the start meets: the stage is then the linearisation there."""
 
@@ -37,55 +41,82 @@ class Fixed(eqx.Module):
     inflation: Float[Array | np.ndarray, ""]
 
 
-def innovations(lin: Linearised, arrays: CampaignArrays) -> Float[Array, "innovations columns"]:
-    """Standardised innovations of the linearised campaign; in the further columns how coordinates move them.
+def innovations(lin: Linearised, arrays: CampaignArrays, before: Belief) -> Seen:
+    """Standardised innovations of linearised spots; in the further columns how coordinates move them.
 
-    The errors at places stand last among them, as coordinates with standard normal priors.
+    The errors at places stand last among them, as coordinates in rad. Behind the two components that the filter sees
+    stand the four that no state changes.
     """
     by_pan, by_tilt = (tuple(lin.slope[:, :, axis].T) for axis in range(2))
     turned = ToStates.of(by_pan, by_tilt)
-    both = jnp.concatenate([lin.residual[..., None], lin.residual_jacobian, -lin.place_load], axis=2)
+    both = jnp.concatenate([lin.residual[..., None], lin.residual_jacobian, -lin.place_columns], axis=2)
     columns = turned.of_many(tuple(both.transpose(1, 2, 0)))
     seen, free = (jnp.stack(part).transpose(2, 0, 1) for part in (columns[:2], columns[2:]))
     rows = filter_rows(seen, turned.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, arrays.spots)
-    return jnp.concatenate([filtered(rows).standardised, free], axis=1).reshape(-1, both.shape[2])
+    found = filtered(rows, before)
+    return eqx.tree_at(lambda f: f.standardised, found, jnp.concatenate([found.standardised, free], axis=1))
 
 
-def reduced_residuals(
-    z: Float[Array, " parameters"], args: tuple[ParameterSpace, CampaignArrays, Fixed]
-) -> LinearResidual:
+class Part(Linearised):
+    """Some spots linearised; products of the columns of their innovations, and the filter's belief after them."""
+
+    gram: Float[Array, "columns columns"]
+    mean: Float[Array, "6 columns"]
+    covariance: Float[Array, "6 6"]
+
+
+@compiled(Part)
+def linear_part(
+    z: Float[Array, " parameters"],
+    space: ParameterSpace,
+    arrays: CampaignArrays,
+    fixed: Fixed,
+    first: Int[Array, ""],
+    before: Belief,
+) -> Part:
+    """`PART` spots from the first on, at the noise of `fixed`."""
+    own = arrays.of_spots(first, min(PART, len(arrays.spots.valid)))
+    lin = linearise(jnp.where(fixed.held, fixed.value, z), space, own, fixed.inflation)
+    seen = innovations(lin, own, before)
+    columns = seen.standardised.reshape(-1, seen.standardised.shape[2])
+    given = {field.name: getattr(lin, field.name) for field in fields(lin)}
+    mean, covariance = jnp.asarray(seen.belief.mean), jnp.asarray(seen.belief.covariance)
+    return Part(**given, gram=columns.T @ columns, mean=mean, covariance=covariance)
+
+
+def linear_campaign(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays, fixed: Fixed) -> LinearResidual:
     """As few residuals as have the sum of squares, slope and normal equations of innovations and prior.
 
     With N = J'J + 1 = L L' and the slope g they are [L^-1 g; what is left of the length], their Jacobian [L'; 0]: prior
     coordinates keep N's condition harmless, and every later product is a thirtieth of the size. The errors at places
     are least squares in every step: they stand before the coordinates in N, and what L has of them is left out.
+    Besides comes the campaign linearised there, as NumPy arrays, without padding.
     """
-    space, arrays, fixed = args
-    lin = linearise(jnp.where(fixed.held, fixed.value, z), space, arrays, fixed.inflation)
-    columns = innovations(lin, arrays)
-    places = lin.place_load.shape[2]
-    residual, jacobian = columns[:, 0], jnp.where(fixed.held, 0.0, columns[:, 1 : 1 + z.size])
-    jacobian = jnp.concatenate([columns[:, 1 + z.size :], jacobian], axis=1)
-    prior = jnp.concatenate([jnp.zeros(places), jnp.where(fixed.held, z - fixed.value, z)])
-    root = jnp.linalg.cholesky(jacobian.T @ jacobian + jnp.eye(prior.size))
-    explained = jax.scipy.linalg.solve_triangular(root, jacobian.T @ residual + prior, lower=True)
-    left = jnp.dot(residual, residual) + jnp.dot(prior, prior) - jnp.dot(explained, explained)
-    reduced = jnp.append(explained[places:], jnp.sqrt(jnp.maximum(left, 0.0)))
-    slope = jnp.concatenate([root[places:, places:].T, jnp.zeros((1, z.size))])
-    return LinearResidual(reduced, slope, lin)
+    count, places, filled = int(arrays.count), len(arrays.gears.places.steps), arrays.gears.errors_filled
+    before = Belief(np.zeros((STATES, 1 + z.size + 2 * places)), np.zeros((STATES, STATES)))
+    parts = []
+    for first in range(0, count, PART):
+        parts.append(linear_part(z, space, arrays, fixed, np.int32(first), before))
+        before = Belief(parts[-1].mean, parts[-1].covariance)
+    gram = np.sum([np.asarray(part.gram) for part in parts], axis=0)
+    lin = Linearised.joined(parts, count, filled)
+    mixed = linalg.block_diag(lin.place_root, np.diag(np.where(fixed.held, 0.0, 1.0)))
+    own = np.concatenate([1 + z.size + filled, np.arange(1, 1 + z.size)])
+    prior = np.concatenate([np.zeros(len(lin.place_root)), np.where(fixed.held, z - fixed.value, z)])
+    root = np.linalg.cholesky(mixed.T @ gram[np.ix_(own, own)] @ mixed + np.eye(prior.size))
+    slope = mixed.T @ gram[own, 0] + prior
+    explained = linalg.solve_triangular(root, slope, lower=True, check_finite=False)
+    left = gram[0, 0] + prior @ prior - explained @ explained
+    free = len(lin.place_root)
+    value = np.append(explained[free:], np.sqrt(np.maximum(left, 0.0)))
+    return LinearResidual(value, np.concatenate([root[free:, free:].T, np.zeros((1, z.size))]), lin)
 
 
-@compiled(Linearised)
 def stage(
-    z: Float[Array, " parameters"],
-    space: ParameterSpace,
-    arrays: CampaignArrays,
-    fixed: Fixed,
-    tolerance: Float[Array, ""],
+    z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays, fixed: Fixed, tolerance: float = STAGE_TOLERANCE
 ) -> Linearised:
     """Geometry and stereo for given noise scales, from z: where Levenberg-Marquardt ended, and the campaign there.
 
-    With the tolerance `NO_STEP` the campaign linearised at z: one compiled function serves both.
+    With the tolerance `NO_STEP` the campaign linearised at z.
     """
-    solver = damped_solver(tolerance, normal_equations=True)
-    return descend(reduced_residuals, solver, z, (space, arrays, fixed), STAGE_STEPS).also
+    return descend(lambda at: linear_campaign(at, space, arrays, fixed), z, tolerance, STAGE_STEPS).also

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from tvsbayes.instrument.axes import APPROACH_SIGN
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
 from tvsbayes.instrument.conditions import kelvin, powered_on_s, warm_minutes
-from tvsbayes.instrument.places import SeenPlaces, gears_vary, seen_places
+from tvsbayes.instrument.places import PLACES_MAX, SeenPlaces, gears_vary, seen_places
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.sightings import Sighting, sighted_deg, sightings_of, tangent_frames
 from tvsbayes.instrument.stereo_pair import triangulate
@@ -26,12 +26,12 @@ from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.laser_path import MoveArrays
 
-SMALLEST_PLACES = 6
-"""Places of both axes together are padded to this number or it times a power of two. Columns of the filter are what a
-density costs: the paper's protocol has these six counters."""
-SMALLEST_BUCKET = 512
-"""Spots and moves are padded to this size or the next power of two above it: campaigns of ordinary size
-share one compiled function."""
+PLACES = (0, 6, 12, 24, 2 * PLACES_MAX)
+"""Numbers of places of both axes together that functions are compiled for, side by side in each. Columns of the filter
+are what a density costs: the paper's protocol has these six counters."""
+SMALLEST_BUCKET = 4096
+"""Spots and moves are padded to this size or the next power of two above it: campaigns up to it share their compiled
+functions, and cost what their own rows need."""
 SIGHTED = (1, 2)
 """Columns of the pixels in which sightings have their two angles: the first column is where ranges are taken out."""
 NOWHERE_MM = np.array([500.0, 0.0, 0.0])
@@ -76,26 +76,47 @@ class GearArrays(eqx.Module):
     """
 
     places: Places
-    error_share: Float[Array, "spots places"]
-    play_share: Float[Array, "spots places"]
+    error_share: Float[Array | np.ndarray, "spots places"]
+    play_share: Float[Array | np.ndarray, "spots places"]
+
+    def first(self, count: int) -> GearArrays:
+        """The first places alone."""
+        places = jax.tree.map(lambda of_place: of_place[:count], self.places)
+        return GearArrays(places, self.error_share[:, :count], self.play_share[:, :count])
+
+    @property
+    def filled(self) -> int:
+        """Places that functions are run for: the least of `PLACES` that holds all; for NumPy's side."""
+        count = int(np.asarray(self.places.valid).sum())
+        return next(size for size in sizes_of(len(self.places.steps)) if size >= count)
+
+    @property
+    def errors_filled(self) -> np.ndarray:
+        """Which of the errors at all places, transmission errors and plays, are those at the filled ones."""
+        return np.add.outer([0, len(self.places.steps)], np.arange(self.filled)).ravel()
+
+    def without_padding(self) -> GearArrays:
+        """As NumPy arrays, of the places that functions are run for."""
+        return jax.tree.map(np.asarray, self).first(self.filled)
 
 
 class CampaignArrays(eqx.Module):
-    """A campaign as arguments of jitted functions."""
+    """A campaign as arguments of jitted functions; `count` of its spots are no padding."""
 
     moves: MoveArrays
     spots: SpotArrays
     gears: GearArrays
     azimuth_convention: Bool[Array, ""]
+    count: Int[Array, ""]
 
-    def of_spots(self, start: Int[Array, ""], count: int) -> CampaignArrays:
+    def of_spots(self, start: Int[Array, ""] | int, count: int) -> CampaignArrays:
         """The same moves with `count` spots from one on: what follows the last is never asked for."""
 
         def part(array):
             return jax.lax.dynamic_slice_in_dim(array, start, count)
 
         gears = GearArrays(self.gears.places, part(self.gears.error_share), part(self.gears.play_share))
-        return CampaignArrays(self.moves, jax.tree.map(part, self.spots), gears, self.azimuth_convention)
+        return CampaignArrays(self.moves, jax.tree.map(part, self.spots), gears, self.azimuth_convention, self.count)
 
 
 def bucket(count: int, smallest: int | None = None, growth: int = 2) -> int:
@@ -134,26 +155,32 @@ def move_arrays(moves: Sequence[Move], size: int | None = None, powered_on_s: fl
     )
 
 
-def place_arrays(seen: SeenPlaces, smallest: int = SMALLEST_PLACES) -> Places:
-    """Pad places to their bucket."""
-    count = len(seen.steps)
-    size = bucket(count, smallest)
+def sizes_of(size: int) -> tuple[int, ...]:
+    """Numbers of `PLACES` up to a padded number of places, itself the last."""
+    return (*(places for places in PLACES if places < size), size)
+
+
+def place_arrays(seen: SeenPlaces) -> Places:
+    """Pad places to the largest number of them."""
+    count, size = len(seen.steps), PLACES[-1]
     return Places(
         padded(seen.steps, size), padded(seen.on_tilt, size, False, bool), padded(np.ones(count), size, False, bool)
     )
 
 
-def gear_arrays(seen: SeenPlaces, size: int, vary: bool) -> GearArrays:
-    """Pad the places of looks; gears that do not vary have none.
+def no_gears(size: int) -> GearArrays:
+    """Of spots, padded to this number, whose gears are taken not to vary."""
+    none = padded(np.zeros((0, 0)), size)
+    return GearArrays(Places(placed(np.zeros(0)), *2 * [placed(np.zeros(0, dtype=bool))]), none, none)
+
+
+def gear_arrays(seen: SeenPlaces, size: int) -> GearArrays:
+    """Pad the places of looks.
 
     Args:
         seen: from `seen_places`.
         size: padded number of spots.
-        vary: whether transmission error or play differ from place to place.
     """
-    if not vary:
-        none = padded(np.zeros((0, 0)), size)
-        return GearArrays(Places(placed(np.zeros(0)), *2 * [placed(np.zeros(0, dtype=bool))]), none, none)
     places = place_arrays(seen)
     wider = (0, 0), (0, len(places.steps) - len(seen.steps))
     return GearArrays(places, *(padded(np.pad(share, wider), size) for share in (seen.error_share, seen.play_share)))
@@ -191,7 +218,8 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
     looks = [s.move for s in spots]
     priors = campaign.rig if table is None else table
     new = redraws(campaign.moves, looks)
-    gears = gear_arrays(seen_places(campaign.moves, looks, priors), size, gears_vary(priors))
+    places = seen_places(campaign.moves, looks, priors)
+    gears = gear_arrays(places if gears_vary(priors) else places.none, size)
     aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
     points_mm = triangulate(campaign.stereo, pixels) if frames is None else frames[:, 2]
     seen = np.isfinite(points_mm).all(axis=1)
@@ -214,7 +242,7 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
     )
     azimuth = placed(campaign.rig.aperture_convention == "azimuth")
     moves = move_arrays(campaign.moves, powered_on_s=powered_on_s(campaign.header))
-    return CampaignArrays(moves, spot_arrays, gears, azimuth)
+    return CampaignArrays(moves, spot_arrays, gears, azimuth, placed(np.int32(len(spots))))
 
 
 def components(rig: RigTable) -> int:

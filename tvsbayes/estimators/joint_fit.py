@@ -28,7 +28,7 @@ from tvsbayes.instrument.campaign import Campaign, Move, ordered_spots
 from tvsbayes.instrument.homing import Sides, homed, prior_chance, unrecorded
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES, TARGETS, ZERO_SHIFT_NAMES, Prior
-from tvsbayes.instrument.places import PLACES_MAX, line_share, seen_places
+from tvsbayes.instrument.places import line_share, seen_places
 from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.headlines import Derived, SeenLine, derived_quantities
@@ -412,8 +412,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
     suspect = used & (chi2_spots > chi2_quantile(readings, GATE_PROBABILITY))
     pose = lin.mirror_angles_rad[used].mean(axis=0)
     seen_at = seen_places(campaign.moves, [spot.move for spot in problem.spots], campaign.rig)
-    # As many for every campaign: headlines of gears that do not vary are compiled once.
-    places = place_arrays(seen_at, 2 * PLACES_MAX)
+    places = place_arrays(seen_at)
     share = placed(np.pad(line_share(seen_at, used), (0, len(places.steps) - len(seen_at.steps))))
     seen = SeenLine(np.asarray(pose), places, share)
     count, joint = len(NAMES), with_places(mode.z, mode.covariance, information)

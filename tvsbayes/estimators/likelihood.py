@@ -12,6 +12,9 @@ in units of its standard deviation.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
+from types import ModuleType
 
 import equinox as eqx
 import jax
@@ -19,14 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, SpotArrays
-from tvsbayes.estimators.looks import Looks, looks_at
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, SpotArrays, sizes_of
+from tvsbayes.estimators.looks import WINDOW, Looks, looks_at, spot_angles
 from tvsbayes.estimators.spot_residuals import NoiseScales, SpotResiduals, ToStates, noise_scales, spot_residuals
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.gear_processes import place_root
+from tvsbayes.model.gear_processes import errors_at, place_root
 from tvsbayes.model.geometry import Scalar
-from tvsbayes.model.laser_path import MirrorAngles, mirror_angles
+from tvsbayes.model.laser_path import MirrorAngles, Stretch, angles_at, mirror_angles, no_moves
 from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 STATES = 6
@@ -58,10 +61,10 @@ class FilterRows(eqx.Module):
     `variance` what is added to its variance since then: that of the draw, or of a random walk.
     """
 
-    residual: Float[Array, "..."]
-    load: Float[Array, "*spots components 6"]
-    keep: Float[Array, "*spots 6"]
-    variance: Float[Array, "*spots 6"]
+    residual: Float[Array | np.ndarray, "..."]
+    load: Float[Array | np.ndarray, "*spots components 6"]
+    keep: Float[Array | np.ndarray, "*spots 6"]
+    variance: Float[Array | np.ndarray, "*spots 6"]
 
 
 def filter_rows(
@@ -71,6 +74,7 @@ def filter_rows(
     stop_variance: Float[Array | np.ndarray, "spots 2"],
     drift_variance: Float[Array | np.ndarray, "spots 2"],
     spots: SpotArrays,
+    functions: ModuleType = jnp,
 ) -> FilterRows:
     """States of the filter at every spot: stop errors, home offsets with their drift, places in an unknown play.
 
@@ -81,16 +85,17 @@ def filter_rows(
         stop_variance: from `stop_variances`.
         drift_variance: from `drift_variances`.
         spots: which of them re-home and draw stop errors anew.
+        functions: jax.numpy or numpy.
     """
-    pairs = (len(spots.valid), 2)
-    home = jnp.where(spots.homed, (HOME_SD_DEG * jnp.pi / 180) ** 2, 0.0)[:, None]
-    segment = jnp.broadcast_to(spots.new_segment[:, None], pairs)
-    drawn = jnp.where(spots.redraw, stop_variance, 0.0)
+    xp, pairs = functions, (len(spots.valid), 2)
+    home = xp.where(spots.homed, (HOME_SD_DEG * np.pi / 180) ** 2, 0.0)[:, None]
+    segment = xp.broadcast_to(spots.new_segment[:, None], pairs)
+    drawn = xp.where(spots.redraw, stop_variance, 0.0)
     return FilterRows(
-        residual=jnp.asarray(residual),
-        load=jnp.concatenate([slope, slope, slope * play_sd_rad[:, None]], axis=2),
-        keep=jnp.where(jnp.concatenate([spots.redraw, segment, segment], axis=1), 0.0, 1.0),
-        variance=jnp.concatenate([drawn, home + drift_variance, jnp.where(segment, 1.0, 0.0)], axis=1),
+        residual=xp.asarray(residual),
+        load=xp.concatenate([slope, slope, slope * play_sd_rad[:, None]], axis=2),
+        keep=xp.where(xp.concatenate([spots.redraw, segment, segment], axis=1), 0.0, 1.0),
+        variance=xp.concatenate([drawn, home + drift_variance, xp.where(segment, 1.0, 0.0)], axis=1),
     )
 
 
@@ -102,7 +107,7 @@ def place_columns(
     return jnp.concatenate([by_place * gears.error_share[:, None], by_place * gears.play_share[:, None]], axis=2)
 
 
-def _along(states: Float[Array, "6"], like: Array) -> Float[Array, "6 ..."]:
+def _along(states: Float[Array | np.ndarray, "6"], like: Array | np.ndarray) -> Float[Array, "6 ..."]:
     """Numbers of the six states for every column of `like`."""
     return jnp.reshape(states, (STATES,) + (1,) * (like.ndim - 1))
 
@@ -110,8 +115,8 @@ def _along(states: Float[Array, "6"], like: Array) -> Float[Array, "6 ..."]:
 class Belief(eqx.Module):
     """Mean, one for every column of residuals, and covariance of the filter's state."""
 
-    mean: Float[Array, "6 *columns"]
-    covariance: Float[Array, "6 6"]
+    mean: Float[Array | np.ndarray, "6 *columns"]
+    covariance: Float[Array | np.ndarray, "6 6"]
 
     def renewed(self, row: FilterRows) -> Belief:
         """The state as the spot finds it, before the spot is looked at."""
@@ -167,10 +172,10 @@ def standing(
     inflation: Float[Array | np.ndarray, ""] | float = 1.0,
     angles: MirrorAngles | None = None,
 ) -> Standing:
-    """Linearise all spots; `inflation` is a factor on pixel and aperture noise (annealing), `angles` those of moves."""
+    """Linearise all spots; `inflation` is a factor on pixel and aperture noise (annealing), `angles` are the spots'."""
     spots = arrays.spots
-    angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves) if angles is None else angles
-    pan, tilt = (angles.angle_rad[:, axis][spots.move_index] for axis in range(2))
+    angles = spot_angles(model, arrays) if angles is None else angles
+    pan, tilt = angles.angle_rad.T
     looks = looks_at(model, pan, tilt, arrays)
     noise, scattered = noise_scales(model, spots, inflation), scatter_variances(model.noise.look_scatter_rad, spots)
     terms = spot_residuals(looks, noise, model, spots)
@@ -178,7 +183,7 @@ def standing(
         looks,
         noise,
         terms,
-        angles.play_sd_rad[spots.move_index],
+        angles.play_sd_rad,
         stop_variances(model.noise.stop_sd_rad, spots),
         drift_variances(jnp.asarray(model.gears.drift_rad_per_root_hour), spots),
         scattered,
@@ -189,12 +194,12 @@ def standing(
 class FilterInput(eqx.Module):
     """Rows of the filter, and what no state can change.
 
-    The rows' columns are the residual, then how the errors at places move it. `free` is what is left of the
-    standardised components, which no state changes; `log_scale` is what each spot adds to the log density besides the
-    rows: theirs in it.
+    `slope` is d(rows' residual)/d(pan, tilt). `free` is what is left of the standardised components, which no state
+    changes; `log_scale` is what each spot adds to the log density besides the rows: theirs in it.
     """
 
     rows: FilterRows
+    slope: Float[Array, "spots 2 2"]
     free: Float[Array, "spots 4"]
     log_scale: Float[Array, " spots"]
 
@@ -209,17 +214,14 @@ def root_at_places(model: Model, gears: GearArrays) -> Float[Array, "errors erro
 
 
 def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | None = None) -> FilterInput:
-    """Linearise all spots for the filter; `angles` are those of the moves, if they are known."""
+    """Linearise all spots for the filter; `angles` are the spots', if they are known."""
     found = standing(model, arrays, angles=angles)
     terms, turned = found.terms, found.to_states
     first, second, *free = turned.of_many(terms.residual)
-    seen = jnp.stack([first, second], axis=1)
-    columns = jnp.concatenate([seen[..., None], place_columns(turned.slope, arrays.gears)], axis=2)
-    rows = filter_rows(
-        columns, turned.slope, found.play_sd_rad, found.stop_variance, found.drift_variance, arrays.spots
-    )
+    seen, slope = jnp.stack([first, second], axis=1), turned.slope
+    rows = filter_rows(seen, slope, found.play_sd_rad, found.stop_variance, found.drift_variance, arrays.spots)
     log_scale = terms.log_scale + turned.log_scale - 0.5 * sum(number**2 for number in free)
-    return FilterInput(rows, jnp.stack(free, axis=1), log_scale)
+    return FilterInput(rows, slope, jnp.stack(free, axis=1), log_scale)
 
 
 class Seen(eqx.Module):
@@ -248,9 +250,10 @@ def filtered(rows: FilterRows, before: Belief | None = None) -> Seen:
 class Passed(eqx.Module):
     """A campaign on its way through the filter, block by block; rows of spots ahead are zero.
 
-    `gram` holds the products of the standardised columns with each other, summed over the spots passed; `log_density`
-    is that of the spots passed without squares of what the filter standardised. A caller that needs the gram alone does
-    not pay for the columns: the compiler drops what nobody reads.
+    Columns are the residual, then how the errors at places move it: those at the places that are filled come first,
+    behind them nothing. `gram` holds the products of the standardised columns with each other, summed over the spots
+    passed; `log_density` is that of the spots passed without squares of what the filter standardised. A caller that
+    needs the gram alone does not pay for the columns: the compiler drops what nobody reads.
     """
 
     belief: Belief
@@ -258,6 +261,7 @@ class Passed(eqx.Module):
     free: Float[Array, "spots 4"]
     gram: Float[Array, "columns columns"]
     log_density: Scalar
+    stretch: Stretch
 
 
 def block_size(spots: SpotArrays) -> int:
@@ -266,33 +270,68 @@ def block_size(spots: SpotArrays) -> int:
     return count if count <= BLOCK else math.gcd(count, BLOCK)
 
 
-def blocks_filled(spots: SpotArrays) -> Int[Array, ""]:
-    """Blocks that hold a spot which counts: padding comes last."""
-    rows = jnp.arange(1, len(spots.valid) + 1)
-    return -(-jnp.max(jnp.where(spots.valid > 0, rows, 0)) // block_size(spots))
+def blocks_filled(arrays: CampaignArrays) -> Int[Array, ""]:
+    """Blocks that hold a spot: padding comes last."""
+    return -(-arrays.count // block_size(arrays.spots))
+
+
+def with_filled[Result](gears: GearArrays, of: Callable[[int], Result]) -> Result:
+    """What a function gives of the number of places that are filled: one of `sizes_of`.
+
+    It is traced for each of them, and run for one: columns cost what a campaign's own places need.
+    """
+    sizes = sizes_of(len(gears.places.steps))
+    if len(sizes) == 1:
+        return of(sizes[0])
+    number = jnp.searchsorted(np.array(sizes), jnp.sum(gears.places.valid))
+    return jax.lax.switch(number, [partial(of, size) for size in sizes])
 
 
 def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -> Passed:
-    """Send the first blocks of spots through the filter; nothing depends on how they are cut."""
+    """Send the first blocks of spots through the filter; nothing depends on how they are cut.
+
+    Moves are followed as far as the spots go; all of them where the number of blocks is a constant.
+    """
     count, size = len(arrays.spots.valid), block_size(arrays.spots)
-    angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
+    gears, zero = model.transmission, model.tilt_zero_rad
+    every = mirror_angles(gears, zero, arrays.moves) if isinstance(blocks, int) else None
 
     def through(number, so_far):
         start = jnp.asarray(number) * size
-        given = filter_input(model, arrays.of_spots(start, size), angles)
-        seen = filtered(given.rows, so_far.belief)
-        rows = seen.standardised.reshape(-1, columns)
-        return Passed(
-            seen.belief,
-            jax.lax.dynamic_update_slice_in_dim(so_far.standardised, seen.standardised, start, 0),
-            jax.lax.dynamic_update_slice_in_dim(so_far.free, given.free, start, 0),
-            so_far.gram + rows.T @ rows,
-            so_far.log_density + jnp.sum(given.log_scale) - 0.5 * jnp.sum(seen.log_variance),
-        )
+        part = arrays.of_spots(start, size)
+        index, stretch = part.spots.move_index, so_far.stretch
+        if every is None:
+            found = angles_at(gears, zero, arrays.moves, index, stretch)
+            angles, stretch = found.angles, found.stretch
+        else:
+            angles = jax.tree.map(lambda of_moves: of_moves[index], every)
+        given = filter_input(model, part, angles)
+
+        def seen(places):
+            columns = 1 + 2 * places
+            own = jnp.concatenate(
+                [given.rows.residual[..., None], place_columns(given.slope, part.gears.first(places))], axis=2
+            )
+            rows = eqx.tree_at(lambda r: r.residual, given.rows, own)
+            before = Belief(so_far.belief.mean[:, :columns], so_far.belief.covariance)
+            found = filtered(rows, before)
+            flat = found.standardised.reshape(-1, columns)
+            standardised = jnp.zeros((size, 2, so_far.standardised.shape[2])).at[..., :columns].set(found.standardised)
+            return Passed(
+                Belief(so_far.belief.mean.at[:, :columns].set(found.belief.mean), found.belief.covariance),
+                jax.lax.dynamic_update_slice_in_dim(so_far.standardised, standardised, start, 0),
+                jax.lax.dynamic_update_slice_in_dim(so_far.free, given.free, start, 0),
+                so_far.gram.at[:columns, :columns].add(flat.T @ flat),
+                so_far.log_density + jnp.sum(given.log_scale) - 0.5 * jnp.sum(found.log_variance),
+                stretch,
+            )
+
+        return with_filled(arrays.gears, seen)
 
     columns = 1 + 2 * len(arrays.gears.places.steps)
     empty = jnp.zeros((count, 2, columns)), jnp.zeros((count, 4)), jnp.zeros((columns, columns)), jnp.zeros(())
-    return jax.lax.fori_loop(0, blocks, through, Passed(no_belief(columns), *empty))
+    begin = Passed(no_belief(columns), *empty, no_moves(arrays.moves))
+    return jax.lax.fori_loop(0, blocks, through, begin)
 
 
 class RepeatedErrors(eqx.Module):
@@ -361,34 +400,53 @@ def innovations(
     """
     every = len(arrays.spots.valid) // block_size(arrays.spots)
     seen = passed(model, arrays, every if blocks is None else blocks)
-    own, places, errors_rad = seen.standardised[..., 0], normal, normal
     log_density = seen.log_density - 0.5 * seen.gram[0, 0]
-    root = root_at_places(model, arrays.gears)
-    if len(root):
-        found = repeated_errors(seen.gram, root)
-        own, places = own - seen.standardised[..., 1:] @ found.errors_rad, found.mean
-        errors_rad = found.drawn_rad(normal)
+    size = len(arrays.gears.places.steps)
+
+    def without_places(places):
+        if not places:
+            return Innovations(whole(seen.standardised[..., 0]), jnp.zeros(2 * size), jnp.zeros(2 * size), log_density)
+        columns = 1 + 2 * places
+        root = root_at_places(model, arrays.gears.first(places))
+        found = repeated_errors(seen.gram[:columns, :columns], root)
+        own = seen.standardised[..., 0] - seen.standardised[..., 1:columns] @ found.errors_rad
         # The errors at places explain this much of the squares (least squares: r'r - b' P^-1 b).
-        log_density += 0.5 * jnp.dot(seen.gram[1:, 0], found.errors_rad) - 0.5 * found.log_determinant
-    return Innovations(jnp.concatenate([own, seen.free], axis=1), places, errors_rad, log_density)
+        explained = jnp.dot(seen.gram[1:columns, 0], found.errors_rad) - found.log_determinant
+        drawn = found.drawn_rad(cut(normal, places))
+        return Innovations(whole(own), filled_up(found.mean), filled_up(drawn), log_density + 0.5 * explained)
+
+    def whole(own):
+        return jnp.concatenate([own, seen.free], axis=1)
+
+    def filled_up(errors):
+        return jnp.pad(errors.reshape(2, -1), ((0, 0), (0, size - len(errors) // 2))).ravel()
+
+    def cut(errors, places):
+        return errors.reshape(2, -1)[:, :places].ravel()
+
+    return with_filled(arrays.gears, without_places)
 
 
 @compiled(jax.Array)
-def prior_errors_at_places(
-    z: Float[Array, "batch parameters"],
-    normal: Float[Array, "batch errors"],
-    space: ParameterSpace,
-    arrays: CampaignArrays,
+def _prior_errors(
+    z: Float[Array, "batch parameters"], normal: Float[Array, "batch errors"], space: ParameterSpace, gears: GearArrays
 ) -> Float[Array, "batch errors"]:
-    """Transmission errors, then plays, at the places before any look, rad: a draw each.
+    return jax.vmap(lambda z, normal: root_at_places(space.model(z), gears) @ normal)(z, normal)
+
+
+def prior_errors_at_places(
+    z: np.ndarray, normal: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
+) -> np.ndarray:
+    """Transmission errors, then plays, at the filled places before any look, rad: a draw each.
 
     Args:
-        z: coordinates of many points, which have the scales.
-        normal: standard normal numbers.
+        z: coordinates of many points (n, p), which have the scales.
+        normal: standard normal numbers, shape (n, e).
         space: priors.
         arrays: the campaign.
     """
-    return jax.vmap(lambda z, normal: root_at_places(space.model(z), arrays.gears) @ normal)(z, normal)
+    given = errors_at(normal, len(arrays.gears.places.steps))
+    return np.asarray(_prior_errors(z, given, space, arrays.gears))[:, arrays.gears.errors_filled]
 
 
 def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Scalar:
@@ -400,26 +458,18 @@ def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: C
 class Evaluation(eqx.Module):
     """Log posterior density and errors at places as in `Innovations`; many points give every field a leading axis."""
 
-    log_density: Float[Array, "*batch"]
-    place_errors_rad: Float[Array, "*batch errors"]
+    log_density: Float[Array | np.ndarray, "*batch"]
+    place_errors_rad: Float[Array | np.ndarray, "*batch errors"]
 
 
 @compiled(Evaluation)
-def evaluate(
+def _evaluate(
     z: Float[Array, "batch parameters"],
     normal: Float[Array, "batch errors"],
     space: ParameterSpace,
     arrays: CampaignArrays,
 ) -> Evaluation:
-    """`log_density` of many points in one call; call it with one batch size, each compiles anew.
-
-    Args:
-        z: coordinates.
-        normal: `no_draw`, or standard normal numbers for a draw of the errors at places for each point.
-        space: priors.
-        arrays: the campaign.
-    """
-    blocks = blocks_filled(arrays.spots)
+    blocks = blocks_filled(arrays)
 
     def one(z, normal):
         seen = innovations(space.model(z), arrays, normal, blocks)
@@ -428,34 +478,60 @@ def evaluate(
     return jax.vmap(one)(z, normal)
 
 
-@compiled(jax.Array)
-def residuals(
-    z: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays
-) -> Float[Array, "batch spots 4"]:
-    """Observed - predicted of all spots in units of their noise, ranges projected out, before any filter.
+def evaluate(z: np.ndarray, normal: np.ndarray, space: ParameterSpace, arrays: CampaignArrays) -> Evaluation:
+    """`log_density` of many points in one call; call it with one batch size, each compiles anew.
 
     Args:
-        z: coordinates of many points.
+        z: coordinates, shape (n, p).
+        normal: `no_draw`, or standard normal numbers for a draw of the errors at the filled places for each point.
         space: priors.
         arrays: the campaign.
     """
-    blocks, size = blocks_filled(arrays.spots), block_size(arrays.spots)
+    found = _evaluate(z, errors_at(normal, len(arrays.gears.places.steps)), space, arrays)
+    errors_rad = np.asarray(found.place_errors_rad)[:, arrays.gears.errors_filled]
+    return Evaluation(np.asarray(found.log_density), errors_rad)
+
+
+@compiled(jax.Array)
+def _residuals(
+    z: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays, first: Int[Array, ""]
+) -> Float[Array, "batch spots 4"]:
+    """Of `WINDOW` spots from the first on."""
+    size, window = block_size(arrays.spots), min(WINDOW, len(arrays.spots.valid))
+    blocks = jnp.minimum(blocks_filled(arrays) - first // size, window // size)
 
     def one(z):
         model = space.model(z)
-        angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
 
         def through(number, so_far):
-            start = jnp.asarray(number) * size
-            found = standing(model, arrays.of_spots(start, size), angles=angles)
-            seen = found.to_states.in_place(found.terms.residual)
-            return jax.lax.dynamic_update_slice_in_dim(so_far, jnp.stack(seen, axis=1), start, 0)
+            seen, stretch = so_far
+            part = arrays.of_spots(first + number * size, size)
+            found = angles_at(model.transmission, model.tilt_zero_rad, arrays.moves, part.spots.move_index, stretch)
+            stood = standing(model, part, angles=found.angles)
+            own = jnp.stack(stood.to_states.in_place(stood.terms.residual), axis=1)
+            return jax.lax.dynamic_update_slice_in_dim(seen, own, number * size, 0), found.stretch
 
-        return jax.lax.fori_loop(0, blocks, through, jnp.zeros((len(arrays.spots.valid), 4)))
+        return jax.lax.fori_loop(0, blocks, through, (jnp.zeros((window, 4)), no_moves(arrays.moves)))[0]
 
     return jax.vmap(one)(z)
 
 
+def residuals(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays) -> np.ndarray:
+    """Observed - predicted of all spots in units of their noise, ranges projected out, before any filter.
+
+    Args:
+        z: coordinates of many points, shape (n, p).
+        space: priors.
+        arrays: the campaign.
+
+    Returns:
+        Shape (n, spots, 4), without padding.
+    """
+    count = int(arrays.count)
+    parts = [np.asarray(_residuals(z, space, arrays, np.int32(first))) for first in range(0, count, WINDOW)]
+    return np.concatenate(parts, axis=1)[:, :count]
+
+
 def no_draw(count: int, arrays: CampaignArrays) -> np.ndarray:
     """For `evaluate`: the errors at places of this many points are their means."""
-    return np.zeros((count, 2 * len(arrays.gears.places.steps)))
+    return np.zeros((count, 2 * arrays.gears.filled))

@@ -9,6 +9,7 @@ State Space Methods, 4.5): leave-one-out residuals, and what a fit would lose wi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import equinox as eqx
@@ -18,10 +19,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import linalg
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, padded
-from tvsbayes.estimators.likelihood import FilterRows, filter_rows, place_columns, root_at_places, standing
+from tvsbayes.estimators.campaign_arrays import CampaignArrays
+from tvsbayes.estimators.likelihood import filter_rows, place_columns, root_at_places, standing
 from tvsbayes.estimators.look_jacobian import look_jacobian
-from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import materialise
 from tvsbayes.model.parameter_space import ParameterSpace
 
@@ -46,6 +46,18 @@ class Linearised(eqx.Module):
     place_root: Float[Array | np.ndarray, "errors errors"]
     residual_jacobian: Float[Array | np.ndarray, "spots 4 parameters"]
     predicted_jacobian: Float[Array | np.ndarray, "spots 5 parameters"]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Linearised], count: int, errors: np.ndarray) -> Linearised:
+        """One after the other: the first `count` spots, and some of the errors at places, as NumPy arrays."""
+        given = {
+            field.name: np.concatenate([np.asarray(getattr(part, field.name)) for part in parts])[:count]
+            for field in fields(cls)
+            if field.name not in ("z", "place_root")
+        }
+        root = np.asarray(parts[0].place_root)[np.ix_(errors, errors)]
+        given["place_columns"] = given["place_columns"][..., errors]
+        return cls(z=np.asarray(parts[0].z), place_root=root, **given)
 
     @property
     def place_load(self) -> Float[Array | np.ndarray, "spots 4 errors"]:
@@ -143,9 +155,6 @@ class LinearSpots:
         return replace(self, jacobian=np.concatenate([self.jacobian, columns], axis=2), places=self.places[..., :0])
 
 
-_rows = compiled(FilterRows)(filter_rows)
-
-
 def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) -> LinearSpots:
     """A linearised campaign as the smoother reads it.
 
@@ -154,11 +163,12 @@ def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) 
         arrays: the campaign it comes from.
         jacobian: d(prediction)/d(whatever is asked about), shape (spots, 4, columns).
     """
-    count, size = len(lin.residual), len(arrays.spots.valid)
-    variances = lin.stop_variance, lin.drift_variance
-    given = (padded(x, size) for x in (lin.residual, lin.slope, lin.play_sd_rad, *variances))
-    rows = jax.tree.map(lambda x: np.asarray(x)[:count], _rows(*given, arrays.spots))
-    return LinearSpots(rows.residual, rows.load, rows.keep == 0, rows.variance, jacobian, np.asarray(lin.place_load))
+    spots = jax.tree.map(lambda x: np.asarray(x)[: len(lin.residual)], arrays.spots)
+    variances = np.asarray(lin.stop_variance), np.asarray(lin.drift_variance)
+    residual, slope, play_sd_rad = (np.asarray(part) for part in (lin.residual, lin.slope, lin.play_sd_rad))
+    rows = filter_rows(residual, slope, play_sd_rad, *variances, spots, functions=np)
+    load, keep, variance = np.asarray(rows.load), np.asarray(rows.keep), np.asarray(rows.variance)
+    return LinearSpots(residual, load, keep == 0, variance, jacobian, np.asarray(lin.place_load))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.estimators.looks import Looks, Numbers, aperture_reading, in_frame_s, seen
+from tvsbayes.estimators.looks import Looks, Numbers, aperture_reading, in_frame_s, seen, spot_angles
 from tvsbayes.instrument.parameters import (
     INDEX,
     NAMES,
@@ -26,7 +26,7 @@ from tvsbayes.instrument.parameters import (
     names_of,
 )
 from tvsbayes.model.geometry import materialise, rotation_matrix, transform
-from tvsbayes.model.laser_path import mirror_angles, trace
+from tvsbayes.model.laser_path import trace
 from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 
@@ -73,8 +73,7 @@ def look_jacobian(
         return materialise(jax.vmap(along)(jnp.asarray(np.eye(len(NAMES))[columns])))
 
     turn = rotation_matrix(space.model_at(physical).extrinsics.rotation_rad)
-    angles = moved(GEARS, lambda m: mirror_angles(m.transmission, m.tilt_zero_rad, arrays.moves).angle_rad)
-    pan, tilt = (angles[:, arrays.spots.move_index, axis] for axis in range(2))
+    pan, tilt = jnp.moveaxis(moved(GEARS, lambda m: spot_angles(m, arrays).angle_rad), 2, 0)
     ways_p = moved(OPTICS, lambda m: trace(m.optics, looks.pan_rad, looks.tilt_rad)).at(looks.range_mm)
     ways_s = moved(FRAMES, lambda m: in_frame_s(m.extrinsics, looks.points_p_mm))
     pixels = moved(CAMERAS, lambda m: seen(m, looks.points_s_mm, arrays.spots))

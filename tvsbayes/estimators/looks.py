@@ -9,15 +9,18 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, SpotArrays
 from tvsbayes.instrument.mirrors import Ray, Turn, Vectors
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
-from tvsbayes.model.laser_path import mirror_angles, trace
+from tvsbayes.model.laser_path import MirrorAngles, angles_at, no_moves, trace
 from tvsbayes.model.parameter_space import Extrinsics, Model, ParameterSpace, Receiver
 
+WINDOW = 512
+"""Spots of which a compiled function gives numbers spot by spot in one call."""
 Numbers = tuple[Float[Array, "..."], ...]
 """Components of many looks, an array each: pixels (u_left, v_left, u_right, v_right) and the aperture's angle."""
 
@@ -169,34 +172,54 @@ def looks_at(model: Model, pan_rad: Array, tilt_rad: Array, arrays: CampaignArra
     )
 
 
+def spot_angles(model: Model, arrays: CampaignArrays) -> MirrorAngles:
+    """Mirror angles at all spots, from the first move on."""
+    index, begin = arrays.spots.move_index, no_moves(arrays.moves)
+    return angles_at(model.transmission, model.tilt_zero_rad, arrays.moves, index, begin).angles
+
+
 @compiled(jax.Array)
-def observe_with_stop_errors(
+def _observed(
     z: Float[Array, "batch parameters"],
-    stop_error_rad: Float[Array, "batch spots 2"],
+    turned_rad: Float[Array, "batch spots 2"],
     space: ParameterSpace,
     arrays: CampaignArrays,
+    first: Int[Array, ""],
 ) -> Float[Array, "batch spots 5"]:
+    part = arrays.of_spots(first, turned_rad.shape[1])
+
+    def one(z, turned):
+        model = space.model(z)
+        pan, tilt = spot_angles(model, part).angle_rad.T + turned.T
+        if part.spots.tangents is not None:
+            angles_rad = angles_seen(trace(model.optics, pan, tilt).direction, part.spots)
+            return jnp.stack([*angles_rad, jnp.zeros_like(pan)], axis=1)
+        triangulated = Vectors.of(part.spots.triangulated_mm.T)
+        ranges_mm = nearest_range(model.extrinsics, trace(model.optics, pan, tilt), triangulated)
+        return observe(model, jnp.stack([pan, tilt, ranges_mm]), part.azimuth_convention).T
+
+    return jax.vmap(one)(z, turned_rad)
+
+
+def observe_with_stop_errors(
+    z: np.ndarray, stop_error_rad: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
+) -> np.ndarray:
     """Noiseless looks at the ranges of the observed spots, the mirrors off by given angles (pan, tilt).
 
     Args:
-        z: coordinates.
-        stop_error_rad: added to the mirror angles, rad; stop error, home offset and position in the play.
+        z: coordinates, shape (n, p).
+        stop_error_rad: added to the mirror angles, rad; stop error, home offset and position in the play; shape (n,
+            spots, 2).
         space: priors.
         arrays: the campaign.
 
     Returns:
-        u_left, v_left, u_right, v_right (px), aperture reading (rad).
+        u_left, v_left, u_right, v_right (px), aperture reading (rad), shape (n, spots, 5), without padding.
     """
-
-    def one(z, error):
-        model = space.model(z)
-        angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
-        pan, tilt = angles.angle_rad[arrays.spots.move_index].T + error.T
-        if arrays.spots.tangents is not None:
-            angles_rad = angles_seen(trace(model.optics, pan, tilt).direction, arrays.spots)
-            return jnp.stack([*angles_rad, jnp.zeros_like(pan)], axis=1)
-        triangulated = Vectors.of(arrays.spots.triangulated_mm.T)
-        ranges_mm = nearest_range(model.extrinsics, trace(model.optics, pan, tilt), triangulated)
-        return observe(model, jnp.stack([pan, tilt, ranges_mm]), arrays.azimuth_convention).T
-
-    return jax.vmap(one)(z, stop_error_rad)
+    count, window, found = int(arrays.count), min(WINDOW, len(arrays.spots.valid)), []
+    for first in range(0, count, window):
+        own = stop_error_rad[:, first : min(first + window, count)]
+        filled = np.zeros((len(z), window, 2))
+        filled[:, : own.shape[1]] = own
+        found.append(np.asarray(_observed(z, filled, space, arrays, np.int32(first)))[:, : own.shape[1]])
+    return np.concatenate(found, axis=1)

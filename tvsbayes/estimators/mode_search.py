@@ -10,12 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Bool
 from scipy import optimize
 
-from tvsbayes.estimators.annealed_stage import NO_STEP, STAGE_TOLERANCE, Fixed, stage
+from tvsbayes.estimators.annealed_stage import NO_STEP, STAGE_TOLERANCE, Fixed, linear_part, stage
 from tvsbayes.estimators.campaign_arrays import campaign_arrays, components
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import (
@@ -64,7 +63,7 @@ COMPILED_SECONDS, SEARCHED_SECONDS = 40.0, 1.0
 
 def search_stages(robust: bool) -> dict[str, float]:
     """Stages of a search, with seconds."""
-    return {COMPILING: stage.wait(COMPILED_SECONDS), SEARCHING: SEARCHED_SECONDS * (2 if robust else 1)}
+    return {COMPILING: linear_part.wait(COMPILED_SECONDS), SEARCHING: SEARCHED_SECONDS * (2 if robust else 1)}
 
 
 @dataclass(frozen=True)
@@ -146,7 +145,7 @@ class Problem:
     def stage(self, z: np.ndarray, inflation: float, tolerance: float) -> Linearised:
         """The campaign linearised where a least-squares stage from z ends."""
         fixed = Fixed(self.held, z, np.array(inflation))
-        return stage(z, self.space, self.arrays, fixed, np.array(tolerance))
+        return stage(z, self.space, self.arrays, fixed, tolerance)
 
     def negative_log_density(self, z: np.ndarray) -> np.ndarray:
         """Of many points (n, p); infinite where the model has no value."""
@@ -194,7 +193,7 @@ class Problem:
 
     def room(self, z: np.ndarray) -> Room:
         """How the scales of repeating errors change the room of geometry and cameras, linearised at z."""
-        places = jax.tree.map(np.asarray, self.arrays.gears.places)
+        places = self.arrays.gears.without_padding().places
         if not len(places.steps):
             return Room(self.space, np.zeros((len(NAMES), len(NAMES))), places.steps, places)
         lin = self.linearised(z)
@@ -234,7 +233,7 @@ class Problem:
 
     def linearised(self, z: np.ndarray) -> Linearised:
         """The campaign linearised at a point, without padding."""
-        return self.stage(z, 1.0, NO_STEP).of_spots(len(self.spots))
+        return self.stage(z, 1.0, NO_STEP)
 
     def information(self, lin: Linearised) -> StopInformation:
         """What its stops tell of geometry and stereo, noise scales held."""

@@ -63,8 +63,8 @@ class ScalesAlone:
 
     def _room(self, z: np.ndarray) -> float:
         """What integrating geometry and cameras out adds to the density at z."""
-        arrays, count = self.fit.arrays, len(self.fit.linearised.residual)
-        lin = stage(z, self._space, arrays, Fixed(self.fit.held, z, np.array(1.0)), np.array(NO_STEP)).of_spots(count)
+        arrays = self.fit.arrays
+        lin = stage(z, self._space, arrays, Fixed(self.fit.held, z, np.array(1.0)), NO_STEP)
         jacobian = np.where(self.fit.held, 0.0, -np.asarray(lin.residual_jacobian))
         spots = linear_spots(lin, arrays, jacobian)
         found = stop_information(spots)

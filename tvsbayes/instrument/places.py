@@ -51,6 +51,11 @@ class SeenPlaces:
     error_share: np.ndarray
     play_share: np.ndarray
 
+    @property
+    def none(self) -> SeenPlaces:
+        """No place, of the same looks."""
+        return SeenPlaces(self.steps[:0], self.on_tilt[:0], self.error_share[:, :0], self.play_share[:, :0])
+
 
 def interpolation(counters: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Share of each counter (n,) in regular or fewer nodes (m,), ascending: Lagrange polynomials, shape (n, m)."""

@@ -3,15 +3,15 @@
 Tracing a large function takes JAX seconds in every process, and its compilation cache saves none of them. A `compiled`
 function is traced once for every shape of its arguments; where a program has asked for a cache folder, what the trace
 gave (StableHLO, by `jax.export`) is kept there and run by later processes, which neither trace nor compile. A stored
-trace belongs to one state of the package's source, one version of the libraries that took part, and one shape of the
-arguments; it is code, and read only as `files.own_folder` allows.
+trace belongs to one state of the sources that it was traced through, one version of the libraries that took part, and
+one shape of the arguments; it is code, and read only as `files.own_folder` allows.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
-import os
+import re
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -27,7 +27,7 @@ from jax.typing import ArrayLike
 
 from tvsbayes.files.own_folder import OwnFolder
 
-LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
+LIBRARIES = ("jax", "jaxlib", "equinox", "numpy")
 """Whose versions decide what a trace gives."""
 BATCH = 32
 """Points per call of a function of many: half an ensemble of 64, the calls of a differential-evolution step."""
@@ -36,6 +36,40 @@ KEPT_SHARE = 0.1
 PACKAGE = Path(__file__).resolve().parents[1]
 LOADED_TIME_S = time.time()
 """When this process read its code, seconds since the epoch: source written later is not what it runs."""
+
+
+IMPORTS = re.compile(rb"^[ \t]*(?:from|import)[ \t]+(tvsbayes[\w.]*)(?:[ \t]+import[ \t]+(\w+))?", re.MULTILINE)
+
+
+@functools.cache
+def sources_of(module: str, package: Path) -> dict[Path, bytes]:
+    """Files of a package, with their contents, that a function of a module may be traced through, sorted.
+
+    Its own and those that it imports, and so on: what else the package says changes no trace. Of a module that is not
+    in the package every file.
+
+    Args:
+        module: its name.
+        package: folder.
+    """
+    found: dict[Path, bytes] = {}
+    start = _file_of(module, package)
+    waiting = [start] if start is not None else [*package.rglob("*.py")]
+    while waiting:
+        path = waiting.pop()
+        if path in found:
+            continue
+        found[path] = path.read_bytes()
+        for name, part in IMPORTS.findall(found[path]):
+            files = _file_of(name.decode(), package), _file_of(f"{name.decode()}.{part.decode()}", package)
+            waiting += [file for file in files if file is not None]
+    return dict(sorted(found.items()))
+
+
+def _file_of(module: str, package: Path) -> Path | None:
+    parts = module.split(".")
+    path = package.joinpath(*parts[1:]).with_suffix(".py")
+    return path if parts[0] == package.name and parts[1:] and path.is_file() else None
 
 
 class Traces:
@@ -50,28 +84,19 @@ class Traces:
     def __init__(self, folder: Path) -> None:
         self.folder = OwnFolder(folder)
 
-    @functools.cached_property
-    def sources(self) -> list[str]:
-        """Every file of the package, sorted."""
-        found = [os.path.join(folder, name) for folder, _, names in os.walk(PACKAGE) for name in names]
-        return sorted(path for path in found if path.endswith(".py"))
-
-    @functools.cached_property
-    def code(self) -> bytes:
-        """Hash of the source of the whole package and of the versions of the libraries."""
+    def code(self, module: str) -> bytes:
+        """Hash of the sources that a function of a module is traced through, and of the versions of the libraries."""
         found = hashlib.sha256(" ".join(version(library) for library in LIBRARIES).encode())
-        for path in self.sources:
-            with open(path, "rb") as stream:
-                content = stream.read()
-            found.update(f"{os.path.relpath(path, PACKAGE)} {len(content)}\n".encode() + content)
+        for path, content in sources_of(module, PACKAGE).items():
+            found.update(f"{path.relative_to(PACKAGE)} {len(content)}\n".encode() + content)
         return found.digest()
 
-    def name(self, key: str) -> str:
-        """The file of a trace; "" where the source has changed since this process read it, or cannot be read."""
+    def name(self, key: str, module: str = "") -> str:
+        """The file of a trace; "" where its source has changed since this process read it, or cannot be read."""
         try:
-            if any(os.stat(path).st_mtime > LOADED_TIME_S for path in self.sources):
+            if any(path.stat().st_mtime > LOADED_TIME_S for path in sources_of(module, PACKAGE)):
                 return ""
-            return hashlib.sha256(self.code + key.encode()).hexdigest()
+            return hashlib.sha256(self.code(module) + key.encode()).hexdigest()
         except OSError:
             return ""
 
@@ -180,7 +205,7 @@ class Compiled[**P, Result]:
         kinds = [Kind(array.shape, array.dtype) for array in arrays]
         backend = jax.default_backend()
         key = repr((self.plain.__module__, self.plain.__qualname__, str(structure), kinds, backend))
-        name = traces.name(key) if traces is not None else ""
+        name = traces.name(key, self.plain.__module__) if traces is not None else ""
         if traces is None or not name:
             return jax.jit(flat)
         exported = traces.load(name)

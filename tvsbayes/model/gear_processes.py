@@ -55,6 +55,13 @@ class Places(eqx.Module):
         return jnp.where(self.on_tilt, of_axis[1], of_axis[0])
 
 
+def errors_at(errors: np.ndarray, places: int) -> np.ndarray:
+    """Transmission errors, then plays (n, e) at the first places, with those at all (n, 2 places); nothing behind."""
+    found = np.zeros((len(errors), 2, places))
+    found[:, :, : errors.shape[1] // 2] = np.reshape(errors, (len(errors), 2, -1))
+    return found.reshape(len(errors), -1)
+
+
 def _by_axis(of_axis: Any, on_tilt: Any, functions: ModuleType) -> Any:
     """Numbers (..., 2) of the axes at the places, shape (..., places)."""
     return functions.where(on_tilt, of_axis[..., 1:], of_axis[..., :1])

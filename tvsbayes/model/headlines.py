@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from tvsbayes.instrument.parameters import BLOCKS, COLUMNS, INDEX, QUANTITIES, TARGETS
 from tvsbayes.instrument.quantities import Quantity
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.gear_processes import Places
+from tvsbayes.model.gear_processes import Places, errors_at
 from tvsbayes.model.geometry import materialise
 from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles, trace
 from tvsbayes.model.parameter_space import Model, ParameterSpace
@@ -207,14 +207,12 @@ def line_deg_per_step(
 
 
 @compiled(Derived)
-def derived_quantities(
+def _derived(
     z: Float[Array, "draws parameters"],
     place_errors_rad: Float[Array, "draws errors"],
     space: ParameterSpace,
     seen: SeenLine,
 ) -> Derived:
-    """Headlines of many points at once (formulation 3.2); every field has the leading axis `draws`."""
-
     def one(z, errors):
         physical = materialise(space.physical(z))
         model = space.model_at(physical)
@@ -223,3 +221,17 @@ def derived_quantities(
         return Derived(physical, values_of(at, _MODELLED_BLOCKS), angles.jacobian, errors)
 
     return jax.vmap(one)(z, place_errors_rad)
+
+
+def derived_quantities(z: np.ndarray, place_errors_rad: np.ndarray, space: ParameterSpace, seen: SeenLine) -> Derived:
+    """Headlines of many points at once (formulation 3.2), as NumPy arrays; every field has the leading axis `draws`.
+
+    Args:
+        z: coordinates, shape (draws, p).
+        place_errors_rad: transmission errors, then plays, at the first of the places, shape (draws, e).
+        space: priors.
+        seen: lines.
+    """
+    given = np.asarray(place_errors_rad)
+    found = _derived(z, errors_at(given, max(len(seen.places.steps), given.shape[1] // 2)), space, seen)
+    return eqx.tree_at(lambda of: of.place_errors_rad, jax.tree.map(np.asarray, found), given)

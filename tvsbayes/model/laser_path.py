@@ -6,11 +6,13 @@ and vectors by their components are those of `instrument.mirrors`.
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.head.chain import HeadOptics
 from tvsbayes.instrument.mirrors import Optics, Ray, Vectors, laser_way
@@ -20,6 +22,8 @@ from tvsbayes.model.geometry import Scalar, materialise
 UNIFORM_SD = 1 / 12**0.5
 """Standard deviation of a uniform distribution of unit width."""
 ORDERS = np.array(HARMONIC_ORDERS, dtype=float)
+STRETCH = 64
+"""Moves that are followed together: a campaign costs what its own moves need, not what it was padded to."""
 
 
 class Harmonics(eqx.Module):
@@ -108,11 +112,35 @@ class MirrorAngles(eqx.Module):
     play_sd_rad: Float[Array, "moves 2"]
 
 
-def way_steps(moves: MoveArrays) -> Float[Array, "moves 2"]:
+class Reached(eqx.Module):
+    """Where the moves before others end: ends of the play's band, counters, and the way since the segment began."""
+
+    low_rad: Float[Array, "2"]
+    high_rad: Float[Array, "2"]
+    steps: Float[Array, "2"]
+    way_steps: Float[Array, "2"]
+
+
+def nowhere() -> Reached:
+    """Before the first move, which begins a segment."""
+    return Reached(*(jnp.zeros(2) for _ in range(4)))
+
+
+def way_steps(moves: MoveArrays, before: Reached | None = None) -> Float[Array, "moves 2"]:
     """Steps that each axis has gone, forwards and backwards, since its segment began."""
-    gone = jnp.abs(jnp.diff(moves.steps, axis=0, prepend=jnp.zeros((1, 2))))
-    total = jnp.cumsum(jnp.where(moves.first[:, None], 0.0, gone), axis=0)
-    return total - jax.lax.cummax(jnp.where(moves.first[:, None], total, 0.0))
+    before = nowhere() if before is None else before
+    gone = jnp.abs(jnp.diff(moves.steps, axis=0, prepend=before.steps[None]))
+    total = before.way_steps + jnp.cumsum(jnp.where(moves.first[:, None], 0.0, gone), axis=0)
+    begun = jnp.where(moves.first[:, None], total, 0.0)
+    return total - jax.lax.cummax(begun)
+
+
+class Stretch(eqx.Module):
+    """Some moves, followed: their angles, the number of the next move, and where it begins."""
+
+    angles: MirrorAngles
+    next: Int[Array, ""]
+    reached: Reached
 
 
 def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: MoveArrays) -> MirrorAngles:
@@ -130,11 +158,18 @@ def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: Move
     Returns:
         Mirror angles (pan, tilt) after each move.
     """
+    return followed(transmission, tilt_zero_rad, moves, jnp.zeros((), dtype=int), nowhere()).angles
+
+
+def followed(
+    transmission: Transmission, tilt_zero_rad: Scalar, moves: MoveArrays, number: Int[Array, ""], before: Reached
+) -> Stretch:
+    """`mirror_angles` of moves that follow others; `number` is that of the first of them."""
     half = transmission.backlash_rad / 2
     harmonics = transmission.harmonics
     # Since the segment began: k n + c/2 times the way gone, for k + c/2 forwards and k - c/2 backwards.
-    travelled = 0.5 * transmission.contrast_rad_per_step * way_steps(moves)
-    q = transmission.ratio_rad_per_step * moves.steps + travelled
+    way = way_steps(moves, before)
+    q = transmission.ratio_rad_per_step * moves.steps + 0.5 * transmission.contrast_rad_per_step * way
     # The errors know no history: outside the scan they cost one vector operation.
     driven = q + jnp.where(harmonics.on_wheel, 0.0, harmonics.error_rad(q))
 
@@ -146,13 +181,67 @@ def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: Move
         high = jnp.where(first, jnp.where(approach > 0, q - half, q + half), jnp.clip(high, q - half, q + half))
         return (low, high), (0.5 * (low + high), UNIFORM_SD * (high - low))
 
-    zero = jnp.zeros(2)
-    _, (output, play_sd_rad) = jax.lax.scan(take_up, (zero, zero), (driven, moves.first, moves.approach))
+    rows = driven, moves.first, moves.approach
+    (low, high), (output, play_sd_rad) = jax.lax.scan(take_up, (before.low_rad, before.high_rad), rows)
     output += jnp.where(harmonics.on_wheel, harmonics.error_rad(output), 0.0)
     output += jnp.stack([jnp.zeros(()), tilt_zero_rad])
     if transmission.zero_shift is not None and moves.warm_minutes is not None and moves.kelvin is not None:
         output += transmission.zero_shift.shift_rad(moves.warm_minutes, moves.kelvin)
-    return MirrorAngles(output, play_sd_rad)
+    reached = Reached(low, high, moves.steps[-1], way[-1])
+    return Stretch(MirrorAngles(output, play_sd_rad), number + len(moves.steps), reached)
+
+
+def no_moves(moves: MoveArrays) -> Stretch:
+    """Before the first stretch of moves."""
+    none = jnp.zeros((stretch_size(moves), 2))
+    return Stretch(MirrorAngles(none, none), jnp.zeros((), dtype=int), nowhere())
+
+
+def stretch_size(moves: MoveArrays) -> int:
+    """Moves that are followed together: `STRETCH`, or what divides the padded number evenly."""
+    count = len(moves.steps)
+    return count if count <= STRETCH else math.gcd(count, STRETCH)
+
+
+class AnglesAt(eqx.Module):
+    """Mirror angles at the moves that were looked for, and the last stretch that was followed for them."""
+
+    angles: MirrorAngles
+    stretch: Stretch
+
+
+def angles_at(
+    transmission: Transmission,
+    tilt_zero_rad: Scalar,
+    moves: MoveArrays,
+    index: Int[Array, " looks"],
+    so_far: Stretch,
+) -> AnglesAt:
+    """`mirror_angles` at the moves before looks, of which only those up to the last look are followed.
+
+    Args:
+        transmission: gears of both axes.
+        tilt_zero_rad: tilt mirror angle at mid-play and counter zero.
+        moves: absolute counters in time order.
+        index: ascending; none lies before `so_far`.
+        so_far: `no_moves`, or from earlier looks.
+    """
+    size = stretch_size(moves)
+
+    def known(stretch: Stretch, before: MirrorAngles) -> MirrorAngles:
+        row = index - (stretch.next - size)
+        there, row = ((row >= 0) & (row < size))[:, None], jnp.clip(row, 0, size - 1)
+        return jax.tree.map(lambda own, old: jnp.where(there, own[row], old), stretch.angles, before)
+
+    def further(state: AnglesAt) -> AnglesAt:
+        start = state.stretch.next
+        rows = jax.tree.map(lambda array: jax.lax.dynamic_slice_in_dim(array, start, size), moves)
+        stretch = followed(transmission, tilt_zero_rad, rows, start, state.stretch.reached)
+        return AnglesAt(known(stretch, state.angles), stretch)
+
+    none = jnp.zeros((len(index), 2))
+    begin = AnglesAt(known(so_far, MirrorAngles(none, none)), so_far)
+    return jax.lax.while_loop(lambda state: state.stretch.next <= index[-1], further, begin)
 
 
 class Reflections(eqx.Module):

@@ -25,8 +25,8 @@ from tvsbayes.estimators.campaign_arrays import (
     CampaignArrays,
     SpotArrays,
     bucket,
-    gear_arrays,
     move_arrays,
+    no_gears,
     padded,
 )
 from tvsbayes.estimators.joint_fit import JointFit, with_places
@@ -37,7 +37,7 @@ from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
 from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.mirrors import Ray
 from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, NAMES, NOISE_NAMES
-from tvsbayes.instrument.places import gears_vary, seen_places
+from tvsbayes.instrument.places import gears_vary
 from tvsbayes.instrument.plan import PlanLog, PlanStep, plan_seconds, run_plan
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import redraws
@@ -146,7 +146,7 @@ def taught_errors(result: JointFit, covariance: np.ndarray) -> TaughtErrors | No
     if not len(result.information.place_mean):
         return None
     both = with_places(result.z, covariance, result.information)
-    valid = np.asarray(result.arrays.gears.places.valid)
+    valid = result.arrays.gears.without_padding().places.valid
     rows = np.concatenate([np.ones(PARAMETERS, dtype=bool), valid, valid])
     return TaughtErrors(fit_places(result), both.covariance[np.ix_(rows, rows)])
 
@@ -280,8 +280,9 @@ def design_arrays(
             homed=padded(new.homed, size, False, bool),
             hours=padded(new.hours, size),
         ),
-        gear_arrays(seen_places(moves, look_moves, rig.table), size, vary=False),
+        no_gears(size),
         placed(rig.table.aperture_convention == "azimuth"),
+        placed(np.int32(count)),
     )
 
 

@@ -224,7 +224,8 @@ def _shown(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> _Shown:
         )
         none = jnp.zeros(0, dtype=bool)
         gears = GearArrays(Places(jnp.zeros(0), none, none), jnp.zeros((1, 0)), jnp.zeros((1, 0)))
-        arrays = CampaignArrays(pair.moves(eyes.warm_minutes), spot, gears, eyes.azimuth_convention)
+        alone = jnp.ones((), dtype=jnp.int32)
+        arrays = CampaignArrays(pair.moves(eyes.warm_minutes), spot, gears, eyes.azimuth_convention, alone)
         # Errors of the gears turn the mirrors as an offset does: their columns follow from its, outside.
         still = jnp.zeros((1, 2, 0))
         found = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], eyes.image_px, still)

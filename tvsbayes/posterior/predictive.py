@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, spot_constants
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, bucket, spot_constants
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import (
     STATES,
@@ -25,7 +25,7 @@ from tvsbayes.estimators.likelihood import (
     kalman_update,
     no_belief,
 )
-from tvsbayes.estimators.looks import observe_with_stop_errors
+from tvsbayes.estimators.looks import WINDOW, observe_with_stop_errors
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots
 from tvsbayes.instrument.parameters import INDEX, names_of
@@ -87,28 +87,12 @@ class LaterSpots(eqx.Module):
 
 
 @compiled(jax.Array)
-def move_log_density(
+def _by_move(
     z: Float[Array, "batch parameters"],
-    place_errors_rad: Float[Array, "batch errors"],
+    turned_rad: Float[Array, "batch spots 2"],
     space: ParameterSpace,
     arrays: CampaignArrays,
 ) -> Float[Array, "batch spots"]:
-    """Log density of the spots of each move given ALL other spots, parameters and gear errors (formulation 4.3).
-
-    Stop errors persist while their axis stands, so spots are not independent given the parameters; whole moves
-    are the unit that can be left out. Backward and forward passes meet at each move (two-filter smoother: Fraser
-    and Potter, IEEE Trans. Automat. Control 14 (1969) 387).
-
-    Args:
-        z: coordinates of many points.
-        place_errors_rad: transmission errors, then plays, at the places; a draw for each point.
-        space: priors.
-        arrays: the campaign.
-
-    Returns:
-        Contribution of each spot given the earlier spots of its own move and all spots of the other moves: the sum
-        over a move's spots is the move's log density, without `campaign_arrays.spot_constants`.
-    """
     index = arrays.spots.move_index
     other = index[1:] != index[:-1]
     first, last = jnp.append(True, other), jnp.append(other, True)
@@ -128,17 +112,42 @@ def move_log_density(
         log_density = log_scale - 0.5 * seen.log_variance - 0.5 * jnp.sum(seen.standardised**2)
         return (kalman_update(belief, row).belief, seen.belief), log_density
 
-    def one(z, errors_rad):
+    def one(z, turned_rad):
         given = filter_input(space.model(z), arrays)
-        columns = given.rows.residual
-        left = columns[..., 0] - columns[..., 1:] @ errors_rad
+        left = given.rows.residual - jnp.einsum("sij,sj->si", given.slope, turned_rad)
         given = eqx.tree_at(lambda x: x.rows.residual, given, left)
         nothing = LaterSpots(jnp.zeros((STATES, STATES)), jnp.zeros(STATES))
         _, beyond = jax.lax.scan(backward, (nothing, nothing), (given.rows, last), reverse=True)
         rows = (given.rows, first, beyond, given.log_scale)
         return jax.lax.scan(forward, (no_belief(), no_belief()), rows)[1]
 
-    return jax.vmap(one)(z, place_errors_rad)
+    return jax.vmap(one)(z, turned_rad)
+
+
+def move_log_density(
+    z: np.ndarray, place_errors_rad: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
+) -> np.ndarray:
+    """Log density of the spots of each move given ALL other spots, parameters and gear errors (formulation 4.3).
+
+    Stop errors persist while their axis stands, so spots are not independent given the parameters; whole moves
+    are the unit that can be left out. Backward and forward passes meet at each move (two-filter smoother: Fraser
+    and Potter, IEEE Trans. Automat. Control 14 (1969) 387). Compiled for `WINDOW` spots or a doubling of them.
+
+    Args:
+        z: coordinates of many points, shape (n, p).
+        place_errors_rad: transmission errors, then plays, at the filled places, shape (n, e); a draw for each point.
+        space: priors.
+        arrays: the campaign.
+
+    Returns:
+        Contribution of each spot given the earlier spots of its own move and all spots of the other moves, shape (n,
+        spots): the sum over a move's spots is the move's log density, without `campaign_arrays.spot_constants`.
+    """
+    count = int(arrays.count)
+    own = arrays.of_spots(0, min(bucket(count, WINDOW), len(arrays.spots.valid)))
+    turned_rad = np.zeros((len(z), len(own.spots.valid), 2))
+    turned_rad[:, :count] = turned_by(arrays, place_errors_rad)
+    return np.asarray(_by_move(z, turned_rad, space, own))[:, :count]
 
 
 @dataclass(frozen=True)
@@ -185,9 +194,9 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
 
     def of_way(fit: JointFit, rows: np.ndarray) -> np.ndarray:
         given = z[rows], errors_rad[rows]
-        return in_batches(lambda z, e: np.asarray(move_log_density(z, e, fit.space, fit.arrays)), *given)
+        return in_batches(lambda z, e: move_log_density(z, e, fit.space, fit.arrays), *given)
 
-    by_spot = by_way(ways_of(posterior, np.arange(len(z))), of_way)[:, : len(spots)] + spot_constants(fit.campaign)
+    by_spot = by_way(ways_of(posterior, np.arange(len(z))), of_way) + spot_constants(fit.campaign)
     index = np.array([spot.move for spot in spots])
     moves_seen = np.unique(index[used])
     values = np.stack([by_spot[:, used & (index == move)].sum(axis=1) for move in moves_seen], axis=1)
@@ -199,18 +208,23 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
 def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarray:
     """Noiseless pixels of all ordered spots, shape (draws, spots, 4), for coordinates (draws, p)."""
     seen = in_batches(lambda z, e: observe_with_stop_errors(z, e, fit.space, fit.arrays), z, stop_error_rad)
-    return np.asarray(seen)[:, : len(ordered_spots(fit.campaign)), :4]
+    return seen[..., :4]
+
+
+def turned_by(arrays: CampaignArrays, place_errors_rad: np.ndarray) -> np.ndarray:
+    """What the gears' repeating errors (draws, e) do to the angles (pan, tilt) of spots, shape (draws, spots, 2)."""
+    gears = arrays.gears.without_padding()
+    count, spots = len(gears.places.steps), int(arrays.count)
+    axes = []
+    for own in (~gears.places.on_tilt, gears.places.on_tilt):
+        error = place_errors_rad[:, :count][:, own] @ gears.error_share[:spots, own].T
+        axes.append(error + place_errors_rad[:, count:][:, own] @ gears.play_share[:spots, own].T)
+    return np.stack(axes, axis=2)
 
 
 def repeated_rad(fit: JointFit, place_errors_rad: np.ndarray) -> np.ndarray:
-    """What the gears' repeating errors (draws, e) do to the angles (pan, tilt) of spots, shape (draws, spots, 2)."""
-    gears = jax.tree.map(np.asarray, fit.arrays.gears)
-    count = len(gears.places.steps)
-    axes = []
-    for own in (~gears.places.on_tilt, gears.places.on_tilt):
-        error = place_errors_rad[:, :count][:, own] @ gears.error_share[:, own].T
-        axes.append(error + place_errors_rad[:, count:][:, own] @ gears.play_share[:, own].T)
-    return np.stack(axes, axis=2)
+    """`turned_by` of a fit's campaign."""
+    return turned_by(fit.arrays, place_errors_rad)
 
 
 def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
@@ -264,15 +278,14 @@ def looks_again(
     looks and pixel noise are drawn anew; ranges are those observed.
     """
     count = len(ordered_spots(fit.campaign))
-    arrays = jax.tree.map(np.asarray, fit.arrays.spots)
+    arrays = jax.tree.map(lambda of_spot: np.asarray(of_spot)[:count], fit.arrays.spots)
     sd_rad = np.radians(physical[:, STOP_COLUMNS])
     variance = np.sum(arrays.redraw_mix[None] * sd_rad[:, None] ** 2, axis=3)
     fresh = np.sqrt(variance) * generator.standard_normal(variance.shape)
-    size = len(arrays.valid)
-    rows = np.arange(size)[:, None]
+    rows = np.arange(count)[:, None]
     error = np.take_along_axis(fresh, np.maximum.accumulate(np.where(arrays.redraw, rows, 0), axis=0)[None], axis=1)
-    home = np.radians(HOME_SD_DEG) * generator.standard_normal((len(z), size, 2)) * arrays.homed[:, None]
-    segment = np.maximum.accumulate(np.where(arrays.new_segment, np.arange(size), 0))
+    home = np.radians(HOME_SD_DEG) * generator.standard_normal((len(z), count, 2)) * arrays.homed[:, None]
+    segment = np.maximum.accumulate(np.where(arrays.new_segment, np.arange(count), 0))
     drift_rad = np.radians(physical[:, DRIFT_COLUMNS])
     walked = drift_rad[:, None] * np.sqrt(arrays.hours)[:, None] * generator.standard_normal(home.shape)
     total = np.cumsum(walked, axis=1)
@@ -281,9 +294,9 @@ def looks_again(
     error = error + repeated_rad(fit, place_errors_rad)
     # Where the play stands is unknown after an unknown approach: Gaussian, as in the filter.
     place = generator.standard_normal(home.shape)[:, segment]
-    error[:, :count] += fit.linearised.play_sd_rad * place[:, :count]
+    error = error + fit.linearised.play_sd_rad * place
     pixel_scale = physical[:, INDEX["pixel_scale"]].reshape(-1, 1, 1)
-    root = np.linalg.inv(arrays.whitening[:count])
+    root = np.linalg.inv(arrays.whitening)
     noise = np.einsum("sij,nsj->nsi", root, generator.standard_normal((len(z), count, 4)))
     error = error + np.radians(physical[:, None, SCATTER_COLUMNS]) * generator.standard_normal(error.shape)
     return looks(fit, z, error) + pixel_scale * noise

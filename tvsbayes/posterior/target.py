@@ -85,14 +85,14 @@ class Target:
 
     def place_normals(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """What `evaluate` makes draws of the errors at places from."""
-        return generator.standard_normal((count, 2 * len(self.fit.arrays.gears.places.steps)))
+        return generator.standard_normal((count, 2 * self.fit.arrays.gears.filled))
 
     def at(self, w: np.ndarray, found: Mapped, normal: np.ndarray) -> Points:
         """Of points that are mapped already, with draws of the errors from standard normal numbers (n, e)."""
 
-        def value_and_errors(z: np.ndarray, normal: np.ndarray) -> tuple[jax.Array, jax.Array]:
+        def value_and_errors(z: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             seen = evaluate(z, normal, self.fit.space, self.fit.arrays)
-            return seen.log_density, seen.place_errors_rad
+            return np.asarray(seen.log_density), np.asarray(seen.place_errors_rad)
 
         value, errors_rad = in_batches(value_and_errors, found.z, normal)
         invalid = np.isnan(value)

@@ -515,7 +515,7 @@ def transport(fit: JointFit) -> Transport:
     wide = np.linalg.cholesky(covariance[np.ix_(order, order)])
     stops, drifts = stop_states(fit, linear), walks(fit)
     by_noise, by_scatter = STOP_COLUMNS.reshape(4, 1) == noise, SCATTER_COLUMNS.reshape(2, 1) == noise
-    places = jax.tree.map(np.asarray, fit.arrays.gears.places)
+    places = fit.arrays.gears.without_padding().places
     seen = np.flatnonzero(places.valid)
     columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, 2 * len(places.steps))
     half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
@@ -523,8 +523,7 @@ def transport(fit: JointFit) -> Transport:
     spots = len(linear.residual)
 
     def misfit(z: np.ndarray) -> np.ndarray:
-        found = in_batches(lambda at: residuals(at, fit.space, fit.arrays), z)
-        return np.asarray(found)[:, :spots].reshape(len(z), -1)
+        return in_batches(lambda at: residuals(at, fit.space, fit.arrays), z).reshape(len(z), -1)
 
     wider = np.flatnonzero(np.diag(wide) >= NARROW)
     narrow = len(others) - (int(wider[-1]) + 1 if len(wider) else 0)
@@ -553,7 +552,7 @@ def transport(fit: JointFit) -> Transport:
         residuals=misfit,
         bend=np.zeros((len(others), narrow, narrow)),
         place_angle_rad=(places.steps * ratio[places.on_tilt.astype(int)])[seen],
-        place_on_tilt=places.on_tilt[seen],
+        place_on_tilt=np.asarray(places.on_tilt)[seen],
         walk=drifts.walk,
         drift_scale=np.radians(np.asarray(fit.mode.physical)[DRIFT_COLUMNS]),
         drift_noise=(DRIFT_COLUMNS[:, None] == noise).astype(float),

@@ -1,24 +1,24 @@
 """Minima of sums of squares and of negative log densities, with the covariance there; float64 throughout.
 
-optimistix' `LevenbergMarquardt` reports success on wrong answers at loose tolerances, so nobody believes its flag: the
-joint fit goes on with Newton steps on the density and judges the step that is left, the bundle adjustment judges the
-next step and a second descent. Residuals are dimensionless (divided by their standard deviations) or in the data's
-unit, as the caller chose; the covariance follows that choice.
+Where Levenberg's and Marquardt's steps end is no minimum yet: the joint fit goes on with Newton steps on the density
+and judges the step that is left, the bundle adjustment judges the next step and a second descent. Residuals are
+dimensionless (divided by their standard deviations) or in the data's unit, as the caller chose; the covariance follows
+that choice.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import cast
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
-from scipy import optimize
+from scipy import linalg, optimize
 
 DIFFERENCE_STEP = 2e-3
 """Of central differences, in posterior standard deviations. Along a bent ridge third derivatives reach ten and fourth
@@ -27,6 +27,11 @@ makes 1e-8."""
 PAIR_STEP = 3e-4
 """Of second differences, one-sided for pairs of ways: a mixed third derivative of a few units is worth 1e-3 of the
 curvature, rounding of a density of 1e4 (1e-11) 2e-4; both are below the thousandth part of any sd that is reported."""
+POOR, GOOD = 0.1, 0.75
+"""Shares of the fall of the sum of squares that the linear model predicts: a step that brings less than the one is
+taken back, one that brings more than the other widens the trust in it (Gould, Orban, Sartenaer and Toint, 4OR 3 (2005)
+227)."""
+WIDENED, NARROWED = 10.0, 0.2
 KINK_STEP = 0.25
 """Newton step, in posterior sds, that may be left where the density falls nowhere along it: on a kink, where a move is
 as long as the play that it takes up, or where the rounding of a thousand looks hides the rest."""
@@ -49,43 +54,17 @@ Residual = Callable[[Float[Array, " parameters"], PyTree], Float[Array, " residu
 class LinearResidual(eqx.Module):
     """Residuals at a point, their Jacobian there, exact or good enough to descend by, and what else came of it."""
 
-    value: Float[Array, " residuals"]
-    jacobian: Float[Array, "residuals parameters"]
-    also: PyTree = None
+    value: Float[Array | np.ndarray, " residuals"]
+    jacobian: Float[Array | np.ndarray, "residuals parameters"]
+    also: Any = None
 
 
-class Descent(eqx.Module):
-    """Where a descent ended, and what else came of the residuals there."""
+@dataclass(frozen=True)
+class Descent:
+    """Where a descent ended, shape (p,), and what else came of the residuals there."""
 
-    value: Float[Array, " parameters"]
-    also: PyTree
-
-
-def damped_solver(tolerance: Float[Array, ""], *, normal_equations: bool = False) -> eqx.Module:
-    """Levenberg-Marquardt whose damping falls tenfold after every step that the linear model predicted well.
-
-    By default optimistix asks for 99 % agreement and divides by 3.5: in directions that only a prior holds, where
-    the damping is as large as the curvature, it then creeps.
-
-    Args:
-        tolerance: relative and absolute, of steps and of the sum of squares.
-        normal_equations: solve them by Cholesky instead of the Jacobian by QR: faster where their condition is
-            harmless, and it asks for nothing that a stored trace may not ask for.
-    """
-    # Here, since whoever takes a descent from its stored trace needs neither.
-    import lineax as lx
-    import optimistix as optx
-
-    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
-        # A traced tolerance, so that every stage shares the compilation, is a float to all of optimistix.
-        rtol=cast(float, tolerance),
-        atol=cast(float, tolerance),
-        linear_solver=lx.Normal(lx.Cholesky()) if normal_equations else lx.QR(),
-    )
-    search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
-        high_cutoff=0.75, low_cutoff=0.1, high_constant=10.0, low_constant=0.2
-    )
-    return eqx.tree_at(lambda s: s.search, solver, search)
+    value: np.ndarray
+    also: Any
 
 
 def linear_residual(residual: Residual, value: Float[Array, " parameters"], args: PyTree) -> LinearResidual:
@@ -98,46 +77,61 @@ residuals_and_jacobian = eqx.filter_jit(linear_residual)
 
 
 def descend(
-    linearised: Callable[[Float[Array, " parameters"], PyTree], LinearResidual],
-    solver: eqx.Module,
-    start: Float[Array, " parameters"],
-    args: PyTree,
-    max_steps: int,
+    linearised: Callable[[np.ndarray], LinearResidual], start: np.ndarray, tolerance: float, max_steps: int
 ) -> Descent:
-    """Where optimistix ends that starts there; to be compiled by the caller.
+    """Levenberg's and Marquardt's damped steps from a start, damping as trust in the linear model demands.
 
-    A step asks its linear model for columns, for products and for transposed products. Left to itself JAX compiles
-    (and runs) the residual's tangent code once for each; here the derivative is the one matrix that is given.
+    The model is asked once a step, by the caller's compiled function: a loop compiled around it would cost its
+    compilation once more. Where a step was predicted well damping falls tenfold: in directions that only a prior holds
+    it is as large as the curvature.
+
+    Args:
+        linearised: residuals and their Jacobian at a point (p,).
+        start: shape (p,).
+        tolerance: relative and absolute, of the last step and of what it changed in the residuals.
+        max_steps: points at most.
     """
-    import optimistix as optx
+    at, trust, here = start, 1.0, linearised(start)
+    settled = _small(np.asarray(here.value), here.value, tolerance)
+    for _ in range(max_steps - 1):
+        if settled:
+            break
+        change = -_damped_step(here, trust)
+        ahead, before = linearised(at + change), np.asarray(here.value)
+        value = np.asarray(ahead.value)
+        # Far out a model may overflow: such a step brings nothing.
+        with np.errstate(over="ignore", invalid="ignore"):
+            gained = np.sum(value**2) - np.sum(before**2)
+        predicted = np.sum((np.asarray(here.jacobian) @ change + before) ** 2) - np.sum(before**2)
+        if gained <= POOR * predicted:
+            trust *= WIDENED if gained < GOOD * predicted else 1.0
+            settled = _small(change, at + change, tolerance) and _small(value - before, value, tolerance)
+            at, here = at + change, ahead
+        else:
+            trust *= NARROWED
+    return Descent(at, here.also)
 
-    def attached(value, args):
-        at = jax.lax.stop_gradient(value)
-        found = linearised(at, args)
-        return found.value + found.jacobian @ (value - at), found.also
 
-    solution: optx.Solution = optx.least_squares(
-        attached,
-        cast(optx.AbstractLeastSquaresSolver, solver),
-        start,
-        args,
-        has_aux=True,
-        max_steps=max_steps,
-        throw=False,
-    )
-    return Descent(solution.value, solution.aux)
+def _small(change: np.ndarray, value: ArrayLike, tolerance: float) -> bool:
+    return bool(np.all(np.abs(change) < tolerance * (1 + np.abs(value))))
 
 
-@eqx.filter_jit
+def _damped_step(found: LinearResidual, trust: float) -> np.ndarray:
+    """What the linear model would go back, damped, by the stacked Jacobian's QR factors."""
+    value, jacobian = np.asarray(found.value), np.asarray(found.jacobian)
+    q, r = np.linalg.qr(np.concatenate([jacobian, np.eye(jacobian.shape[1]) / np.sqrt(trust)]))
+    return linalg.solve_triangular(r, q[: len(value)].T @ value, check_finite=False)
+
+
 def levenberg_marquardt(
-    residual: Residual,
-    start: Float[Array, " parameters"],
-    args: PyTree,
-    tolerance: Float[Array, ""],
-    max_steps: int,
-) -> Float[Array, " parameters"]:
-    """One Levenberg-Marquardt run; the tolerance is traced so that every run of a residual shares the compilation."""
-    return descend(partial(linear_residual, residual), damped_solver(tolerance), start, args, max_steps).value
+    residual: Residual, start: np.ndarray, args: PyTree, tolerance: float, max_steps: int
+) -> np.ndarray:
+    """One run on a residual that JAX differentiates."""
+
+    def linearised(at: np.ndarray) -> LinearResidual:
+        return residuals_and_jacobian(residual, jnp.asarray(at), args)
+
+    return descend(linearised, np.asarray(start), tolerance, max_steps).value
 
 
 NEIGHBOUR_STEPS, NEIGHBOUR_SETTLED = 20, 0.01

@@ -5,17 +5,21 @@ By the model itself (formulation 3), at the mode of a fit or at the centre of th
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.estimators.looks import in_frame_s, nearest_range
+from tvsbayes.estimators.looks import WINDOW, in_frame_s, nearest_range, spot_angles
 from tvsbayes.instrument.mirrors import Optics, Ray, Vectors
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import image, rotation_matrix, transform
-from tvsbayes.model.laser_path import mirror_angles, reflections
+from tvsbayes.model.laser_path import reflections
 from tvsbayes.model.parameter_space import ParameterSpace
 
 
@@ -40,20 +44,15 @@ class Ways(eqx.Module):
 
 
 @compiled(Ways)
-def laser_ways(
-    z: Float[Array, " parameters"], turned_rad: Float[Array, "looks 2"], space: ParameterSpace, arrays: CampaignArrays
+def _window(
+    z: Float[Array, " parameters"],
+    turned_rad: Float[Array, "looks 2"],
+    space: ParameterSpace,
+    arrays: CampaignArrays,
+    first: Int[Array, ""],
 ) -> Ways:
-    """Ways of all looks of a campaign, padding included.
-
-    Args:
-        z: coordinates.
-        turned_rad: added to the mirror angles (pan, tilt): what gears repeat by position.
-        space: priors.
-        arrays: the campaign.
-    """
-    model = space.model(z)
-    angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
-    pan, tilt = angles.angle_rad[arrays.spots.move_index].T + turned_rad.T
+    model, arrays = space.model(z), arrays.of_spots(first, len(turned_rad))
+    pan, tilt = spot_angles(model, arrays).angle_rad.T + turned_rad.T
     if not isinstance(model.optics, Optics):
         remedy = "`tvsbayes fit --details` has the terms of a head"
         raise InputError("usage", "view draws the mirrors of a scanner, and this is a pan-tilt head", remedy=remedy)
@@ -71,3 +70,20 @@ def laser_ways(
         end_mm=end.stacked(),
         predicted_px=jnp.stack(image(model.cameras, end)),
     )
+
+
+def laser_ways(z: np.ndarray, turned_rad: np.ndarray, space: ParameterSpace, arrays: CampaignArrays) -> Ways:
+    """Ways of all looks of a campaign, as NumPy arrays.
+
+    Args:
+        z: coordinates, shape (p,).
+        turned_rad: added to the mirror angles (pan, tilt), shape (looks, 2): what gears repeat by position.
+        space: priors.
+        arrays: the campaign.
+    """
+    count, size = len(turned_rad), min(WINDOW, len(arrays.spots.valid))
+    filled = np.zeros((-(-count // size) * size, 2))
+    filled[:count] = turned_rad
+    parts = [_window(z, filled[k : k + size], space, arrays, np.int32(k)) for k in range(0, count, size)]
+    joined = jax.tree.map(lambda *own: np.concatenate(own, axis=1)[:, :count], *parts)
+    return replace(joined, origin_mm=np.asarray(parts[0].origin_mm))

@@ -186,7 +186,7 @@ def _ways(campaign: Campaign, fitted: Fitted | None) -> Ways | None:
         return None
     if fitted is None:
         arrays = campaign_arrays(campaign)
-        turned = np.zeros((len(arrays.spots.valid), 2))
+        turned = np.zeros((int(arrays.count), 2))
         return laser_ways(np.zeros(len(NAMES)), turned, parameter_space(campaign.rig, campaign.stereo), arrays)
     fit = fitted.fit
     turned = repeated_rad(fit, np.asarray(fit.mode.place_errors_rad)[None])[0]

@@ -45,9 +45,10 @@ class Fault:
 
 FAULTS = (
     # Mirrors, gears, cameras: the model.
-    Fault("the contrast of the ratios has the wrong sign", "laser_path.mirror_angles", Local("travelled", "-value"),
+    Fault("the contrast of the ratios has the wrong sign", "laser_path.followed",
+          Reads("transmission.contrast_rad_per_step", "-value"),
           "test_contrast_is_positive_minus_negative_ratio"),
-    Fault("the backlash has the wrong sign", "laser_path.mirror_angles", Local("half", "-value"),
+    Fault("the backlash has the wrong sign", "laser_path.followed", Local("half", "-value"),
           "test_first_row_of_a_segment_rehomes_with_the_mean_ratio"),
     Fault("the creep of the zeros has the wrong sign", "shift_rad", Local("crept", "-value"), "test_zeros_in_time"),
     Fault("the mirror offset has the wrong sign", "beam_angles", Local("offset", "-value"),
@@ -68,7 +69,7 @@ FAULTS = (
     Fault("the drift of the zero is left out of the filter", "drift_variances", Reads("spots.hours", "0 * value"),
           "test_log_density_is_that_of_the_dense_gaussian"),
     Fault("the log-determinant of the stop errors is dropped", "likelihood.passed",
-          Reads("seen.log_variance", "0 * value"), "test_filter_equals_dense_gaussian"),
+          Reads("found.log_variance", "0 * value"), "test_filter_equals_dense_gaussian"),
     Fault("stop errors and zeros are forgotten between blocks of spots", "likelihood.passed",
           Call("filtered", "function(arg0)"), "test_blocks_of_spots_are_one_campaign"),
     Fault("a spot counts four residuals instead of three", "spot_residuals.spot_residuals",

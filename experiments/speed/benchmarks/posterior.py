@@ -11,7 +11,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from experiments.common.clock import timed
-from experiments.common.fits import compile_for
+from experiments.common.fits import without_padding
 from experiments.common.reference_samplers import (
     AXES,
     Run,
@@ -26,6 +26,7 @@ from experiments.common.rigs import dense_plan, mounted_rig
 from experiments.speed.benchmarks.measure import Bench, Case, Column
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.estimators.likelihood import log_density
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.posterior.target import WALKERS
@@ -100,8 +101,10 @@ class Contenders:
             def z_of(w):
                 return route.z_of_y(route.y_of_w(w))
 
+            arrays = without_padding(self.joint.arrays, len(self.joint.campaign.moves))
+
             def potential(w):
-                return self.joint.log_density - log_density(z_of(w), self.joint.space, self.joint.arrays)
+                return self.joint.log_density - log_density(z_of(w), self.joint.space, arrays)
 
             run = sampler(potential, route.index.size, Setting(CHAINS, WARMUP, DRAWS, seed))
             shape = run.draws.shape
@@ -128,7 +131,7 @@ def measure(bench: Bench) -> None:
     repeats = min(bench.repeats, REPEATS)
     if not bench.missing(NAME, (OURS, FIRST_TIER, NUTS, BLACKJAX, STRETCH), repeats):
         return
-    compile_for(BUCKET)
+    use_compilation_cache()
     jax.config.update("jax_enable_x64", True)
     joint = fit(simulate(mounted_rig(), dense_plan(("d1", "d3")), seed=1).campaign)
     # Compiles everything that `sample` calls, and gives the stretch move walkers that are draws already.
