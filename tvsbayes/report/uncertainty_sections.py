@@ -133,7 +133,7 @@ def _mattering(table: BudgetTable) -> list[BudgetRow]:
 def _named(row: BudgetRow) -> str:
     """The source of a row in words, with the unit of its u; standardised effects count in their sds."""
     words = source_in_words(row.quantity)
-    standardised = row.unit == "1" and row.quantity.removeprefix("prior of ") not in REGISTRY
+    standardised = row.unit == "1" and parameter_of(row.quantity.removeprefix("prior of ")) is None
     unit = "in sds" if standardised else row.unit.removesuffix("1")
     return words if row.u is None or not unit or words.endswith(f", {unit}") else f"{words}, {unit}"
 
