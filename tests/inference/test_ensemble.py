@@ -23,6 +23,8 @@ from tvsbayes.posterior.target import WALKERS, walkers_for
 RESOLVED = 0.05
 """Five standard errors of E[x.x]/d have to be below this, or the run could not see a bias of sd x0.97."""
 INDEPENDENT_STEPS = {1: 1500, 5: 600, 20: 600, 40: 900}
+DIMENSIONS = [1, 5, pytest.param(20, marks=pytest.mark.slow), 40]
+"""What five and forty see twenty sees too."""
 RENEWAL_STEPS = {**INDEPENDENT_STEPS, 1: 4500}
 EVOLUTION_STEPS = {1: 1500, 5: 1600, 20: 1000, 40: 900}
 """Steps by dimension: autocorrelation times (quoted from runs of 2000 steps) are 1.3 to 27 steps with independence
@@ -65,7 +67,7 @@ def off_target(dimension: int) -> Independence:
     return tabulated(np.full(dimension, 0.3), np.linspace(1.0, 1.2, dimension), places)
 
 
-@pytest.mark.parametrize("dimension", INDEPENDENT_STEPS)
+@pytest.mark.parametrize("dimension", DIMENSIONS)
 @pytest.mark.parametrize("which", ["independence", "renewal", "mixture"])
 def test_independence_and_the_mixture_keep_the_target(which, dimension):
     mixture = ensemble.moves(off_target(dimension))
@@ -75,7 +77,7 @@ def test_independence_and_the_mixture_keep_the_target(which, dimension):
     assert bias(run(moves, dimension, steps, walkers_for(dimension))) == ""
 
 
-@pytest.mark.parametrize("dimension", EVOLUTION_STEPS)
+@pytest.mark.parametrize("dimension", DIMENSIONS)
 def test_differential_evolution_keeps_the_target(dimension):
     move, _ = ensemble.moves(off_target(dimension))[2]
     assert isinstance(move, GroupEvolution)

@@ -107,8 +107,9 @@ def test_what_does_not_work_is_said_in_words(folder, monkeypatch, told, found):
     assert not state.used and found in state.found and state.remedy
 
 
-def test_the_doctor_says_it_without_hardware(folder, say):
+def test_the_doctor_says_it_without_hardware(folder, say, monkeypatch):
     """A rig file that names no port yet: its faults, and this computer's state."""
+    monkeypatch.setattr(subject, "_tried", answer)
     code, out, _ = say("doctor", ROOT / "data" / "rigs" / "mounted" / "rig.toml")
     assert code == 5
     (line,) = (line for line in out.splitlines() if "compilation cache" in line)

@@ -80,7 +80,7 @@ FAULTS = (
           Reads("spot.ruv_right", "spot.ruv_left"), "test_range_is_flat_in_image_displacement"),
     Fault("the stereo covariance enters with its root transposed", "look_jacobian.look_jacobian",
           Reads("space.stereo_root.T", "space.stereo_root"), "test_parts_make_the_whole"),
-    Fault("degrees are taken for radians", "parameter_space.SCALE", Constant("value**0"),
+    Fault("degrees are taken for radians", "parameter_space.scale_of", Returns("value**0"),
           "test_every_name_drives_its_field_and_nothing_else"),
     Fault("prior sds count twice", "parameter_space._values", Reads("space.u", "2 * value"),
           "test_physical_values_are_scipys_quantiles"),
