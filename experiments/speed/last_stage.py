@@ -23,7 +23,8 @@ from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import NAMES
-from tvsbayes.statistics.least_squares import LinearResidual, levenberg_marquardt, linear_residual
+from tvsbayes.model.descent import descend
+from tvsbayes.statistics.least_squares import LinearResidual, linear_residual, residuals_and_jacobian
 
 PEER_TOLERANCE = 1e-6
 ANNEALING = (60.0, 10.0, 2.0)
@@ -101,7 +102,9 @@ class LastStage:
         if kind is stage_residuals:
             space, _, fixed = self.args
             return stage(self.start, space, self.arrays, fixed, tolerance).z
-        return levenberg_marquardt(exact_values, self.start, self.args, tolerance, steps)
+        return descend(
+            lambda at: residuals_and_jacobian(exact_values, jnp.asarray(at), self.args), self.start, tolerance, steps
+        ).value
 
     def peer(self, method: str, differences: bool = False, kind: Linear = stage_residuals) -> np.ndarray:
         """Where `scipy.optimize.least_squares` ends, with the same Jacobian or with finite differences."""

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tvsbayes.statistics.least_squares import least_squares_covariance, levenberg_marquardt, residuals_and_jacobian
+from tvsbayes.model.descent import descend
+from tvsbayes.statistics.least_squares import least_squares_covariance, residuals_and_jacobian
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "strd"
 PRINTED_DIGITS = 11.0
@@ -127,7 +128,9 @@ class End:
 
 
 def descended(residual, start: np.ndarray, args, steps: int = STEPS) -> End:
-    value = levenberg_marquardt(residual, np.asarray(start), args, TOLERANCE, steps)
+    value = descend(
+        lambda at: residuals_and_jacobian(residual, jnp.asarray(at), args), np.asarray(start), TOLERANCE, steps
+    ).value
     found = residuals_and_jacobian(residual, value, args)
     residuals, jacobian = np.asarray(found.value), np.asarray(found.jacobian)
     sd = np.linalg.norm(residuals) / np.sqrt(max(residuals.size - value.size, 1))

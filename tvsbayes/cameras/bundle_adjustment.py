@@ -26,8 +26,9 @@ from tvsbayes.cameras.boards import Board, View
 from tvsbayes.errors import NotConverged, NothingToEstimate
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.model.compiled import compiled, placed
+from tvsbayes.model.descent import descend
 from tvsbayes.model.geometry import CV_FROM_S, StereoCameras, project, rotation_matrix
-from tvsbayes.statistics.least_squares import LinearResidual, descend, least_squares_covariance, linear_residual
+from tvsbayes.statistics.least_squares import LinearResidual, least_squares_covariance, linear_residual
 
 VIEWS_PER_BUCKET, CORNERS_PER_BUCKET = 16, 32
 """Padding: calibrations of like size share one compilation."""

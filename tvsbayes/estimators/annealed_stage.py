@@ -20,8 +20,9 @@ from tvsbayes.estimators.likelihood import STATES, Belief, Seen, filter_rows, fi
 from tvsbayes.estimators.linear_spots import Linearised, linearise
 from tvsbayes.estimators.spot_residuals import ToStates
 from tvsbayes.model.compiled import compiled
+from tvsbayes.model.descent import descend
 from tvsbayes.model.parameter_space import ParameterSpace
-from tvsbayes.statistics.least_squares import LinearResidual, descend
+from tvsbayes.statistics.least_squares import LinearResidual
 
 STAGE_TOLERANCE = 1e-2
 STAGE_STEPS = 12

@@ -1,9 +1,9 @@
 """Minima of sums of squares and of negative log densities, with the covariance there; float64 throughout.
 
-Where Levenberg's and Marquardt's steps end is no minimum yet: the joint fit goes on with Newton steps on the density
-and judges the step that is left, the bundle adjustment judges the next step and a second descent. Residuals are
-dimensionless (divided by their standard deviations) or in the data's unit, as the caller chose; the covariance follows
-that choice.
+optimistix' `LevenbergMarquardt` reports success on wrong answers at loose tolerances, so its flag decides nothing: the
+joint fit goes on with Newton steps on the density and judges the step that is left, the bundle adjustment judges the
+next step and a second descent. Residuals are dimensionless (divided by their standard deviations) or in the data's
+unit, as the caller chose; the covariance follows that choice.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
-from scipy import linalg, optimize
+from scipy import optimize
 
 DIFFERENCE_STEP = 2e-3
 """Of central differences, in posterior standard deviations. Along a bent ridge third derivatives reach ten and fourth
@@ -27,11 +26,6 @@ makes 1e-8."""
 PAIR_STEP = 3e-4
 """Of second differences, one-sided for pairs of ways: a mixed third derivative of a few units is worth 1e-3 of the
 curvature, rounding of a density of 1e4 (1e-11) 2e-4; both are below the thousandth part of any sd that is reported."""
-POOR, GOOD = 0.1, 0.75
-"""Shares of the fall of the sum of squares that the linear model predicts: a step that brings less than the one is
-taken back, one that brings more than the other widens the trust in it (Gould, Orban, Sartenaer and Toint, 4OR 3 (2005)
-227)."""
-WIDENED, NARROWED = 10.0, 0.2
 KINK_STEP = 0.25
 """Newton step, in posterior sds, that may be left where the density falls nowhere along it: on a kink, where a move is
 as long as the play that it takes up, or where the rounding of a thousand looks hides the rest."""
@@ -59,14 +53,6 @@ class LinearResidual(eqx.Module):
     also: Any = None
 
 
-@dataclass(frozen=True)
-class Descent:
-    """Where a descent ended, shape (p,), and what else came of the residuals there."""
-
-    value: np.ndarray
-    also: Any
-
-
 def linear_residual(residual: Residual, value: Float[Array, " parameters"], args: PyTree) -> LinearResidual:
     """Residuals and their Jacobian, the tangents of all parameters pushed forward side by side."""
     residuals, push = jax.linearize(lambda x: residual(x, args), value)
@@ -74,64 +60,6 @@ def linear_residual(residual: Residual, value: Float[Array, " parameters"], args
 
 
 residuals_and_jacobian = eqx.filter_jit(linear_residual)
-
-
-def descend(
-    linearised: Callable[[np.ndarray], LinearResidual], start: np.ndarray, tolerance: float, max_steps: int
-) -> Descent:
-    """Levenberg's and Marquardt's damped steps from a start, damping as trust in the linear model demands.
-
-    The model is asked once a step, by the caller's compiled function: a loop compiled around it would cost its
-    compilation once more. Where a step was predicted well damping falls tenfold: in directions that only a prior holds
-    it is as large as the curvature.
-
-    Args:
-        linearised: residuals and their Jacobian at a point (p,).
-        start: shape (p,).
-        tolerance: relative and absolute, of the last step and of what it changed in the residuals.
-        max_steps: points at most.
-    """
-    at, trust, here = start, 1.0, linearised(start)
-    settled = _small(np.asarray(here.value), here.value, tolerance)
-    for _ in range(max_steps - 1):
-        if settled:
-            break
-        change = -_damped_step(here, trust)
-        ahead, before = linearised(at + change), np.asarray(here.value)
-        value = np.asarray(ahead.value)
-        # Far out a model may overflow: such a step brings nothing.
-        with np.errstate(over="ignore", invalid="ignore"):
-            gained = np.sum(value**2) - np.sum(before**2)
-        predicted = np.sum((np.asarray(here.jacobian) @ change + before) ** 2) - np.sum(before**2)
-        if gained <= POOR * predicted:
-            trust *= WIDENED if gained < GOOD * predicted else 1.0
-            settled = _small(change, at + change, tolerance) and _small(value - before, value, tolerance)
-            at, here = at + change, ahead
-        else:
-            trust *= NARROWED
-    return Descent(at, here.also)
-
-
-def _small(change: np.ndarray, value: ArrayLike, tolerance: float) -> bool:
-    return bool(np.all(np.abs(change) < tolerance * (1 + np.abs(value))))
-
-
-def _damped_step(found: LinearResidual, trust: float) -> np.ndarray:
-    """What the linear model would go back, damped, by the stacked Jacobian's QR factors."""
-    value, jacobian = np.asarray(found.value), np.asarray(found.jacobian)
-    q, r = np.linalg.qr(np.concatenate([jacobian, np.eye(jacobian.shape[1]) / np.sqrt(trust)]))
-    return linalg.solve_triangular(r, q[: len(value)].T @ value, check_finite=False)
-
-
-def levenberg_marquardt(
-    residual: Residual, start: np.ndarray, args: PyTree, tolerance: float, max_steps: int
-) -> np.ndarray:
-    """One run on a residual that JAX differentiates."""
-
-    def linearised(at: np.ndarray) -> LinearResidual:
-        return residuals_and_jacobian(residual, jnp.asarray(at), args)
-
-    return descend(linearised, np.asarray(start), tolerance, max_steps).value
 
 
 NEIGHBOUR_STEPS, NEIGHBOUR_SETTLED = 20, 0.01
