@@ -241,9 +241,7 @@ def _results(
     mechanism = found.space.mechanism
     derived = {name: values for name, values in Draws(behind, mechanism).items() if name not in found.names}
     columns = np.stack(list(derived.values()), axis=1)
-    told = [column for column, name in enumerate(found.names) if name in mechanism.told]
-    names = tuple(found.names[column] for column in told)
-    draws = ResultDraws(names, physical[:, told], effective, found.reference_pose_rad, tuple(derived), columns)
+    draws = ResultDraws(found.names, physical, effective, found.reference_pose_rad, tuple(derived), columns)
     record = FitRecord(
         summary,
         covariance_of_draws(draws.names, draws.physical, summary.parameters),

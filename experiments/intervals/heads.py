@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.fits import compile_for
 from experiments.common.rigs import mounted_rig, shipped_plan
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.errors import TvsError
@@ -29,13 +28,13 @@ from tvsbayes.instrument.parameters import HEAD_TERMS, Prior, names_of
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.instrument.stereo_pair import NO_STEREO
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 
 ROWS = output(__file__, "heads.jsonl")
 KINDS = ("sightings", "spots")
-SMALLEST_BUCKET = 96
 PAN_STEPS, TILT_STEPS = (-1500, -800, -200, 400, 900, 1500), (100, 400, 800, 1200)
 LEVEL = 0.95
 SETTLED = 0.1
@@ -75,7 +74,7 @@ def plan_of(kind: str, seed: int) -> tuple[PlanStep, ...]:
 def one_head(task: tuple[str, int]) -> dict[str, object]:
     """One head; whatever fails is recorded as a failure."""
     kind, seed = task
-    compile_for(SMALLEST_BUCKET)
+    use_compilation_cache()
     simulated = simulate(head_of(kind), plan_of(kind, seed), seed)
     campaign, began = simulated.campaign, time.process_time()
     row: dict[str, object] = {"kind": kind, "seed": seed, "answer": "none", "problems": []}

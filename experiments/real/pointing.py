@@ -17,19 +17,18 @@ from pathlib import Path
 import numpy as np
 
 from experiments.common.command_line import parser
-from experiments.common.fits import compile_for
 from experiments.common.rows import append_row, output, read_rows
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.head.pointing_model import PointingModel, pointing_model
 from tvsbayes.head.pointing_table import AZIMUTH_FROM_DEG, Star, campaign_of, read_stars
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.sightings import sightings_of
+from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.predictive import looks_again
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.statistics.chances import rms_bounds
 
 ROWS = output(__file__, "pointing.jsonl")
-SMALLEST_BUCKET = 96
 TERMS = {
     "IA": ("azimuth_zero_deg", -1),
     "IE": ("elevation_zero_deg", 1),
@@ -134,7 +133,7 @@ def between(folder: Path) -> dict[str, object]:
 
 def run(arguments: argparse.Namespace) -> None:
     """A row for every table that is not there yet, and one of the first two nights together."""
-    compile_for(SMALLEST_BUCKET)
+    use_compilation_cache()
     done = {row["file"] for row in read_rows(ROWS)}
     for file in sorted(arguments.folder.glob("*.dat")):
         if file.name not in done:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.optics import Ray, Vector, ahead, beam_components, output_deg
+from tvsbayes.calibration.optics import Ray, Vector, ahead, beam_components, is_head, output_deg
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import APPROACH_SIGN, AXES, SIDES, bad_approach
@@ -83,9 +83,14 @@ class Direction:
     elevation_deg: float
 
     @property
+    def finite(self) -> bool:
+        """No number is no direction."""
+        return math.isfinite(self.azimuth_deg) and math.isfinite(self.elevation_deg)
+
+    @property
     def ahead(self) -> bool:
-        """Whether it leaves the baseline forwards; no number is no direction."""
-        return math.isfinite(self.azimuth_deg) and math.isfinite(self.elevation_deg) and abs(self.azimuth_deg) < 90
+        """Whether it leaves the baseline forwards."""
+        return self.finite and abs(self.azimuth_deg) < 90
 
     def seen_from(self, origin: Vector) -> Direction:
         """The same from everywhere."""
@@ -99,9 +104,14 @@ class Point:
     xyz_mm: np.ndarray
 
     @property
+    def finite(self) -> bool:
+        """No number is no point."""
+        return bool(np.all(np.isfinite(self.xyz_mm)))
+
+    @property
     def ahead(self) -> bool:
         """Whether it is a point before the baseline."""
-        return bool(np.all(np.isfinite(self.xyz_mm)) and ahead(float(self.xyz_mm[0])))
+        return self.finite and bool(ahead(float(self.xyz_mm[0])))
 
     def seen_from(self, origin: Vector) -> Direction:
         """The direction that leads to it from the origin of a beam."""
@@ -122,7 +132,8 @@ def mirror_angles(values: Mapping[str, float], target: Point | Direction) -> tup
         InputError: no mirror angles send the beam there.
     """
     pan_deg = tilt_deg = 0.0
-    for _ in range(AIM_STEPS if target.ahead else 0):
+    # A head turns all round; behind a scanner's baseline there is nothing to be seen.
+    for _ in range(AIM_STEPS if target.ahead or (is_head(values) and target.finite) else 0):
         beam = beam_components(values, pan_deg, tilt_deg, math)
         goal, (x, y, z) = target.seen_from(beam.origin), beam.direction
         azimuth = math.remainder(goal.azimuth_deg - math.degrees(math.atan2(y, x)), 360.0)

@@ -81,10 +81,10 @@ def output_deg(
         output = output + _harmonic(values, axis, output, period_deg, m)
     if (error := values.get(f"{ERROR_AT}.{axis}")) is not None:
         output = output + error - 0.5 * side * values[f"{PLAY_AT}.{axis}"]
-    return output if axis == "pan" else output + values["elevation_zero_deg" if _is_head(values) else "tilt_zero_deg"]
+    return output if axis == "pan" else output + values["elevation_zero_deg" if is_head(values) else "tilt_zero_deg"]
 
 
-def _is_head(values: Values) -> bool:
+def is_head(values: Values) -> bool:
     """Whether these are the parameters of a pan-tilt head."""
     return "azimuth_zero_deg" in values
 
@@ -113,7 +113,7 @@ class Components(NamedTuple):
 
 def _optics(values: Values) -> Optics | HeadOptics:
     """Laser and mirrors, or the terms of a head, of parameters by name."""
-    if _is_head(values):
+    if is_head(values):
         return HeadOptics.of(lambda name: values[name] * (TO_RAD if "_deg" in name else 1.0))
 
     def block(name: str) -> Number | list[Number]:

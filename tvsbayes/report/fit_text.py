@@ -88,7 +88,9 @@ def more_line(summary: FitSummary) -> str:
 
 def detail_lines(summary: FitSummary) -> list[Part]:
     """What else a fit says: the positioner, the gears, what was tested, priors that matter, what stays unknown."""
-    lines: list[Part] = [details_table(summary)]
+    where = details_table(summary)
+    # A head that says where it points stands in no camera's frame.
+    lines: list[Part] = [where] if where.rows else []
     if (gears := gears_table(summary)) is not None:
         lines += [gears, *gear_lines(summary)]
     lines.append(f"chi2 {summary.noise.chi2:.1f} for {summary.noise.dof:.1f} degrees of freedom")

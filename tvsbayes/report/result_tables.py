@@ -82,7 +82,8 @@ def headline_table(summary: FitSummary) -> TableView:
 
 def details_table(summary: FitSummary) -> TableView:
     """Where the positioner stands, and L."""
-    rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in MORE_PARAMETERS]
+    there = (row for row in MORE_PARAMETERS if row[0] in summary.parameters)
+    rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in there]
     return TableView("the positioner in frame S (the left camera's)", ESTIMATE_COLUMNS, rows)
 
 
