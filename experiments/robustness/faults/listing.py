@@ -222,6 +222,12 @@ FAULTS = (
           Reads("added", "{k: -v for k, v in value.items()}"), "test_linuxcnc_sends_the_corrected_command_by_its_rule"),
     Fault("a table is made of a fit that is not accepted", "refuse_answer", Never("answer"),
           "test_no_table_is_made_of_what_is_not_accepted"),
+    Fault("a scanner's lost play goes for a kept promise", "AimedLooks.off_deg", Local("half", "0 * value"),
+          "test_every_world_is_named"),
+    Fault("the camera's ray has the axes of the stereo frame", "frames.OPENCV_AXES", Constant("np.eye(3)"),
+          "test_frame_s_is_where_the_twins_light_goes"),
+    Fault("stored draws that are repeats count once", "stored_posterior._weighted",
+          Local("weights", "value * 0 + 1 / len(value)"), "test_a_scanners_draws_and_what_is_carried"),
     Fault("a fault of the play alone goes for a kept promise", "verification.SEPARATE", Constant("1e12"),
           "test_every_world_is_named"),
 )  # fmt: skip
