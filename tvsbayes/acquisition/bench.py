@@ -33,6 +33,7 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.emulated_board import EmulatedBoard
 from tvsbayes.positioner.interface import Clock, Positioner
+from tvsbayes.results.records import plain
 from tvsbayes.twin.true_rig import pan_and_tilt
 
 SIMULATED_START = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
@@ -100,7 +101,7 @@ def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench
     try:
         connect_trigger(positioner, camera)
         settings = camera.settings()
-        details = {"device": dict(positioner.identity), "cameras": settings.as_json()}
+        details = {"device": dict(positioner.identity), "cameras": plain(settings)}
         observer = CameraObserver(camera, detector)
         warnings = (*getattr(positioner, "warnings", ()), *settings.warnings)
         yield Bench(positioner, observer, operator, time, _utc_now, details, warnings=warnings)

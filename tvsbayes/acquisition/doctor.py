@@ -56,10 +56,6 @@ class Check:
     found: str
     remedy: str = ""
 
-    def as_json(self) -> dict[str, str]:
-        """An entry of the document of `tvsbayes doctor`."""
-        return {"name": self.name, "status": self.status, "found": self.found, "remedy": self.remedy}
-
 
 def examine(
     rig: Rig,

@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -55,10 +55,6 @@ class NexusSummary:
     ok: int
     events: int
     pictures: int
-
-    def as_json(self) -> dict[str, int]:
-        """Entries of the document of `tvsbayes export`."""
-        return asdict(self)
 
 
 def write_nexus(folder: Path, path: Path) -> NexusSummary:

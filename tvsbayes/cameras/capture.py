@@ -76,10 +76,6 @@ class CameraSettings:
     values: dict[str, float]
     warnings: tuple[str, ...] = ()
 
-    def as_json(self) -> dict[str, object]:
-        """As the journal holds it."""
-        return {"values": self.values, "warnings": list(self.warnings)}
-
 
 class StereoCamera(Protocol):
     """A pair of cameras, whatever they hang on."""

@@ -322,6 +322,7 @@ def doctor(
     from tvsbayes.errors import DeviceFault
     from tvsbayes.instrument.rig import read_rig
     from tvsbayes.model.compilation_cache import cache_state
+    from tvsbayes.results.records import plain
 
     instrument = read_rig(rig)
     checks = examine(instrument, Path.cwd(), laser=laser)
@@ -338,7 +339,7 @@ def doctor(
     if faults:
         message = f"{len(faults)} fault{'s' * (len(faults) > 1)}: {', '.join(c.name for c in faults)}"
         error = DeviceFault("doctor", message, remedy=faults[0].remedy)
-    finish({"checks": [c.as_json() for c in checks]}, "\n".join(lines), as_json, error)
+    finish({"checks": plain(checks)}, "\n".join(lines), as_json, error)
 
 
 def export(
@@ -350,7 +351,8 @@ def export(
     if serve("export", folder, nexus=nexus, as_json=as_json):
         return
     from tvsbayes.acquisition.nexus_file import write_nexus
+    from tvsbayes.results.records import plain
 
     done = write_nexus(folder, nexus)
     text = f"{escaped(str(nexus), 200)}: {done.moves} moves, {done.looks} looks ({done.ok} ok), {done.events} events"
-    finish({"nexus": str(nexus), **done.as_json()}, text, as_json)
+    finish({"nexus": str(nexus), **plain(done)}, text, as_json)

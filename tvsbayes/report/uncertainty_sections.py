@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tvsbayes.instrument.axes import SENSES
-from tvsbayes.instrument.parameters import REGISTRY, parameter_of
+from tvsbayes.instrument.parameters import parameter_of
 from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.document import FigureView, Section, sentence
