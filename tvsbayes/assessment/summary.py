@@ -35,8 +35,8 @@ from tvsbayes.instrument.parameters import (
     names_of,
 )
 from tvsbayes.instrument.stops import legs_of
-from tvsbayes.model.headlines import DERIVED, Derived
-from tvsbayes.posterior.draws import Posterior
+from tvsbayes.model.headlines import Derived
+from tvsbayes.posterior.draws import Posterior, derived_names
 from tvsbayes.posterior.predictive import ideal_pixels
 from tvsbayes.results.estimates import CurvePoint, Curves, Estimate, FitSummary, LostMotion, RatioAt, fit_noise
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
@@ -275,7 +275,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         lacks = {"accepted": "", "rough": "ROUGH", "laplace": "LAPLACE"}[posterior.convergence.answer]
         problems += tuple(f"{lacks}: {sentence}" for sentence in posterior.convergence.missing)
     # What `fit.json` holds by direction has places of its own.
-    others = [name for name in DERIVED if not QUANTITIES[name].ratio]
+    others = [name for name in derived_names(fit.space.mechanism) if not QUANTITIES[name].ratio]
     parameters = {**_parameters(source), **{name: source.estimate(name) for name in others}}
     return FitSummary(
         converged=fit.converged and (posterior is None or posterior.converged),
