@@ -478,7 +478,12 @@ def _evaluate(
     return jax.vmap(one)(z, normal)
 
 
-def evaluate(z: np.ndarray, normal: np.ndarray, space: ParameterSpace, arrays: CampaignArrays) -> Evaluation:
+def evaluate(
+    z: Float[Array | np.ndarray, "batch parameters"],
+    normal: Float[Array | np.ndarray, "batch errors"],
+    space: ParameterSpace,
+    arrays: CampaignArrays,
+) -> Evaluation:
     """`log_density` of many points in one call; call it with one batch size, each compiles anew.
 
     Args:
@@ -487,7 +492,7 @@ def evaluate(z: np.ndarray, normal: np.ndarray, space: ParameterSpace, arrays: C
         space: priors.
         arrays: the campaign.
     """
-    found = _evaluate(z, errors_at(normal, len(arrays.gears.places.steps)), space, arrays)
+    found = _evaluate(z, errors_at(np.asarray(normal), len(arrays.gears.places.steps)), space, arrays)
     errors_rad = np.asarray(found.place_errors_rad)[:, arrays.gears.errors_filled]
     return Evaluation(np.asarray(found.log_density), errors_rad)
 
@@ -516,7 +521,9 @@ def _residuals(
     return jax.vmap(one)(z)
 
 
-def residuals(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays) -> np.ndarray:
+def residuals(
+    z: Float[Array | np.ndarray, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays
+) -> np.ndarray:
     """Observed - predicted of all spots in units of their noise, ranges projected out, before any filter.
 
     Args:

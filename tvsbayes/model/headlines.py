@@ -223,7 +223,12 @@ def _derived(
     return jax.vmap(one)(z, place_errors_rad)
 
 
-def derived_quantities(z: np.ndarray, place_errors_rad: np.ndarray, space: ParameterSpace, seen: SeenLine) -> Derived:
+def derived_quantities(
+    z: Float[Array | np.ndarray, "draws parameters"],
+    place_errors_rad: Float[Array | np.ndarray, "draws errors"],
+    space: ParameterSpace,
+    seen: SeenLine,
+) -> Derived:
     """Headlines of many points at once (formulation 3.2), as NumPy arrays; every field has the leading axis `draws`.
 
     Args:
