@@ -26,10 +26,11 @@ def _rows(*names: str) -> tuple[tuple[str, str, str], ...]:
 
 KEY_PARAMETERS = _rows(
     *(of.name for of in HEADLINES if of.label and not of.ratio),
-    *(term.name for term in HEAD_TERMS.values()),
     *names_of("stop_sd_deg", "look_scatter_deg", "pixel_scale"),
 )
 """Parameters of the table that ends a fit: name, label, unit."""
+HEAD_PARAMETERS = _rows(*(term.name for term in HEAD_TERMS.values()))
+"""The terms of a head, behind them."""
 MORE_PARAMETERS = _rows(*names_of("mirror_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm"))
 """Those of its details."""
 SHARE_SHOWN = 5e-4
@@ -73,7 +74,7 @@ def headline_table(summary: FitSummary) -> TableView:
     told = {f"effective_deg_per_step.{part}": e for part, e in summary.effective.items()}
     told |= {f"effective_contrast_deg_per_step.{part}": e for part, e in summary.contrasts.items() if e is not None}
     rows = [estimate_row(label, told[name], unit) for name, label, unit in _rows(*told)]
-    there = (row for row in KEY_PARAMETERS if row[0] in summary.parameters)
+    there = (row for row in (*KEY_PARAMETERS, *HEAD_PARAMETERS) if row[0] in summary.parameters)
     rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in there]
     kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
     title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
