@@ -34,7 +34,7 @@ class Linear(eqx.Module):
 
     def __call__(self, at: Float[Array, " parameters"]) -> Float[Array, " residuals"]:
         """Residuals as it has them elsewhere."""
-        return self.value + self.jacobian @ (at - self.point)
+        return jnp.asarray(self.value + self.jacobian @ (at - self.point))
 
 
 class Search(eqx.Module):
@@ -67,7 +67,9 @@ def _solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
     # A traced tolerance, so that every stage shares the compilation, is a float to all of optimistix.
     limit = cast(float, tolerance)
     solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(limit, limit, linear_solver=lx.Normal(lx.Cholesky()))
-    trust = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.1, high_constant=10.0, low_constant=0.2)
+    trust: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
+        high_cutoff=0.75, low_cutoff=0.1, high_constant=10.0, low_constant=0.2
+    )
     return eqx.tree_at(lambda s: s.search, solver, trust)
 
 
