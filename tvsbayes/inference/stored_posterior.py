@@ -113,8 +113,7 @@ def load_posterior(folder: Path | str, *, anyway: bool = False) -> StoredPosteri
         message = f"results/fit.json: the fit is {what}: its intervals are not accepted"
         remedy = "run `tvsbayes fit` without --no-sample or --quick; or load it with anyway=True and say so"
         raise NotConverged("unaccepted", message, remedy=remedy)
-    by_name = _draws(place / "draws.npz")
-    return StoredPosterior(*_weighted(by_name), answer)
+    return _merged(_draws(place / "draws.npz"), answer)
 
 
 def _answer(keys: Keys) -> AnswerKind:
@@ -153,9 +152,10 @@ def _draws(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def _weighted(by_name: dict[str, np.ndarray]) -> tuple[Mapping[str, np.ndarray], np.ndarray]:
-    """Draws and weights (n,); repeats, which systematic resampling leaves beside each other, are one."""
+def _merged(by_name: dict[str, np.ndarray], answer: AnswerKind) -> StoredPosterior:
+    """Of draws that weigh the same: repeats, which systematic resampling leaves beside each other, are one."""
     rows = np.stack(list(by_name.values()), axis=1)
     first = np.flatnonzero(np.r_[True, np.any(rows[1:] != rows[:-1], axis=1)])
     weights = np.diff(np.r_[first, len(rows)]) / len(rows)
-    return MappingProxyType({name: column[first] for name, column in by_name.items()}), weights
+    kept = MappingProxyType({name: column[first] for name, column in by_name.items()})
+    return StoredPosterior(kept, weights, answer)

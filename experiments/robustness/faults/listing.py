@@ -226,7 +226,7 @@ FAULTS = (
           "test_every_world_is_named"),
     Fault("the camera's ray has the axes of the stereo frame", "frames.OPENCV_AXES", Constant("np.eye(3)"),
           "test_frame_s_is_where_the_twins_light_goes"),
-    Fault("stored draws that are repeats count once", "stored_posterior._weighted",
+    Fault("stored draws that are repeats count once", "stored_posterior._merged",
           Local("weights", "value * 0 + 1 / len(value)"), "test_a_scanners_draws_and_what_is_carried"),
     Fault("a fault of the play alone goes for a kept promise", "verification.SEPARATE", Constant("1e12"),
           "test_every_world_is_named"),
