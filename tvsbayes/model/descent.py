@@ -87,7 +87,8 @@ def _initial(linear: Linear, tolerance: Float[Array, ""]) -> Any:
 def begun(linear: Linear, tolerance: Float[Array, ""]) -> Search:
     """The search before its first step, which is to the point itself."""
     state = _initial(linear, tolerance)
-    return Search(linear.point, state.y_eval, jnp.zeros((), bool), ravel_pytree(eqx.filter(state, eqx.is_array))[0])
+    packed = ravel_pytree(eqx.filter(state, eqx.is_array))[0]
+    return Search(jnp.asarray(linear.point), state.y_eval, jnp.zeros((), bool), packed)
 
 
 @compiled(Search)
