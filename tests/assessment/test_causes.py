@@ -6,11 +6,11 @@ import copy
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import equinox as eqx
 import numpy as np
 import pytest
+from support.drawn_quantities import drawn_quantities
 from support.linear_fit import ROWS, fit_of, linear_problem, refitted, slope_of
 from support.written_rows import move_row
 
@@ -43,7 +43,7 @@ def linear_fit(mounted_rig):
         physical[:, INDEX[name]] = np.exp((0.1, 0.2, 0.05)[k] * rng.standard_normal(len(draws_z)))
     rows = ((0, 0, 0.0, 0, 0, "left", "up"), (1, 0, 1.0, 9, 0), (2, 0, 2.0, 0, 0), (3, 0, 3.0, 0, 9))
     moves = tuple(move_row(*row) for row in rows)
-    draws = SimpleNamespace(physical=physical, effective_deg_per_step=values[:, :4])
+    draws = drawn_quantities(len(physical), physical=physical, effective_deg_per_step=values[:, :4])
     for name, value in (("draws_z", draws_z), ("covariance", covariance), ("draws", draws)):
         object.__setattr__(fit, name, value)
     object.__setattr__(fit, "campaign", replace(fit.campaign, moves=moves))
