@@ -27,7 +27,7 @@ from jax.typing import ArrayLike
 
 from tvsbayes.files.own_folder import OwnFolder
 
-LIBRARIES = ("jax", "jaxlib", "equinox", "numpy")
+LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
 """Whose versions decide what a trace gives."""
 BATCH = 32
 """Points per call of a function of many: half an ensemble of 64, the calls of a differential-evolution step."""
