@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from support.drawn_quantities import drawn_quantities
 from support.two_parameters import autoregressive
 
 from tvsbayes.inference.summaries import propagated
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.posterior.draws import Posterior
 
@@ -45,7 +48,8 @@ def test_lost_motion_takes_ratio_and_backlash_of_its_own_axis():
         physical[..., INDEX[name]] = value
     shape = physical.shape[:2]
     draws = drawn_quantities(*shape, physical=physical)
-    known = Posterior(None, physical, np.zeros(shape), draws, np.full(shape, 1 / 6), None, 0, 0.0)
+    fit = SimpleNamespace(space=SimpleNamespace(mechanism=TWO_MIRROR))
+    known = Posterior(fit, physical, np.zeros(shape), draws, np.full(shape, 1 / 6), None, 0, 0.0)
     expected = {"left": (0.122, 0.3), "right": (0.118, 0.3), "up": (0.144, 0.5), "down": (0.136, 0.5)}
     for direction, lost in expected.items():
         found = known.lost_motion_deg(direction, np.array([2, 200]))

@@ -108,6 +108,8 @@ class Recorder:
                 self._moved(event, self.moves[-1].segment)
             case Looked():
                 self._looks(event)
+                # Where the sheet stood, also if the line of its placement is lost.
+                self.state = replace(self.state, target=event.target)
         if isinstance(event, Homed | Moved | Placed | Looked) and event.step is not None:
             self.state = replace(self.state, next_step=max(self.state.next_step, event.step + 1))
 

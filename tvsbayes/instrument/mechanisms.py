@@ -6,7 +6,7 @@ the mirrors for terms of its own: the gears' coordinates, and every array, are t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -42,6 +42,10 @@ class Mechanism:
     terms: Mapping[str, Parameter] = field(default_factory=dict)
     held: Mapping[str, float] = field(default_factory=dict)
     freed: Mapping[str, Prior] = field(default_factory=dict)
+
+    def __reduce__(self) -> tuple[Callable[[str], Mechanism], tuple[str]]:
+        """A copy, also in another process, is the entry of the list: mechanisms are compared by identity."""
+        return mechanism_by_key, (self.key,)
 
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
@@ -112,6 +116,11 @@ MECHANISMS: dict[str, Mechanism] = {each.key: each for each in (TWO_MIRROR, HEAD
 """By key."""
 WORDS: tuple[str, ...] = tuple(dict.fromkeys(each.word for each in MECHANISMS.values()))
 """Of the key `mechanism` in files, the default first."""
+
+
+def mechanism_by_key(key: str) -> Mechanism:
+    """The entry of the list."""
+    return MECHANISMS[key]
 
 
 def mechanism_of(word: str, sightings: bool) -> Mechanism:

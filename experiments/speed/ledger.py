@@ -1,0 +1,177 @@
+"""Does the package get slower, or its intervals worse, from one state to the next?
+
+    python -m experiments.speed.ledger append        # measures this commit on a quiet machine, some 6 minutes
+    python -m experiments.speed.ledger table > experiments/speed/ledger.md
+
+An entry of `ledger.jsonl` is one commit: CPU seconds of commands as processes of their own, from warm caches, in units
+of importing jax, optimistix and scipy.stats in the same run (least of three each); effective draws of the worst
+headline of `fit --quick` per CPU second of that unit; intervals that hold the truth on a fixed small set of drawn
+axes and of strangers' benches; lines of Python. `tests/promises/test_ledger.py` holds the last entry against `BOUNDS`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from experiments.common.command_line import act, parser
+from experiments.common.rows import ROOT, append_row, read_rows
+from experiments.speed.benchmarks.measure import command_cost, cpu_model, state
+
+LEDGER = Path(__file__).with_suffix(".jsonl")
+IMPORTS = "import jax, optimistix, scipy.stats"
+REPEATS = 3
+AXES, BENCHES = 8, 8
+"""Of the fixed sets: so many axes a protocol, so many benches of seed 0."""
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "fit --no-sample": ("fit", "twin", "--no-sample", "--json"),
+    "fit --quick": ("fit", "twin", "--quick", "--json"),
+    "demo": ("demo",),
+    "classic": ("classic", "twin", "--json"),
+    "report": ("report", "twin"),
+    "locate": ("locate", "twin", "--pan-steps", "100", "--tilt-steps", "20", "--aperture-deg", "70", "--json"),
+    "check": ("check", "twin"),
+    "fit --quick, axis": ("fit", "axis", "--quick", "--json"),
+    "--help": ("--help",),
+}
+"""In a folder that holds a copy of the paper twin and a simulated axis; in this order, `report` takes up the fit."""
+BOUNDS: dict[str, tuple[float, float]] = {}
+"""Lowest and highest allowed value of the last entry, by the names of `figures`."""
+
+
+def figures(entry: Mapping) -> dict[str, float]:
+    """The figures of an entry that have bounds, by name."""
+    commands = {f"CPU of {name} / imports": float(value) for name, value in entry["commands"].items()}
+    shares = {
+        f"{what}: {share}": float(counts[part]) / counts[whole]
+        for what, counts in entry["intervals"].items()
+        for share, part, whole in (("answered", "answered", "drawn"), ("95 % intervals that hold", "held", "intervals"))
+    }
+    return {**commands, "effective draws per import": float(entry["effective_draws_per_import"]), **shares}
+
+
+def _least(command: Sequence[str], folder: Path) -> tuple[str, float]:
+    """What a command prints last, and its least CPU seconds."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    costs = []
+    for _ in range(REPEATS):
+        printed, cost = command_cost(("/usr/bin/env", "-C", str(folder), *command), environment)
+        costs.append(cost["cpu_s"])
+    return printed, min(costs)
+
+
+def write_axis(folder: Path) -> None:
+    """A simulated axis of 60 readings, to and fro over twelve positions, as `axis` of an absolute folder."""
+    way = [*range(0, 1200, 100), *range(1150, -50, -100)]
+    rows = [f"{k},0,{60 * k},{command},{'' if k else 'backward'}" for k, command in enumerate([-50, *(way * 3)[:60]])]
+    template = folder / "template"
+    template.mkdir()
+    (template / "moves.csv").write_text("\n".join(["move,segment,time_s,command,approach", *rows, ""]))
+    (template / "readings.csv").write_text("reading,move,value,u,status\n")
+    header = ('format = "tvsbayes-axis/1"', 'unit = "deg"', "[axis]", "per_command = { value = 0.01, u = 0.001 }", "")
+    (template / "campaign.toml").write_text("\n".join(header))
+    words = ("simulate", str(template), str(folder / "axis"), "--seed", "1")
+    command_cost((sys.executable, "-m", "tvsbayes", *words))
+
+
+def _effective_draws(fit: Mapping) -> float:
+    return float(fit["sampling"]["importance"]["least_ess"]["value"])
+
+
+def _study(module: str, number: int, *words: str) -> list[dict]:
+    """Rows of a study in a file of their own: what another state of the package left is not taken up."""
+    with tempfile.TemporaryDirectory() as folder:
+        rows = Path(folder) / "rows.jsonl"
+        command = (sys.executable, "-m", f"experiments.intervals.{module}", "run", "--n", str(number))
+        command_cost((*command, *words, "--rows", str(rows)), limit_s=3600.0)
+        return read_rows(rows)
+
+
+def _counts(rows: Sequence[Mapping], answered: Sequence[Mapping], held: Iterable[bool]) -> dict[str, int]:
+    each = list(held)
+    return {"drawn": len(rows), "answered": len(answered), "intervals": len(each), "held": sum(each)}
+
+
+def axes() -> dict[str, int]:
+    """Drawn axes that creep and make waves: every parameter's 95 % interval."""
+    rows = _study("axis_in_time", AXES)
+    answered = [row for row in rows if not row["problems"]]
+    scores = (value for row in answered for value in row.values() if isinstance(value, dict) and "below" in value)
+    return _counts(rows, answered, (abs(score["below"] - 0.5) <= 0.475 for score in scores))
+
+
+def benches() -> dict[str, int]:
+    """Strangers' benches: every headline's 95 % interval."""
+    rows = _study("strangers", BENCHES)
+    answered = [row for row in rows if row["answer"] in ("accepted", "rough")]
+    headlines = (each for row in answered for each in row["headlines"].values() if each["sd"] > 0)
+    return _counts(rows, answered, (each["low"] <= each["truth"] <= each["high"] for each in headlines))
+
+
+def lines(folder: str) -> int:
+    """Lines of Python in a folder."""
+    return sum(len(path.read_bytes().splitlines()) for path in (ROOT / folder).rglob("*.py"))
+
+
+def append(_: argparse.Namespace) -> None:
+    """Measure this state of the package and write its entry."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        _, unit = _least((sys.executable, "-c", IMPORTS), folder)
+        shutil.copytree(ROOT / "data" / "twins" / "paper_twin", folder / "twin")
+        write_axis(folder)
+        entry: dict = {"commit": state(), "at": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M}"}
+        entry |= {"processor": cpu_model(), "import_cpu_s": round(unit, 2), "commands": {}}
+        for name, words in COMMANDS.items():
+            printed, cost = _least((sys.executable, "-m", "tvsbayes", *words), folder)
+            entry["commands"][name] = round(cost / unit, 2)
+            if name == "fit --quick":
+                entry["effective_draws_per_import"] = round(_effective_draws(json.loads(printed)) / cost * unit)
+    entry["intervals"] = {"axes": axes(), "benches": benches()}
+    entry["lines"] = {folder: lines(folder) for folder in ("tvsbayes", "tests", "experiments")}
+    append_row(LEDGER, entry)
+    for problem in problems(entry):
+        print(problem)
+
+
+def problems(entry: Mapping) -> list[str]:
+    """What of an entry is outside its bounds, a sentence each."""
+    return [
+        f"{name}: {value:.3g}, allowed {BOUNDS[name][0]:.3g} to {BOUNDS[name][1]:.3g}"
+        for name, value in figures(entry).items()
+        if not BOUNDS[name][0] <= value <= BOUNDS[name][1]
+    ]
+
+
+def table(_: argparse.Namespace) -> None:
+    """All entries side by side."""
+    entries = read_rows(LEDGER)
+    print("# Ledger\n\nA column is a commit, measured by `python -m experiments.speed.ledger append`; what a row means")
+    print("stands in the script. Bounds are those of the last entry.\n")
+    names = [f"{entry['commit']}, {entry['at'][:10]}" for entry in entries]
+    print(f"| | {' | '.join(names)} | bounds |\n|{'---|' * (len(names) + 2)}")
+    print(f"| CPU s of the imports | {' | '.join(str(entry['import_cpu_s']) for entry in entries)} | |")
+    for name, (low, high) in BOUNDS.items():
+        values = [figures(entry).get(name) for entry in entries]
+        cells = ["" if value is None else f"{value:.3g}" for value in values]
+        print(f"| {name} | {' | '.join(cells)} | {low:.3g} to {high:.3g} |")
+    for folder in entries[-1]["lines"]:
+        print(f"| lines of {folder}/ | {' | '.join(str(entry['lines'].get(folder, '')) for entry in entries)} | |")
+
+
+def main() -> None:
+    """Command line."""
+    command = parser(__doc__)
+    command.add_argument("action", choices=("append", "table"))
+    act(command, append=append, table=table)
+
+
+if __name__ == "__main__":
+    main()
