@@ -1,4 +1,4 @@
-"""The tutorial prints what the commands print, and the README's picture turns every axis the way the code does."""
+"""The tutorial prints what the commands print, and the drawing of the instrument turns every axis the way the code does."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_left_out_lines_are_marked():
 
 @pytest.fixture(scope="module")
 def drawing():
-    """The script that draws the README's picture."""
+    """The script that draws the instrument."""
     pytest.importorskip("matplotlib")
     from experiments.inputs import draw_rig
 
@@ -150,7 +150,7 @@ def drawing():
 
 
 def test_picture_from_above_obeys_the_conventions(drawing):
-    """README: S has X depth (up the page), Y left, Z up (to the reader); pan positive = left."""
+    """The drawing: S has X depth (up the page), Y left, Z up (to the reader); pan positive = left."""
     origin, x, y, z = drawing.seen_from_above(np.vstack([np.zeros(3), np.eye(3)]))
     assert (x - origin).tolist() == [0, 1]
     assert (y - origin).tolist() == [-1, 0]
