@@ -17,13 +17,13 @@ from support.small_posterior import ROUNDING, play_priors
 from support.varying_gears import PERIODS_DEG, coordinates_with, varying_gears
 
 from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
-from tvsbayes.estimators.campaign_arrays import campaign_arrays
-from tvsbayes.estimators.linear_spots import linear_spots, stop_information
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, campaign_arrays
+from tvsbayes.estimators.linear_spots import Linearised, linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, NOISE_NAMES, names_of
-from tvsbayes.model.parameter_space import coordinates_of, free_mask, parameter_space, physical_at
-from tvsbayes.posterior.transport import Transport, transport
+from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, Prior, names_of
+from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, free_mask, parameter_space, physical_at
+from tvsbayes.posterior.transport import SCALE_NAMES, Transport, transport
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -36,13 +36,22 @@ VALUES = {
 """Without drift: few coordinates see it, and the map leaves it out."""
 SCATTER = dict(zip(LOOK_SCATTER_NAMES, (0.01, 0.015), strict=True))
 """Less than the stops' own errors: a variance that scatter of the mode leaves is never below none."""
+CREEP = {"creep_deg.pan": 2e-4, "creep_deg.tilt": -1e-4, "creep_minutes": 3.0}
+"""So little that the slopes of the model are the same wherever the zeros have crept to: to 1e-5."""
 FLOOR = 1e-8
 """Of a centred map, in y: Gauss and Newton take differences of residuals of 1e4 units of noise."""
+
+
+def linearised(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays) -> Linearised:
+    """The campaign at z, nothing held."""
+    with jax.enable_x64(True):
+        return stage(z, space, arrays, Fixed(np.zeros(len(NAMES), bool), z, np.array(1.0)), NO_STEP)
 
 
 def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str, ...], redraw: bool) -> SimpleNamespace:
     """What the map reads of a fit, at values; `redraw`: every look has stop errors of its own."""
     table = varying_gears(campaign.rig)
+    table = replace(table, priors={**table.priors, **dict.fromkeys(names_of("creep_deg"), Prior(0.0, 0.05))})
     with jax.enable_x64(True):
         space = jax.tree.map(jnp.asarray, parameter_space(table, campaign.stereo))
         arrays = jax.tree.map(jnp.asarray, campaign_arrays(campaign, table))
@@ -50,13 +59,13 @@ def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str,
             arrays = drawn_at_every_move(campaign, arrays)
         z = coordinates_of(space, physical_at(dozen.z, dozen.space).value)
         z = coordinates_with(space, z, values)
-        lin = stage(z, space, arrays, Fixed(np.zeros(len(NAMES), bool), z, np.array(1.0)), NO_STEP)
-        information = stop_information(linear_spots(lin, arrays, -lin.residual_jacobian))
+        lin = linearised(z, space, arrays)
+        information = stop_information(linear_spots(lin, arrays, -np.asarray(lin.residual_jacobian)))
     free = free_mask(space, has_aperture=True)
     free[[INDEX[name] for name in held]] = False
     covariance = np.linalg.inv(np.eye(len(NAMES)) + information.fisher)
-    noise = np.isin(NAMES, NOISE_NAMES)
-    # Noise scales as wide as a dozen spots leave them.
+    noise = np.isin(NAMES, SCALE_NAMES)
+    # Scales as wide as a dozen spots leave them.
     covariance[noise], covariance[:, noise] = 0.0, 0.0
     covariance[noise, noise] = 0.3**2
     return SimpleNamespace(
@@ -76,7 +85,7 @@ def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str,
 @pytest.fixture(scope="module")
 def fitted(dozen) -> SimpleNamespace:
     """Of looks that do not scatter."""
-    values = VALUES | dict.fromkeys(LOOK_SCATTER_NAMES, 0.0)
+    values = VALUES | CREEP | dict.fromkeys(LOOK_SCATTER_NAMES, 0.0)
     held = (*names_of("drift_deg_per_root_hour"), *LOOK_SCATTER_NAMES)
     return fit_of(dozen, dozen.campaign, values, held, redraw=False)
 
@@ -90,10 +99,10 @@ def path(fitted) -> Transport:
 
 @pytest.fixture(scope="module")
 def scattered(dozen) -> SimpleNamespace:
-    """Of looks that scatter, each at a stop of its own; pixel noise held."""
+    """Of looks that scatter, each at a stop of its own; pixel noise held, no creep."""
     first = {spot.move: spot for spot in reversed(dozen.campaign.spots)}
     campaign = replace(dozen.campaign, spots=tuple(first[move] for move in sorted(first)))
-    held = (*names_of("drift_deg_per_root_hour"), "pixel_scale")
+    held = (*names_of("drift_deg_per_root_hour", "creep_deg", "creep_minutes"), "pixel_scale")
     return fit_of(dozen, campaign, VALUES | SCATTER, held, redraw=True)
 
 
@@ -107,8 +116,12 @@ def values_at(fitted: SimpleNamespace, z: np.ndarray) -> dict[str, float]:
 
 
 def dense_density(fitted: SimpleNamespace, path: Transport, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Precision and score of the coordinates y that are no noise scales, by the covariance of all residuals at z."""
-    values, mode = values_at(fitted, z), values_at(fitted, fitted.z)
+    """Precision and score of the coordinates y that are no scales, by the covariance of all residuals at z."""
+    values, mode, at = values_at(fitted, z), values_at(fitted, fitted.z), fitted.linearised
+    if fitted.free[INDEX["creep_minutes"]]:
+        # The model itself at another time constant.
+        only = np.where(np.arange(len(NAMES)) == INDEX["creep_minutes"], z, fitted.z)
+        at = linearised(only, fitted.space, fitted.arrays)
     pixels = values["pixel_scale"] / mode["pixel_scale"]
     others = path.free[path.noise :]
     wide = path.root[path.noise :, path.noise :]
@@ -119,10 +132,10 @@ def dense_density(fitted: SimpleNamespace, path: Transport, z: np.ndarray) -> tu
     for axis, name in enumerate(LOOK_SCATTER_NAMES):
         angles[axis] += np.radians(np.radians(values[name] ** 2 - mode[name] ** 2)) * np.eye(len(slope))
     covariance = residual_covariance(angles, slope)
-    jacobian = -fitted.linearised.residual_jacobian.reshape(len(covariance), -1)[:, others] @ wide / pixels
+    jacobian = -np.asarray(at.residual_jacobian).reshape(len(covariance), -1)[:, others] @ wide / pixels
     solved = np.linalg.solve(covariance, jacobian)
     prior = (wide.T * play_priors(path)[0]) @ wide
-    return prior + jacobian.T @ solved, solved.T @ fitted.linearised.residual.ravel() / pixels
+    return prior + jacobian.T @ solved, solved.T @ np.asarray(at.residual).ravel() / pixels
 
 
 def check_dense(fitted: SimpleNamespace, path: Transport, least: float) -> None:
@@ -144,9 +157,16 @@ def check_dense(fitted: SimpleNamespace, path: Transport, least: float) -> None:
 
 
 def test_the_map_has_mean_and_covariance_of_the_dense_campaign_at_any_scales(fitted, path):
-    """Scales of pixels, stops, gears and play together."""
+    """Scales of pixels, stops, gears, play and the time constant of a creep together."""
     assert path.pixels.sum() == 1 and np.isin(LOOK_SCATTER_NAMES, np.array(NAMES)[path.free]).sum() == 0
     check_dense(fitted, path, 0.01)
+
+
+def test_a_creep_moves_the_map_with_its_time_constant(fitted, path):
+    """Of the time constant alone."""
+    one, other = (path.conditional(w[None]).own[0] for w in (2.0 * path.creep_noise, 0.0 * path.creep_noise))
+    precision, at_mode = one @ one.T, other @ other.T
+    assert path.creep_noise.sum() == 1 and np.abs(precision - at_mode).max() > 0.01 * np.abs(at_mode).max()
 
 
 def test_looks_that_scatter_more_or_less_than_at_the_mode(scattered):

@@ -59,6 +59,7 @@ def route() -> Transport:
         drift_noise=np.zeros((2, 1)),
         gear_scale=np.zeros(len(GEAR_SCALES)),
         gear_noise=np.zeros((len(GEAR_SCALES), 1)),
+        creep_noise=np.zeros(1),
         period_deg=np.zeros((2, PERIODS_MAX)),
     )
 
@@ -98,6 +99,7 @@ def ridge() -> Transport:
         bend=np.zeros((2, 1, 1)),
         drift_noise=np.zeros((2, 0)),
         gear_noise=np.zeros((len(GEAR_SCALES), 0)),
+        creep_noise=np.zeros(0),
     )
     return replace(straight, bend=bends(straight))
 

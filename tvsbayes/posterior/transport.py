@@ -1,8 +1,9 @@
 """The map that makes the posterior nearly normal, so that proposals need no knowledge of its ridges.
 
 Three layers: z, the prior-normal coordinates of the model; y, whitened by the Laplace covariance; w, in which draws are
-made. Noise scales widen and turn what they limit (a stop sd its ratio, the backlash and their sums): in w everything
-else is measured from the mean and by the covariance that the linearised campaign has at the noise scales of the draw.
+made. Noise scales widen and turn what they limit (a stop sd its ratio, the backlash and their sums), and so does the
+time constant of a creep: in w everything else is measured from the mean and by the covariance that the linearised
+campaign has at these scales of the draw.
 Wide directions (laser tilt, lens distortion) bend the ridges on which the narrow ones (extrinsics, ratios) lie: at
 every draw of the noise scales and the wide coordinates the narrow ones are centred by Gauss-Newton steps from the
 residuals that the model has there. NumPy outside the compiled functions.
@@ -22,7 +23,7 @@ from scipy.linalg import lapack
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import residuals
 from tvsbayes.estimators.linear_spots import linear_spots
-from tvsbayes.instrument.parameters import BLOCKS, CREEP_NAMES, INDEX, KINDS, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
+from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import place_root
@@ -46,6 +47,7 @@ GEAR_SCALES = np.array(
 )
 """Coordinates of what the covariance of the errors at places depends on."""
 DRIFT_COLUMNS = np.array([INDEX[name] for name in names_of("drift_deg_per_root_hour")])
+CREEP_COLUMNS = np.array([INDEX[name] for name in names_of("creep_deg")])
 WALK_TERMS = 3
 """Terms of the Karhunen-Loeve series of a drift between two homings: 93 % of its variance."""
 LEAST_SCALE = 1e-6
@@ -63,13 +65,13 @@ CENTRINGS = 2
 BEND_STEP = 2.0
 """Step of second differences in posterior sds: they should hold over +-2 sd, not only at the mode. A move as
 long as the play bends the residuals by a kink, whose second difference grows as the step gets shorter."""
-HEAVY_NAMES = (
-    *(*NOISE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y", "mirror_offset_mm"),
-    *CREEP_NAMES,
-)
+SCALE_NAMES = (*NOISE_NAMES, *BLOCKS["creep_minutes"])
+"""What everything else is conditioned on: scales of the noise, and the time constant of a creep, by whose size it moves
+the spots far from linearly."""
+HEAVY_NAMES = (*SCALE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y", "mirror_offset_mm")
 """Coordinates whose tails are heavier than normal: those that few stops tell (a walker stood still for 155 steps at 3.7
-sd of a stop sd), the tilt of the frames with the mirrors' offset, and a creep: wide where its time constant is long.
-Each of them is always proposed from a t of its own."""
+sd of a stop sd), and the tilt of the frames with the mirrors' offset. Each of them is always proposed from a t of its
+own."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,50 @@ class Mapped:
     def joined(cls, parts: Sequence[Mapped]) -> Mapped:
         """One after the other."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+
+
+@dataclass(frozen=True)
+class Creep:
+    """Zeros that creep: columns of a linearised campaign that another time constant changes.
+
+    Attributes:
+        warm_minutes: since the machine was switched on, of every spot, shape (s,).
+        minutes: time constant at the mode.
+        slope: d(predicted)/d(zero, rad), shape (s, 4, 2).
+        rows: how far the zeros creep in all, rad, by the columns of `LinearCampaign`, shape (2, c).
+    """
+
+    warm_minutes: np.ndarray
+    minutes: float
+    slope: np.ndarray
+    rows: np.ndarray
+
+    def later(self, log_scale: np.ndarray) -> np.ndarray:
+        """How much more of the creep is over at each spot than at the mode, by ln of the time constants (n,) over it.
+
+        Shape (n, s).
+        """
+        minutes = self.minutes * np.exp([[0.0], *log_scale[:, None]])
+        over = -np.expm1(-self.warm_minutes / minutes)
+        return over[1:] - over[0]
+
+    def seen(self, rows: np.ndarray) -> np.ndarray:
+        """Products of rows (4 s, c), spot by spot, with the slopes, shape (s, 2, c)."""
+        return np.einsum("sia,sic->sac", self.slope, rows.reshape(*self.slope.shape[:2], -1))
+
+    @cached_property
+    def square(self) -> np.ndarray:
+        """Products of the slopes with each other, shape (s, 2, 2)."""
+        return np.einsum("sia,sib->sab", self.slope, self.slope)
+
+    def products(self, misfit: np.ndarray, later: np.ndarray) -> np.ndarray:
+        """Of misfits (n, 4 s) with what `more` sees of either zero, shares (n, s) or (1, s), shape (n, 2)."""
+        by_spot = np.einsum("nsi,sia->nsa", misfit.reshape(len(misfit), *self.slope.shape[:2]), self.slope)
+        return np.einsum("nsa,ns->na", by_spot, np.broadcast_to(later, by_spot.shape[:2]))
+
+    def more(self, later: np.ndarray, crept_rad: np.ndarray) -> np.ndarray:
+        """What spots are seen farther on where zeros (n, 2) creep, by shares (n, s) of it, shape (n, 4 s)."""
+        return np.einsum("sia,ns,na->nsi", self.slope, later, crept_rad, optimize=True).reshape(len(later), -1)
 
 
 @dataclass(frozen=True)
@@ -100,6 +146,7 @@ class LinearCampaign:
         constant: variance that scales with none, less what the noise of the looks has already, shape (m,).
         places: d(predicted)/d(errors at places, then terms of the drifts), shape (4 n, e).
         prior: precision of y without data, shape (g, g).
+        creep: None where its time constant is not estimated.
     """
 
     residual: np.ndarray
@@ -109,6 +156,7 @@ class LinearCampaign:
     constant: np.ndarray
     places: np.ndarray
     prior: np.ndarray
+    creep: Creep | None = None
 
     @cached_property
     def columns(self) -> np.ndarray:
@@ -125,6 +173,30 @@ class LinearCampaign:
         """Products of the states with the columns, shape (m, e + g + 1)."""
         return self.states.load.T @ self.columns
 
+    @cached_property
+    def _by_creep(self) -> np.ndarray:
+        assert self.creep is not None
+        return self.creep.seen(np.concatenate([self.columns, self.states.load], axis=1))
+
+    def at(self, later: np.ndarray | None) -> Products:
+        """Products of the columns where so much more of the creep is over, as `Creep.later` gives it."""
+        creep = self.creep
+        if creep is None or later is None:
+            return Products(self.gram, self.by_states)
+        new, count = np.tensordot(later, self._by_creep, 1), len(self.gram)
+        cross = np.swapaxes(new[..., :count], 1, 2) @ creep.rows
+        both = creep.rows.T @ np.tensordot(later**2, creep.square, 1) @ creep.rows
+        by_states = self.by_states + np.swapaxes(new[..., count:], 1, 2) @ creep.rows
+        return Products(self.gram + cross + np.swapaxes(cross, 1, 2) + both, by_states)
+
+
+@dataclass(frozen=True)
+class Products:
+    """Of the columns of a linearised campaign with each other (..., c, c), and of the states with them (..., m, c)."""
+
+    gram: np.ndarray
+    by_states: np.ndarray
+
 
 @dataclass(frozen=True)
 class Conditional:
@@ -138,6 +210,7 @@ class Conditional:
         factor: lower triangular factor of the precision of errors at places (N(0, 1) a priori) and y together, shape
             (n, e + g, e + g).
         shift: factor' x the mean of y, shape (n, g).
+        later: as `Creep.later` gives it; None without a creep.
     """
 
     weight: np.ndarray
@@ -146,6 +219,7 @@ class Conditional:
     root: np.ndarray
     factor: np.ndarray
     shift: np.ndarray
+    later: np.ndarray | None = None
 
     @property
     def own(self) -> np.ndarray:
@@ -170,6 +244,8 @@ class Conditional:
         count = places + narrow
         white = self.elimination.whitened((misfit @ linear.states.load)[..., None])
         right = misfit @ linear.columns[:, :count] - np.einsum("nmc,nmo->nc", self.white[..., :count], white)
+        if linear.creep is not None and self.later is not None:
+            right += linear.creep.products(misfit, self.later) @ linear.creep.rows[:, :count]
         right *= self.weight[:, None]
         right[:, :places] = np.einsum("nji,nj->ni", self.root, right[:, :places])
         factors = np.broadcast_to(self.factor[:, :count, :count], (len(misfit), count, count))
@@ -240,6 +316,7 @@ class Transport:
         drift_noise: which noise coordinate each of them is, shape (2, q).
         gear_scale: values of `GEAR_SCALES` at the mode, in the units of their names, shape (12,).
         gear_noise: which noise coordinate each of them is, shape (12, q).
+        creep_noise: 1 at the noise coordinate that is the time constant of a creep, shape (q,).
         period_deg: of the gears, shape (2, 3).
     """
 
@@ -261,6 +338,7 @@ class Transport:
     drift_noise: np.ndarray
     gear_scale: np.ndarray
     gear_noise: np.ndarray
+    creep_noise: np.ndarray
     period_deg: np.ndarray
 
     @property
@@ -351,12 +429,14 @@ class Transport:
         linear, log_scale = self.linear, self._log_scale(noise)
         weight = np.exp(-2 * log_scale @ self.pixels)
         places, count = linear.places.shape[1], len(linear.gram)
+        later = None if linear.creep is None else linear.creep.later(log_scale @ self.creep_noise)
+        products = linear.at(later)
         variance = linear.constant + np.exp(2 * log_scale) @ linear.by_noise.T
         # Less scatter of looks than at the mode leaves less than the stops' own variance: never none.
         variance = np.maximum(variance, LEAST_SCALE * (linear.constant + linear.by_noise.sum(axis=1)))
         elimination = Elimination.of(linear.states, np.sqrt(weight[:, None] * variance))
-        white = elimination.whitened(linear.by_states)
-        whole = weight[:, None, None] * (linear.gram - np.swapaxes(white, 1, 2) @ white)
+        white = elimination.whitened(products.by_states)
+        whole = weight[:, None, None] * (products.gram - np.swapaxes(white, 1, 2) @ white)
         root = self._place_roots(log_scale)
         # Errors at places in units of their prior sds: their covariance may be as good as singular.
         whole[:, :places] = np.swapaxes(root, 1, 2) @ whole[:, :places]
@@ -369,7 +449,7 @@ class Transport:
         whole[:, -1, -1] = FAR_ABOVE
         found = np.linalg.cholesky(whole)
         last = count - 1
-        return Conditional(weight, elimination, white, root, found[:, :last, :last], found[:, last, places:last])
+        return Conditional(weight, elimination, white, root, found[:, :last, :last], found[:, last, places:last], later)
 
     @cached_property
     def _score_at_mode(self) -> np.ndarray:
@@ -390,11 +470,15 @@ class Transport:
     def _centred(self, noise: np.ndarray, wide: np.ndarray, found: Conditional) -> Centred:
         """The narrow coordinates given noise coordinates (n, q) and y of the wide ones (n, g - k)."""
         mean, linear = found.means(wide[:, ::-1])[:, ::-1], self.linear
-        centre = mean
+        centre, still = mean, self.free[: self.noise][self.creep_noise == 0]
         for _ in range(CENTRINGS):
-            y = np.concatenate([np.zeros_like(noise), wide, centre], axis=1)
-            own = y[:, self.noise :]
-            beyond = self.residuals(self.from_whitened(y)) - linear.residual + own @ linear.along.T
+            y = np.concatenate([noise, wide, centre], axis=1)
+            own, z = y[:, self.noise :], self.from_whitened(y)
+            z[:, still] = self.mode[still]
+            beyond = self.residuals(z) - linear.residual + own @ linear.along.T
+            if linear.creep is not None and found.later is not None:
+                places, rows = linear.places.shape[1], linear.creep.rows
+                beyond += linear.creep.more(found.later, own[:, ::-1] @ rows[:, places:-1].T - rows[:, -1])
             step = found.centring(linear, np.nan_to_num(beyond), self.narrow)[:, ::-1]
             turn = np.eye(self.narrow) + np.tensordot(own, self.bend, 1)
             centre = centre + np.linalg.solve(turn, (mean + step - centre)[..., None])[..., 0]
@@ -499,12 +583,31 @@ def walks(fit: JointFit) -> Walks:
     return Walks(np.reshape(columns, (len(columns), rows)).T, np.reshape(walk, (len(walk), 2)))
 
 
+def creep(fit: JointFit, by_y: np.ndarray, errors: int) -> Creep | None:
+    """Of zeros whose creep's time constant is estimated.
+
+    Args:
+        fit: converged.
+        by_y: the coordinates z of how far each zero creeps by y, shape (2, g).
+        errors: at places and of drifts, columns before those of y.
+    """
+    minutes = INDEX["creep_minutes"]
+    if not fit.free[minutes]:
+        return None
+    slope, physical = np.asarray(fit.linearised.slope), np.asarray(fit.mode.physical)
+    moves = np.asarray(fit.arrays.spots.move_index)[: len(slope)]
+    unit_rad = np.radians(np.asarray(fit.space.u)[CREEP_COLUMNS])
+    at_mode = -np.radians(physical[CREEP_COLUMNS])
+    rows = np.column_stack([np.zeros((2, errors)), unit_rad[:, None] * by_y[:, ::-1], at_mode])
+    return Creep(np.asarray(fit.arrays.moves.warm_minutes)[moves], float(physical[minutes]), slope, rows)
+
+
 def transport(fit: JointFit) -> Transport:
     """The map at the mode of a converged fit."""
     linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
     names = np.array(NAMES)
     free = np.flatnonzero(fit.free)
-    scales = np.isin(names[free], NOISE_NAMES)
+    scales = np.isin(names[free], SCALE_NAMES)
     # What several scales share comes first: given it, they have little to do with each other.
     noise, others = free[scales], free[~scales]
     noise = noise[np.argsort(~np.isin(names[noise], names_of("look_scatter_deg")), kind="stable")]
@@ -548,6 +651,7 @@ def transport(fit: JointFit) -> Transport:
             constant=stops.constant + stops.variance @ ~by_noise.any(axis=1) - stops.scatter @ by_scatter.any(axis=1),
             places=np.column_stack([columns[:, np.concatenate([seen, len(places.steps) + seen])], drifts.columns]),
             prior=(wide.T * precision) @ wide,
+            creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, 2 * len(seen) + len(drifts.walk)),
         ),
         residuals=misfit,
         bend=np.zeros((len(others), narrow, narrow)),
@@ -558,6 +662,7 @@ def transport(fit: JointFit) -> Transport:
         drift_noise=(DRIFT_COLUMNS[:, None] == noise).astype(float),
         gear_scale=np.asarray(fit.mode.physical)[GEAR_SCALES],
         gear_noise=(GEAR_SCALES[:, None] == noise).astype(float),
+        creep_noise=(noise == INDEX["creep_minutes"]).astype(float),
         period_deg=np.asarray(fit.space.harmonic_period_deg),
     )
     return replace(path, bend=bends(path))
