@@ -119,10 +119,13 @@ def small_rig(mounted_rig: Rig) -> Rig:
 
 @pytest.fixture
 def ctrl_c_works():
-    """A shell's background jobs are born with SIGINT ignored; the tests that ask for this raise it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """A shell's background jobs are born with SIGINT ignored, nohup's with SIGHUP; the tests of this raise them."""
+    wanted = {"SIGINT": signal.default_int_handler, "SIGHUP": signal.SIG_DFL}
+    numbers = {getattr(signal, name): handler for name, handler in wanted.items() if hasattr(signal, name)}
+    before = {number: signal.signal(number, handler) for number, handler in numbers.items()}
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The tutorial prints what the commands print, and the drawing of the instrument turns every axis the way the code does."""
+"""The tutorial prints what the commands print; the drawing of the instrument turns every axis as the code does."""
 
 from __future__ import annotations
 

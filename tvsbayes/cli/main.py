@@ -91,9 +91,10 @@ def _run(arguments: list[str]) -> int:
         if wants_json:
             print_json(error_document(InputError("usage", error.format_message(), remedy=remedy)))
         else:
-            error.show()
-            if commas:
-                report_line(f"what to do: {remedy}")
+            usage = io.StringIO()
+            error.show(file=usage)
+            for line in [*usage.getvalue().splitlines(), *[f"what to do: {remedy}"] * bool(commas)]:
+                report_line(line)
         return InputError.exit_code
     if code == INTERRUPTED:
         if wants_json:
