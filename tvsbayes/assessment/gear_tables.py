@@ -79,6 +79,12 @@ class Process:
     def __getitem__(self, chosen: slice) -> Process:
         return Process(self.sd[chosen], self.length[chosen], self.amplitudes[chosen], self.periods)
 
+    def without(self, number: int) -> Process:
+        """The process without one of its parts of stated period."""
+        amplitudes = self.amplitudes.copy()
+        amplitudes[:, number] = 0.0
+        return Process(self.sd, self.length, amplitudes, self.periods)
+
 
 @dataclass(frozen=True)
 class Conditional:
@@ -116,7 +122,19 @@ def _axis(name: str) -> Axis:
     return AXES[0] if name.endswith(AXES[0]) else AXES[1]
 
 
-def _process(physical: np.ndarray, name: str, periods: tuple[float, ...]) -> Process:
+def stated_periods(fit: JointFit, axis: Axis) -> tuple[float, ...]:
+    """Periods of an axis that the rig states, deg."""
+    return tuple(np.ravel(fit.campaign.rig.harmonic_period_deg.get(axis, ())).tolist())
+
+
+def seen_places(fit: JointFit) -> dict[Axis, np.ndarray]:
+    """Numbers of each axis' places among those of the fit."""
+    places = fit.arrays.gears.places
+    valid, on_tilt = np.asarray(places.valid), np.asarray(places.on_tilt)
+    return {axis: np.flatnonzero(valid & (on_tilt == (axis == AXES[1]))) for axis in AXES}
+
+
+def process_of(physical: np.ndarray, name: str, periods: tuple[float, ...]) -> Process:
     """Scales of one of `GEAR_INPUTS`, of draws (n, parameters)."""
     axis = _axis(name)
     length = physical[:, INDEX[f"transmission_error_length_deg.{axis}"]]
@@ -159,9 +177,7 @@ def drawn_gears(
     if not errors:
         none = np.zeros((count, 0))
         return DrawnGears(NO_GEARS, none, none, np.zeros((0, 0)))
-    places = fit.arrays.gears.places
-    steps, valid = np.asarray(places.steps), np.asarray(places.valid)
-    own = {axis: np.flatnonzero(valid & (np.asarray(places.on_tilt) == (axis == AXES[1]))) for axis in AXES}
+    steps, own = np.asarray(fit.arrays.gears.places.steps), seen_places(fit)
     table = _table(physical, {axis: steps[own[axis]] for axis in AXES})
     # The fit's own scales too: how its table follows the places, in units in which they are N(0, 1) a priori.
     mode, root = np.asarray(fit.mode.physical), np.asarray(fit.linearised.place_root) * DEGREES
@@ -171,14 +187,14 @@ def drawn_gears(
     for name, part in table.parts.items():
         axis = _axis(name)
         at = own[axis] + (0 if name.startswith(ERROR_AT) else errors // 2)
-        periods = tuple(np.ravel(fit.campaign.rig.harmonic_period_deg.get(axis, ())).tolist())
+        periods = stated_periods(fit, axis)
         seen, new = steps[own[axis]], np.array(table.steps[AXES.index(axis)])
         normal = generator.standard_normal((count, len(new) + 1))
-        process, ratio = _process(physical, name, periods), physical[:, INDEX[f"degrees_per_step.{axis}"], None]
+        process, ratio = process_of(physical, name, periods), physical[:, INDEX[f"degrees_per_step.{axis}"], None]
         values = place_errors_rad[:, at] * DEGREES
         found = conditional(process, ratio * seen, values, ratio * new, normal[:, :-1])
         own_ratio = float(mode[INDEX[f"degrees_per_step.{axis}"]])
-        follows = _following(_process(mode[None], name, periods), own_ratio * seen, own_ratio * new)
+        follows = _following(process_of(mode[None], name, periods), own_ratio * seen, own_ratio * new)
         inner = slice(part.start, part.stop - 1)
         by_places[inner] = follows @ root[at]
         expected[:, inner] = found.expected if own_scales else values @ follows.T

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from msgspec import structs
 
+from tvsbayes.assessment.gear_waves import gear_periods
 from tvsbayes.assessment.prior_sensitivity import prior_sensitivity
 from tvsbayes.assessment.score_tests import validate
 from tvsbayes.assessment.weaknesses import (
@@ -304,4 +305,5 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
         local=_by_part(source, "local_deg_per_step", moved),
         range_steps=seen_range(fit),
         homing_side=fit.homing_side,
+        periods=() if usable is None else gear_periods(usable),
     )

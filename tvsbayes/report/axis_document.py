@@ -29,8 +29,9 @@ from tvsbayes.report.document import (
 )
 from tvsbayes.report.page import digest_number, numbered
 from tvsbayes.report.position_figures import CURVE_POINTS, axis_errors, wave
+from tvsbayes.report.result_tables import WAVE_COLUMNS, WAVES, percent, wave_row
 from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
-from tvsbayes.results.estimates import Estimate
+from tvsbayes.results.estimates import Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.records import plain
 from tvsbayes.single_axis.axis_campaign import axis_hashes
@@ -40,7 +41,6 @@ from tvsbayes.single_axis.axis_periods import wave_samples
 from tvsbayes.single_axis.axis_record import (
     AxisResults,
     AxisSummary,
-    PeriodEstimate,
     PositionDeviation,
     drawn_deviations,
 )
@@ -71,24 +71,11 @@ def _row(name: str, of: Estimate) -> list[str]:
 
 def period_table(summary: AxisSummary) -> TableView | None:
     """Every wave with amplitude and period, given that it is there; None where none was asked for."""
-    unit = escaped(summary.unit)
-    rows = []
-    for what, found in (("gear", summary.periods), ("encoder", summary.encoder_periods)):
+    unit, rows = escaped(summary.unit), []
+    for what, waves in (("gear", summary.periods), ("encoder", summary.encoder_periods)):
         of = "s" if what == "gear" and summary.periods_in == "seconds" else unit
-        for one in found:
-            period = f"{one.period.value:.10g}" if one.source == "stated" else concise(one.period.value, one.period.sd)
-            amplitude = concise(one.amplitude.value, one.amplitude.sd)
-            across = interval_text(*one.amplitude.interval95, one.amplitude.sd)
-            between = interval_text(*one.period.interval95, one.period.sd) if one.source == "inferred" else "stated"
-            phase, chance = concise(one.phase_deg.value, one.phase_deg.sd), percent(one.probability)
-            rows.append([what, f"{amplitude} {unit} every {period} {of}", across, between, phase, chance])
-    head = ["", "amplitude(u) every period(u)", "amplitude, 95 %", "period, 95 %", "phase(u), deg", "there is a wave"]
-    return TableView("waves, given that they are there; phase at position or time 0", head, rows) if rows else None
-
-
-def percent(probability: float) -> str:
-    """Of draws, so that neither 0 nor 100 % is claimed."""
-    return "> 99.9 %" if probability > 0.999 else "< 0.1 %" if probability < 0.001 else f"{100 * probability:.1f} %"
+        rows += [wave_row(what, wave, unit, of) for wave in waves]
+    return TableView(f"{WAVES}; phase at position or time 0", WAVE_COLUMNS, rows) if rows else None
 
 
 def ratio_table(summary: AxisSummary) -> TableView:

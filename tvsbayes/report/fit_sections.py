@@ -25,6 +25,7 @@ from tvsbayes.report.result_tables import (
     gears_table,
     hold_out_table,
     range_text,
+    waves_table,
 )
 from tvsbayes.report.spot_pictures import spot_gallery
 from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
@@ -191,7 +192,8 @@ def gear_section(e: Evidence) -> Section:
         "as extrapolated, and their uncertainty grows.",
     ]
     views = [_view(band, [stop for stop in e.shown.residuals if stop.axis == band.axis]) for band in e.gears]
-    return Section("Gears: what repeats by position", text, tables=[gears_table(summary), ratios], figures=views)
+    tables = [waves_table(summary), gears_table(summary), ratios]
+    return Section("Gears: what repeats by position", text, tables=tables, figures=views)
 
 
 def _view(band: GearBand, stops: Sequence[StopResidual]) -> FigureView:

@@ -19,6 +19,7 @@ from tvsbayes.report.result_tables import (
     gears_table,
     headline_table,
     range_text,
+    waves_table,
 )
 from tvsbayes.report.tables import TableView, concise
 from tvsbayes.results.convergence import Importance, Sampling
@@ -91,6 +92,8 @@ def detail_lines(summary: FitSummary) -> list[Part]:
     where = details_table(summary)
     # A head that says where it points stands in no camera's frame.
     lines: list[Part] = [where] if where.rows else []
+    if (waves := waves_table(summary)) is not None:
+        lines.append(waves)
     if (gears := gears_table(summary)) is not None:
         lines += [gears, *gear_lines(summary)]
     lines.append(f"chi2 {summary.noise.chi2:.1f} for {summary.noise.dof:.1f} degrees of freedom")

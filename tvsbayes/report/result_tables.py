@@ -16,7 +16,7 @@ from tvsbayes.metrology.look_budget import Budget
 from tvsbayes.report.parameter_words import share_in_words
 from tvsbayes.report.tables import TableView, concise, interval_text, signed
 from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
-from tvsbayes.results.estimates import Estimate, FitSummary
+from tvsbayes.results.estimates import Estimate, FitSummary, PeriodEstimate
 
 
 def _rows(*names: str) -> tuple[tuple[str, str, str], ...]:
@@ -107,6 +107,35 @@ def gears_table(summary: FitSummary) -> TableView | None:
         return None
     rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in _rows(*there)]
     return TableView("gears: what repeats by position", ESTIMATE_COLUMNS, rows)
+
+
+WAVES = "waves, given that they are there"
+WAVE_COLUMNS = [
+    *("", "amplitude(u) every period(u)", "amplitude, 95 %", "period, 95 %"),
+    *("phase(u), deg", "there is a wave"),
+]
+
+
+def wave_row(what: str, wave: PeriodEstimate, unit: str, of: str) -> list[str]:
+    """A row of `WAVE_COLUMNS`; `unit` of the amplitude, `of` the period."""
+    stated = wave.source == "stated"
+    period = f"{wave.period.value:.10g}" if stated else concise(wave.period.value, wave.period.sd)
+    amplitude = concise(wave.amplitude.value, wave.amplitude.sd)
+    across = interval_text(*wave.amplitude.interval95, wave.amplitude.sd)
+    between = "stated" if stated else interval_text(*wave.period.interval95, wave.period.sd)
+    phase = concise(wave.phase_deg.value, wave.phase_deg.sd)
+    return [what, f"{amplitude} {unit} every {period} {of}", across, between, phase, percent(wave.probability)]
+
+
+def percent(probability: float) -> str:
+    """Of draws, so that neither 0 nor 100 % is claimed."""
+    return "> 99.9 %" if probability > 0.999 else "< 0.1 %" if probability < 0.001 else f"{100 * probability:.1f} %"
+
+
+def waves_table(summary: FitSummary) -> TableView | None:
+    """Waves of the periods that the rig states; None where there are none."""
+    rows = [wave_row(wave.axis, wave, "deg", "deg") for wave in summary.periods]
+    return TableView(f"{WAVES}; phase at counter 0", WAVE_COLUMNS, rows) if rows else None
 
 
 def gap_table(gaps: Mapping[str, Gap | None]) -> TableView:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -218,6 +218,43 @@ class Curves(ClosedRecord, frozen=True, rename={"ratios": "effective_deg_per_ste
     lost_motion: ByDirection[tuple[LostMotion, ...]]
 
 
+class Measured(Record, frozen=True):
+    """A quantity by its draws.
+
+    Attributes:
+        value, sd, interval95: mean, standard uncertainty, central interval.
+    """
+
+    value: float
+    sd: NotNegative
+    interval95: tuple[float, float]
+
+
+class PeriodEstimate(Record, frozen=True):
+    """One wave. Where more than one period explains the data, value and sd are of the likeliest, intervals of all.
+
+    Attributes:
+        period: of an axis in the unit of the readings, or s; of a scanner deg of the output.
+        amplitude: of the first harmonic, in the unit of the output; half of what it makes from crest to trough.
+        phase_deg: the wave is highest where 360 x / period is the phase; x is |unit per command| x command, `time_s`,
+            or the reading for a wave of the encoder. About its circular mean: an interval may leave -180 to 180.
+        source: whether the period was stated or inferred.
+        probability: that there is such a wave.
+    """
+
+    period: Measured
+    amplitude: Measured
+    phase_deg: Measured
+    source: Literal["stated", "inferred"]
+    probability: Probability
+
+
+class GearPeriod(PeriodEstimate, frozen=True):
+    """A wave in the gears of one axis of a scanner."""
+
+    axis: AxisName
+
+
 class FitNoise(ClosedRecord, frozen=True):
     """How well the model fits, and the noise that it found.
 
@@ -286,6 +323,7 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
         curves: local ratios over the range and lost motion against steps; only from a posterior.
         validation: whether the residuals look as the model says; None where nobody asked.
         few_stops: directions in which so few stops were seen that their scatter is poorly known, with the number.
+        periods: waves of the periods that the rig states, given that they are there; only from a posterior.
     """
 
     estimator: EstimatorName
@@ -314,6 +352,7 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
     curves: Curves | None
     validation: Validation | None = None
     few_stops: ByDirection[Count] = msgspec.field(default_factory=dict)
+    periods: tuple[GearPeriod, ...] = ()
 
     def shown(self) -> View:
         """Every estimate but the cameras' parameters."""

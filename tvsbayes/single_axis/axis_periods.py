@@ -6,11 +6,10 @@ Numbers are given that there is a wave; `probability` says whether. Amplitude an
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from tvsbayes.results.records import NotNegative, Probability, Record
+from tvsbayes.results.estimates import Measured, PeriodEstimate
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, wave_columns
@@ -21,37 +20,6 @@ WITH_WAVE_MIN, WITH_WAVE = 200, 1000
 TAILS_PERCENT = (2.5, 97.5)
 ALIKE = 0.02
 """Draws of a period that lie farther apart than this share of it belong to different waves that explain the same."""
-
-
-class Measured(Record, frozen=True):
-    """A quantity by its draws.
-
-    Attributes:
-        value, sd, interval95: mean, standard uncertainty, central interval.
-    """
-
-    value: float
-    sd: NotNegative
-    interval95: tuple[float, float]
-
-
-class PeriodEstimate(Record, frozen=True):
-    """One wave. Where more than one period explains the readings, value and sd are of the likeliest, intervals of all.
-
-    Attributes:
-        period: in the unit of the readings, or s.
-        amplitude: of the first harmonic, unit of the readings; half of what it makes from crest to trough.
-        phase_deg: the wave is highest where 360 x / period is the phase; x is |unit per command| x command, `time_s`,
-            or the reading for a wave of the encoder. About its circular mean: an interval may leave -180 to 180.
-        source: whether the period was stated or inferred.
-        probability: that there is such a wave.
-    """
-
-    period: Measured
-    amplitude: Measured
-    phase_deg: Measured
-    source: Literal["stated", "inferred"]
-    probability: Probability
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from tvsbayes.errors import NothingToEstimate, TvsError, escaped, listed, refusa
 from tvsbayes.files.disk import RESULTS_BYTES_MAX, make_folder, read_arrays, write_atomically
 from tvsbayes.progress import Show
 from tvsbayes.results.convergence import Convergence, MonteCarloError
-from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate
+from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import Provenance, Sha256, provenance
 from tvsbayes.results.records import (
     AnswerKind,
@@ -38,7 +38,7 @@ from tvsbayes.single_axis.axis_density import FUNCTIONALS, blocks_of, line_weigh
 from tvsbayes.single_axis.axis_doubts import data_doubts
 from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_SHARE, kind_of, prior_sd
-from tvsbayes.single_axis.axis_periods import PeriodEstimate, period_estimate, wave_samples, waves_at_an_end, weak_waves
+from tvsbayes.single_axis.axis_periods import period_estimate, wave_samples, waves_at_an_end, weak_waves
 from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
 from tvsbayes.statistics.intervals import NORMAL_95

@@ -1,0 +1,125 @@
+"""Waves of stated period in the gears of a scanner: amplitude, phase, and the probability that there is one.
+
+A wave is a cos(2 pi x / P) + b sin(2 pi x / P) of the output's angle x = k n, with a and b normal of sd A, half-normal
+itself (formulation 3.1). Given the errors at the places, a and b are normal again. deg.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tvsbayes.assessment.gear_tables import BLOCK, Process, process_of, seen_places, stated_periods
+from tvsbayes.calibration.optics import ERROR_AT
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.parameters import INDEX
+from tvsbayes.model.headlines import DEGREES
+from tvsbayes.posterior.draws import Posterior
+from tvsbayes.results.estimates import GearPeriod, Measured
+
+DRAWS = 2048
+"""Of equal weight: the error of a mean is a forty-fifth of its sd, that of a probability at most 0.011."""
+
+
+@dataclass(frozen=True)
+class WaveDraws:
+    """One wave, a row for every draw of the posterior.
+
+    Attributes:
+        cosine, sine: its parts, deg, shape (draws,).
+        log_evidence_ratio: of the errors at the places without the wave against those with it, shape (draws,).
+    """
+
+    cosine: np.ndarray
+    sine: np.ndarray
+    log_evidence_ratio: np.ndarray
+
+    @property
+    def probability(self) -> float:
+        """That there is a wave, where it was as likely as none beforehand.
+
+        The mean over the posterior of p(errors | no wave) / p(errors | wave) is the ratio of both evidences, since
+        the looks know of the wave by the errors alone.
+        """
+        none = float(np.mean(np.exp(self.log_evidence_ratio)))
+        return 1 / (1 + none)
+
+    @property
+    def amplitude(self) -> np.ndarray:
+        """Half of what it makes from crest to trough, deg, shape (draws,)."""
+        return np.hypot(self.cosine, self.sine)
+
+    @property
+    def phase_deg(self) -> np.ndarray:
+        """Within half a turn of the circular mean, shape (draws,)."""
+        phase = np.arctan2(self.sine, self.cosine)
+        middle = np.angle(np.mean(np.exp(1j * phase)))
+        return np.degrees(middle + np.angle(np.exp(1j * (phase - middle))))
+
+
+def wave_draws(
+    process: Process, number: int, angle_deg: np.ndarray, errors_deg: np.ndarray, normal: np.ndarray
+) -> WaveDraws:
+    """The wave of one stated period, given the errors at places.
+
+    Args:
+        process: scales by draw.
+        number: of the period in `process.periods`.
+        angle_deg: of the places, shape (draws, p).
+        errors_deg: transmission errors there, shape (draws, p).
+        normal: standard normal numbers, shape (draws, 2).
+    """
+    parts, ratio = np.empty((len(errors_deg), 2)), np.empty(len(errors_deg))
+    for begin in range(0, len(errors_deg), BLOCK):
+        rows = slice(begin, begin + BLOCK)
+        angle, error, whole = angle_deg[rows], errors_deg[rows], process[rows]
+        variance = whole.amplitudes[:, number] ** 2
+        phase = 2 * np.pi * angle / process.periods[number]
+        wave = np.stack([np.cos(phase), np.sin(phase)], axis=-1)
+        root = np.linalg.cholesky(whole.covariance(angle))
+        # a, b | errors: gain V W^T C^-1 e, covariance V (1 - V W^T C^-1 W), of which the 2 x 2 root is taken by its
+        # eigenvalues: rounding may leave one of them below 0 where the errors determine the wave.
+        scaled, white = np.linalg.solve(root, wave), np.linalg.solve(root, error[..., None])
+        mean = variance[:, None] * (scaled.swapaxes(1, 2) @ white)[..., 0]
+        left = np.eye(2) - variance[:, None, None] * (scaled.swapaxes(1, 2) @ scaled)
+        share, vectors = np.linalg.eigh(left)
+        sd = np.sqrt(np.maximum(share, 0.0) * variance[:, None])
+        parts[rows] = mean + (vectors @ (sd * normal[rows])[..., None])[..., 0]
+        plain = np.linalg.cholesky(whole.without(number).covariance(angle))
+        alone = np.linalg.solve(plain, error[..., None])
+        ratio[rows] = 0.5 * (np.sum(white**2, axis=(1, 2)) - np.sum(alone**2, axis=(1, 2))) + _log_root(root)
+        ratio[rows] -= _log_root(plain)
+    return WaveDraws(parts[:, 0], parts[:, 1], ratio)
+
+
+def _log_root(root: np.ndarray) -> np.ndarray:
+    """Half the logarithm of the determinant of a covariance, of its factors (n, p, p)."""
+    return np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)), axis=1)
+
+
+def _measured(draws: np.ndarray) -> Measured:
+    low, high = np.percentile(draws, (2.5, 97.5))
+    return Measured(float(draws.mean()), float(draws.std()), (float(low), float(high)))
+
+
+def gear_periods(posterior: Posterior) -> tuple[GearPeriod, ...]:
+    """Every wave whose period `[rig]` states and whose amplitude is not held at 0, given that it is there."""
+    fit, rng = posterior.fit, np.random.default_rng([posterior.seed, 13])
+    drawn = posterior.resampled(1, DRAWS).joined
+    physical, errors_deg = np.asarray(drawn.physical), np.asarray(drawn.place_errors_rad) * DEGREES
+    found: list[GearPeriod] = []
+    if not errors_deg.shape[1]:
+        return ()
+    places = seen_places(fit)
+    for axis in AXES:
+        process = process_of(physical, f"{ERROR_AT}{axis}", stated_periods(fit, axis))
+        at, steps = places[axis], np.asarray(fit.arrays.gears.places.steps)[places[axis]]
+        angle_deg = physical[:, INDEX[f"degrees_per_step.{axis}"], None] * steps
+        for number, period in enumerate(process.periods):
+            if np.any(process.amplitudes[:, number] > 0) and len(at):
+                one = wave_draws(process, number, angle_deg, errors_deg[:, at], rng.standard_normal((DRAWS, 2)))
+                stated = Measured(period, 0.0, (period, period))
+                amplitude, phase = _measured(one.amplitude), _measured(one.phase_deg)
+                found.append(GearPeriod(stated, amplitude, phase, "stated", one.probability, axis))
+    return tuple(found)
