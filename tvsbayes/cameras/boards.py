@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from tvsbayes.cameras.camera_marks import paired_pictures, unnamed_pictures
-from tvsbayes.cameras.marker_boards import MARKERS_MIN, Markers, as_seen, marker_board_corners, most_markers
+from tvsbayes.cameras.marker_boards import MARKERS_MIN, Markers, as_seen, marker_board_corners, most_markers, spread
 from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
 from tvsbayes.cameras.seen_boards import why_no_board
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
@@ -338,12 +338,12 @@ def find_views(
     counted = Counter(sizes.values())
     size = max(counted, key=lambda s: (counted[s], s))
     used = [picture for picture, own in sizes.items() if own == size]
-    spread = _spread(used)
+    tried = spread(used, TRIED_MAX)
     if board.markers is not None:
-        greys = [part for picture in spread for part in _greys(picture, folder, size).values()]
+        greys = [part for picture in tried for part in _greys(picture, folder, size).values()]
         board = replace(board, markers=as_seen(greys, board.markers))
-    if len(used) > len(spread) and not _any_board(folder, spread, size, board, finder):
-        raise _without_board(folder, spread, len(used), size, board)
+    if len(used) > len(tried) and not _any_board(folder, tried, size, board, finder):
+        raise _without_board(folder, tried, len(used), size, board)
     boards: dict[str, dict[str, _Detection]] = {}
     names: dict[tuple[str, str], str] = {}
     without, fallback = [], []
@@ -361,7 +361,7 @@ def find_views(
             if detection.by_fallback:
                 fallback.append(name)
     if not boards:
-        raise _without_board(folder, spread, len(used), size, board)
+        raise _without_board(folder, tried, len(used), size, board)
     views, reordered = [], []
     for name in sorted(boards, key=natural_order):
         left, right = (boards[name].get(side) for side in CAMERAS)
@@ -384,11 +384,6 @@ def find_views(
     )
 
 
-def _spread(used: Sequence[Picture]) -> list[Picture]:
-    """Some pictures, spread evenly over all."""
-    return [used[k] for k in sorted({round(x) for x in np.linspace(0, len(used) - 1, min(TRIED_MAX, len(used)))})]
-
-
 def _any_board(folder: Path, tried: Sequence[Picture], size: tuple[int, int], board: Board, finder: Finder) -> bool:
     """Whether one of some pictures shows the board: all would take minutes."""
     for k in range(0, len(tried), TRIED_AT_ONCE):
@@ -405,8 +400,9 @@ def _without_board(
     greys = [part for picture in tried for part in _greys(picture, folder, size).values()]
     reason, remedy = why_no_board(greys, board.columns, board.rows)
     if board.markers is None:
-        name, markers = most_markers(greys)
-        if markers >= MARKERS_MIN * len(greys):
+        looked = spread(greys)
+        name, markers = most_markers(looked)
+        if markers >= MARKERS_MIN * len(looked):
             reason += f"; {markers} markers of {name.partition('_')[0]} are seen, as on a ChArUco board"
             remedy = f"--charuco COLUMNSxROWS --dictionary {name} in place of --board, counting squares"
     else:

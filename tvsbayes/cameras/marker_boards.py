@@ -23,6 +23,8 @@ MISFIT_SQUARES = 0.2
 """Centres of markers may miss the plane of the board by so much: lenses bend it by less over a picture."""
 MARKERS_MIN = 6
 """A homography has eight parameters: four markers fit any arrangement."""
+LOOKED_AT = 4
+"""Pictures in which markers of other dictionaries are looked for: a thousand markers take 0.2 s of one."""
 SQUARES_MAX = 60
 GAP_SHARE = 0.9
 """Half the window of cornerSubPix over the gap between a corner and the markers beside it, which must stay outside."""
@@ -118,7 +120,7 @@ def as_seen(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
         tried[legacy] = [fit for one in seen if (fit := _plane_of(one, board)) is not None]
     best = min(tried, key=lambda legacy: np.median([fit[0] for fit in tried[legacy]] or [np.inf]))
     if not tried[best]:
-        _refuse_other_markers(pictures, markers, sum(len(one.numbers) for one in seen))
+        _refuse_other_markers(spread(pictures), markers)
         return replace(markers, share=markers.share or SHARE_USUAL)
     if np.median([fit[0] for fit in tried[best]]) > MISFIT_SQUARES:
         raise _other_board(seen, markers)
@@ -148,18 +150,29 @@ def _other_board(seen: Sequence[_Seen], markers: Markers) -> NothingToEstimate:
     )
 
 
+def spread[T](pictures: Sequence[T], count: int = LOOKED_AT) -> list[T]:
+    """So many of the pictures, spread evenly over all."""
+    places = np.linspace(0, len(pictures) - 1, min(count, len(pictures)))
+    return [pictures[round(place)] for place in places]
+
+
 def most_markers(pictures: Sequence[np.ndarray]) -> tuple[str, int]:
-    """The dictionary of which pictures show the most markers, and how many."""
-    counted = {name: sum(len(_markers(grey, name).numbers) for grey in pictures) for name in WIDEST_DICTIONARIES}
+    """The dictionary of which pictures show the most markers, or the first of which all show enough, and how many."""
+    counted: dict[str, int] = {}
+    for name in WIDEST_DICTIONARIES:
+        counted[name] = sum(len(_markers(grey, name).numbers) for grey in pictures)
+        if counted[name] >= MARKERS_MIN * len(pictures):
+            return name, counted[name]
     name = max(counted, key=lambda one: counted[one])
     return name, counted[name]
 
 
-def _refuse_other_markers(pictures: Sequence[np.ndarray], markers: Markers, own: int) -> None:
-    """Refuse pictures that show none of the `own` dictionary's markers, or more of another's.
+def _refuse_other_markers(pictures: Sequence[np.ndarray], markers: Markers) -> None:
+    """Refuse pictures that show none of the dictionary's markers, or more of another's.
 
     Of few bits some are seen where none is.
     """
+    own = sum(len(_markers(grey, markers.dictionary).numbers) for grey in pictures)
     name, count = most_markers(pictures)
     if own >= max(1, count):
         return
