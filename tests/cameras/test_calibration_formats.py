@@ -79,7 +79,7 @@ def test_ros_export_is_in_metres(mounted):
     """P[0][3] of the right camera is -fx x baseline in metres, 0 in the left one."""
     files = exported(mounted, "ros")
     left, right = (
-        np.array(read_container(files[name], name).table("projection_matrix").values["data"]).reshape(3, 4)
+        np.array(read_container(files[name], name)[0].table("projection_matrix").values["data"]).reshape(3, 4)
         for name in ("left.yaml", "right.yaml")
     )
     assert left[0, 3] == 0
@@ -217,7 +217,7 @@ def test_opencvs_own_sample_files():
     if not (OPENCV_DATA / "intrinsics.yml").is_file():
         pytest.skip("Debian's package opencv-doc is not installed")
     data = (OPENCV_DATA / "left_intrinsics.yml").read_bytes()
-    keys = read_container(data, "left_intrinsics.yml")
+    (keys,) = read_container(data, "left_intrinsics.yml")
     assert keys.values["image_width"] == 640
     assert keys.table("camera_matrix").values["data"][0] == 535.91573396163199
     assert len(keys.table("extrinsic_parameters").values["data"]) == 78

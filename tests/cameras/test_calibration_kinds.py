@@ -365,6 +365,64 @@ def test_rational_models(mounted, tmp_path):
             same(found.stereo, mounted)
 
 
+def test_poses_of_both_cameras_and_turns_the_other_way(mounted, tmp_path):
+    """R and T in the table of each camera are its pose; `.T` takes a matrix or Rodrigues' vector the other way."""
+    world, at_mm = rotation_matrix(np.array([0.3, -0.2, 0.1])), np.array([10.0, 20, 1000])
+    right = {"R": mounted.R @ world, "T": mounted.R @ at_mm + mounted.T, "K": mounted.M2, "D": mounted.D2}
+    tables = {"left": {"R": world, "T": at_mm, "K": mounted.M1, "D": mounted.D1}, "right": right}
+    document = {side: {key: value.tolist() for key, value in table.items()} for side, table in tables.items()}
+    document["size"] = [1280, 720]
+    path = tmp_path / "poses.json"
+    path.write_text(json.dumps(document))
+    same(read_calibration([path]).stereo, mounted)
+    good = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()} | {"size": [1280, 720]}
+    for other_way in (mounted.R.T, -rotation_vector(mounted.R)):
+        path.write_text(json.dumps({**good, "R": other_way.tolist()}))
+        same(read_calibration([path], keys={"R": "R.T"}).stereo, mounted)
+
+
+def test_messages_of_both_cameras_in_one_paste(mounted, tmp_path):
+    """What repeats but for its header is one message; a line of dashes at the end is none."""
+    texts = [exported(mounted, "ros")[f"{side}.yaml"].decode() for side in ("left", "right")]
+    path = tmp_path / "pasted.txt"
+    path.write_text("".join(f"header: {{seq: {k}}}\n{text}---\n" for k, text in enumerate(2 * texts)))
+    found = read_calibration([path])
+    assert found.source == "ros" and np.abs(found.stereo.vector - mounted.vector).max() < 1e-9
+
+
+def test_a_fisheye_of_orb_slam_and_a_rectified_pair_by_its_baseline(tmp_path):
+    """k1 k2 k3 k4 of single keys; one camera and `Stereo.b`, m."""
+    lens = [
+        f"Camera{n}.{key}: {v}"
+        for n in (1, 2)
+        for key, v in zip(
+            ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+            (812.4, 811.9, 318.2, 243.7, 0.03, -0.02, 0.03, -0.01),
+            strict=True,
+        )
+    ]
+    pose = "Stereo.T_c1_c2: {rows: 4, cols: 4, data: [1,0,0,0.1, 0,1,0,0, 0,0,1,0, 0,0,0,1]}"
+    size = ["Camera.width: 640", "Camera.height: 480"]
+    path = tmp_path / "orb.yaml"
+    path.write_text("\n".join(["%YAML:1.0", "Camera.type: KannalaBrandt8", *lens, *size, pose]))
+    found = read_calibration([path])
+    assert found.source == "orb-slam" and found.stereo.T.tolist() == [-100.0, 0, 0]
+    fitted = fitted_to_five(found.stereo.M1, np.array([0.03, -0.02, 0.03, -0.01]), (640, 480), "fisheye")
+    np.testing.assert_array_equal(found.stereo.D2, fitted.distortion)
+    path.write_text("\n".join(["%YAML:1.0", "Camera.type: Rectified", *lens[:4], *size, "Stereo.b: 0.11"]))
+    found = read_calibration([path])
+    assert found.stereo.T.tolist() == [-110.0, 0, 0] and np.array_equal(found.stereo.M1, found.stereo.M2)
+    assert not found.stereo.D1.any() and np.array_equal(found.stereo.R, np.eye(3))
+
+
+@pytest.mark.parametrize("key", ("ret", "retStereo", "mean_reprojection_error", "metadata.error"))
+def test_an_rms_is_used_under_the_names_that_it_has(mounted, tmp_path, key):
+    good = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()} | {"size": [1280, 720]}
+    *table, name = key.split(".")
+    (tmp_path / "a.json").write_text(json.dumps({**good, **({table[0]: {name: 0.77}} if table else {name: 0.77})}))
+    assert "RMS 0.77 px (of the file)" in read_calibration([tmp_path / "a.json"]).stereo.assumed_from
+
+
 def test_what_no_name_tells_is_named_by_the_user(mounted, tmp_path):
     path = tmp_path / "odd.json"
     odd = plain(mounted, "alpha beta gamma delta epsilon zeta")
@@ -390,8 +448,22 @@ def mistaken(mounted: Stereo) -> dict[str, tuple[dict[str, object], str]]:
         "R transposed": ({**good, **turned}, "R transposed, by what else the file says"),
         "R of another file": (
             {**good, **turned, "R": rotation_matrix(np.array([0, 0.3, 0])).tolist()},
-            "another rotation",
+            "another pose than the rest of the file says",
         ),
+        "R transposed, by F": (
+            {
+                **good,
+                "R": turned["R"],
+                "F": np.linalg.solve(mounted.M2.T, essential @ np.linalg.inv(mounted.M1)).tolist(),
+            },
+            "--key R=R.T",
+        ),
+        "two poses": ({**good, "T_right_left": np.eye(4).tolist()}, "another pose"),
+        "by columns": ({**good, "M1": mounted.M1.T.tolist()}, "--key R=R.T where it is transposed too"),
+        "three coefficients": ({**good, "D2": [0.1, 0.0, 0.2]}, "D2: found 3 numbers"),
+        "no number": ({**good, "T": [None, 0, 0]}, "T: found no list of finite numbers"),
+        "no picture's T": ({**good, "T": (mounted.T * 500).tolist()}, "--import-unit mm if it is so"),
+        "squares": ({**good, "T": (mounted.T / 25).tolist()}, "--import-unit 25 where it counts squares"),
         "R no rotation": ({**good, "R": (2 * mounted.R).tolist()}, "misses it by"),
         "R in degrees": ({**good, "R": [0.0, 5.0, 1.0]}, "is it in degrees?"),
         "omnidirectional": ({**good, "camera_model": "omni"}, "the model omni"),
@@ -453,6 +525,11 @@ def test_what_would_pass_in_silence_is_said(mounted, tmp_path):
         "are left and right swapped?": {"T": inverse, "R": mounted.R.T.tolist()},
         "--import-unit": {"T": (mounted.T / 25.4).tolist()},
         "is that its size?": {"image_size": [640, 360]},
+        "is R transposed?": {"R": rotation_matrix(np.array([0, -0.1, 0.02])).tolist()},
+        "transposed they diverge": {"R": rotation_matrix(np.array([0, 0.1, 0.02])).tolist()},
+        "of pictures of two sizes": {"M2": np.diag([2, 2, 1]).dot(mounted.M2).tolist()},
+        "turns by 25 deg": {"R": rotation_matrix(np.array([0.0, 0.1, 0.43])).tolist()},
+        "is taken as rows, columns": {"image_size": [720, 1280]},
         "a view of": {"M1": [[4.2, 0, 640], [0, 4.2, 360], [0, 0, 1]]},
     }
     for word, new in attacks.items():
@@ -474,6 +551,8 @@ HOSTILE = {
     "h5.mat": b"\x89HDF\r\n\x1a\n" + 50 * b"\0",
     "short.npz": b"PK\x03\x04 nothing",
     "short.mat": b"MATLAB 5.0 MAT-file" + 150 * b"\0",
+    "picture.png": b"\x89PNG\r\n\x1a\n" + 50 * b"\0",
+    "pickle.pkl": b"\x80\x04\x95" + 50 * b"\0",
     "text.txt": b"fx = 800\nfy",
 }
 
@@ -482,7 +561,7 @@ HOSTILE = {
 def test_hostile_and_damaged_containers_are_refused(name):
     with pytest.raises(InputError) as caught:
         read_container(HOSTILE[name], name)
-    assert caught.value.remedy and name in str(caught.value)
+    assert caught.value.remedy and name in str(caught.value) and "UTF-8" not in caught.value.remedy
 
 
 def test_pickles_and_bombs_are_refused(tmp_path):

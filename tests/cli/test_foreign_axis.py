@@ -38,7 +38,12 @@ def lines(form: str, **words: object) -> str:
     """A line for each reading."""
     rows = readings()
     return "".join(
-        form.format(c=c, v=v, s="+-"[s < 0], word=("up", "down")[s < 0], d=dms(v), dev=1000 * (v - RATIO * c), k=k)
+        form.format(
+            **{"c": c, "v": v, "s": "+-"[s < 0], "word": ("up", "down")[s < 0], "d": dms(v), "k": k},
+            **{"dev": 1000 * (v - RATIO * c), "m": f"{'-' * (v < 0)}{int(abs(v))}\u00b0 {60 * (abs(v) % 1):.4f}'"},
+            # Past midnight.
+            h=f"{(23 + (50 + k) // 60) % 24:02d}:{(50 + k) % 60:02d}:00",
+        )
         for k, (c, v, s) in enumerate(rows)
     )
 
@@ -52,6 +57,15 @@ WRITTEN = {
     "inch": "step;reading;dir\n" + lines('{c};{v:.4f}";{word}\n'),
     "units in cells": "step;reading;dir\n" + lines("{c};{v:.4f} mm;{word}\n"),
     "decimal commas": "Schritte;Messwert (mm);Richtung\n" + lines("{c};{v:.4f};{s}\n").replace(".", ","),
+    "units below the names": "steps,reading,direction\n[counts],[mm],\n" + lines("{c},{v:.4f},{s}\n"),
+    "words that the order tells": "steps,reading mm,direction\n"
+    + lines("{c},{v:.4f},{word}\n").replace("up", "CW").replace("down", "CCW"),
+    "actual": "Setpoint;Actual (mm);Dir\n" + lines("{c};{v:.4f};{s}\n"),
+    "no number": "steps;mm;dir\n" + lines("{c};{v:.4f};{s}\n") + "0;NaN;-\n",
+    "commas in a serial monitor": lines("Step: {c}; Angle: {v:.4f} deg\n").replace(".", ","),
+    "minutes with decimals": "step\tangle\tdir\n" + lines("{c}\t{m}\t{word}\n"),
+    "milliseconds since 1970": "timestamp,steps,mm,dir\n" + lines("17000000{k:02d}000,{c},{v:.4f},{s}\n"),
+    "time of day": "time,steps,mm,dir\n" + lines("{h},{c},{v:.4f},{s}\n"),
     "camonitor": lines(
         "T:Axis1-PosAct 2021-07-09 10:29:{k:02d}.000000 {c}\nT:Enc1 2021-07-09 10:29:{k:02d}.000000 {v:.4f}\n"
     ),
@@ -67,11 +81,14 @@ def test_every_notation_gives_the_same_axis(ask, tmp_path, name):
     assert code == 0 and document["ok"] == len(readings()) and document["next"] == f"tvsbayes calibrate {out}"
     found = classic_axis(rows_of(read_axis(out)))
     # A second of arc or 1e-4 is the last digit that is written; of the first stop without a word the side is unknown.
-    loose = PLAY / 3200 if name in ("serial", "clock", "camonitor") else 1e-4 / 3200
+    without = ("serial", "clock", "camonitor", "commas in a serial monitor")
+    loose = PLAY / 3200 if name in without else 1e-4 / 3200
     assert found.per_command == pytest.approx(RATIO, abs=loose)
     assert abs(found.backlash) == pytest.approx(PLAY, abs=2e-3)
-    unit = {"heading": "mm", "words": "mm", "dms": "deg", "serial": "deg", "inch": "inch"}
-    assert read_axis(out).unit == unit.get(name, "deg" if name in ("clock", "camonitor") else "mm")
+    unit = {**dict.fromkeys(("dms", "minutes with decimals", *without), "deg"), "inch": "inch"}
+    assert read_axis(out).unit == unit.get(name, "mm")
+    times = [move.time_s for move in read_axis(out).moves if move.command == 3200]
+    assert times == sorted(times) and times[-1] - times[0] < 3600
 
 
 @pytest.mark.parametrize(
@@ -96,6 +113,25 @@ def test_files_that_people_have(ask, tmp_path, file, ratio, play, unit, said):
         assert abs(found.per_command - ratio) < 4 * found.u_per_command
         assert abs(abs(found.backlash) - play) < 4 * found.u_backlash
     assert rows.both_sides and {reading.u for reading in campaign.readings} == {0.0}
+
+
+SILENT = {
+    # header and rows, what is said, and the last reading with its u
+    "gon": ("steps,angle (gon)\n0,300\n100,350\n200,0\n300,50\n400,100\n", "400 gon each", (500.0, 0.0)),
+    "expanded": ("steps,mm,U (k=2.5)\n0,0,0.5\n1,1,0.5\n2,2.1,0.5\n", "an expanded uncertainty, over 2.5", (2.1, 0.2)),
+    "the command again": ("target,actual\n0,0\n1,1\n2,2\n", "equals the command in every row", (2.0, 0.0)),
+    "a share of 100": ("target,actual,error %\n1,1.1,10\n2,2.1,5\n4,4.1,2.5\n", "u: none", (4.1, 0.0)),
+}
+
+
+@pytest.mark.parametrize("name", SILENT)
+def test_what_would_be_a_wrong_answer_in_silence(ask, tmp_path, name):
+    content, said, last = SILENT[name]
+    file, out = tmp_path / "log.csv", tmp_path / "out"
+    file.write_text(content)
+    code, document = ask("import", file, "--axis", "--to", out, "--yes")
+    reading = read_axis(out).readings[-1]
+    assert code == 0 and any(said in text for text in document["assumed"]) and (reading.value, reading.u) == last
 
 
 def test_deviations_on_demand(ask, tmp_path):
@@ -153,7 +189,12 @@ MISTAKES = {
         "forward where commands rise",
         "--column approach=",
     ),
-    "directions of nobody": (TABLE.replace(";+", ";cw"), (), "forward or backward, + or -", "--column approach="),
+    "directions of nobody": (
+        TABLE.replace(";+", ";cw").replace(";cw", ";x", 1),
+        (),
+        "forward or backward, + or -",
+        "--column approach=",
+    ),
     "an uncertainty below zero": ("steps,angle,sd\n0,1,0.1\n1,2,-0.1\n", (), "a number from 0", "correct the cell"),
     "a word among readings": (TABLE.replace("5.0000", "abc", 1), (), 'found "abc"', "correct the cell"),
     "two readings": ("steps,mm,deg\n0,1,2\n1,2,3\n", (), "value", "--column value=NAME"),

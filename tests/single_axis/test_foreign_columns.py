@@ -67,12 +67,14 @@ def test_runs_side_by_side_follow_each_other():
         **{"Forward 2 (mm)": ("3", "4")},
     )
     wide.columns["Backward 1 (mm)"] = ("5", "6")
-    found, (told,) = one_reading_a_row(wide, {})
+    rows = one_reading_a_row(wide, {})
+    found, (told,) = rows.table, rows.remarks
     assert found.columns["reading (mm)"] == ("2", "1", "5", "6", "4", "3")
     assert found.columns["Position"] == ("0", "10", "10", "0", "0", "10")
     assert found.columns["direction"] == ("forward",) * 2 + ("backward",) * 2 + ("forward",) * 2
     assert found.lines == (3, 2, 2, 3, 3, 2) and "3 columns" in told
-    assert one_reading_a_row(wide, {"value": "Forward 1 (mm)"}) == (wide, [])
+    assert rows.stated == {"command": "Position"}
+    assert one_reading_a_row(wide, {"value": "Forward 1 (mm)"}).table is wide
 
 
 def test_runs_in_two_units_or_without_positions_are_refused():

@@ -26,8 +26,8 @@ import numpy as np
 from tvsbayes.cameras.maker_calibrations import printed_values
 from tvsbayes.errors import InputError, escaped, refusal, shown
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.files.disk import decode
 from tvsbayes.files.documents import Keys, parse_json, parse_toml
+from tvsbayes.files.foreign_table import text_of
 
 MATRIX_TAG = "!!opencv-matrix"
 CONTAINER_BYTES_MAX = 4 * 1024 * 1024
@@ -37,13 +37,14 @@ _ALLOWED = (
     "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, .mat of MATLAB up to version 7, a ZED's SN*.conf,"
     " what rs-enumerate-devices -c prints"
 )
+_TEXT_REMEDY = "name a calibration file; from Python save the matrices by numpy.savez, not as pickles or pictures"
 MAT_SECONDS_MAX = 60.0
 _MAT_HEADER_BYTES, _MAT_COMPRESSED = 128, 15
 """Of MAT-file 5: the header, and the type of a compressed element (MATLAB MAT-File Format, 1-3, 1-6)."""
 
 
-def read_container(data: bytes, file: str) -> Keys:
-    """The top map of a calibration file.
+def read_container(data: bytes, file: str) -> list[Keys]:
+    """The top map of a calibration file; several where messages of several cameras follow each other.
 
     Raises:
         InputError: too large, unknown, damaged, or with more than such files hold; names file and line.
@@ -59,22 +60,22 @@ def read_container(data: bytes, file: str) -> Keys:
                 raise bad(file, None, str(e), "write it again with its program") from e
             except (MemoryError, RecursionError, struct.error, IndexError, AttributeError, OverflowError) as e:
                 raise bad(file, None, "a damaged file", "write it again with its program") from e
-            return Keys(_plain(values, file), file, "")
-    text = decode(data, file)
+            return [Keys(_plain(values, file), file, "")]
+    text, _ = text_of(data, file, _ALLOWED, _TEXT_REMEDY)
     try:
         printed = printed_values(text)
     except ValueError as error:
         raise bad(file, None, str(error), "take the file as the camera's program wrote it") from error
     if printed is not None:
-        return Keys(_plain(printed, file), file, text)
+        return [Keys(_plain(printed, file), file, text)]
     first = text.lstrip()[:1]
     if first == "<":
-        return Keys(_plain(_xml(text, file), file), file, "")
+        return [Keys(_plain(_xml(text, file), file), file, "")]
     if first == "{":
-        return parse_json(data, file)
+        return [parse_json(text.encode(), file)]
     if re.search(r"^\s*\[[\w.\"-]+\]\s*(#.*)?$|^\s*[\w.-]+\s*=", text, re.MULTILINE) and not text.startswith("%YAML"):
-        return parse_toml(data, file)
-    return Keys(_plain(_yaml(text, file), file), file, text)
+        return [parse_toml(text.encode(), file)]
+    return [Keys(_plain(one, file), file, text) for one in _yaml(text, file)]
 
 
 def bad(file: str, line: int | None, found: str, remedy: str = "write it as its own program does") -> InputError:
@@ -207,8 +208,11 @@ def _number(word: str) -> int | float | None:
     return int(word) if re.fullmatch(r"[+-]?[0-9]{1,15}", word) else float(word)
 
 
-def _yaml(text: str, file: str) -> dict[str, Any]:
-    """The first document of YAML, by PyYAML's safe loader; tags of OpenCV mean nothing to it."""
+def _yaml(text: str, file: str) -> list[dict[str, Any]]:
+    """The documents of YAML, by PyYAML's safe loader; tags of OpenCV mean nothing to it.
+
+    Messages of one camera that repeat differ in their headers alone.
+    """
     import yaml
 
     class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -237,16 +241,21 @@ def _yaml(text: str, file: str) -> dict[str, Any]:
     body = re.sub(r"\A%YAML[^\n]*\n", "\n", text)
     try:
         _counted(yaml.parse(body, Loader=Loader), file)
-        found = next(iter(yaml.load_all(body, Loader=Loader)), None)
+        found = list(yaml.load_all(body, Loader=Loader))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         told = getattr(error, "problem", None) or str(error)
         raise bad(file, None if mark is None else mark.line + 1, str(told)) from error
     except (RecursionError, ValueError) as error:
         raise bad(file, None, "YAML that is nested too deeply") from error
-    if not isinstance(found, dict):
-        raise bad(file, 1, "nothing" if found is None else shown(found), "name a calibration file")
-    return found
+    kept: list[dict[str, Any]] = []
+    for one in found or [None]:
+        if not isinstance(one, dict) and (one or not kept):
+            raise bad(file, 1, shown(one) if one else "nothing", "name a calibration file")
+        plain = {key: value for key, value in (one or {}).items() if key != "header"}
+        if plain and plain not in kept:
+            kept.append(plain)
+    return kept
 
 
 def _counted(events: Iterable[Any], file: str) -> None:

@@ -9,26 +9,26 @@ whatever unit the squares of their board had.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from tvsbayes.cameras.assumed_covariance import GUESS_FACTOR, Known, with_assumed_covariance
 from tvsbayes.cameras.calibration_containers import CONTAINER_BYTES_MAX, read_container
-from tvsbayes.cameras.calibration_names import ROTATION_TOLERANCE, Entry, Found
-from tvsbayes.cameras.lens_models import ERROR_MAX_PX, fitted_to_five, kind_of
+from tvsbayes.cameras.calibration_names import MADE_BY, ROTATION_TOLERANCE, Entry, Found
+from tvsbayes.cameras.lens_models import ERROR_MAX_PX, Kind, fitted_to_five, kind_of
 from tvsbayes.cameras.maker_calibrations import MakersPair, makers_pair
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import read_bytes
-from tvsbayes.files.documents import Keys
 from tvsbayes.instrument.stereo_pair import (
     ASSUMED_REMEDY,
-    PRINCIPAL_SHARE_MAX,
     Stereo,
     pair_doubts,
     parse_stereo,
+    rotation_vector,
     stereo_bytes,
 )
 
@@ -37,16 +37,13 @@ BASELINES_MM = (20.0, 3000.0)
 """Cameras of one bench stand so far apart; what is outside is asked, not taken."""
 RMS_PX_MAX, VIEWS_MAX = 20.0, 100_000
 NOTHING_KNOWN = Known()
-_MADE_BY = {
-    **dict.fromkeys(("rms", "rms_px", "rms_error", "stereo_rms", "reprojection_error", "rmse"), "rms_px"),
-    **dict.fromkeys(("avg_reprojection_error", "reprojectionerror", "reprojection_rms", "ret", "retval"), "rms_px"),
-    **dict.fromkeys(("views", "n_views", "num_views", "nframes", "nr_of_frames", "num_images"), "views"),
-    **dict.fromkeys(("board_width", "board_columns", "board_cols"), "columns"),
-    **dict.fromkeys(("board_height", "board_rows"), "rows"),
-}
-"""Keys, in small letters, under which files say how they were made, and what each is in `Known`. The pitch is left out:
-its unit is not known."""
 SIDE_NAMES = ("left", "right")
+STATED = ("M1", "D1", "M2", "D2", "R", "T")
+"""What `--key` may name."""
+ORB_SLAM = ("Stereo.T_c1_c2", "stereo.T_c1_c2")
+"""Key of ORB-SLAM3 whose lengths are metres."""
+TURN_SAID_DEG = 0.5
+"""Rotations by less change little where they are transposed."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,7 @@ class Imported:
     Attributes:
         stereo: the pair, mm and px.
         source: opencv (also any other program whose names are known), ros, kalibr, euroc, matlab, realsense, depthai,
-            zed, boofcv or tvsbayes.
+            orb-slam, zed, boofcv or tvsbayes.
         notes: what was assumed.
         warnings: what makes it implausible (`pair_doubts`).
     """
@@ -89,7 +86,7 @@ def read_calibration(
     """
     names = [escaped(Path(path).name) for path in paths]
     contents = [read_bytes(path, CONTAINER_BYTES_MAX) for path in paths]
-    files = [read_container(data, name) for data, name in zip(contents, names, strict=True)]
+    files = [keys for data, name in zip(contents, names, strict=True) for keys in read_container(data, name)]
     if len(paths) == 1 and str(files[0].values.get("format", "")).startswith("tvsbayes"):
         stereo = parse_stereo(contents[0], names[0])
         if stated != NOTHING_KNOWN:
@@ -106,10 +103,10 @@ def read_calibration(
     if maker is not None:
         reader.take(maker)
     bare = reader.pair()
-    doubts = pair_doubts(bare, reader.places)
+    doubts = (*reader.warnings, *pair_doubts(bare, reader.places))
     try:
         stereo = with_assumed_covariance(
-            bare, stated, _made_by(files, {"ros": True, "kalibr": False}.get(reader.source))
+            bare, stated, _made_by(reader.found.pair, {"ros": True, "kalibr": False}.get(reader.source))
         )
     except InputError as error:
         if error.code != "no-common-view":
@@ -131,13 +128,35 @@ class _Camera:
     distortion: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Pose:
+    """A way to R (3, 3) and T (3,) of x_right = R x_left + T, T in the file's unit.
+
+    Attributes:
+        rotation, translation: both.
+        turn, shift: entries that they come from.
+        source: whose file it is, "" where this does not tell.
+        plain: whether R stands under a name that does not tell its direction.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    turn: Entry
+    shift: Entry
+    source: str = ""
+    plain: bool = False
+
+
 class _Reader:
     """From entries by field to a pair.
 
     Attributes:
         source: whose file it seems to be.
         notes: what was assumed.
+        warnings: what is doubtful.
         places: key and file of M1, M2, D1, D2, R, T, in words.
+        matrices: of both cameras, as the file has them.
+        transposed: a camera matrix that the file has by columns.
     """
 
     def __init__(self, found: Found, size: tuple[int, int] | None, unit_mm: float | None):
@@ -145,7 +164,10 @@ class _Reader:
         self.source = "opencv"
         self.unit: str | None = None
         self.notes: list[str] = []
+        self.warnings: list[str] = []
         self.places: dict[str, str] = {}
+        self.matrices: list[np.ndarray] = []
+        self.transposed: Entry | None = None
 
     def take(self, maker: MakersPair) -> None:
         """Whose file it is, and in which unit, where a maker's format tells."""
@@ -154,14 +176,14 @@ class _Reader:
 
     def pair(self) -> Stereo:
         """The pair, without a covariance, checked as `stereo.json` is."""
-        for first, second in self.found.twice:
-            raise first.refuse(
-                "twice", "every quantity once", "name it: --key M1=NAME", f"another under {second.place}"
-            )
+        for name, (first, second) in self.found.twice.items():
+            remedy = f"say which: --key {name}={second.path}" if name in STATED else "remove one of them"
+            raise first.refuse("twice", "every quantity once", remedy, f"another under {second.place}")
         self._exchange()
+        self._take_rectified()
         for side in (0, 1):
             self._check_model(side)
-        matrices = [self._matrix(side) for side in (0, 1)]
+        matrices = self.matrices = [self._matrix(side) for side in (0, 1)]
         size = self._size(matrices)
         if self._of_matlab():
             matrices = [matrix - np.outer([1, 1, 0], [0, 0, 1]) for matrix in matrices]
@@ -189,7 +211,7 @@ class _Reader:
         """Whether the fields are those of MATLAB's stereoParameters."""
         pair = self.found.pair
         structured = any("radial" in camera for camera in self.found.cameras) or "R_transposed" in pair
-        return structured or _named(pair.get("pose"), "a")
+        return structured or self.transposed is not None or _named(pair.get("pose"), "a")
 
     def _exchange(self) -> None:
         """Files of one camera in the other order: the left projection alone has no shift."""
@@ -199,19 +221,28 @@ class _Reader:
             if shifts[1] == 0 and shifts[0] > 0:
                 self.found.cameras = cameras[::-1]
 
+    def _take_rectified(self) -> None:
+        """One camera and a baseline: the right camera of a rectified pair is as the left one."""
+        left, right = self.found.cameras
+        if "baseline" in self.found.pair and "fx" in left and not {"M", "fx", "P"} & set(right):
+            right.update({key: entry for key, entry in left.items() if key in ("fx", "fy", "cx", "cy")})
+
     def _matrix(self, side: int) -> np.ndarray:
-        """The camera matrix, of nine numbers, of four, of single ones, or of a projection alone."""
+        """The camera matrix, of nine numbers, of four, of two and two, of single ones, or of a projection alone."""
         camera, name = self.found.cameras[side], f"M{side + 1}"
-        single = [camera.get(key) for key in ("fx", "fy", "cx", "cy")]
+        parts = [camera.get(key) for key in ("fx", "fy", "cx", "cy")]
+        if "focal" in camera and "centre" in camera:
+            parts = [camera["focal"], camera["centre"]]
         entry = camera.get("M")
         if entry is not None and entry.numbers.size == 9:
             matrix = entry.numbers.reshape(3, 3)
             if matrix[0, 2] == matrix[1, 2] == 0 and matrix[2, :2].all():
                 matrix, self.source = matrix.T, "matlab"
-        elif entry is not None or all(one is not None for one in single):
-            fx, fy, cx, cy = entry.numbers if entry is not None else (float(one.numbers[0]) for one in single if one)
-            matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-            entry = entry or single[0]
+                self.transposed = entry
+        elif entry is not None or all(one is not None for one in parts):
+            entries = [one for one in (parts if entry is None else [entry]) if one is not None]
+            fx, fy, cx, cy = np.concatenate([one.numbers for one in entries])
+            matrix, entry = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), entries[0]
         elif "P" in camera and not any({"M", "fx"} & set(one) for one in self.found.cameras):
             entry = camera["P"]
             matrix = entry.numbers.reshape(3, 4)[:, :3]
@@ -234,9 +265,9 @@ class _Reader:
     def _distortion(self, side: int, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """k1 k2 p1 p2 k3, fitted where the file has another model."""
         camera, kind = self.found.cameras[side], kind_of(self.found.model(side))
-        found = self._coefficients(camera)
+        found = self._coefficients(camera, kind)
         if found is None:
-            if {"M", "fx"} & set(camera):
+            if {"M", "fx"} & set(camera) and self.found.model(side) != "rectified":
                 raise self.found.missing([f"D{side + 1}"])
             return np.zeros(5)
         values, entry = found
@@ -270,7 +301,7 @@ class _Reader:
         return fitted.distortion
 
     @staticmethod
-    def _coefficients(camera: Mapping[str, Entry]) -> tuple[np.ndarray, Entry] | None:
+    def _coefficients(camera: Mapping[str, Entry], kind: Kind | None) -> tuple[np.ndarray, Entry] | None:
         """Coefficients in OpenCV's order and where they stand: of one entry, of MATLAB's two, of single numbers."""
         if "D" in camera:
             return camera["D"].numbers, camera["D"]
@@ -278,14 +309,15 @@ class _Reader:
             radial = camera["radial"].numbers
             tangential = camera["tangential"].numbers if "tangential" in camera else np.zeros(2)
             return np.array([*radial[:2], *tangential, *radial[2:]]), camera["radial"]
-        single = [camera.get(f"coefficient_{name}") for name in ("k1", "k2", "p1", "p2", "k3")]
+        names = ("k1", "k2", "k3", "k4") if kind == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+        single = [camera.get(f"coefficient_{name}") for name in names]
         some = [entry for entry in single if entry is not None]
         values = np.array([0.0 if entry is None else float(entry.numbers[0]) for entry in single])
         return (values, some[0]) if some else None
 
     def _size(self, matrices: Sequence[np.ndarray]) -> tuple[int, int]:
         """The size of the pictures, the same for both cameras."""
-        sizes = []
+        sizes: list[tuple[tuple[int, int], Entry]] = []
         for side, camera in enumerate(self.found.cameras):
             if "size" in camera:
                 entry = camera["size"]
@@ -300,9 +332,10 @@ class _Reader:
                     "image-size", "whole numbers of pixels", "correct it", escaped(str(one.tolist()), 60)
                 )
             width, height = int(one[0]), int(one[1])
-            if "size" in camera and _off(matrices[side], (width, height)) and not _off(matrices[side], (height, width)):
+            by_rows = _off_middle(matrices[side], (height, width)) < _off_middle(matrices[side], (width, height))
+            if "size" in camera and (by_rows or self._of_matlab()) and width != height:
                 width, height = height, width
-                self.notes.append(f"{entry.place} is taken as rows, columns: {width} x {height} px")
+                self.notes += [f"{entry.place} is taken as rows, columns: {width} x {height} px"] * (not sizes)
             sizes.append(((width, height), entry))
         if len({size for size, _ in sizes}) > 1:
             (one_size, entry), (other, _) = sizes
@@ -318,52 +351,77 @@ class _Reader:
         raise refusal("missing-key", file=file, found="no image size", allowed="image_width", remedy=remedy)
 
     def _extrinsics(self) -> tuple[np.ndarray, np.ndarray]:
-        """R and T of x_right = R x_left + T, T in the file's unit."""
+        """R and T of x_right = R x_left + T, T in the file's unit: the first way to them, which all others confirm."""
+        ways = list(self._ways())
+        if not ways:
+            left, pair = self.found.cameras[0], self.found.pair
+            if self.found.by_file or "M" in left or "fx" in left:
+                raise self.found.missing([name for name in ("R", "T") if name not in pair])
+            raise self.found.missing(["M1", "M2", "R", "T"])
+        first, *others = ways
+        self.places |= {"R": first.turn.place, "T": first.shift.place}
+        self.source = first.source or self.source
+        checks = [_of_pose(other) for other in others]
+        cameras = self.found.cameras
+        if all("rectification" in c for c in cameras) and not any("P" in c for c in cameras):
+            one, two = (c["rectification"].rotation() for c in cameras)
+            if first.turn not in (c["rectification"] for c in cameras):
+                checks.append(lambda r, t: float(np.abs(two.T @ one - r).max()))
+        for name, (one, two) in {"E": (np.eye(3), np.eye(3)), "F": self.matrices}.items():
+            if name in self.found.pair:
+                found = two.T @ self.found.pair[name].numbers.reshape(3, 3) @ one
+                checks.append(partial(_off_essential, found))
+        for off in checks:
+            if off(first.rotation, first.translation) > ROTATION_TOLERANCE:
+                allowed, found_here = "one pose of the right camera", "another pose than the rest of the file says"
+                remedy = "take the files as they were written, or remove what is of another calibration"
+                if off(first.rotation.T, first.translation) <= ROTATION_TOLERANCE:
+                    allowed, found_here = "R from left to right", "R transposed, by what else the file says"
+                    remedy = f"take its transpose: --key R={first.turn.path}.T"
+                raise first.turn.refuse("rotation", allowed, remedy, found_here)
+        if not checks and first.plain and "R" not in self.found.stated:
+            self._doubt_turn(first)
+        return first.rotation, first.translation
+
+    def _ways(self) -> Iterator[_Pose]:
+        """Every pose of the right camera that the files hold."""
         pair, (left, right) = self.found.pair, self.found.cameras
-        if "R" not in pair and "T" in pair and ("rectification" in left) != ("rectification" in right):
-            # R in the file or table of one camera, beside T: no rectification, which both would have.
-            pair["R"] = left.get("rectification") or right["rectification"]
+        for field, of_one in (("R", "rectification"), ("T", "camera_T")):
+            # In the file or table of one camera: that of the pair, since both would have a rectification or a pose.
+            if field not in pair and (of_one in left) != (of_one in right) and "P" not in left:
+                pair[field] = left.get(of_one) or right[of_one]
+        if "baseline" in pair and right.get("fx") is left.get("fx") and "fx" in left:
+            shift = np.array([-pair["baseline"].numbers[0], 0.0, 0.0])
+            yield _Pose(np.eye(3), shift, pair["baseline"], pair["baseline"], "orb-slam")
         turn = pair.get("R") or pair.get("R_transposed")
         if turn is not None and "T" in pair:
-            self.places |= {"R": turn.place, "T": pair["T"].place}
-            rotation = turn.rotation()
+            rotation, source = turn.rotation(), ""
             by_columns = turn.numbers.size == 9 and turn.shape == (9,) and _named(left.get("cx"), "ppx")
             if "R" not in pair or by_columns:
-                rotation, self.source = rotation.T, "matlab" if "R" not in pair else "realsense"
+                rotation, source = rotation.T, "matlab" if "R" not in pair else "realsense"
                 if by_columns:
                     self.notes.append(f"{turn.place}: nine numbers, taken column by column as librealsense has them")
-            return self._consistent(rotation, turn), pair["T"].numbers
-        if (entry := pair.get("pose") or pair.get("pose_backwards")) is not None:
-            self.places |= {"R": entry.place, "T": entry.place}
-            pose = entry.pose()
-            if _named(entry, "tcncnm1"):
-                self.source = "kalibr"
-            if "pose" not in pair:
-                pose = np.linalg.inv(pose)
-            return pose[:3, :3], pose[:3, 3]
+            yield _Pose(rotation, pair["T"].numbers, turn, pair["T"], source, plain=not source)
+        for field in ("pose", "pose_backwards"):
+            if (entry := pair.get(field)) is not None:
+                source = "kalibr" if _named(entry, "tcncnm1") else "orb-slam" if entry.path in ORB_SLAM else ""
+                yield _posed(entry.pose() if field == "pose" else np.linalg.inv(entry.pose()), entry, source)
         for field, source in (("from_body", "kalibr"), ("to_body", "euroc")):
             if field in left and field in right:
-                self.source = source
-                self.places |= dict.fromkeys(("R", "T"), right[field].place)
                 one, two = (camera[field].pose() for camera in (left, right))
                 pose = two @ np.linalg.inv(one) if field == "from_body" else np.linalg.inv(two) @ one
-                return pose[:3, :3], pose[:3, 3]
-        if all("camera_R" in camera and "camera_T" in camera for camera in (left, right)):
-            self.places |= {"R": right["camera_R"].place, "T": right["camera_T"].place}
-            one, two = (camera["camera_R"].rotation() for camera in (left, right))
-            rotation = two @ one.T
-            return rotation, right["camera_T"].numbers - rotation @ left["camera_T"].numbers
-        if "P" in left and "P" in right:
-            return self._from_projections()
-        if self.found.by_file or "M" in left or "fx" in left:
-            raise self.found.missing([name for name in ("R", "T") if name not in pair])
-        raise self.found.missing(["M1", "M2", "R", "T"])
+                yield _posed(pose, right[field], source)
+        turns = [turn for c in (left, right) if (turn := c.get("camera_R", c.get("rectification"))) is not None]
+        if all("camera_T" in camera for camera in (left, right)) and len(turns) == 2:
+            one, two = (turn.rotation() for turn in turns)
+            shift = right["camera_T"].numbers - two @ one.T @ left["camera_T"].numbers
+            yield _Pose(two @ one.T, shift, turns[1], right["camera_T"])
+        if "P" in left and "P" in right and not ("R" in pair and "T" in pair and "rectification" not in left):
+            yield self._from_projections()
 
-    def _from_projections(self) -> tuple[np.ndarray, np.ndarray]:
+    def _from_projections(self) -> _Pose:
         """Rectified, the right camera sees x' = x + (P03 / P00, P13 / P11, 0): R = R2^T R1, T = R2^T of that."""
         left, right = self.found.cameras
-        self.source = "ros" if self.found.by_file else "opencv"
-        self.places |= {"R": right["P"].place, "T": right["P"].place}
         one, two = (camera["P"].numbers.reshape(3, 4) for camera in (left, right))
         if np.any(one[:2, 3] != 0) or not np.any(two[:2, 3]) or not (two[0, 0] > 0 and two[1, 1] > 0):
             allowed = "P[0][3] = 0 in the left camera, -fx baseline in the right one"
@@ -374,33 +432,29 @@ class _Reader:
             # The rectified pair itself is what is there.
             turns = [np.eye(3), np.eye(3)]
         shift = np.array([two[0, 3] / two[0, 0], two[1, 3] / two[1, 1], 0.0])
-        return turns[1].T @ turns[0], turns[1].T @ shift
+        source = "ros" if self.found.by_file else ""
+        return _Pose(turns[1].T @ turns[0], turns[1].T @ shift, right["P"], right["P"], source)
 
-    def _consistent(self, rotation: np.ndarray, turn: Entry) -> np.ndarray:
-        """R held against what else the file says of it: the essential matrix, both rectifications."""
-        pair, cameras = self.found.pair, self.found.cameras
-        others = []
-        if all("rectification" in c for c in cameras) and turn not in (c["rectification"] for c in cameras):
-            one, two = (c["rectification"].rotation() for c in cameras)
-            others.append(lambda r: float(np.abs(two.T @ one - r).max()))
-        if "E" in pair:
-            essential = pair["E"].numbers.reshape(3, 3)
-            x, y, z = pair["T"].numbers
-            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    def _doubt_turn(self, pose: _Pose) -> None:
+        """Say what R means and what its transpose would mean, where nothing else in the file decides.
 
-            def by_essential(r: np.ndarray) -> float:
-                one, two = (e / np.linalg.norm(e) for e in (essential, cross @ r))
-                return float(min(np.abs(one - two).max(), np.abs(one + two).max()))
-
-            others.append(by_essential)
-        for off in others:
-            if off(rotation) > ROTATION_TOLERANCE:
-                if off(rotation.T) <= ROTATION_TOLERANCE:
-                    found, remedy = "R transposed, by what else the file says", "store R of x_right = R x_left + T"
-                    raise turn.refuse("rotation", "R from left to right", remedy, found)
-                found = "another rotation than the rest of the file says"
-                raise turn.refuse("rotation", "files of one calibration", "take the files as they were written", found)
-        return rotation
+        Raises:
+            InputError: the camera matrices are transposed, so that R may be too.
+        """
+        path = pose.turn.path
+        if self.transposed is not None:
+            remedy = f"say which: --key R={path}.T where it is transposed too, as by MATLAB, or --key R={path}"
+            found = f"R beside {self.transposed.place}, which is transposed: R may be too"
+            raise pose.turn.refuse("rotation", "R from left to right", remedy, found)
+        if math.degrees(float(np.linalg.norm(rotation_vector(pose.rotation)))) < TURN_SAID_DEG:
+            return
+        here, there = (_toe_in_deg(turn, pose.translation) for turn in (pose.rotation, pose.rotation.T))
+        said = f"{pose.turn.place} is taken from left to right, x_right = R x_left + T, and nothing else in the file "
+        said += f"says so: the optical axes {_toe_in(here)}; transposed they {_toe_in(there)}: --key R={path}.T"
+        if here < -TURN_SAID_DEG < TURN_SAID_DEG < there:
+            self.warnings.append(f"is R transposed? {said}")
+        else:
+            self.notes.append(said)
 
     def _unit(self, length: float) -> float:
         """Millimetres of the file's unit: as stated, as the format has it, asked where that is implausible."""
@@ -412,7 +466,8 @@ class _Reader:
                 allowed="a baseline",
                 remedy="T is 0: name the right one, --key T=NAME",
             )
-        stated = self.unit or ("m" if self.source in ("kalibr", "ros", "euroc", "realsense") else "")
+        in_metres = ("kalibr", "ros", "euroc", "realsense", "orb-slam")
+        stated = self.unit or ("m" if self.source in in_metres else "")
         if self.unit_mm is not None:
             return self.unit_mm
         unit = stated or "mm"
@@ -423,7 +478,9 @@ class _Reader:
                 for name, mm in UNITS_MM.items()
                 if low <= length * mm <= high
             ]
-            remedy = f"give {' or '.join(fits) or '--import-unit'}, or --import-unit {unit} if it is so"
+            fits.append(f"--import-unit {unit} if it is so")
+            fits += ["--import-unit 25 where it counts squares of 25 mm"] * (length < low)
+            remedy = f"give {', or '.join(fits)}"
             found = f"cameras {length * UNITS_MM[unit]:.4g} mm apart, taken in {unit}"
             raise refusal(
                 "unit",
@@ -437,9 +494,9 @@ class _Reader:
         return UNITS_MM[unit]
 
 
-def _off(matrix: np.ndarray, size: tuple[int, int]) -> bool:
-    """Whether a principal point is far from the middle of pictures of a size."""
-    return any(abs(c - (n - 1) / 2) > PRINCIPAL_SHARE_MAX * n for c, n in zip(matrix[:2, 2], size, strict=True))
+def _off_middle(matrix: np.ndarray, size: tuple[int, int]) -> float:
+    """By which share of pictures of a size a principal point misses their middle."""
+    return max(abs(c - (n - 1) / 2) / n for c, n in zip(matrix[:2, 2], size, strict=True))
 
 
 def _named(entry: Entry | None, word: str) -> bool:
@@ -447,18 +504,45 @@ def _named(entry: Entry | None, word: str) -> bool:
     return entry is not None and entry.key.lower().replace("_", "") == word
 
 
-def _made_by(files: Sequence[Keys], fixed_intrinsics: bool | None) -> Known:
+def _posed(pose: np.ndarray, entry: Entry, source: str) -> _Pose:
+    return _Pose(pose[:3, :3], pose[:3, 3], entry, entry, source)
+
+
+def _of_pose(other: _Pose) -> Callable[[np.ndarray, np.ndarray], float]:
+    """How far a pose is off another one, whose unit may be another."""
+
+    def off(rotation: np.ndarray, translation: np.ndarray) -> float:
+        ways = [t / np.linalg.norm(t) for t in (translation, other.translation) if t.any()]
+        apart = float(np.abs(ways[0] - ways[1]).max()) if len(ways) == 2 else 0.0
+        return max(float(np.abs(other.rotation - rotation).max()), apart)
+
+    return off
+
+
+def _off_essential(essential: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> float:
+    """How far [T]x R is off an essential matrix of any length and sign."""
+    x, y, z = translation
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    one, two = (e / np.linalg.norm(e) for e in (essential, cross @ rotation))
+    return float(min(np.abs(one - two).max(), np.abs(one + two).max()))
+
+
+def _toe_in_deg(rotation: np.ndarray, translation: np.ndarray) -> float:
+    """Angle between the optical axes in the plane of the baseline, deg; negative where they diverge."""
+    to_right, to_left = -rotation.T @ translation, translation
+    sines = [way[2] / np.linalg.norm(way) for way in (to_right, to_left)]
+    return math.degrees(sum(map(math.asin, sines)))
+
+
+def _toe_in(angle_deg: float) -> str:
+    return f"{'converge' if angle_deg >= 0 else 'diverge'} by {abs(angle_deg):.1f} deg"
+
+
+def _made_by(pair: Mapping[str, Entry], fixed_intrinsics: bool | None) -> Known:
     """What files say of how they were made."""
-    values: dict[str, float] = {}
-    for keys in files:
-        for key, value in keys.values.items():
-            name = _MADE_BY.get(key.lower())
-            if name is not None and isinstance(value, int | float) and not isinstance(value, bool) and value > 0:
-                values.setdefault(name, value)
-    columns, rows = values.get("columns", 0), values.get("rows", 0)
-    views = values.get("views", 0.0)
+    rms, views, columns, rows = (float(pair[name].numbers[0]) if name in pair else 0.0 for name in MADE_BY)
     return Known(
-        rms_px=values["rms_px"] if values.get("rms_px", math.inf) <= RMS_PX_MAX else None,
+        rms_px=rms if 0 < rms <= RMS_PX_MAX else None,
         views=int(views) if 3 <= views <= VIEWS_MAX else None,
         board=(int(columns), int(rows)) if 3 <= columns <= 100 and 3 <= rows <= 100 else None,
         fixed_intrinsics=fixed_intrinsics,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,24 +28,26 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
     # Of each camera.
     "M": (
         (9, 4),
-        "m k a mtx matrix cameramatrix cammatrix cameramtx intrinsic intrinsics intrinsicmatrix "
+        "m k a cm mtx matrix cammat cameramatrix cammatrix cameramtx intrinsic intrinsics intrinsicmatrix "
         "intrinsicsmatrix intrinsicparameters cameraintrinsics kmatrix kk intrinsicsk "
         "intrinsicsintrinsicmatrix",
     ),
     "D": (
         (4, 5, 8, 12, 14),
-        "d dist distortion distortions distcoeff distcoeffs distcoefs distcoef coeffs distortioncoeff "
+        "d dc dist distortion distortions distcoeff distcoeffs distcoefs distcoef coeffs distortioncoeff "
         "distortioncoeffs distortioncoefs distortioncoefficients distortioncoefficient distortionparameters "
         "kc distvec distortionvector intrinsicscoeffs",
     ),
     "radial": ((2, 3), "radialdistortion intrinsicsradialdistortion"),
     "tangential": ((2,), "tangentialdistortion intrinsicstangentialdistortion"),
+    "focal": ((2,), "fc focallength intrinsicsfocallength"),
+    "centre": ((2,), "cc principalpoint intrinsicsprincipalpoint"),
     "rectification": ((9,), "r rect rectification rectificationmatrix rectificationtransform rectify"),
     "P": ((12,), "p proj projection projectionmatrix projmatrix"),
     "from_body": ((16,), "tcamimu tcimu tcambody"),
-    "to_body": ((16,), "tbs timucam tbc tbodycam"),
+    "to_body": ((16,), "tbs timucam tbc tbodycam bodyt"),
     "camera_R": ((9, 3), "rotation rvec rotationvector"),
-    "camera_T": ((3,), "translation tvec translationvector"),
+    "camera_T": ((3,), "translation tvec translationvector t trans"),
     "size": ((2,), "size resolution imagesize imgsize imagesizewh imageshape"),
     "width": ((1,), "width imagewidth imgwidth w sizex nx"),
     "height": ((1,), "height imageheight imgheight h sizey ny"),
@@ -53,7 +55,7 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
     "fy": ((1,), "fy intrinsicsfy"),
     "cx": ((1,), "cx ppx intrinsicscx intrinsicsppx"),
     "cy": ((1,), "cy ppy intrinsicscy intrinsicsppy"),
-    **{f"coefficient_{name}": ((1,), name) for name in ("k1", "k2", "p1", "p2", "k3")},
+    **{f"coefficient_{name}": ((1,), name) for name in ("k1", "k2", "p1", "p2", "k3", "k4")},
     # Of the pair.
     "R": (
         (9, 3),
@@ -69,12 +71,25 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
     "pose": (
         (16, 12),
         "tcncnm1 tc1c0 tcam1cam0 trightleft trl posecamera2a extrinsics extrinsic rt extrinsicmatrix "
-        "tlefttoright cam1tcncnm1",
+        "tlefttoright cam1tcncnm1 t transform transformation transformationmatrix",
     ),
     "pose_backwards": ((16, 12), "tc1c2 stereotc1c2 tcam0cam1 tleftright trighttoleft tc0c1"),
     "E": ((9,), "e essential essentialmatrix"),
+    "F": ((9,), "f fundamental fundamentalmatrix"),
+    "baseline": ((1,), "stereob baseline"),
+    "rms_px": (
+        (1,),
+        "rms rmse rmspx rmserror rmsstereo stereorms error stereoerror ret retval rets retstereo stereoret "
+        "reprojectionerror reprojerror reprojectionrms avgreprojectionerror meanreprojectionerror "
+        "calibrationerror",
+    ),
+    "views": ((1,), "views nviews numviews nframes nrofframes numimages nimages"),
+    "board_columns": ((1,), "boardwidth boardcolumns boardcols"),
+    "board_rows": ((1,), "boardheight boardrows"),
 }
 """Numbers that a field may hold, and its names. Every name of a camera's field stands before or after a side."""
+MADE_BY = tuple(FIELDS)[tuple(FIELDS).index("rms_px") :]
+"""How a calibration was made, as its file says. The pitch is left out: its unit is not known."""
 OF_CAMERA = tuple(FIELDS)[: tuple(FIELDS).index("R")]
 SIDES = {"left": 0, "right": 1, "l": 0, "r": 1, "first": 0, "second": 1}
 """Words for the camera; numbers count from 0 where one is 0, else from 1."""
@@ -85,10 +100,10 @@ _OTHER_TABLES = {"roi", "region_of_interest", "header"}
 MODEL_NAMES = ("distortionmodel", "distmodel", "cameratype", "cameramodel", "model", "lensmodel", "distortiontype")
 
 
-def _table() -> dict[tuple[str, int], list[tuple[str, str]]]:
-    """Field and side by name and count; the side "" is none."""
-    found: dict[tuple[str, int], list[tuple[str, str]]] = {}
-    for field, (counts, words) in FIELDS.items():
+def _table() -> dict[str, list[tuple[str, str]]]:
+    """Field and side by name; the side "" is none."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    for field, (_, words) in FIELDS.items():
         names = {(f"{mark}{word}", "") for word in words.split() for mark in _MARKS}
         if field in OF_CAMERA:
             for word in words.split():
@@ -97,8 +112,7 @@ def _table() -> dict[tuple[str, int], list[tuple[str, str]]]:
                         names |= {(f"{mark}{side}{word}", side), (f"{side}{mark}{word}", side)}
                         names |= {(f"{word}{mark}{side}", side), (f"{mark}{word}{side}", side)}
         for name, side in names:
-            for count in counts:
-                found.setdefault((name, count), []).append((field, side))
+            found.setdefault(name, []).append((field, side))
     return found
 
 
@@ -145,6 +159,10 @@ class Entry:
                 raise self.refuse("rotation", "Rodrigues' vector, rad", "is it in degrees? give R as a matrix", found)
             return rotation_matrix(self.numbers)
         return self._nearest(self.numbers.reshape(3, 3))
+
+    def transposed(self) -> Entry:
+        """The same turn the other way: the transpose of a matrix, the opposite of a vector."""
+        return replace(self, numbers=self.numbers.reshape(3, 3).T.ravel() if self.numbers.size == 9 else -self.numbers)
 
     def pose(self) -> np.ndarray:
         """The homogeneous transformation (4, 4) of 12 or 16 numbers."""
@@ -199,19 +217,27 @@ def entries_of(keys: Keys, file: int) -> Iterator[Entry]:
         elif isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
             for number, one in enumerate(value):
                 yield from entries_of(Keys(one, keys.file, keys.text, (*keys.path, key, str(number))), file)
+        elif isinstance(value, list):
+            yield Entry(keys, key, np.empty(0), (0,), file)
 
 
 def _bare(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
-def meanings(entry: Entry) -> list[tuple[str, str]]:
-    """Fields and sides that an entry may be, by the longest part of its path that is a name."""
+def meanings(entry: Entry, *, of_any_count: bool = False) -> list[tuple[str, str]]:
+    """Fields and sides that an entry may be, by the longest part of its path that is a name.
+
+    Args:
+        entry: of a file.
+        of_any_count: by its name alone, however many numbers it holds.
+    """
     parts = (*entry.keys.path, entry.key)
     if _OTHER_TABLES & set(parts):
         return []
     for count in range(min(4, len(parts)), 0, -1):
-        found = _NAMES.get((_bare("".join(parts[-count:])), entry.numbers.size))
+        named = _NAMES.get(_bare("".join(parts[-count:])), ())
+        found = [one for one in named if of_any_count or entry.numbers.size in FIELDS[one[0]][0]]
         if found:
             # A name without a side may stand in the table of one camera.
             side = next((s for part in reversed(parts[:-count]) if (s := _side_of(part))), "")
@@ -240,12 +266,14 @@ class Found:
 
     def __init__(self, files: Sequence[Keys], stated: Mapping[str, str]):
         """Entries by name, and by `stated`: field such as M1 to the path that holds it."""
-        self.files = files
+        self.files, self.stated = files, set(stated)
         self.entries = [entry for k, keys in enumerate(files) for entry in entries_of(keys, k)]
         self.pair: dict[str, Entry] = {}
         self.cameras: tuple[dict[str, Entry], dict[str, Entry]] = ({}, {})
-        self.twice: list[tuple[Entry, Entry]] = []
+        self.twice: dict[str, tuple[Entry, Entry]] = {}
         sided = [(entry, *meaning) for entry in self.entries for meaning in meanings(entry)]
+        # What has no side stands in for what a camera lacks.
+        sided.sort(key=lambda one: not one[2])
         numbers = {side for _, _, side in sided if side.isdigit()}
         first = 0 if "0" in numbers or not numbers else 1
         # Files of one camera each hold entries without a side: the first named is the left one, unless names say.
@@ -255,20 +283,25 @@ class Found:
             whole.reverse()
         self.by_file = alone
         for entry, field, side in sided:
-            if field not in OF_CAMERA:
+            if field in MADE_BY:
+                if not any(map(_side_of, entry.keys.path)):
+                    self.pair.setdefault(field, entry)
+            elif field not in OF_CAMERA:
                 if not (alone and field == "R" and entry.file in whole):
-                    self._keep(self.pair, field, entry)
+                    self._keep(self.pair, field, field, entry)
             elif side:
                 number = SIDES[side] if side in SIDES else int(side) - first
                 if number in (0, 1):
-                    self._keep(self.cameras[number], field, entry)
+                    self._keep(self.cameras[number], field, f"{field}{number + 1}", entry)
             elif alone and entry.file in whole:
-                self._keep(self.cameras[whole.index(entry.file)], field, entry)
+                number = whole.index(entry.file)
+                self._keep(self.cameras[number], field, f"{field}{number + 1}", entry)
             elif field in ("size", "width", "height"):
                 for camera in self.cameras:
                     camera.setdefault(field, entry)
         for field, name in stated.items():
             entry = self._named(field, name)
+            self.twice.pop(field, None)
             if field in ("R", "T"):
                 self.pair[field] = entry
                 self.pair.pop("pose", None)
@@ -280,17 +313,19 @@ class Found:
         """Whether a file holds one camera's matrix without a side."""
         return any(e.file == file and field in ("M", "fx") and not side for e, field, side in sided)
 
-    def _keep(self, into: dict[str, Entry], field: str, entry: Entry) -> None:
+    def _keep(self, into: dict[str, Entry], field: str, name: str, entry: Entry) -> None:
         there = into.get(field)
         if there is None or (there.numbers.size == 3 and entry.numbers.size == 9):
             # Of a rotation's vector and its matrix, the matrix.
             into[field] = entry
         elif there.numbers.size == entry.numbers.size and not np.array_equal(there.numbers, entry.numbers):
-            self.twice.append((there, entry))
+            self.twice[name] = there, entry
 
     def _named(self, field: str, name: str) -> Entry:
-        """The entry that a user named."""
+        """The entry that a user named, transposed where NAME.T says so."""
         some = [entry for entry in self.entries if name in (entry.path, entry.key)]
+        if not some and field == "R" and name.endswith(".T"):
+            return self._named(field, name.removesuffix(".T")).transposed()
         if len(some) != 1 or some[0].numbers.size not in STATED_SIZES[field[0]]:
             paths = [entry.path for entry in self.entries]
             found = f"{len(some)} entries of that name" if len(some) != 1 else f"{some[0].numbers.size} numbers"
@@ -313,6 +348,17 @@ class Found:
                 allowed="a pair: both cameras, and R and T between them",
                 remedy="name the other camera's file too: --import LEFT --import RIGHT; R and T need pictures of both",
             )
+        fields = {field.rstrip("12") for field in wanted}
+        for entry in self.entries:
+            names = {field for field, _ in meanings(entry, of_any_count=True)} & fields
+            if names and entry.numbers.size != 1 and not meanings(entry):
+                counts = FIELDS[min(names)][0]
+                return entry.refuse(
+                    "matrix",
+                    f"{listed([str(count) for count in counts], len(counts))} finite numbers",
+                    "write k1 k2 p1 p2 k3, 0 for those that the lens lacks" if "D" in names else "correct it",
+                    f"{entry.numbers.size} numbers" if entry.numbers.size else "no list of finite numbers",
+                )
         unknown = [entry.path for entry in self.entries if not meanings(entry) and entry.numbers.size > 1]
         there = listed([escaped(path, 40) for path in unknown], NAMES_LISTED) if unknown else "no other numbers"
         remedy = "a pair needs M D of both cameras and R T between them: name the other file too"

@@ -18,7 +18,7 @@ from tvsbayes.instrument.stereo_pair import distort
 Kind = Literal["five", "rational", "fisheye", "inverse"]
 FIVE: tuple[str, ...] = (
     *("plumb_bob", "radtan", "radial_tangential", "radialtangential", "standard", "brown", "brown_conrady"),
-    *("opencv", "none", "modified_brown_conrady", "pinhole", "perspective"),
+    *("opencv", "none", "modified_brown_conrady", "pinhole", "perspective", "rectified"),
 )
 RATIONAL = ("rational_polynomial", "rational", "thin_prism", "tilted")
 INVERSE = ("inverse_brown_conrady",)

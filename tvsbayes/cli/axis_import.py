@@ -184,7 +184,8 @@ def _table_understood(table: ForeignTable, stated: Mapping[str, str], wish: Axis
     from tvsbayes.single_axis.foreign_columns import deviation_columns, one_reading_a_row, refuse_small
     from tvsbayes.single_axis.foreign_readings import AXIS_FIELDS, readings_of, understand_axis, unwrapped
 
-    table, remarks = one_reading_a_row(table, stated)
+    rows = one_reading_a_row(table, stated)
+    table, stated, remarks = rows.table, rows.stated, rows.remarks
     known = understand_axis(table.columns, stated)
     missing = [field for field in NEEDED if field not in known.columns]
     if missing or known.claimed:

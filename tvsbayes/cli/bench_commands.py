@@ -17,6 +17,7 @@ from tvsbayes.cli.app import Json, finish, finite, refuse_options, report_line
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, refusal
+from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.pipeline import compile_for
 
@@ -70,10 +71,10 @@ def stereo(
     robust: Annotated[bool, typer.Option("--robust", help="Leave out outlying views, by name.")] = False,
     image_size: Annotated[str | None, typer.Option("--image-size", help="1280x720, where imports lack it.")] = None,
     import_unit: Annotated[
-        str | None, typer.Option("--import-unit", help="mm, cm or m: unit of an imported T.")
+        str | None, typer.Option("--import-unit", help="Unit of an imported T: mm, cm, m, or its mm: 25.")
     ] = None,
     key: Annotated[
-        list[str] | None, typer.Option("--key", help="M1=NAME: what holds M1, D1, M2, D2, R or T; repeatable.")
+        list[str] | None, typer.Option("--key", help="M1=NAME: what holds M1, D1, M2, D2, R (R=NAME.T: transposed), T.")
     ] = None,
     rms_px: Annotated[
         float | None, typer.Option("--rms-px", help="RMS of an imported calibration, as OpenCV gives it.")
@@ -94,11 +95,10 @@ def stereo(
     """Calibrate the camera pair from checkerboard pictures. With the covariance of all 24 parameters; or import one."""
     words = (
         *((export, ("opencv", "ros")), (finder, ("classic", "sector"))),
-        *((import_unit, ("mm", "cm", "m")), (pair, ("name", "order"))),
+        (pair, ("name", "order")),
     )
     if odd := [escaped(str(value)) for value, allowed in words if value not in (None, *allowed)]:
-        remedy = "--export opencv or ros, --finder classic or sector, --import-unit mm, cm or m"
-        remedy += ", --pair name or order"
+        remedy = "--export opencv or ros, --finder classic or sector, --pair name or order"
         raise InputError("usage", f"{', '.join(odd)}: no option of stereo takes this value", remedy=remedy)
     if (folder is None) == (not imports):
         found = "stereo needs pictures of a board, or a calibration to import"
@@ -236,10 +236,12 @@ def _known(
 
 def _named_keys(keys: list[str] | None) -> dict[str, str]:
     """Fields with the names that hold them, of --key."""
+    from tvsbayes.cameras.calibration_formats import STATED
+
     found = {}
     for text in keys or []:
         field, _, name = text.partition("=")
-        if field not in ("M1", "D1", "M2", "D2", "R", "T") or not name:
+        if field not in STATED or not name:
             remedy = "write --key M1=NAME, with M1, D1, M2, D2, R or T"
             raise InputError("usage", f"--key {escaped(text, 80)}: no such name", remedy=remedy)
         found[field] = name
@@ -254,7 +256,12 @@ def _imported(
     from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
     from tvsbayes.report.command_text import stereo_text
 
-    unit_mm = None if import_unit is None else UNITS_MM[import_unit]
+    unit_mm = None if import_unit is None else UNITS_MM.get(import_unit)
+    if import_unit is not None and unit_mm is None:
+        unit_mm = float(import_unit) if NUMBER.fullmatch(import_unit) else 0.0
+        if not 0 < unit_mm <= UNITS_MM["m"]:
+            allowed, remedy = "mm, cm, m or a number of mm", "write --import-unit 25 where T counts squares of 25 mm"
+            raise InputError("usage", f"--import-unit {escaped(import_unit)}", allowed=allowed, remedy=remedy)
     found = read_calibration(paths, _image_size(image_size), unit_mm=unit_mm, stated=known, keys=keys)
     if found.source == "tvsbayes":
         options = {"image_size": image_size, "import_unit": import_unit, "key": keys or None}

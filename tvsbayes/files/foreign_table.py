@@ -51,7 +51,7 @@ _MARKS = (
 _COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?")
 _GROUPED_POINT = re.compile(r"[+-]?[0-9]{1,3}(?:,[0-9]{3})+\.[0-9]+")
 _PAIR = re.compile(
-    r"(?P<name>[^\W\d][^:=,;|\t]*?)\s*[:=]\s*(?P<value>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
+    r"(?P<name>[^\W\d][^:=,;|\t]*?)\s*[:=]\s*(?P<value>[+-]?(?:\d+[.,]\d+|\d+\.?|\.\d+)(?:[eE][+-]?\d+)?)"
     r"(?:\s*(?P<unit>\u00b0|mm|um|\u00b5m|deg|rad|counts|steps|ms|us|s)(?![\w:]))?\s*(?:[,;|\t]\s*|\s+|$)"
 )
 """One of "Step: 200, Angle: 12.5 deg"."""
@@ -144,8 +144,10 @@ def is_foreign(head: bytes) -> bool:
     return head.startswith(marks) or re.search(rb"[;\t|]", head.partition(b"\n")[0]) is not None
 
 
-def text_of(data: bytes, file: str) -> tuple[str, str]:
-    """The text and the name of its encoding."""
+def text_of(
+    data: bytes, file: str, allowed: str = "a table as CSV (text) or XLSX", remedy: str = "export the table as CSV"
+) -> tuple[str, str]:
+    """The text and the name of its encoding; `allowed` and `remedy` are those of its refusal of binary data."""
     marked = [(codec, name) for mark, codec, name in _MARKS if data.startswith(mark)]
     codec, name = marked[0] if marked else ("utf-8", "UTF-8")
     if not marked and b"\0" in data[:200]:
@@ -157,7 +159,6 @@ def text_of(data: bytes, file: str) -> tuple[str, str]:
         text, name = data.decode("cp1252", errors="replace"), "Windows-1252"
     if control := CONTROL.search(text):
         line = text.count("\n", 0, control.start()) + 1
-        allowed, remedy = "a table as CSV (text) or XLSX", "export the table as CSV"
         raise refusal("kind", file=file, line=line, found="binary data", allowed=allowed, remedy=remedy)
     return text, name
 
@@ -178,7 +179,9 @@ def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | N
         if not found or found[0].start() or "".join(match.group() for match in found) != rest:
             continue
         paired += 1
-        values = {m["name"].strip() + (f" ({m['unit']})" if m["unit"] else ""): m["value"] for m in found}
+        values = {
+            m["name"].strip() + (f" ({m['unit']})" if m["unit"] else ""): m["value"].replace(",", ".") for m in found
+        }
         if len(values) < len(found):
             return None
         names.update(dict.fromkeys(values))
@@ -379,6 +382,9 @@ def _table(file: str, rows: Sequence[tuple[int, list[str]]], words: list[str]) -
     named = not all(_is_number(cell) for cell in filled[0][1] if cell)
     names = _unique(filled[0][1]) if named else [f"column {k}" for k in range(1, width + 1)]
     body = filled[1:] if named else filled
+    if named and len(body) > 1 and _units_below(body[0][1], body[1][1]):
+        names = [name and f"{name} {unit}".strip() for name, unit in zip(names, body[0][1], strict=True)]
+        words, body = [*words, "units in the row below the names"], body[1:]
     cells = [cell for _, row in body for cell in row if not isinstance(cell, _Number)]
     commas = any(_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell) for cell in cells)
     # "1.5" beside "1,5" is nobody's notation: such cells stay as they are and are refused where a number is needed.
@@ -391,6 +397,12 @@ def _table(file: str, rows: Sequence[tuple[int, list[str]]], words: list[str]) -
             own = (row[k] if isinstance(row[k], _Number) else row[k][:CELL_CHARS_MAX] for _, row in body)
             columns[name] = tuple(str(cell) if mixed else _with_point(cell, commas) for cell in own)
     return ForeignTable(file, ", ".join(words), tuple(line for line, _ in body), columns, rows[0][0])
+
+
+def _units_below(cells: Sequence[str], after: Sequence[str]) -> bool:
+    """Whether a row stands between names and numbers: no number in it, most of the next row numbers."""
+    numbers = sum(map(_is_number, after))
+    return not any(map(_is_number, cells)) and any(cells) and numbers > 1 and 2 * numbers > len(after)
 
 
 def _unique(names: Sequence[str]) -> list[str | None]:

@@ -108,7 +108,8 @@ class Move:
         Column(
             "seconds, never decreasing",
             *(-1e12, 1e12),
-            names="time t timestamp datetime date zeit uhrzeit zeitstempel datum tiempo hora fecha temps heure utc",
+            names="time t timestamp datetime date millis micros seconds elapsed zeit uhrzeit zeitstempel datum tiempo "
+            "hora fecha temps heure utc",
         ),
     ]
     pan_steps: Annotated[

@@ -41,10 +41,10 @@ SECONDS = {"us": 1e-6, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 """Units of times that a name may say, in s."""
 DEGREES = {
     **{"deg": 1.0, "rad": math.degrees(1.0), "mrad": math.degrees(1e-3), "urad": math.degrees(1e-6)},
-    **{"arcmin": 1 / 60, "arcsec": 1 / 3600},
+    **{"arcmin": 1 / 60, "arcsec": 1 / 3600, "gon": 0.9},
 }
 """Units of angles that a name may say, in deg."""
-READING_UNITS = (*DEGREES, "mm", "um", "nm", "counts", "inch")
+READING_UNITS = (*DEGREES, "mm", "um", "nm", "thou", "counts", "inch")
 """Units of readings that a name may say."""
 _UNITS = {
     "us": {"us", "usec", "micros", "microseconds", "mikrosekunden", "microsegundos", "microsecondes"},
@@ -53,6 +53,8 @@ _UNITS = {
     "h": {"h", "hr", "hrs", "hour", "hours", "stunde", "stunden", "horas", "heures"},
     "rad": {"rad", "radians", "radianten", "radianes"},
     "mrad": {"mrad", "milliradians", "millirad"},
+    "gon": {"gon", "gons", "neugrad"},
+    "thou": {"thou", "mil", "mils"},
     "arcmin": {"arcmin", "arcminutes", "bogenminuten"},
     "arcsec": {"arcsec", "arcseconds", "bogensekunden"},
     "deg": {"deg", "degrees", "grad", "grados", "degres"},

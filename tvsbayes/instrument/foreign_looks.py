@@ -48,8 +48,14 @@ BAD = {
 """Words of a status, in small letters without accents."""
 WORDS_TOLD = 5
 """Of those that leave rows out."""
+NO_NUMBER = {"nan", "n/a", "#n/a", "null"}
+"""What programs write into a cell that has no number, in small letters."""
+EPOCH_SCALES = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3}
+"""Seconds of a unit by the least number that counts it since 1970; smaller ones are seconds."""
+DAY_S = 86400.0
 _FLAGS = {"": False, "0": False, "false": False, "1": True, "true": True}
 """Cells of a column that marks homings, in small letters."""
+_CLOCK = re.compile(r"[0-9]{1,2}:[0-9]{2}:[0-9]{2}(?:\.[0-9]{1,6})?")
 _DOTTED_DATE = re.compile(r"([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})[ ,T]+")
 """Day, month and year: with dots in no other order."""
 
@@ -115,7 +121,8 @@ class FieldCells:
         default = column.default if column.may_be_empty else None
         least, most = column.low if low is None else low, column.high if high is None else high
         found: list[Any] = []
-        for row, cell in enumerate(self.text(field)):
+        for row, text in enumerate(self.text(field)):
+            cell = "" if text.lower() in NO_NUMBER else text
             value = float(cell) if NUMBER.fullmatch(cell) else math.nan
             if not cell and empty:
                 found.append(default)
@@ -294,12 +301,23 @@ def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
         return None
     texts = cells.text("time_s")
     if all(NUMBER.fullmatch(cell) for cell in texts):
-        scale = SECONDS.get(unit_of_name(cells.columns["time_s"], SECONDS) or "", 1.0)
+        unit = unit_of_name(cells.columns["time_s"], SECONDS)
+        scale = SECONDS.get(unit or "", 1.0)
         found = [scale * float(cell) for cell in texts]
+        since_1970 = next((each for least, each in EPOCH_SCALES.items() if found and found[0] >= least), None)
+        if unit is None and since_1970 is not None:
+            found = [since_1970 * (value - found[0]) for value in found]
+            assumed.append(f"time_s: counted in {since_1970:g} s since 1970, so seconds since the first row")
     else:
         found = []
         for row, cell in enumerate(texts):
             try:
+                if _CLOCK.fullmatch(cell):
+                    clock = datetime.time.fromisoformat(cell.zfill(8))
+                    day = datetime.datetime.combine(datetime.date(1970, 1, 1), clock, datetime.UTC).timestamp()
+                    later = found and day < found[-1] % DAY_S
+                    found.append(day + DAY_S * ((found[-1] // DAY_S if found else 0) + bool(later)))
+                    continue
                 when = datetime.datetime.fromisoformat(_DOTTED_DATE.sub(_iso_date, cell, count=1))
                 # Without a zone every hour has its length: this machine's summer time is not the logger's.
                 found.append((when if when.tzinfo else when.replace(tzinfo=datetime.UTC)).timestamp())

@@ -202,8 +202,10 @@ PRINCIPAL_SHARE_MAX = 0.25
 """Share of the image's width or height by which a principal point may miss its middle before it is worth a word."""
 ASPECT_SHARE_MAX = 0.05
 """The same of fx / fy from 1: pixels of today's sensors are square."""
-VIEW_DEG_MAX, TURN_DEG_MAX = 150.0, 45.0
+VIEW_DEG_MIN, VIEW_DEG_MAX, TURN_DEG_MAX = 2.0, 150.0, 20.0
 """Of a lens that five coefficients describe, across the picture; of two cameras that look at one scene."""
+FOCAL_TIMES_MAX = 1.5
+"""Of the focal lengths of two cameras of one kind."""
 TANGENTIAL_MAX = 0.01
 """Of p1 and p2: decentring of real lenses is some 1e-3."""
 SHORTEST_BASELINE_MM, LONGEST_BASELINE_MM = 2.0, 10_000.0
@@ -374,6 +376,8 @@ def _lens_doubts(
         doubts.append(
             f"fx in {matrix_place} is {matrix[0, 0]:.4g} px: a view of {widest:.0f} deg, which no such lens has"
         )
+    if widest < VIEW_DEG_MIN:
+        doubts.append(f"fx in {matrix_place} is {matrix[0, 0]:.4g} px: a view of {widest:.2g} deg: is it in px?")
     corners = np.array([[x, y] for x in (0, size_px[0] - 1) for y in (0, size_px[1] - 1)], float)
     corner = float(np.linalg.norm((corners - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], axis=1).max())
     fold = fold_radius(distortion)
@@ -419,6 +423,12 @@ def pair_doubts(stereo: Stereo, places: Mapping[str, str] | None = None) -> tupl
         doubts.append(
             f"{place['T']} puts the second camera {below_mm:+.4g} mm below and {before_mm:+.4g} mm before the first, "
             f"and only {right_mm:+.4g} mm to the right: is it in axes of another frame, or the inverse of a pose?"
+        )
+    focal_px = sorted((float(stereo.M1[0, 0]), float(stereo.M2[0, 0])))
+    if focal_px[1] > FOCAL_TIMES_MAX * focal_px[0]:
+        doubts.append(
+            f"fx of the two cameras are {focal_px[0]:.4g} and {focal_px[1]:.4g} px ({place['M1']}, {place['M2']}): are "
+            "they of pictures of two sizes?"
         )
     size_px = stereo.image_width, stereo.image_height
     for side, matrix in (("left", stereo.M1), ("right", stereo.M2)):

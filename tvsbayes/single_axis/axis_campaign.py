@@ -68,7 +68,7 @@ class AxisMove:
             *(-COMMAND_MAX, COMMAND_MAX),
             names="command commanded cmd counter steps step counts target goal position pos microsteps microstep "
             "mikroschritte mikroschritt usteps ustep micropasos micropas schritte soll sollwert zahler pasos contador "
-            "consigna posicion pas consigne",
+            "consigna posicion pas consigne setpoint nominal demand pulse pwm sollposition sollwinkel",
         ),
     ]
     approach: Annotated[
@@ -107,7 +107,8 @@ class Reading:
             *(-COMMAND_MAX, COMMAND_MAX),
             rule=filled_where_ok("give the value, or say why there is none"),
             names="value reading read measured encoder angle ist istwert messwert winkel lesung lectura medida valor "
-            "angulo codificador lecture mesure codeur autocollimator",
+            "angulo codificador lecture mesure codeur autocollimator actual feedback dial gauge indicator istposition "
+            "istwinkel",
         ),
     ] = None
     u: Annotated[

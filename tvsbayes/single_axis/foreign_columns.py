@@ -24,13 +24,13 @@ DIRECTIONS = {
 """Words of columns that hold the readings of one direction, without accents."""
 DEVIATION = {"deviation", "dev", "abweichung", "desviacion", "diff", "difference", "delta", "differenz", "ecart"}
 """Words of columns that may be actual less commanded position, beside those of uncertainties."""
-LENGTHS_MM = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "inch": 25.4}
+LENGTHS_MM = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "thou": 0.0254, "inch": 25.4}
 SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
 """Readings in the unit of the commands that span less than the first share of them, and scatter by more than the second
 share of their own span about a line, are no positions."""
 _ARROWS = str.maketrans({"\u2191": " forward ", "\u2193": " backward ", "\u2192": " forward ", "\u2190": " backward "})
 _SEXAGESIMAL = re.compile(
-    r"(?P<sign>[+-]?)\s*(?P<d>\d+)\s*(?:\u00b0|deg|d|:|\s)\s*(?P<m>\d{1,2})\s*(?:['\u2032m:]|\s|$)\s*"
+    r"(?P<sign>[+-]?)\s*(?P<d>\d+)\s*(?:\u00b0|deg|d|:|\s)\s*(?P<m>\d{1,2}(?:\.\d+)?)\s*(?:['\u2032m:]|\s|$)\s*"
     r"(?:(?P<s>\d{1,2}(?:\.\d+)?)\s*(?:\"|''|\u2033|s)?)?"
 )
 _FRACTION = re.compile(r"(?P<sign>[+-]?)(?:(?P<whole>\d+)[ -])?(?P<above>\d+)/(?P<below>\d+)")
@@ -97,7 +97,7 @@ def _degrees(cell: str) -> float | None:
     match = _SEXAGESIMAL.fullmatch(cell)
     if match is None or NUMBER.fullmatch(cell):
         return None
-    minutes, seconds = int(match["m"]), float(match["s"] or 0.0)
+    minutes, seconds = float(match["m"]), float(match["s"] or 0.0)
     if minutes >= 60 or seconds >= 60:
         return None
     return math.copysign(int(match["d"]) + minutes / 60.0 + seconds / 3600.0, -1.0 if match["sign"] == "-" else 1.0)
@@ -130,8 +130,17 @@ def run_columns(columns: Mapping[str, Sequence[str]]) -> dict[str, tuple[int, in
     return found if (both or len(found) > 1) and len(set(found.values())) == len(found) else {}
 
 
-def one_reading_a_row(table: ForeignTable, stated: Mapping[str, str]) -> tuple[ForeignTable, list[str]]:
-    """A table with a column for each run as one with a row for each reading, and that in words; any other as it is.
+@dataclass(frozen=True)
+class OneReadingARow:
+    """A table with a row for each reading, its columns by field where they are known, and remarks in words."""
+
+    table: ForeignTable
+    stated: Mapping[str, str]
+    remarks: list[str]
+
+
+def one_reading_a_row(table: ForeignTable, stated: Mapping[str, str]) -> OneReadingARow:
+    """A table with a column for each run as one with a row for each reading; any other as it is.
 
     Forward runs rise, backward runs fall, in the order of their numbers.
 
@@ -144,7 +153,7 @@ def one_reading_a_row(table: ForeignTable, stated: Mapping[str, str]) -> tuple[F
     """
     runs = run_columns(table.columns)
     if not runs or stated.get("value") or stated.get("approach"):
-        return table, []
+        return OneReadingARow(table, stated, [])
     others = [name for name in table.columns if name not in runs]
     numeric = [name for name in others if table.columns[name] and all(map(NUMBER.fullmatch, table.columns[name]))]
     position = stated.get("command") or (numeric[0] if len(numeric) == 1 else None)
@@ -174,7 +183,8 @@ def one_reading_a_row(table: ForeignTable, stated: Mapping[str, str]) -> tuple[F
         "cycle": [str(runs[name][0]) for _, name, _ in rows],
     }
     sentence = f"runs: {len(runs)} columns ({named}), read one after the other; forward runs rise, backward runs fall"
-    return table_of(table.file, table.kind, columns, [table.lines[row] for row, _, _ in rows]), [sentence]
+    by_rows = table_of(table.file, table.kind, columns, [table.lines[row] for row, _, _ in rows])
+    return OneReadingARow(by_rows, {**stated, "command": position}, [sentence])
 
 
 def deviation_columns(table: ForeignTable, columns: Mapping[str, str]) -> dict[str, str]:

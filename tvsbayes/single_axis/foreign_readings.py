@@ -7,6 +7,7 @@ that did is put in. What a table does not say is assumed and listed in words.
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -66,12 +67,18 @@ AXIS_FIELDS = tuple(dict.fromkeys(("command", "value", *_COLUMNS)))
 """All that a table of an axis can give."""
 _FOUND_BY_ENCODERS = {"position", "pos", "posicion", "counts", "zahler", "contador"}
 """Words of commands that name what was read where another column is the command for certain."""
+_PERCENT = {"percent", "prozent", "pct"}
+_COVERAGE = re.compile(r"\bk\s*=?\s*([0-9]+(?:\.[0-9]+)?)\b")
+"""Of an expanded uncertainty, in the name of its column: the factor over the standard one (GUM, 6.2)."""
+COVERAGE_USUAL = 2.0
 _TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura", "humidity"}
 """Degrees of these are no angle."""
 
 
 def axis_field_of(name: str) -> str | None:
-    """The field of an axis that a column's name tells of: by its first word that is known."""
+    """The field of an axis that a column's name tells of: by its first word that is known; shares of 100 are none."""
+    if "%" in name or _PERCENT.intersection(words_of(name)):
+        return None
     return field_by_word(words_of(name), _COLUMNS.values())
 
 
@@ -168,10 +175,15 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: boo
     table, unit = _plain(table, columns, assumed)
     cells = FieldCells(table, columns)
     commands, values, stated_u = (cells.read(_COLUMNS[name]) for name in ("command", "value", "u"))
+    if not deviations and len(set(values)) > 2 and values == commands:
+        assumed.append("value: equals the command in every row: what was read, or the command again?")
     if deviations:
         values, factor = positions_of_deviations(columns, commands, values)
         stated_u, unit = [factor * u for u in stated_u], unit_of_name(columns["command"], READING_UNITS) or unit
         assumed.append("value: the command plus the deviation, because --deviations says so")
+    if "u" in columns and (coverage := _coverage_of(columns["u"])) is not None:
+        stated_u = [u / coverage for u in stated_u]
+        assumed.append(f"u: column {escaped(columns['u'])} is an expanded uncertainty, over {coverage:g}")
     times, homings, statuses = seconds_of(cells, assumed), homings_of(cells, assumed), cells.text("status")
     if times is None:
         assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
@@ -186,6 +198,13 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: boo
     if "u" not in cells:
         assumed.append("u: none, so that the scatter of stops covers the readings' own")
     return ForeignReadings(tuple(stops.moves), tuple(readings), tuple(assumed), unit)
+
+
+def _coverage_of(name: str) -> float | None:
+    """The coverage factor of a column of expanded uncertainties; None of a standard one."""
+    if stated := _COVERAGE.search(name.lower()):
+        return float(stated[1]) or None
+    return COVERAGE_USUAL if {"expanded", "erweiterte", "expandida", "elargie"}.intersection(words_of(name)) else None
 
 
 def _plain(table: ForeignTable, columns: Mapping[str, str], assumed: list[str]) -> tuple[ForeignTable, str | None]:
@@ -216,7 +235,7 @@ class _Stops:
         assumed: list[str],
     ) -> None:
         self._cells, self._commands, self._values, self._homings = cells, commands, values, homings
-        self._sides = _sides(cells)
+        self._sides = _sides(cells, commands, homings, assumed)
         self._temperatures = temperatures_of(cells, assumed)
         again = [name for name in cells.table.columns if _AGAIN.intersection(words_of(name))]
         self._counts = cells.table.columns[again[0]] if again else None
@@ -313,17 +332,31 @@ class _Stops:
         return said
 
 
-def _sides(cells: FieldCells) -> list[int]:
-    """1 where a row's column of directions says forward, -1 backward, 0 where it says nothing."""
-    found = []
-    for row, text in enumerate(cells.text("approach")):
-        word = word_of(text)
-        if word not in FORWARD | BACKWARD | {"", "unknown"}:
+def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool], assumed: list[str]) -> list[int]:
+    """1 where a row's column of directions says forward, -1 backward, 0 where it says nothing.
+
+    Of two words that are not known the order of the commands tells which is which.
+    """
+    words = [word_of(text) for text in cells.text("approach")]
+    sides = {**dict.fromkeys(("", "unknown"), 0), **dict.fromkeys(FORWARD, 1), **dict.fromkeys(BACKWARD, -1)}
+    listed = sorted(set(words) - {"", "unknown"})
+    if not set(listed) <= set(sides) and len(listed) == 2:
+        moved: dict[str, set[int]] = {word: set() for word in listed}
+        for row in range(1, len(words)):
+            step = commands[row] - commands[row - 1]
+            if step and words[row] in moved and not homings[row]:
+                moved[words[row]].add(1 if step > 0 else -1)
+        found = [next(iter(moved[word])) if len(moved[word]) == 1 else 0 for word in listed]
+        if found[0] * found[1] < 0:
+            sides |= dict(zip(listed, found, strict=True))
+            forward, backward = (escaped(listed[found.index(side)], 24) for side in (1, -1))
+            assumed.append(f"approach: {forward} is forward and {backward} backward, as the commands rise and fall")
+    for row, word in enumerate(words):
+        if word not in sides:
             allowed = "forward or backward, + or -, fwd or rev, up or down, unknown"
             remedy = "forward is the direction of rising commands; or leave it out with --column approach="
             raise cells.refuse(row, "approach", allowed, remedy)
-        found.append((word in FORWARD) - (word in BACKWARD))
-    return found
+    return [sides[word] for word in words]
 
 
 def unwrapped(found: ForeignReadings, unit: str, counts_per_turn: float | None = None) -> ForeignReadings:
