@@ -85,8 +85,12 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
     for name in PARAMETERS:
         if name in draws and draws[name].std() > 0 and not (protocol == "drive" and name == "backlash"):
             row[name] = _scored(draws[name], true[name])
-    waves = []
-    for wave, sample in zip(made.truth.waves, wave_samples(found), strict=True):
+    samples, truths = wave_samples(found), made.truth.waves
+    # Of a range that holds one wave, what was added to it is a false one.
+    waves: list[dict[str, object]] = [
+        {"there": False, "probability": sample.probability} for sample in samples[len(truths) :]
+    ]
+    for wave, sample in zip(truths, samples, strict=False):
         one: dict[str, object] = {"there": bool(wave.amplitude > 0), "probability": sample.probability}
         if wave.amplitude > 0:
             one["amplitude"] = _scored(sample.amplitude, wave.amplitude)

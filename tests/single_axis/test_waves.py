@@ -11,7 +11,7 @@ from support.axes import campaign, drawn, random_moves, runs
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import AxisPrior
-from tvsbayes.single_axis.axis_periods import separate_periods
+from tvsbayes.single_axis.axis_periods import WaveSample, separate_periods, strong_harmonics
 from tvsbayes.single_axis.axis_record import summarise_axis
 from tvsbayes.single_axis.waves import (
     SECOND,
@@ -155,6 +155,24 @@ def test_no_wave_is_claimed_of_noise():
     assert not found.missing and estimate.probability < 0.5
 
 
+def test_a_range_holds_more_waves_than_were_asked_for():
+    """Three waves, two in one range: the strongest of every range first, in the order of the ranges, then the third."""
+    made, waves = drive(4, AMPLITUDE, AskedPeriods((), ((60.0, 120.0), (120.0, 700.0)), True), 400, 4000.0), {97.0: 1.0}
+    waves |= {PERIOD: AMPLITUDE, 410.0: 2.0}
+    values = [
+        r.value + sum(waves[period] * np.cos(2 * np.pi * r.time_s / period + 0.4) for period in (97.0, 410.0))
+        for r in made.readings
+    ]
+    readings = tuple(replace(r, value=float(v)) for r, v in zip(made.readings, values, strict=True))
+    found = fit_axis(replace(made, readings=readings), tier="importance")
+    periods = summarise_axis(found).periods
+    assert not found.missing
+    for estimate, (period, amplitude) in zip(periods, waves.items(), strict=True):
+        assert estimate.probability > 0.95
+        assert abs(estimate.period.value - period) < 4 * estimate.period.sd
+        assert abs(estimate.amplitude.value - amplitude) < 4 * estimate.amplitude.sd
+
+
 def test_a_stated_period_of_position():
     """A wave of 8 deg on an axis with play, from both sides, at places that are not even."""
     rng = np.random.default_rng(3)
@@ -185,6 +203,15 @@ def test_periods_that_lie_apart_are_named():
     found = separate_periods(period)
     assert [(group.mean, group.share) for group in found] == [(pytest.approx(3.7), 0.7), (pytest.approx(12.4), 0.3)]
     assert found[1].between == (12.4, 12.4)
+
+
+def test_a_second_harmonic_that_is_stronger_than_the_first_is_named():
+    wave = replace(Wave.fixed("seconds", 2 * PERIOD, 1.0), low=100.0, high=700.0)
+    coefficients = np.tile([1.0, 0.0, 0.0, 2.0, 0.0, 0.0], (10, 1))
+    sample = WaveSample(wave, np.full(10, 480.0), np.full(10, 480.0), coefficients, 1.0, WaveRecord(0.0, 1.0))
+    [text] = strong_harmonics((sample,), "arcsec")
+    assert "240 s" in text and "2 arcsec" in text
+    assert not strong_harmonics((replace(sample, coefficients=coefficients[:, [3, 1, 2, 0, 4, 5]]),), "arcsec")
 
 
 def test_a_period_at_the_end_of_its_range_is_doubted():

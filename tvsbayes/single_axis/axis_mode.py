@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,13 +89,19 @@ def _missing(log_density: float, off: float = 0.0) -> tuple[str, ...]:
     return ()
 
 
-def find_mode(model: AxisModel) -> AxisMode:
+def find_mode(model: AxisModel, near: Mapping[str, float] | None = None) -> AxisMode:
     """The mode by a quasi-Newton search from the least-squares line and the scatter of repeats.
 
     A search that does not get there begins anew where stops scatter as widely as rows do about the line: a single wild
     reading lies far outside what repeats tell, where the density is all slope.
+
+    Args:
+        model: whose mode is looked for.
+        near: coordinates to begin at, by name: of a model with fewer waves.
     """
-    found = _searched(model, *_start(model, _repeat_sd(model)))
+    start, width = _start(model, _repeat_sd(model))
+    start = np.array([(near or {}).get(name, at) for name, at in zip(model.coordinates.names, start, strict=True)])
+    found = _searched(model, start, width)
     if found.missing and len(found.w):
         again = _searched(model, *_start(model, max(fit_line(model.rows).scatter, 1e-4 * model.rows.travel)))
         found = max(found, again, key=lambda mode: (not mode.missing, mode.log_density))

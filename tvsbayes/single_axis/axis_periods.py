@@ -11,7 +11,7 @@ import numpy as np
 
 from tvsbayes.results.estimates import Measured, PeriodEstimate
 from tvsbayes.single_axis.axis_fit import AxisFit
-from tvsbayes.single_axis.axis_model import AxisModel
+from tvsbayes.single_axis.axis_model import LinearPosterior
 from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, wave_columns
 from tvsbayes.statistics.weighted_draws import systematic
 
@@ -59,11 +59,12 @@ class WaveSample:
         return np.einsum("ntc,nc->nt", wave_columns(x, self.period, self.record), self.coefficients)
 
 
-def _with_wave(model: AxisModel, w: np.ndarray, k: int, rng: np.random.Generator) -> np.ndarray:
-    """Draws (m, d) of the posterior given that wave k is there."""
+def _with_wave(fit: AxisFit, k: int, rng: np.random.Generator) -> tuple[np.ndarray, LinearPosterior]:
+    """Draws (m, d) of the posterior given that wave k is there, and what is linear at them."""
+    model, w = fit.model, fit.w
     there = model.coordinates.wave_draws(w)[k].scale > 0
     if there.sum() >= WITH_WAVE_MIN:
-        return w[there]
+        return w[there], LinearPosterior(fit.linear.mean[there], fit.linear.covariance[there])
     from scipy.special import ndtri
 
     # The wave is added to draws without it: all else follows what the readings say without it.
@@ -80,29 +81,40 @@ def _with_wave(model: AxisModel, w: np.ndarray, k: int, rng: np.random.Generator
     gain = model.log_density(found) - model.log_density(before)
     gain += 0.5 * (found[:, column] ** 2 - before[:, column] ** 2)
     gain = np.where(np.isfinite(gain), gain, -np.inf)
-    if not np.any(np.isfinite(gain)):
-        return found
-    weights = np.exp(gain - gain.max())
-    return found[systematic(weights / weights.sum(), WITH_WAVE, rng.random())]
+    if np.any(np.isfinite(gain)):
+        weights = np.exp(gain - gain.max())
+        found = found[systematic(weights / weights.sum(), WITH_WAVE, rng.random())]
+    return found, model.linear(found)
 
 
 def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
-    """Every wave of a fit, given that it is there."""
+    """Every wave of a fit, given that it is there.
+
+    In order: stated ones, the strongest of every range that was asked for, further ones by strength, the encoder's.
+    """
     model, rng = fit.model, np.random.default_rng([fit.seed, 9])
     found = []
     for k, wave in enumerate(model.coordinates.waves):
         probability = float(np.mean(model.coordinates.wave_draws(fit.w)[k].scale > 0))
-        w = _with_wave(model, fit.w, k, rng)
+        w, linear = _with_wave(fit, k, rng)
         begins = model.waves_begin + COLUMNS * k
         picked = np.concatenate([np.zeros((COLUMNS, model.columns)), model.head(slope=1.0)[None]])
         picked[range(COLUMNS), range(begins, begins + COLUMNS)] = 1.0
-        drawn = model.linear(w).drawn(picked, rng)
+        drawn = linear.drawn(picked, rng)
         coefficients, ratio = drawn[:, :COLUMNS], drawn[:, COLUMNS] / fit.rows.line[1]
         period = np.broadcast_to(model.coordinates.wave_draws(w)[k].period, len(w)).copy()
         # Positions of the model are by the line; the true ratio makes them longer or shorter.
         true_period = period * ratio if wave.clock == "position" else period
         found.append(WaveSample(wave, period, true_period, coefficients, probability, model.record(wave)))
-    return tuple(found)
+    given = [each for each in found if each.wave.known is not None]
+    inferred = [each for each in found if each.wave.known is None]
+    further = sorted(inferred, key=lambda each: (each.probability > 0.5, each.amplitude.mean()), reverse=True)
+    first = []
+    for ends in fit.campaign.periods.between:
+        k = next(k for k, each in enumerate(further) if (each.wave.low, each.wave.high) == ends)
+        first.append(further.pop(k))
+    stated = [each for each in given if each.wave.clock != "encoder"]
+    return (*stated, *first, *further, *given[len(stated) :])
 
 
 def _measured(draws: np.ndarray, likeliest: np.ndarray) -> Measured:
@@ -156,7 +168,21 @@ def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
                 f"the readings cannot tell which period the wave has: {said}; read a longer run, at places that are "
                 "not evenly spaced"
             )
-    return found + _one_wave_twice(fit)
+    return found + strong_harmonics(samples, fit.campaign.unit) + _one_wave_twice(fit)
+
+
+def strong_harmonics(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
+    """Waves whose second harmonic is stronger than the first: half of the period is the wave that leads."""
+    found = []
+    for sample in samples:
+        second = float(np.hypot(sample.coefficients[:, 2], sample.coefficients[:, 3]).mean())
+        if sample.probability > 0.5 and second > float(sample.amplitude.mean()):
+            period, of = float(sample.true_period.mean()), "s" if sample.wave.clock == "seconds" else unit
+            found.append(
+                f"the wave of {period:.4g} {of} is strongest by its second harmonic: {second:.2g} {unit} every "
+                f"{0.5 * period:.4g} {of}; ask for that period in a range of its own to part two wheels"
+            )
+    return found
 
 
 def waves_at_an_end(samples: tuple[WaveSample, ...], unit: str) -> list[str]:

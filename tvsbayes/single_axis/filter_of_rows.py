@@ -5,6 +5,8 @@ Two states, many draws at once; times in hours, variances in the square of the r
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from tvsbayes.single_axis.axis_rows import AxisRows
@@ -34,29 +36,24 @@ def whitened(
         Innovations over their sd (n, rows, c), and the log-determinant of the scatter (n,).
     """
     n, count, width = len(drift), columns.shape[1], columns.shape[2]
-    white = np.empty((n, count, width))
-    log_scatter = np.zeros(n)
-    zero, held = np.zeros((n, width)), np.zeros((n, width))
-    p_zero, p_held, p_both = np.zeros(n), np.zeros(n), np.zeros(n)
-    for k in range(count):
-        if k and rows.segment[k] != rows.segment[k - 1]:
-            zero, p_zero, p_both = np.zeros((n, width)), np.zeros(n), np.zeros(n)
-        p_zero = p_zero + drift * rows.hours[k]
-        kept = carry[:, k]
-        if np.all(kept == 0):
-            held, p_held, p_both = np.zeros((n, width)), stop[:, k], np.zeros(n)
+    begins = np.append(False, rows.segment[1:] != rows.segment[:-1]).tolist()
+    renewed = np.all(carry == 0, axis=0).tolist()
+    # Numbers of one draw are plain floats: rows of a long record cost arithmetic, not calls.
+    by_row = [_by_row(each, n) for each in (np.outer(drift, rows.hours), stop, reading, carry)]
+    found = []
+    p_zero = p_held = p_both = 0.0 * by_row[0][0]
+    for k, (walked, scatter, noise, kept) in enumerate(zip(*by_row, strict=True)):
+        if begins[k]:
+            p_zero, p_both = 0.0 * p_zero, 0.0 * p_both
+        p_zero = p_zero + walked
+        if renewed[k]:
+            p_held, p_both = scatter, 0.0 * p_both
         else:
-            held, p_both = kept[:, None] * held, kept * p_both
-            p_held = kept**2 * p_held + (1 - kept**2) * stop[:, k]
-        noise = reading[:, k]
+            p_both = kept * p_both
+            p_held = kept**2 * p_held + (1 - kept**2) * scatter
         variance = p_zero + 2 * p_both + p_held + noise
-        innovation = columns[:, k] - zero - held
-        white[:, k] = innovation / np.sqrt(variance)[:, None]
-        log_scatter += np.log(variance)
         gain_zero, gain_held = (p_zero + p_both) / variance, (p_held + p_both) / variance
-        zero = zero + gain_zero[:, None] * innovation
-        if k + 1 < count and np.any(carry[:, k + 1]):
-            held = held + gain_held[:, None] * innovation
+        found.append((variance, gain_zero, gain_held))
         # Joseph's form: differences of large variances keep the rest positive.
         left_zero, left_held = 1 - gain_zero, 1 - gain_held
         after_zero = left_zero**2 * p_zero - 2 * left_zero * gain_zero * p_both + gain_zero**2 * (p_held + noise)
@@ -68,4 +65,31 @@ def whitened(
             + gain_zero * gain_held * noise
         )
         p_zero, p_held = after_zero, after_held
-    return white, log_scatter
+    # Shape (3, rows, n, 1).
+    variance, gain_zero, gain_held = np.array(found).reshape(count, 3, n).swapaxes(0, 1)[..., None]
+    white = np.empty((count, n, width))
+    zero, held = np.zeros((n, width)), np.zeros((n, width))
+    of_row = np.swapaxes(columns, 0, 1)
+    kept = np.broadcast_to(carry, (n, count)).T[..., None]
+    for k in range(count):
+        if begins[k]:
+            zero = np.zeros((n, width))
+        if renewed[k]:
+            innovation = of_row[k] - zero
+            held = gain_held[k] * innovation
+        else:
+            held = kept[k] * held
+            innovation = of_row[k] - zero - held
+            held += gain_held[k] * innovation
+        white[k] = innovation
+        zero = zero + gain_zero[k] * innovation
+    return np.swapaxes(white / np.sqrt(variance), 0, 1), np.log(variance[..., 0]).sum(axis=0)
+
+
+def _by_row(of_draws: np.ndarray, count: int) -> list[Any]:
+    """Numbers (n or 1, rows) of every row: arrays (count,), or floats of one draw."""
+    return (
+        of_draws[0].tolist()
+        if count == 1
+        else list(np.ascontiguousarray(np.broadcast_to(of_draws, (count, of_draws.shape[1])).T))
+    )

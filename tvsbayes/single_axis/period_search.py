@@ -45,6 +45,11 @@ TEMPER, FLOOR = 0.6, 0.05
 """Power of the evidence in a table, and its uniform share: tables are wider than the posterior."""
 ABSENT_MIN, ABSENT_MAX = 0.03, 0.9
 """Of a table's share without a wave."""
+WAVES_MAX, FURTHER = 6, 3.0
+"""Inferred waves while more are added than were asked for, and the log Bayes factor that another one needs."""
+RESOLVED, UNRESOLVED = 0.5, 1e3
+"""Periods in the record by which two waves differ at least, P / (2 N) of a period of which N fit in; log evidence of
+one that does not is lowered by so much: it would be what the other changes by."""
 
 
 @dataclass(frozen=True)
@@ -99,15 +104,32 @@ def _log_evidence(ready: _Prepared, wave: Wave, log_period: np.ndarray, scales: 
     return found
 
 
-def _searched(ready: _Prepared, wave: Wave) -> Wave:
-    """The wave with tables by what the readings say, all others as in `ready`."""
+@dataclass(frozen=True)
+class _Searched:
+    """A wave with tables by what the readings say, and its log Bayes factor against none."""
+
+    wave: Wave
+    log_evidence: float
+
+
+def _searched(ready: _Prepared, wave: Wave, apart: Sequence[Wave] = ()) -> _Searched:
+    """The wave, all others as in `ready`; its period resolved from those of `apart`, which the record hardly parts."""
+    rows = ready.model.rows
+    span = float(np.ptp(ready.model.clock(wave, rows.command, rows.time_s, rows.value)))
     low, high = (np.log(end * wave.unit) for end in SCALE_RANGE)
     log_scale = np.linspace(low, high, SCALES)
     prior = log_scale_prior(log_scale, wave.unit)
     weights = prior + np.log(np.gradient(log_scale))
     scales = np.exp(log_scale)
-    grid = np.array([np.log(wave.low)]) if wave.is_fixed else _grid(ready.model.rows, wave, ready.model)
-    evidence = _log_evidence(ready, wave, grid, scales)
+
+    def evidence_at(log_period: np.ndarray) -> np.ndarray:
+        found = _log_evidence(ready, wave, log_period, scales)
+        for other in apart:
+            found[np.abs(np.exp(-log_period) - 1 / other.peak) * span < RESOLVED] -= UNRESOLVED
+        return found
+
+    grid = np.array([np.log(wave.low)]) if wave.is_fixed else _grid(wave, span)
+    evidence = evidence_at(grid)
     for _ in range(0 if wave.is_fixed else REFINEMENTS):
         by_period = np.logaddexp.reduce(evidence + weights, axis=1)
         best = np.maximum(by_period[1:], by_period[:-1])
@@ -120,7 +142,7 @@ def _searched(ready: _Prepared, wave: Wave) -> Wave:
         more = 0.5 * (grid[1:] + grid[:-1])[steep]
         order = np.argsort(np.concatenate([grid, more]), kind="stable")
         grid = np.concatenate([grid, more])[order]
-        evidence = np.concatenate([evidence, _log_evidence(ready, wave, more, scales)])[order]
+        evidence = np.concatenate([evidence, evidence_at(more)])[order]
     by_period = np.logaddexp.reduce(evidence + weights, axis=1)
     if wave.is_fixed:
         total, table, over = float(by_period[0]), None, np.zeros(1)
@@ -132,7 +154,7 @@ def _searched(ready: _Prepared, wave: Wave) -> Wave:
     absent = float(np.clip(1 / (1 + np.exp(np.clip(total, -50, 50))), ABSENT_MIN, ABSENT_MAX))
     scale_table = Tabulated.of(log_scale, TEMPER * by_scale, FLOOR)
     peak_at = float(np.exp(grid[int(np.argmax(by_period))]))
-    return replace(wave, log_scale=scale_table, log_period=table, absent=absent, peak=peak_at)
+    return _Searched(replace(wave, log_scale=scale_table, log_period=table, absent=absent, peak=peak_at), total)
 
 
 def _sharp(evidence: np.ndarray, grid: np.ndarray) -> float:
@@ -145,13 +167,12 @@ def _sharp(evidence: np.ndarray, grid: np.ndarray) -> float:
     return float(0.5 / np.sqrt(max(-2 * fitted, 1e-12)))
 
 
-def _grid(rows: AxisRows, wave: Wave, model: AxisModel) -> np.ndarray:
-    """Logs of periods, evenly in frequency, ascending.
+def _grid(wave: Wave, span: float) -> np.ndarray:
+    """Logs of periods, evenly in frequency, ascending; `span` of the readings on the clock of the wave.
 
     Raises:
         InputError: the range is too wide for the span of the readings.
     """
-    span = float(np.ptp(model.clock(wave, rows.command, rows.time_s, rows.value)))
     count = int(np.ceil((1 / wave.low - 1 / wave.high) * span * PER_RESOLUTION)) + 2
     if count > GRID_MAX:
         least = span * PER_RESOLUTION / GRID_MAX
@@ -189,20 +210,47 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], asked: AskedPeriod
     unknown = [replace(Wave.fixed(clock, low, unit), high=high) for low, high in asked.between]
     encoder = [] if asked.encoder is None else [_of_stated("encoder", asked.encoder, unit, rows, priors)]
     known = [Wave.fixed(wave.clock, wave.peak, unit) for wave in (*stated, *encoder)]
-    # One after the other, strongest evidence first, then each anew beside all others.
-    peaks: list[Wave] = []
-    for wave in unknown:
-        model = AxisModel.of(rows, priors, None, [*known, *peaks])
-        found = _searched(_prepared(model, find_mode(model).w[None]), wave)
-        peaks.append(replace(Wave.fixed(clock, found.peak, unit), absent=found.absent))
+    unknown, peaks = _inferred(rows, priors, known, unknown)
     every = [*known[: len(stated)], *peaks, *known[len(stated) :]]
     model = AxisModel.of(rows, priors, None, every)
     mode = find_mode(model).w
     final = []
     for k, wave in enumerate([*stated, *unknown, *encoder]):
         others = [*every[:k], *every[k + 1 :]]
-        final.append(_searched(_prepared(*_without(rows, priors, others, model, mode, k)), wave))
+        final.append(_searched(_prepared(*_without(rows, priors, others, model, mode, k)), wave).wave)
     return tuple(final)
+
+
+def _inferred(
+    rows: AxisRows, priors: Mapping[str, AxisPrior], known: Sequence[Wave], asked: Sequence[Wave]
+) -> tuple[list[Wave], list[Wave]]:
+    """The waves of unknown period, and each at its peak: one after the other, the strongest evidence first.
+
+    Every range gets the waves that it was asked for, and further ones while the evidence for another is `FURTHER`: a
+    gear train has more periods than its owner knows of, and the one that is asked for may not be the strongest.
+    """
+    found: list[Wave] = []
+    peaks: list[Wave] = []
+    near: dict[str, float] = {}
+
+    def strongest(ranges: Sequence[Wave]) -> _Searched:
+        model = AxisModel.of(rows, priors, None, [*known, *peaks])
+        mode = find_mode(model, near).w
+        near.update(zip(model.coordinates.names, mode.tolist(), strict=True))
+        ready = _prepared(model, mode[None])
+        return max((_searched(ready, wave, peaks) for wave in ranges), key=lambda each: each.log_evidence)
+
+    def take(best: _Searched) -> None:
+        found.append(next(wave for wave in asked if (wave.low, wave.high) == (best.wave.low, best.wave.high)))
+        peaks.append(replace(Wave.fixed(best.wave.clock, best.wave.peak, best.wave.unit), absent=best.wave.absent))
+
+    different = list({(wave.low, wave.high): wave for wave in asked}.values())
+    while different and len(found) < WAVES_MAX and (best := strongest(different)).log_evidence > FURTHER:
+        take(best)
+    for wave in different:
+        while found.count(wave) < asked.count(wave):
+            take(strongest([wave]))
+    return found, peaks
 
 
 RATIO_SDS = 3.0

@@ -256,8 +256,11 @@ def wave_columns(x: np.ndarray, period: np.ndarray, record: WaveRecord, width: n
     cosine, sine = np.cos(turn), np.sin(turn)
     second = [cosine**2 - sine**2, 2 * sine * cosine]
     if np.any(width):
-        share = np.asarray(width)[None] / period[:, None]
-        cosine, sine = cosine * np.sinc(share), sine * np.sinc(share)
-        second = [each * np.sinc(2 * share) for each in second]
+        half = np.maximum(pi * np.asarray(width)[None] / period[:, None], 1e-9)
+        kept = np.sin(half) / half
+        cosine, sine = cosine * kept, sine * kept
+        # sin 2x / 2x = cos x sin x / x.
+        kept = kept * np.cos(half)
+        second = [each * kept for each in second]
     along = ((x - record.middle) / record.half)[None]
     return np.stack([cosine, sine, *second, along * cosine, along * sine], axis=-1)
