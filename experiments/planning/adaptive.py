@@ -15,7 +15,6 @@ bisection where Laplace meets it, then upwards until the sampled posterior does.
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -38,6 +37,7 @@ from tvsbayes.acquisition.replanning import (
 )
 from tvsbayes.acquisition.running_estimate import FIRST_LOOKS, GROWTH, EstimateWish
 from tvsbayes.acquisition.simulated_instrument import Instrument
+from tvsbayes.cli.acquire_command import ahead_of, fitted, proposed
 from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.axes import DIRECTIONS
@@ -86,7 +86,7 @@ class Beside(Replanning):
         except NotConverged:
             return
         self._last.fit, self._last.sampled = found, proposed.confirmed
-        self.latest = self._read(json.loads(json.dumps(proposed.as_json())))
+        self.latest = self._read(ahead_of(proposed, looks))
 
 
 def laplace_sds(found: JointFit) -> np.ndarray:
@@ -118,7 +118,7 @@ def adapted(seed: int, folder: Path) -> dict[str, object]:
     rig, plan, last = mounted_rig(), shipped_plan("grid"), Last()
     truth = Instrument(rig, seed).truth
     session.Replanning = partial(Beside, last=last)
-    wish, minutes = EstimateWish((), TARGET), AdaptWish((), MINUTES)
+    wish, minutes = EstimateWish(fitted, TARGET), AdaptWish(partial(proposed, Path()), MINUTES)
     outcome = session.acquire(rig, plan, folder, simulate=True, seed=seed, estimate=wish, adapt=minutes)
     campaign, journal = read_campaign(folder), read_journal(folder)
     steps = adapted_plan(plan, journal.records)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from contextlib import closing
+from functools import partial
 
 import pytest
 from support.bench_runs import Run, small_plan
+from support.fits_beside import given_rig, proposing, two_directions
 
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.operator import Terminal
@@ -20,30 +21,10 @@ from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.plan import plan_seconds
 
-NEXT = """
-import json, sys
-from pathlib import Path
-given, count, confirm = (sys.argv[sys.argv.index(name) + 1] for name in ("--given", "--next", "--confirm"))
-looks = len((Path(given) / "spots.csv").read_text().splitlines()) - 1
-count, sheet, step = int(count), "SHEET", STEP
-steps = [{"action": "place", "target": sheet}]
-for n in range(count):
-    steps += [{"action": "move", "pan_steps": step * n + looks, "tilt_steps": -10}, {"action": "look"}]
-entry = {"value": 0.06, "sd": 0.012 / looks}
-document = {"steps": steps, "now": 0.012 / looks, "after_each": [0.012 / (looks + n + 1) for n in range(count)]}
-document["effective_deg_per_step"] = {d: entry for d in ("left", "right", "up", "down")}
-directions = document["effective_deg_per_step"]
-sampled = {d: {"value": 0.061, "sd": RATIO * 0.012 / looks} for d in directions}
-if 0.012 / looks <= float(confirm):
-    document["confirmed"] = {"tier": "importance", "accepted": ACCEPTED, "effective_deg_per_step": sampled}
-print(json.dumps({**document, "why": f"{count} looks at {sheet} help most"}))
-"""
 
-
-def command(sheet: str = "d2", step: int = 5, ratio: float = 1.0, accepted: bool = True) -> tuple[str, ...]:
-    """A stand-in for `tvsbayes plan RIG`: Laplace u falls as 0.012 / looks, the sampled one is `ratio` times that."""
-    code = NEXT.replace("SHEET", sheet).replace("STEP", str(step))
-    return sys.executable, "-c", code.replace("RATIO", str(ratio)).replace("ACCEPTED", str(accepted))
+def ahead(sheet: str = "d2", step: int = 5, ratio: float = 1.0, accepted: bool = True):
+    """See `support.fits_beside.proposing`."""
+    return partial(proposing, sheet, step, ratio, accepted)
 
 
 def changes(folder, event: str = "adapted") -> list[dict]:
@@ -53,7 +34,7 @@ def changes(folder, event: str = "adapted") -> list[dict]:
 def test_the_looks_left_are_those_proposed(mounted_rig, tmp_path):
     """Proposals at 12, 15, 18, 22 and 27 looks; 4.6e-4 is met at the last."""
     plan = small_plan(20)
-    with Replanning(tmp_path / "c", command(), 4.6e-4, 60.0, wait=True) as estimate:
+    with Replanning(tmp_path / "c", ahead(), 4.6e-4, 60.0, wait=True) as estimate:
         run_ = Run(mounted_rig, tmp_path / "c", plan, estimate=estimate)
         outcome = run_.engine.run()
     assert (outcome.reason, outcome.looks) == ("target met", 27) and run_.dark() and not outcome.warnings
@@ -78,7 +59,7 @@ def test_the_looks_left_are_those_proposed(mounted_rig, tmp_path):
 
 def test_the_sampled_posterior_has_the_last_word(mounted_rig, tmp_path):
     """Half as much again as Laplace: 27 looks (4.4e-4) are not enough, 33 (3.6e-4) not worth asking, 40 are."""
-    with Replanning(tmp_path / "c", command(ratio=1.5), 4.6e-4, 60.0, wait=True) as estimate:
+    with Replanning(tmp_path / "c", ahead(ratio=1.5), 4.6e-4, 60.0, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(20), estimate=estimate).engine.run()
     assert (outcome.reason, outcome.looks) == ("target met", 40)
     told = changes(tmp_path / "c", "confirmed")
@@ -91,7 +72,7 @@ def test_the_sampled_posterior_has_the_last_word(mounted_rig, tmp_path):
 
 def test_weights_that_cannot_be_used_end_no_run(mounted_rig, tmp_path):
     minutes = plan_seconds(mounted_rig, small_plan(3)) / 60 + 2.5
-    with Replanning(tmp_path / "c", command(accepted=False), 4.6e-4, minutes, wait=True) as estimate:
+    with Replanning(tmp_path / "c", ahead(accepted=False), 4.6e-4, minutes, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(3), estimate=estimate).engine.run()
     told = changes(tmp_path / "c", "confirmed")
     assert outcome.reason == "time over" and outcome.looks > 33 and outcome.estimate.tier == "laplace"
@@ -118,7 +99,7 @@ def test_the_command_says_by_what_it_ended(tmp_path, monkeypatch, capsys):
     from tvsbayes.files.disk import shipped_data
     from tvsbayes.instrument.plan import write_plan
 
-    monkeypatch.setattr("tvsbayes.cli.acquire_command.PLAN_COMMAND", command())
+    monkeypatch.setattr("tvsbayes.cli.acquire_command.proposed", partial(given_rig, "d2", 5, 1.0, True))
     write_plan(small_plan(4), tmp_path / "plan.csv")
     rig, plan = shipped_data() / "rigs" / "mounted" / "rig.toml", tmp_path / "plan.csv"
     words = ["acquire", rig, plan, tmp_path / "c", "--simulate", "--centroids", "--adapt", "--target-u", "8e-4"]
@@ -133,7 +114,7 @@ def test_the_command_says_by_what_it_ended(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize(("sheet", "step"), [("d9", 5), ("d2", 5000)])
 def test_a_proposal_that_the_rig_cannot_run_is_not_followed(mounted_rig, tmp_path, sheet, step):
-    with Replanning(tmp_path / "c", command(sheet, step), 1e-9, 60.0, wait=True) as estimate:
+    with Replanning(tmp_path / "c", ahead(sheet, step), 1e-9, 60.0, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(4), estimate=estimate).engine.run()
     assert (outcome.reason, outcome.looks) == ("done", 16) and not changes(tmp_path / "c")
     assert "proposed looks were not followed" in outcome.warnings[0]
@@ -143,7 +124,7 @@ def test_the_time_ends_a_run_before_it_is_over(mounted_rig, tmp_path):
     """Also one that goes on beyond the end of its plan."""
     plan = small_plan(3)
     minutes = plan_seconds(mounted_rig, plan) / 60 + 2
-    with Replanning(tmp_path / "c", command(), 1e-9, minutes, wait=True) as estimate:
+    with Replanning(tmp_path / "c", ahead(), 1e-9, minutes, wait=True) as estimate:
         run_ = Run(mounted_rig, tmp_path / "c", plan, estimate=estimate)
         assert run_.engine.run().reason == "time over"
     record = recorded(read_journal(tmp_path / "c").records)
@@ -157,7 +138,7 @@ def test_a_resumed_run_has_the_plan_of_the_interrupted_one(mounted_rig, tmp_path
             if progress.looks == stop_at and progress.doing == "looking":
                 raise KeyboardInterrupt
 
-        wish, adapt = EstimateWish((), 5.5e-4), AdaptWish(command(), 60.0)
+        wish, adapt = EstimateWish(two_directions, 5.5e-4), AdaptWish(ahead(), 60.0)
         terminal = Terminal(show=show)
         return acquire(
             mounted_rig, small_plan(20), folder, simulate=True, seed=4, estimate=wish, adapt=adapt, terminal=terminal,

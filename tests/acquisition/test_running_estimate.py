@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import multiprocessing
 import os
-import subprocess
-import sys
 
 import pytest
+from msgspec import structs
 from support.bench_runs import Run, small_plan
+from support.fits_beside import endless, killed, two_directions, waiting
 from support.live_runs import scripted_run
 
 from tvsbayes.acquisition import running_estimate
@@ -16,17 +18,11 @@ from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
 from tvsbayes.acquisition.session import acquire
-from tvsbayes.cli.acquire_command import FIT_COMMAND
+from tvsbayes.assessment.summary import summarise
+from tvsbayes.cli import acquire_command
+from tvsbayes.errors import NotConverged
 from tvsbayes.instrument.plan import run_plan
 from tvsbayes.instrument.stops import legs_of
-
-FIT = """
-import json, sys
-from pathlib import Path
-looks = len((Path(sys.argv[1]) / "spots.csv").read_text().splitlines()) - 1
-entry = {"value": 0.06, "sd": 0.012 / looks}
-print(json.dumps({"converged": looks != 15, "effective_deg_per_step": {"left": entry, "right": entry, "up": None}}))
-"""
 
 
 def test_run_ends_when_the_running_estimate_meets_its_target(mounted_rig, tmp_path):
@@ -34,22 +30,21 @@ def test_run_ends_when_the_running_estimate_meets_its_target(mounted_rig, tmp_pa
     plan, texts = small_plan(20), []
     directions = set(legs_of(run_plan(plan, mounted_rig).moves))
     assert directions == {"left", "right"}
-    command = [sys.executable, "-c", FIT]
-    with RunningEstimate(tmp_path / "c", command, 5e-4, directions, wait=True) as estimate:
+    with RunningEstimate(tmp_path / "c", two_directions, 5e-4, directions, wait=True) as estimate:
         run_ = Run(mounted_rig, tmp_path / "c", plan, estimate=estimate, show=lambda p: texts.append(p.estimate))
         outcome = run_.engine.run()
     assert (outcome.reason, outcome.looks, estimate.latest.looks) == ("target met", 27, 27) and run_.dark()
     assert texts[0] == "" and texts[-1].startswith("left 0.060000 u 5.")
     assert recorded(read_journal(tmp_path / "c").records).unverified == (), "the closing homing took place"
     for needed in ({"left", "up"}, set()):
-        with RunningEstimate(tmp_path / "c", command, 1.0, needed, wait=True) as estimate:
+        with RunningEstimate(tmp_path / "c", two_directions, 1.0, needed, wait=True) as estimate:
             assert not estimate.update(27) and estimate.latest is not None, "a direction without a figure is not met"
 
 
 @pytest.mark.parametrize(("asked", "shown"), [(None, False), (True, True), (False, False)])
 def test_estimate_is_shown_without_a_target(mounted_rig, tmp_path, asked, shown):
     """What is known so far belongs into the live line whether or not it ends the run; simulations must ask for it."""
-    wish = EstimateWish((sys.executable, "-c", FIT), asked=asked)
+    wish = EstimateWish(two_directions, asked=asked)
     texts = []
 
     def show(progress):
@@ -63,16 +58,23 @@ def test_estimate_is_shown_without_a_target(mounted_rig, tmp_path, asked, shown)
 
 
 def test_running_estimate_does_not_hold_up_the_run_and_dies_with_it(mounted_rig, tmp_path):
-    command = [sys.executable, "-c", "import threading; threading.Event().wait()"]
-    with RunningEstimate(tmp_path / "c", command, 1.0, {"left"}) as estimate:
+    with RunningEstimate(tmp_path / "c", endless, 1.0, {"left"}) as estimate:
         assert Run(mounted_rig, tmp_path / "c", small_plan(5), estimate=estimate).engine.run().reason == "done"
-        child = estimate._process
-        assert child.poll() is None and estimate.latest is None
-    assert child.poll() is not None
+        (child,) = multiprocessing.active_children()
+        assert child.is_alive() and estimate.latest is None
+    assert child.exitcode is not None
 
 
-FIT_THAT_WAITS = "import sys; open(sys.argv[1] + '/../go').read()"
-"""Ends once somebody opens the other end of a pipe."""
+def test_fits_share_a_process_and_another_takes_over_from_one_that_was_killed(tmp_path):
+    """Libraries are imported and functions compiled once a run; a fit that the kernel kills is one without a result."""
+    with RunningEstimate(tmp_path, killed, None, (), wait=True) as estimate:
+        estimate.update(12)
+        assert estimate.latest is None
+        numbers = []
+        for looks in (15, 18):
+            estimate.update(looks)
+            numbers.append((estimate.latest.looks, estimate.latest.u_deg_per_step["left"]))
+    assert [looks for looks, _ in numbers] == [15, 18] and numbers[0][1] == numbers[1][1]
 
 
 @pytest.mark.usefixtures("ctrl_c_works")
@@ -85,13 +87,13 @@ def test_requests_are_heeded_while_a_fit_is_waited_for(mounted_rig, tmp_path, mo
     settle = live.requests.settle
 
     class Asking(RunningEstimate):
-        def _begin(self, looks):
-            super()._begin(looks)
+        def _arguments(self, looks):
             if not states:
                 live.ask(asked)
+            return super()._arguments(looks)
 
     def settled(request, state, answer):
-        states.append((request.what, state, estimate._process.poll() if estimate._process else None))
+        states.append((request.what, state, len(multiprocessing.active_children())))
         if request.what == "laser off":
             (tmp_path / "go").write_text("go")
             (tmp_path / "go").unlink()
@@ -99,19 +101,32 @@ def test_requests_are_heeded_while_a_fit_is_waited_for(mounted_rig, tmp_path, mo
         return settle(request, state, answer)
 
     monkeypatch.setattr(live.requests, "settle", settled)
-    with Asking(tmp_path / "c", [sys.executable, "-c", FIT_THAT_WAITS], None, {"left"}, wait=True) as estimate:
+    with Asking(tmp_path / "c", waiting, None, {"left"}, wait=True) as estimate:
         outcome = Run(mounted_rig, tmp_path / "c", small_plan(4), estimate=estimate, live=live).engine.run()
-        assert estimate._process is None
-    assert states[0] == (asked, "acknowledged", None)
+        assert len(multiprocessing.active_children()) == (asked != "stop"), "a stop ends the fit"
+    assert states[0] == (asked, "acknowledged", 1)
     assert (outcome.reason, outcome.looks) == (("interrupted", 12) if asked == "stop" else ("done", 16))
 
 
-def test_estimate_that_cannot_start_does_not_end_the_run(tmp_path):
+def test_estimate_that_cannot_start_does_not_end_the_run(tmp_path, monkeypatch):
+    def full(self):
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(multiprocessing.context.SpawnProcess, "start", full)
     for wait in (True, False):
-        with RunningEstimate(tmp_path, [str(tmp_path / "nothing")], 1.0, {"left"}, wait=wait) as estimate:
+        with RunningEstimate(tmp_path, two_directions, 1.0, {"left"}, wait=wait) as estimate:
             assert not estimate.update(12) and estimate.latest is None
 
 
-def test_the_command_of_acquire_is_a_fit():
-    done = subprocess.run([*FIT_COMMAND, "--help"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0 and "--no-sample" in done.stdout, done.stderr
+def test_estimate_of_the_command_is_the_laplace_fit(paper_fit, monkeypatch):
+    """The numbers of `fit --no-sample`, in a record."""
+    summary = summarise(paper_fit)
+    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda campaign: paper_fit)
+    found = acquire_command.fitted(paper_fit.campaign.path, 384)
+    assert (found.looks, found.tier) == (384, "laplace")
+    assert found.deg_per_step == {d: e.value for d, e in summary.effective.items()}
+    assert found.u_deg_per_step == {d: e.sd for d, e in summary.effective.items()}
+    astray = structs.replace(summary, problems=("astray",), answer=None, converged=False)
+    monkeypatch.setattr("tvsbayes.assessment.summary.summarise", lambda fit: astray)
+    with pytest.raises(NotConverged):
+        acquire_command.fitted(paper_fit.campaign.path, 384)

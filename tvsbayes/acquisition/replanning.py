@@ -1,16 +1,16 @@
 """`acquire --adapt`: looks that are left are chosen anew from the running estimate, until target or time is reached.
 
-`tvsbayes plan --given --next` runs beside the instrument as the running estimate does: one process, which fits what is
-on the disk and says what to look at next. A proposal that leaves the rig's limits is not followed. Where the Laplace
-approximation meets the target the same process samples the posterior, and only that ends the run: with few looks the
-scales of the noise are rough, and Laplace's sds too short. Every change of plan
-is an event of the journal, so that a resumed run has the same plan as the one that was interrupted.
+What `plan --given --next` prints is computed beside the instrument as the running estimate is: one process, which fits
+what is on the disk and says what to look at next. A proposal that leaves the rig's limits is not followed. Where the
+Laplace approximation meets the target the same process samples the posterior, and only that ends the run: with few
+looks the scales of the noise are rough, and Laplace's sds too short. Every change of plan is an event of the journal,
+so that a resumed run has the same plan as the one that was interrupted.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -88,15 +88,29 @@ class Proposal:
 
 
 @dataclass(frozen=True)
+class Ahead:
+    """What a fit beside the run says: its estimate, that of the sampled posterior where it was asked, looks to take.
+
+    `accepted` is whether the weighted draws behind `sampled` may be used.
+    """
+
+    laplace: Estimate
+    proposal: Proposal
+    sampled: Estimate | None = None
+    accepted: bool = False
+
+
+@dataclass(frozen=True)
 class AdaptWish:
     """That the looks of a run are to be chosen while it runs.
 
     Attributes:
-        command: `tvsbayes plan RIG`, as a process is started.
+        ahead: from a campaign folder, its number of looks, the u wanted, how many looks to propose and the Laplace u
+            at which to sample, as a process of its own can import it.
         minutes: by `[costs]`, that the whole run may take; None: as long as its plan.
     """
 
-    command: tuple[str, ...]
+    ahead: Callable[[Path, int, float, int, float], Ahead]
     minutes: float | None = None
 
 
@@ -105,16 +119,22 @@ class Replanning(RunningEstimate):
 
     Args:
         folder: the campaign folder.
-        command: `tvsbayes plan RIG`.
+        ahead: as of `AdaptWish`.
         target_u_deg_per_step: wanted of the effective ratios of all directions.
         minutes: that the run may take.
         wait: whether to wait for every proposal.
     """
 
     def __init__(
-        self, folder: Path, command: Sequence[str], target_u_deg_per_step: float, minutes: float, *, wait: bool = False
+        self,
+        folder: Path,
+        ahead: Callable[[Path, int, float, int, float], Ahead],
+        target_u_deg_per_step: float,
+        minutes: float,
+        *,
+        wait: bool = False,
     ):
-        super().__init__(folder, command, target_u_deg_per_step, DIRECTIONS, wait=wait)
+        super().__init__(folder, ahead, target_u_deg_per_step, DIRECTIONS, wait=wait)
         self.minutes = minutes
         self._proposal: Proposal | None = None
         self._confirmed: Confirmed | None = None
@@ -130,37 +150,26 @@ class Replanning(RunningEstimate):
         """Worst Laplace u at which sampling may confirm the target, by how far the two were apart the last time."""
         return float(self.target or 0.0) / self._ratio
 
-    def _arguments(self, looks: int) -> list[str]:
-        target = f"u(worst) <= {self.target:g} deg/step"
-        confirm = "--confirm", repr(self.confirm_below)
-        given = "--given", str(self.folder), "--target", target
-        return [*self._command, *given, "--next", str(looks_next(looks)), *confirm, "--json"]
+    def _arguments(self, looks: int) -> tuple[object, ...]:
+        return self.folder, looks, self.target, looks_next(looks), self.confirm_below
 
-    def _read(self, document: Mapping[str, Any]) -> Estimate:
-        steps = tuple(_step(number, entry) for number, entry in enumerate(document["steps"]))
-        after = tuple(map(float, document["after_each"]))
-        if not steps or steps[0].action != "place":
-            raise ValueError("the looks do not begin with a placement")
-        self._proposal = Proposal(steps, after, float(document["now"]), self._looks, str(document["why"]))
-        laplace = super()._read({**document, "converged": True})
-        sampled = document.get("confirmed")
-        return laplace if sampled is None else self._sampled(laplace, sampled)
-
-    def _sampled(self, laplace: Estimate, document: Mapping[str, Any]) -> Estimate:
-        """What sampling has found, Laplace's where it cannot be used; both are told."""
-        sampled, accepted = self._estimate(document["effective_deg_per_step"], "importance"), bool(document["accepted"])
+    def _read(self, result: Ahead) -> Estimate:
+        """The sampled posterior where it can be used, else Laplace; both are written down."""
+        self._proposal, laplace, sampled, target = result.proposal, result.laplace, result.sampled, self.target or 0.0
+        if sampled is None:
+            return laplace
         before, after = (max(each.u_deg_per_step.values()) for each in (laplace, sampled))
-        if accepted:
+        if result.accepted:
             self._ratio = max(1.0, after / before)
         self._confirmed = Confirmed(
-            looks=self._looks,
-            target_u_deg_per_step=float(self.target or 0.0),
+            looks=laplace.looks,
+            target_u_deg_per_step=target,
             laplace_u_deg_per_step=before,
             importance_u_deg_per_step=after,
-            accepted=accepted,
-            reached=accepted and after <= float(self.target or 0.0),
+            accepted=result.accepted,
+            reached=result.accepted and after <= target,
         )
-        return sampled if accepted else laplace
+        return sampled if result.accepted else laplace
 
     def proposal(self) -> Proposal | None:
         """The newest one, once."""
@@ -174,8 +183,7 @@ class Replanning(RunningEstimate):
 
     def last(self, looks: int) -> bool:
         """At the end of the plan: one more estimate of all looks, waited for; whether the target is met."""
-        if self._process is not None:
-            self._wait_for_fit()
+        self._wait_for_fit()
         if self._proposal is None and looks > self._looks:
             self._begin(looks)
             self._wait_for_fit()

@@ -119,11 +119,11 @@ def _running(
     target = None if estimate is None else estimate.target_u_deg_per_step
     if adapt is not None and target is not None:
         minutes = plan_seconds(rig, plan) / 60 if adapt.minutes is None else adapt.minutes
-        return Replanning(folder, adapt.command, target, minutes, wait=simulate)
+        return Replanning(folder, adapt.ahead, target, minutes, wait=simulate)
     if estimate is None or not estimate.holds(simulate):
         return None
     directions = set(legs_of(run_plan(plan, rig).moves))
-    return RunningEstimate(folder, estimate.command, target, directions, wait=simulate)
+    return RunningEstimate(folder, estimate.fit, target, directions, wait=simulate)
 
 
 def _before(folder: Path) -> Recorded:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,12 +27,12 @@ from tvsbayes.errors import InputError, escaped
 
 if TYPE_CHECKING:
     from tvsbayes.acquisition.live_run import LiveRun
+    from tvsbayes.acquisition.replanning import Ahead
     from tvsbayes.acquisition.run_log import Outcome
+    from tvsbayes.acquisition.running_estimate import Estimate
     from tvsbayes.instrument.plan import PlanStep
     from tvsbayes.instrument.rig import Rig
-
-FIT_COMMAND, PLAN_COMMAND = ((sys.executable, "-m", "tvsbayes", name) for name in ("fit", "plan"))
-"""`tvsbayes fit` and `tvsbayes plan` in processes of their own."""
+    from tvsbayes.planning.next_looks import NextLooks
 
 LaserClass = Annotated[
     str | None, typer.Option("--laser-class", help="Class on the laser's label: states the hazard is known.")
@@ -138,14 +138,67 @@ def acquire(
             resume=resume,
             laser_class=laser_class,
             seed=seed or 0,
-            estimate=EstimateWish(FIT_COMMAND, target_u, estimate),
-            adapt=AdaptWish((*PLAN_COMMAND, str(rig)), minutes) if adapt else None,
+            estimate=EstimateWish(fitted, target_u, estimate),
+            adapt=AdaptWish(partial(proposed, rig), minutes) if adapt else None,
             vision=vision,
             terminal=Terminal(report_line, line.show, line.ask),
             live=watched,
             place_command=placing,
         )
     _end(outcome, out, target_u, as_json)
+
+
+def fitted(folder: Path, looks: int) -> Estimate:
+    """The Laplace estimate of a campaign; called in a process beside the run.
+
+    Raises:
+        TvsError: no campaign, or a fit that must not be used.
+    """
+    from tvsbayes.acquisition.running_estimate import Estimate
+    from tvsbayes.assessment.summary import summarise
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.pipeline import compile_for, untold, unusable
+
+    compile_for(untold)
+    summary = summarise(fit(read_campaign(folder)))
+    error = unusable(summary)
+    if error is not None:
+        raise error
+    moved = {direction: e for direction, e in summary.effective.items() if e is not None}
+    return Estimate(looks, {d: e.value for d, e in moved.items()}, {d: e.sd for d, e in moved.items()})
+
+
+def proposed(rig: Path, folder: Path, looks: int, target_u: float, count: int, confirm_below: float) -> Ahead:
+    """The looks that go on best from a campaign; called in a process beside the run.
+
+    Raises:
+        TvsError: no campaign, or a fit that must not be used.
+    """
+    from tvsbayes.estimators.joint_fit import fit
+    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.rig import read_rig
+    from tvsbayes.pipeline import compile_for, untold
+    from tvsbayes.planning.next_looks import next_looks
+    from tvsbayes.planning.target import parse_target
+
+    compile_for(untold)
+    target = parse_target(f"u(worst) <= {target_u:g} deg/step")
+    found = next_looks(fit(read_campaign(folder)), read_rig(rig), target, count, confirm_below=confirm_below)
+    return ahead_of(found, looks)
+
+
+def ahead_of(found: NextLooks, looks: int) -> Ahead:
+    """What a run takes of the next looks after so many."""
+    from tvsbayes.acquisition.replanning import Ahead, Proposal
+    from tvsbayes.acquisition.running_estimate import Estimate
+
+    proposal = Proposal(found.steps, found.after_each, found.now, looks, found.why)
+    laplace, checked = Estimate(looks, found.deg_per_step, found.u_deg_per_step), found.confirmed
+    if checked is None:
+        return Ahead(laplace, proposal)
+    sampled = Estimate(looks, checked.deg_per_step, checked.u_deg_per_step, "importance")
+    return Ahead(laplace, proposal, sampled, checked.accepted)
 
 
 @contextmanager

@@ -254,22 +254,20 @@ def intervals(
     told = {d: (x.value, x.interval95) for d, x in ratios.items() if x is not None}
     seen = {d: (x.mean_deg_per_step, x.interval95_gum or (x.mean_deg_per_step,) * 2) for d, x in classic.items() if x}
     with drawing(3.2) as figure:
-        axes = figure.add_subplot()
         apart = 0.12 if seen and told else 0.0
-        for offset, name, results in ((-apart, "classic", seen), (apart, "joint", told)):
-            colour, marker = OF_ESTIMATOR[name]
-            # Of the first only, or every point would have its line in the legend.
-            label: str | None = name
-            for row, direction in enumerate(DIRECTIONS):
-                if direction not in results:
-                    continue
-                value, (low, high) = results[direction]
-                bars = [[max(value - low, 0.0)], [max(high - value, 0.0)]]
-                axes.errorbar(value, row + offset, xerr=bars, fmt=marker, color=colour, capsize=3, label=label)
-                label = None
-        axes.set(yticks=range(len(DIRECTIONS)), yticklabels=DIRECTIONS, xlabel="deg/step, 95 % intervals")
-        axes.invert_yaxis()
-        axes.tick_params(axis="x", labelrotation=30)
+        # Gears of pan and tilt differ by more than any interval is long: each has its scale.
+        for axes, pair in zip(figure.subplots(len(SENSES), 1), SENSES.values(), strict=True):
+            for offset, name, results in ((-apart, "classic", seen), (apart, "joint", told)):
+                colour, marker = OF_ESTIMATOR[name]
+                for row, direction in enumerate(pair):
+                    if direction not in results:
+                        continue
+                    value, (low, high) = results[direction]
+                    bars = [[max(value - low, 0.0)], [max(high - value, 0.0)]]
+                    axes.errorbar(value, row + offset, xerr=bars, fmt=marker, color=colour, capsize=3, label=name)
+            axes.set(yticks=range(len(pair)), yticklabels=pair, ylim=(len(pair) - 0.5, -0.5))
+            axes.locator_params(axis="x", nbins=5)
+        axes.set_xlabel("deg/step, 95 % intervals")
         legend(figure, 2)
     return figure
 
