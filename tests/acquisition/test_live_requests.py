@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from tvsbayes.acquisition.live_requests import (
+from tvsbayes.acquisition.live_control import (
     ACKNOWLEDGED,
     FAILED,
     KEPT_MAX,

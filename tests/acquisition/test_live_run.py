@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from support.bench_runs import Failing, Run, raise_error
 
-from tvsbayes.acquisition.live_run import LiveRun
-from tvsbayes.acquisition.live_snapshot import ESTIMATES_MAX, REMARKS_MAX, TRAIL_MAX, SeenLook, temperature
+from tvsbayes.acquisition.live_run import ESTIMATES_MAX, REMARKS_MAX, TRAIL_MAX, LiveRun, SeenLook, temperature
 from tvsbayes.acquisition.observation import Observation, Sighting, TwinObserver
 from tvsbayes.acquisition.running_estimate import Estimate
 from tvsbayes.errors import DeviceFault

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tvsbayes.acquisition.live_requests import Requests
+from tvsbayes.acquisition.live_control import Requests
 from tvsbayes.acquisition.live_run import LiveRun
 
 

@@ -17,8 +17,7 @@ pytest.importorskip("tornado", reason="the extra live is not installed")
 
 from support.bench_runs import Failing, Run
 
-from tvsbayes.acquisition.live_run import LiveRun
-from tvsbayes.acquisition.live_snapshot import SeenLook
+from tvsbayes.acquisition.live_run import LiveRun, SeenLook
 from tvsbayes.errors import InputError
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import frame_name, read_campaign

@@ -14,8 +14,8 @@ from support.viewed_twin import PICTURED, UNDETECTED
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import ordered_spots, read_campaign, with_pixels
 from tvsbayes.instrument.parameters import names_of
-from tvsbayes.view.document import KINDS, document
 from tvsbayes.view.gathering import NOT_FITTED, NOT_OF_THESE, found_in, look_at
+from tvsbayes.view.page import KINDS, document
 from tvsbayes.view.scene import Looked, scene
 
 

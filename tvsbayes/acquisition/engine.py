@@ -21,8 +21,7 @@ from tvsbayes.acquisition.bench import Bench
 from tvsbayes.acquisition.journal import Journal
 from tvsbayes.acquisition.journal_events import Asked, Four, Homed, Looked, Moved, Placed, Start
 from tvsbayes.acquisition.live_control import Control, HeedingPositioner, LightRefused
-from tvsbayes.acquisition.live_run import LiveRun
-from tvsbayes.acquisition.live_snapshot import COMING_MAX, PAUSED, REMARKS_MAX, RUNNING, SeenLook
+from tvsbayes.acquisition.live_run import COMING_MAX, PAUSED, REMARKS_MAX, RUNNING, LiveRun, SeenLook
 from tvsbayes.acquisition.observation import Observation
 from tvsbayes.acquisition.operator import HAZARD, Progress, StopKey
 from tvsbayes.acquisition.place_command import PlaceCommand, require_placed

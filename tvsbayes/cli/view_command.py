@@ -35,8 +35,7 @@ def view(
     from tvsbayes.view.gathering import look_at
 
     looked = look_at(campaign, beside, report_line)
-    from tvsbayes.view.document import document
-    from tvsbayes.view.page import page_html
+    from tvsbayes.view.page import document, page_html
     from tvsbayes.view.pictures import PICTURES_BYTES_MAX, look_pictures
 
     pictures, share = [], PICTURES_BYTES_MAX // len(folders)

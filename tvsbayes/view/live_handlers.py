@@ -6,17 +6,38 @@ No path of a request is ever a path on the disk, and nothing can be written.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 from tornado import web
 
 from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.view.access import SECURITY_HEADERS, Access
-from tvsbayes.view.watched import SAFER, Watched
 
 Files = Mapping[str, tuple[bytes, str]]
 """Content and type of the page's own files, by path."""
+SAFER = ("pause", "laser off")
+"""What every browser with the link may ask for: it only makes a run safer."""
+
+
+class Watched(Protocol):
+    """What a page reads of a run and asks of it; called by the server's thread, so no call may wait for the run."""
+
+    def told(self) -> dict[str, Any]:
+        """The newest snapshot, as JSON holds it."""
+
+    def picture(self, spot: int, camera: str, kind: str) -> bytes | None:
+        """JPEG of the last look: "whole", or "spot" for its surroundings; None where there is none."""
+
+    def ask(self, what: str) -> bool:
+        """Puts a request in the queue; False once the run has ended.
+
+        Raises:
+            ValueError: nothing that can be asked for.
+        """
+
+    def control_passed(self) -> None:
+        """Another browser controls the run from now on."""
 
 
 class Guarded(web.RequestHandler):
@@ -26,14 +47,15 @@ class Guarded(web.RequestHandler):
         access: who may ask.
         files: of the page.
         live: the run.
+        read: told the number of every snapshot that is sent.
         open_to_all: whether the page's own browser is answered without the key.
     """
 
     open_to_all = False
 
-    def initialize(self, access: Access, files: Files, live: Watched) -> None:
+    def initialize(self, access: Access, files: Files, live: Watched, read: Callable[[int], None]) -> None:
         """Called by Tornado for every request."""
-        self.access, self.files, self.live = access, files, live
+        self.access, self.files, self.live, self.read = access, files, live, read
 
     def set_default_headers(self) -> None:
         """Those of `SECURITY_HEADERS`, and nothing of the server's make."""
@@ -103,6 +125,7 @@ class Now(Guarded):
         self.set_header("Content-Type", "application/json")
         told = {**self.live.told(), "controls": self.access.controls(self.request.headers)}
         self.finish(json.dumps(told, allow_nan=False))
+        self.read(told["number"])
 
 
 class Ask(Guarded):
@@ -139,9 +162,9 @@ class LivePicture(Guarded):
         self.finish(found)
 
 
-def application(files: Files, access: Access, live: Watched) -> web.Application:
+def application(files: Files, access: Access, live: Watched, read: Callable[[int], None]) -> web.Application:
     """All of them by path."""
-    given: dict[str, Any] = {"access": access, "files": files, "live": live}
+    given: dict[str, Any] = {"access": access, "files": files, "live": live, "read": read}
     pictures = rf"/live/([0-9]{{1,10}})/({'|'.join(CAMERAS)})/(whole|spot)"
     routes: list[Any] = [(path.replace(".", r"\."), File, given) for path in files]
     routes += [("/key", Key, given), ("/live", Now, given), ("/ask", Ask, given), (pictures, LivePicture, given)]

@@ -12,12 +12,14 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.view.access import HOSTS, Access
-from tvsbayes.view.watched import Watched
+
+if TYPE_CHECKING:
+    from tvsbayes.view.live_handlers import Watched
 
 HTML, CSS, SCRIPT = ("text/html; charset=utf-8", "text/css; charset=utf-8", "text/javascript; charset=utf-8")
 PAGE_FILES = {
@@ -66,13 +68,14 @@ def connections_max() -> int:
     return CONNECTIONS_MAX if soft < 0 else max(2, min(CONNECTIONS_MAX, soft // DESCRIPTORS_SHARE))
 
 
-async def serving(live: Watched, port: int, started: Callable[[str], None]) -> None:
+async def serving(live: Watched, port: int, started: Callable[[str], None], read: Callable[[int], None]) -> None:
     """Serve the page of a run on 127.0.0.1 until the task is cancelled.
 
     Args:
         live: the run.
         port: to listen on; 0 takes a free one.
         started: given the link once the server listens.
+        read: told the number of every snapshot that is sent.
 
     Raises:
         InputError: the port is taken or forbidden, or the extra is missing.
@@ -104,7 +107,7 @@ async def serving(live: Watched, port: int, started: Callable[[str], None]) -> N
     listening.setblocking(False)
     access = Access(listening.getsockname()[1])
     limits = {"max_body_size": REQUEST_BYTES_MAX, "idle_connection_timeout": IDLE_S, "body_timeout": IDLE_S}
-    server = Server(application(files, access, live), **limits)
+    server = Server(application(files, access, live, read), **limits)
     server.add_sockets([listening])
     try:
         started(access.link)
@@ -113,32 +116,6 @@ async def serving(live: Watched, port: int, started: Callable[[str], None]) -> N
         server.stop()
         # A browser that waits on a connection kept open would else wait for ever.
         await server.close_all_connections()
-
-
-class _Read:
-    """A run, and when it was read last; see `Watched`."""
-
-    def __init__(self, live: Watched):
-        self._live = live
-        self.read_s, self.number = -READER_S, -1
-
-    def told(self) -> dict[str, Any]:
-        """See `Watched.told`."""
-        told = self._live.told()
-        self.read_s, self.number = time.monotonic(), told["number"]
-        return told
-
-    def picture(self, spot: int, camera: str, kind: str) -> bytes | None:
-        """See `Watched.picture`."""
-        return self._live.picture(spot, camera, kind)
-
-    def ask(self, what: str) -> bool:
-        """See `Watched.ask`."""
-        return self._live.ask(what)
-
-    def control_passed(self) -> None:
-        """See `Watched.control_passed`."""
-        self._live.control_passed()
 
 
 class LivePage:
@@ -157,10 +134,10 @@ class LivePage:
 
     def __init__(self, live: Watched, port: int):
         self.link = ""
-        self._live, self._read = live, _Read(live)
+        self._live, self._read_s, self._number = live, -READER_S, -1
         self._link: Future[str] = Future()
         self._loop = asyncio.new_event_loop()
-        self._task = self._loop.create_task(serving(self._read, port, self._link.set_result))
+        self._task = self._loop.create_task(serving(live, port, self._link.set_result, self._was_read))
         # A daemon: a server that hangs must not keep the process, and so the laser's port, alive.
         self._thread = threading.Thread(target=self._serve, name="live page", daemon=True)
 
@@ -191,12 +168,15 @@ class LivePage:
         finally:
             self._loop.close()
 
+    def _was_read(self, number: int) -> None:
+        self._read_s, self._number = time.monotonic(), number
+
     def _linger(self) -> None:
         """Let the browsers that are there see how it ended."""
         until = time.monotonic() + LINGER_S
         last = self._live.told()["number"]
         while time.monotonic() < until and self._thread.is_alive():
-            since_s = time.monotonic() - self._read.read_s
-            if since_s > (PICTURES_S if self._read.number == last else READER_S):
+            since_s = time.monotonic() - self._read_s
+            if since_s > (PICTURES_S if self._number == last else READER_S):
                 return
             time.sleep(LINGER_POLL_S)

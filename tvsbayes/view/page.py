@@ -1,15 +1,89 @@
-"""The page of a campaign: one HTML file with its style, scripts and document, which asks nobody for anything."""
+"""The page of a campaign: one HTML file with its style, scripts and document, which asks nobody for anything.
+
+The document is scenes as JSON, its columns of numbers little-endian arrays in base64. Single precision, enough to draw
+by: 1e-4 px of 2000 px. Not a number stays what it is.
+"""
 
 from __future__ import annotations
 
+import base64
+import json
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 
+import numpy as np
 from markupsafe import Markup
 
+from tvsbayes.instrument.campaign import CAMERAS, PIXELS
 from tvsbayes.report.page import rendered
+from tvsbayes.results.records import plain
+from tvsbayes.view.pictures import PagePicture
+from tvsbayes.view.scene import LookColumns, Looked, Scene, numbers_of
+from tvsbayes.view.shapes import PROBABILITY
 
 SCRIPTS = ("drawing.js", "columns.js", "plots.js", "rig.js", "page.js")
 """In `data/view`, in the order in which they run; the page of a run draws with the first of them too."""
+KINDS = {"f": "<f4", "i": "<i4", "b": "u1"}
+"""How a column is sent, by the kind of its array."""
+
+
+def packed(values: np.ndarray) -> dict[str, object]:
+    """An array as the page unpacks it: type, shape, content."""
+    kind = KINDS[values.dtype.kind]
+    content = np.ascontiguousarray(values, dtype=kind).tobytes()
+    return {"type": kind, "shape": list(values.shape), "base64": base64.b64encode(content).decode("ascii")}
+
+
+def _looks(looks: LookColumns) -> dict[str, object]:
+    """The columns; residuals are taken in double precision."""
+    numbers = numbers_of(looks) | {"residual_px": looks.pixels_px - looks.predicted_px}
+    texts = {"target": list(looks.target), "status": list(looks.status), "direction": list(looks.direction)}
+    return {**{name: packed(values) for name, values in numbers.items()}, **texts}
+
+
+def _bare(values: np.ndarray) -> list[float] | None:
+    """A short list of numbers, None where they are not known."""
+    return values.tolist() if np.isfinite(values).all() else None
+
+
+Pictures = Mapping[int, Mapping[str, PagePicture]]
+"""By look and camera."""
+
+
+def _scene(shown: Scene, pictures: Pictures) -> dict[str, object]:
+    """One campaign."""
+    gears = [{**plain(band), "seen_steps": list(band.seen_steps)} for band in shown.gears]
+    return {
+        "name": shown.name,
+        "fitted": shown.fitted,
+        "notes": list(shown.notes),
+        "image_px": list(shown.image_px),
+        "looks": _looks(shown.looks),
+        "pictures": {str(spot): plain(own) for spot, own in pictures.items()},
+        "pictured": len(pictures),
+        "rig": {"cameras": plain(shown.cameras), "sheets": plain(shown.sheets), "origin_mm": _bare(shown.origin_mm)},
+        "gears": gears,
+        "parameters": plain(shown.parameters),
+        "correlation": {"names": list(shown.correlated), "matrix": shown.correlation.round(4).tolist()},
+    }
+
+
+def document(looked: Looked, pictures: Sequence[Pictures] = ()) -> bytes:
+    """The document of everything that a page shows.
+
+    Args:
+        looked: the scenes.
+        pictures: of each of them; none by default.
+    """
+    held = pictures or [{}] * len(looked.scenes)
+    content = {
+        "scenes": [_scene(one, own) for one, own in zip(looked.scenes, held, strict=True)],
+        "changes": None if looked.changes is None else plain(looked.changes),
+        "cameras": list(CAMERAS),
+        "pixels": list(PIXELS),
+        "probability": PROBABILITY,
+    }
+    return json.dumps(content, allow_nan=False).encode()
 
 
 def page_html(document: bytes) -> bytes:
