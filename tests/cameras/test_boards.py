@@ -42,15 +42,25 @@ def test_pairs_of_png_and_jpeg_are_found_where_they_are(six_views):
         assert min(misses) < FOUND_PX
 
 
-def test_cameras_of_two_picture_sizes_are_named(tmp_path):
-    """Each camera agrees with itself: the smaller pictures are no odd ones out."""
+@pytest.mark.parametrize("proportion", ("the same", "another"))
+def test_cameras_of_two_picture_sizes(tmp_path, proportion):
+    """Corners of right pictures of half the size are scaled to the left one's; those of another proportion named."""
     for k, pose in enumerate(POSES[:3]):
         left, right = pictures(pose)
+        small = cv2.resize(right, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(tmp_path / f"left{k}.png"), left)
-        cv2.imwrite(str(tmp_path / f"right{k}.png"), right[::2, ::2])
+        cv2.imwrite(str(tmp_path / f"right{k}.png"), small if proportion == "the same" else small[:-40])
     width, height = SIZE
-    with pytest.raises(InputError, match=f"two sizes: {width} x {height} and {width // 2} x {height // 2}"):
-        find_views(tmp_path, BOARD)
+    if proportion == "another":
+        with pytest.raises(InputError, match=f"two sizes: {width} x {height} and {width // 2} x {height // 2 - 40}"):
+            find_views(tmp_path, BOARD)
+        return
+    found = find_views(tmp_path, BOARD)
+    assert found.right_image_size == (width // 2, height // 2) and not found.other_size
+    for view, pose in zip(found.views, POSES[:3], strict=True):
+        seen = np.hstack([view.left, view.right])
+        # A corner of a picture of half the size is found half as well.
+        assert min(np.abs(order - true_corners(pose)).max() for order in (seen, seen[::-1])) < 2 * FOUND_PX
 
 
 def test_other_files_are_ignored_and_lonely_pictures_named(tmp_path):

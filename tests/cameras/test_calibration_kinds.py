@@ -415,6 +415,24 @@ def test_a_fisheye_of_orb_slam_and_a_rectified_pair_by_its_baseline(tmp_path):
     assert not found.stereo.D1.any() and np.array_equal(found.stereo.R, np.eye(3))
 
 
+def test_two_picture_sizes_of_one_proportion(mounted, tmp_path):
+    """The right camera's matrix of pictures of 3/2 of the size comes out as that of the left one's size."""
+    larger = {name: value.tolist() for name, value in plain(mounted, "K1 D1 K2 D2 R T").items()}
+    K2 = np.diag([1.5, 1.5, 1]) @ mounted.M2
+    K2[:2, 2] += 0.25
+    tables = {"left": {"K": larger["K1"], "D": larger["D1"], "size": [1280, 720]}}
+    tables["right"] = {"K": K2.tolist(), "D": larger["D2"], "size": [1920, 1080]}
+    path = tmp_path / "two.json"
+    path.write_text(json.dumps({**tables, "R": larger["R"], "T": larger["T"]}))
+    found = read_calibration([path])
+    same(found.stereo, mounted)
+    assert found.stereo.right_image_size == (1920, 1080) and any("two sizes" in note for note in found.notes)
+    tables["right"]["size"] = [1920, 1200]
+    path.write_text(json.dumps({**tables, "R": larger["R"], "T": larger["T"]}))
+    with pytest.raises(InputError, match="two sizes: 1280 x 720 and 1920 x 1200"):
+        read_calibration([path])
+
+
 @pytest.mark.parametrize("key", ("ret", "retStereo", "mean_reprojection_error", "metadata.error"))
 def test_an_rms_is_used_under_the_names_that_it_has(mounted, tmp_path, key):
     good = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()} | {"size": [1280, 720]}

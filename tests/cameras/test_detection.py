@@ -18,6 +18,7 @@ from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.images import png_bytes
 from tvsbayes.instrument.campaign import Campaign, read_campaign, write_campaign
+from tvsbayes.instrument.stereo_pair import scaled_px, write_stereo
 from tvsbayes.report.command_text import detection_text
 from tvsbayes.twin.physics import cameras_of
 from tvsbayes.twin.spot_pictures import Footprint, Scene, Sensor, render_spot
@@ -96,6 +97,26 @@ def check_sds(folder: Folder, found, tolerance: float) -> None:
 def test_stated_sd_is_the_actual_error_without_speckle(plain, found_plain):
     check_sds(plain, found_plain, 0.10)
     assert np.sqrt(np.mean(plain.errors(found_plain)[0] ** 2)) < 0.02
+
+
+def test_spots_of_a_camera_with_larger_pictures_are_scaled(tmp_path):
+    """Right pictures of twice the size: centres and their sds are those of the left one's size."""
+    folder = Folder(tmp_path / "c", looks=6)
+    size, double = (WIDTH, HEIGHT), (2 * WIDTH, 2 * HEIGHT)
+    for look in range(6):
+        centre = scaled_px(folder.true_px[look, 2:], size, double)
+        mark = Footprint(centre, 4 * oval(np.random.default_rng(look), 2.5), 180.0)
+        folder.put(look, "right", render_spot(mark, *double, Scene(), Sensor(), (1, look, 9)))
+    with pytest.raises(InputError, match=f"{double[0]} x {double[1]} pixels"):
+        detect(read_campaign(folder.path))
+    write_stereo(replace(folder.stereo, right_image_size=double), folder.path / "stereo.json")
+    campaign = read_campaign(folder.path)
+    assert campaign.stereo.right_image_size == double
+    errors, stated = folder.errors(detect(campaign))
+    # Five sds of 24 coordinates.
+    assert errors.shape == (6, 4) and (np.abs(errors) < 5 * stated).all()
+    with pytest.raises(InputError, match="one picture size for contour"):
+        detect(campaign, "contour")
 
 
 def test_stated_sd_is_the_actual_error_with_speckle_and_clipped_cores(speckled, found_speckled):

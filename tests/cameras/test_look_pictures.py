@@ -85,7 +85,7 @@ def test_what_is_no_pair_is_said(tmp_path):
         ("left4.png", "right4.png"),
         ("left5.tif",),
     )
-    assert (seen.image_width, seen.image_height) == SIZE[::-1]
+    assert seen.image_sizes == dict.fromkeys(("left", "right"), SIZE[::-1])
     drawn(tmp_path / "lonely", "left1.png")
     with pytest.raises(InputError, match="no pair among 1"):
         views_of(tmp_path / "lonely")

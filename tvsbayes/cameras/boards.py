@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,12 +21,13 @@ import numpy as np
 
 from tvsbayes.cameras.camera_marks import paired_pictures, unnamed_pictures
 from tvsbayes.cameras.marker_boards import MARKERS_MIN, Markers, as_seen, marker_board_corners, most_markers, spread
-from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
+from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, Size, natural_order, usual_sizes
 from tvsbayes.cameras.seen_boards import why_no_board
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, in_grey_levels, read_image
 from tvsbayes.instrument.campaign import CAMERAS
+from tvsbayes.instrument.stereo_pair import same_shape, scaled_px
 from tvsbayes.progress import Advance, unshown
 
 Finder = Literal["classic", "sector"]
@@ -161,6 +161,7 @@ class Views:
         other_size: pictures of another size than most; not used.
         by_fallback: pictures whose board only the other finder found.
         reordered: views whose right corners were turned to agree with the left ones.
+        right_image_size: of the right camera's pictures where it is another; its corners are scaled to the left one's.
     """
 
     views: tuple[View, ...]
@@ -172,6 +173,7 @@ class Views:
     other_size: tuple[str, ...] = ()
     by_fallback: tuple[str, ...] = ()
     reordered: tuple[str, ...] = ()
+    right_image_size: Size | None = None
 
 
 def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> tuple[np.ndarray, bool] | None:
@@ -334,21 +336,21 @@ def find_views(
     """
     folder = Path(folder)
     sizes = _sizes(folder, pairing)
-    _refuse_two_sizes(sizes, folder)
-    counted = Counter(sizes.values())
-    size = max(counted, key=lambda s: (counted[s], s))
-    used = [picture for picture, own in sizes.items() if own == size]
+    usual = usual_sizes(sizes)
+    _refuse_two_shapes(usual, folder)
+    size = usual["left"] if min(usual["left"]) else usual["right"]
+    used = [picture for picture, own in sizes.items() if all(own == usual[side] for side in picture.sides)]
     tried = spread(used, TRIED_MAX)
     if board.markers is not None:
-        greys = [part for picture in tried for part in _greys(picture, folder, size).values()]
+        greys = [part for picture in tried for part in _greys(picture, folder, sizes[picture]).values()]
         board = replace(board, markers=as_seen(greys, board.markers))
-    if len(used) > len(tried) and not _any_board(folder, tried, size, board, finder):
-        raise _without_board(folder, tried, len(used), size, board)
+    if len(used) > len(tried) and not _any_board(folder, tried, sizes, board, finder):
+        raise _without_board(folder, tried, len(used), sizes, board)
     boards: dict[str, dict[str, _Detection]] = {}
     names: dict[tuple[str, str], str] = {}
     without, fallback = [], []
     for count, (picture, detections) in enumerate(
-        zip(used, _detections(folder, used, size, board, finder), strict=True), 1
+        zip(used, _detections(folder, used, sizes, board, finder), strict=True), 1
     ):
         advance(count / len(used))
         for side, detection in detections.items():
@@ -361,7 +363,7 @@ def find_views(
             if detection.by_fallback:
                 fallback.append(name)
     if not boards:
-        raise _without_board(folder, tried, len(used), size, board)
+        raise _without_board(folder, tried, len(used), sizes, board)
     views, reordered = [], []
     for name in sorted(boards, key=natural_order):
         left, right = (boards[name].get(side) for side in CAMERAS)
@@ -369,6 +371,7 @@ def find_views(
         if left is not None and right is not None:
             corners, turned = _agreeing(left, right, board)
             reordered += [name] * turned
+        corners = None if corners is None else scaled_px(corners, usual["right"], size)
         views.append(View(name, None if left is None else left.corners, corners))
     lonely = [n for (view, side), n in names.items() if (view, CAMERAS[side == "left"]) not in names]
     return Views(
@@ -378,26 +381,30 @@ def find_views(
         unpaired=tuple(sorted(lonely, key=natural_order)),
         unnamed=unnamed_pictures(folder, sizes),
         without_board=tuple(without),
-        other_size=tuple(picture.path.relative_to(folder).as_posix() for picture, own in sizes.items() if own != size),
+        other_size=tuple(p.path.relative_to(folder).as_posix() for p in sizes if p not in used),
+        right_image_size=None if usual["right"] in (size, (0, 0)) else usual["right"],
         by_fallback=tuple(fallback),
         reordered=tuple(reordered),
     )
 
 
-def _any_board(folder: Path, tried: Sequence[Picture], size: tuple[int, int], board: Board, finder: Finder) -> bool:
+def _any_board(
+    folder: Path, tried: Sequence[Picture], sizes: Mapping[Picture, Size], board: Board, finder: Finder
+) -> bool:
     """Whether one of some pictures shows the board: all would take minutes."""
     for k in range(0, len(tried), TRIED_AT_ONCE):
-        found = _detections(folder, tried[k : k + TRIED_AT_ONCE], size, board, finder)
+        found = _detections(folder, tried[k : k + TRIED_AT_ONCE], sizes, board, finder)
         if any(one is not None for detections in found for one in detections.values()):
             return True
     return False
 
 
 def _without_board(
-    folder: Path, tried: Sequence[Picture], count: int, size: tuple[int, int], board: Board
+    folder: Path, tried: Sequence[Picture], count: int, sizes: Mapping[Picture, Size], board: Board
 ) -> NothingToEstimate:
     """That pictures do not show the board, and what they show instead."""
-    greys = [part for picture in tried for part in _greys(picture, folder, size).values()]
+    greys = [part for picture in tried for part in _greys(picture, folder, sizes[picture]).values()]
+    of_sizes = " and ".join(f"{width} x {height}" for width, height in dict.fromkeys(sizes[one] for one in tried))
     reason, remedy = why_no_board(greys, board.columns, board.rows)
     if board.markers is None:
         looked = spread(greys)
@@ -411,13 +418,13 @@ def _without_board(
     where = f"{len(tried)} of {count} pictures" if len(tried) < count else f"{count} pictures"
     return NothingToEstimate(
         "no-board",
-        f"no board of {board.columns}x{board.rows} inner corners in {where} of {size[0]} x {size[1]} px: {reason}",
+        f"no board of {board.columns}x{board.rows} inner corners in {where} of {of_sizes} px: {reason}",
         allowed="pictures that show the whole board",
         remedy=remedy,
     )
 
 
-def _greys(picture: Picture, folder: Path, size: tuple[int, int]) -> dict[str, np.ndarray]:
+def _greys(picture: Picture, folder: Path, size: Size) -> dict[str, np.ndarray]:
     """The grey images in a picture by their camera, uint8."""
     pixels = in_grey_levels(read_image(picture.path, folder))
     # The finders want 8 bits; a corner is an average over hundreds of pixels.
@@ -429,24 +436,20 @@ def _greys(picture: Picture, folder: Path, size: tuple[int, int]) -> dict[str, n
     }
 
 
-def _refuse_two_sizes(sizes: dict[Picture, tuple[int, int]], folder: Path) -> None:
-    """Refuses two cameras of two picture sizes: one of them would pass for a camera without boards."""
-    usual = []
-    for side in CAMERAS:
-        own = Counter(size for picture, size in sizes.items() if picture.sides == (side,))
-        usual += [size for size, count in own.most_common(1) if 2 * count > own.total()]
-    if len(set(usual)) > 1:
-        (left, right) = (f"{width} x {height}" for width, height in usual)
+def _refuse_two_shapes(usual: Mapping[str, Size], folder: Path) -> None:
+    """Refuses two cameras whose pictures differ in proportion: the right one's are not the left one's, scaled."""
+    if min(usual["left"] + usual["right"]) > 0 and not same_shape(usual["left"], usual["right"]):
+        (left, right) = (f"{width} x {height}" for width, height in usual.values())
         raise refusal(
             "image-size",
             file=escaped(folder.resolve().name),
             found=f"left and right have two sizes: {left} and {right}",
-            allowed="pictures of one size",
-            remedy="take the pictures of both cameras at one size, for the board and for the spots",
+            allowed="pictures of one size, or of one proportion of width to height",
+            remedy="take the pictures of both cameras at such sizes, for the board and for the spots",
         )
 
 
-def _sizes(folder: Path, pairing: Pairing) -> dict[Picture, tuple[int, int]]:
+def _sizes(folder: Path, pairing: Pairing) -> dict[Picture, Size]:
     """Width and height of one camera's image in every picture of a board, by their headers.
 
     The pictures of the majority are one calibration, and only those are decoded.
@@ -485,17 +488,18 @@ def _size(path: Path, folder: Path) -> tuple[int, int]:
 
 
 def _detections(
-    folder: Path, pictures: Sequence[Picture], size: tuple[int, int], board: Board, finder: Finder
+    folder: Path, pictures: Sequence[Picture], sizes: Mapping[Picture, Size], board: Board, finder: Finder
 ) -> Iterator[dict[str, _Detection | None]]:
     """The boards in pictures, by the camera whose image holds it."""
 
     def detect(picture: Picture) -> dict[str, _Detection | None] | InputError:
         try:
-            return {side: _detection(part, board, finder) for side, part in _greys(picture, folder, size).items()}
+            parts = _greys(picture, folder, sizes[picture])
+            return {side: _detection(part, board, finder) for side, part in parts.items()}
         except InputError as error:
             return error
 
-    at_once = PIXELS_MAX // (size[0] * size[1] * max(len(p.sides) for p in pictures))
+    at_once = PIXELS_MAX // max(sizes[p][0] * sizes[p][1] * len(p.sides) for p in pictures)
     with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, at_once))) as pool:
         refused = []
         for found in pool.map(detect, pictures):

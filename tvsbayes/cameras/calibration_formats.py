@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -29,6 +29,8 @@ from tvsbayes.instrument.stereo_pair import (
     pair_doubts,
     parse_stereo,
     rotation_vector,
+    same_shape,
+    scaled_px,
     stereo_bytes,
 )
 
@@ -155,6 +157,7 @@ class _Reader:
         notes: what was assumed.
         warnings: what is doubtful.
         places: key and file of M1, M2, D1, D2, R, T, in words.
+        right_size: of the right camera's pictures, where it is not that of the left one's.
         matrices: of both cameras, as the file has them.
         transposed: a camera matrix that the file has by columns.
     """
@@ -166,6 +169,7 @@ class _Reader:
         self.notes: list[str] = []
         self.warnings: list[str] = []
         self.places: dict[str, str] = {}
+        self.right_size: tuple[int, int] | None = None
         self.matrices: list[np.ndarray] = []
         self.transposed: Entry | None = None
 
@@ -188,11 +192,18 @@ class _Reader:
         if self._of_matlab():
             matrices = [matrix - np.outer([1, 1, 0], [0, 0, 1]) for matrix in matrices]
             self.notes.append("MATLAB counts pixels from 1: 1 px is taken off cx and cy of both cameras")
-        left, right = (_Camera(m, self._distortion(side, m, size)) for side, m in enumerate(matrices))
+        sizes = (size, self.right_size or size)
+        left, right = (
+            _Camera(m, self._distortion(side, m, own))
+            for side, (m, own) in enumerate(zip(matrices, sizes, strict=True))
+        )
+        scaled = right.matrix * np.array([[size[0] / sizes[1][0]] * 2 + [1.0]] * 2 + [[1.0] * 3])
+        scaled[:2, 2] = scaled_px(right.matrix[:2, 2], sizes[1], size)
         rotation, translation = self._extrinsics()
         translation = translation * self._unit(float(np.linalg.norm(translation)))
-        inner = left.matrix, left.distortion, right.matrix, right.distortion
+        inner = left.matrix, left.distortion, scaled, right.distortion
         bare = Stereo(*size, *inner, rotation, translation, np.zeros((24, 24)), 0.0, assumed=True)
+        bare = replace(bare, right_image_size=self.right_size)
         return parse_stereo(stereo_bytes(bare), "the imported calibration")
 
     def _check_model(self, side: int) -> None:
@@ -316,7 +327,7 @@ class _Reader:
         return (values, some[0]) if some else None
 
     def _size(self, matrices: Sequence[np.ndarray]) -> tuple[int, int]:
-        """The size of the pictures, the same for both cameras."""
+        """The size of the left camera's pictures; that of the right one's, where it is another, is kept beside."""
         sizes: list[tuple[tuple[int, int], Entry]] = []
         for side, camera in enumerate(self.found.cameras):
             if "size" in camera:
@@ -340,7 +351,11 @@ class _Reader:
         if len({size for size, _ in sizes}) > 1:
             (one_size, entry), (other, _) = sizes
             found = f"left and right have two sizes: {one_size[0]} x {one_size[1]} and {other[0]} x {other[1]}"
-            raise entry.refuse("image-size", "two images of one size", "calibrate them at one size", found)
+            if not same_shape(one_size, other):
+                remedy = "calibrate them at sizes of one proportion"
+                raise entry.refuse("image-size", "sizes of one proportion of width to height", remedy, found)
+            self.right_size = other
+            self.notes.append(f"{found}: the right camera's numbers are those of its pictures scaled to the left one's")
         if sizes and self.stated_size not in (None, sizes[0][0]):
             found = f"{sizes[0][0][0]} x {sizes[0][0][1]} px"
             raise sizes[0][1].refuse("image-size", "the size of the pictures", "leave out --image-size", found)

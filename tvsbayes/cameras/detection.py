@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from itertools import product
@@ -153,7 +153,7 @@ class _Frames:
     """
 
     folder: Path
-    size: tuple[int, int]
+    sizes: Mapping[str, tuple[int, int]]
     white: int | None = None
     dark: Path | None = None
 
@@ -173,7 +173,7 @@ class _Frames:
             return lit
         place = self._dark_picture(spot, side)
         data = read_bytes(place, IMAGE_BYTES_MAX, self.dark)
-        self._require_size(data, place)
+        self._require_size(data, place, side)
         dark = in_grey_levels(decode_image(data, place.name), self.white)
         left = np.maximum(lit.astype(np.float32) - dark + PEDESTAL_DN, 0.0)
         return np.where(lit >= CLIPPED_DN, lit.astype(np.float32), left)
@@ -216,18 +216,18 @@ class _Frames:
         path = self.path(spot, side)
         # Its size before it is decoded: a small file can hold 50 million pixels, on every thread.
         data = read_bytes(path, IMAGE_BYTES_MAX, self.folder)
-        self._require_size(data, path)
+        self._require_size(data, path, side)
         return data
 
-    def _require_size(self, data: bytes, path: Path) -> None:
+    def _require_size(self, data: bytes, path: Path, side: str) -> None:
         """Refuse a picture of another size than that of the calibration."""
         size = image_size(data, escaped(path.name))
-        if size != self.size:
+        if size != self.sizes[side]:
             raise refusal(
                 "image-size",
                 file=path.name,
                 found=f"{size[0]} x {size[1]} pixels",
-                allowed=f"{self.size[0]} x {self.size[1]} as in stereo.json",
+                allowed="{} x {} as in stereo.json".format(*self.sizes[side]),
                 remedy="calibrate and observe at one image size",
             )
 
@@ -298,7 +298,9 @@ def detect(
         raise all_of(every or [first]) from None
     noise = _relearned(looks.noise, pairs, speckle_contrast) if method == "fit" else looks.noise
     sides = {side: widened([pair[k].under(noise[side]) for pair in pairs]) for k, side in enumerate(CAMERAS)}
-    seen = list(zip(sides["left"].centres, sides["right"].centres, strict=True))
+    sizes = campaign.stereo.image_sizes
+    right = [centre.scaled(sizes["right"], sizes["left"]) for centre in sides["right"].centres]
+    seen = list(zip(sides["left"].centres, right, strict=True))
     spots = _rows(campaign.spots, present, seen, campaign.stereo)
     after = [spots[row] for row in present]
     sds = [
@@ -344,7 +346,10 @@ def _frames_of(campaign: Campaign, method: str) -> _Frames:
         raise InputError("method", f"no method {method!r}", found=method, allowed=", ".join(METHODS), remedy=remedy)
     if campaign.path is None:
         raise InputError("path", "a campaign that was not read from a folder has no frames")
-    return _Frames(Path(campaign.path), (campaign.stereo.image_width, campaign.stereo.image_height))
+    if method != "fit" and campaign.stereo.right_image_size is not None:
+        remedy, allowed = "leave out --method: fit is the default", "cameras of one picture size for contour"
+        raise InputError("method", f"cameras of two picture sizes; allowed: {allowed}", allowed=allowed, remedy=remedy)
+    return _Frames(Path(campaign.path), campaign.stereo.image_sizes)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ where no number does, pairs and rows are matched one by one in the order of the 
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from tvsbayes.cameras.camera_marks import OTHER_SUFFIXES, paired_pictures, unnamed_pictures
-from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, natural_order
+from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, Size, natural_order, usual_sizes
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, PNG_SIGNATURE, decode_image, image_size, png_bytes
@@ -59,8 +58,8 @@ class ViewedFolder:
     """The pairs of a folder.
 
     Attributes:
-        views: pairs of one size, in the natural order of their names.
-        image_width, image_height: size of one camera's picture, px.
+        views: pairs, in the natural order of their names.
+        image_sizes: of most pictures of the left and of the right camera, px.
         unpaired: files without their other camera.
         unnamed: files whose names tell no camera, and that hold no two pictures side by side.
         other_size: files of another size than most.
@@ -68,8 +67,7 @@ class ViewedFolder:
     """
 
     views: tuple[View, ...]
-    image_width: int
-    image_height: int
+    image_sizes: dict[str, Size]
     unpaired: tuple[str, ...]
     unnamed: tuple[str, ...]
     other_size: tuple[str, ...]
@@ -108,28 +106,27 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
         InputError: no folder, no pair, an unreadable picture.
     """
     pictures = paired_pictures(folder, swap=swap, most=2 * LOOKS_MAX)
-    sizes: dict[Picture, tuple[int, int]] = {}
+    sizes: dict[Picture, Size] = {}
     for picture in pictures:
         data = read_bytes(picture.path, IMAGE_BYTES_MAX, folder)
         width, height = image_size(data, escaped(picture.path.name))
         if len(picture.sides) == 1 or width >= SIDE_BY_SIDE_RATIO * height:
             sizes[picture] = width // len(picture.sides), height
     unread = [path.name for path in sorted(Path(folder).iterdir()) if path.suffix.lower() in OTHER_SUFFIXES]
-    counted = Counter(sizes.values())
-    size = max(counted, key=lambda one: (counted[one], one), default=(0, 0))
+    usual = usual_sizes(sizes)
+    used = [picture for picture, own in sizes.items() if all(own == usual[side] for side in picture.sides)]
     by_view: dict[str, dict[str, Picture]] = {}
-    for picture in (one for one, own in sizes.items() if own == size):
+    for picture in used:
         by_view.setdefault(picture.view, {}).update(dict.fromkeys(picture.sides, picture))
     whole = {name: both for name, both in by_view.items() if len(both) == 2}
     if not whole:
         raise _no_pairs(folder, len(pictures))
     return ViewedFolder(
         views=tuple(View(n, (whole[n]["left"], whole[n]["right"])) for n in sorted(whole, key=natural_order)),
-        image_width=size[0],
-        image_height=size[1],
+        image_sizes=usual,
         unpaired=tuple(p.path.name for both in by_view.values() if len(both) == 1 for p in both.values()),
         unnamed=unnamed_pictures(Path(folder), sizes),
-        other_size=tuple(picture.path.name for picture, own in sizes.items() if own != size),
+        other_size=tuple(picture.path.name for picture in sizes if picture not in used),
         unread=tuple(unread),
     )
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +19,8 @@ from tvsbayes.instrument.campaign import CAMERAS
 SUFFIXES = (".png", ".jpg", ".jpeg")
 SIDE_BY_SIDE_RATIO = 2.0
 """Width over height from which a picture that is named neither left nor right holds both cameras' images."""
+Size = tuple[int, int]
+"""Width and height, px."""
 NAMING = "left01.png with right01.png, 01_left.png with 01_right.png, or folders left/ and right/"
 """How pictures of two cameras are named, for messages."""
 _LETTERS = {"l": "left", "r": "right", "left": "left", "right": "right"}
@@ -41,6 +45,15 @@ class Picture:
     view: str
     path: Path
     sides: tuple[str, ...]
+
+
+def usual_sizes(sizes: Mapping[Picture, Size]) -> dict[str, Size]:
+    """The size, px, that most pictures of each camera have; of equally many the larger."""
+    found: dict[str, Size] = {}
+    for side in CAMERAS:
+        counted = Counter(size for picture, size in sizes.items() if side in picture.sides)
+        found[side] = max(counted, key=lambda one: (counted[one], one), default=(0, 0))
+    return found
 
 
 def _sided(stem: str) -> tuple[str, str] | None:

@@ -23,6 +23,7 @@ from tvsbayes.cameras.alternate_lines import AlternateLines, shift_of_lines, wid
 from tvsbayes.cameras.spot_noise import SpotNoise, pixel_noise, through_demosaicing
 from tvsbayes.cameras.spot_window import CLIPPED_DN, CLIPPED_SHARE_MAX, SHRINK, Patch, patch_around
 from tvsbayes.files.images import in_grey_levels
+from tvsbayes.instrument.stereo_pair import scaled_px
 
 AREA_MIN_PX = 4.0
 """Least area at half height, px^2: a hot pixel after demosaicing has 2."""
@@ -85,6 +86,13 @@ class Centre:
         """Centre and covariance of a spot that counts."""
         assert self.centre_px is not None and self.covariance_px2 is not None, self.status
         return Located(self.centre_px, self.covariance_px2)
+
+    def scaled(self, size: tuple[int, int], to: tuple[int, int]) -> Centre:
+        """The same centre in pixels of pictures of another size."""
+        if size == to or self.centre_px is None or self.covariance_px2 is None:
+            return self
+        covariance = self.covariance_px2 * (to[0] / size[0]) ** 2
+        return replace(self, centre_px=scaled_px(self.centre_px, size, to), covariance_px2=covariance)
 
     def under(self, noise: SpotNoise) -> Centre:
         """The same centre with the covariance that this noise gives it; misshapen where its skew is no noise."""

@@ -208,6 +208,7 @@ def calibrate_stereo(
     pitch[21:, 21:] = np.outer(shift, shift)
     rms, nothing = _rms(adjustment.residuals_px), np.zeros(1)
     bare = Stereo(*size, nothing, nothing, nothing, nothing, nothing, nothing, pitch, rms)
+    bare = replace(bare, right_image_size=None if found is None else found.right_image_size)
     stereo = bare.with_vector(adjustment.vector)
     errors = board_errors(adjustment, done.views, board, stereo)
     covariance = errors.correlation_factor * adjustment.covariance + errors.covariance + pitch

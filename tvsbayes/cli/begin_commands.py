@@ -5,7 +5,7 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -188,12 +188,16 @@ def _refuse_other_size(out: Path, seen: ViewedFolder) -> None:
 
     if not (out / "stereo.json").is_file():
         return
-    stereo = read_stereo(out / "stereo.json")
-    wanted, size = (stereo.image_width, stereo.image_height), (seen.image_width, seen.image_height)
-    if size != wanted:
-        found, allowed = f"pictures of {size[0]} x {size[1]} px", f"{wanted[0]} x {wanted[1]} px as in stereo.json"
+    wanted = read_stereo(out / "stereo.json").image_sizes
+    if seen.image_sizes != wanted:
+        found, allowed = f"pictures of {_sizes_px(seen.image_sizes)}", f"{_sizes_px(wanted)} as in stereo.json"
         place, remedy = escaped(str(out / "stereo.json"), 200), "calibrate and observe at one image size"
         raise refusal("image-size", file=place, found=found, allowed=allowed, remedy=remedy)
+
+
+def _sizes_px(sizes: Mapping[str, tuple[int, int]]) -> str:
+    """Sizes of pictures in words, once where both cameras have one."""
+    return " and ".join(f"{width} x {height} px" for width, height in dict.fromkeys(sizes.values()))
 
 
 def _paired_text(
@@ -233,7 +237,7 @@ def _unpaired_lines(seen: ViewedFolder, found: PairedLooks, rows: str) -> list[s
     files = {
         "without the picture of the other camera": seen.unpaired,
         "their names tell no camera": seen.unnamed,
-        f"not of {seen.image_width} x {seen.image_height} px as most": seen.other_size,
+        f"not of {_sizes_px(seen.image_sizes)} as most": seen.other_size,
         "of a kind that is not read; save them as PNG of 8 bits": seen.unread,
         "a second pair for its row": found.left_over,
     }

@@ -397,6 +397,10 @@ def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, Setting]:
         if key in table:
             device = isinstance(table.values[key], str)
             values[key] = table.text_value(key) if device else table.integer(key, 0, 1000)
+    if stereo.right_image_size is not None:
+        remedy = "record with the cameras' own program, then `tvsbayes new --pictures FOLDER`"
+        found = "a stereo file of two picture sizes"
+        raise table.refuse("stereo", "image-size", "cameras of one picture size", remedy, found)
     for key, calibrated in (("width", stereo.image_width), ("height", stereo.image_height)):
         if key in table:
             values[key] = table.integer(key, 1, 65_535)

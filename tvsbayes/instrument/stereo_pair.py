@@ -99,7 +99,8 @@ class Stereo:
 
     `D1`, `D2` are k1 k2 p1 p2 k3. `parameter_covariance` orders the 24 parameters as
     `STEREO_PARAMETER_NAMES` (rotation as Rodrigues vector, rad; translation in mm).
-    Where it is `assumed`, `assumed_from` says from what.
+    Where it is `assumed`, `assumed_from` says from what. Where the right camera's pictures have another size, it is
+    `right_image_size`, width and height; its parameters and pixels are those of pictures scaled to the left one's size.
     """
 
     image_width: int
@@ -114,6 +115,13 @@ class Stereo:
     rms_px: float
     assumed: bool = False
     assumed_from: str = ""
+    right_image_size: tuple[int, int] | None = None
+
+    @property
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """Width and height of the pictures of the left and of the right camera, as they are recorded."""
+        size = self.image_width, self.image_height
+        return {"left": size, "right": self.right_image_size or size}
 
     @property
     def vector(self) -> np.ndarray:
@@ -185,7 +193,7 @@ def rotation_vector(matrix: np.ndarray) -> np.ndarray:
 
 _STEREO_KEYS = (
     *("format", "image_width", "image_height", "M1", "D1", "M2", "D2", "R", "T"),
-    *("parameter_covariance", "rms_px", "assumed", "assumed_from"),
+    *("parameter_covariance", "rms_px", "assumed", "assumed_from", "right_image_size"),
 )
 _ORIGIN_CHARS_MAX = 400
 ASSUMED_REMEDY = (
@@ -204,6 +212,8 @@ ASPECT_SHARE_MAX = 0.05
 """The same of fx / fy from 1: pixels of today's sensors are square."""
 VIEW_DEG_MIN, VIEW_DEG_MAX, TURN_DEG_MAX = 2.0, 150.0, 20.0
 """Of a lens that five coefficients describe, across the picture; of two cameras that look at one scene."""
+SHAPE_SHARE_MAX = 0.005
+"""By which proportions of two picture sizes may differ: rounding to whole pixels."""
 FOCAL_TIMES_MAX = 1.5
 """Of the focal lengths of two cameras of one kind."""
 TANGENTIAL_MAX = 0.01
@@ -211,6 +221,19 @@ TANGENTIAL_MAX = 0.01
 SHORTEST_BASELINE_MM, LONGEST_BASELINE_MM = 2.0, 10_000.0
 """Two lenses cannot stand closer, and the longest baseline in metres that anybody calls a stereo pair is shorter; no
 cameras on one rig stand farther apart, and the shortest baseline in mm, taken for metres, is longer."""
+
+
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether pictures of two sizes, width and height, have one proportion."""
+    return min(other) > 0 and abs(size[0] * other[1] / (size[1] * other[0]) - 1.0) <= SHAPE_SHARE_MAX
+
+
+def scaled_px(pixels: np.ndarray, size: tuple[int, int], to: tuple[int, int]) -> np.ndarray:
+    """Pixels (..., 2) of pictures of one size as those of the same pictures scaled to another one.
+
+    The integer is at a pixel's centre, so that pictures begin at -1/2.
+    """
+    return (pixels + 0.5) * (to[0] / size[0]) - 0.5
 
 
 def _array(keys: Keys, key: str, *shapes: tuple[int, ...]) -> np.ndarray:
@@ -286,6 +309,13 @@ def parse_stereo(data: bytes, file: str) -> Stereo:
     if not 0 < np.linalg.norm(translation) <= 1e5:
         allowed = "a translation longer than 0 and at most 100000 mm"
         raise keys.refuse("T", "translation", allowed, "give T in mm", escaped(str(translation.tolist())))
+    right = None
+    if "right_image_size" in keys:
+        across, down = _array(keys, "right_image_size", (2,)).astype(int).tolist()
+        right = across, down
+        if not same_shape((width, height), right):
+            allowed = f"width and height in the proportion of {width} to {height} px"
+            raise keys.refuse("right_image_size", "image-size", allowed, "calibrate at sizes of one proportion")
     covariance = _array(keys, "parameter_covariance", (24, 24))
     _check_covariance(keys, "parameter_covariance", covariance)
     return Stereo(
@@ -301,6 +331,7 @@ def parse_stereo(data: bytes, file: str) -> Stereo:
         rms_px=keys.number("rms_px", 0.0, 1e4),
         assumed="assumed" in keys and keys.flag("assumed"),
         assumed_from=keys.text_value("assumed_from", _ORIGIN_CHARS_MAX) if "assumed_from" in keys else "",
+        right_image_size=right,
     )
 
 
@@ -326,7 +357,7 @@ def stereo_bytes(stereo: Stereo) -> bytes:
     lines = []
     for key in _STEREO_KEYS:
         value = "tvsbayes-stereo/1" if key == "format" else getattr(stereo, key)
-        if key == "assumed_from" and not value:
+        if key in ("assumed_from", "right_image_size") and not value:
             continue
         if isinstance(value, np.ndarray) and value.ndim == 2:
             rows = ",\n  ".join(json.dumps(row) for row in value.tolist())

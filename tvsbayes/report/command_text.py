@@ -166,6 +166,8 @@ def stereo_text(stereo: Stereo) -> str:
     units = ("px",) * 4 + ("",) * 5
     rows = [[name, cells[k], cells[9 + k], unit] for k, (name, unit) in enumerate(zip(names, units, strict=True))]
     title = f"stereo pair, {stereo.image_width} x {stereo.image_height} px"
+    if stereo.right_image_size is not None:
+        title += "; right camera {} x {} px, scaled to that".format(*stereo.right_image_size)
     cameras = TableView(title, ["", "left(u)", "right(u)", "unit"], rows)
     rows = [[axis, cells[18 + k], cells[21 + k]] for k, axis in enumerate("xyz")]
     return terminal(cameras, TableView("x_right = R x_left + T", ["", "rotation, rad", "T, mm"], rows))
