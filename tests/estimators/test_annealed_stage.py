@@ -29,9 +29,9 @@ def beside(dozen) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def found(dozen):
+def found(dozen, evaluate):
     with jax.enable_x64(True):
-        return SimpleNamespace(z=beside(dozen), **vars(found_at(dozen, beside(dozen))))
+        return SimpleNamespace(z=beside(dozen), **vars(found_at(evaluate, dozen, beside(dozen))))
 
 
 def test_innovations_are_those_of_the_density(dozen, found):
@@ -39,8 +39,8 @@ def test_innovations_are_those_of_the_density(dozen, found):
     lin, size, filled = found.reduced.also, len(dozen.campaign.spots), dozen.arrays.gears.errors_filled
     before = no_belief(1 + len(NAMES) + len(filled))
     columns = np.asarray(jax.jit(innovations)(lin, dozen.arrays.of_spots(0, size), before).standardised)
-    own = columns[..., 0] + columns[..., 1 + len(NAMES) :] @ lin.place_root @ found.seen.places[0][filled]
-    expected = found.seen.standardised[0][:size]
+    own = columns[..., 0] + columns[..., 1 + len(NAMES) :] @ lin.place_root @ found.moved.places[0][filled]
+    expected = found.moved.standardised[0][:size]
     np.testing.assert_allclose(own, expected, atol=ALGEBRA * np.abs(expected).max())
 
 

@@ -86,7 +86,7 @@ def test_of_stops_looked_at_once_the_sum_of_both_scatters_is_known(dozen, evalua
     once = eqx.tree_at(
         lambda a: (a.spots.redraw, a.spots.redraw_mix),
         dozen.arrays,
-        (jnp.ones(shape, bool), jnp.full((*shape, 2), 0.5)),
+        (np.ones(shape, bool), np.full((*shape, 2), 0.5)),
     )
     index, stops = [INDEX[name] for name in LOOK_SCATTER_NAMES], [INDEX[n] for n in NAMES if n.startswith("stop_sd")]
     found = []
@@ -101,17 +101,17 @@ def test_of_stops_looked_at_once_the_sum_of_both_scatters_is_known(dozen, evalua
     assert abs(shared - found[0]) > LOG_UNIT, "of stops looked at twice the shares are told"
 
 
-@pytest.mark.parametrize("size", [4, 20])
-def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch, size):
+def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch):
     """Stop errors, homings and play of the dozen last from one block of four to the next.
 
     Twenty do not divide the padded number: four do.
     """
     whole = evaluate(dozen.z, dozen.space, dozen.arrays).innovations
     still = jnp.zeros(2 * len(dozen.arrays.gears.places.steps))
-    monkeypatch.setattr(density, "BLOCK", size)
+    monkeypatch.setattr(density, "BLOCK", 20)
     cut = jax.jit(
-        lambda z, space, arrays: density.innovations(space.model(z), arrays, still, density.blocks_filled(arrays))
+        lambda z, space, arrays: density.innovations(space.model(z), arrays, still, density.blocks_filled(arrays)),
+        compiler_options={"xla_backend_optimization_level": 0},
     )(jnp.asarray(dozen.z), dozen.space, dozen.arrays)
     assert float(cut.log_density) == pytest.approx(float(whole.log_density), abs=FINE_UNIT, rel=1e-12)
     np.testing.assert_allclose(cut.standardised, whole.standardised, atol=1e-8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +31,7 @@ def both(dozen):
         pan, tilt = angles[dozen.arrays.spots.move_index].T
         return observe(model, jnp.stack([pan, tilt, ranges_mm]), dozen.arrays.azimuth_convention)
 
-    @jax.jit
+    @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     def compute(z):
         looks = standing(dozen.space.model(z), dozen.arrays).looks
         parts = jnp.stack(look_jacobian(z, dozen.space.physical(z), dozen.space, looks, dozen.arrays))

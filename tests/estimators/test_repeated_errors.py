@@ -86,11 +86,11 @@ def varying(dozen) -> Varying:
 
 
 @pytest.fixture(scope="module", params=SCALES)
-def found(request, varying) -> SimpleNamespace:
+def found(request, varying, evaluate) -> SimpleNamespace:
     moved = varying.z + np.where(NOISE, 0.0, 0.3 * np.random.default_rng(33).standard_normal(len(NAMES)))
     with jax.enable_x64(True):
         z = coordinates_with(varying.space, moved, SCALES[request.param])
-        here = found_at(varying, z)
+        here = found_at(evaluate, varying, z)
     values = physical(here)
     for name, value in SCALES[request.param].items():
         assert values[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
@@ -99,13 +99,13 @@ def found(request, varying) -> SimpleNamespace:
 
 def test_log_density_is_that_of_the_dense_gaussian(varying, found):
     dense = dense_log_density(varying.campaign, found)
-    assert found.seen.log_density[0] == pytest.approx(dense, abs=FINE_UNIT, rel=1e-10)
+    assert found.moved.log_density[0] == pytest.approx(dense, abs=FINE_UNIT, rel=1e-10)
     # Quadratic form and determinant as the fit and its diagnoses read them.
     count = len(ordered_spots(varying.campaign))
     residual, slope = found.terms.residual[:count], found.terms.slope[:count]
     covariance = residual_covariance(angle_covariances(varying.campaign, found.values), slope)
     chi2 = residual.ravel() @ np.linalg.solve(covariance, residual.ravel())
-    squares = np.sum(found.seen.standardised[0] ** 2) + np.sum(found.seen.places[0] ** 2)
+    squares = np.sum(found.moved.standardised[0] ** 2) + np.sum(found.moved.places[0] ** 2)
     assert squares == pytest.approx(chi2, rel=ALGEBRA)
 
 
@@ -159,7 +159,7 @@ def test_draws_of_errors_at_places_have_the_conditional_gaussians_moments(varyin
     whole = residual_covariance(angle_covariances(varying.campaign, found.values), slope)
     gain = np.linalg.solve(whole, load @ prior).T
     own = np.tile(valid, 2)
-    drawn = found.seen.place_errors_rad
+    drawn = found.moved.place_errors_rad
     mean, moved = drawn[0][own], (drawn[1:] - drawn[0])[:, own]
     scale = np.sqrt(np.diag(prior)) + 1e-12
     np.testing.assert_allclose(mean / scale, gain @ residual.ravel() / scale, atol=ALGEBRA * 100)
@@ -195,8 +195,8 @@ def test_scales_of_nought_are_perfect_gears(varying, dozen, evaluate):
         arrays = jax.tree.map(jnp.asarray, campaign_arrays(dozen.campaign, table))
         space = jax.tree.map(jnp.asarray, parameter_space(table, dozen.campaign.stereo))
         none = {n: 0.0 for n in SCALES["rough"] if "length" not in n}
-        here = found_at(varying, coordinates_with(varying.space, varying.z, none))
+        here = found_at(evaluate, varying, coordinates_with(varying.space, varying.z, none))
         z = coordinates_of(space, physical_at(varying.z, varying.space).value)
         perfect = evaluate(z, space, arrays).innovations.log_density
     # What is left is the floor of 1e-12 rad under every place: with slopes of 1e4 per rad 1e-16 of a variance.
-    assert here.seen.log_density[0] == pytest.approx(perfect, abs=1e-9 * LOG_UNIT, rel=1e-12)
+    assert here.moved.log_density[0] == pytest.approx(perfect, abs=1e-9 * LOG_UNIT, rel=1e-12)
