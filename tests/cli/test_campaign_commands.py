@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,9 @@ from support.commands import (
     two_sheets,
 )
 
+from tvsbayes.cli import campaign_commands
+from tvsbayes.cli.campaign_commands import _sampled
+from tvsbayes.cli.main import run
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.plan import write_plan
 
@@ -121,10 +125,21 @@ def test_simulate_can_keep_the_homing_sides_to_itself(ask, tmp_path):
     assert truth["effective_deg_per_step"] == pytest.approx(truth["local_deg_per_step"], rel=5 * 0.05 * 2**0.5 / 1.8)
 
 
-def test_demo_shows_classic_and_joint_beside_the_truth(ask, tmp_path):
-    out = tmp_path / "kept"
-    code, document = ask("demo", out)
-    assert code == 0
+@pytest.fixture(scope="module")
+def demonstrated(own_compilation_cache) -> SimpleNamespace:
+    """What `demo` ends with: its document, its text, and the summary of its fit."""
+    fitted, ended = [], []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(campaign_commands, "_sampled", lambda *given: fitted.append(_sampled(*given)) or fitted[0])
+        patch.setattr(campaign_commands, "finish", lambda *given: ended.append(given))
+        assert run(["demo"]) == 0
+    ((document, text, as_json, error),) = ended
+    assert not as_json and error is None
+    return SimpleNamespace(document=json.loads(json.dumps(document)), text=text, summary=fitted[0])
+
+
+def test_demo_shows_classic_and_joint_beside_the_truth(demonstrated):
+    document = demonstrated.document
     assert set(document) == {"classic", "fit", "truth"}
     fit, truth = document["fit"], document["truth"]
     intervals = {d: fit["effective_deg_per_step"][d]["interval95"] for d in DIRECTIONS}
@@ -142,19 +157,29 @@ def test_demo_shows_classic_and_joint_beside_the_truth(ask, tmp_path):
         predicted = fit["classic_predicted_deg_per_step"][direction]
         sd = np.hypot(predicted["sd"], result["u_type_a_deg_per_step"])
         assert abs(predicted["value"] - result["mean_deg_per_step"]) < 5 * sd
-    assert (out / "truth.json").is_file()
-    assert (out / "results" / "fit.json").is_file()
+
+
+def test_demo_keeps_campaign_and_results_where_it_is_told(ask, demonstrated, tmp_path, monkeypatch):
+    out, kept = tmp_path / "kept", []
+
+    def calibrate(campaign, place, *, tier, progress):
+        kept.append((len(campaign.spots), place, tier))
+        return SimpleNamespace(record=demonstrated)
+
+    monkeypatch.setattr(campaign_commands, "calibrate", calibrate)
+    assert ask("demo", out) == (0, demonstrated.document)
+    assert kept == [(384, out / "results", "importance")]
+    assert read_campaign(out).spots == read_campaign(PAPER_TWIN).spots and (out / "truth.json").is_file()
     assert ask("demo", out)[0] == 2
 
 
-def test_readme_shows_what_the_demo_prints(say):
+def test_readme_shows_what_the_demo_prints(demonstrated):
     """Same lines; each number within a tenth of its uncertainty (another processor rounds differently)."""
     readme = DATA.parent / "README.md"
     if not readme.is_file():
         pytest.skip("the README is not part of an installed package")
     shown = readme.read_text(encoding="utf-8").split("```text\n")[1].split("```")[0]
-    code, out, _ = say("demo")
-    assert code == 0
+    out = demonstrated.text
     number = re.compile(r"(-?\d+\.\d+)(?:\((\d+\.?\d*)\))?")
     assert [re.sub(r" +", " ", number.sub("#", line)) for line in out.splitlines()] == [
         re.sub(r" +", " ", number.sub("#", line)) for line in shown.splitlines()

@@ -39,7 +39,7 @@ def drive(folder, place, factors):
     return place
 
 
-def test_from_a_fit_to_a_verified_machine(ask, say, folder, tmp_path):
+def test_from_a_fit_to_a_verified_machine(ask, say, folder, tmp_path, no_pictures):
     out = tmp_path / "stage.comp"
     code, document = ask("compensate", folder, "--to", "linuxcnc", "-o", out, "--applied-by", "host")
     assert code == 0 and document["applied_by"] == "host" and out.read_text().startswith("-20.0000000")

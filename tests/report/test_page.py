@@ -123,12 +123,12 @@ def test_numbers_of_the_page_are_the_libraries(page, evidence):
     assert f"Not met: {missed.quantity} within 1 mm (probability {chance})" in text
 
 
-def test_the_first_page_has_the_answer_and_who_asked(page, evidence):
+def test_the_first_page_has_the_answer_and_who_asked(page, evidence, no_pictures):
     """Before the contents: ratios, backlashes, millimetres, what to do next, day, laboratory, customer."""
-    issue = Issue(datetime.date(2026, 1, 15), "Optics Lab", "Robotics group")
+    issued = report_html(evidence, Issue(datetime.date(2026, 1, 15), "Optics Lab", "Robotics group"))
     for source, told in (
-        (report_html(evidence, issue), "issued 2026-01-15"),
-        (report_html(evidence, issue), "laboratory Optics Lab customer Robotics group"),
+        (issued, "issued 2026-01-15"),
+        (issued, "laboratory Optics Lab customer Robotics group"),
         (page, "measured 2026-01-15 instrument not recorded serial number not recorded operator not recorded"),
         (page, "laboratory not stated customer not stated"),
     ):
@@ -144,7 +144,7 @@ def test_the_first_page_has_the_answer_and_who_asked(page, evidence):
         assert "Why classic is off there" in first and "of the variance" in first
 
 
-def test_what_check_warns_of_stands_on_the_first_page(evidence):
+def test_what_check_warns_of_stands_on_the_first_page(evidence, no_pictures):
     """The page outlives the terminal: an interrupted run is not usable without a word of it."""
     doubted = replace(evidence, criteria=(), doubts=("whether steps were lost in segment 0 is not known",))
     first = " ".join(" ".join(Nodes(report_html(doubted).split(b"<nav")[0] + b"</header></body></html>").text).split())
