@@ -1,9 +1,10 @@
-"""Do guide logs of real mounts give the periods that are published?
+"""Do guide logs of real mounts give the periods that are published, and does one night predict the next?
 
     python -m experiments.real.guide_logs run FOLDER          # PHD2 logs, by the importer of `import --axis`
     python -m experiments.real.guide_logs table > experiments/real/guide_logs.md
 
-Every run of at least `FRAMES_MIN` frames is read and asked for the waves of `ASKED`; fits by weighted draws.
+Every run of at least `FRAMES_MIN` frames is read and asked for what `import --axis` writes: one range of periods,
+from a minute to a third of the run; fits by weighted draws.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
+
+import numpy as np
 
 from experiments.common.command_line import parser
 from experiments.common.rows import append_row, output, read_rows
@@ -24,19 +27,26 @@ from tvsbayes.single_axis.waves import AskedPeriods
 
 ROWS = output(__file__, "guide_logs.jsonl")
 FRAMES_MIN = 100
-ASKED = AskedPeriods((), ((60.0, 200.0), (200.0, 700.0)), True)
-"""s: one wave among those of gears before the worm, one among worms."""
+SURE = 0.95
+"""Probability from which on a wave is named."""
 PUBLISHED_S = {"AstroPhysics": 382.95, "Gemini": 239.34, "EQMOD": 478.69}
 """By the driver's name in the log: periods of worms (PHD2 wiki, page "Mount Worm Period Info", April 2022)."""
 
 
+NIGHTS = {"PHD2_GuideLog_001.txt": "first", "PHD2_GuideLog_002.txt": "second"}
+"""Of one mount."""
+NEAR = 0.03
+"""Share of the published period within which a wave is the worm's."""
+
+
 def campaign_of(run: GuideRun, file: str) -> AxisCampaign:
-    """What `import --axis --run N` writes, asked for the waves of `ASKED`."""
+    """What `import --axis --run N` writes."""
     found = readings_of_run(run, file, {})
-    if found.drive is None:
-        raise SystemExit(f"{file}: no drive at constant rate")
+    if found.drive is None or found.drive.period_between is None:
+        raise SystemExit(f"{file}: no drive at constant rate, or too short")
     stated = {name: AxisPrior(value, u) for name, (value, u) in found.drive.priors.items()}
-    return AxisCampaign("arcsec", found.moves, found.readings, stated, {"rate": found.drive.rate}, ASKED)
+    asked = AskedPeriods((), (found.drive.period_between,), True)
+    return AxisCampaign("arcsec", found.moves, found.readings, stated, {"rate": found.drive.rate}, asked)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -67,28 +77,55 @@ def run(arguments: argparse.Namespace) -> None:
 TEXT = """# Periods of real mounts, from guide logs
 
 Made by `python -m experiments.real.guide_logs`. Logs of PHD2 (OpenPHDGuiding/phd2, commit 27ca7e21dd, and
-ste7e/PHD2Insight, commit 7de4df4d1e), uncorrected motion as `import --axis` makes it. Value(u) with 95 % interval,
-given that there is the wave; P/2N: period / (2 N) for N periods in the run; arcsec: amplitude on the axis. The log
-names a driver, not a model: the worm is that of the driver's mount that is published.
+ste7e/PHD2Insight, commit 7de4df4d1e), uncorrected motion as `import --axis` makes it, with the one range of periods
+that it writes. Value(u) with 95 % interval, given that there is the wave, strongest first; P/2N: period / (2 N) for N
+periods in the run; arcsec: amplitude on the axis. The log names a driver, not a model: the worm is that of the
+driver's mount that is published.
 
-| log, run | frames | 60 to 200 s | 200 to 700 s | 95 % | P/2N | published | inside | arcsec | there | CPU s |
-|---|---|---|---|---|---|---|---|---|---|---|"""
+| log, run | frames | strongest, s | 95 % | P/2N | arcsec | published | inside | further waves: arcsec every s | CPU s |
+|---|---|---|---|---|---|---|---|---|---|"""
+NIGHTS_TEXT = """
+## One night predicts the next
+
+The worm's wave in the runs of one mount on two nights: every run beside the weighted mean of the other night's.
+z: difference over both u.
+
+| night, run | arcsec | other night | z |
+|---|---|---|---|"""
+
+
+def published_of(row: dict) -> float | None:
+    """Period of the mount's worm, s."""
+    return next((period for name, period in PUBLISHED_S.items() if name in row["mount"]), None)
 
 
 def table(_: argparse.Namespace) -> None:
-    """A line for every run."""
+    """A line for every run, then the nights of one mount."""
     print(TEXT)
+    nights: dict[str, list[tuple[int, float, float]]] = {}
     for row in read_rows(ROWS):
-        short, long = row["periods"]
-        value, (low, high) = long["period"]["value"], long["period"]["interval95"]
-        published = next((period for name, period in PUBLISHED_S.items() if name in row["mount"]), None)
+        every = [wave for wave in row["periods"] if wave["probability"] > SURE]
+        first, further = (every or row["periods"])[0], every[1:]
+        value, (low, high) = first["period"]["value"], first["period"]["interval95"]
+        published = published_of(row)
         cells = [f"`{row['file']}`, {row['run']}", str(row["frames"])]
-        cells += [f"{short['amplitude']['value']:.2f} arcsec every {short['period']['value']:.2f} s"]
-        cells += [f"{value:.2f}({long['period']['sd']:.2f})", f"{low:.2f} to {high:.2f}"]
+        cells += [f"{value:.2f}({first['period']['sd']:.2f})", f"{low:.2f} to {high:.2f}"]
         cells += [f"{value**2 / (2 * row['span_s']):.1f}"]
+        cells += [f"{first['amplitude']['value']:.2f}({first['amplitude']['sd']:.2f})"]
         cells += ["", ""] if published is None else [f"{published}", "yes" if low <= published <= high else "no"]
-        cells += [f"{long['amplitude']['value']:.2f}({long['amplitude']['sd']:.2f})", f"{long['probability']:.3f}"]
+        cells += [", ".join(f"{w['amplitude']['value']:.2f} every {w['period']['value']:.1f}" for w in further)]
         print("| " + " | ".join([*cells, f"{row['cpu_s']:.0f}"]) + " |")
+        if row["file"] in NIGHTS and published is not None and abs(value / published - 1) < NEAR:
+            amplitude = first["amplitude"]
+            nights.setdefault(row["file"], []).append((row["run"], amplitude["value"], amplitude["sd"]))
+    print(NIGHTS_TEXT)
+    for file, runs in nights.items():
+        others = np.array([run for other, every in nights.items() if other != file for run in every])
+        weight = others[:, 2] ** -2
+        mean, u = float(weight @ others[:, 1] / weight.sum()), float(weight.sum() ** -0.5)
+        for number, value, sd in runs:
+            cells = [f"{NIGHTS[file]}, {number}", f"{value:.2f}({sd:.2f})", f"{mean:.2f}({u:.2f})"]
+            print("| " + " | ".join([*cells, f"{(value - mean) / np.hypot(sd, u):.1f}"]) + " |")
 
 
 def main() -> None:

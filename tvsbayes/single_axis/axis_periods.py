@@ -53,6 +53,13 @@ class WaveSample:
         middle = np.angle(np.mean(np.exp(1j * phase)))
         return np.degrees(middle + np.angle(np.exp(1j * (phase - middle))))
 
+    @property
+    def likeliest(self) -> np.ndarray:
+        """Which draws (n,) are of the period that explains the readings best, where several do."""
+        groups = separate_periods(self.period)
+        low, high = groups[0].between if groups else (0.0, np.inf)
+        return (self.period >= low) & (self.period <= high)
+
     def curve(self, turn: np.ndarray) -> np.ndarray:
         """The wave over one mean period from the middle of the record on, at shares `turn` (t,) of it: shape (n, t)."""
         x = self.record.middle + turn * float(np.mean(self.period))
@@ -125,10 +132,7 @@ def _measured(draws: np.ndarray, likeliest: np.ndarray) -> Measured:
 
 def period_estimate(sample: WaveSample) -> PeriodEstimate:
     """One wave in numbers."""
-    known = sample.wave.known
-    groups = separate_periods(sample.period)
-    low, high = groups[0].between if groups else (0.0, np.inf)
-    likeliest = (sample.period >= low) & (sample.period <= high)
+    known, likeliest = sample.wave.known, sample.likeliest
     return PeriodEstimate(
         period=_measured(sample.true_period, likeliest) if known is None else Measured(known, 0.0, (known, known)),
         amplitude=_measured(sample.amplitude, likeliest),
@@ -175,9 +179,10 @@ def strong_harmonics(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
     """Waves whose second harmonic is stronger than the first: half of the period is the wave that leads."""
     found = []
     for sample in samples:
-        second = float(np.hypot(sample.coefficients[:, 2], sample.coefficients[:, 3]).mean())
-        if sample.probability > 0.5 and second > float(sample.amplitude.mean()):
-            period, of = float(sample.true_period.mean()), "s" if sample.wave.clock == "seconds" else unit
+        mine = sample.likeliest
+        second = float(np.hypot(*sample.coefficients[mine, 2:4].T).mean())
+        if sample.probability > 0.5 and second > float(sample.amplitude[mine].mean()):
+            period, of = float(sample.true_period[mine].mean()), "s" if sample.wave.clock == "seconds" else unit
             found.append(
                 f"the wave of {period:.4g} {of} is strongest by its second harmonic: {second:.2g} {unit} every "
                 f"{0.5 * period:.4g} {of}; ask for that period in a range of its own to part two wheels"
