@@ -9,11 +9,13 @@ import pytest
 from support.reported_twin import BATCH, PLANNED, evidence_of
 from support.small_results import small_summary
 
+from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
 from tvsbayes.errors import InputError
 from tvsbayes.report.evidence import CANNOT_TELL, MET, NOT_MET, Criterion, criterion
-from tvsbayes.report.scanner_document import criteria_table, verdict_of
+from tvsbayes.report.scanner_document import criteria_table, report_document, verdict_of
+from tvsbayes.results.compensation_record import APPLIED, KEPT, VERIFICATION_FORMAT, WORLDS
 
-STORED = {"compare.json": "held_out", "plan.json": "planned"}
+STORED = {"compare.json": "held_out", "plan.json": "planned", "verification.json": "verified"}
 
 
 @pytest.mark.parametrize("name", STORED)
@@ -26,7 +28,7 @@ def test_results_that_belong_to_other_data_are_not_reported(reported, name):
         (reported / "results" / name).unlink()
 
 
-@pytest.mark.parametrize("name", STORED)
+@pytest.mark.parametrize("name", ["compare.json", "plan.json"])
 @pytest.mark.parametrize("content", [{}, {"held_out": None, "target": 3}, {"held_out": {"verdict": "x"}, "target": {}}])
 def test_results_that_no_command_wrote_are_refused_by_name(reported, evidence, name, content):
     path = reported / "results" / name
@@ -79,3 +81,25 @@ def test_the_headline_and_the_table_say_a_probability_alike():
     assert verdict_of(small_summary(), (open_,)).text.endswith("(probability 0.551)")
     far = Criterion("ratio left", 1e-3, "deg/step", 0.0, NOT_MET)
     assert verdict_of(small_summary(), (far,)).text.endswith("(probability below 0.001)")
+
+
+def test_a_verification_of_this_calibration_is_reported_with_millimetres(reported, evidence):
+    """Kept by `verify` of the very calibration; of another one it is not."""
+    size = {"rms": 0.0123, "worst": 0.045}
+    mm = {"distance_mm": 1000.0, "before": {"rms": 37.7, "worst": 60.2}, "after": {"rms": 1.83, "worst": 4.1}}
+    mm["promised95"] = 5.18
+    worlds = dict.fromkeys(WORLDS, 0.01) | {APPLIED: 0.96}
+    made = {"verdict": KEPT, "p": 0.4, "worlds": worlds, "before": size, "after": size, "promised95": 0.05}
+    made |= {"readings": 12, "millimetres": mm, "format": VERIFICATION_FORMAT, "inputs": evidence.fit.provenance.inputs}
+    path = reported / "results" / "verification.json"
+    table = content_sha256(calibration_json(load_calibration(reported)))
+    try:
+        path.write_text(json.dumps({**made, "table": table}))
+        [section] = [s for s in report_document(evidence_of(reported)).sections if s.title.startswith("Applied")]
+        path.write_text(json.dumps({**made, "table": "0" * 64}))
+        assert evidence_of(reported).verified is None
+    finally:
+        path.unlink()
+    assert "KEPT: 12 fresh looks" in section.text[0] and "at 1000 mm 5.2 mm" in section.text[0]
+    cells = [cell for row in section.tables[0].rows for cell in row]
+    assert {"38", "1.8", "4.1"} <= set(cells)

@@ -29,7 +29,6 @@ from tvsbayes.results.compensation_record import (
     NOT_APPLIED,
     OTHER_MACHINE,
     TWICE,
-    VERIFICATION_FORMAT,
     WORLDS,
     WRONG_SIGN,
     Compensation,
@@ -328,18 +327,6 @@ def stored_compensation(campaign: AxisCampaign) -> Compensation:
         what, allowed = "no compensation of these data", "the one whose table is in force"
         raise refusal("missing-file", file="results/compensation.json", found=what, allowed=allowed, remedy=AGAIN)
     return found
-
-
-def verification_in(campaign: AxisCampaign, made: Compensation) -> Verification | None:
-    """What `verify` said last of this table; None of another one.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    keys = stored_document(campaign, "verification.json", (VERIFICATION_FORMAT,), axis_hashes(campaign))
-    if keys is None or keys.values.get("table") != made.digest:
-        return None
-    return read_record(Verification, keys, "run `tvsbayes verify` again")
 
 
 def verify_axis(

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tvsbayes.compensation.verification import compensation_in, verification_in
+from tvsbayes.compensation.verification import compensation_in
 from tvsbayes.errors import escaped, typed
 from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.advice import ROUGH, UNSAMPLED
@@ -31,6 +31,7 @@ from tvsbayes.report.page import digest_number, numbered
 from tvsbayes.report.position_figures import CURVE_POINTS, axis_errors, wave
 from tvsbayes.report.result_tables import WAVE_COLUMNS, WAVES, percent, wave_row
 from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
+from tvsbayes.results.compensation_record import stored_verification
 from tvsbayes.results.estimates import Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import provenance
 from tvsbayes.results.records import plain
@@ -320,7 +321,10 @@ def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[S
     in_words = [sentence(text) for text in (offered(summary) if summary.explained else ())]
     repeated = [deviation_table(summary.deviations, unit, TABLE_ROWS) if summary.deviations else None]
     made = compensation_in(campaign)
-    applied = [] if made is None else [compensation_section(made, verification_in(campaign, made))]
+    applied = []
+    if made is not None:
+        fresh = stored_verification(campaign, axis_hashes(campaign), made.digest, made.unit)
+        applied = [compensation_section(made, fresh)]
     return [
         Section("Result", in_words, tables=parameters, figures=figures, opened=True),
         Section("What repeats by position", tables=repeated),

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from msgspec import structs
-
 from tvsbayes.compensation.verification import VerifyPlan
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.axes import SIDES
@@ -143,22 +141,33 @@ def verification_text(found: Verification) -> str:
     return terminal(*lines)
 
 
+APPLIED_TITLE = "Applied, and what is left"
+
+
 def compensation_section(made: Compensation, found: Verification | None) -> Section:
     """Report: what was made to be applied, what is left by the promise, and what fresh readings say of it."""
     low, high = made.range_command
     text = [
         f"Made for {made.target}, to be applied by the {made.applied_by}; the promise holds for commands from "
         f"{low:.10g} to {high:.10g}, within {two_digits(made.hours)} h and {made.travel_command:.4g} commands of "
-        "travel since homing."
+        "travel since homing.",
+        "No fresh readings have verified it." if found is None else _verdict(found),
     ]
-    tables = [promise_table(made)]
-    if found is None:
-        text.append("No fresh readings have verified it.")
-    else:
-        said = f"{found.verdict}: {found.readings} fresh readings, most probable: {found.world}, p = {found.p:.2g}."
-        text.append(f"{said} Promised: 95 % of errors at most {two_digits(found.promised95)} {escaped(made.unit)}.")
-        tables.append(sizes_table(structs.replace(found, unit=made.unit)))
-    return Section("Applied, and what is left", text, made.unsaid, tables)
+    tables = [promise_table(made), *([] if found is None else [sizes_table(found)])]
+    return Section(APPLIED_TITLE, text, made.unsaid, tables)
+
+
+def verified_section(found: Verification) -> Section:
+    """Report of a scanner: what fresh looks say that its calibration aimed, with points in mm."""
+    text = "Counters by `tvsbayes steps-for` or the header, held against fresh looks. " + _verdict(found)
+    return Section(APPLIED_TITLE, [text], tables=[sizes_table(found)])
+
+
+def _verdict(found: Verification) -> str:
+    kind = "readings" if found.millimetres is None else "looks"
+    said = f"{found.verdict}: {found.readings} fresh {kind}, most probable: {found.world}, p = {found.p:.2g}."
+    promised = _promised(found)
+    return f"{said} {promised[0].upper()}{promised[1:]}."
 
 
 def verify_plan_text(found: VerifyPlan) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.calibration.calibration_file import stored_ratios
+from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, stored_ratios
 from tvsbayes.calibration.optics import ERROR_AT, PLAY_AT
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.coordinates.error_map import ErrorMap, SimpleError, error_map, simple_error
@@ -21,6 +21,7 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.look_budget import Budget, budget, coordinate_budget
 from tvsbayes.report.spot_pictures import SpotCrop, spot_crops
 from tvsbayes.results.comparison_record import CANNOT_TELL, HoldOut, stored_hold_out
+from tvsbayes.results.compensation_record import Verification, stored_verification
 from tvsbayes.results.fit_record import FitEvidence, FitRecord
 from tvsbayes.results.metrology_tables import BudgetTable
 from tvsbayes.results.plan_record import PlanRecord, stored_plan
@@ -120,6 +121,7 @@ class Evidence:
         gears: what they repeat over the counters, by axis; none where they do not vary.
         crops: of a few spots, where there are frames.
         doubts: what `check` warns of.
+        verified: what `verify` said last of this calibration; None where it has not.
     """
 
     campaign: Campaign
@@ -137,6 +139,7 @@ class Evidence:
     gears: tuple[GearBand, ...]
     crops: tuple[SpotCrop, ...] = ()
     doubts: tuple[str, ...] = ()
+    verified: Verification | None = None
 
     @property
     def shown(self) -> FitEvidence:
@@ -200,6 +203,9 @@ def gather(
         gears=gear_bands(calibration),
         crops=spot_crops(campaign, fit.summary.suspect_spots),
         doubts=tuple(doubts),
+        verified=stored_verification(
+            campaign, fit.provenance.inputs, content_sha256(calibration_json(calibration)), "deg"
+        ),
     )
 
 

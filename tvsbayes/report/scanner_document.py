@@ -17,6 +17,7 @@ from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.traceability import performed, traceability
 from tvsbayes.report import figures
 from tvsbayes.report.advice import assumed_stereo, steps_ahead, verdict_line
+from tvsbayes.report.compensation_text import verified_section
 from tvsbayes.report.document import Document, FigureView, Issue, Number, Verdict, about_table, sentence
 from tvsbayes.report.drawing import OF_ESTIMATOR
 from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
@@ -44,6 +45,7 @@ def report_document(e: Evidence, issue: Issue | None = None) -> Document:
         issue: who issues it, for whom and when; None is today, by nobody.
     """
     issue = issue or Issue.today()
+    applied = [] if e.verified is None else [verified_section(e.verified)]
     return numbered(
         Document(
             results=e.fit.results_id,
@@ -59,7 +61,7 @@ def report_document(e: Evidence, issue: Issue | None = None) -> Document:
             traceable=traceability(e.campaign).statement,
             warnings=warnings_of(e),
             versions=e.fit.provenance.versions,
-            sections=[*fit_sections(e), *uncertainty_sections(e)],
+            sections=[*fit_sections(e), *applied, *uncertainty_sections(e)],
             issue=issue,
         )
     )

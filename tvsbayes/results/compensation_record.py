@@ -7,12 +7,23 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from msgspec import Meta
+from msgspec import Meta, structs
 
 from tvsbayes.display import Shown, View
-from tvsbayes.results.records import Count, FromOne, NotNegative, Positive, Probability, Record
+from tvsbayes.results.records import (
+    Count,
+    FromOne,
+    HasFolder,
+    NotNegative,
+    Positive,
+    Probability,
+    Record,
+    read_record,
+    stored_document,
+)
 
 COMPENSATION_FORMAT = "tvsbayes-compensation/1"
 VERIFICATION_FORMAT = "tvsbayes-verification/1"
@@ -187,3 +198,21 @@ class Verification(Shown, Record, frozen=True, kw_only=True):
         """Probabilities of the worlds."""
         title = f"Verification: {self.verdict}, p = {self.p:.3g}"
         return View(title, ("world", "probability"), list(self.worlds.items()))
+
+
+def stored_verification(campaign: HasFolder, inputs: Mapping[str, str], table: str, unit: str) -> Verification | None:
+    """What `verify` said last; None where it has not, or of other data or another table.
+
+    Args:
+        campaign: whose folder it lies in.
+        inputs: hashes of its data.
+        table: digest of the table or calibration in force.
+        unit: of errors.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    keys = stored_document(campaign, "verification.json", (VERIFICATION_FORMAT,), inputs)
+    if keys is None or keys.values.get("table") != table:
+        return None
+    return structs.replace(read_record(Verification, keys, "run `tvsbayes verify` again"), unit=unit)
