@@ -77,6 +77,7 @@ def test_time_and_travel_since_homing_are_the_longest_segment():
     [
         (Wish("step7"), "unknown"),
         (Wish("grbl"), "$100"),
+        (Wish("grbl", in_force=-250.0), "-250"),
         (Wish("csv", in_force=3.0), "--in-force"),
         (Wish("csv", per_command=-1.0), "--per-command"),
         (Wish("csv", resolution=float("nan")), "--resolution"),
@@ -88,6 +89,17 @@ def test_wishes_that_cannot_be_met_are_refused(wish, said):
     with pytest.raises(InputError) as refused:
         compensation_of(results(), wish)
     assert said in f"{refused.value.message} {refused.value.allowed}"
+
+
+def test_a_play_that_was_never_read_is_no_setting():
+    """Of stops from one side alone, grblHAL's play is left as it is, and the promise says why."""
+    whole = results().fit.campaign
+    first = [move for move in whole.moves if move.segment == 0]
+    turn = int(np.argmax([move.command for move in first]))
+    moves = tuple(first[: turn + 1])
+    campaign = replace(whole, moves=moves, readings=tuple(r for r in whole.readings if r.move < len(moves)))
+    made = compensate(campaign, "grblhal", in_force=250.0)
+    assert set(made.settings) == {"$100"} and any("one side" in text for text in made.unsaid)
 
 
 def test_no_table_is_made_of_what_is_not_accepted():

@@ -78,7 +78,7 @@ def compensate(
     Nothing is applied. With -o the promise is kept in results/compensation.json, for `verify`. Of a scanner's campaign
     `--to header` gives its calibration for a microcontroller; its promise is that of `locate`.
     """
-    from tvsbayes.compensation.promise import Wish, compensation_of, file_beside, file_text
+    from tvsbayes.compensation.promise import Wish, checked, compensation_of, file_beside, file_text
     from tvsbayes.report.compensation_text import compensation_text
     from tvsbayes.results.compensation_record import COMPENSATION_FORMAT
     from tvsbayes.results.fit_record import provenance
@@ -94,8 +94,9 @@ def compensate(
     _refuse_scanner(campaign, f"compensate --to {escaped(to)}")
     _one_of("--applied-by", applied_by, APPLIERS)
     _one_of("--letter", letter, tuple(LETTERS))
-    data = read_axis(campaign)
     wish = Wish(to, "host" if applied_by == "host" else "controller", per_command, resolution, in_force, letter, period)
+    checked(wish)
+    data = read_axis(campaign)
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed, tell=report_line)
         made = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))

@@ -92,7 +92,8 @@ def _linuxcnc(made: Compensation, origin: Origin) -> str:
     for row in made.table:
         added = {"forward": scale * row.add_forward, "backward": scale * row.add_backward}
         ahead, back = ("forward", "backward") if scale > 0 else ("backward", "forward")
-        nominal = scale * row.command
+        # 0 has no sign in a file.
+        nominal = scale * row.command + 0.0
         rows.append((nominal, nominal - added[ahead], nominal - added[back]))
     lines = [" ".join(f"{value:.{LINUXCNC_DECIMALS}f}" for value in values) for values in sorted(rows)]
     says = (

@@ -37,6 +37,7 @@ TRIED = 20
 """Commands at which the promise is tried, from each side."""
 UNIT_COMMANDS = 0.2
 """Share by which the ratio may differ from 1 or -1 where commands count in the unit of readings."""
+ONE_SIDED = "every stop was read from one side: the play is not known, and what is left on the other is by its prior"
 RUNS_MAX = 20
 """Up and down, in a prediction: a longer travel is not followed."""
 SIDES = (("forward", 1), ("backward", -1))
@@ -68,11 +69,12 @@ class Wish:
 
 @dataclass(frozen=True)
 class _Expected:
-    """Readings expected at commands (m,): mean and u by side, (2, m) each, forward first."""
+    """Readings expected at commands (m,): mean and u by side, (2, m) each, forward first; was it read from both?"""
 
     command: np.ndarray
     mean: np.ndarray
     u: np.ndarray
+    both_sides: bool
 
 
 def _expected(fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, seed: int) -> _Expected:
@@ -80,9 +82,8 @@ def _expected(fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, 
     found, run = _run(fit, commands, overrun, since, None, 0.0, seed)
     mean, covariance = found.pooled()
     order = [np.flatnonzero(run.side == side)[np.argsort(run.index[run.side == side])] for _, side in SIDES]
-    return _Expected(
-        commands, np.array([mean[o] for o in order]), np.array([np.sqrt(np.diag(covariance)[o]) for o in order])
-    )
+    u = np.sqrt(np.diag(covariance))
+    return _Expected(commands, np.array([mean[o] for o in order]), np.array([u[o] for o in order]), fit.rows.both_sides)
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ def _nominal(campaign: AxisCampaign, fitted: float, wish: Wish) -> float:
     return fitted
 
 
-def _checked(wish: Wish, fitted: float) -> Format:
+def checked(wish: Wish) -> Format:
     """The format that is wanted.
 
     Raises:
@@ -149,15 +150,16 @@ def _checked(wish: Wish, fitted: float) -> Format:
     form = FORMATS.get(wish.target)
     if form is None:
         allowed = ", ".join(FORMATS)
-        raise InputError("format", f"--to {wish.target[:60]!r}: unknown", allowed=allowed, remedy="name one of them")
-    if wish.per_command is not None and not (np.isfinite(wish.per_command) and wish.per_command * fitted > 0):
-        message = f"--per-command {wish.per_command:g}: the readings go by {fitted:.6g} per command"
-        raise InputError("usage", message, remedy="give the nominal ratio with the sign of the readings")
+        remedy = f"name one of {allowed}"
+        raise InputError("format", f"--to {wish.target[:60]!r}: unknown", allowed=allowed, remedy=remedy)
     if not (np.isfinite(wish.resolution) and wish.resolution >= 0):
         raise InputError("usage", f"--resolution {wish.resolution:g}", allowed="0 or more", remedy="give commands")
-    if form.in_force and not (wish.in_force is not None and wish.in_force > 0 and np.isfinite(wish.in_force)):
+    if form.in_force and wish.in_force is None:
         message = f"--to {wish.target} changes a setting, and nothing says which value {form.in_force} has now"
         raise InputError("usage", message, remedy=f"add --in-force with the value of {form.in_force} in force")
+    if wish.in_force is not None and not 0 < wish.in_force < np.inf:
+        remedy = "give the value without a sign: which way the axis runs is another setting"
+        raise InputError("usage", f"--in-force {wish.in_force:g}", allowed="more than 0", remedy=remedy)
     if wish.in_force is not None and not form.in_force:
         raise InputError("usage", f"--in-force is not for --to {wish.target}", remedy="leave it out")
     if (wish.period is not None) != (form.holds == "period"):
@@ -204,7 +206,7 @@ def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wi
     if wish.target in ("grbl", "grblhal"):
         settings[f"${100 + axis}"] = round(float(wish.in_force or 0.0) * factor, 3)
         factor = settings[f"${100 + axis}"] / float(wish.in_force or 1.0)
-    if wish.target == "grblhal":
+    if wish.target == "grblhal" and at.both_sides:
         taken = settings[f"${160 + axis}"] = max(round(play, 3), 0.0)
     if wish.target == "klipper":
         settings["rotation_distance"] = round(float(wish.in_force or 0.0) / factor, 6)
@@ -263,7 +265,8 @@ def _folded(at: _Expected, nominal: float, fitted: float, wish: Wish) -> _Shaped
     if not 8 * spacing <= period <= high - low:
         message = f"--period {period:g}: positions every {spacing:g} commands over {high - low:g}"
         allowed = "at least eight positions in a period, and a whole period in the range"
-        raise InputError("usage", message, allowed=allowed, remedy="read more positions, or state another period")
+        remedy = f"state a period from {8 * spacing:g} to {high - low:g} commands, or read more positions"
+        raise InputError("usage", message, allowed=allowed, remedy=remedy)
     middle = at.mean.mean(axis=0)
     off = middle - np.polyval(np.polyfit(at.command, middle, 1), at.command)
     phase = 2 * np.pi * at.command / period
@@ -365,7 +368,10 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
     rows, since = fit.rows, Since.of(campaign.moves)
     draws = fit.draws["effective_per_command"]
     fitted = float(draws.mean())
-    form = _checked(wish, fitted)
+    form = checked(wish)
+    if wish.per_command is not None and not (np.isfinite(wish.per_command) and wish.per_command * fitted > 0):
+        message = f"--per-command {wish.per_command:g}: the readings go by {fitted:.6g} per command"
+        raise InputError("usage", message, remedy="give the nominal ratio with the sign of the readings")
     nominal = _nominal(campaign, fitted, wish)
     low, high = float(rows.positions[0]), float(rows.positions[-1])
     with Job({"table": 1.0, "promise": 2.0}, progress) as job:
@@ -403,7 +409,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         table=table,
         settings=shaped.settings,
         promise=promise,
-        unsaid=form.unsaid,
+        unsaid=form.unsaid if rows.both_sides else (*form.unsaid, ONE_SIDED),
     )
 
 
@@ -434,6 +440,7 @@ def compensate(
     """
     campaign = folder if isinstance(folder, AxisCampaign) else read_axis(folder)
     wanted = Wish(target=to, **wish)  # type: ignore[arg-type]
+    checked(wanted)
     with Job({"fit": 1.0, "compensation": 1.0}, progress) as job:
         results = results_for(campaign, progress=job.part("fit"), seed=seed)
         made = compensation_of(results, wanted, seed=seed, progress=job.part("compensation"))
