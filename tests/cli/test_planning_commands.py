@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -12,22 +11,7 @@ from tvsbayes.instrument.parameters import TARGETS
 from tvsbayes.instrument.plan import read_plan
 from tvsbayes.planning import planner
 
-pytestmark = pytest.mark.usefixtures("small_searches")
-
-
-@pytest.fixture
-def ask(capsys, monkeypatch):
-    """Run a command with --json without touching JAX's settings: exit code and document."""
-    from tvsbayes.cli.main import run
-
-    monkeypatch.setattr("tvsbayes.model.compilation_cache.use_compilation_cache", lambda: False)
-    monkeypatch.setattr("tvsbayes.studies.executors.use_compilation_cache", lambda: False)
-
-    def command(*arguments) -> tuple[int, dict]:
-        code = run([*map(str, arguments), "--json"])
-        return code, json.loads(capsys.readouterr().out)
-
-    return command
+pytestmark = pytest.mark.usefixtures("small_searches", "own_compilation_cache")
 
 
 MOUNTED = shipped_data() / "rigs" / "mounted"
@@ -42,32 +26,26 @@ def test_a_plan_does_not_replace_the_rig_file_that_it_is_made_for(ask, tmp_path,
     assert code == 2 and "would replace" in document["error"]["message"] and rig.read_bytes() == before
 
 
-def test_plan_writes_a_plan_and_says_by_its_exit_code_whether_the_users_target_is_met(ask, tmp_path):
+def test_plan_writes_a_plan_and_says_by_its_exit_code_whether_the_users_target_is_met(ask, say, tmp_path, monkeypatch):
+    whole, made = planner.plan, []
     small = ("--draws", 20, "--minutes", 3, "-o", tmp_path / "plan.csv")
+    monkeypatch.setattr(planner, "plan", lambda *given, **options: made.append(whole(*given, **options)) or made[0])
     code, document = ask("plan", MOUNTED / "rig.toml", "--target", "u(left) <= 1e-7 deg/step", *small)
     assert code == 1 and not document["met"] and document["n80"] is None
     assert document["limited_by"]["reachable"] is False and document["limited_by"]["needed"]
     assert sum(s.action == "look" for s in read_plan(tmp_path / "plan.csv")) == document["looks"]
-    assert document["minutes"] <= 3
+    assert document["minutes"] <= 3 and made[0].draws == 20
+    monkeypatch.setattr(planner, "plan", lambda *_, **__: made[0])
     code, document = ask("plan", MOUNTED / "rig.toml", *small)
     assert code == 0 and not document["met"], "the default target is nobody's demand"
+    monkeypatch.setattr(planner, "plan", lambda *_, **__: replace(made[0], met=True))
     code, document = ask("plan", MOUNTED / "rig.toml", "--target", "u(left) <= 5e-3 deg/step", *small)
     assert code == 0 and document["met"]
-
-
-def test_a_plan_with_nothing_left_to_measure_says_that_it_wrote_none(capsys, tmp_path, monkeypatch):
-    from tvsbayes.cli.main import run
-
-    whole = planner.plan
-    monkeypatch.setattr("tvsbayes.model.compilation_cache.use_compilation_cache", lambda: False)
-    monkeypatch.setattr("tvsbayes.studies.executors.use_compilation_cache", lambda: False)
-    monkeypatch.setattr(
-        "tvsbayes.planning.planner.plan", lambda *given, **options: replace(whole(*given, **options), steps=())
-    )
-    place = tmp_path / "plan.csv"
-    code = run([*map(str, ("plan", MOUNTED / "rig.toml", "--draws", 20, "--minutes", 3, "-o", place))])
-    assert code == 0 and not place.exists()
-    assert f"nothing written to {place}" in capsys.readouterr().out
+    # Nothing is left to measure.
+    monkeypatch.setattr(planner, "plan", lambda *_, **__: replace(made[0], steps=()))
+    place = tmp_path / "none.csv"
+    code, text, _ = say("plan", MOUNTED / "rig.toml", "-o", place)
+    assert code == 0 and not place.exists() and f"nothing written to {place}" in text
 
 
 @pytest.mark.parametrize("options", [("--target", "u(left) <= 1 mm"), ("--criterion", "E"), ("--minutes", "0.2")])
