@@ -191,12 +191,12 @@ class LivePage {
     by("estimate-remark").textContent = `of ${last.looks} looks${wanted}${drift}`;
     if (estimates.length === this.shown.estimates) return;
     this.shown.estimates = estimates.length;
-    const heads = ["direction", "deg/step (u)", "target", "moved, sd"];
+    const heads = ["direction", "deg/step (u)", ...(target === null ? [] : ["target"]), "moved, sd"];
     rows(by("estimates"), heads, Object.entries(last.deg_per_step).map(([name, value]) => {
       const u = last.u_deg_per_step[name];
       const moved = temperature?.moved[name] ?? null;
-      const met = target === null || !aim.directions.includes(name) ? "" : u <= target ? "met" : `u is ${(u / target).toFixed(1)} times the target`;
-      return [name, withU(value, u), met, [moved === null ? "" : moved.toFixed(1), Math.abs(moved) > 3 ? "hot" : ""]];
+      const met = !aim.directions.includes(name) ? "" : u <= target ? "met" : `u is ${(u / target).toFixed(1)} times the target`;
+      return [name, withU(value, u), ...(target === null ? [] : [met]), [moved === null ? "" : moved.toFixed(1), Math.abs(moved) > 3 ? "hot" : ""]];
     }));
     this.drawHistory(told);
   }

@@ -7,6 +7,8 @@ const RING = 24;
 const MIRROR_HALF_MM = 8;
 const DEG = Math.PI / 180;
 const DRAG_DEG = 0.4;
+/** Size of a label's letter and line. */
+const LETTER_PX = 6.5, LINE_PX = 13;
 /** Where the eye is, as azimuth from X (depth) towards Y (left) and elevation, degrees. */
 const VIEWS = { "from-above": [180, 90], "from-side": [-90, 10], "from-behind": [190, 17] };
 
@@ -94,10 +96,15 @@ class Space extends Chart {
     for (let k = 0; k < 8; k++) {
       for (const bit of [1, 2, 4]) if (!(k & bit)) box += trail([at(corners[k]), at(corners[k | bit])]);
     }
+    const taken = [];
     const words = this.labels.filter(({ point, of }) => point.every(Number.isFinite) && !this.layers.some((layer) => layer.name === of && layer.hidden))
       .map(({ point, text, dy = 16 }) => {
         const [x, y] = at(point);
-        return node("text", { x: px(x), y: px(y + dy), "text-anchor": "middle", class: "label" }, text);
+        const box = { x, y: y + dy, half: LETTER_PX * text.length / 2 };
+        // A word that would lie on another one goes below it.
+        for (let below; (below = taken.find((one) => Math.abs(one.x - x) < one.half + box.half && Math.abs(one.y - box.y) < LINE_PX)); ) box.y = below.y + LINE_PX;
+        taken.push(box);
+        return node("text", { x: px(x), y: px(box.y), "text-anchor": "middle", class: "label" }, text);
       });
     return [node("path", { d: box, class: "grid" }), ...this.rulers(low, high, at), ...this.paths(at), ...words];
   }
