@@ -6,72 +6,20 @@ import doctest
 import json
 import re
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.commands import caching_in
+from support.printed_pages import first_difference, follow, same, shown
 
 from tvsbayes.cli.main import run
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "data" / "tutorial" / "README.md"
 TEXT = PAGE.read_text(encoding="utf-8")
-NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e-?\d+)?")
 QUICK = ("simulate", "check", "classic", "new")
 """Commands without a fit: they run by default."""
-ANYTHING = "..."
-"""A printed line of dots stands for lines that the page leaves out."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A command of the page and what the page says it prints."""
-
-    arguments: tuple[str, ...]
-    printed: str
-
-
-def shown() -> list[Shown]:
-    """Every `$ tvsbayes ...` of the page in order, long lines joined at their backslashes."""
-    found = []
-    for block in re.findall(r"```console\n(.*?)```", TEXT, flags=re.DOTALL):
-        for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
-            command, printed = part.replace("\\\n", "").split("\n", 1)
-            words = [word.strip("'") for word in re.findall(r"'[^']*'|\S+", command)]
-            assert words[0] == "tvsbayes", command
-            found.append(Shown(tuple(words[1:]), printed))
-    return found
-
-
-def same(line: str, expected: str) -> bool:
-    """Words equal, each number within one unit of its last printed digit: another processor rounds otherwise."""
-    if NUMBER.sub("#", " ".join(line.split())) != NUMBER.sub("#", " ".join(expected.split())):
-        return False
-    pairs = zip(NUMBER.findall(line), NUMBER.findall(expected), strict=True)
-    for found, wanted in pairs:
-        digits, _, exponent = wanted.partition("e")
-        unit = 10.0 ** (int(exponent or 0) - len(digits.partition(".")[2]))
-        # Half a unit for the binary fractions of the digits themselves.
-        if abs(float(found) - float(wanted)) > 1.5 * unit:
-            return False
-    return True
-
-
-def first_difference(printed: str, expected: str) -> str | None:
-    """The first line of the page that the command did not print in its place, or None."""
-    lines, at, free = printed.rstrip("\n").splitlines(), 0, False
-    for wanted in expected.rstrip("\n").splitlines():
-        if wanted == ANYTHING:
-            free = True
-            continue
-        places = range(at, len(lines)) if free else range(at, min(at + 1, len(lines)))
-        here = next((k for k in places if same(lines[k], wanted)), None)
-        if here is None:
-            return f"page: {wanted!r}, printed: {lines[at] if at < len(lines) else None!r}"
-        at, free = here + 1, False
-    return None if free or at == len(lines) else f"printed, not on the page: {lines[at]!r}"
 
 
 @pytest.fixture(scope="module")
@@ -82,17 +30,8 @@ def folder(tmp_path_factory) -> Path:
     return made
 
 
-def follow(steps: list[Shown], folder: Path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(folder)
-    for step in steps:
-        code = run(list(step.arguments))
-        captured = capsys.readouterr()
-        assert code == 0, (step.arguments, captured.err)
-        assert (difference := first_difference(captured.out, step.printed)) is None, (step.arguments, difference)
-
-
 def test_commands_without_a_fit_print_what_the_page_says(folder, monkeypatch, capsys):
-    steps = [step for step in shown() if step.arguments[0] in QUICK]
+    steps = [step for step in shown(TEXT) if step.arguments[0] in QUICK]
     assert {step.arguments[0] for step in steps} == set(QUICK)
     follow(steps, folder, monkeypatch, capsys)
 
@@ -110,7 +49,7 @@ def test_python_examples_print_what_the_page_says(folder, monkeypatch):
 @pytest.mark.slow
 def test_the_whole_page_prints_what_it_says(tmp_path, monkeypatch, capsys):
     (tmp_path / "data").symlink_to(ROOT / "data")
-    steps = shown()
+    steps = shown(TEXT)
     wanted = {"fit", "compare", "steps-for", "locate", "plan", "report"}
     assert wanted <= {step.arguments[0] for step in steps}
     with caching_in(tmp_path / "cache"):
