@@ -1,6 +1,7 @@
 """A stereo camera in software: serves what is rendered as an MJPEG stream over HTTP on this computer.
 
-The path of the stream is a secret: other users of the computer get no picture. So the twin is seen through the same camera code as the bench. Seconds where a name says `_s`.
+So the twin is seen through the same camera code as the bench. The path of the stream is a secret: other users of the
+computer get no picture. Seconds where a name says `_s`.
 """
 
 from __future__ import annotations
