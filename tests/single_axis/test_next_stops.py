@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.axes import campaign, drawn, runs
 
-from tvsbayes.errors import InputError
+from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.single_axis.axis_campaign import Reading, read_axis
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals
 from tvsbayes.single_axis.axis_fit import fit_axis
@@ -44,6 +44,20 @@ def test_a_plan_begins_at_the_u_of_the_fit(fitted, target):
     found = plan_next(fitted, target, count=1)
     assert found.u_now == pytest.approx(np.hypot(given, mean.std()), rel=1e-6)
     assert found.u_now > 1.001 * given and found.next[0].u < found.u_now
+
+
+def test_stops_lower_a_play_that_is_sampled_and_none_that_is_held():
+    """Where moves may be shorter than the play it is no linear quantity."""
+    made = drawn(4, runs(1)).campaign
+    found = fit_axis(made, tier="importance")
+    assert found.model.play_is_sampled
+    plan = plan_next(found, "backlash", count=2)
+    u = [plan.u_now, *(stop.u for stop in plan.next)]
+    assert u[0] == pytest.approx(found.draws["backlash"].std(), rel=0.05)
+    assert u[0] > u[1] > u[2] > 0
+    held = fit_axis(replace(made, stated=made.stated | {"backlash": AxisPrior(0.1, 0.0)}), sampled=False)
+    with pytest.raises(NothingToEstimate, match="held"):
+        plan_next(held, "backlash", count=1)
 
 
 def test_actions_name_commands_with_all_their_digits():

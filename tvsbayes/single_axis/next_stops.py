@@ -160,6 +160,14 @@ def _known(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray
     return _Known(float(np.mean(sd**2)), float(np.mean(np.var(mean, axis=0))))
 
 
+def _with_linear_play(fit: AxisFit) -> AxisFit:
+    """The fit as if every reversal were longer than the play, which then is linear in the readings."""
+    names = fit.model.coordinates.names
+    left = tuple(name for name in names if name != "backlash")
+    model = replace(fit.model, coordinates=replace(fit.model.coordinates, names=left))
+    return replace(fit, model=model, w=np.delete(fit.w, names.index("backlash"), axis=1))
+
+
 def plan_next(
     fit: AxisFit,
     target: str = "per_command",
@@ -179,7 +187,7 @@ def plan_next(
 
     Raises:
         InputError: an unknown target.
-        NothingToEstimate: the folder is of a drive that never stops.
+        NothingToEstimate: the folder is of a drive that never stops, or the target is held at its value.
     """
     if fit.rows.in_motion:
         raise NothingToEstimate(
@@ -199,7 +207,15 @@ def plan_next(
     w = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
     seconds = _move_seconds(fit.campaign)
     campaign, chosen, spent = fit.campaign, [], 0.0
-    known, few = (_known(fit, campaign, target, grid, draws) for draws in (fit.w, w))
+    known = _known(fit, campaign, target, grid, fit.w)
+    if target == "backlash" and fit.model.play_is_sampled:
+        # Given the scales there is no uncertainty of a play that is one of them: that of a linear play shrinks alike.
+        known, fit = _Known(known.given + known.between, 0.0), _with_linear_play(fit)
+        w = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
+    few = _known(fit, campaign, target, grid, w)
+    if not few.given:
+        remedy = f"state {target} in [axis] with u above 0, or name another target"
+        raise NothingToEstimate("held", f"{target} is held at its value: no reading changes it", remedy=remedy)
 
     def u_of(read: AxisCampaign) -> float:
         # Of a few draws the ratio is surer than the value.
