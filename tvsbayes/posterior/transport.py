@@ -56,9 +56,9 @@ FAR_ABOVE = 1e200
 """A last diagonal element that keeps a matrix positive definite whatever stands in its row; nothing reads its root."""
 BLOCK_ROWS = 64
 """Points that are mapped at a time: their matrices stay in the processor's cache."""
-NARROW = 0.15
-"""Conditional posterior sd, in prior sds, below which a coordinate is centred anew at every draw. Where the others take
-it, it is known so well that a step of Gauss and Newton is as good as exact."""
+NARROW, NARROW_PLAY = 0.25, 0.15
+"""Conditional posterior sd, in prior sds, below which a coordinate is centred anew at every draw: where the others take
+it, it is known so well that a step of Gauss and Newton is as good as exact. A play that reaches zero is bent there."""
 
 CENTRINGS = 2
 """Gauss-Newton steps of the narrow coordinates at every draw."""
@@ -613,6 +613,9 @@ def transport(fit: JointFit) -> Transport:
     noise = noise[np.argsort(~np.isin(names[noise], names_of("look_scatter_deg")), kind="stable")]
     covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
     order = by_width(covariance)
+    least = np.where(np.isin(names[others[order]], BLOCKS["backlash_deg"]), NARROW_PLAY, NARROW)
+    broad = np.diag(np.linalg.cholesky(covariance[np.ix_(order, order)])) >= least
+    order, narrow = np.concatenate([order[broad], order[~broad]]), int((~broad).sum())
     others = others[order]
     of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
     wide = np.linalg.cholesky(covariance[np.ix_(order, order)])
@@ -628,8 +631,6 @@ def transport(fit: JointFit) -> Transport:
     def misfit(z: np.ndarray) -> np.ndarray:
         return in_batches(lambda at: residuals(at, fit.space, fit.arrays), z).reshape(len(z), -1)
 
-    wider = np.flatnonzero(np.diag(wide) >= NARROW)
-    narrow = len(others) - (int(wider[-1]) + 1 if len(wider) else 0)
     precision = np.ones(len(others))
     for place in np.flatnonzero(np.isin(names[others[: len(others) - narrow]], BLOCKS["backlash_deg"])):
         precision[place] = HalfNormal(float(fit.z[others[place]])).precision
