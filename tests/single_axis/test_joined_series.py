@@ -124,6 +124,8 @@ def test_what_angle_calibrate_saves():
         (b"\x1f\x8bxx", "a damaged gzip file"),
         (json.dumps(klipper()[2]).encode() + b"\x03", "series angle:my_sensor"),
         (b"[angle a]\ncalibrate = 1.0\n", "a calibration of 1 angles"),
+        # Long, so that a search which tries every division of it does not end.
+        (b"[angle a]\nsensor_type: a1333\n" + 60 * b"#*# nothing more\n", "a calibration of 0 angles"),
         (json.dumps({"q": "stepq:x", "params": {"data": 3}}).encode(), "a queue of steps of another form"),
     ],
 )

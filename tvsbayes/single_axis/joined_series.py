@@ -6,6 +6,7 @@ held where it stands. The result is a table, as `read_foreign` gives one.
 
 from __future__ import annotations
 
+import configparser
 import datetime
 import json
 import re
@@ -64,7 +65,13 @@ def is_camonitor(text: str) -> bool:
 
 def is_klipper(data: bytes) -> bool:
     """Whether a file is a log of Klipper's data logger, packed or not, or a configuration with an angle sensor."""
-    return data.startswith(b"\x1f\x8b") or b"\x03" in data[:100000] or _CALIBRATED.search(data[: 2**20]) is not None
+    head = data[:100000]
+    return (
+        data.startswith(b"\x1f\x8b")
+        or b"\x03" in head
+        or (head.startswith(b"{") and b'"params"' in head)
+        or _saved_angles(data[: 2**20]) is not None
+    )
 
 
 def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignTable:
@@ -184,11 +191,21 @@ def command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]:
     return commands.values[at] + np.where(moving, share * rise, 0.0), int(moving.sum())
 
 
-_CALIBRATED = re.compile(
-    rb"^(?:#\*# )?\[angle\s+([^\]]+)\](?:(?!^(?:#\*# )?\[).*\n?)*?^(?:#\*# )?calibrate\s*[=:][ \t]*"
-    rb"((?:[-\d.,\s]|#\*#)+)",
-    re.MULTILINE,
-)
+def _saved_angles(data: bytes) -> tuple[str, list[float]] | None:
+    """The sensor and the table that SAVE_CONFIG wrote below "#*#" into a configuration; None where there is none."""
+    if b"[angle" not in data:
+        return None
+    lines = [line.removeprefix("#*#").removeprefix(" ") for line in data.decode(errors="replace").splitlines()]
+    parser = configparser.ConfigParser(interpolation=None, allow_no_value=True, strict=False)
+    try:
+        parser.read_string("\n".join(["[top]", *lines]))
+    except configparser.Error:
+        return None
+    tables = {name: parser[name].get("calibrate") or "" for name in parser.sections() if name.startswith("angle ")}
+    if not tables:
+        return None
+    name = max(tables, key=lambda one: len(tables[one]))
+    return name.removeprefix("angle "), [float(number) for number in _NUMBER.findall(tables[name])]
 
 
 def klipper_table(data: bytes, file: str) -> ForeignTable:
@@ -201,12 +218,12 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
     Raises:
         InputError: no angles in it, or no steps beside them.
     """
-    if (match := _CALIBRATED.search(data)) and not data.startswith(b"\x1f\x8b"):
-        numbers = [float(text) for text in re.findall(rb"-?\d+(?:\.\d+)?", match[2].replace(b"#*#", b""))]
+    if (saved := _saved_angles(data)) is not None:
+        sensor, numbers = saved
         if len(numbers) < 3:
             found, remedy = f"a calibration of {len(numbers)} angles", "run ANGLE_CALIBRATE and SAVE_CONFIG"
             raise refusal("empty", file=file, found=found, allowed="one for every full step", remedy=remedy)
-        kind = f"Klipper, ANGLE_CALIBRATE of {escaped(match[1].decode(errors='replace'))}: a mean of both directions "
+        kind = f"Klipper, ANGLE_CALIBRATE of {escaped(sensor)}: a mean of both directions "
         kind += "for each full step, so that it holds no play"
         angles = [repr(number * 360.0 / KLIPPER_TURN) for number in numbers]
         columns: dict[str, Sequence[object]] = {"full steps": range(len(numbers)), "angle (deg)": angles}
