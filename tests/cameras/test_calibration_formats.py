@@ -271,7 +271,7 @@ CHANGES = {
     "short data": ("opencv", "intrinsics.yml", b"rows: 3", b"rows: 2", "rows times cols"),
     "huge matrix": ("opencv", "intrinsics.yml", b"rows: 3", b"rows: 100000", "rows times cols"),
     "skewed": ("ros", "right.yaml", b"rectification_matrix:\n  rows: 3\n  cols: 3\n  data: [0.9", b"", ""),
-    "sizes": ("ros", "left.yaml", b"image_width: 1280", b"image_width: 1281", "two sizes"),
+    "sizes": ("ros", "left.yaml", b"image_width: 1280", b"image_width: 1380", "two sizes"),
     "text size": ("ros", "left.yaml", b"image_width: 1280", b"image_width: wide", "whole number of px"),
 }
 

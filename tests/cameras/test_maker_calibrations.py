@@ -96,7 +96,7 @@ BROKEN = {
         SMALL,
         "no pose between",
     ),
-    "BoofCV without a shift": (lambda: edited("boofcv/stereo.yaml", "  z:", "  depth:"), None, "('z')"),
+    "BoofCV without a shift": (lambda: edited("boofcv/stereo.yaml", "  z:", "  depth:"), None, "no T under"),
     "BoofCV's other lens": (
         lambda: edited("boofcv/stereo.yaml", "pinhole_radial_tangential", "universal_omni"),
         None,

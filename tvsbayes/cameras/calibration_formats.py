@@ -42,8 +42,8 @@ NOTHING_KNOWN = Known()
 SIDE_NAMES = ("left", "right")
 STATED = ("M1", "D1", "M2", "D2", "R", "T")
 """What `--key` may name."""
-ORB_SLAM = ("Stereo.T_c1_c2", "stereo.T_c1_c2")
-"""Key of ORB-SLAM3 whose lengths are metres."""
+POSES_OF = {"kalibr": ("T_cn_cnm1",), "orb-slam": ("Stereo.T_c1_c2",), "boofcv": ("rightToLeft",)}
+"""Programs whose poses stand under a key of their own."""
 TURN_SAID_DEG = 0.5
 """Rotations by less change little where they are transposed."""
 
@@ -221,7 +221,10 @@ class _Reader:
     def _of_matlab(self) -> bool:
         """Whether the fields are those of MATLAB's stereoParameters."""
         pair = self.found.pair
-        structured = any("radial" in camera for camera in self.found.cameras) or "R_transposed" in pair
+        structured = (
+            any(_named(camera.get("radial"), "radialdistortion") for camera in self.found.cameras)
+            or "R_transposed" in pair
+        )
         return structured or self.transposed is not None or _named(pair.get("pose"), "a")
 
     def _exchange(self) -> None:
@@ -318,7 +321,9 @@ class _Reader:
             return camera["D"].numbers, camera["D"]
         if "radial" in camera:
             radial = camera["radial"].numbers
-            tangential = camera["tangential"].numbers if "tangential" in camera else np.zeros(2)
+            single = [camera.get(f"coefficient_{name}") for name in ("p1", "p2")]
+            tangential = np.array([0.0 if entry is None else float(entry.numbers[0]) for entry in single])
+            tangential = camera["tangential"].numbers if "tangential" in camera else tangential
             return np.array([*radial[:2], *tangential, *radial[2:]]), camera["radial"]
         names = ("k1", "k2", "k3", "k4") if kind == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
         single = [camera.get(f"coefficient_{name}") for name in names]
@@ -416,10 +421,10 @@ class _Reader:
                 rotation, source = rotation.T, "matlab" if "R" not in pair else "realsense"
                 if by_columns:
                     self.notes.append(f"{turn.place}: nine numbers, taken column by column as librealsense has them")
-            yield _Pose(rotation, pair["T"].numbers, turn, pair["T"], source, plain=not source)
+            yield _Pose(rotation, pair["T"].numbers, turn, pair["T"], source, plain=not source and self.unit is None)
         for field in ("pose", "pose_backwards"):
             if (entry := pair.get(field)) is not None:
-                source = "kalibr" if _named(entry, "tcncnm1") else "orb-slam" if entry.path in ORB_SLAM else ""
+                source = next((source for source, keys in POSES_OF.items() if entry.key in keys), "")
                 yield _posed(entry.pose() if field == "pose" else np.linalg.inv(entry.pose()), entry, source)
         for field, source in (("from_body", "kalibr"), ("to_body", "euroc")):
             if field in left and field in right:

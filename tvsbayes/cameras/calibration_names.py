@@ -38,7 +38,7 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
         "distortioncoeffs distortioncoefs distortioncoefficients distortioncoefficient distortionparameters "
         "kc distvec distortionvector intrinsicscoeffs",
     ),
-    "radial": ((2, 3), "radialdistortion intrinsicsradialdistortion"),
+    "radial": ((2, 3), "radialdistortion intrinsicsradialdistortion radialtangentialradial"),
     "tangential": ((2,), "tangentialdistortion intrinsicstangentialdistortion"),
     "focal": ((2,), "fc focallength intrinsicsfocallength"),
     "centre": ((2,), "cc principalpoint intrinsicsprincipalpoint"),
@@ -55,7 +55,8 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
     "fy": ((1,), "fy intrinsicsfy"),
     "cx": ((1,), "cx ppx intrinsicscx intrinsicsppx"),
     "cy": ((1,), "cy ppy intrinsicscy intrinsicsppy"),
-    **{f"coefficient_{name}": ((1,), name) for name in ("k1", "k2", "p1", "p2", "k3", "k4")},
+    **{f"coefficient_{name}": ((1,), name) for name in ("k1", "k2", "k3", "k4")},
+    **{f"coefficient_p{n}": ((1,), f"p{n} radialtangentialt{n}") for n in (1, 2)},
     # Of the pair.
     "R": (
         (9, 3),
@@ -73,7 +74,7 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
         "tcncnm1 tc1c0 tcam1cam0 trightleft trl posecamera2a extrinsics extrinsic rt extrinsicmatrix "
         "tlefttoright cam1tcncnm1 t transform transformation transformationmatrix",
     ),
-    "pose_backwards": ((16, 12), "tc1c2 stereotc1c2 tcam0cam1 tleftright trighttoleft tc0c1"),
+    "pose_backwards": ((16, 12), "tc1c2 stereotc1c2 tcam0cam1 tleftright trighttoleft righttoleft tc0c1"),
     "E": ((9,), "e essential essentialmatrix"),
     "F": ((9,), "f fundamental fundamentalmatrix"),
     "baseline": ((1,), "stereob baseline"),
@@ -187,8 +188,12 @@ def numbers_of(value: Any) -> tuple[np.ndarray, tuple[int, ...]] | None:
         if inner is not None and "sizes" in value:
             return inner[0], (inner[0].size,)
         if inner is None or not isinstance(rows, int) or not isinstance(cols, int) or rows * cols != inner[0].size:
-            if set(value) == {"x", "y", "z"}:
-                return numbers_of([value["x"], value["y"], value["z"]])
+            if {"x", "y", "z"} <= set(value) <= {"x", "y", "z", "rotation"}:
+                # BoofCV's pose has its rotation beside.
+                shift, turn = numbers_of([value[axis] for axis in "xyz"]), numbers_of(value.get("rotation"))
+                if shift is None or turn is None or turn[0].size != 9:
+                    return shift
+                return np.column_stack([turn[0].reshape(3, 3), shift[0]]).ravel(), (3, 4)
             return None
         return inner[0], (rows, cols)
     if isinstance(value, bool) or not isinstance(value, int | float | list):
@@ -375,8 +380,13 @@ class Found:
     def model(self, camera: int) -> str:
         """The name of the lens model that the files state for a camera, in small letters; "" where none is."""
         place = next((self.cameras[camera][f] for f in ("D", "M", "fx") if f in self.cameras[camera]), None)
-        tables = [place.keys] if place is not None else []
-        tables += [self.files[place.file]] if place is not None else list(self.files)
+        tables = list(self.files)
+        if place is not None:
+            tables = [self.files[place.file]]
+            for part in place.keys.path:
+                if isinstance(tables[0].values.get(part), dict):
+                    tables.insert(0, tables[0].table(part))
+            tables.insert(0, place.keys)
         for keys in tables:
             for key, value in keys.values.items():
                 bare = _bare(key)

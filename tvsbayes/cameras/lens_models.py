@@ -17,7 +17,16 @@ from tvsbayes.instrument.stereo_pair import distort
 
 Kind = Literal["five", "rational", "fisheye", "inverse"]
 FIVE: tuple[str, ...] = (
-    *("plumb_bob", "radtan", "radial_tangential", "radialtangential", "standard", "brown", "brown_conrady"),
+    *(
+        "plumb_bob",
+        "radtan",
+        "pinhole_radial_tangential",
+        "radial_tangential",
+        "radialtangential",
+        "standard",
+        "brown",
+        "brown_conrady",
+    ),
     *("opencv", "none", "modified_brown_conrady", "pinhole", "perspective", "rectified"),
 )
 RATIONAL = ("rational_polynomial", "rational", "thin_prism", "tilted")

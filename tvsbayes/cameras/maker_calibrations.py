@@ -1,4 +1,4 @@
-"""Calibrations as makers of stereo cameras and BoofCV write them, brought to the names of `calibration_names`.
+"""Calibrations as makers of stereo cameras write them, brought to the names of `calibration_names`.
 
 A name is not enough for them: cameras by the number of a socket and poses by a chain (DepthAI), one calibration for
 each size of the pictures (ZED, RealSense), a pose in components. Each becomes tables `left` and `right` and the pose
@@ -266,27 +266,8 @@ def _realsense(document: Values, keys: Keys, size: Size | None) -> MakersPair:
     return MakersPair(Keys({**values, **pose}, keys.file, keys.text), "realsense", "m", (note,))
 
 
-def _boofcv(document: Values, keys: Keys, size: Size | None) -> MakersPair:
-    """`rightToLeft`: x_left = R x_right + t; unit of the board."""
-    del size
-    outer = document["rightToLeft"]
-    values: Values = {}
-    for side in ("left", "right"):
-        camera = document[side]
-        values[side] = dict(camera["pinhole"]) if "pinhole" in camera else {}
-        lens = camera.get("radial_tangential", {})
-        k1, k2, *others = [*lens.get("radial", ()), 0.0, 0.0][: max(2, len(lens.get("radial", ())))]
-        values[side]["D"] = [k1, k2, lens.get("t1", 0.0), lens.get("t2", 0.0), *others]
-        model = str(camera.get("model", ""))
-        values[side]["distortion_model"] = "radtan" if model in ("pinhole_radial_tangential", "pinhole") else model
-    turn = np.reshape(np.array(outer["rotation"], dtype=float), (3, 3))
-    shift = -turn.T @ np.array([outer["x"], outer["y"], outer["z"]], dtype=float)
-    return MakersPair(Keys({**values, "R": turn.T.tolist(), "T": shift.tolist()}, keys.file, keys.text), "boofcv", "")
-
-
 _MAKERS: tuple[tuple[Callable[[Values], bool], Callable[[Values, Keys, Size | None], MakersPair]], ...] = (
     (lambda values: isinstance(values.get("cameraData"), list), _depthai),
     (lambda values: isinstance(values.get("realsense"), dict) and "streams" in values["realsense"], _realsense),
     (lambda values: any(str(name).lower().startswith("left_cam_") for name in values), _zed),
-    (lambda values: isinstance(values.get("rightToLeft"), dict), _boofcv),
 )
