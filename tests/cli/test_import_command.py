@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import io
+import math
 import shlex
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from support.commands import MOUNTED, assert_error
 
 from tvsbayes.instrument.campaign import moves_bytes, pixels_of, read_campaign, write_campaign
+from tvsbayes.instrument.rig import read_rig
 
 TABLE = "Nr;Pan;Tilt;XL;YL;XR;YR;Blatt\n1;0;0;640,5;360,25;500;360;nah\n2;200;0;700,5;360,25;560;360;nah\n"
 
@@ -237,3 +240,28 @@ def test_a_title_where_names_should_stand_is_called_one(ask, tmp_path, first, sa
     log.write_text(f"{first}\n0,0,1\n5,1,1\n")
     code, document = ask("import", log, "--axis", "--to", tmp_path / "mine")
     assert code == 2 and ("is a title" in assert_error(document, "missing-column")["remedy"]) is said
+
+
+def test_a_urdf_becomes_a_head_with_sightings_or_keeps_its_spots(ask, say, tmp_path):
+    """Written only with --yes; the folder is read by `check`, and its rig file has the limits of the joints."""
+    unit = Path(__file__).parents[1] / "head" / "unit.urdf"
+    words = "import", "--urdf", unit, "--steps-per-turn", 400, "--to"
+    code, text, _ = say(*words, tmp_path / "head")
+    assert code == 0 and "nothing written" in text and "position of tilt's joint falls" in text
+    code, document = ask(*words, tmp_path / "head", "--yes")
+    assert (code, document["joints"]) == (0, {"pan": "pan_joint", "tilt": "tilt_joint"})
+    found = read_campaign(tmp_path / "head")
+    assert found.rig.mechanism.sightings and found.header["urdf"]["steps_per_turn"] == 400.0
+    assert found.rig.priors["degrees_per_step.tilt"].value == 360 / 400 / 20
+    assert found.rig.priors["azimuth_zero_deg"].value == pytest.approx(document["nominal"]["azimuth_zero_deg"])
+    rig = read_rig(tmp_path / "head" / "rig.toml")
+    assert rig.limits.steps["tilt"] == (round(math.degrees(-0.5) / 0.045), round(math.degrees(1.2) / 0.045))
+    assert ask("check", tmp_path / "head")[0] == 0
+    assert ask(*words, tmp_path / "head", "--yes")[0] == 2, "nothing is overwritten"
+    assert ask("new", tmp_path / "laser", "--mechanism", "pan-tilt")[0] == 0
+    assert ask(*words, tmp_path / "laser", "--yes")[0] == 0
+    shutil.copy(MOUNTED / "stereo.json", tmp_path / "laser")
+    laser = read_campaign(tmp_path / "laser")
+    assert laser.rig.priors["elevation_axis_offset_mm"].value == pytest.approx(30.0)
+    code, document = ask("import", unit, "--to", tmp_path / "x", "--pan-joint", "pan_joint")
+    assert code == 2 and "--urdf" in document["error"]["remedy"]

@@ -21,35 +21,27 @@ from tvsbayes.cli.app import (
     report_line,
     spared,
 )
-from tvsbayes.cli.instruments import instrument_of
+from tvsbayes.cli.head_commands import compensate as compensate_head
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
+from tvsbayes.instrument.campaign_header import mechanism_of
+from tvsbayes.instrument.mechanisms import MECHANISMS
 from tvsbayes.pipeline import StoredOrFitted
 from tvsbayes.pipeline import verify as verified
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
+    from tvsbayes.instrument.mechanisms import Mechanism
     from tvsbayes.results.compensation_record import Verification
 
 FITTING, MAKING = "fit", "compensation"
 LETTERS, APPLIERS = "XYZABC", ("controller", "host")
 
 
-def _is_scanner(folder: Path) -> bool:
-    return (folder / "campaign.toml").is_file() and instrument_of(folder) is None
-
-
-def _refuse_scanner(folder: Path, command: str) -> None:
-    """An axis folder alone has a table of one command.
-
-    Raises:
-        InputError: it is a campaign of a scanner.
-    """
-    if _is_scanner(folder):
-        message = f"{command} is for an axis, and {escaped(str(folder), 200)} is the campaign of a scanner"
-        remedy = "its compensation is `tvsbayes compensate CAMPAIGN --to header`"
-        raise InputError("usage", message, remedy=remedy)
+def _mechanism(folder: Path) -> Mechanism | None:
+    """Of two axes, a scanner's or a head's; None of an axis, and where nothing can be read."""
+    return MECHANISMS.get(mechanism_of(folder))
 
 
 def compensate(
@@ -75,8 +67,9 @@ def compensate(
 ) -> None:
     """A controller's table, and the promise of what it leaves.
 
-    Nothing is applied. With -o the promise is kept in results/compensation.json, for `verify`. Of a scanner's campaign
-    `--to header` gives its calibration for a microcontroller; its promise is that of `locate`.
+    Nothing is applied. With -o the promise is kept in results/compensation.json, for `verify`. Of a scanner `--to
+    header` gives its calibration for a microcontroller; its promise is that of `locate`. Of a pan-tilt head `--to urdf`
+    gives its model: zeros, axes and reductions of the joints, and beside it YAML with their covariance.
     """
     from tvsbayes.compensation.promise import Wish, checked, compensation_of, file_beside, file_text
     from tvsbayes.report.compensation_text import compensation_text
@@ -87,11 +80,20 @@ def compensate(
     from tvsbayes.single_axis.axis_record import results_for
 
     spared(out)
-    if to == "header" and _is_scanner(campaign):
+    if (mechanism := _mechanism(campaign)) is not None:
         # Counters of two axes follow from the calibration as a whole: it is the table.
-        export_calibration(campaign, to, out, as_json)
+        own = "urdf" if mechanism.terms else "header"
+        if to != own:
+            what = "a pan-tilt head" if mechanism.terms else "a scanner"
+            message = f"compensate --to {escaped(to)} is for an axis, and {escaped(str(campaign), 200)} is {what}"
+            counters = "; `tvsbayes steps-for` gives the counters of a direction" if mechanism.terms else ""
+            remedy = f"its compensation is `tvsbayes compensate CAMPAIGN --to {own}`{counters}"
+            raise InputError("usage", message, remedy=remedy)
+        if mechanism.terms:
+            compensate_head(campaign, out, as_json)
+        else:
+            export_calibration(campaign, to, out, as_json)
         return
-    _refuse_scanner(campaign, f"compensate --to {escaped(to)}")
     _one_of("--applied-by", applied_by, APPLIERS)
     _one_of("--letter", letter, tuple(LETTERS))
     wish = Wish(to, "host" if applied_by == "host" else "controller", per_command, resolution, in_force, letter, period)
@@ -167,13 +169,15 @@ def verify(
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
 
-    scanner = _is_scanner(campaign)
-    if scanner != _is_scanner(fresh):
-        kind = "a scanner" if scanner else "an axis"
+    mechanism = _mechanism(campaign)
+    scanner = mechanism is not None
+    if mechanism is not _mechanism(fresh):
+        kind = "an axis" if mechanism is None else "a head" if mechanism.terms else "a scanner"
         message = f"{escaped(str(campaign), 200)} is of {kind}, {escaped(str(fresh), 200)} is not"
         raise InputError("usage", message, remedy="give fresh readings or looks of the same kind of machine")
-    if not scanner and distance_mm is not None:
-        raise InputError("usage", "--distance-mm is not for an axis", remedy="leave it out")
+    if distance_mm is not None and (mechanism is None or mechanism.sightings):
+        message = "--distance-mm is not for an axis, nor for a head that says where it points"
+        raise InputError("usage", message, remedy="leave it out")
     judge = _verified_scanner if scanner else _verified_axis
     found, made_of = judge(campaign, fresh, seed, distance_mm)
     keep(
@@ -223,7 +227,7 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
     if folder is None:
         remedy = "write tvsbayes plan FOLDER --verify -o plan.csv"
         raise InputError("usage", "--verify needs a folder with a table or a calibration in force", remedy=remedy)
-    if _is_scanner(folder):
+    if _mechanism(folder) is not None:
         _plan_looks(folder, out, as_json)
         return
     data = read_axis(folder)

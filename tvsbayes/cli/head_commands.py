@@ -5,21 +5,35 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import finish, report_line, tell_removed
+import typer
+
+from tvsbayes.cli.app import command_line, finish, report_line, somebody_there, spared, tell_removed
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import InputError
-from tvsbayes.files.disk import output_place
+from tvsbayes.errors import InputError, escaped, typed
+from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically
+from tvsbayes.files.documents import toml_line
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.counter_limits import LIMIT_KEYS
 from tvsbayes.pipeline import StoredOrFitted
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
     from tvsbayes.calibration.pointing import Calibration
+    from tvsbayes.head.urdf import HeadJoints
+    from tvsbayes.instrument.parameters import Prior
     from tvsbayes.report.document import Issue
 
 FITTING, DRAWING = "fit", "drawing the page"
+HEAD_URDF = "head.urdf"
+"""In a campaign folder: the model that `import --urdf` read."""
+PARTS = ("campaign.toml", "moves.csv", "spots.csv")
+"""Of a campaign that `new` made."""
+RATIO_U = 0.01
+"""Relative u of a nominal ratio."""
 OF_SIGHTINGS = "check, classic, fit, compare, report, steps-for --azimuth-deg --elevation-deg"
 """Commands that such a head has."""
 
@@ -46,6 +60,140 @@ def refuse_head(command: str, calibration: Calibration) -> None:
     if calibration.names != INPUT_NAMES:
         message = f"{command} meets the beam with the scanner's aperture, and a pan-tilt head has none"
         raise InputError("usage", message, remedy="steps-for says which counters point along a direction")
+
+
+def import_urdf(
+    file: Path, to: Path, joints: Mapping[str, str | None], steps_per_turn: float | None, *, yes: bool, as_json: bool
+) -> None:
+    """Nominal geometry of two joints into a new campaign of a head, or into one that `new` made."""
+    from tvsbayes.head.urdf import URDF_BYTES_MAX, head_joints, ratios_of
+    from tvsbayes.instrument.campaign import head_templates
+    from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
+    from tvsbayes.instrument.parameters import Prior
+
+    data = read_bytes(file, URDF_BYTES_MAX)
+    head = head_joints(data, escaped(file.name), joints)
+    spots = {name: (to / name).read_bytes() for name in PARTS if (to / name).is_file()}
+    untouched = {name: text for name, text in head_templates(False).items() if name in PARTS}
+    kind = HEAD if spots == untouched else SIGHTING_HEAD
+    ratios = {} if steps_per_turn is None else ratios_of(head, steps_per_turn)
+    priors = {name: Prior(value, RATIO_U * value) for name, value in ratios.items()}
+    terms = {name: value for name, value in head.terms.items() if value and name in kind.told}
+    priors |= {name: Prior(value, kind.priors[name].u) for name, value in terms.items()}
+    assumed = [
+        f"pan is joint {escaped(head.names['pan'])}, tilt joint {escaped(head.names['tilt'])}; zero counters are zero "
+        "of the joints",
+        "the beam is x of the tilt joint's child link; directions are in the parent link of the pan joint, z up",
+    ]
+    for axis, angle in (("pan", "azimuth"), ("tilt", "elevation")):
+        sense = "rises" if head.sign[axis] > 0 else "falls"
+        assumed.append(f"{axis}_steps count up where {angle} grows: there the position of {axis}'s joint {sense}")
+    if not ratios:
+        assumed.append("degrees per step: the default; --steps-per-turn N, or state them in [rig.prior]")
+    files = _urdf_files(head_templates(kind is SIGHTING_HEAD), priors, head, steps_per_turn)
+    files[HEAD_URDF] = data
+    lines = [f"nominal: {name} = {prior.value:.6g}" for name, prior in priors.items()]
+    lines += [f"assumed: {text}" for text in assumed]
+    if not (yes or as_json) and somebody_there():
+        typer.echo("\n".join(lines))
+        yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
+        lines = []
+    said = "nothing written: add --yes"
+    if yes:
+        if kind is SIGHTING_HEAD:
+            make_folder(to, empty=True)
+        for name, text in files.items():
+            write_atomically(to / name, text)
+        log = "moves and sightings" if kind is SIGHTING_HEAD else "moves and spots"
+        said = f"written: {escaped(str(to), 200)}\nnext: log {log} there, then `tvsbayes check {typed(to)}`"
+    document = {"campaign": str(to), "joints": dict(head.names), "signs": dict(head.sign), "assumed": assumed}
+    document |= {"nominal": {name: prior.value for name, prior in priors.items()}, "written": yes}
+    finish({**document, "files": list(files) if yes else []}, "\n".join([*lines, said]), as_json)
+
+
+def _urdf_files(
+    templates: Mapping[str, bytes], priors: Mapping[str, Prior], head: HeadJoints, steps_per_turn: float | None
+) -> dict[str, bytes]:
+    """Templates of a head with nominal values, joints and limits."""
+    entries = [
+        toml_line(name, {"value": float(f"{p.value:.9g}"), "u": float(f"{p.u:.3g}")}) for name, p in priors.items()
+    ]
+    joints: dict[str, object] = {f"{axis}_joint": head.names[axis] for axis in AXES}
+    joints |= {} if steps_per_turn is None else {"steps_per_turn": float(steps_per_turn)}
+    tables = {"campaign.toml": ["[urdf]", *(toml_line(key, value) for key, value in joints.items())], "rig.toml": []}
+    for axis, keys in LIMIT_KEYS.items() if steps_per_turn is not None else ():
+        ratio = priors[f"degrees_per_step.{axis}"].value
+        if (ends := head.limits_deg(axis)) is not None:
+            tables["rig.toml"] += [toml_line(key, round(end / ratio)) for key, end in zip(keys, ends, strict=True)]
+    if tables["rig.toml"]:
+        tables["rig.toml"].insert(0, "[positioner]")
+    files = dict(templates)
+    for name, table in tables.items():
+        kept = [line for line in files[name].decode().splitlines() if not _states(line, priors)]
+        at = kept.index("[rig.prior]") + 1
+        files[name] = "\n".join([*kept[:at], *entries, *kept[at:], *([""] if table else []), *table, ""]).encode()
+    return files
+
+
+def _states(line: str, priors: Mapping[str, Prior]) -> bool:
+    """Whether a line of a template states one of these priors."""
+    return line.partition("=")[0].strip().strip('"') in priors
+
+
+def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
+    """The model of the robot with what was estimated, and beside it YAML with the covariance."""
+    import hashlib
+
+    import numpy as np
+    import yaml
+
+    from tvsbayes.calibration.calibration_file import Origin
+    from tvsbayes.comparison.verified_looks import accepted_calibration
+    from tvsbayes.head.urdf import URDF_BYTES_MAX, HeadModel, head_joints
+    from tvsbayes.instrument.campaign import input_hashes, read_campaign
+    from tvsbayes.report.tables import concise
+
+    data = read_campaign(folder)
+    calibration, origin = accepted_calibration(data), Origin.of(data)
+    kind = data.rig.mechanism
+    terms = {f"backlash_deg.{axis}" for axis in AXES} | {f"degrees_per_step.{axis}" for axis in AXES}
+    terms |= {term.name for term in kind.terms.values() if term.name in kind.told}
+    kept = [k for k, name in enumerate(calibration.names) if name in terms and calibration.covariance[k, k] > 0]
+    stated = data.header.get("urdf")
+    known: dict[str, Any] = stated if isinstance(stated, dict) else {}
+    made = (
+        f"made by tvsbayes {origin.tvsbayes}, {origin.exported}, of {escaped(origin.campaign)}; applied to nothing yet"
+    )
+    model = HeadModel(
+        names=tuple(calibration.names[k] for k in kept),
+        values=calibration.mean[kept],
+        covariance=calibration.covariance[np.ix_(kept, kept)],
+        origin=made,
+        data_sha256=hashlib.sha256("".join(input_hashes(data).values()).encode()).hexdigest(),
+        steps_per_turn=known.get("steps_per_turn"),
+    )
+    place, joints = folder / HEAD_URDF, {axis: known.get(f"{axis}_joint") for axis in AXES}
+    head = head_joints(read_bytes(place, URDF_BYTES_MAX, folder), HEAD_URDF, joints) if place.is_file() else None
+    text, document = model.urdf(head), model.document(head)
+    lines = [f"{name} {concise(v, u)}" for name, v, u in zip(model.names, model.values, document["u"], strict=True)]
+    lines += [
+        f"{axis}: {joint['steps_per_rad']:.9g} counters per radian of joint {escaped(joint['name'])}"
+        for axis, joint in document["joints"].items()
+    ]
+    lines += [f"not said: {words}" for words in document["unsaid"]]
+    files: dict[str, str] = {}
+    if out is None:
+        what = "xacro properties" if head is None else f"{HEAD_URDF} with these terms"
+        lines.append(f"nothing written: give -o FILE; it would hold {what}, and FILE.yaml their covariance")
+    else:
+        second = out.with_name(f"{out.name}.yaml")
+        spared(second)
+        write_atomically(out, text)
+        write_atomically(second, f"# {made}\n{yaml.safe_dump(document, sort_keys=False)}".encode())
+        files = {"urdf": str(out), "yaml": str(second)}
+        lines.append(f"written: {', '.join(files.values())}")
+        lines.append(f"next: load it in place of the old model, then {command_line('verify', folder, 'FRESH')}")
+    finish({**document, "target": "urdf", "files": files}, "\n".join(lines), as_json)
 
 
 def classic(folder: Path, as_json: bool) -> None:

@@ -14,6 +14,7 @@ import typer
 
 from tvsbayes.cli.app import Json, finish, refuse_options, report_line, somebody_there
 from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
+from tvsbayes.cli.head_commands import import_urdf
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, closest, escaped, refusal, typed
@@ -78,6 +79,14 @@ def import_(
         str, typer.Option("--pan-approach", help="How pan came to the first row: left, right or unknown.")
     ] = "unknown",
     tilt_approach: Annotated[str, typer.Option("--tilt-approach", help="Likewise up, down or unknown.")] = "unknown",
+    urdf: Annotated[bool, typer.Option("--urdf", help="FILE is a URDF: nominal geometry of a pan-tilt head.")] = False,
+    pan_joint: Annotated[
+        str | None, typer.Option("--pan-joint", help="Of a URDF: the joint about the vertical (default: by its name).")
+    ] = None,
+    tilt_joint: Annotated[str | None, typer.Option("--tilt-joint", help="Of a URDF: the joint on it.")] = None,
+    steps_per_turn: Annotated[
+        float | None, typer.Option("--steps-per-turn", min=1.0, max=1e9, help="Of a URDF: counts of a motor's turn.")
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Write without asking.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -106,9 +115,17 @@ def import_(
         wish = replace(correction, pixels_from=pixels_from, relative=relative)
         _correct_campaign(file, to, wish, yes=yes, as_json=as_json)
         return
-    if kind == POINTING:
+    of_urdf = {"pan_joint": pan_joint, "tilt_joint": tilt_joint, "steps_per_turn": steps_per_turn}
+    if not urdf:
+        refuse_options("for a URDF", "add --urdf, or leave it out", **of_urdf)
+    if urdf or kind == POINTING:
         others = {"column": column, "sheet": sheet, "angles": angles, "axis": axis, "relative": relative, "flip": flip}
         refuse_options("for other tables", "leave it out", **others, shift_moves=shift_moves, swap=swap, sd_px=sd_px)
+    if urdf:
+        refuse_options("for other tables", "leave it out", format=kind if kind != "auto" else None)
+        import_urdf(file, to, {"pan": pan_joint, "tilt": tilt_joint}, steps_per_turn, yes=yes, as_json=as_json)
+        return
+    if kind == POINTING:
         _import_pointing(file, to, yes=yes, as_json=as_json)
         return
     if axis or instrument_of(to) is INSTRUMENTS["axis"]:

@@ -14,6 +14,7 @@ SCANNER = "two-mirror"
 """Mechanism of a campaign that states none."""
 _TEXT_CHARS = {
     **dict.fromkeys(("name", "operator", "instrument", "serial", "method", "board_certificate"), 200),
+    **dict.fromkeys(("pan_joint", "tilt_joint"), 200),
     "notes": 4000,
 }
 _QUANTITIES = {
@@ -24,6 +25,7 @@ _QUANTITIES = {
 _HEADER_TABLES = {
     "environment": ("temperature_degC", "humidity_percent"),
     "traceability": ("board_certificate", "pitch_mm", "stereo_calibrated"),
+    "urdf": ("pan_joint", "tilt_joint", "steps_per_turn"),
 }
 _HEADER_KEYS = (
     *("format", "name", "created", "powered_on", "synthetic", "seed"),
@@ -42,6 +44,8 @@ def _header_value(keys: Keys, key: str) -> object:
         return keys.flag(key)
     if key == "seed":
         return keys.integer(key, 0, 2**63 - 1)
+    if key == "steps_per_turn":
+        return keys.number(key, 1.0, 1e9)
     if not isinstance(keys.values[key], datetime.date):
         allowed = "a date or time such as 2026-01-15T10:00:00Z"
         raise keys.refuse(key, "date", allowed, "write it without quotes")
