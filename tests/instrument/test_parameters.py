@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import (
     BLOCKS,
     INDEX,
     KINDS,
     NAMES,
     NOISE_NAMES,
-    PRIOR_GROUPS,
     RECEIVER_NAMES,
     REGISTRY,
     RIG_NAMES,
@@ -62,11 +62,12 @@ def test_noise_and_receiver():
 
 
 def test_every_prior_is_in_one_group():
-    assert next(iter(PRIOR_GROUPS)) == "stereo calibration"
-    assert PRIOR_GROUPS["stereo calibration"] == list(range(len(RIG_NAMES), len(NAMES)))
-    assert [NAMES[column] for column in PRIOR_GROUPS["prior of backlash_deg"]] == list(BLOCKS["backlash_deg"])
-    assert len(PRIOR_GROUPS["prior of extrinsics"]) == 6 and len(PRIOR_GROUPS["focal scale"]) == 1
-    assert sorted(column for group in PRIOR_GROUPS.values() for column in group) == list(range(len(NAMES)))
+    assert next(iter(TWO_MIRROR.prior_groups)) == "stereo calibration"
+    assert TWO_MIRROR.prior_groups["stereo calibration"] == list(range(len(RIG_NAMES), len(NAMES)))
+    plays = TWO_MIRROR.prior_groups["prior of backlash_deg"]
+    assert [NAMES[column] for column in plays] == list(BLOCKS["backlash_deg"])
+    assert len(TWO_MIRROR.prior_groups["prior of extrinsics"]) == 6 and len(TWO_MIRROR.prior_groups["focal scale"]) == 1
+    assert sorted(column for group in TWO_MIRROR.prior_groups.values() for column in group) == list(range(len(NAMES)))
 
 
 def test_units_of_contract_names():

@@ -23,7 +23,8 @@ from tvsbayes.errors import InputError
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
-from tvsbayes.instrument.parameters import PRIOR_GROUPS, RIG_NAMES
+from tvsbayes.instrument.mechanisms import TWO_MIRROR
+from tvsbayes.instrument.parameters import RIG_NAMES
 from tvsbayes.metrology.positioning_table import positioning
 from tvsbayes.metrology.traceability import traceability
 from tvsbayes.report.document import Document, Issue, Section, Verdict
@@ -180,7 +181,7 @@ def test_half_an_interval_is_left_out_where_its_ends_lie_unlike_far():
 
 def test_causes_and_parameters_are_called_by_words():
     """Every prior and every parameter but the cameras'; budgets say the part and the unit as well."""
-    told = {cause: cause_in_words(cause) for cause in PRIOR_GROUPS if cause.startswith("prior of ")}
+    told = {cause: cause_in_words(cause) for cause in TWO_MIRROR.prior_groups if cause.startswith("prior of ")}
     assert all(words != cause for cause, words in told.items())
     tables = [share_in_words(cause) for cause in told] + [source_in_words(f"prior of {name}") for name in RIG_NAMES]
     tables += [name_in_words(name) for name in RIG_NAMES]

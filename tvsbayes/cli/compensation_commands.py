@@ -25,7 +25,6 @@ from tvsbayes.cli.head_commands import compensate as compensate_head
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place, write_atomically
-from tvsbayes.instrument.campaign_header import mechanism_of
 from tvsbayes.instrument.mechanisms import MECHANISMS
 from tvsbayes.pipeline import StoredOrFitted
 from tvsbayes.pipeline import verify as verified
@@ -41,6 +40,8 @@ LETTERS, APPLIERS = "XYZABC", ("controller", "host")
 
 def _mechanism(folder: Path) -> Mechanism | None:
     """Of two axes, a scanner's or a head's; None of an axis, and where nothing can be read."""
+    from tvsbayes.instrument.campaign_header import mechanism_of
+
     return MECHANISMS.get(mechanism_of(folder))
 
 
@@ -163,8 +164,8 @@ def verify(
     """Whether a machine keeps the promise of its table or calibration.
 
     KEPT, BROKEN or CANNOT TELL: exit 0, 1 or 3. Of an axis FRESH lists the commands that were asked for, before the
-    correction; of a scanner the counters that steps-for or the header gave, and the looks there. Which world fits:
-    applied, not applied, applied twice, wrong sign, another machine.
+    correction; of a scanner or head the counters that steps-for or the header gave, and the looks there. Which
+    world fits: applied, not applied, applied twice, wrong sign, another machine.
     """
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
@@ -206,7 +207,7 @@ def _verified_axis(folder: Path, fresh: Path, seed: int, _: float | None) -> tup
 def _verified_scanner(
     folder: Path, fresh: Path, seed: int, distance_mm: float | None
 ) -> tuple[Verification, dict[str, object]]:
-    """Looks of a scanner, and of which data and calibration that is."""
+    """Looks of a scanner or head, and of which data and calibration that is."""
     from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
     from tvsbayes.instrument.campaign import input_hashes, read_campaign
 
@@ -245,7 +246,7 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
 
 
 def _plan_looks(folder: Path, out: Path | None, as_json: bool) -> None:
-    """The looks of a scanner that tell soonest, at the target that the campaign looked at most."""
+    """The looks of a scanner or head that tell soonest, at the target that the campaign looked at most."""
     from collections import Counter
 
     from tvsbayes.comparison.verified_looks import accepted_calibration, plan_looks
@@ -259,7 +260,7 @@ def _plan_looks(folder: Path, out: Path | None, as_json: bool) -> None:
     document, text = plain(found), aim_plan_text(found)
     if out is not None:
         target = Counter(spot.target for spot in data.spots).most_common(1)[0][0]
-        write_plan(found.steps(target), out)
+        write_plan(found.steps(target), out, not data.rig.mechanism.sightings)
         document["plan"] = str(out)
         text += f"\nwritten: {escaped(str(out), 200)}"
     finish(document, text, as_json)

@@ -78,9 +78,10 @@ INSTRUMENTS = {
         "a head that says where it points",
         "the folder of one",
         "tvsbayes.cli.head_commands",
-        "of such a head: check, classic, fit, compare, report, steps-for --azimuth-deg --elevation-deg",
-        {"plan": "sight more directions, from both sides, and some of them twice", "calibrate": "fit, then report"},
-        ("check", "fit", "compare", "steps-for"),
+        "of such a head: check, classic, fit, compare, report, watch, verify, plan, study, compensate --to urdf, "
+        "steps-for --azimuth-deg --elevation-deg",
+        {"calibrate": "fit, then report"},
+        ("check", "fit", "compare", "steps-for", "watch", "plan"),
     ),
 }
 """By mechanism, as `campaign.toml` states it."""

@@ -28,7 +28,7 @@ from tvsbayes.cli.app import (
     spared,
 )
 from tvsbayes.cli.compensation_commands import export_calibration, plan_verify
-from tvsbayes.cli.head_commands import refuse_head, refuse_sightings
+from tvsbayes.cli.head_commands import refuse_head
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.watch_command import plan_watch
@@ -281,7 +281,6 @@ def plan(
     from tvsbayes.instrument.rig import read_rig
 
     instrument, data = read_rig(rig), None if given is None else read_campaign(given)
-    refuse_sightings("plan", instrument.table.mechanism.sightings)
     from tvsbayes.planning.planner import plan as find_plan
     from tvsbayes.planning.search import CRITERIA
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
@@ -313,7 +312,7 @@ def plan(
         )
     text, document = plan_text(result), result.as_json()
     if out is not None and result.steps:
-        write_plan(result.steps, out)
+        write_plan(result.steps, out, not instrument.table.mechanism.sightings)
         document["plan"] = str(out)
         text += f"\nwritten: {escaped(str(out), 200)}"
     elif out is not None:
@@ -381,8 +380,7 @@ def study(
         refuse_options("for a cluster that is started here", "leave it out, or leave out --scheduler", workers=workers)
     in_order(rig, plan_file)
     instrument = read_rig(rig)
-    refuse_sightings("study", instrument.table.mechanism.sightings)
-    steps = read_plan(plan_file)
+    steps = read_plan(plan_file, not instrument.table.mechanism.sightings)
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import study_text
     from tvsbayes.statistics.chances import ASSURED

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tvsbayes.cli.app import TARGET_MISSED, CampaignFolder, Ended, Json, Seed, finish, report_line
-from tvsbayes.cli.instruments import instrument_of, serve
+from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
@@ -94,10 +94,10 @@ def plan_watch(
     from tvsbayes.instrument.rig import read_rig
 
     campaign = given or place
-    if campaign is None or instrument_of(campaign) is not None:
+    if campaign is None or instrument_of(campaign) is INSTRUMENTS["axis"]:
         raise InputError(
             "usage",
-            "--watch needs the campaign of a scanner",
+            "--watch needs the campaign of a scanner or a head",
             remedy="write tvsbayes plan CAMPAIGN --watch -o looks.csv",
         )
     known, rig = read_campaign(campaign), None if given is None or place is None else read_rig(place)
@@ -112,7 +112,7 @@ def plan_watch(
 
     text = watch_plan_text(found)
     if out is not None:
-        write_plan(found.steps, out)
+        write_plan(found.steps, out, not known.rig.mechanism.sightings)
         found = structs.replace(found, plan=str(out))
         text += f"\nwritten: {escaped(str(out), 200)}"
     finish(found.as_json(), text, as_json)

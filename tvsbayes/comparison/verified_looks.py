@@ -1,6 +1,6 @@
-"""Looks at counters that `steps-for` or the header gave: whether a scanner points where its calibration says.
+"""Looks at counters that `steps-for` or the header gave: whether a scanner or head points where its calibration says.
 
-Every look says where both mirror angles were, seen less predicted, with the covariance of `watched_looks`: a scanner's
+Every look says where both mirror angles were, seen less predicted, with the covariance of `watched_looks`: both
 angles are two axes, and `compensation.verification` judges them as the readings of one. Not applied means counters by
 the nominal degrees per step without play; what is applied is the rest. Mirror angles in degrees, points in mm.
 """
@@ -12,8 +12,9 @@ from functools import cache
 
 import numpy as np
 
+from tvsbayes.calibration.aiming import Direction, mirror_angles
 from tvsbayes.calibration.calibration_file import stored_calibration
-from tvsbayes.calibration.optics import beam_components, output_deg
+from tvsbayes.calibration.optics import beam_components, is_head, output_deg
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.comparison.watched_looks import LOOKS_MIN, WatchedLooks
 from tvsbayes.compensation.promise import bound_of, refuse_answer
@@ -22,8 +23,8 @@ from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.estimators.campaign_arrays import in_sight
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.noise_scales import noise_draws
-from tvsbayes.instrument.axes import AXES, HOME_SD_DEG, SIDES
-from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
+from tvsbayes.instrument.campaign import Campaign, input_hashes, looks_file, ordered_spots
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.stops import rests_of
@@ -99,9 +100,15 @@ class AimedLooks:
         """Counters (m, 2) that the nominal degrees per step send to the same directions (formulation 5)."""
         values, (pan, tilt) = self.calibration.estimates, self.angles_deg(self.sides).T
         x, y, z = beam_components(values, pan, tilt).direction
-        azimuth = np.degrees(np.arctan2(y, x)) + 90.0 - nominal["pan_zero_emission_deg"]
-        both = azimuth / nominal["degrees_per_step.pan"], np.degrees(np.arcsin(z)) / nominal["degrees_per_step.tilt"]
-        return np.stack(both, axis=1)
+        azimuth, elevation = np.degrees([np.arctan2(y, x), np.arcsin(z)])
+        if is_head(values):
+            aims = [Direction(*map(float, row)) for row in zip(azimuth, elevation, strict=True)]
+            angles = np.array([mirror_angles(nominal, aim) for aim in aims]) - [0.0, nominal["elevation_zero_deg"]]
+            # Of all turns, the one that the axis has made.
+            angles[:, 0] += FULL_TURN_DEG * np.round((pan - angles[:, 0]) / FULL_TURN_DEG)
+        else:
+            angles = np.stack([azimuth + 90.0 - nominal["pan_zero_emission_deg"], elevation], axis=1)
+        return angles / [nominal[f"degrees_per_step.{axis}"] for axis in AXES]
 
     @property
     def ratios(self) -> np.ndarray:
@@ -212,8 +219,8 @@ def verify_looks(
     if used.sum() < LOOKS_MIN:
         raise NothingToEstimate(
             "too-few-looks",
-            f"spots.csv: {int(used.sum())} fresh looks can be used; a scanner is verified with at least {LOOKS_MIN}",
-            file="spots.csv",
+            f"{looks_file(looks)}: {int(used.sum())} fresh looks can be used; verify takes at least {LOOKS_MIN}",
+            file=looks_file(looks),
             remedy="aim at more points; `tvsbayes plan CAMPAIGN --verify` names them",
         )
     aimed = AimedLooks.of(calibration, looks, used)
@@ -238,9 +245,11 @@ def verify_looks(
         after=size_of(seen.value),
         promised95=bound_of(found.promised, aim, np.arange(len(aim))),
         readings=len(aimed.steps),
-        millimetres=_millimetres(aimed, seen, before, distance_mm, seed),
+        # A head that says where it points has no lengths.
+        millimetres=None if looks.rig.mechanism.sightings else _millimetres(aimed, seen, before, distance_mm, seed),
         unit="deg",
         needed=None if found.needed is None else -(-found.needed // 2),
+        looks=True,
         remarks=_remarks(fit.campaign, looks, aimed),
     )
 
@@ -327,7 +336,7 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
 def _drawn_angles(calibration: Calibration, aimed: AimedLooks, k: int) -> np.ndarray:
     """Mirror angles (draws, m) of one axis by the draws of the calibration."""
     own, gears = np.split(calibration.inputs[:DRAWS], [len(INPUT_NAMES)], axis=1)
-    values = dict(zip(INPUT_NAMES, own.T[..., None], strict=True))
+    values = dict(zip(calibration.names, own.T[..., None], strict=True))
     values |= calibration.gears.at(gears, (aimed.steps[:, 0], aimed.steps[:, 1]))
     axis = AXES[k]
     return np.asarray(output_deg(values, axis, aimed.steps[:, k], aimed.sides[:, k], calibration.period_deg.get(axis)))

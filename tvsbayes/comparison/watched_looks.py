@@ -7,6 +7,7 @@ them; nothing is refitted. A change is a shift of parameters for the new looks a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import equinox as eqx
@@ -19,9 +20,12 @@ from tvsbayes.estimators.joint_fit import JointFit, priors_used
 from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_information
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.estimators.noise_scales import noise_draws
-from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
+from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
+from tvsbayes.instrument.campaign import Campaign, input_hashes, looks_file, ordered_spots
 from tvsbayes.instrument.homing import homed
-from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
+from tvsbayes.instrument.mechanisms import Mechanism
+from tvsbayes.instrument.parameters import COLUMNS as COORDINATES
+from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, OK, MovedPart, SeenChange, Verdict, Watch
@@ -74,22 +78,35 @@ def _single(what: str, name: str, size: float, unit: str) -> StatedChange:
     return StatedChange(what, (name,), (what,), size, unit)
 
 
-CHANGES = (
-    *_pose("cameras", "stereo"),
-    *_pose("positioner", "extrinsics"),
-    *(_single(f"ratio: {axis}", f"degrees_per_step.{axis}", 0.3, "%") for axis in ("pan", "tilt")),
-    *(_single(f"play: {axis}", f"backlash_deg.{axis}", 0.1, "deg") for axis in ("pan", "tilt")),
+_GEARS = (
+    *(_single(f"ratio: {axis}", f"degrees_per_step.{axis}", 0.3, "%") for axis in AXES),
+    *(_single(f"play: {axis}", f"backlash_deg.{axis}", 0.1, "deg") for axis in AXES),
 )
+CHANGES = (*_pose("cameras", "stereo"), *_pose("positioner", "extrinsics"), *_GEARS)
 """Everything that is asked about, and the size that must be noticed."""
+_LEAN = tuple(f"azimuth_axis_tilt_deg.{side}" for side in ("north", "east"))
+SIGHTED_CHANGES = (
+    # What a homing leaves open hides less.
+    *(_single(f"zero: {angle}", f"{angle}_zero_deg", 5 * HOME_SD_DEG, "deg") for angle in ("azimuth", "elevation")),
+    StatedChange("base: lean", _LEAN, ("base: lean to azimuth 0", "base: lean to azimuth 90"), 0.1, "deg"),
+    _single("beam: not square", "beam_not_square_deg", 0.1, "deg"),
+    *_GEARS,
+)
+"""The same of a head that says where it points."""
 
 
-def _columns() -> tuple[slice, ...]:
-    ends = np.cumsum([len(change.names) for change in CHANGES])
-    return tuple(slice(int(end) - len(change.names), int(end)) for end, change in zip(ends, CHANGES, strict=True))
+def changes_of(mechanism: Mechanism) -> tuple[StatedChange, ...]:
+    """What is asked about an instrument."""
+    return SIGHTED_CHANGES if mechanism.sightings else CHANGES
 
 
-COLUMNS = _columns()
-_SHIFTED = [INDEX[name] for change in CHANGES for name in change.names]
+def columns_of(changes: Sequence[StatedChange]) -> tuple[slice, ...]:
+    """Places of each change among the shifts of all."""
+    ends = np.cumsum([len(change.names) for change in changes])
+    return tuple(slice(int(end) - len(change.names), int(end)) for end, change in zip(ends, changes, strict=True))
+
+
+COLUMNS = columns_of(CHANGES)
 
 
 def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
@@ -99,7 +116,7 @@ def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
         replace(m, move=m.move + moves, segment=m.segment + last.segment + 1, time_s=m.time_s + last.time_s)
         for m in looks.moves
     )
-    seen = tuple(replace(s, spot=s.spot + spots, move=s.move + moves, experiment=None, point=None) for s in looks.spots)
+    seen = tuple(s.renumbered(s.spot + spots, s.move + moves) for s in looks.spots)
     return replace(campaign, moves=(*campaign.moves, *later), spots=(*campaign.spots, *seen))
 
 
@@ -110,14 +127,21 @@ class Departure:
     Attributes:
         chi2: squared length of the foretold residuals in units of their covariance.
         dof: observations in it.
-        score: of the shifts, in the units of `CHANGES`, shape (q,).
+        score: of the shifts, in the units of `changes`, shape (q,).
         information: that the looks have of them, shape (q, q).
+        changes: whose shifts these are.
     """
 
     chi2: float
     dof: int
     score: np.ndarray
     information: np.ndarray
+    changes: tuple[StatedChange, ...] = CHANGES
+
+    @property
+    def columns(self) -> tuple[slice, ...]:
+        """Places of each change among the shifts."""
+        return columns_of(self.changes)
 
     def given(self, known: list[slice]) -> Departure:
         """With some changes free: what is left for the others."""
@@ -221,16 +245,18 @@ class WatchedLooks:
         later = self.problem.spots[self.first :]
         self.looks = int(used[self.first :].sum())
         readings = sum(s.aperture_deg is not None for s, use in zip(later, used[self.first :], strict=True) if use)
-        self.dof = 3 * self.looks + readings
+        self.changes = changes_of(table.mechanism)
+        # Three of four pixels: one is the range's. A sighting has two angles.
+        self.dof = 2 * self.looks if table.mechanism.sightings else 3 * self.looks + readings
 
     def departure(self, z: np.ndarray, *, angles: bool = False) -> Departure:
         """What the looks say beyond the first day, both linearised at z; its noise scales are held.
 
-        Of the shifts of `CHANGES`, or with `angles` of the mirror angles (pan, tilt) of every usable look, deg.
+        Of the shifts of the changes, or with `angles` of the mirror angles (pan, tilt) of every usable look, deg.
         """
         linear, prior = self.linear(z, angles=angles), np.where(self.problem.held, 0.0, z)
         both, before = (_Told.of(spots, prior) for spots in (linear, rows_of(linear, slice(self.first))))
-        return Departure(both.chi2 - before.chi2, self.dof, both.score, both.information)
+        return Departure(both.chi2 - before.chi2, self.dof, both.score, both.information, self.changes)
 
     def linear(self, z: np.ndarray, *, angles: bool = False) -> LinearSpots:
         """Both days at z, with columns for the coordinates and, behind them, for the changes or the looks' angles.
@@ -254,7 +280,8 @@ class WatchedLooks:
         if angles:
             shifts = self._of_angles(np.asarray(found.slope))
         else:
-            shifts = physical[:, :, _SHIFTED] * self._unit_sizes(at.value)
+            shifted = [COORDINATES[name] for change in self.changes for name in change.names]
+            shifts = physical[:, :, shifted] * self._unit_sizes(at.value)
             shifts[: self.first] = 0.0
         return linear_spots(found, self.problem.arrays, np.concatenate([own, shifts], axis=2))
 
@@ -271,14 +298,13 @@ class WatchedLooks:
             found[place, :, 2 * k : 2 * k + 2] = np.radians(1.0) * slope[place]
         return found
 
-    @staticmethod
-    def _unit_sizes(value: np.ndarray) -> np.ndarray:
-        """Physical values of a shift by one unit of `CHANGES`, shape (q,)."""
+    def _unit_sizes(self, value: np.ndarray) -> np.ndarray:
+        """Physical values of a shift by one unit of the changes, shape (q,)."""
         sizes = []
-        for change in CHANGES:
+        for change in self.changes:
             for name in change.names:
                 radians = np.radians(1.0) if "rotation_rad" in name else 1.0
-                sizes.append(0.01 * value[INDEX[name]] if change.unit == "%" else radians)
+                sizes.append(0.01 * value[COORDINATES[name]] if change.unit == "%" else radians)
         return np.array(sizes)
 
     def believed(self, seed: int) -> Believed:
@@ -298,7 +324,7 @@ def log_chances(believed: Believed, known: list[slice]) -> np.ndarray:
     found = []
     for departure in believed.drawn:
         left, own = departure.given(known), [log_chance(departure.chi2, departure.dof)]
-        for rows in COLUMNS:
+        for rows in departure.columns:
             chi2, dof = _test(left.score[rows], left.information[rows, rows])
             own.append(np.zeros(()) if rows in known or not dof else log_chance(chi2, dof))
         found.append(np.array(own))
@@ -309,9 +335,10 @@ def log_chances(believed: Believed, known: list[slice]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class NullDistribution:
-    """Least log p of all changes if nothing has moved, sorted, shape (draws,)."""
+    """Least log p of all changes if nothing has moved, sorted, shape (draws,); so many `tests` there are."""
 
     least: np.ndarray
+    tests: int
 
     @property
     def limit(self) -> float:
@@ -322,7 +349,7 @@ class NullDistribution:
         """Of a least log p like this; beyond the draws by Bonferroni's bound."""
         counted = np.searchsorted(self.least, log_p, side="right")
         if not counted:
-            return float(min(1 / len(self.least), len(CHANGES) * np.exp(log_p)))
+            return float(min(1 / len(self.least), self.tests * np.exp(log_p)))
         return float(counted / len(self.least))
 
 
@@ -333,11 +360,11 @@ def null_distribution(departure: Departure, seed: int) -> NullDistribution:
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     scores = generator.standard_normal((NULL_DRAWS, len(root))) @ root.T
     logs = [np.zeros(NULL_DRAWS)]
-    for rows in COLUMNS:
+    for rows in departure.columns:
         chi2, dof = _test(scores[:, rows], departure.information[rows, rows])
         if dof:
             logs.append(log_chance(chi2, dof))
-    return NullDistribution(np.sort(np.min(logs, axis=0)))
+    return NullDistribution(np.sort(np.min(logs, axis=0)), len(departure.changes))
 
 
 def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) -> list[float]:
@@ -354,7 +381,7 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
     from scipy import special
 
     generator, found = np.random.default_rng(seed), []
-    for change, rows in zip(CHANGES, COLUMNS, strict=True):
+    for change, rows in zip(departure.changes, departure.columns, strict=True):
         own = departure.information[rows, rows]
         dof = len(_directions(own)[0])
         if not dof:
@@ -371,18 +398,19 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
 def _moved(believed: Believed, limit: float) -> tuple[MovedPart, ...]:
     """Changes that explain the looks, the best first, each beyond what those before it explain."""
     known: list[slice] = []
-    while len(known) < len(COLUMNS):
+    places = believed.centre.columns
+    while len(known) < len(places):
         logs = log_chances(believed, known)[1:]
         best = int(np.argmin(logs))
         if logs[best] > limit:
             break
-        known.append(COLUMNS[best])
+        known.append(places[best])
     if not known:
         return ()
     rows = np.concatenate([np.arange(part.start, part.stop) for part in known])
     covariance = _inverse(believed.centre.information[np.ix_(rows, rows)])
     shift = Shift(covariance @ believed.centre.score[rows], covariance)
-    named = [(part, change.unit) for change in CHANGES for part in change.parts]
+    named = [(part, change.unit) for change in believed.centre.changes for part in change.parts]
     parts: list[MovedPart] = []
     start = 0
     for columns in known:
@@ -412,8 +440,8 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
     if usable < LOOKS_MIN:
         raise NothingToEstimate(
             "too-few-looks",
-            f"spots.csv: {usable} new looks can be used; a calibration is watched with at least {LOOKS_MIN}",
-            file="spots.csv",
+            f"{looks_file(looks)}: {usable} new looks can be used; a calibration is watched with at least {LOOKS_MIN}",
+            file=looks_file(looks),
             remedy="look at more places, or detect the refused spots again",
         )
     watched = WatchedLooks(fit, looks)
@@ -423,7 +451,7 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
     able = powers(believed.centre, null.limit, seed)
     changes = tuple(
         SeenChange(change.what, change.size, change.unit, power, float(np.exp(log_p)))
-        for change, power, log_p in zip(CHANGES, able, logs[1:], strict=True)
+        for change, power, log_p in zip(watched.changes, able, logs[1:], strict=True)
     )
     # All residuals together raise no alarm: much that moves nothing makes single looks bad.
     found = bool(logs[1:].min() <= null.limit)

@@ -214,6 +214,10 @@ class Spot:
     ruv_left: Annotated[float, _CORRELATION] = 0.0
     ruv_right: Annotated[float, _CORRELATION] = 0.0
 
+    def renumbered(self, number: int, move: int) -> Spot:
+        """The same with another id, after another move, of no experiment."""
+        return replace(self, spot=number, move=move, experiment=None, point=None)
+
 
 MOVES = CsvKind(
     Move,
@@ -519,6 +523,11 @@ def moves_bytes(moves: Iterable[Move]) -> bytes:
 def spots_bytes(spots: Iterable[Spot]) -> bytes:
     """The content of `spots.csv`; the correlations appear only where one is not zero."""
     return SPOTS.content(spots)
+
+
+def looks_file(campaign: Campaign) -> str:
+    """Name of the table of its looks."""
+    return SIGHTINGS.file if campaign.rig.mechanism.sightings else SPOTS.file
 
 
 def looks_bytes(campaign: Campaign, ordered: bool = False) -> bytes:

@@ -238,11 +238,6 @@ HEADLINES = tuple(quantity for quantity in QUANTITIES.values() if quantity.headl
 TARGETS = {quantity.target: quantity for quantity in HEADLINES if quantity.target}
 """Headlines that plans and studies are for, by the names that they have there."""
 TARGET_ROWS = {target: row for row, target in enumerate(TARGETS)}
-PRIOR_GROUPS: dict[str, list[int]] = {
-    cause: [INDEX[parameter.name] for parameter in _PARAMETERS if parameter.cause == cause]
-    for cause in dict.fromkeys(REGISTRY[name].cause for name in (*STEREO_PARAMETER_NAMES, *RIG_NAMES))
-}
-"""Coordinates of every prior that can be a cause of uncertainty, the stereo calibration first."""
 
 
 def names_of(*blocks: str) -> tuple[str, ...]:

@@ -105,10 +105,10 @@ def read_plan(path: Path, sheets: bool = True) -> tuple[PlanStep, ...]:
     return parse_plan(read_bytes(path, CSV_BYTES_MAX), escaped(Path(path).name), sheets)
 
 
-def write_plan(steps: Sequence[PlanStep], path: Path) -> None:
+def write_plan(steps: Sequence[PlanStep], path: Path, sheets: bool = True) -> None:
     """Writes `plan.csv` atomically; refuses what `read_plan` would refuse."""
     data = PLANS.content(steps)
-    parse_plan(data, escaped(Path(path).name))
+    parse_plan(data, escaped(Path(path).name), sheets)
     write_atomically(path, data)
 
 
@@ -125,8 +125,9 @@ class PlanBuilder:
         self.steps.append(PlanStep(len(self.steps), "home", pan, tilt))
 
     def place(self, target: str) -> None:
-        """Ask for a target."""
-        self.steps.append(PlanStep(len(self.steps), "place", target=target))
+        """Ask for a target; one without a name is looked at wherever it is."""
+        if target:
+            self.steps.append(PlanStep(len(self.steps), "place", target=target))
 
     def move(self, pan: int | None = None, tilt: int | None = None) -> None:
         """Move to absolute counters; nothing is ordered where they are reached already."""
@@ -257,7 +258,7 @@ def described(rig: Rig, steps: Sequence[PlanStep], before: Sequence[PlanStep] = 
         stops = pan[look.move], tilt[look.move]
         came = ", ".join(direction_of(axis, stop.sign) for axis, stop in zip(AXES, stops, strict=True))
         words.append(f"({stops[0].steps}, {stops[1].steps}) by {came}")
-    return f"{log.sheet}: " + "; ".join(words)
+    return f"{log.sheet}: ".removeprefix(": ") + "; ".join(words)
 
 
 def step_json(step: PlanStep) -> dict[str, object]:

@@ -5,6 +5,7 @@ Units are those of the names: mm, degrees, radians, px, s; counters in steps. No
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
@@ -102,6 +103,16 @@ class Rig:
     def sighting_sd_deg(self) -> float:
         """Standard uncertainty stated for simulated sightings."""
         return float(self.cameras.get("sighting_sd_deg", SIGHTING_SD_DEG))
+
+    @property
+    def look_sd(self) -> float:
+        """Standard uncertainty of a simulated look: px of a spot's centre, rad of a sighting."""
+        return math.radians(self.sighting_sd_deg) if self.table.mechanism.sightings else self.spot_sd_px
+
+    @property
+    def depths_mm(self) -> dict[str, float]:
+        """Of all that looks may be at: the sheets; a head that says where it points looks at one without a name."""
+        return {"": 1.0} if self.table.mechanism.sightings else self.sheets_mm
 
     @property
     def limits(self) -> CounterLimits:

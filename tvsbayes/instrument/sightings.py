@@ -8,7 +8,7 @@ are those of the light as it arrives. No JAX.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -62,6 +62,10 @@ class Sighting:
     @property
     def point(self) -> None:
         """As `experiment`."""
+
+    def renumbered(self, number: int, move: int) -> Sighting:
+        """The same with another id, after another move."""
+        return replace(self, sighting=number, move=move)
 
     @property
     def aperture_deg(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -126,9 +126,9 @@ class Allowed:
     notes: tuple[str, ...]
 
 
-def allowed(stated: CounterLimits) -> Allowed:
-    """What the rig file states, else the limits of the grid protocol."""
-    limits = stated.within(UNSTATED_STEPS)
+def allowed(stated: CounterLimits, widest: Mapping[str, tuple[int, int]]) -> Allowed:
+    """What the rig file states, else `widest`."""
+    limits = stated.within(widest)
     steps = np.array([limits[axis] for axis in AXES])
     if not stated.unstated:
         return Allowed(steps, ())
@@ -197,15 +197,18 @@ def candidates(knowledge: Knowledge) -> Candidates:
         InputError: no sheets, nothing that both cameras see, or limits too narrow for a run-up.
     """
     rig = knowledge.rig
-    if not rig.sheets_mm:
+    if not rig.depths_mm:
         remedy = "name the sheets and their X in mm in [sheets] of the rig file"
         raise InputError(
             "no-sheet", "the rig has no sheets to look at", file="rig.toml", column="sheets", remedy=remedy
         )
-    counters = allowed(rig.limits)
-    limits = counters.limits
     physical = np.asarray(physical_at(knowledge.z, knowledge.space).value)
     ratio = physical[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
+    reach = {axis: int(REACH_DEG / abs(r)) for axis, r in zip(AXES, ratio.tolist(), strict=True)}
+    # What no picture bounds goes as far as candidates do.
+    turns_round = {axis: (-steps, steps) for axis, steps in reach.items()}
+    counters = allowed(rig.limits, turns_round if rig.table.mechanism.sightings else UNSTATED_STEPS)
+    limits = counters.limits
     overshoot = overshoot_steps(knowledge)
     box = _box_in_view(knowledge, limits, ratio)
     turn = round(FULL_TURN_DEG / abs(float(ratio[0])))

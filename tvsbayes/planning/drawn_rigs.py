@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tvsbayes.instrument.parameters import RIG_NAMES
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, physical_at
 from tvsbayes.planning.expectation import PARAMETERS, Knowledge
@@ -51,7 +50,8 @@ class Instruments:
 def instruments_in(knowledge: Knowledge, truths: Sequence[Truth]) -> Instruments:
     """Coordinates of rigs under the ANALYSIS priors; what these hold fixed is held at its true value."""
     space = knowledge.space
-    true = np.array([[truth.parameters[name] for name in RIG_NAMES] for truth in truths]).reshape(-1, len(RIG_NAMES))
+    names = knowledge.rig.table.mechanism.rig_names
+    true = np.array([[truth.parameters[name] for name in names] for truth in truths]).reshape(-1, len(names))
     cameras = np.array([truth.stereo.vector for truth in truths]).reshape(len(true), -1)
     # A half-normal with u = 0 is 0 whatever its value; nothing else can be stated for it.
     held = np.where(np.asarray(space.u) > 0, np.asarray(space.value), true)

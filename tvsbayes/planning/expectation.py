@@ -96,7 +96,7 @@ class Knowledge:
     @property
     def sheets(self) -> tuple[str, ...]:
         """Names of the sheets, nearest first."""
-        return tuple(sorted(self.rig.sheets_mm, key=self.rig.sheets_mm.__getitem__))
+        return tuple(sorted(self.rig.depths_mm, key=self.rig.depths_mm.__getitem__))
 
     @property
     def gears_vary(self) -> bool:
@@ -193,12 +193,18 @@ def met_sheet(
     model: Model,
     moves: MoveArrays,
     depth_mm: Float[Array, " looks"],
-    image_px: Float[Array, "4"],
+    image_px: Float[Array, "4"] | None,
     look_moves: Int[Array, " looks"] | slice = slice(None),
 ) -> _MetSheet:
-    """Looks after some of the moves, by default after each, at sheets across X without an error of their own."""
+    """Looks after some of the moves, by default after each, at sheets across X without an error of their own.
+
+    Without images a head says where it points: its points are directions, and every one is seen.
+    """
     pan, tilt = mirror_angles(model.transmission, model.tilt_zero_rad, moves).angle_rad[look_moves].T
     ray = trace(model.optics, pan, tilt)
+    if image_px is None:
+        points = materialise(ray.direction).stacked()
+        return _MetSheet(points, jnp.all(jnp.isfinite(points), axis=0))
     turn = rotation_matrix(model.extrinsics.rotation_rad)
     ray = materialise(Ray(in_frame_s(model.extrinsics, ray.origin_mm), transform(turn, ray.direction)))
     reach = (depth_mm - ray.origin_mm.x) / ray.direction.x
@@ -214,7 +220,7 @@ def expect(
     space: ParameterSpace,
     arrays: CampaignArrays,
     depth_mm: Float[Array, " looks"],
-    image_px: Float[Array, "4"],
+    image_px: Float[Array, "4"] | None,
     turning: Float[Array, "looks 2 errors"],
 ) -> Expectation:
     """Expected looks on sheets at given depths X, linearised and whitened by the filter in time order.
@@ -224,7 +230,7 @@ def expect(
         space: priors.
         arrays: moves and looks; pixels and points are not read.
         depth_mm: X of each look's sheet in frame S.
-        image_px: largest (u, v, u, v) inside the images.
+        image_px: largest (u, v, u, v) inside the images; None of a head that says where it points.
         turning: how errors of the gears turn (pan, tilt), see `GearPlaces.turning`.
 
     Returns:
@@ -239,6 +245,8 @@ def expect(
         arrays,
         (jnp.where(seen, 1.0, 0.0), jnp.where(seen, met.points_mm, harmless).T),
     )
+    if image_px is None:
+        arrays = eqx.tree_at(lambda a: a.spots.tangents, arrays, tangents_at(arrays.spots.triangulated_mm))
     spots = arrays.spots
     lin = linearise(z, space, arrays)
     jacobian = jnp.where(NOISE_COLUMNS, 0.0, -lin.residual_jacobian)
@@ -255,6 +263,14 @@ def expect(
     return Expectation(rows, jacobian, lin.slope, given.load, given.keep, given.variance, seen, lin.mirror_angles_rad)
 
 
+def tangents_at(direction: Float[Array, "looks 3"]) -> Float[Array, "looks 2 3"]:
+    """Unit vectors along azimuth and elevation at directions, as `sightings.tangent_frames` has them of angles."""
+    x, y, _ = direction.T
+    level = jnp.maximum(jnp.hypot(x, y), 1e-9)
+    across = jnp.stack([-y / level, x / level, jnp.zeros_like(x)], axis=1)
+    return jnp.stack([across, jnp.cross(direction, across)], axis=1)
+
+
 def design_arrays(
     moves: Sequence[Move], look_moves: Sequence[int], rig: Rig, *, homed_from: int, aperture: bool
 ) -> CampaignArrays:
@@ -268,7 +284,7 @@ def design_arrays(
         SpotArrays(
             move_index=padded(look_moves, size, look_moves[-1], np.int32),
             pixels=padded(np.zeros((count, 4)), size),
-            whitening=padded(np.tile(np.eye(4) / rig.spot_sd_px, (count, 1, 1)), size, np.eye(4)),
+            whitening=padded(np.tile(np.eye(4) / rig.look_sd, (count, 1, 1)), size, np.eye(4)),
             aperture_rad=padded(np.zeros(count), size),
             has_aperture=padded([float(aperture)] * count, size),
             triangulated_mm=padded(np.zeros((count, 3)), size),
@@ -279,6 +295,7 @@ def design_arrays(
             new_segment=padded(new.new_segment, size, False, bool),
             homed=padded(new.homed, size, False, bool),
             hours=padded(new.hours, size),
+            tangents=padded(np.zeros((count, 2, 3)), size) if rig.table.mechanism.sightings else None,
         ),
         no_gears(size),
         placed(rig.table.aperture_convention == "azimuth"),
@@ -286,8 +303,10 @@ def design_arrays(
     )
 
 
-def largest_px(rig: Rig) -> np.ndarray:
-    """Largest (u, v, u, v) inside the images of a rig, shape (4,)."""
+def largest_px(rig: Rig) -> np.ndarray | None:
+    """Largest (u, v, u, v) inside the images of a rig, shape (4,); None of a head that says where it points."""
+    if rig.table.mechanism.sightings:
+        return None
     return np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
 
 
@@ -369,7 +388,7 @@ def information_of(
     rig = knowledge.rig
     log = _logged(steps, rig)
     look_moves = tuple(look.move for look in log.looks)
-    depth = np.array([rig.sheets_mm[log.targets[look.placement]] for look in log.looks])
+    depth = np.array([rig.depths_mm[log.targets[look.placement]] for look in log.looks])
     arrays = design_arrays(log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture)
     turning = knowledge.gears.turning_after(log.moves, look_moves)
     found = expected_information(arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space, turning)

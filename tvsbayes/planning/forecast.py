@@ -12,7 +12,7 @@ from tvsbayes.errors import TvsError
 from tvsbayes.estimators.four_point import classic, ratio_slopes, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, NAMES, RIG_NAMES, names_of
+from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, RIG_NAMES, names_of
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import Knowledge
@@ -58,7 +58,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
     pixels, steps, axes, local, stops, looks, spot_sds = [], [], [], [], [], [], []
     first = None
     for physical in instruments.physical[:CLASSIC_DRAWS]:
-        parameters = dict(zip(NAMES, map(float, physical), strict=True))
+        parameters = dict(zip(rig.table.mechanism.names, map(float, physical), strict=True))
         quiet = dict.fromkeys([*names_of("stop_sd_deg", "look_scatter_deg"), "pixel_scale"], 0.0)
         stereo = rig.stereo.with_vector(physical[len(RIG_NAMES) :])
         run = simulate(rig, plan, 0, Truth(with_derived({**parameters, **quiet}), stereo))

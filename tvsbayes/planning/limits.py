@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR
-from tvsbayes.instrument.parameters import NAMES, PRIOR_GROUPS, RIG_NAMES
+from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, described
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.planning.expectation import Knowledge
@@ -68,7 +68,7 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, f
         # What the campaign taught and its priors cannot be told apart here: `locate --budget` and `fit` do.
         parts["the campaign and its priors"] = float(pull @ knowledge.precision @ pull)
     else:
-        for name, columns in PRIOR_GROUPS.items():
+        for name, columns in knowledge.rig.table.mechanism.prior_groups.items():
             parts[name] = float(np.sum(pull[columns] ** 2))
         errors = np.split(pull[len(NAMES) :], 2)
         parts |= {
@@ -126,7 +126,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target:
     cause = next(iter(shares))
     if floor <= target.limit:
         return Limit(floor, cause, shares, True, None)
-    groups = PRIOR_GROUPS
+    groups = knowledge.rig.table.mechanism.prior_groups
     if (at_point := _needed_at_point(found, target)) is not None:
         return Limit(floor, cause, shares, False, at_point)
 

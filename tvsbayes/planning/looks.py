@@ -193,10 +193,10 @@ class _Pairs(eqx.Module):
 
 
 class _Eyes(eqx.Module):
-    """What takes the looks: largest (u, v, u, v) inside the images, noise of a spot, and the aperture; and when."""
+    """What takes the looks: largest (u, v, u, v) inside the images, noise of a look, and the aperture; and when."""
 
-    image_px: Float[Array, "4"]
-    spot_sd_px: Float[Array, ""]
+    image_px: Float[Array, "4"] | None
+    look_sd: Float[Array, ""]
     has_aperture: Float[Array, ""]
     azimuth_convention: Bool[Array, ""]
     warm_minutes: Float[Array, ""]
@@ -210,7 +210,7 @@ def _shown(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> _Shown:
         spot = SpotArrays(
             move_index=jnp.zeros(1, dtype=jnp.int32),
             pixels=jnp.zeros((1, 4)),
-            whitening=jnp.eye(4)[None] / eyes.spot_sd_px,
+            whitening=jnp.eye(4)[None] / eyes.look_sd,
             aperture_rad=jnp.zeros(1),
             has_aperture=eyes.has_aperture[None],
             triangulated_mm=jnp.zeros((1, 3)),
@@ -221,6 +221,7 @@ def _shown(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> _Shown:
             new_segment=jnp.ones(1, dtype=bool),
             homed=jnp.zeros(1, dtype=bool),
             hours=jnp.zeros(1),
+            tangents=jnp.zeros((1, 2, 3)) if eyes.image_px is None else None,
         )
         none = jnp.zeros(0, dtype=bool)
         gears = GearArrays(Places(jnp.zeros(0), none, none), jnp.zeros((1, 0)), jnp.zeros((1, 0)))
@@ -262,11 +263,12 @@ class LookArrays:
 
     def __init__(self, looks: Looks, knowledge: Knowledge, aperture: bool):
         rig, self.looks, self.space = knowledge.rig, looks, knowledge.space
-        self.depth_mm = np.array([rig.sheets_mm[name] for name in knowledge.sheets])[looks.sheet]
+        self.depth_mm = np.array([rig.depths_mm[name] for name in knowledge.sheets])[looks.sheet]
         azimuth = rig.table.aperture_convention == "azimuth"
         self.turning = knowledge.gears.turning(looks.steps, looks.side)
-        of_look = placed(rig.spot_sd_px), placed(float(aperture)), placed(azimuth), placed(knowledge.warm_minutes)
-        self.eyes = _Eyes(placed(largest_px(rig)), *of_look)
+        of_look = placed(rig.look_sd), placed(float(aperture)), placed(azimuth), placed(knowledge.warm_minutes)
+        image_px = largest_px(rig)
+        self.eyes = _Eyes(None if image_px is None else placed(image_px), *of_look)
 
     def _blocks(self, z: np.ndarray, value: np.ndarray, size: int) -> list[_Pairs]:
         """Every instrument (n,) with every look (m,), the last block filled up with its last pair."""

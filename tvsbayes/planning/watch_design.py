@@ -16,11 +16,10 @@ from itertools import combinations
 import numpy as np
 
 from tvsbayes.comparison.watched_looks import (
-    CHANGES,
-    COLUMNS,
     FALSE_ALARM_RATE,
     Departure,
     WatchedLooks,
+    columns_of,
     null_distribution,
     powers,
     rows_of,
@@ -98,7 +97,7 @@ class Pattern:
 def _rig_of(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> Rig:
     """What a campaign says of its rig: sheets where its spots lie, the usual costs."""
     sheets: dict[str, float] = {}
-    for name in dict.fromkeys(spot.target for spot in spots):
+    for name in () if campaign.rig.mechanism.sightings else dict.fromkeys(spot.target for spot in spots):
         own = [spot for spot, use in zip(spots, used, strict=True) if use and spot.target == name]
         if own:
             sheets[name] = float(np.median(triangulate(campaign.stereo, pixels_of(own))[:, 0]))
@@ -136,6 +135,7 @@ class WatchDesigns:
         later = again.problem.spots[again.first :]
         shift = max(spot.spot for spot in spots) + 1
         rows = {spot.spot - shift: again.first + place for place, spot in enumerate(later)}
+        self.changes = again.changes
         self._learn(again.linear(self.z), again.first, [rows[one.spot.spot] for one in self.candidates])
 
     @cached_property
@@ -152,7 +152,7 @@ class WatchDesigns:
         return np.array([known[axis] for axis in AXES])
 
     def _reachable(self, one: Candidate) -> bool:
-        if one.target not in self.rig.sheets_mm:
+        if one.target not in self.rig.depths_mm:
             return False
         start = np.array(one.steps) - np.array(one.side) * self._overshoot
         both = np.stack([np.array(one.steps), start])
@@ -163,7 +163,7 @@ class WatchDesigns:
         errors = linear.places.shape[2]
         self.own = len(NAMES)
         spelled = linear.spelled_out(linear.places)
-        shifts = COLUMNS[-1].stop
+        shifts = columns_of(self.changes)[-1].stop
         fisher = stop_information(rows_of(spelled, slice(first))).fisher
         keep = np.r_[: self.own, self.own + shifts : self.own + shifts + errors]
         self.known = fisher[np.ix_(keep, keep)] + np.eye(len(keep))
@@ -183,7 +183,7 @@ class WatchDesigns:
         self.shifts = shifts
         generator = np.random.default_rng([self.seed, 5])
         self._ways = []
-        for change in CHANGES:
+        for change in self.changes:
             ways = generator.standard_normal((DIRECTIONS, len(change.names)))
             self._ways.append(change.size * ways / np.linalg.norm(ways, axis=1, keepdims=True))
 
@@ -210,13 +210,13 @@ class WatchDesigns:
     def powers(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:
         """Of every change, at a limit by Bonferroni's bound."""
         information = self.information(pattern, homings, also_before)
-        departure = Departure(0.0, 0, np.zeros(len(information)), information)
-        return np.array(powers(departure, np.log(FALSE_ALARM_RATE / len(CHANGES)), self.seed))
+        departure = Departure(0.0, 0, np.zeros(len(information)), information, self.changes)
+        return np.array(powers(departure, np.log(FALSE_ALARM_RATE / len(self.changes)), self.seed))
 
     def _worth(self, pattern: Pattern, homings: float) -> float:
         """What patterns are chosen by: logs of the noncentralities that are too small, over directions and changes."""
         information, total = self.information(pattern, homings), 0.0
-        for rows, ways in zip(COLUMNS, self._ways, strict=True):
+        for rows, ways in zip(columns_of(self.changes), self._ways, strict=True):
             seen = np.einsum("ni,ij,nj->n", ways, information[rows, rows], ways) / ENOUGH
             total += float(np.mean(np.minimum(np.log(np.maximum(seen, 1e-12)), 0.0)))
         return total
@@ -272,7 +272,7 @@ class WatchDesigns:
         log = run_plan([step for step, _ in ordered], self.rig)
         seen = [spot for _, spot in ordered if spot is not None]
         spots = tuple(
-            replace(spot, spot=number, move=look.move, experiment=None, point=None)
+            spot.renumbered(number, look.move)
             for number, (spot, look) in enumerate(zip(seen, log.looks, strict=True))
         )
         planned = replace(self.fit.campaign, moves=tuple(log.moves), spots=spots)

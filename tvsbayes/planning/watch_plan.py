@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.comparison.watched_looks import CHANGES, FALSE_ALARM_RATE, LOOKS_MIN, POWER_MIN
+from tvsbayes.comparison.watched_looks import FALSE_ALARM_RATE, LOOKS_MIN, POWER_MIN
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.rig import Rig
@@ -108,7 +108,7 @@ def _at_once(tried: _Tried, wanted: np.ndarray) -> bool:
 
 def _most(every: list[_Tried], minutes: float) -> np.ndarray:
     """The largest set of changes that a plan within the budget notices, as a mask."""
-    best, best_key = np.zeros(len(CHANGES), dtype=bool), (-1, -1.0)
+    best, best_key = np.zeros(every[0].powers.shape[1], dtype=bool), (-1, -1.0)
     for tried in every:
         for powers in tried.powers[tried.allowed(minutes)]:
             seen = powers >= POWER_MIN
@@ -175,10 +175,10 @@ def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTE
 
 def _changes(designs: WatchDesigns, every: list[_Tried], judged: list[float]) -> tuple[PlannedChange, ...]:
     """What the plan notices of every change, and what each by itself would take."""
-    alone = [_fewest(designs, every, np.arange(len(CHANGES)) == number) for number in range(len(CHANGES))]
-    added = _to_add(designs, every) if None in alone else [None] * len(CHANGES)
+    alone = [_fewest(designs, every, mask) for mask in np.eye(len(designs.changes), dtype=bool)]
+    added = _to_add(designs, every) if None in alone else [None] * len(alone)
     found = []
-    for change, power, need, more in zip(CHANGES, judged, alone, added, strict=True):
+    for change, power, need, more in zip(designs.changes, judged, alone, added, strict=True):
         told = change.what, change.size, change.unit, power
         if need is None:
             found.append(PlannedChange(*told, None, None, None, more))
@@ -190,7 +190,7 @@ def _changes(designs: WatchDesigns, every: list[_Tried], judged: list[float]) ->
 
 def _to_add(designs: WatchDesigns, every: list[_Tried]) -> list[int | None]:
     """Looks that the campaign and every watch must have more before each change is noticed, to the next rung."""
-    fewest: list[int | None] = [None] * len(CHANGES)
+    fewest: list[int | None] = [None] * len(designs.changes)
     for tried in every:
         for homings in RUNGS:
             looks, seen = tried.looks(int(homings)), designs.powers(tried.pattern, float(homings), True) >= POWER_MIN

@@ -76,7 +76,8 @@ def sizes_table(found: Verification) -> TableView:
         columns += [f"RMS at {at.distance_mm:.10g} mm, mm", "worst, mm"]
         for row, size in zip(rows, (at.before, at.after), strict=True):
             row += [two_digits(size.rms), two_digits(size.worst)]
-    return TableView(f"errors, {escaped(found.unit)}{' of the mirrors, and of points' if at else ''}", columns, rows)
+    of = " of both axes" * found.looks + ", and of points" * (at is not None)
+    return TableView(f"errors, {escaped(found.unit)}{of}", columns, rows)
 
 
 def _promised(found: Verification) -> str:
@@ -114,7 +115,7 @@ def verification_text(found: Verification) -> str:
     """A verification for people."""
     p = "< 0.0003" if found.p < 3e-4 else f"= {found.p:.2g}"
     rows = [[name, f"{100 * chance:.1f} %"] for name, chance in found.worlds.items()]
-    axis = found.millimetres is None
+    axis = not found.looks
     what = (
         f"{found.readings} readings under the table" if axis else f"{found.readings} looks that the calibration aimed"
     )
@@ -128,7 +129,7 @@ def verification_text(found: Verification) -> str:
         *found.remarks,
     ]
     if found.verdict == BROKEN:
-        remedies = REMEDIES if found.millimetres is None else REMEDIES | SCANNER_REMEDIES
+        remedies = REMEDIES if axis else REMEDIES | SCANNER_REMEDIES
         lines.append(f"what to do: {remedies[found.world]}")
     elif found.verdict == CANNOT_TELL and found.needed is None:
         lines.append(

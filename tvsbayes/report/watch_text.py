@@ -13,6 +13,10 @@ HELPS = {
     "cameras: shift": "more looks on both sheets, over the whole picture",
     "positioner: rotation": "more homings, each with its looks: what a homing leaves open looks the same",
     "positioner: shift": "looks on both sheets at more counters",
+    "zero: azimuth": "more homings, each with its sightings: what a homing leaves open looks the same",
+    "zero: elevation": "more homings, each with its sightings: what a homing leaves open looks the same",
+    "base: lean": "sightings all round, in opposite azimuths",
+    "beam: not square": "sightings low and high, at the same azimuths",
     "ratio: pan": "pan counters further apart, each reached several times",
     "ratio: tilt": "tilt counters further apart, each reached several times",
     "play: pan": "each pan counter from both sides, several times",
@@ -24,6 +28,9 @@ LINEAR = {"deg": 1.0, "mm": 10.0}
 MISSED = {
     "cameras": "calibrate the cameras anew, then the rig",
     "positioner": "fasten it and calibrate anew; coordinates are off by what is told above until then",
+    "zero": "look for a homing switch or a coupling that slipped, then calibrate anew",
+    "base": "fasten it and calibrate anew",
+    "beam": "fasten camera or telescope on the head, then calibrate anew",
     "ratio": "look for a slipping gear or lost steps, then calibrate anew",
     "play": "look for wear or a loose grub screw, then calibrate anew",
 }

@@ -167,9 +167,10 @@ class Verification(Shown, Record, frozen=True, kw_only=True):
         promised95: 95 % of errors are at most so large, of these stops, by the promise.
         readings: how many were used; of a scanner looks, each of which shows both axes.
         millimetres: the same of points; of a scanner alone.
-        unit: of errors; with `needed` and `remarks` no part of the document.
+        unit: of errors; with `needed`, `remarks` and `looks` no part of the document.
         needed: readings that would tell; None where no number does, 0 where these do.
         remarks: what else is to be said, in sentences.
+        looks: these are looks of two axes that a calibration aimed.
     """
 
     verdict: Verdict
@@ -183,7 +184,8 @@ class Verification(Shown, Record, frozen=True, kw_only=True):
     unit: str = ""
     needed: int | None = 0
     remarks: tuple[str, ...] = ()
-    beside: ClassVar = ("unit", "needed", "remarks")
+    looks: bool = False
+    beside: ClassVar = ("unit", "needed", "remarks", "looks")
 
     def as_json(self) -> dict[str, Any]:
         """The document; an axis has no points."""

@@ -1,0 +1,178 @@
+"""A head whose fit is known: its model corrected, fresh looks verified and watched, what to look at next."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from support.commands import assert_error
+
+from tvsbayes.head.urdf import head_joints
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import read_campaign, write_campaign
+from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
+from tvsbayes.instrument.parameters import Prior, names_of
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, read_plan
+from tvsbayes.instrument.rig import Rig, RigTable
+from tvsbayes.instrument.stereo_pair import NO_STEREO
+from tvsbayes.pipeline import calibrate
+from tvsbayes.planning.expectation import information_of, prior_knowledge
+from tvsbayes.planning.looks import covariance_of
+from tvsbayes.twin.head_physics import head_beam
+from tvsbayes.twin.simulated_campaign import simulate
+
+UNIT = (Path(__file__).parent / "unit.urdf").read_bytes()
+RATIO = 0.045
+PLACES = [(pan, tilt) for pan in (-1500, -500, 600, 1400) for tilt in (-300, 200, 700, 1200)]
+
+
+def head_rig() -> Rig:
+    """A head of 0.045 deg a step with an error of a hundredth of it, and sightings of 0.005 deg."""
+    ratios = dict.fromkeys(names_of("degrees_per_step"), Prior(RATIO, 0.01 * RATIO))
+    nominal = head_joints(UNIT, "unit.urdf", {"pan": None, "tilt": None}).terms
+    terms = {name: Prior(value, 0.3) for name, value in nominal.items() if name in SIGHTING_HEAD.told}
+    table = RigTable({**ratios, **terms}, mechanism=SIGHTING_HEAD)
+    costs = {"move_s": 1.5, "look_s": 1.0}
+    return Rig(table, NO_STEREO, dict(table.priors), {}, {}, {"sighting_sd_deg": 0.005}, costs)
+
+
+def rounds() -> tuple[PlanStep, ...]:
+    """Every place twice, in orders of their own."""
+    rng, plan = np.random.default_rng(7), PlanBuilder()
+    plan.home()
+    for _ in range(2):
+        for place in rng.permutation(len(PLACES)).tolist():
+            plan.move(*PLACES[place])
+            plan.look()
+    return tuple(plan.steps)
+
+
+@pytest.fixture(scope="module")
+def known_head(tmp_path_factory):
+    """Folder of a campaign with accepted results, its model beside it; and the true head."""
+    folder = tmp_path_factory.mktemp("head")
+    simulated = simulate(head_rig(), rounds(), 11)
+    header = {"urdf": {"pan_joint": "pan_joint", "tilt_joint": "tilt_joint", "steps_per_turn": 400.0}}
+    simulated.campaign.header.update(header)
+    simulated.write(folder)
+    (folder / "head.urdf").write_bytes(UNIT)
+    results = calibrate(simulated.campaign, folder / "results", tier="importance")
+    assert results.record.summary.answer == "accepted"
+    return folder, simulated.truth
+
+
+def fresh(truth, steps, folder, seed=5, counters=lambda pan, tilt: (pan, tilt)):
+    """Looks of the same head; its campaign says other counters than the motors got where they were not corrected."""
+    plan = [
+        replace(step, **dict(zip(("pan_steps", "tilt_steps"), counters(step.pan_steps, step.tilt_steps), strict=True)))
+        if step.action == "move"
+        else step
+        for step in steps
+    ]
+    campaign = simulate(head_rig(), plan, seed, truth).campaign
+    stated = iter([step for step in steps if step.action in ("home", "move")])
+    moves = tuple(
+        replace(move, pan_steps=step.pan_steps or 0, tilt_steps=step.tilt_steps or 0)
+        for move, step in zip(campaign.moves, stated, strict=True)
+    )
+    write_campaign(replace(campaign, moves=moves), folder)
+    return folder
+
+
+def direction(head, pan_deg, tilt_deg):
+    """Azimuth and elevation, deg, by the twin's optics."""
+    tilt = np.radians(tilt_deg + head["elevation_zero_deg"])
+    _, beam = head_beam(np.radians(pan_deg), tilt, {"tangent_flexure_deg": 0.0, **head})
+    return np.degrees([np.arctan2(beam[1], beam[0]), np.arcsin(beam[2])])
+
+
+def test_a_model_is_corrected_and_says_so(ask, known_head, tmp_path):
+    folder, truth = known_head
+    out = tmp_path / "new.urdf"
+    code, document = ask("compensate", folder, "--to", "urdf", "-o", out)
+    assert code == 0 and document["files"] == {"urdf": str(out), "yaml": f"{out}.yaml"}
+    kept = yaml.safe_load((tmp_path / "new.urdf.yaml").read_text())
+    u = dict(zip(kept["names"], np.sqrt(np.diag(kept["covariance"])), strict=True))
+    found = head_joints(out.read_bytes(), "new.urdf", dict.fromkeys(AXES)).terms
+    for name in ("azimuth_axis_tilt_deg.north", "axes_not_square_deg", "azimuth_zero_deg"):
+        assert abs(found[name] - truth.parameters[name]) < 4 * u[name], name
+    again = tmp_path / "again"
+    again.mkdir()
+    for path in folder.rglob("*"):
+        if path.is_file():
+            place = again / path.relative_to(folder)
+            place.parent.mkdir(exist_ok=True)
+            place.write_bytes(path.read_bytes())
+    (again / "head.urdf").write_bytes(out.read_bytes())
+    assert_error(ask("compensate", again, "--to", "urdf")[1], "applied")
+    code, document = ask("compensate", folder, "--to", "csv")
+    assert code == 2 and "--to urdf" in document["error"]["remedy"]
+
+
+@pytest.mark.parametrize("applied", [True, False])
+def test_fresh_looks_say_whether_the_calibration_acts(ask, known_head, tmp_path, applied):
+    """Not applied: the motors get the counters of the nominal head for the directions that were meant."""
+    folder, truth = known_head
+    assert ask("plan", folder, "--verify", "-o", tmp_path / "plan.csv")[0] == 0
+    steps = read_plan(tmp_path / "plan.csv", sheets=False)
+    priors = read_campaign(folder).rig.priors
+    true, nominal = truth.parameters, {name: prior.value for name, prior in priors.items()}
+
+    def sent(pan, tilt):
+        aim = direction(true, true["degrees_per_step.pan"] * pan, true["degrees_per_step.tilt"] * tilt)
+        angles = np.zeros(2)
+        for _ in range(10):
+            angles += np.degrees(np.angle(np.exp(1j * np.radians(aim - direction(nominal, *angles)))))
+        return tuple(np.round(angles / RATIO).astype(int).tolist())
+
+    looks = fresh(truth, steps, tmp_path / "fresh", counters=(lambda *n: n) if applied else sent)
+    code, document = ask("verify", folder, looks)
+    assert (code, document["verdict"]) == ((0, "KEPT") if applied else (1, "BROKEN"))
+    world = max(document["worlds"], key=document["worlds"].get)
+    assert world == ("applied" if applied else "not applied") and "millimetres" not in document
+    assert ask("verify", folder, looks, "--distance-mm", "500")[0] == 2
+
+
+def test_what_moved_is_named(ask, say, known_head, tmp_path):
+    folder, truth = known_head
+    plan = rounds()
+    code, document = ask("watch", folder, fresh(truth, plan, tmp_path / "still"))
+    assert document["verdict"] != "MOVED" and {c["what"] for c in document["changes"]} >= {"base: lean", "play: tilt"}
+    leaning = {**truth.parameters, "azimuth_axis_tilt_deg.east": truth.parameters["azimuth_axis_tilt_deg.east"] + 0.5}
+    moved = fresh(replace(truth, parameters=leaning), plan, tmp_path / "leaning")
+    code, document = ask("watch", folder, moved)
+    assert (code, document["verdict"]) == (1, "MOVED")
+    part = document["moved"][0]
+    assert part["what"] == "base: lean to azimuth 90" and abs(part["value"] - 0.5) < 4 * part["u"]
+    assert "fasten it" in say("watch", folder, moved)[1]
+
+
+def test_plan_of_a_watch_needs_no_sheet(ask, known_head, tmp_path):
+    folder, _ = known_head
+    code, document = ask("plan", folder, "--watch", "--minutes", 3, "-o", tmp_path / "looks.csv")
+    assert code == 0 and document["looks"] >= 4
+    steps = read_plan(tmp_path / "looks.csv", sheets=False)
+    assert {step.action for step in steps} == {"home", "move", "look"}
+
+
+def test_a_plan_foretells_what_the_fit_reports(known_head):
+    """The covariance expected of the plan that was run, beside that of its fit: within a third, with 32 looks."""
+    folder, _ = known_head
+    knowledge = prior_knowledge(head_rig())
+    plan = rounds()
+    expected = covariance_of(
+        (
+            known := knowledge.with_gears(np.array([(s.pan_steps, s.tilt_steps) for s in plan if s.action == "move"]))
+        ).precision
+        + information_of(plan, known).fisher
+    )
+    summary = json.loads((folder / "results" / "fit.json").read_text())["parameters"]
+    names, space = head_rig().table.mechanism.names, known.space
+    for name in ("azimuth_axis_tilt_deg.north", "axes_not_square_deg"):
+        k = names.index(name)
+        sd = float(np.sqrt(expected[k, k]) * np.asarray(space.u)[k])
+        assert 2 / 3 < sd / summary[name]["sd"] < 3 / 2, (name, sd, summary[name]["sd"])
