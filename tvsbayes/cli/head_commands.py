@@ -107,8 +107,8 @@ def import_urdf(
         log = "moves and sightings" if kind is SIGHTING_HEAD else "moves and spots"
         said = f"written: {escaped(str(to), 200)}\nnext: log {log} there, then `tvsbayes check {typed(to)}`"
     document = {"campaign": str(to), "joints": dict(head.names), "signs": dict(head.sign), "assumed": assumed}
-    document |= {"nominal": {name: prior.value for name, prior in priors.items()}, "written": yes}
-    finish({**document, "files": list(files) if yes else []}, "\n".join([*lines, said]), as_json)
+    document |= {"nominal": {name: prior.value for name, prior in priors.items()}}
+    finish({**document, "written": yes, "files": list(files) if yes else []}, "\n".join([*lines, said]), as_json)
 
 
 def _urdf_files(
@@ -172,7 +172,8 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
         data_sha256=hashlib.sha256("".join(input_hashes(data).values()).encode()).hexdigest(),
         steps_per_turn=known.get("steps_per_turn"),
     )
-    place, joints = folder / HEAD_URDF, {axis: known.get(f"{axis}_joint") for axis in AXES}
+    place = folder / HEAD_URDF
+    joints: dict[str, str | None] = {axis: known.get(f"{axis}_joint") for axis in AXES}
     head = head_joints(read_bytes(place, URDF_BYTES_MAX, folder), HEAD_URDF, joints) if place.is_file() else None
     text, document = model.urdf(head), model.document(head)
     lines = [f"{name} {concise(v, u)}" for name, v, u in zip(model.names, model.values, document["u"], strict=True)]

@@ -387,8 +387,8 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
     if b"xmlns:xacro" not in root:
         root = root[:-1] + b' xmlns:xacro="http://www.ros.org/wiki/xacro">'
     edits.append((head.urdf.root.begin, head.urdf.root.end, root + b"\n" + block.rstrip().encode()))
-    for begin, end, text in sorted(edits, reverse=True):
-        data = data[:begin] + text + data[end:]
+    for begin, end, written in sorted(edits, reverse=True):
+        data = data[:begin] + written + data[end:]
     return data
 
 
@@ -474,7 +474,7 @@ class HeadModel:
         Raises:
             InputError: the URDF has these data's correction already.
         """
-        sign = {axis: 1 for axis in AXES} if head is None else head.sign
+        sign: Mapping[str, int] = {"pan": 1, "tilt": 1} if head is None else head.sign
         said = "\n".join(f"       {line.replace('--', '- -')}" for line in (self.origin, *UNSAID))
         block = f"  <!--\n{said}\n  -->\n" if head is None else ""
         properties = self.properties(sign)
@@ -487,7 +487,7 @@ class HeadModel:
             message = "head.urdf has the correction by these data already: it is not applied twice"
             raise InputError("applied", message, remedy="use it, then `tvsbayes verify` it with fresh looks")
         ratios = {} if self.steps_per_turn is None else dict(zip(self.names, self.values.tolist(), strict=True))
-        reductions = {}
+        reductions: dict[str, float] = {}
         for axis in AXES:
             stated = head.reduction(axis)
             if ratios and stated is not None:
@@ -497,7 +497,7 @@ class HeadModel:
 
     def document(self, head: HeadJoints | None) -> dict[str, Any]:
         """The same for programs, with the covariance; units of the names."""
-        sign = {axis: 1 for axis in AXES} if head is None else head.sign
+        sign: Mapping[str, int] = {"pan": 1, "tilt": 1} if head is None else head.sign
         joints = {
             axis: {
                 "name": axis if head is None else head.names[axis],
