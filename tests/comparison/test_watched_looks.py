@@ -17,6 +17,7 @@ from tvsbayes.comparison.watched_looks import (
     CHANGES,
     COLUMNS,
     FALSE_ALARM_RATE,
+    SIGHTED_CHANGES,
     Believed,
     Departure,
     WatchedLooks,
@@ -166,5 +167,5 @@ def test_the_command_keeps_a_table(mounted_rig, mixed_fit, truth, tmp_path, monk
     document = json.loads(capsys.readouterr().out)
     assert (document["verdict"], document["error"]["code"]) == ("CANNOT TELL", "header")
     assert (tmp_path / "other.csv").read_text() == "night,what\n"
-    assert set(HELPS) == {change.what for change in CHANGES}
-    assert set(MISSED) == {change.what.split(":")[0] for change in CHANGES}
+    assert set(HELPS) == {change.what for change in (*CHANGES, *SIGHTED_CHANGES)}
+    assert set(MISSED) == {what.split(":")[0] for what in HELPS}

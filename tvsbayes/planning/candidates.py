@@ -204,10 +204,12 @@ def candidates(knowledge: Knowledge) -> Candidates:
         )
     physical = np.asarray(physical_at(knowledge.z, knowledge.space).value)
     ratio = physical[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
-    reach = {axis: int(REACH_DEG / abs(r)) for axis, r in zip(AXES, ratio.tolist(), strict=True)}
-    # What no picture bounds goes as far as candidates do.
-    turns_round = {axis: (-steps, steps) for axis, steps in reach.items()}
-    counters = allowed(rig.limits, turns_round if rig.table.mechanism.sightings else UNSTATED_STEPS)
+    widest: Mapping[str, tuple[int, int]] = UNSTATED_STEPS
+    if rig.table.mechanism.sightings:
+        # What no picture bounds goes as far as candidates do.
+        reach = {axis: int(REACH_DEG / abs(r)) for axis, r in zip(AXES, ratio.tolist(), strict=True)}
+        widest = {axis: (-steps, steps) for axis, steps in reach.items()}
+    counters = allowed(rig.limits, widest)
     limits = counters.limits
     overshoot = overshoot_steps(knowledge)
     box = _box_in_view(knowledge, limits, ratio)
