@@ -165,32 +165,32 @@ def calibrate(
         require_writable(place)
     fitting = {FITTING: sum(fit_stages(model.robust, campaign.moves).values())}
     with Job(fitting | _later_stages(sampled, tier, place), progress) as job:
-        found = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))
+        joint = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))
         posterior, files = None, {}
         # A sample of what must not be used anyway would only take time.
-        if sampled and worth_sampling(found):
+        if sampled and worth_sampling(joint):
             from tvsbayes.posterior.sampling import sample
 
             if place is not None:
                 make_folder(place)
             shown = job.part(SAMPLING)
             if tier == "importance":
-                posterior = sample(found, tier, seed=seed, progress=shown)
+                posterior = sample(joint, tier, seed=seed, progress=shown)
             else:
                 posterior = sample(
-                    found,
+                    joint,
                     tier,
                     max_minutes=max_minutes,
                     seed=seed,
                     checkpoint=None if place is None else place / "chain.npz",
                     resume=resume,
                     progress=shown,
-                    first=None if first is None else lambda early: first(summarise(found, early)),
+                    first=None if first is None else lambda early: first(summarise(joint, early)),
                 )
                 job.begin(FILING)
                 files = _posterior_files(posterior, place, tell)
         job.begin(SUMMARISING)
-        return _results(found, posterior, seed, place, files, tell)
+        return _results(joint, posterior, seed, place, files, tell)
 
 
 def _later_stages(sampled: bool, tier: str, folder: Path | None) -> dict[str, float]:
@@ -287,8 +287,8 @@ def evidence_of(
     axes = []
     for axis in AXES:
         contrast = physical[:, fit.names.index(f"ratio_contrast_deg_per_step.{axis}")]
-        own = stop_readings(fit, axis)
-        axes.append(positioning(calibration, axis, readings=own, contrast_deg_per_step=contrast))
+        readings = stop_readings(fit, axis)
+        axes.append(positioning(calibration, axis, readings=readings, contrast_deg_per_step=contrast))
     return FitEvidence(listed, causes, gaps if any(gaps.values()) else None, budgets, tuple(axes))
 
 
@@ -441,9 +441,9 @@ def verify(
 
     calibration = accepted_calibration(campaign)
     with Job({FITTING: 1.0, "verification": 2.0}, progress) as job:
-        found = StoredOrFitted(campaign, tell, job.part(FITTING)).fit
+        joint = StoredOrFitted(campaign, tell, job.part(FITTING)).fit
         job.begin("verification")
-        return verify_looks(found, calibration, looks, distance_mm=distance_mm, seed=seed)
+        return verify_looks(joint, calibration, looks, distance_mm=distance_mm, seed=seed)
 
 
 def _why_not_stored(campaign: Campaign) -> str:
@@ -460,9 +460,9 @@ def _why_not_stored(campaign: Campaign) -> str:
             else "there are no results/ yet"
         )
     record = read_fit(path)
-    now, told = input_hashes(campaign), record.provenance
-    others = [HASHED[name] for name in HASHED if told.inputs.get(name) != now[name]]
-    made_by = told.versions["tvsbayes"]
+    now, stored = input_hashes(campaign), record.provenance
+    others = [HASHED[name] for name in HASHED if stored.inputs.get(name) != now[name]]
+    made_by = stored.versions["tvsbayes"]
     if others == [HASHED["rig"]] and made_by != provenance(now, 0).versions["tvsbayes"]:
         return f"results/ are of tvsbayes {escaped(made_by, 40)}, which modelled less of the rig, or of another [rig]"
     if others:

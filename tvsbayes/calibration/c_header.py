@@ -70,8 +70,8 @@ def _origin_lines(calibration: Calibration, origin: Origin | None) -> str:
     name = _UNCOMMENTED.sub("_", origin.campaign)
     sha256 = content_sha256(cast(Mapping[str, object], calibration_json(calibration)))
     measured = origin.measured or "on a day that nobody recorded"
-    told = f"Campaign: {name}, measured {measured}; exported {origin.exported} by tvsbayes {origin.tvsbayes}."
-    return f" * {told}\n * SHA-256 of the same calibration as JSON, without its origin: {sha256}."
+    sentence = f"Campaign: {name}, measured {measured}; exported {origin.exported} by tvsbayes {origin.tvsbayes}."
+    return f" * {sentence}\n * SHA-256 of the same calibration as JSON, without its origin: {sha256}."
 
 
 def _header_gears(calibration: Calibration) -> list[str]:

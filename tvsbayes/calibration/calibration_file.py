@@ -153,8 +153,8 @@ class Origin:
 
 def content_sha256(document: Mapping[str, object]) -> str:
     """SHA-256 of an exported calibration, whoever exports it and when."""
-    said = {key: value for key, value in document.items() if key != "origin"}
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+    content = {key: value for key, value in document.items() if key != "origin"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def calibration_json(calibration: Calibration, origin: Origin | None = None) -> CalibrationDocument:
@@ -181,7 +181,7 @@ def _document(calibration: Calibration) -> CalibrationDocument:
         },
         "noise_variance_deg2": dict(calibration.noise_variance),
         "overshoot_steps": dict(calibration.overshoot_steps),
-        "range_steps": {axis: list(seen) for axis, seen in calibration.seen_steps.items()},
+        "range_steps": {axis: list(steps) for axis, steps in calibration.seen_steps.items()},
         "gear_errors": gear_errors(calibration),
         "inputs": dict(calibration.inputs_sha256),
         "expected_error": asdict(expected_error(calibration)),
@@ -197,12 +197,12 @@ def gear_errors(calibration: Calibration) -> dict[str, GearErrors]:
     """The table by axis; empty where gears do not vary."""
     first, table = len(INPUT_NAMES), calibration.gears
     u = np.sqrt(np.maximum(np.diag(calibration.covariance)[first:], 0.0))
-    found: dict[str, GearErrors] = {}
+    errors: dict[str, GearErrors] = {}
     for axis, steps in zip(AXES, table.steps, strict=True):
         if not table.size:
             break
         error, play = (table.parts[f"{kind}.{axis}"] for kind in (ERROR_AT, PLAY_AT))
-        found[axis] = {
+        errors[axis] = {
             "steps": list(steps),
             "transmission_error_deg": calibration.mean[first:][error][:-1].tolist(),
             "u_transmission_error_deg": u[error][:-1].tolist(),
@@ -211,7 +211,7 @@ def gear_errors(calibration: Calibration) -> dict[str, GearErrors]:
             "beyond_u_transmission_error_deg": float(u[error][-1]),
             "beyond_u_play_variation_deg": float(u[play][-1]),
         }
-    return found
+    return errors
 
 
 @dataclass(frozen=True)

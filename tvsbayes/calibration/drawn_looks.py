@@ -50,10 +50,10 @@ def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
     generator = np.random.default_rng([seed, 6])
     # Fewer draws than are stored: evenly chosen; more: all, again and again, with new noises.
     chosen = np.arange(draws) % stored if draws > stored else np.linspace(0, stored - 1, draws).astype(int)
-    own, gears = np.split(calibration.inputs[chosen], [len(INPUT_NAMES)], axis=1)
+    inputs, gears = np.split(calibration.inputs[chosen], [len(INPUT_NAMES)], axis=1)
     normal = generator.standard_normal((draws, NOISES))
     noise = np.column_stack([normal[:, :2], generator.uniform(-0.5, 0.5, (draws, 2)), normal[:, 4]])
-    return Drawn(np.concatenate([own, calibration.noise[chosen]], axis=1), gears, noise)
+    return Drawn(np.concatenate([inputs, calibration.noise[chosen]], axis=1), gears, noise)
 
 
 def noise_of_a_look(values: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -61,9 +61,9 @@ def noise_of_a_look(values: Mapping[str, np.ndarray]) -> np.ndarray:
 
     Without a scatter of looks among them, as in results before 0.3.0, there is none.
     """
-    found = [values[name] for name in NOISE_NAMES]
+    variances = [values[name] for name in NOISE_NAMES]
     for axis, sides in SIDES.items():
         for side in sides:
             place = NOISE_NAMES.index(f"stop_sd_deg.{side}")
-            found[place] = np.hypot(found[place], values.get(f"look_scatter_deg.{axis}", 0.0))
-    return np.stack(found, axis=-1)
+            variances[place] = np.hypot(variances[place], values.get(f"look_scatter_deg.{axis}", 0.0))
+    return np.stack(variances, axis=-1)

@@ -65,9 +65,9 @@ def in_cameras(ray: np.ndarray, extrinsics: np.ndarray, frame: str) -> np.ndarra
 def camera_slopes(ray: np.ndarray, extrinsics: np.ndarray, frame: str) -> np.ndarray:
     """Derivatives of `in_cameras` by the ray, then by the extrinsics, shape (6, 12)."""
     turn = camera_rotation(extrinsics, frame)
-    found = np.zeros((6, 12))
-    found[:3, :3] = found[3:, 3:6] = turn
+    slopes = np.zeros((6, 12))
+    slopes[:3, :3] = slopes[3:, 3:6] = turn
     for column, step in enumerate(ROTATION_STEP_RAD * np.eye(6)):
         ends = [in_cameras(ray, extrinsics + sign * step, frame) for sign in (1, -1)]
-        found[:, 6 + column] = (ends[0] - ends[1]) / (2 * ROTATION_STEP_RAD)
-    return found
+        slopes[:, 6 + column] = (ends[0] - ends[1]) / (2 * ROTATION_STEP_RAD)
+    return slopes

@@ -47,12 +47,12 @@ class GearTable:
     @cached_property
     def parts(self) -> dict[str, slice]:
         """Columns of each of `inputs`; the last one of each stands for counters beyond the table."""
-        found, begin = {}, 0
+        parts, begin = {}, 0
         for name in self.inputs:
             end = begin + len(self.steps[_axis(name)]) + 1
-            found[name] = slice(begin, end)
+            parts[name] = slice(begin, end)
             begin = end
-        return found
+        return parts
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -67,10 +67,10 @@ class GearTable:
         """Share of the columns of one error of an axis in its value at counters (...), shape (..., columns)."""
         nodes, flat = np.array(self.steps[axis]), np.ravel(counters).astype(float)
         inside = (flat >= nodes[0]) & (flat <= nodes[-1])
-        found = np.zeros((len(flat), len(nodes) + 1))
-        found[inside, :-1] = interpolation(flat[inside], nodes)
-        found[~inside, -1] = 1.0
-        return found.reshape(*np.shape(counters), -1)
+        shares = np.zeros((len(flat), len(nodes) + 1))
+        shares[inside, :-1] = interpolation(flat[inside], nodes)
+        shares[~inside, -1] = 1.0
+        return shares.reshape(*np.shape(counters), -1)
 
     def _near(self, axis: int, counter: float) -> tuple[slice, list[float]]:
         """Columns of one error that have a share in its value at a counter, and their shares, as `shares` has them."""
@@ -78,23 +78,23 @@ class GearTable:
         if not nodes[0] <= counter <= nodes[-1]:
             return slice(len(nodes), len(nodes) + 1), [1.0]
         begin = min(max(bisect_right(nodes, counter) - NEAREST // 2, 0), len(nodes) - NEAREST)
-        at, found = nodes[begin : begin + NEAREST], []
+        at, weights = nodes[begin : begin + NEAREST], []
         for k in range(NEAREST):
             share = 1.0
             for other in range(NEAREST):
                 if other != k:
                     share *= (counter - at[other]) / (at[k] - at[other])
-            found.append(share)
-        return slice(begin, begin + NEAREST), found
+            weights.append(share)
+        return slice(begin, begin + NEAREST), weights
 
     def estimates_at(self, columns: np.ndarray, steps: tuple[float, float]) -> dict[str, float]:
         """The same as `at` of one row of columns (size,) at one pair of counters, sooner: a robot asks often."""
-        found, places = {}, [self._near(axis, n) for axis, n in enumerate(steps)] if self.size else []
+        estimates, places = {}, [self._near(axis, n) for axis, n in enumerate(steps)] if self.size else []
         for name, part in self.parts.items():
             chosen, share = places[_axis(name)]
             values = columns[part.start + chosen.start : part.start + chosen.stop].tolist()
-            found[name] = sum(a * b for a, b in zip(values, share, strict=True))
-        return found
+            estimates[name] = sum(a * b for a, b in zip(values, share, strict=True))
+        return estimates
 
     def at(self, columns: np.ndarray, steps: tuple[Number, Number]) -> dict[str, np.ndarray]:
         """Errors at counters, by name of `inputs`.
@@ -131,12 +131,12 @@ class GearTable:
             moved = (share.reshape(-1, self.size) @ rows).reshape(*shape, count, -1)
         else:
             moved = share @ rows
-        found = np.empty((*moved.shape[:-2], others + count, others + count))
-        found[..., :others, :others] = covariance[..., :others, :others]
-        found[..., others:, :others] = moved[..., :others]
-        found[..., :others, others:] = np.swapaxes(moved[..., :others], -1, -2)
-        found[..., others:, others:] = moved[..., others:] @ np.swapaxes(share, -1, -2)
-        return found
+        joint = np.empty((*moved.shape[:-2], others + count, others + count))
+        joint[..., :others, :others] = covariance[..., :others, :others]
+        joint[..., others:, :others] = moved[..., :others]
+        joint[..., :others, others:] = np.swapaxes(moved[..., :others], -1, -2)
+        joint[..., others:, others:] = moved[..., others:] @ np.swapaxes(share, -1, -2)
+        return joint
 
 
 NO_GEARS = GearTable()
@@ -161,14 +161,14 @@ def table_of(steps: Mapping[str, object]) -> GearTable:
         ValueError: counters that are no regular, ascending, finite ones.
         KeyError: an axis is missing.
     """
-    found = [np.array(steps[axis], dtype=float) for axis in AXES]
-    for nodes in found:
+    steps_of_axes = [np.array(steps[axis], dtype=float) for axis in AXES]
+    for nodes in steps_of_axes:
         regular = nodes.ndim == 1 and len(nodes) <= 4 * COUNTERS_MAX and np.all(np.isfinite(nodes))
         if not regular or len(nodes) in (1, 2, 3):
             raise ValueError("counters of a gear table")
         gaps = np.diff(nodes)
         if len(nodes) and (gaps.min() <= 0 or np.ptp(gaps) > 1e-6 * gaps.max()):
             raise ValueError("a gear table's counters are not regular")
-    if (len(found[0]) == 0) != (len(found[1]) == 0):
+    if (len(steps_of_axes[0]) == 0) != (len(steps_of_axes[1]) == 0):
         raise ValueError("a gear table of one axis")
-    return GearTable((tuple(found[0].tolist()), tuple(found[1].tolist())))
+    return GearTable((tuple(steps_of_axes[0].tolist()), tuple(steps_of_axes[1].tolist())))

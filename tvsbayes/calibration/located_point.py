@@ -50,5 +50,5 @@ class Located(Shown):
         """Coordinates with their uncertainty."""
         u = np.sqrt(np.diag(self.covariance_mm2)).tolist()
         rows = list(zip("xyz", self.xyz_mm.tolist(), u, self.u95_mm.tolist(), strict=True))
-        told = "Located point, frame T" + f", EXTRAPOLATED: {self.unseen}, where looks were" * self.extrapolated
-        return View(told, ("axis", "mm", "u", "U95"), rows)
+        title = "Located point, frame T" + f", EXTRAPOLATED: {self.unseen}, where looks were" * self.extrapolated
+        return View(title, ("axis", "mm", "u", "U95"), rows)

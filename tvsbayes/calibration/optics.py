@@ -117,8 +117,8 @@ def _optics(values: Values) -> Optics | HeadOptics:
         return HeadOptics.of(lambda name: values[name] * (TO_RAD if "_deg" in name else 1.0))
 
     def block(name: str) -> Number | list[Number]:
-        found = [values[entry] * TO_RAD if name.endswith("_deg") else values[entry] for entry in BLOCKS[name]]
-        return found if len(found) > 1 else found[0]
+        entries = [values[entry] * TO_RAD if name.endswith("_deg") else values[entry] for entry in BLOCKS[name]]
+        return entries if len(entries) > 1 else entries[0]
 
     return Optics.of(block)
 
@@ -222,6 +222,6 @@ def beam_angle_deg(values: Values, axis: str, mirror_deg: Number, other_deg: Num
 def beam_deg_per_step(values: Mapping[str, float], axis: str, pose_deg: tuple[float, float]) -> float:
     """Mean of both directions' effective degrees per step at mirror angles (pan, tilt) (formulation 3.2)."""
     index, half = AXES.index(axis), 1e-3
-    here, other = pose_deg[index], pose_deg[1 - index]
-    ends = [beam_angle_deg(values, axis, here + s * half, other) for s in (1, -1)]
+    pose, other = pose_deg[index], pose_deg[1 - index]
+    ends = [beam_angle_deg(values, axis, pose + s * half, other) for s in (1, -1)]
     return float(values[f"degrees_per_step.{axis}"] * (ends[0] - ends[1]) / (2 * half))

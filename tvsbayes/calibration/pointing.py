@@ -167,12 +167,12 @@ class Calibration(Shown):
         """Covariance of `look_inputs` and the unit noises at counters, numbers or arrays (n,): shape (..., k, k)."""
         if not self.gears.size:
             return self.covariance_with_noise
-        own = self.gears.look_covariance(self.covariance, steps)
-        count = own.shape[-1]
-        found = np.zeros((*own.shape[:-2], count + NOISES, count + NOISES))
-        found[..., :count, :count] = own
-        found[..., np.arange(count, count + NOISES), np.arange(count, count + NOISES)] = [*UNIT_NOISES.values()]
-        return found
+        looks = self.gears.look_covariance(self.covariance, steps)
+        count = looks.shape[-1]
+        whole = np.zeros((*looks.shape[:-2], count + NOISES, count + NOISES))
+        whole[..., :count, :count] = looks
+        whole[..., np.arange(count, count + NOISES), np.arange(count, count + NOISES)] = [*UNIT_NOISES.values()]
+        return whole
 
     def covers(self, pan_steps: float, tilt_steps: float) -> bool:
         """Whether looks of the campaign reached as far as these counters."""
@@ -228,10 +228,10 @@ class Calibration(Shown):
         steps, sides = (pan_steps, tilt_steps), sides_of(approach)
         beam = self.beam_at(steps, sides, math, NO_INPUTS if frame == "T" else P_INPUTS)
         ray, at = np.array([*beam.origin, *beam.direction]), (float(pan_steps), float(tilt_steps))
-        found = self._ray_covariance(ray, at, sides, frame) if covariance else None
+        ray_covariance = self._ray_covariance(ray, at, sides, frame) if covariance else None
         if frame in ("S", "camera"):
             ray = in_cameras(ray, self._pose, frame)
-        return Ray(ray[:3], ray[3:], not self.covers(pan_steps, tilt_steps), frame, found)
+        return Ray(ray[:3], ray[3:], not self.covers(pan_steps, tilt_steps), frame, ray_covariance)
 
     @cached_property
     def _pose(self) -> np.ndarray:
@@ -243,10 +243,10 @@ class Calibration(Shown):
         """Covariance of `INPUT_NAMES`, the extrinsics, and the columns of the gears."""
         first, pose = len(INPUT_NAMES), len(EXTRINSICS_NAMES)
         drawn = np.column_stack([self.inputs[:, :first], self.extrinsics, self.inputs[:, first:]])
-        found = np.cov(drawn, rowvar=False)
-        own = np.r_[0:first, first + pose : len(found)]
-        found[np.ix_(own, own)] = self.covariance
-        return found
+        drawn_covariance = np.cov(drawn, rowvar=False)
+        kept = np.r_[0:first, first + pose : len(drawn_covariance)]
+        drawn_covariance[np.ix_(kept, kept)] = self.covariance
+        return drawn_covariance
 
     def _ray_covariance(self, ray: np.ndarray, steps: Counters, sides: Sides, frame: str) -> np.ndarray:
         """Covariance (6, 6) of a ray (6,) that is in T where the frame is T, else in P."""
@@ -412,8 +412,8 @@ class Calibration(Shown):
 
     def _moved_gears(self, steps: Counters) -> dict[str, np.ndarray]:
         """Moved errors of the gears at counters, numbers or arrays (n,); shape (look inputs + NOISES, ...)."""
-        found = self.estimates_at(steps) if self.gears.size else {}
-        return {name: np.add.outer(self._moved.gears[name], found[name]) for name in self.gears.inputs}
+        estimates = self.estimates_at(steps) if self.gears.size else {}
+        return {name: np.add.outer(self._moved.gears[name], estimates[name]) for name in self.gears.inputs}
 
     def steps_for(
         self,
@@ -445,7 +445,7 @@ class Calibration(Shown):
         pan, tilt = arrivals
         reached = pan.side, tilt.side
         ray = self.ray(pan.steps, tilt.steps, reached)
-        found = Steps(
+        steps = Steps(
             *(pan.steps, tilt.steps, reached, pan.via_steps, tilt.via_steps, ray),
             extrapolated=ray.extrapolated,
             unseen=self.unseen(pan.steps, tilt.steps),
@@ -455,11 +455,11 @@ class Calibration(Shown):
         if isinstance(target, Direction):
             goal = unit_vector(target.azimuth_deg, target.elevation_deg)
             rounding = math.degrees(math.atan2(np.linalg.norm(np.cross(d, goal)), d @ goal))
-            return replace(found, rounding_deg=rounding, u95_deg=self.beam_u95_deg(counters, sides))
+            return replace(steps, rounding_deg=rounding, u95_deg=self.beam_u95_deg(counters, sides))
         reach = float((target.xyz_mm - o) @ d)
         point = o + reach * d
         return replace(
-            found,
+            steps,
             xyz_mm=point,
             aperture_deg=self.reading(point),
             rounding_mm=float(np.linalg.norm(target.xyz_mm - point)),

@@ -71,16 +71,18 @@ def cloud(
     """
     (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
     for rows in looks:
-        asked = rows.settings
-        found = locate_linear(calibration, asked)
-        seen = _meets(calibration, asked, found)
-        pan, tilt = asked.steps[seen].T
-        reading = asked.aperture_deg[seen]
-        refused = tuple(Refused(rows.lines[k], _refusal(calibration, asked, k)) for k in np.flatnonzero(~seen).tolist())
+        settings = rows.settings
+        linear = locate_linear(calibration, settings)
+        meets = _meets(calibration, settings, linear)
+        pan, tilt = settings.steps[meets].T
+        reading = settings.aperture_deg[meets]
+        refused = tuple(
+            Refused(rows.lines[k], _refusal(calibration, settings, k)) for k in np.flatnonzero(~meets).tolist()
+        )
         yield CloudBlock(
-            lines=np.array(rows.lines)[seen],
-            xyz_mm=found.value[seen],
-            covariance_mm2=found.covariance[seen],
+            lines=np.array(rows.lines)[meets],
+            xyz_mm=linear.value[meets],
+            covariance_mm2=linear.covariance[meets],
             extrapolated=(pan < pan_low) | (pan > pan_high) | (tilt < tilt_low) | (tilt > tilt_high),
             simple_xyz_mm={
                 name: simple_belief(one, pan, tilt).points(reading, calibration.azimuth).T
@@ -90,20 +92,20 @@ def cloud(
         )
 
 
-def _meets(calibration: Calibration, asked: Settings, found: Linear) -> np.ndarray:
+def _meets(calibration: Calibration, settings: Settings, linear: Linear) -> np.ndarray:
     """Which looks have a point, shape (n,): those that `Calibration.locate` does not refuse."""
-    pan, tilt = asked.steps.T
-    pan_side, tilt_side = asked.side.T
+    pan, tilt = settings.steps.T
+    pan_side, tilt_side = settings.side.T
     beam = calibration.beam_at((pan, tilt), (pan_side, tilt_side))
     origin, direction = (np.stack(np.broadcast_arrays(*vector), axis=-1) for vector in beam)
-    reach = np.einsum("pi,pi->p", found.value - origin, direction)
-    return np.asarray(meets(reach, direction, found.covariance))
+    reach = np.einsum("pi,pi->p", linear.value - origin, direction)
+    return np.asarray(meets(reach, direction, linear.covariance))
 
 
-def _refusal(calibration: Calibration, asked: Settings, row: int) -> InputError:
-    pan, tilt = asked.steps[row].tolist()
-    pan_side, tilt_side = asked.side[row].tolist()
-    return calibration.refusal(pan, tilt, float(asked.aperture_deg[row]), (pan_side, tilt_side))
+def _refusal(calibration: Calibration, settings: Settings, row: int) -> InputError:
+    pan, tilt = settings.steps[row].tolist()
+    pan_side, tilt_side = settings.side[row].tolist()
+    return calibration.refusal(pan, tilt, float(settings.aperture_deg[row]), (pan_side, tilt_side))
 
 
 class EvenSample:
@@ -146,9 +148,9 @@ class LawChecked:
 def checked(calibration: Calibration, sample: EvenSample, draws: int, seed: int) -> LawChecked:
     """Some of the points again, draw by draw (JCGM 101, 8)."""
     pan, tilt, reading, approach = zip(*sample.looks, strict=True)
-    found = locate(calibration, pan, tilt, reading, approach, draws=draws, seed=seed)
-    seen = np.array([error is None for error in found.refused])
-    held = np.asarray(found.digits_held).min(axis=1) >= 1
-    off = found.law_off_mm[seen]
+    located = locate(calibration, pan, tilt, reading, approach, draws=draws, seed=seed)
+    accepted = np.array([error is None for error in located.refused])
+    agrees = np.asarray(located.digits_held).min(axis=1) >= 1
+    off = located.law_off_mm[accepted]
     sizes = (float(np.median(off)), float(off.max())) if len(off) else (None, None)
-    return LawChecked(len(off), int(np.sum(held & seen)), *sizes)
+    return LawChecked(len(off), int(np.sum(agrees & accepted)), *sizes)

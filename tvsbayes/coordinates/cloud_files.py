@@ -65,8 +65,8 @@ def columns_of(names: Sequence[str]) -> tuple[str, ...]:
 
     `quality` is the root of the summed variances, the property by which MeshLab colours points.
     """
-    own = (*AXIS_NAMES, *(f"sd_{axis}" for axis in AXIS_NAMES), "quality")
-    return (*own, *(f"{name}_{axis}" for name in names for axis in AXIS_NAMES), "extrapolated", "line")
+    joint = (*AXIS_NAMES, *(f"sd_{axis}" for axis in AXIS_NAMES), "quality")
+    return (*joint, *(f"{name}_{axis}" for name in names for axis in AXIS_NAMES), "extrapolated", "line")
 
 
 def _numbers(block: CloudBlock, names: Sequence[str]) -> np.ndarray:

@@ -111,12 +111,12 @@ def simple_error(
     beam = calibration.beam_at(steps, (1.0, 1.0))
     point = np.array(beam.at(range_mm))
     reading = np.array(calibration.reading(point))
-    own = simple_belief(simple, np.array(steps[:1]), np.array(steps[1:]))
+    belief = simple_belief(simple, np.array(steps[:1]), np.array(steps[1:]))
     joint = Belief(beam, best["baseline_mm"], best["aperture_zero_deg"])
-    turned = replace(joint, beam=Components(beam.origin, own.beam.direction))
-    moved = replace(own, beam=Components(own.beam.origin, beam.direction))
+    turned = replace(joint, beam=Components(beam.origin, belief.beam.direction))
+    moved = replace(belief, beam=Components(belief.beam.origin, beam.direction))
     parts = [float(np.linalg.norm(np.ravel(b.points(reading, azimuth)) - point)) for b in (turned, moved)]
-    directions = [np.ravel(np.array(each.direction)) for each in (own.beam, beam)]
+    directions = [np.ravel(np.array(each.direction)) for each in (belief.beam, beam)]
     pan, tilt = (np.degrees(np.subtract(*angle)) for angle in zip(*map(_angles, directions), strict=True))
     return SimpleError(float(pan), float(tilt), *parts)
 

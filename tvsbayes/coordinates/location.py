@@ -269,14 +269,16 @@ def locate(
             parts.append(_statistics(block, *points, given, calibration))
             done = begin + len(block.steps)
             job.at(done / len(settings.steps), f"{done} of {len(settings.steps)} points")
-        found = _together(parts)
-    asked = zip(settings.steps.tolist(), settings.aperture_deg.tolist(), settings.side.tolist(), strict=True)
+        located = _together(parts)
+    requests = zip(settings.steps.tolist(), settings.aperture_deg.tolist(), settings.side.tolist(), strict=True)
     refused = tuple(
         None if share <= DIVERGING_SHARE else calibration.refusal(pan, tilt, deg, (pan_side, tilt_side))
-        for share, ((pan, tilt), deg, (pan_side, tilt_side)) in zip(found.diverging_share.tolist(), asked, strict=True)
+        for share, ((pan, tilt), deg, (pan_side, tilt_side)) in zip(
+            located.diverging_share.tolist(), requests, strict=True
+        )
     )
     unseen = tuple(calibration.unseen(pan, tilt) for pan, tilt in settings.steps.tolist())
-    return replace(found, refused=refused, unseen=unseen, extrapolated=np.array([bool(words) for words in unseen]))
+    return replace(located, refused=refused, unseen=unseen, extrapolated=np.array([bool(words) for words in unseen]))
 
 
 def _together[T: (Locations, Validation)](parts: Sequence[T]) -> T:
@@ -298,19 +300,19 @@ def _statistics(settings: Settings, carried: Carried, law: Linear, given: Drawn,
     count = len(meets)
     # The few draws without a point take the point's median place: at most one in a thousand, or the point is refused.
     for point in np.flatnonzero(~meets.all(axis=0) & meets.any(axis=0)):
-        seen = meets[:, point]
-        xyz[~seen, point] = np.median(xyz[seen, point], axis=0)
+        valid = meets[:, point]
+        xyz[~valid, point] = np.median(xyz[valid, point], axis=0)
     mean = xyz.mean(axis=0)
     centred = xyz - mean
     covariance = np.einsum("dpi,dpj->pij", centred, centred) / (count - 1)
-    own, inputs = len(INPUT_NAMES), len(calibration.look_inputs)
-    away = np.concatenate([given.inputs[:, :own] - calibration.mean[:own], given.noise], axis=1)
-    fixed = np.delete(law.jacobian, np.arange(own, inputs), axis=2)
+    named, inputs = len(INPUT_NAMES), len(calibration.look_inputs)
+    away = np.concatenate([given.inputs[:, :named] - calibration.mean[:named], given.noise], axis=1)
+    fixed = np.delete(law.jacobian, np.arange(named, inputs), axis=2)
     u = np.sqrt(np.einsum("pii->pi", law.covariance))
     linearised = law.value + np.einsum("pik,dk->dpi", fixed, away)
     pan, tilt = settings.steps.T
-    off = calibration.gears.at(given.gears - calibration.mean[own:], (pan, tilt))
-    for place, name in enumerate(calibration.gears.inputs, own):
+    off = calibration.gears.at(given.gears - calibration.mean[named:], (pan, tilt))
+    for place, name in enumerate(calibration.gears.inputs, named):
         linearised += law.jacobian[:, :, place] * off[name][..., None]
     interval = symmetric_interval(xyz)
     empty = np.where(lost <= DIVERGING_SHARE, 0.0, np.nan)

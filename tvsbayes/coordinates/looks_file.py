@@ -76,9 +76,9 @@ class LookRows:
 
 def _rows(table: Table) -> LookRows:
     """Checked cells of a table."""
-    found = {name: tuple(cells) for name, cells in LOOKS.values(table).items()}
-    pairs = zip(found.pop("pan_approach"), found.pop("tilt_approach"), strict=True)
-    return LookRows(lines=tuple(table.lines), approach=tuple(pairs), **found)
+    cells_of = {name: tuple(cells) for name, cells in LOOKS.values(table).items()}
+    pairs = zip(cells_of.pop("pan_approach"), cells_of.pop("tilt_approach"), strict=True)
+    return LookRows(lines=tuple(table.lines), approach=tuple(pairs), **cells_of)
 
 
 def _no_points(path: Path) -> InputError:
@@ -91,10 +91,10 @@ def _foreign(path: Path) -> Table | None:
     with opened(path, "a readable file") as stream:
         if not is_foreign(stream.read(HEAD_BYTES)):
             return None
-    found = read_foreign(path)
+    table = read_foreign(path)
     # The same columns are asked for, with the same words.
-    parse_table(csv_bytes(list(found.columns), ()), found.file, LOOKS.required)
-    return Table(found.file, list(found.lines), dict(found.columns))
+    parse_table(csv_bytes(list(table.columns), ()), table.file, LOOKS.required)
+    return Table(table.file, list(table.lines), dict(table.columns))
 
 
 def _part(table: Table, begin: int) -> Table:

@@ -53,8 +53,8 @@ def simple_calibration(
 
 def simple_calibrations(priors: Mapping[str, Prior], classic: ClassicResult | None) -> dict[str, SimpleCalibration]:
     """By name: nominal, and classic where there is a result."""
-    found = {"nominal": simple_calibration(priors)}
-    return found if classic is None else {**found, "classic": simple_calibration(priors, classic)}
+    calibrations = {"nominal": simple_calibration(priors)}
+    return calibrations if classic is None else {**calibrations, "classic": simple_calibration(priors, classic)}
 
 
 def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Ray:

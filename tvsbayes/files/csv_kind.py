@@ -67,9 +67,9 @@ class Column:
         if self.kind is str:
             return table.texts(self.name, self.chars_max, not self.filled)
         read: Callable[..., list[Any]] = table.integers if self.kind is int else table.numbers
-        found = read(self.name, self.low, self.high, self.may_be_empty)
+        values = read(self.name, self.low, self.high, self.may_be_empty)
         filled = self.default is MISSING or self.default is None
-        return found if filled else [self.default if value is None else value for value in found]
+        return values if filled else [self.default if value is None else value for value in values]
 
 
 def _leaves(hint: object) -> list[object]:
@@ -106,8 +106,14 @@ class CsvKind[Row]:
             words = tuple(leaf for leaf in leaves if isinstance(leaf, str))
             number = next((known for known in (int, float) if known in leaves), str)
             meaning = column.meaning or meaning
-            own = {"name": entry.name, "kind": number, "words": words, "default": entry.default, "meaning": meaning}
-            self.columns[entry.name] = replace(column, **own)
+            attributes = {
+                "name": entry.name,
+                "kind": number,
+                "words": words,
+                "default": entry.default,
+                "meaning": meaning,
+            }
+            self.columns[entry.name] = replace(column, **attributes)
 
     def __getitem__(self, name: str) -> Column:
         return self.columns[name]
@@ -128,11 +134,11 @@ class CsvKind[Row]:
         Raises:
             InputError: a cell that is no value of its column, or that a rule of its column refuses.
         """
-        found = {name: column.values(table) for name, column in self.columns.items()}
+        values = {name: column.values(table) for name, column in self.columns.items()}
         for column in self.columns.values():
             if column.rule is not None and column.name in table.columns:
-                column.rule(table, column, found)
-        return found
+                column.rule(table, column, values)
+        return values
 
     def parse(self, data: bytes, file: str, *checks: Callable[[Table, Values], None]) -> tuple[Row, ...]:
         """The checked rows of a file.

@@ -202,12 +202,12 @@ class Keys:
         allowed = f"a number from {low:g} to {high:g}, or a list of up to {most} different ones"
         value = self._get(key, allowed)
         entries = value if isinstance(value, list) else [value]
-        found = [
+        values = [
             float(e) for e in entries if isinstance(e, int | float) and not isinstance(e, bool) and low <= e <= high
         ]
-        if len(found) != len(entries) or not 1 <= len(found) <= most or len(set(found)) != len(found):
+        if len(values) != len(entries) or not 1 <= len(values) <= most or len(set(values)) != len(values):
             raise self.refuse(key, "numbers", allowed, "correct the values and mind their unit")
-        return tuple(found)
+        return tuple(values)
 
     def table(self, key: str) -> Keys:
         """The table under `key`; an absent one is empty."""

@@ -174,15 +174,15 @@ def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | N
     paired, day_s, before_s = 0, 0.0, -1.0
     for number, line in lines:
         clock = _CLOCK.match(line)
-        rest = line[clock.end() if clock else 0 :]
-        found = list(_PAIR.finditer(rest))
-        if not found or found[0].start() or "".join(match.group() for match in found) != rest:
+        remainder = line[clock.end() if clock else 0 :]
+        pairs = list(_PAIR.finditer(remainder))
+        if not pairs or pairs[0].start() or "".join(match.group() for match in pairs) != remainder:
             continue
         paired += 1
         values = {
-            m["name"].strip() + (f" ({m['unit']})" if m["unit"] else ""): m["value"].replace(",", ".") for m in found
+            m["name"].strip() + (f" ({m['unit']})" if m["unit"] else ""): m["value"].replace(",", ".") for m in pairs
         }
-        if len(values) < len(found):
+        if len(values) < len(pairs):
             return None
         names.update(dict.fromkeys(values))
         if not rows or rows[-1][1].keys() & values.keys():
@@ -219,11 +219,11 @@ def _without_heading(rows: list[tuple[int, list[str]]]) -> tuple[list[tuple[int,
     often = Counter(count for count, _ in filled).most_common(1)
     if not often or often[0][0] < 2 or 2 * often[0][1] <= len(filled):
         return rows, []
-    most = often[0][0]
-    first = next(k for count, k in filled if count == most)
+    cells_usual = often[0][0]
+    first = next(k for count, k in filled if count == cells_usual)
     above = [k for count, k in filled if k < first]
     names = [cell for cell in rows[first][1] if cell]
-    wider = any(count > most for count, k in filled if k < first)
+    wider = any(count > cells_usual for count, k in filled if k < first)
     if not above or wider or len(above) > ABOVE_MAX or any(map(_is_number, names)):
         return rows, []
     text = " ".join(cell for cell in rows[above[0]][1] if cell)
@@ -295,9 +295,9 @@ def _separator(lines: Sequence[str]) -> str:
         counted = {s: [len(line.split(None if s == " " else s)) for line in tried] for s in SEPARATORS}
         often = {s: max(Counter(of).items(), key=lambda item: item[1], default=(1, 0)) for s, of in counted.items()}
         clear = (s for s, (cells, count) in often.items() if cells > 1 and count >= 0.9 * len(tried))
-        most = (s for s, (cells, count) in often.items() if 1 < cells == counted[s][0] and 2 * count > len(tried))
-        if found := next(clear, None) or next(most, None):
-            return found
+        frequent = (s for s, (cells, count) in often.items() if 1 < cells == counted[s][0] and 2 * count > len(tried))
+        if separator := next(clear, None) or next(frequent, None):
+            return separator
     # A short table below a heading: names and rows alone are divided.
     whole = {s: Counter(len(line.split(None if s == " " else s)) for line in lines) for s in SEPARATORS}
     divided = {s: max(((n, c) for c, n in of.items() if c > 1), default=(0, 0)) for s, of in whole.items() if s != " "}
@@ -344,14 +344,14 @@ def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[i
 
 def _cells(rows: Iterable[tuple[object, ...]], file: str) -> list[tuple[int, list[str]]]:
     """Cells of a sheet as text."""
-    found, cells = [], 0
+    values, cells = [], 0
     for number, row in enumerate(rows, start=1):
         cells += len(row)
         if number > CSV_ROWS_MAX + 1 or cells > CELLS_MAX:
             allowed, remedy = f"at most {CSV_ROWS_MAX} rows, {CELLS_MAX} cells", "save the table alone in a file"
             raise refusal("size", file=file, found="more", allowed=allowed, remedy=remedy)
-        found.append((number, [_cell(value) for value in row]))
-    return found
+        values.append((number, [_cell(value) for value in row]))
+    return values
 
 
 class _Number(str):
@@ -394,8 +394,8 @@ def _table(file: str, rows: Sequence[tuple[int, list[str]]], words: list[str]) -
     columns = {}
     for k, name in enumerate(names):
         if name is not None:
-            own = (row[k] if isinstance(row[k], _Number) else row[k][:CELL_CHARS_MAX] for _, row in body)
-            columns[name] = tuple(str(cell) if mixed else _with_point(cell, commas) for cell in own)
+            body_cells = (row[k] if isinstance(row[k], _Number) else row[k][:CELL_CHARS_MAX] for _, row in body)
+            columns[name] = tuple(str(cell) if mixed else _with_point(cell, commas) for cell in body_cells)
     return ForeignTable(file, ", ".join(words), tuple(line for line, _ in body), columns, rows[0][0])
 
 
@@ -407,12 +407,12 @@ def _units_below(cells: Sequence[str], after: Sequence[str]) -> bool:
 
 def _unique(names: Sequence[str]) -> list[str | None]:
     """Names of columns: numbered where they repeat, None without a name."""
-    seen: Counter[str] = Counter()
-    found: list[str | None] = []
+    counts: Counter[str] = Counter()
+    names_once: list[str | None] = []
     for name in names:
-        seen[name] += 1
-        found.append(None if not name else name if seen[name] == 1 else f"{name} ({seen[name]})")
-    return found
+        counts[name] += 1
+        names_once.append(None if not name else name if counts[name] == 1 else f"{name} ({counts[name]})")
+    return names_once
 
 
 def _with_point(cell: str, commas: bool) -> str:

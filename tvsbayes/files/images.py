@@ -67,8 +67,8 @@ def image_size(data: bytes, file: str) -> tuple[int, int]:
         width, height = _jpeg_size(data, bad)
     else:
         raise bad("image", f"a file that begins with {data[:8].hex(' ') or 'nothing'}", "save it as PNG")
-    most = IMAGE_PIXELS_MAX // (2 if is_deep(data) else 1)
-    if not 0 < width * height <= most:
+    pixels_max = IMAGE_PIXELS_MAX // (2 if is_deep(data) else 1)
+    if not 0 < width * height <= pixels_max:
         raise bad("image-size", f"{width} x {height} pixels", "crop or scale it")
     return width, height
 

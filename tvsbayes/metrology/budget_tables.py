@@ -89,8 +89,8 @@ def budget_table(
         if share < SMALL_SHARE:
             small.append((source, contribution, share))
         else:
-            told = vars(source) | {"dof": _finite(source.dof)}
-            rows.append(BudgetRow(**told, contribution=contribution, share=share))
+            fields = vars(source) | {"dof": _finite(source.dof)}
+            rows.append(BudgetRow(**fields, contribution=contribution, share=share))
     if small:
         kinds = sorted({kind for source, _, _ in small for kind in source.kind.split(", ")})
         several = (f"{len(small)} further inputs, each below {100 * SMALL_SHARE:g} %", "", None, None, ", ".join(kinds))
@@ -99,5 +99,5 @@ def budget_table(
     rows.append(BudgetRow(CORRELATIONS, "", None, None, "", "", None, None, None, 1 - sum(shares)))
     dof = effective_dof(u, contributions, [s.dof for s in sources])
     k = coverage_factor(dof, probability)
-    said = (*notes, INDEPENDENCE)
-    return BudgetTable(quantity, unit, estimate, tuple(rows), u, _finite(dof), k, probability, k * u, said)
+    remarks = (*notes, INDEPENDENCE)
+    return BudgetTable(quantity, unit, estimate, tuple(rows), u, _finite(dof), k, probability, k * u, remarks)

@@ -92,8 +92,8 @@ def _software(parent: ET.Element, tag: str, made: Provenance, **attributes: str)
     software = add(add(parent, tag), "dcc:software", **attributes)
     add_words(software, "dcc:name", "tvsbayes")
     # PTB's Schematron wants a letter and up to four numbers; the whole version stands in the description.
-    found = _RELEASE.match(made.versions["tvsbayes"])
-    add(software, "dcc:release", f"v{found.group() if found else '0'}")
+    release = _RELEASE.match(made.versions["tvsbayes"])
+    add(software, "dcc:release", f"v{release.group() if release else '0'}")
     listed = ", ".join(f"{name} {version}" for name, version in made.versions.items())
     add_words(software, "dcc:description", f"{listed}; seed {made.seed}; command: {made.command}")
 
@@ -156,8 +156,8 @@ def _statements(data: ET.Element, campaign: Campaign, fit: FitRecord, when: Perf
         add_words(statement, "dcc:declaration", text)
 
     state("accreditation", NOT_ACCREDITED)
-    found = traceability(campaign)
-    state("traceability", found.statement, found.declared)
+    trace = traceability(campaign)
+    state("traceability", trace.statement, trace.declared)
     state("scope", ITEM_ONLY)
     validation = fit.summary.validation
     if validation is not None and not validation.passed:
@@ -217,7 +217,7 @@ def _conditions(parent: ET.Element, campaign: Campaign) -> None:
 def _check_certifiable(campaign: Campaign, fit: FitRecord, parties: Parties) -> None:
     """Refuse what no certificate may be made of; errors as in `dcc_bytes`."""
     where = "in which the campaign was measured", "of the customer"
-    for country, told in zip((parties.country, parties.customer_country), where, strict=True):
+    for country, place in zip((parties.country, parties.customer_country), where, strict=True):
         if not re.fullmatch("[A-Z]{2}", country):
             raise InputError(
                 "country",
@@ -225,7 +225,7 @@ def _check_certifiable(campaign: Campaign, fit: FitRecord, parties: Parties) -> 
                 column="country",
                 found=escaped(country),
                 allowed="two capital letters of ISO 3166-1, such as MX or DE",
-                remedy=f"write the two letters of the country {told}: MX for Mexico",
+                remedy=f"write the two letters of the country {place}: MX for Mexico",
             )
     again = "run `tvsbayes fit` on the campaign again"
     if fit.provenance.inputs != input_hashes(campaign):
@@ -288,8 +288,8 @@ def _measurement(root: ET.Element, campaign: Campaign, fit: FitRecord) -> None:
     pose = summary.reference_pose_deg
     where = f"at mirror angles pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     kind = "posterior draws" if summary.estimator == "posterior" else "the Laplace approximation of the posterior"
-    told = f"Effective ratios hold {where}. Values and intervals from {kind}. {COVERAGE}"
-    add_words(part, "dcc:description", told)
+    scope = f"Effective ratios hold {where}. Values and intervals from {kind}. {COVERAGE}"
+    add_words(part, "dcc:description", scope)
     method = add(add(part, "dcc:usedMethods"), "dcc:usedMethod", id="method")
     add_words(method, "dcc:name", "joint estimate from stereo spots")
     texts = [METHOD, *(f"Method as named by the user: {t}" for t in [campaign.header.get("method")] if t)]
@@ -339,10 +339,10 @@ def _positioning_result(results: ET.Element, table: AxisPositioning) -> None:
     title = f"ISO 230-2-style figures of the {table.axis} axis, posterior predictive"
     data = _result(results, title, "; ".join(table.notes))
     for name, (symbol, term) in FIGURES.items():
-        found = table.predicted[name]
+        figure = table.predicted[name]
         quantity = add(data, "dcc:quantity", refType="basic_measuredValue")
         add_words(quantity, "dcc:name", f"{symbol}, {term}")
-        low, high = found.interval95
+        low, high = figure.interval95
         # Medians and intervals of a simulation: the half width over 1.96 stands for u.
         u = (high - low) / (2 * NORMAL_95)
-        add_real(quantity, UNIT_SI["deg"], found.median, u, found.interval95, "simulated tests")
+        add_real(quantity, UNIT_SI["deg"], figure.median, u, figure.interval95, "simulated tests")

@@ -89,10 +89,10 @@ def budget(
     if calibration.gears.size:
         parts = calibration.gears.look_covariance(parts, steps)
     count = len(calibration.look_inputs)
-    calibrated, here = jacobian[:, :count], jacobian[:, count:]
+    calibrated, at_look = jacobian[:, :count], jacobian[:, count:]
     by_cause = [np.einsum("ij,jk,ik->i", calibrated, c, calibrated) for c in parts]
-    own = here**2 * np.diag(covariance)[count:]
-    by_cause += [own[:, :2].sum(axis=1), own[:, 2:4].sum(axis=1), own[:, 4]]
+    noise_variance = at_look**2 * np.diag(covariance)[count:]
+    by_cause += [noise_variance[:, :2].sum(axis=1), noise_variance[:, 2:4].sum(axis=1), noise_variance[:, 4]]
     variance = np.array(by_cause)
     u = np.sqrt(np.diag(covariance))
     # What does not vary correlates with nothing.

@@ -95,9 +95,9 @@ def _plug_in(readings: StopReadings, deg_per_step: float, wanted: int) -> _PlugI
     }
     usable = {n: pair for n, pair in runs.items() if min(map(len, pair)) >= RUNS_MIN}
     if len(usable) < TARGETS_MIN:
-        both = f"{len(usable)} counter{'s' * (len(usable) != 1)}"
+        counters = f"{len(usable)} counter{'s' * (len(usable) != 1)}"
         reason = (
-            f"{both} of the {readings.axis} axis with at least {RUNS_MIN} stops from either side; {TARGETS_MIN} "
+            f"{counters} of the {readings.axis} axis with at least {RUNS_MIN} stops from either side; {TARGETS_MIN} "
             f"are needed, ISO 230-2 asks for {wanted} with {RUNS} runs"
         )
         return _PlugIn(missing=reason, reading_u_deg=u, notes=tuple(unplayed))
@@ -127,10 +127,10 @@ def _plug_in(readings: StopReadings, deg_per_step: float, wanted: int) -> _PlugI
 
 def _predicted(runs: Runs) -> dict[str, Predicted]:
     """Median and interval of every figure over simulated tests."""
-    found = figures_of(runs.up_deg, runs.down_deg)
+    figures = figures_of(runs.up_deg, runs.down_deg)
     predicted = {}
     for name in FIGURES:
-        low, middle, high = np.quantile(getattr(found, name), [0.025, 0.5, 0.975])
+        low, middle, high = np.quantile(getattr(figures, name), [0.025, 0.5, 0.975])
         predicted[name] = Predicted(float(middle), (float(low), float(high)))
     return predicted
 
@@ -188,10 +188,10 @@ def positioning(
     if chosen:
         options = {"runs": runs, "tests": tests, "seed": seed}
         contrast = contrast_deg_per_step
-        found = simulated_runs(calibration, axis, chosen, ratio, contrast_deg_per_step=contrast, **options)
-        predicted, made = _predicted(found), SIMULATED.format(tests, runs, calibration.estimator)
+        cycles = simulated_runs(calibration, axis, chosen, ratio, contrast_deg_per_step=contrast, **options)
+        predicted, made = _predicted(cycles), SIMULATED.format(tests, runs, calibration.estimator)
     wanted = targets_wanted((high - low) * ratio)
-    own = _PlugIn(missing="no stops were given") if readings is None else _plug_in(readings, ratio, wanted)
+    plug_in = _PlugIn(missing="no stops were given") if readings is None else _plug_in(readings, ratio, wanted)
     return AxisPositioning(
         axis=axis,
         deg_per_step=ratio,
@@ -199,10 +199,10 @@ def positioning(
         target_steps=chosen,
         runs=runs,
         estimator=calibration.estimator,
-        plug_in=own.figures,
-        plug_in_steps=own.steps,
-        plug_in_runs=own.runs,
-        reading_u_deg=own.reading_u_deg,
-        missing=own.missing,
-        notes=(INDIRECT, *own.notes, made, DEFINITIONS, *(f"not covered: {text}" for text in NOT_COVERED)),
+        plug_in=plug_in.figures,
+        plug_in_steps=plug_in.steps,
+        plug_in_runs=plug_in.runs,
+        reading_u_deg=plug_in.reading_u_deg,
+        missing=plug_in.missing,
+        notes=(INDIRECT, *plug_in.notes, made, DEFINITIONS, *(f"not covered: {text}" for text in NOT_COVERED)),
     )

@@ -45,8 +45,8 @@ def target_steps(low: float, high: float, deg_per_step: float, seed: int = 0) ->
     """
     count = targets_wanted((high - low) * deg_per_step)
     places = np.arange(count) + 0.5 + np.random.default_rng([seed, 230]).uniform(-0.2, 0.2, count)
-    found = sorted({round(low + (high - low) * p / count) for p in places} - {round(low), round(high)})
-    return tuple(found) if len(found) >= TARGETS_MIN else ()
+    targets = sorted({round(low + (high - low) * p / count) for p in places} - {round(low), round(high)})
+    return tuple(targets) if len(targets) >= TARGETS_MIN else ()
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,8 @@ def simulated_runs(
     middle = float(calibration.range_steps[AXES.index(other)].mean())
     at = (steps[:, 0], np.full(len(steps), middle)) if axis == AXES[0] else (np.full(len(steps), middle), steps[:, 0])
     # What repeats by position is told at the counter: what the contrast has gained by then moves it by far less.
-    found = calibration.gears.at(calibration.inputs[rows, len(INPUT_NAMES) :], at)
-    values |= {name: errors[..., None] for name, errors in found.items()}
+    gear_errors = calibration.gears.at(calibration.inputs[rows, len(INPUT_NAMES) :], at)
+    values |= {name: errors[..., None] for name, errors in gear_errors.items()}
     other_deg = output_deg(values, other, middle, 0.0, calibration.period_deg.get(other))
     ratio = values[f"degrees_per_step.{axis}"]
     # Upwards a step is k + c/2, downwards k - c/2 (formulation 3.1): a whole cycle of 2 L steps gains c L.

@@ -258,9 +258,9 @@ def stored_hold_out(campaign: Campaign, inputs: Mapping[str, str]) -> HoldOut | 
     if keys is None:
         return None
     again = "run `tvsbayes compare` again"
-    held = keys.table("held_out")
-    found = read_record(HoldOut, held, again)
-    if (found.classic is None) != (found.joint is None):
-        lacking = "classic" if found.classic is None else "joint"
-        raise held.refuse(lacking, "table", "scores of both estimators or of none", again)
-    return found
+    table = keys.table("held_out")
+    record = read_record(HoldOut, table, again)
+    if (record.classic is None) != (record.joint is None):
+        lacking = "classic" if record.classic is None else "joint"
+        raise table.refuse(lacking, "table", "scores of both estimators or of none", again)
+    return record

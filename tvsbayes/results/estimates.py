@@ -193,8 +193,8 @@ class CurvePoint(ClosedRecord, frozen=True):
     @property
     def ratios(self) -> dict[str, RatioAt]:
         """Those of the directions that moved."""
-        found = {direction: getattr(self, direction) for direction in DIRECTIONS}
-        return {direction: ratio for direction, ratio in found.items() if ratio is not UNSET}
+        values = {direction: getattr(self, direction) for direction in DIRECTIONS}
+        return {direction: ratio for direction, ratio in values.items() if ratio is not UNSET}
 
 
 class LostMotion(ClosedRecord, frozen=True):
@@ -278,7 +278,7 @@ def fit_noise(chi2: float, dof: float, parameters: Mapping[str, Estimate]) -> Fi
     stops = {direction: parameters[f"stop_sd_deg.{direction}"].value for direction in DIRECTIONS}
     # Where a rig states that looks do not scatter, there is no such parameter.
     scatters = {axis: parameters.get(f"look_scatter_deg.{axis}") for axis in AXES}
-    looks: dict[str, float] = {axis: 0.0 if found is None else found.value for axis, found in scatters.items()}
+    looks: dict[str, float] = {axis: 0.0 if scatter is None else scatter.value for axis, scatter in scatters.items()}
     return FitNoise(chi2, dof, parameters["pixel_scale"].value, stops, looks)
 
 

@@ -130,9 +130,9 @@ class FitRecord(Shown):
     @property
     def digest(self) -> str:
         """SHA-256 of what the results say, from what and by what: the identity of everything made from them."""
-        said = plain([self.summary.estimator, self.summary.effective, self.summary.parameters])
+        content = plain([self.summary.estimator, self.summary.effective, self.summary.parameters])
         made = [self.provenance.inputs, self.provenance.versions, self.provenance.seed]
-        return hashlib.sha256(json.dumps([said, made], sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([content, made], sort_keys=True).encode()).hexdigest()
 
     @property
     def results_id(self) -> str:

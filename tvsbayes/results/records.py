@@ -123,21 +123,21 @@ def _array_schema(kind: type) -> dict[str, object]:
 def _meanings(docstring: str) -> tuple[str, dict[str, str]]:
     """What a docstring says of a class, and what its section "Attributes" says of each field."""
     text, _, attributes = docstring.partition("\n\nAttributes:\n")
-    found = {}
+    meanings = {}
     for entry in re.split(r"\n(?! )", inspect.cleandoc(attributes)):
         names, _, meaning = entry.partition(": ")
         # What is None in Python is null in JSON.
-        found.update(dict.fromkeys(names.split(", "), re.sub(r"\bNone\b", "null", " ".join(meaning.split()))))
-    return " ".join(text.split()), found
+        meanings.update(dict.fromkeys(names.split(", "), re.sub(r"\bNone\b", "null", " ".join(meaning.split()))))
+    return " ".join(text.split()), meanings
 
 
 def _records() -> dict[str, type[Record]]:
     """Every declared record by its name."""
-    found, kinds = {}, [Record]
+    records, kinds = {}, [Record]
     while kinds:
         kinds += (kind := kinds.pop()).__subclasses__()
-        found[kind.__name__] = kind
-    return found
+        records[kind.__name__] = kind
+    return records
 
 
 def _alike(schema: Any) -> Any:
@@ -146,12 +146,12 @@ def _alike(schema: Any) -> Any:
         return [_alike(inner) for inner in schema]
     if not isinstance(schema, dict):
         return schema
-    found = {key: _alike(inner) for key, inner in schema.items()}
-    items = found.get("prefixItems")
+    plain_schema = {key: _alike(inner) for key, inner in schema.items()}
+    items = plain_schema.get("prefixItems")
     if not items or any(item != items[0] for item in items):
-        return found
-    del found["prefixItems"]
-    return found | {"items": items[0]}
+        return plain_schema
+    del plain_schema["prefixItems"]
+    return plain_schema | {"items": items[0]}
 
 
 def _described(component: dict[str, Any], kind: type[Record] | None) -> dict[str, Any]:

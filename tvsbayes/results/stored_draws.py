@@ -132,18 +132,18 @@ def stored_mode(campaign: Campaign) -> StoredMode | None:
         file = read_arrays(path, RESULTS_BYTES_MAX)
         if "mode_z" not in file:
             return None
-        found = {name: np.array(file[f"mode_{name}"], dtype=float) for name in _MODE_ARRAYS}
+        arrays = {name: np.array(file[f"mode_{name}"], dtype=float) for name in _MODE_ARRAYS}
         log_density = np.array(file["mode_log_density"], dtype=float)
         names = tuple(file["names"].tolist())
         count, spots = len(names), sum(spot.status == "ok" for spot in campaign.spots)
         shapes = {"z": (count,), "covariance": (count, count), "valid": (spots,), "weight": (spots,)}
-        if any(found[name].shape != shape for name, shape in shapes.items()) or found["prior"].shape[:1] != (2,):
+        if any(arrays[name].shape != shape for name, shape in shapes.items()) or arrays["prior"].shape[:1] != (2,):
             raise ValueError("a mode of another shape")
-        if log_density.shape or not all(np.isfinite(array).all() for array in (*found.values(), log_density)):
+        if log_density.shape or not all(np.isfinite(array).all() for array in (*arrays.values(), log_density)):
             raise ValueError("a mode that is not finite")
         sides = tuple(map(str, file["mode_sides"].tolist())) if "mode_sides" in file else ("", "")
         if any(side not in ("", ANYWHERE, *SENSES[axis]) for axis, side in zip(AXES, sides, strict=True)):
             raise ValueError("a way of homing that there is not")
-        return StoredMode(names, log_density=float(log_density), sides=sides, **found)
+        return StoredMode(names, log_density=float(log_density), sides=sides, **arrays)
     except (KeyError, TypeError, ValueError) as error:
         raise damaged_calibration(path, error) from error

@@ -83,8 +83,8 @@ class StudyRow:
     def as_json(self) -> dict[str, object]:
         """Its line in a file of rows, less the format."""
         document = {**asdict(self), "problems": list(self.problems)}
-        told = ("headlines", "target") if self.headlines else ()
-        order = ("design", "index", "seed", "estimator", "converged", "unseen", "problems", *told, "seconds")
+        names = ("headlines", "target") if self.headlines else ()
+        order = ("design", "index", "seed", "estimator", "converged", "unseen", "problems", *names, "seconds")
         return {name: document[name] for name in order}
 
     @classmethod

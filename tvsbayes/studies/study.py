@@ -117,7 +117,7 @@ def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
         message = "no fit of the study converged" + (f"; {problems[0]}" if problems else "")
         raise NotConverged("not-converged", message, remedy="check the plan with `tvsbayes check RIG PLAN`")
     n = len(good)
-    found = {}
+    headlines = {}
     for name, quantity in TARGETS.items():
         entries = [row.headlines[name] for row in good]
         if all(e.interval95[0] == e.interval95[1] for e in entries):
@@ -127,7 +127,7 @@ def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
         ).T
         error = value - truth
         null = job.rig.table.priors[quantity.stated].value if quantity.stated else 0.0
-        found[name] = HeadlineStudy(
+        headlines[name] = HeadlineStudy(
             coverage={f"{100 * level:g}": float(np.mean(np.abs(pit - 0.5) < level / 2)) for level in LEVELS},
             bounds={f"{100 * level:g}": binomial_bounds(n, level) for level in LEVELS},
             rms_z=float(np.sqrt(np.mean((error / sd) ** 2))),
@@ -145,7 +145,7 @@ def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
         estimator=job.estimator,
         campaigns=len(rows),
         converged=n,
-        headlines=found,
+        headlines=headlines,
         target=job.target,
         # A fit that failed met nothing.
         assurance=hits / len(rows),
@@ -183,12 +183,12 @@ def study(
     """
     done = rows.of(job.key)
     missing = [index for index in range(count) if index not in done]
-    with Job({CAMPAIGNS: 1.0}, progress) as told:
+    with Job({CAMPAIGNS: 1.0}, progress) as work:
         if missing:
-            told.at(0.0, f"{count - len(missing)} of {count}")
+            work.at(0.0, f"{count - len(missing)} of {count}")
             with closing(made_rows(job, missing, engine, min(workers, len(missing)), address)) as running:
                 for made, row in enumerate(running, 1):
                     rows.append(row)
-                    told.at(made / len(missing), f"{count - len(missing) + made} of {count}")
+                    work.at(made / len(missing), f"{count - len(missing) + made} of {count}")
         every = rows.of(job.key)
         return study_result(job, [every[index] for index in range(count)])

@@ -103,18 +103,18 @@ def study_row(job: StudyJob, index: int) -> StudyRow:
     row = StudyRow(job.key, index, seed, False, unseen, (), 0.0, estimator=job.estimator)
     try:
         result = fit(run.campaign)
-        problems, found = tuple(result.problems), laplace_estimates(result)
+        problems, estimates = tuple(result.problems), laplace_estimates(result)
         if job.estimator == "importance" and result.converged:
             posterior = posterior_of(result, seed % 2**32)
-            problems, found = posterior.convergence.missing, sampled_estimates(posterior)
+            problems, estimates = posterior.convergence.missing, sampled_estimates(posterior)
     except TvsError as error:
         return replace(row, problems=(error.message,), seconds=time.perf_counter() - start)
     return replace(
         row,
         converged=not problems,
         problems=problems,
-        headlines=_compared(job, result, found, run.truth),
-        target=reported(job, result, found),
+        headlines=_compared(job, result, estimates, run.truth),
+        target=reported(job, result, estimates),
         seconds=time.perf_counter() - start,
     )
 
@@ -144,23 +144,23 @@ class Estimates:
     weights: np.ndarray
 
 
-def reported(job: StudyJob, result: JointFit, found: Estimates) -> float | None:
+def reported(job: StudyJob, result: JointFit, estimates: Estimates) -> float | None:
     """The target's value by an estimator; None where no beam reaches its point."""
     target = job.target
     if target.point_mm is None:
-        return target.factor * float(spread(found)[list(target.indices)].max())
-    taught = taught_errors(result, found.covariance)
-    gears, covariance = (NO_PLACES, found.covariance) if taught is None else (taught.places, taught.covariance)
+        return target.factor * float(spread(estimates)[list(target.indices)].max())
+    taught = taught_errors(result, estimates.covariance)
+    gears, covariance = (NO_PLACES, estimates.covariance) if taught is None else (taught.places, taught.covariance)
     try:
-        at = sensitivity(target, found.z, result.space, job.rig.table, result.reference_pose_rad, gears)
+        at = sensitivity(target, estimates.z, result.space, job.rig.table, result.reference_pose_rad, gears)
     except InputError:
         return None
     return at.value(covariance, target.factor)
 
 
-def spread(found: Estimates) -> np.ndarray:
+def spread(estimates: Estimates) -> np.ndarray:
     """Sd of every headline, shape (9,)."""
-    return np.sqrt(found.weights @ (found.draws - weighted_mean(found.draws, found.weights)) ** 2)
+    return np.sqrt(estimates.weights @ (estimates.draws - weighted_mean(estimates.draws, estimates.weights)) ** 2)
 
 
 def laplace_estimates(result: JointFit) -> Estimates:
@@ -180,7 +180,7 @@ def sampled_estimates(posterior: Posterior) -> Estimates:
     return Estimates(weighted_mean(z, weights), covariance, weighted_mean(draws, weights), draws, weights)
 
 
-def _compared(job: StudyJob, result: JointFit, found: Estimates, true: Truth) -> dict[str, HeadlineRow]:
+def _compared(job: StudyJob, result: JointFit, estimates: Estimates, true: Truth) -> dict[str, HeadlineRow]:
     """Every headline beside the truth, and beside what the planner predicts at that truth."""
     bare, pose = prior_knowledge(job.rig), result.reference_pose_rad
     instruments = instruments_in(bare, [true])
@@ -191,15 +191,15 @@ def _compared(job: StudyJob, result: JointFit, found: Estimates, true: Truth) ->
     at_truth = knowledge.gears.headlines(z, space, pose)
     predicted = predicted_sds(knowledge, information.fisher, np.asarray(at_truth.gradient), z)
     values = true_headlines(true, result.campaign, pose)
-    low, high = weighted_quantiles(found.draws, found.weights, TAILS)
-    sd = spread(found)
+    low, high = weighted_quantiles(estimates.draws, estimates.weights, TAILS)
+    sd = spread(estimates)
     return {
         name: HeadlineRow(
             truth=float(values[k]),
-            value=float(found.value[k]),
+            value=float(estimates.value[k]),
             sd=float(sd[k]),
             interval95=(float(low[k]), float(high[k])),
-            pit=float(found.weights @ (found.draws[:, k] < values[k])),
+            pit=float(estimates.weights @ (estimates.draws[:, k] < values[k])),
             predicted_sd=float(predicted[k]),
         )
         for k, name in enumerate(TARGETS)

@@ -146,13 +146,13 @@ def _board_window(camera: Camera, pose: BoardPose, board: Board) -> tuple[slice,
     ends = [np.column_stack((x, np.full(60, edge))) for edge in y[[0, -1]]]
     ends += [np.column_stack((np.full(60, edge), y)) for edge in x[[0, -1]]]
     rim = np.column_stack((np.vstack(ends) * board.pitch_mm, np.zeros(240)))
-    seen = camera.project(rim @ pose.rotation.T + pose.translation_mm)
+    pixels = camera.project(rim @ pose.rotation.T + pose.translation_mm)
     size = np.array([camera.width, camera.height])
-    if not np.isfinite(seen).all():
+    if not np.isfinite(pixels).all():
         return slice(0, camera.height), slice(0, camera.width)
     # Between two of the 60 points an edge bulges by less than a pixel; gradients need two more.
-    low = np.clip(np.floor(seen.min(axis=0)) - 4, 0, size).astype(int)
-    high = np.clip(np.ceil(seen.max(axis=0)) + 5, 0, size).astype(int)
+    low = np.clip(np.floor(pixels.min(axis=0)) - 4, 0, size).astype(int)
+    high = np.clip(np.ceil(pixels.max(axis=0)) + 5, 0, size).astype(int)
     return slice(low[1], high[1]), slice(low[0], high[0])
 
 
@@ -185,7 +185,7 @@ def board_poses(cameras: CameraPair, board: Board, views: int, seed: int) -> lis
     middle = corners.mean(axis=0)
     reach = np.array([board.columns, board.rows]) * board.pitch_mm
     rim = np.array([[x, y, 0.0] for x in (-board.pitch_mm, reach[0]) for y in (-board.pitch_mm, reach[1])])
-    left, right, found = cameras.left, cameras.right, []
+    left, right, poses = cameras.left, cameras.right, []
     further = max(1.0, *(camera.matrix[1, 1] / (LENS * camera.height) for camera in (left, right)))
     for _ in range(200 * views):
         depth = rng.uniform(*DEPTHS_MM) * further
@@ -194,18 +194,18 @@ def board_poses(cameras: CameraPair, board: Board, views: int, seed: int) -> lis
         turned = rotation_matrix(tilt * np.array([np.cos(heading), np.sin(heading), 0.0]))
         turned = turned @ rotation_matrix(np.array([0.0, 0.0, roll]))
         pose = BoardPose(turned, depth * np.linalg.solve(left.matrix, aim) - turned @ middle)
-        seen = np.hstack([c.project(rim @ pose.rotation.T + pose.translation_mm) for c in (left, right)])
+        pixels = np.hstack([c.project(rim @ pose.rotation.T + pose.translation_mm) for c in (left, right)])
         last = np.tile([left.width - 1, left.height - 1], 2)
-        if np.isfinite(seen).all() and ((seen > BORDER_PX) & (seen < last - BORDER_PX)).all():
-            found.append(pose)
-            if len(found) == views:
-                return found
+        if np.isfinite(pixels).all() and ((pixels > BORDER_PX) & (pixels < last - BORDER_PX)).all():
+            poses.append(pose)
+            if len(poses) == views:
+                return poses
     far = " to ".join(f"{depth * further:.0f}" for depth in DEPTHS_MM)
     size = f"a board of {reach[0]:g} x {reach[1]:g} mm"
     raise refusal(
         "boards",
         file="stereo.json",
-        found=f"cameras that share little of their views: {size} fits into both images {len(found)} of {views} times",
+        found=f"cameras that share little of their views: {size} fits into both images {len(poses)} of {views} times",
         allowed=f"cameras that both see the board at {far} mm",
         remedy="correct R and T, or simulate without --frames",
     )

@@ -71,10 +71,10 @@ def _begun(folder: Path, files: Mapping[str, bytes]) -> bool:
     if not folder.is_dir():
         return False
     # Hidden files are those that a killed process was writing.
-    there = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
-    whole = there & set(files) if there <= {*files, "frames", "boards"} else set()
+    names = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
+    whole = names & set(files) if names <= {*files, "frames", "boards"} else set()
     same = all((folder / name).is_file() and (folder / name).read_bytes() == files[name] for name in whole)
-    return bool(whole) and same and (whole == set(files) or there == whole)
+    return bool(whole) and same and (whole == set(files) or names == whole)
 
 
 def write_frames(
@@ -126,9 +126,9 @@ def _render(
     # NumPy's generators, OpenCV and the writing of files leave Python's lock: threads are enough.
     pool = ThreadPoolExecutor(min(WORKERS_MAX, cpu_count() or 1))
     try:
-        with Job({"rendering": 1.0}, progress) as told:
+        with Job({"rendering": 1.0}, progress) as work:
             for count, _ in enumerate(pool.map(lambda job: job(), jobs), start=1):
-                told.at(count / len(jobs), f"{count} of {len(jobs)} pairs")
+                work.at(count / len(jobs), f"{count} of {len(jobs)} pairs")
     finally:
         pool.shutdown(cancel_futures=True)
     return 2 * len(jobs)

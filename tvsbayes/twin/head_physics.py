@@ -58,7 +58,9 @@ def sighted_angles(directions: np.ndarray, noise_deg: np.ndarray) -> np.ndarray:
     """Azimuth and elevation (n, 2), deg, of directions (n, 3) that are sighted with noise (n, 2) on the sphere."""
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
     side = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=1)
-    seen = directions + np.tan(np.radians(noise_deg[:, :1])) * side
-    seen = seen + np.tan(np.radians(noise_deg[:, 1:])) * np.cross(directions, side)
-    found = np.stack([np.arctan2(seen[:, 1], seen[:, 0]), np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1]))])
-    return np.degrees(found.T)
+    sighted = directions + np.tan(np.radians(noise_deg[:, :1])) * side
+    sighted = sighted + np.tan(np.radians(noise_deg[:, 1:])) * np.cross(directions, side)
+    angles = np.stack(
+        [np.arctan2(sighted[:, 1], sighted[:, 0]), np.arctan2(sighted[:, 2], np.hypot(sighted[:, 0], sighted[:, 1]))]
+    )
+    return np.degrees(angles.T)

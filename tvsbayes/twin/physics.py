@@ -100,15 +100,15 @@ def stop_errors(
     while only the other axis moves. `sds` maps "+", "-" to the standard deviation of positive and negative
     moves; an unknown approach takes their root mean square. `approach` (n,) is read at first rows.
     """
-    held, error = np.empty(len(counters)), 0.0
-    both = float(np.sqrt((sds["+"] ** 2 + sds["-"] ** 2) / 2))
+    errors, error = np.empty(len(counters)), 0.0
+    mean_sd = float(np.sqrt((sds["+"] ** 2 + sds["-"] ** 2) / 2))
     for i in range(len(counters)):
         if first[i]:
-            error = draws[i] * {1: sds["+"], -1: sds["-"], 0: both}[APPROACH_SIGN[approach[i]]]
+            error = draws[i] * {1: sds["+"], -1: sds["-"], 0: mean_sd}[APPROACH_SIGN[approach[i]]]
         elif counters[i] != counters[i - 1]:
             error = draws[i] * sds["+" if counters[i] > counters[i - 1] else "-"]
-        held[i] = error
-    return held
+        errors[i] = error
+    return errors
 
 
 def mirror_chain(
@@ -220,16 +220,16 @@ class Camera:
 
         Beyond the image's borders too; NaN behind the camera and beyond the radius where distortion turns back.
         """
-        own = points_mm @ self.rotation.T + self.translation_mm
+        in_camera = points_mm @ self.rotation.T + self.translation_mm
         k1, k2, p1, p2, k3 = self.distortion
         with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = own[:, 0] / own[:, 2], own[:, 1] / own[:, 2]
+            a, b = in_camera[:, 0] / in_camera[:, 2], in_camera[:, 1] / in_camera[:, 2]
         r2 = a * a + b * b
         radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
         u = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
         v = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
         pixels = np.column_stack((self.matrix[0, 0] * u + self.matrix[0, 2], self.matrix[1, 1] * v + self.matrix[1, 2]))
-        good = (own[:, 2] > 0) & (r2 < _turning_radius_squared(k1, k2, k3))
+        good = (in_camera[:, 2] > 0) & (r2 < _turning_radius_squared(k1, k2, k3))
         return np.where(good[:, None], pixels, np.nan)
 
 

@@ -152,8 +152,8 @@ def draw_axis(
     ]
     true = {name: _drawn(name, priors[name.split(".")[0]], rng) for name in names}
     # Of their own, so that the same seed draws the same gears whatever is asked for.
-    [own] = rng.spawn(1)
-    true |= {name: _drawn(name, priors[name], own) for name in IN_TIME}
+    [gear_rng] = rng.spawn(1)
+    true |= {name: _drawn(name, priors[name], gear_rng) for name in IN_TIME}
     true["per_command"] = per_command
     true["ratio_contrast"] = CONTRAST_SHARE * abs(per_command) * float(rng.standard_normal())
     distance = abs(per_command) * (at[:, None] - at)
@@ -165,7 +165,7 @@ def draw_axis(
         return AxisTruth(true, at, error, play)
     record = {"position": ends, "encoder": tuple(sorted((per_command * at[0], per_command * at[-1])))}
     record["seconds"] = between_s
-    return AxisTruth(true, at, error, play, _drawn_waves(asked, priors, travel, record, own))
+    return AxisTruth(true, at, error, play, _drawn_waves(asked, priors, travel, record, gear_rng))
 
 
 def _drawn_waves(
@@ -181,7 +181,7 @@ def _drawn_waves(
     periods += [(clock, float(low * (high / low) ** rng.random())) for low, high in asked.between]
     periods += [("encoder", asked.encoder)] if asked.encoder is not None else []
     unit = priors["transmission_error"].u or priors["transmission_error"].value or 0.002 * travel
-    found = []
+    waves = []
     for of, period in periods:
         scale = unit * abs(float(rng.standard_normal())) * float(rng.random() < 0.5)
         drawn = rng.standard_normal((3, 2)) @ np.array([1, 1j])
@@ -190,8 +190,8 @@ def _drawn_waves(
         first, second, change = (float(each) for each in size)
         at, at_second, at_change = (float(each) for each in angle)
         begin, end = record[of]
-        found.append(TrueWave(of, period, first, at, second, at_second, change, at_change, begin, end))
-    return tuple(found)
+        waves.append(TrueWave(of, period, first, at, second, at_second, change, at_change, begin, end))
+    return tuple(waves)
 
 
 def _encoder_reads(truth: AxisTruth, stand: float) -> float:
@@ -215,7 +215,7 @@ def stops_of(
     """Where the output stands after every move, unit, (moves,), warming since `powered_on_s` or the first move."""
     true = truth.parameters
     ratio, contrast, backlash = true["per_command"], true["ratio_contrast"], true["backlash"]
-    found = np.empty(len(moves))
+    stops = np.empty(len(moves))
     wheel = stand = zero = stop = 0.0
     side = 0
     last: AxisMove | None = None
@@ -243,11 +243,11 @@ def stops_of(
             stop = sd * float(rng.standard_normal())
         place = int(np.searchsorted(truth.command, move.command))
         share = 2 * (stand - wheel) / backlash if backlash else -side * np.sign(ratio)
-        found[row] = stand + truth.error[place] + 0.5 * share * truth.play_variation[place] + zero + stop
-        found[row] += sum(wave.at(abs(ratio) * move.command) for wave in truth.waves if wave.of == "position")
-        found[row] += _time_shift(truth, move.time_s - since, kelvin[row], move.time_s)
+        stops[row] = stand + truth.error[place] + 0.5 * share * truth.play_variation[place] + zero + stop
+        stops[row] += sum(wave.at(abs(ratio) * move.command) for wave in truth.waves if wave.of == "position")
+        stops[row] += _time_shift(truth, move.time_s - since, kelvin[row], move.time_s)
         last = move
-    return found
+    return stops
 
 
 def drive_of(
@@ -255,7 +255,7 @@ def drive_of(
 ) -> np.ndarray:
     """Where the output of a drive at constant rate is at times (n,), ascending, after a move; shape (n,)."""
     true = truth.parameters
-    found = np.empty(len(times_s))
+    positions = np.empty(len(times_s))
     seeing, zero, last = 0.0, 0.0, None
     for k, time_s in enumerate(times_s):
         command = move.command + rate * (time_s - move.time_s)
@@ -263,11 +263,13 @@ def drive_of(
         zero += true["drift_per_root_hour"] * math.sqrt(gap / 3600.0) * float(rng.standard_normal())
         keep = 0.0 if last is None else math.exp(-gap / true["seeing_s"])
         seeing = keep * seeing + true["seeing_scale"] * math.sqrt(1.0 - keep**2) * float(rng.standard_normal())
-        found[k] = true["per_command"] * command + zero + _time_shift(truth, time_s - move.time_s, 0.0, time_s)
-        found[k] += sum(wave.at(abs(true["per_command"]) * command) for wave in truth.waves if wave.of == "position")
-        found[k] += seeing * true["reading_u"]
+        positions[k] = true["per_command"] * command + zero + _time_shift(truth, time_s - move.time_s, 0.0, time_s)
+        positions[k] += sum(
+            wave.at(abs(true["per_command"]) * command) for wave in truth.waves if wave.of == "position"
+        )
+        positions[k] += seeing * true["reading_u"]
         last = time_s
-    return found
+    return positions
 
 
 def simulate_axis(
@@ -292,8 +294,8 @@ def simulate_axis(
     moves = template.moves if moves is None else tuple(moves)
     per_command = _per_command(template)
     commands = [m.command for m in moves]
-    seen = [m.command for m in moves if read is None or m.move in read]
-    travel = (max(seen) - min(seen)) * abs(per_command)
+    commands_read = [m.command for m in moves if read is None or m.move in read]
+    travel = (max(commands_read) - min(commands_read)) * abs(per_command)
     if not travel > 0:
         raise NothingToEstimate("too-few-positions", "all moves are to one position", remedy="list more positions")
     truth = draw_axis(
@@ -340,8 +342,8 @@ def _simulated_drive(template: AxisCampaign, rate: float, seed: int, rng: np.ran
 def _per_command(template: AxisCampaign) -> float:
     if "per_command" in template.stated:
         return template.stated["per_command"].value
-    seen = (r for r in template.readings if r.status == "ok" and r.value is not None)
-    used = [(template.moves[r.move].command, r.value) for r in seen]
+    usable = (r for r in template.readings if r.status == "ok" and r.value is not None)
+    used = [(template.moves[r.move].command, r.value) for r in usable]
     if len({command for command, _ in used}) < 2:
         raise InputError(
             "unstated",

@@ -174,9 +174,9 @@ def simulate(
         _spot(number, look, log.targets[look.placement], pixels[number], sd_px, angles[number])
         for number, look in enumerate(log.looks)
     )
-    seen = [look.move for look, spot in zip(log.looks, spots, strict=True) if spot.status == "ok"]
-    if seen:
-        pan, tilt = driven.resting_deg[seen].mean(axis=0)
+    moves_seen = [look.move for look, spot in zip(log.looks, spots, strict=True) if spot.status == "ok"]
+    if moves_seen:
+        pan, tilt = driven.resting_deg[moves_seen].mean(axis=0)
         truth = replace(truth, reference_pose_deg=(float(pan), float(tilt)))
     moves = log.moves if sides_recorded else [_unrecorded(move) for move in log.moves]
     campaign = Campaign(tuple(moves), spots, rig.stereo, rig.table, full_header)

@@ -121,12 +121,12 @@ def footprint(
     across = plane @ (np.eye(3) - np.outer(beam, beam)) @ plane.T
     sheet_covariance = scene.beam_sd_mm**2 * np.linalg.inv(across)
     step_mm = 1e-3  # truncation 1e-9 of the slope at 100 mm, rounding 1e-10
-    seen = camera.project(point + np.vstack((np.zeros(3), step_mm * plane, -step_mm * plane)))
-    if not np.isfinite(seen).all():
+    pixels = camera.project(point + np.vstack((np.zeros(3), step_mm * plane, -step_mm * plane)))
+    if not np.isfinite(pixels).all():
         return None
-    slope = (seen[1:3] - seen[3:5]).T / (2 * step_mm)
+    slope = (pixels[1:3] - pixels[3:5]).T / (2 * step_mm)
     covariance = slope @ sheet_covariance @ slope.T + blur_px**2 * np.eye(2)
-    return Footprint(seen[0], covariance, scene.peak_dn * abs(float(beam @ normal)))
+    return Footprint(pixels[0], covariance, scene.peak_dn * abs(float(beam @ normal)))
 
 
 def spot_irradiance(spot: Footprint, width: int, height: int) -> tuple[tuple[slice, slice], np.ndarray]:

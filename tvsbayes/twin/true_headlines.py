@@ -52,7 +52,7 @@ def effective_deg_per_step(
         _mirror_deg(parameters, errors, axis, counters[i], campaign.rig.first_period_deg.get(axis, FULL_TURN_DEG))
         for i, axis in enumerate(AXES)
     ]
-    found: dict[str, float] = {}
+    ratios: dict[str, float] = {}
     for i, axis in enumerate(AXES):
         angle_deg, others_deg = mirrors[i], float(np.mean(mirrors[1 - i]))
         slope = float(np.mean(_mirror_slope(parameters, i, angle_deg, others_deg)))
@@ -62,8 +62,8 @@ def effective_deg_per_step(
         else:
             line = parameters[f"degrees_per_step.{axis}"] * slope
         half = 0.5 * parameters[f"ratio_contrast_deg_per_step.{axis}"] * slope
-        found |= dict(zip(SENSES[axis], (line + half, line - half), strict=True))
-    return found
+        ratios |= dict(zip(SENSES[axis], (line + half, line - half), strict=True))
+    return ratios
 
 
 def _mirror_deg(
@@ -77,12 +77,12 @@ def _mirror_deg(
 
 def _beam_deg(parameters: Mapping[str, float], axis: int, angle_deg: np.ndarray, others_deg: float) -> np.ndarray:
     """Azimuth or elevation (n,) of the beam for mirror angles of that axis, counted on over full turns."""
-    own, other = np.radians(angle_deg), np.full(len(angle_deg), np.radians(others_deg))
-    psi, beta = (own, other) if axis == 0 else (other, own)
+    moving, other = np.radians(angle_deg), np.full(len(angle_deg), np.radians(others_deg))
+    psi, beta = (moving, other) if axis == 0 else (other, moving)
     direction = mirror_chain(psi, beta, parameters)[1]
     beam = np.arctan2(direction[:, 1], direction[:, 0]) if axis == 0 else np.arcsin(direction[:, 2])
     # The beam follows its mirror to some degrees.
-    return np.degrees(own + np.angle(np.exp(1j * (beam - own))))
+    return np.degrees(moving + np.angle(np.exp(1j * (beam - moving))))
 
 
 def _mirror_slope(parameters: Mapping[str, float], axis: int, angle_deg: np.ndarray, others_deg: float) -> np.ndarray:

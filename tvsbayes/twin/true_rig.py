@@ -117,12 +117,12 @@ class Truth:
     def as_json(self, campaign: Campaign) -> TruthDocument:
         """The document of truth.json of a campaign of this rig, with the effective ratios where there are looks."""
         mechanism = campaign.rig.mechanism
-        held = mechanism.held
+        constants = mechanism.held
         cameras = dict(zip(STEREO_PARAMETER_NAMES, map(float, self.stereo.vector), strict=True))
         document: TruthDocument = {
             "format": TRUTH_FORMAT,
             "note": self.note,
-            "parameters": {name: float(v) for name, v in self.parameters.items() if name not in held},
+            "parameters": {name: float(v) for name, v in self.parameters.items() if name not in constants},
             "stereo": {} if mechanism.sightings else cameras,
             "mirror_angles_deg": self.mirror_angles_deg,
             "stop_errors_deg": self.stop_errors_deg,
