@@ -19,6 +19,7 @@ from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.campaign import UNDETECTED
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import HomeReport
+from tvsbayes.results.records import plain
 
 
 @dataclass(frozen=True)
@@ -50,17 +51,7 @@ class Outcome:
 
     def as_json(self) -> dict[str, object]:
         """The document of `tvsbayes acquire`."""
-        return {
-            "reason": self.reason,
-            "looks": self.looks,
-            "ok": self.ok,
-            "refused": self.refused,
-            "references": self.references,
-            "retries": self.retries,
-            "lost_segments": list(self.lost_segments),
-            "warnings": list(self.warnings),
-            "estimate": None if self.estimate is None else self.estimate.as_json(),
-        }
+        return {**plain(self), "estimate": None if self.estimate is None else self.estimate.as_json()}
 
 
 class RunLog:

@@ -235,7 +235,7 @@ def _compare_pointing(data: Campaign, as_json: bool) -> None:
     import numpy as np
 
     from tvsbayes.head.pointing_model import pointing_model
-    from tvsbayes.report.command_text import pointing_text
+    from tvsbayes.report.result_tables import pointing_table
 
     model = pointing_model(data)
     with waiting() as progress:
@@ -243,7 +243,7 @@ def _compare_pointing(data: Campaign, as_json: bool) -> None:
     centre, sd = np.asarray(fitted.mode.physical), np.asarray(fitted.draws.physical).std(axis=0)
     joint = {n: (float(centre[k]), float(sd[k])) for k, n in enumerate(fitted.names) if n in model.names}
     document = {**model.as_json(), "joint": {name: {"value": v, "sd": u} for name, (v, u) in joint.items()}}
-    text = f"{pointing_text(model, joint)}\nhow well sightings are predicted: --by positions"
+    text = f"{pointing_table(model, joint).text()}\nhow well sightings are predicted: --by positions"
     finish({**document, "files": {}}, text, as_json)
 
 

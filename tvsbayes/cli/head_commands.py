@@ -201,10 +201,10 @@ def classic(folder: Path, as_json: bool) -> None:
     """A pointing model by least squares, without gears."""
     from tvsbayes.head.pointing_model import pointing_model
     from tvsbayes.instrument.campaign import read_campaign
-    from tvsbayes.report.command_text import pointing_text
+    from tvsbayes.report.result_tables import pointing_table
 
     model = pointing_model(read_campaign(folder))
-    finish(model.as_json(), pointing_text(model), as_json)
+    finish(model.as_json(), pointing_table(model).text(), as_json)
 
 
 def report(folder: Path, issue: Issue, pdf: bool, out: Path | None, as_json: bool) -> None:

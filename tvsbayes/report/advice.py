@@ -53,6 +53,7 @@ def factor_told(validation: Validation) -> str:
     return "no factor on u covers it"
 
 
+LAPLACE_SHORT = "Intervals are those of the Laplace approximation: too short for a backlash seen at few stops."
 LAPLACE_WORTH = "the table is the Laplace approximation, whose intervals are up to a quarter too short"
 UNSAMPLED = f"usable with care: the posterior could not be sampled; {LAPLACE_WORTH}"
 ROUGH = "usable, but rough: see the Monte Carlo error"

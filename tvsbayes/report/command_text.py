@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from tvsbayes.coordinates.cloud import LawChecked
     from tvsbayes.coordinates.cloud_files import CloudFile
     from tvsbayes.coordinates.location import Locations
-    from tvsbayes.head.pointing_model import PointingModel
     from tvsbayes.instrument.stereo_pair import Stereo
     from tvsbayes.metrology.look_budget import Budget
     from tvsbayes.planning.planner import CurvePoint, PlanResult
@@ -361,20 +360,6 @@ def positions_text(found: PositionHoldOut) -> str:
     table = TableView(caption, ["axis", "counter", "direction", "n", "mean", "predicted(u)", "z"], rows)
     told = [] if found.rms_z is None else [f"RMS z {found.rms_z:.2f}"]
     return terminal(table, *told, *(f"warning: {text}" for text in found.warnings))
-
-
-def pointing_text(model: PointingModel, joint: Mapping[str, tuple[float, float]] | None = None) -> str:
-    """The terms of a head by least squares, with what a fit says of each, value and sd, where there is one."""
-    rows = []
-    for name, value, error in zip(model.names, model.value.tolist(), model.standard_error.tolist(), strict=True):
-        row = [name_in_words(name), concise(value, error)]
-        if joint is not None:
-            row += [concise(*joint[name]), f"{error / joint[name][1]:.2g}" if joint[name][1] > 0 else ""]
-        rows.append(row)
-    columns = ["term", "least squares (se)", *(["joint (sd)", "se / sd"] if joint is not None else [])]
-    caption = f"pointing model without gears, {len(model.residual_deg)} sightings"
-    end = f"RMS on the sphere {two_digits(model.rms_deg)} deg = {two_digits(3600 * model.rms_deg)} arcsec"
-    return f"{TableView(caption, columns, rows).text()}\n{end}"
 
 
 def changes_text(comparison: Comparison) -> str:

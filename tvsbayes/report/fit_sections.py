@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS, Axis
 from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.advice import asks_for_looks
@@ -258,13 +258,17 @@ def residuals_section(e: Evidence) -> Section:
         if any(c.axis == axis and len(c.groups) > 1 for c in causes):
             alt = f"Mean deviation by group, {axis} axis; values in fit.json"
             views.append(FigureView(figures.causes(causes, axis), alt, f"{axis} axis: mean deviation by group."))
-        stops = [stop for stop in e.shown.residuals if stop.axis == axis]
-        if stops:
-            alt = f"Deviations of {len(stops)} stops of the {axis} axis over time and counter"
-            caption = f"Stops of the {axis} axis: observed minus fitted angle."
-            views.append(FigureView(figures.residuals(stops, axis), alt, caption))
+        views += stop_views(e.shown.residuals, axis)
     tables = [_causes(causes)] if causes else []
     return Section("Residuals by cause", text, tables=tables, figures=views)
+
+
+def stop_views(stops: Sequence[StopResidual], axis: Axis) -> list[FigureView]:
+    """Deviations of the stops of an axis; none without stops."""
+    count = sum(stop.axis == axis for stop in stops)
+    alt = f"Deviations of {count} stops of the {axis} axis over time and counter"
+    caption = f"Stops of the {axis} axis: observed minus fitted angle."
+    return [FigureView(figures.residuals(stops, axis), alt, caption)] if count else []
 
 
 def _causes(causes: tuple[Cause, ...]) -> TableView:

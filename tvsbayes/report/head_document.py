@@ -11,14 +11,15 @@ from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import HEAD_TERMS
-from tvsbayes.report import figures
-from tvsbayes.report.document import Document, FigureView, Issue, Section, about_table
+from tvsbayes.report.advice import LAPLACE_SHORT
+from tvsbayes.report.document import Document, Issue, Section, about_table
+from tvsbayes.report.fit_sections import stop_views
 from tvsbayes.report.fit_text import validation_lines
 from tvsbayes.report.page import numbered
 from tvsbayes.report.parameter_words import name_in_words, sentence_in_words
-from tvsbayes.report.result_tables import ESTIMATE_COLUMNS, estimate_row, headline_table
+from tvsbayes.report.result_tables import ESTIMATE_COLUMNS, estimate_row, headline_table, pointing_table
 from tvsbayes.report.scanner_document import measured_days, verdict_of
-from tvsbayes.report.tables import TableView, concise, two_digits
+from tvsbayes.report.tables import TableView
 from tvsbayes.results.fit_record import FitRecord
 
 METHOD = (
@@ -45,13 +46,22 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
     warnings = [*summary.problems, *(f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts)]
     warnings += [f"`check` warns: {sentence_in_words(text)}" for text in doubts]
     if summary.estimator == "laplace":
-        warnings.append("Intervals are those of the Laplace approximation: too short for a backlash seen at few stops.")
+        warnings.append(LAPLACE_SHORT)
     validation = [] if summary.validation is None else validation_lines(summary.validation)
+    stops = () if record.evidence is None else record.evidence.residuals
     sections = [
         Section(
-            "Result", tables=[headline_table(summary), term_table(record), beside_table(campaign, record)], opened=True
+            "Result",
+            tables=[
+                headline_table(summary),
+                term_table(record),
+                pointing_table(
+                    pointing_model(campaign), {name: (e.value, e.sd) for name, e in summary.parameters.items()}
+                ),
+            ],
+            opened=True,
         ),
-        Section("Stops", text=_noise_text(record), figures=_stops(record)),
+        Section("Stops", text=_noise_text(record), figures=[view for axis in AXES for view in stop_views(stops, axis)]),
         Section(
             "What the sightings cannot tell",
             items=[sentence_in_words(text) for text in open_ends] or ["Nothing of note."],
@@ -89,32 +99,9 @@ def term_table(record: FitRecord) -> TableView:
     return TableView("terms of the line of sight", ESTIMATE_COLUMNS, rows)
 
 
-def beside_table(campaign: Campaign, record: FitRecord) -> TableView:
-    """Least squares without gears, beside the fit."""
-    model, parameters = pointing_model(campaign), record.summary.parameters
-    rows = []
-    for name, value, error in zip(model.names, model.value.tolist(), model.standard_error.tolist(), strict=True):
-        joint = parameters[name]
-        rows.append([name_in_words(name), concise(value, error), concise(joint.value, joint.sd)])
-    caption = f"pointing model without gears, RMS {two_digits(model.rms_deg)} deg on the sphere"
-    return TableView(caption, ["term", "least squares (se)", "joint (sd)"], rows)
-
-
 def _noise_text(record: FitRecord) -> list[str]:
     noise, scale = record.summary.noise, record.summary.parameters["pixel_scale"].value
     return [
         f"chi-square {noise.chi2:.1f} for {noise.dof:.1f} degrees of freedom; sightings scatter by {scale:.2f} times "
         "their stated u."
     ]
-
-
-def _stops(record: FitRecord) -> list[FigureView]:
-    """Deviations of the stops of each axis."""
-    views = []
-    for axis in AXES:
-        shown = () if record.evidence is None else record.evidence.residuals
-        stops = [stop for stop in shown if stop.axis == axis]
-        if stops:
-            alt = f"Deviations of {len(stops)} stops of the {axis} axis over time and counter"
-            views.append(FigureView(figures.residuals(stops, axis), alt, f"{axis} axis: observed minus fitted angle."))
-    return views

@@ -16,7 +16,7 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.traceability import performed, traceability
 from tvsbayes.report import figures
-from tvsbayes.report.advice import assumed_stereo, steps_ahead, verdict_line
+from tvsbayes.report.advice import LAPLACE_SHORT, assumed_stereo, steps_ahead, verdict_line
 from tvsbayes.report.compensation_text import verified_section
 from tvsbayes.report.document import Document, FigureView, Issue, Number, Verdict, about_table, sentence
 from tvsbayes.report.drawing import OF_ESTIMATOR
@@ -217,7 +217,7 @@ def warnings_of(e: Evidence) -> list[str]:
     summary = e.fit.summary
     found = list(summary.problems)
     if summary.estimator == "laplace":
-        found.append("Intervals are those of the Laplace approximation: too short for a backlash seen at few stops.")
+        found.append(LAPLACE_SHORT)
     if e.campaign.header.get("synthetic"):
         found.append("The campaign is synthetic: made by the digital twin, not measured.")
     if (told := assumed_stereo(e.campaign.stereo, e.shown.budgets)) is not None:
