@@ -13,7 +13,9 @@ truth states no `approach` came from the left and from below.
 
 `page` prints the share that was answered (sampled: accepted or rough) and accepted by importance sampling, coverage of
 the 95 % intervals and RMS z of every headline with two-sided bounds at 1e-4 for that number of benches, and CPU seconds
-over those of importing jax, optimistix and scipy.stats in the same run. The truth: least-squares slopes of the true
+over those of importing jax, optimistix and scipy.stats in the same run. z is the standard normal quantile of the
+posterior probability above the truth (probability integral transform: Gneiting et al., J. R. Stat. Soc. B 69 (2007)
+243): normal for right posteriors of any shape, which (mean - truth) / sd of a play near zero is not. The truth: least-squares slopes of the true
 azimuth and elevation of the beam on the counters of the looks seen; contrasts are 0.
 """
 
@@ -33,6 +35,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from scipy import special
 
 from experiments.common.command_line import act, parser
 from experiments.common.headlines import SHRINK, marked
@@ -149,6 +152,8 @@ def one_bench(task: tuple[int | None, str | None, str], fresh: bool = False) -> 
             document = tvsbayes("fit", Path(place) / "campaign", "--quick", fresh=fresh)
             row |= {"cpu_s": cpu_s() - start, "exit": document["exit"]}
             row |= answer_of(document) | {"headlines": headlines_of(document, truth)}
+            for name, below in chances_below(Path(place) / "campaign", row["headlines"]).items():
+                row["headlines"][name]["below_truth"] = below
         except Exception as error:
             row["problems"] = [repr(error)]
     return row
@@ -208,10 +213,20 @@ def headlines_of(document: dict, truth: dict) -> dict[str, dict[str, float | Non
     return found
 
 
+def chances_below(campaign: Path, headlines: dict[str, dict]) -> dict[str, float]:
+    """Share of the posterior below the truth of every headline, never zero or one: a draw more on each side."""
+    from tvsbayes.inference.stored_posterior import load_posterior
+
+    found = load_posterior(campaign, anyway=True)
+    count = len(found.weights)
+    below = {name: found.weights @ (found.by_name[name] < entry["truth"]) for name, entry in headlines.items()}
+    return {name: float((count * share + 1) / (count + 2)) for name, share in below.items()}
+
+
 def judged(rows: Sequence[Row], name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """z, whether the interval holds the truth, and contraction, each (benches that state the headline,)."""
     each = [row["headlines"][name] for row in rows if name in row.get("headlines", {})]
-    z = np.array([(e["value"] - e["truth"]) / e["sd"] for e in each if e["sd"] > 0])
+    z = -special.ndtri([e["below_truth"] for e in each if e["sd"] > 0])
     held = np.array([e["low"] <= e["truth"] <= e["high"] for e in each if e["sd"] > 0], float)
     return z, held, np.array([e["contraction"] or 0.0 for e in each if e["sd"] > 0])
 

@@ -6,15 +6,18 @@ import ast
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from scipy import stats
 from support.printed_vector import LAST_6, LAST_7, LAST_9, LAST_12, VECTOR
 
 from experiments.intervals import strange_bench, strange_optics, strangers
 from experiments.intervals.strange_bench import Bench, bench, true_values
 from experiments.intervals.strange_optics import Gear, Head, turn
+from tvsbayes.inference import stored_posterior
 from tvsbayes.instrument.stereo_pair import parse_stereo
 
 SEED, BENCHES = 7, 6
@@ -216,5 +219,23 @@ def test_headlines_stand_beside_their_truths():
         "backlash_deg.pan": 0.1,
         "effective_mirror_offset_mm": 30.0,
     }
+    found["backlash_deg.pan"]["below_truth"] = stats.norm.cdf(-1.8)
     z, held, _ = strangers.judged([{"headlines": found}, {}], "backlash_deg.pan")
     assert z == pytest.approx([1.8]) and held.tolist() == [1.0]
+
+
+def test_a_skewed_posterior_is_judged_by_the_probability_below_the_truth(monkeypatch):
+    """Of right posteriors of any shape the transform is normal: here exponential ones, by weighted draws."""
+    rng = np.random.default_rng(4)
+    draws = rng.uniform(0, 12, 4000)
+    weights = np.exp(-draws) / np.exp(-draws).sum()
+    loaded = SimpleNamespace(weights=weights, by_name={"backlash_deg.pan": draws})
+    monkeypatch.setattr(stored_posterior, "load_posterior", lambda folder, anyway: loaded)
+    truths = rng.exponential(size=400)
+    rows = []
+    for truth in truths:
+        entry = {"truth": truth, "value": 1.0, "sd": 1.0, "low": 0.0, "high": 3.7, "contraction": 1.0}
+        entry["below_truth"] = strangers.chances_below(Path(), {"backlash_deg.pan": entry})["backlash_deg.pan"]
+        rows.append({"headlines": {"backlash_deg.pan": entry}})
+    z, *_ = strangers.judged(rows, "backlash_deg.pan")
+    assert stats.kstest(z, "norm").pvalue > 1e-3 > stats.kstest(1 - truths, "norm").pvalue
