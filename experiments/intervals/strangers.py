@@ -15,8 +15,8 @@ truth states no `approach` came from the left and from below.
 the 95 % intervals and RMS z of every headline with two-sided bounds at 1e-4 for that number of benches, and CPU seconds
 over those of importing jax, optimistix and scipy.stats in the same run. z is the standard normal quantile of the
 posterior probability above the truth (probability integral transform: Gneiting et al., J. R. Stat. Soc. B 69 (2007)
-243): normal for right posteriors of any shape, which (mean - truth) / sd of a play near zero is not. The truth: least-squares slopes of the true
-azimuth and elevation of the beam on the counters of the looks seen; contrasts are 0.
+243): normal for right posteriors of any shape, which (mean - truth) / sd of a play near zero is not. The truth:
+least-squares slopes of the true azimuth and elevation of the beam on the counters of the looks seen; contrasts are 0.
 """
 
 from __future__ import annotations
