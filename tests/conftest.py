@@ -38,6 +38,8 @@ pytest_plugins = [
 ]
 """Fixtures of one small campaign, of commands, of the report, of planning and of studies, with their helpers."""
 COMPILES = "cli"
+BESIDE = ("acquisition", "cameras", "single_axis", "statistics")
+"""Packages that need little of the model: what the other process is at while one compiles it."""
 TOGETHER = {
     **{"estimators": "estimators", "posterior": "posterior", "planning": "planning", "report": "report"},
     **{"assessment": "judgements", "comparison": "judgements"},
@@ -49,13 +51,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Order the packages for two processes.
 
     One compiles the model for the commands while the other is at what needs little of it, and then reads it from the
-    cache; the long packages follow, so that neither is left alone with one at the end.
+    cache; the long packages follow, and then single files, so that neither is left alone with a package at the end.
     """
-    groups = list(dict.fromkeys(TOGETHER.values()))
+    turns = [COMPILES, *BESIDE, *dict.fromkeys(TOGETHER.values())]
 
     def turn(item: pytest.Item) -> int:
         package = item.path.parent.name
-        return 0 if package == COMPILES else 2 + groups.index(TOGETHER[package]) if package in TOGETHER else 1
+        name = TOGETHER.get(package, package)
+        return turns.index(name) if name in turns else len(turns)
 
     items.sort(key=turn)
 

@@ -11,6 +11,7 @@ from msgspec import structs
 from support.bench_runs import Run, small_plan
 from support.fits_beside import endless, killed, two_directions, waiting
 from support.live_runs import scripted_run
+from support.small_results import small_summary
 
 from tvsbayes.acquisition import running_estimate
 from tvsbayes.acquisition.journal import read_journal
@@ -18,9 +19,9 @@ from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
 from tvsbayes.acquisition.session import acquire
-from tvsbayes.assessment.summary import summarise
 from tvsbayes.cli import acquire_command
 from tvsbayes.errors import NotConverged
+from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.plan import run_plan
 from tvsbayes.instrument.stops import legs_of
 
@@ -118,15 +119,17 @@ def test_estimate_that_cannot_start_does_not_end_the_run(tmp_path, monkeypatch):
             assert not estimate.update(12) and estimate.latest is None
 
 
-def test_estimate_of_the_command_is_the_laplace_fit(paper_fit, monkeypatch):
-    """The numbers of `fit --no-sample`, in a record."""
-    summary = summarise(paper_fit)
-    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda campaign: paper_fit)
-    found = acquire_command.fitted(paper_fit.campaign.path, 384)
+def test_estimate_of_the_command_is_the_laplace_fit(monkeypatch):
+    """The numbers of `fit --no-sample`, in a record; a direction that was never moved has none."""
+    campaign, summary = shipped_data() / "twins" / "paper_twin", small_summary()
+    fits = {"paper twin": summary}
+    monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda campaign: campaign.title)
+    monkeypatch.setattr("tvsbayes.assessment.summary.summarise", lambda fit: fits[fit])
+    found = acquire_command.fitted(campaign, 384)
     assert (found.looks, found.tier) == (384, "laplace")
-    assert found.deg_per_step == {d: e.value for d, e in summary.effective.items()}
-    assert found.u_deg_per_step == {d: e.sd for d, e in summary.effective.items()}
+    assert found.deg_per_step == {"left": summary.effective["left"].value}
+    assert found.u_deg_per_step == {"left": summary.effective["left"].sd}
     astray = structs.replace(summary, problems=("astray",), answer=None, converged=False)
     monkeypatch.setattr("tvsbayes.assessment.summary.summarise", lambda fit: astray)
     with pytest.raises(NotConverged):
-        acquire_command.fitted(paper_fit.campaign.path, 384)
+        acquire_command.fitted(campaign, 384)

@@ -88,7 +88,6 @@ def test_the_departure_is_that_of_a_dense_gaussian(mounted_rig, mixed_fit, truth
     ("changed", "what", "size"),
     [
         ({"stereo__rotation_rad__x": np.radians(0.1)}, "cameras: rotation about x", 0.1),
-        ({"extrinsics__translation_mm__y": 3.0}, "positioner: shift along y", 3.0),
         ({"degrees_per_step__tilt": 0.05 * 0.07}, "ratio: tilt", 5.0),
         ({"backlash_deg__tilt": 0.8}, "play: tilt", 0.8),
     ],

@@ -37,7 +37,7 @@ def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge,
     picks = np.random.default_rng(4).integers(0, len(found.looks), 12)
     family = Family(knowledge, found, np.concatenate([picks, picks]), False)
     target = parse_target(DEFAULT_TARGET)
-    drawn = draw_instruments(knowledge, 3, 5)
+    drawn = draw_instruments(knowledge, 2, 5)
     drawn.z[:, CONTRAST_COLUMNS] = 0.0
     # Looks count without creep, by the median of its time constant.
     drawn.z[:, [INDEX[name] for name in CREEP_NAMES]] = 0.0
@@ -45,7 +45,7 @@ def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge,
     first = assurance.values([2])
     reported = {**first, **assurance.values([6, 2])}
     instruments = assurance.instruments
-    for row in range(3):
+    for row in range(2):
         here, z, space = instruments[np.array([row])], instruments.z[row], instruments.space_of(row)
         seen = assurance.arrays.at(z, space)
         for n in (2, 6):

@@ -17,6 +17,7 @@ from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.plan import plan_seconds, read_plan
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
+from tvsbayes.planning import watch_plan as plans
 from tvsbayes.planning.watch_design import Pattern, WatchDesigns
 from tvsbayes.planning.watch_plan import watch_plan
 from tvsbayes.twin.simulated_campaign import simulate
@@ -102,11 +103,13 @@ def test_looks_keep_to_the_sheets_of_the_rig(watched_fit):
         WatchDesigns(watched_fit, replace(rig, sheets_mm={"wall": 275.0}), 0)
 
 
-def test_a_short_budget_is_kept_or_refused(watched_fit):
+def test_a_short_budget_is_kept_or_refused(watched_fit, monkeypatch):
+    tried, kept = plans._tried, []
+    monkeypatch.setattr(plans, "_tried", lambda designs: kept or kept.extend(tried(designs)) or kept)
     found = watch_plan(watched_fit, read_rig(RIG), minutes=2.0)
     assert found.minutes <= 2 and found.looks >= 4
     with pytest.raises(InputError, match="4 looks take"):
-        watch_plan(watched_fit, minutes=0.5)  # a placement alone takes one
+        watch_plan(watched_fit, read_rig(RIG), minutes=0.5)  # a placement alone takes one
 
 
 def test_the_command_writes_the_plan(watched_fit, planned, tmp_path, monkeypatch, capsys):

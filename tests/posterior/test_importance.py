@@ -24,6 +24,7 @@ from tvsbayes.inference.density import Points
 from tvsbayes.inference.importance import Pool, Weighing, k_max, lacking, uncertain
 from tvsbayes.inference.proposal import Independence, first_proposal
 from tvsbayes.inference.tables import Tables
+from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.parameters import BLOCKS, Prior
 from tvsbayes.pipeline import unusable
 from tvsbayes.posterior.draws import headline_names
@@ -327,9 +328,9 @@ def test_no_chain_is_kept_or_resumed_without_one(sampled, tmp_path):
         sample(sampled[0], "nested")
 
 
-def test_the_paper_twin_against_nuts(paper_fit):
+def test_the_paper_twin_against_nuts():
     """The reference of `experiments/sampler/nuts_reference.py`, of perfect gears, which shares no sampling code."""
-    campaign = paper_fit.campaign
+    campaign = read_campaign(shipped_data() / "twins" / "paper_twin")
     # Errors of a nanodegree are none, and need no functions of other shapes than gears that err.
     table = perfect_gears(campaign.rig)
     nearly = dict.fromkeys(BLOCKS["transmission_error_deg"], Prior(1e-9, 0.0, "half-normal"))

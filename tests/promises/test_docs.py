@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import doctest
 import importlib.util
 import json
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from support.package_imports import MODULES, ORDER, imported, room
+from support.package_imports import MODULES, ORDER, imports_of, room
 
 import tvsbayes
 from tvsbayes.cli.main import app, run
@@ -215,8 +214,7 @@ def test_map_lists_every_module_once_in_the_order_of_imports():
     assert rooms == list(ORDER)
     place = {name: number for number, name in enumerate(listed)}
     for name in listed:
-        tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
-        for other in {o.removeprefix("tvsbayes.") for o in imported(tree)} & set(MODULES):
+        for other in {o.removeprefix("tvsbayes.") for o in imports_of(name)} & set(MODULES):
             assert room(other) != room(name) or place[other] < place[name], (
                 f"{name} imports {other}, which stands below"
             )

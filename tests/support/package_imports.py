@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[2] / "tvsbayes"
@@ -73,6 +74,12 @@ def imported(tree: ast.AST, modules: frozenset[str] | None = None) -> set[str]:
 
 def parsed(name: str) -> ast.AST:
     return ast.parse(MODULES[name].read_text(encoding="utf-8"))
+
+
+@cache
+def imports_of(name: str) -> set[str]:
+    """Of a module of the package, types included."""
+    return imported(parsed(name))
 
 
 def inside(imports: dict[str, set[str]]) -> dict[str, set[str]]:
