@@ -12,7 +12,7 @@ import numpy as np
 from tvsbayes.results.estimates import Measured, PeriodEstimate
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import LinearPosterior
-from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, wave_columns
+from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, absent_at, wave_columns
 from tvsbayes.statistics.weighted_draws import systematic
 
 WITH_WAVE_MIN, WITH_WAVE = 200, 1000
@@ -41,6 +41,10 @@ class WaveSample:
     coefficients: np.ndarray
     probability: float
     record: WaveRecord
+
+    def period_unit(self, unit: str) -> str:
+        """Of its period, in a folder whose readings have this unit."""
+        return "s" if self.wave.clock == "seconds" else unit
 
     @property
     def amplitude(self) -> np.ndarray:
@@ -80,7 +84,7 @@ def _with_wave(fit: AxisFit, k: int, rng: np.random.Generator) -> tuple[np.ndarr
     before = found.copy()
     wave = model.coordinates.waves[k]
     column = names.index(f"wave_scale.{k + 1}")
-    before[:, column] = ndtri(0.5 * wave.absent)
+    before[:, column] = absent_at(wave)
     found[:, column] = ndtri(wave.absent + (1 - wave.absent) * rng.uniform(1e-9, 1 - 1e-9, len(found)))
     if not wave.is_fixed:
         place = names.index(f"wave_period.{k + 1}")
@@ -164,7 +168,7 @@ def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
     """What the readings leave open about waves, in words, with what would tell."""
     found = []
     for sample in samples:
-        unit = "s" if sample.wave.clock == "seconds" else fit.campaign.unit
+        unit = sample.period_unit(fit.campaign.unit)
         groups = separate_periods(sample.period)
         if sample.probability > 0.5 and len(groups) > 1 and sample.wave.known is None:
             said = ", ".join(f"{group.mean:.4g} {unit} ({100 * group.share:.0f} %)" for group in groups[:4])
@@ -182,7 +186,7 @@ def strong_harmonics(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
         mine = sample.likeliest
         second = float(np.hypot(*sample.coefficients[mine, 2:4].T).mean())
         if sample.probability > 0.5 and second > float(sample.amplitude[mine].mean()):
-            period, of = float(sample.true_period[mine].mean()), "s" if sample.wave.clock == "seconds" else unit
+            period, of = float(sample.true_period[mine].mean()), sample.period_unit(unit)
             found.append(
                 f"the wave of {period:.4g} {of} is strongest by its second harmonic: {second:.2g} {unit} every "
                 f"{0.5 * period:.4g} {of}; ask for that period in a range of its own to part two wheels"
@@ -199,7 +203,7 @@ def waves_at_an_end(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
             continue
         low, high = np.percentile(sample.period, TAILS_PERCENT)
         if low < wave.low * (1 + ALIKE) or high > wave.high * (1 - ALIKE):
-            of = "s" if wave.clock == "seconds" else unit
+            of = sample.period_unit(unit)
             found.append(
                 f"the period {np.mean(sample.period):.4g} {of} lies at the end of the range that was asked for "
                 f"({wave.low:.4g} to {wave.high:.4g} {of}): the true one may lie beyond; widen period_between"

@@ -27,6 +27,7 @@ from tvsbayes.single_axis.waves import (
     Tabulated,
     Wave,
     WaveRecord,
+    absent_at,
     log_scale_prior,
     wave_columns,
 )
@@ -57,7 +58,7 @@ class _Prepared:
     """Whitened readings and columns at the mode.
 
     Attributes:
-        model: the wave that is looked for is not in it.
+        model: with all other waves; the one that is looked for is not in it, or has no size at `w`.
         w: coordinates, shape (1, d).
         base: whitened readings and columns in units of their priors, shape (rows, 1 + columns).
         inverse: of the columns' information, shape (columns, columns).
@@ -213,11 +214,11 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], asked: AskedPeriod
     unknown, peaks = _inferred(rows, priors, known, unknown)
     every = [*known[: len(stated)], *peaks, *known[len(stated) :]]
     model = AxisModel.of(rows, priors, None, every)
-    mode = find_mode(model).w
-    final = []
+    mode, names, final = find_mode(model).w, model.coordinates.names, []
     for k, wave in enumerate([*stated, *unknown, *encoder]):
-        others = [*every[:k], *every[k + 1 :]]
-        final.append(_searched(_prepared(*_without(rows, priors, others, model, mode, k)), wave).wave)
+        without = mode[None].copy()
+        without[0, names.index(f"wave_scale.{k + 1}")] = absent_at(every[k])
+        final.append(_searched(_prepared(model, without), wave).wave)
     return tuple(final)
 
 
@@ -276,16 +277,3 @@ def _of_stated(clock: Clock, period: float, unit: float, rows: AxisRows, priors:
         return replace(Wave.fixed(clock, middle, unit), known=period)
     factor = float(np.exp(RATIO_SDS * spread))
     return replace(Wave.fixed(clock, middle, unit), low=middle / factor, high=middle * factor, known=period)
-
-
-def _without(
-    rows: AxisRows, priors: Mapping[str, AxisPrior], others: Sequence[Wave], model: AxisModel, mode: np.ndarray, k: int
-) -> tuple[AxisModel, np.ndarray]:
-    """The model without wave k (from 0), and its coordinates (1, d) at the mode with it."""
-    left = AxisModel.of(rows, priors, None, others)
-    known = dict(zip(model.coordinates.names, mode, strict=True))
-    found = []
-    for name in left.coordinates.names:
-        number = int(name.split(".")[1]) if name.startswith("wave_") else 0
-        found.append(known[f"wave_scale.{number + (number > k)}" if number else name])
-    return left, np.array(found)[None]

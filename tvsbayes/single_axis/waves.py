@@ -185,6 +185,13 @@ def wave_draws(wave: Wave, strength: np.ndarray, place: np.ndarray | None) -> Wa
     return WaveDraws(np.where(there, np.exp(log_scale), 0.0), period, prior + np.where(there, own, 0.0))
 
 
+def absent_at(wave: Wave) -> float:
+    """Coordinate of a wave's scale at which there is none."""
+    from scipy.special import ndtri
+
+    return float(ndtri(0.5 * wave.absent))
+
+
 def names_of(waves: Sequence[Wave]) -> tuple[str, ...]:
     """Coordinates of the waves, in order."""
     found = []
