@@ -63,21 +63,21 @@ def _told(fit: JointFit) -> _Told:
     linear = linear_spots(
         fit.linearised, fit.arrays, np.where(fit.held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
     )
-    found = stop_information(linear.spelled_out(linear.places))
-    gain = np.concatenate([group.jacobian for group in found.groups])
+    information = stop_information(linear.spelled_out(linear.places))
+    gain = np.concatenate([group.jacobian for group in information.groups])
     noise, places = gain.T @ gain, linear.places.shape[2] // 2
     scattered = np.einsum("nia,nip->nap", fit.linearised.slope, gain.reshape(-1, 4, gain.shape[1]))
     scattered *= np.sqrt(fit.linearised.scatter_variance)[:, :, None]
     by_looks = np.einsum("nap,naq->pq", scattered, scattered)
-    own = len(NAMES) + np.arange(places)
+    error_columns = len(NAMES) + np.arange(places)
     groups = dict(fit.space.mechanism.prior_groups)
-    groups |= {TRANSMISSION_ERROR: own.tolist(), PLAY_VARIATION: (own + places).tolist()}
+    groups |= {TRANSMISSION_ERROR: error_columns.tolist(), PLAY_VARIATION: (error_columns + places).tolist()}
     return _Told(
         _noise_of(fit, bool(readings)),
         noise - by_looks,
         by_looks,
-        found.fisher - noise,
-        np.linalg.inv(found.fisher + np.eye(len(noise))),
+        information.fisher - noise,
+        np.linalg.inv(information.fisher + np.eye(len(noise))),
         {cause: columns for cause, columns in groups.items() if columns},
     )
 
@@ -108,17 +108,21 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None) -> Causes:
         fit: a converged fit.
         by_places: further inputs, as d(input)/d(errors at places, N(0, 1) a priori), shape (inputs, errors).
     """
-    told = _told(fit)
-    parts = {told.pixels: told.by_pixels, LOOK_SCATTER: told.by_looks, STOP_ERRORS: told.by_stops}
-    for stem, columns in told.groups.items():
-        share = np.zeros_like(told.posterior)
+    information = _told(fit)
+    parts = {
+        information.pixels: information.by_pixels,
+        LOOK_SCATTER: information.by_looks,
+        STOP_ERRORS: information.by_stops,
+    }
+    for stem, columns in information.groups.items():
+        share = np.zeros_like(information.posterior)
         share[columns, columns] = 1.0
         parts[stem] = share
     inputs = [INDEX[name] for name in INPUT_NAMES]
     slope = np.asarray(physical_at(fit.z, fit.space).slope)[inputs]
-    spread = slope @ told.posterior[: len(NAMES)]
+    spread = slope @ information.posterior[: len(NAMES)]
     if by_places is not None:
-        spread = np.concatenate([spread, by_places @ told.posterior[len(NAMES) :]])
+        spread = np.concatenate([spread, by_places @ information.posterior[len(NAMES) :]])
     covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
     # A prior that was fixed, or that no coordinate hangs on, is no cause.
     kept = {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
@@ -147,9 +151,9 @@ def headline_causes(fit: JointFit) -> HeadlineCauses:
     if not columns:
         none = np.zeros((0, 0))
         return HeadlineCauses((), (), none, np.zeros(0), np.zeros(0), (), none)
-    told = _told(fit)
-    spread = whole_gradients(fit, np.stack(list(columns.values()), axis=1)) @ told.posterior
-    causes = [*_noise_causes(fit, told, tuple(columns), spread), *_prior_causes(fit, spread)]
+    information = _told(fit)
+    spread = whole_gradients(fit, np.stack(list(columns.values()), axis=1)) @ information.posterior
+    causes = [*_noise_causes(fit, information, tuple(columns), spread), *_prior_causes(fit, spread)]
     kept = [cause for cause in causes if np.any(cause.contribution != 0)]
     return HeadlineCauses(
         quantities=tuple(columns),
@@ -169,7 +173,7 @@ def _headline_draws(fit: JointFit) -> dict[str, np.ndarray]:
     return {name: fit.draws[name] for name in names}
 
 
-def _noise_causes(fit: JointFit, told: _Told, quantities: tuple[str, ...], spread: np.ndarray) -> list[_Cause]:
+def _noise_causes(fit: JointFit, information: _Told, quantities: tuple[str, ...], spread: np.ndarray) -> list[_Cause]:
     """What is no single quantity: noise of the campaign, errors of the gears, the cameras' calibration as one."""
     moved, every = moved_directions(fit), np.ones(len(quantities))
     physical = np.asarray(fit.draws.physical)
@@ -195,20 +199,20 @@ def _noise_causes(fit: JointFit, told: _Told, quantities: tuple[str, ...], sprea
         return min(known, default=np.inf)
 
     return [
-        _Cause(told.pixels, root(told.by_pixels), freedom(["pixel_scale"]) * every),
-        _Cause(LOOK_SCATTER, root(told.by_looks), np.array([look_freedom(q) for q in quantities])),
-        _Cause(STOP_ERRORS, root(told.by_stops), np.array([stop_freedom(q) for q in quantities])),
+        _Cause(information.pixels, root(information.by_pixels), freedom(["pixel_scale"]) * every),
+        _Cause(LOOK_SCATTER, root(information.by_looks), np.array([look_freedom(q) for q in quantities])),
+        _Cause(STOP_ERRORS, root(information.by_stops), np.array([stop_freedom(q) for q in quantities])),
         *(
-            _Cause(name, np.linalg.norm(spread[:, told.groups[name]], axis=1), np.inf * every)
+            _Cause(name, np.linalg.norm(spread[:, information.groups[name]], axis=1), np.inf * every)
             for name in PRIOR_PARTS
-            if name in told.groups
+            if name in information.groups
         ),
     ]
 
 
 def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
     """Every stated prior of the rig that a quantity hangs on."""
-    found = []
+    causes = []
     stated = (np.asarray(x).tolist() for x in (fit.space.value, fit.space.u, fit.space.kind))
     for column, (name, centre, u, kind) in enumerate(zip(fit.space.mechanism.rig_names, *stated, strict=True)):
         contribution, shape = spread[:, column], KINDS[kind]
@@ -218,8 +222,8 @@ def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
             centre = math.log(centre)
         elif shape == "half-normal":
             centre, u = u * HALF_NORMAL_MEAN, u * HALF_NORMAL_SD
-        found.append(_Cause(name, contribution, np.full(len(spread), np.inf), shape, centre, u))
-    return found
+        causes.append(_Cause(name, contribution, np.full(len(spread), np.inf), shape, centre, u))
+    return causes
 
 
 def headline_budget(causes: HeadlineCauses, quantity: str, estimate: Estimate) -> BudgetTable:

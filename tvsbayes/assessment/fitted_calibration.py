@@ -59,16 +59,16 @@ def calibration_of_draws(
 
     def standard() -> np.ndarray:
         # Exactly mean 0 and sd 1: the prior is known, its few draws need not be noise.
-        found = generator.standard_normal(len(physical))
-        return (found - found.mean()) / found.std()
+        normal = generator.standard_normal(len(physical))
+        return (normal - normal.mean()) / normal.std()
 
     if not any(spot.aperture_deg is not None for spot in campaign.spots if spot.status == "ok"):
         for name in RECEIVER_NAMES:
             prior, off = campaign.rig.priors[name], standard()
             log = prior.distribution == "log-normal"
             column[name] = prior.value * np.exp(prior.u * off) if log else prior.value + prior.u * off
-    own = campaign.rig.mechanism.named(INPUT_NAMES)
-    inputs = np.stack([column[name] for name in own], axis=1)
+    named_inputs = campaign.rig.mechanism.named(INPUT_NAMES)
+    inputs = np.stack([column[name] for name in named_inputs], axis=1)
     noise = noise_of_a_look(column)
     table = NO_GEARS if gears is None else gears.table
     if gears is not None:
@@ -93,7 +93,7 @@ def calibration_of_draws(
         noise=noise,
         gears=table,
         extrinsics=extrinsics_of(names, physical),
-        names=own,
+        names=named_inputs,
     )
 
 
@@ -128,14 +128,14 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
         draws, estimator = equal_laplace_draws(fit), "laplace"
     physical = np.asarray(draws.physical)
     # Laplace draws of the errors at places hold at the mode's scales, those of a posterior at their own.
-    own = estimator == "posterior"
-    gears = drawn_gears(fit, physical, np.asarray(draws.place_errors_rad), seed, own_scales=own)
+    sampled = estimator == "posterior"
+    gears = drawn_gears(fit, physical, np.asarray(draws.place_errors_rad), seed, own_scales=sampled)
     # Looks that the fit left out reached nothing.
-    seen = seen_range(fit)
-    range_steps = np.array([seen[axis] for axis in AXES], dtype=float)
-    found = calibration_of_draws(fit.names, physical, fit.campaign, estimator, seed, range_steps, gears)
+    counters = seen_range(fit)
+    range_steps = np.array([counters[axis] for axis in AXES], dtype=float)
+    calibration = calibration_of_draws(fit.names, physical, fit.campaign, estimator, seed, range_steps, gears)
     causes = _with_left_open(causes_of(fit, gears.by_places), gears) if gears.table.size else causes_of(fit)
-    return replace(found, causes=causes.names, cause_covariance=causes.covariance)
+    return replace(calibration, causes=causes.names, cause_covariance=causes.covariance)
 
 
 def _with_left_open(causes: Causes, gears: DrawnGears) -> Causes:
@@ -143,9 +143,9 @@ def _with_left_open(causes: Causes, gears: DrawnGears) -> Causes:
     parts, first = dict(zip(causes.names, causes.covariance, strict=True)), len(INPUT_NAMES)
     for name, part in gears.table.parts.items():
         cause = TRANSMISSION_ERROR if name.startswith(ERROR_AT) else PLAY_VARIATION
-        own = np.zeros(causes.covariance.shape[1:])
+        open_covariance = np.zeros(causes.covariance.shape[1:])
         place = slice(first + part.start, first + part.stop)
-        own[place, place] = np.cov(gears.left_open[:, part], rowvar=False)
-        if np.any(own):
-            parts[cause] = parts.get(cause, 0.0) + own
+        open_covariance[place, place] = np.cov(gears.left_open[:, part], rowvar=False)
+        if np.any(open_covariance):
+            parts[cause] = parts.get(cause, 0.0) + open_covariance
     return Causes(tuple(parts), np.stack(list(parts.values())))

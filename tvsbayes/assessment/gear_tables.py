@@ -66,10 +66,10 @@ class Process:
         """Of values at angles (draws, n): shape (draws, n, n), deg^2."""
         distance = angle_deg[:, :, None] - angle_deg[:, None, :]
         sd, length, *amplitudes = (x[:, None, None] for x in (self.sd, self.length, *self.amplitudes.T))
-        found = repeated(distance, sd, length, zip(amplitudes, self.periods, strict=True))
+        covariance = repeated(distance, sd, length, zip(amplitudes, self.periods, strict=True))
         # Of plays too, which `place_root` scales after their factor: draws may have none.
         floor = JITTER * self.variance + FLOOR_RAD2 * DEGREES**2
-        return found + floor[:, None, None] * np.eye(angle_deg.shape[1])
+        return covariance + floor[:, None, None] * np.eye(angle_deg.shape[1])
 
     @property
     def variance(self) -> np.ndarray:
@@ -111,8 +111,8 @@ def conditional(
     for begin in range(0, len(values), BLOCK):
         rows = slice(begin, begin + BLOCK)
         root = np.linalg.cholesky(process[rows].covariance(np.concatenate([seen_deg[rows], new_deg[rows]], axis=1)))
-        own = np.linalg.solve(root[:, :count, :count], values[rows, :, None])
-        expected[rows] = (root[:, count:, :count] @ own)[..., 0]
+        whitened = np.linalg.solve(root[:, :count, :count], values[rows, :, None])
+        expected[rows] = (root[:, count:, :count] @ whitened)[..., 0]
         left_open[rows] = (root[:, count:, count:] @ normal[rows, :, None])[..., 0]
     return Conditional(expected, left_open)
 
@@ -147,15 +147,15 @@ def process_of(physical: np.ndarray, name: str, periods: tuple[float, ...]) -> P
 
 def _table(physical: np.ndarray, seen_steps: Mapping[str, np.ndarray]) -> GearTable:
     """Regular counters around those seen, by the draws' middle lengths."""
-    found = []
+    columns = []
     for axis in AXES:
         length = float(np.median(physical[:, INDEX[f"transmission_error_length_deg.{axis}"]]))
         steps = length / abs(float(np.median(physical[:, INDEX[f"degrees_per_step.{axis}"]])))
         low, high = float(seen_steps[axis].min()), float(seen_steps[axis].max())
         reach = MARGIN_LENGTHS * steps
         nodes = regular_counters(low - reach, high + reach, steps / COUNTERS_PER_LENGTH)
-        found.append(tuple(nodes.tolist()))
-    return GearTable((found[0], found[1]))
+        columns.append(tuple(nodes.tolist()))
+    return GearTable((columns[0], columns[1]))
 
 
 def drawn_gears(
@@ -177,8 +177,8 @@ def drawn_gears(
     if not errors:
         none = np.zeros((count, 0))
         return DrawnGears(NO_GEARS, none, none, np.zeros((0, 0)))
-    steps, own = np.asarray(fit.arrays.gears.places.steps), seen_places(fit)
-    table = _table(physical, {axis: steps[own[axis]] for axis in AXES})
+    steps, seen_of = np.asarray(fit.arrays.gears.places.steps), seen_places(fit)
+    table = _table(physical, {axis: steps[seen_of[axis]] for axis in AXES})
     # The fit's own scales too: how its table follows the places, in units in which they are N(0, 1) a priori.
     mode, root = np.asarray(fit.mode.physical), np.asarray(fit.linearised.place_root) * DEGREES
     generator = np.random.default_rng([seed, 7])
@@ -186,19 +186,19 @@ def drawn_gears(
     by_places = np.zeros((table.size, errors))
     for name, part in table.parts.items():
         axis = _axis(name)
-        at = own[axis] + (0 if name.startswith(ERROR_AT) else errors // 2)
+        at = seen_of[axis] + (0 if name.startswith(ERROR_AT) else errors // 2)
         periods = stated_periods(fit, axis)
-        seen, new = steps[own[axis]], np.array(table.steps[AXES.index(axis)])
+        known, new = steps[seen_of[axis]], np.array(table.steps[AXES.index(axis)])
         normal = generator.standard_normal((count, len(new) + 1))
         process, ratio = process_of(physical, name, periods), physical[:, INDEX[f"degrees_per_step.{axis}"], None]
         values = place_errors_rad[:, at] * DEGREES
-        found = conditional(process, ratio * seen, values, ratio * new, normal[:, :-1])
+        drawn = conditional(process, ratio * known, values, ratio * new, normal[:, :-1])
         own_ratio = float(mode[INDEX[f"degrees_per_step.{axis}"]])
-        follows = _following(process_of(mode[None], name, periods), own_ratio * seen, own_ratio * new)
+        follows = _following(process_of(mode[None], name, periods), own_ratio * known, own_ratio * new)
         inner = slice(part.start, part.stop - 1)
         by_places[inner] = follows @ root[at]
-        expected[:, inner] = found.expected if own_scales else values @ follows.T
-        left_open[:, inner] = found.left_open
+        expected[:, inner] = drawn.expected if own_scales else values @ follows.T
+        left_open[:, inner] = drawn.left_open
         left_open[:, part.stop - 1] = np.sqrt(process.variance) * normal[:, -1]
     # What nobody knows moves no estimate.
     return DrawnGears(table, expected, left_open - left_open.mean(axis=0), by_places)

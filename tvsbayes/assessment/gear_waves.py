@@ -108,7 +108,7 @@ def gear_periods(posterior: Posterior) -> tuple[GearPeriod, ...]:
     fit, rng = posterior.fit, np.random.default_rng([posterior.seed, 13])
     drawn = posterior.resampled(1, DRAWS).joined
     physical, errors_deg = np.asarray(drawn.physical), np.asarray(drawn.place_errors_rad) * DEGREES
-    found: list[GearPeriod] = []
+    periods: list[GearPeriod] = []
     if not errors_deg.shape[1]:
         return ()
     places = seen_places(fit)
@@ -121,5 +121,5 @@ def gear_periods(posterior: Posterior) -> tuple[GearPeriod, ...]:
                 one = wave_draws(process, number, angle_deg, errors_deg[:, at], rng.standard_normal((DRAWS, 2)))
                 stated = Measured(period, 0.0, (period, period))
                 amplitude, phase = _measured(one.amplitude), _measured(one.phase_deg)
-                found.append(GearPeriod(stated, amplitude, phase, "stated", one.probability, axis))
-    return tuple(found)
+                periods.append(GearPeriod(stated, amplitude, phase, "stated", one.probability, axis))
+    return tuple(periods)

@@ -93,12 +93,12 @@ class SampledHeadlines:
         # In units of the stated u: a half-normal quantity of its own value, all others of their coordinate.
         stated = np.where(self.half[members], half_normal(z), z)
         log_ratio = -0.5 * (factor**-2 - 1) * np.sum(stated**2, axis=1)
-        found = smoothed_weights(np.log(np.maximum(self.weights, np.finfo(float).tiny)) + log_ratio)
-        if found.pareto_k >= K_LIMIT or effective_draws(found.weights) < ENOUGH:
+        weights = smoothed_weights(np.log(np.maximum(self.weights, np.finfo(float).tiny)) + log_ratio)
+        if weights.pareto_k >= K_LIMIT or effective_draws(weights.weights) < ENOUGH:
             return None
-        mean, centre = weighted_mean(self.values, found.weights), weighted_mean(self.values, self.weights)
+        mean, centre = weighted_mean(self.values, weights.weights), weighted_mean(self.values, self.weights)
         sd = np.sqrt(self.weights @ (self.values - centre) ** 2)
-        return Change((mean - centre) / sd, np.sqrt(found.weights @ (self.values - mean) ** 2) / sd)
+        return Change((mean - centre) / sd, np.sqrt(weights.weights @ (self.values - mean) ** 2) / sd)
 
 
 def sampled_headlines(fit: JointFit, moved: set[str], posterior: Posterior) -> tuple[list[str], SampledHeadlines]:
@@ -141,13 +141,13 @@ def prior_sensitivity(
     names = np.array(fit.names)[rows]
     groups = {name: np.flatnonzero(names == name) for name in names if not name.startswith("stereo.")}
     groups["stereo calibration"] = np.flatnonzero(np.char.startswith(names, "stereo."))
-    found = []
+    changes = []
     for parameter, members in groups.items():
         for factor in FACTORS:
             change = None if sampled is None else sampled.changed(members, factor)
             change = normal.changed(members, factor) if change is None else change
             for quantity, shift, ratio in zip(quantities, change.shift_sd, change.sd_ratio, strict=True):
                 if abs(shift) > SENSITIVE_SHIFT or abs(np.log(ratio)) > np.log1p(SENSITIVE_SD):
-                    found.append(PriorSensitivity(str(parameter), quantity, factor, float(shift), float(ratio)))
-    found.sort(key=lambda e: -max(abs(e.shift_sd), abs(np.log(e.sd_ratio))))
-    return tuple(found[:LISTED])
+                    changes.append(PriorSensitivity(str(parameter), quantity, factor, float(shift), float(ratio)))
+    changes.sort(key=lambda e: -max(abs(e.shift_sd), abs(np.log(e.sd_ratio))))
+    return tuple(changes[:LISTED])

@@ -63,25 +63,25 @@ def _left_to_stops(fit: JointFit) -> np.ndarray:
     """
     left = np.concatenate([group.residual for group in fit.information.groups]).reshape(-1, 4)
     slope, spots = np.asarray(fit.linearised.slope), ordered_spots(fit.campaign)
-    told = np.einsum("nia,ni->na", slope, left)
+    projected = np.einsum("nia,ni->na", slope, left)
     for index, axis in enumerate(AXES):
         rests = rests_of(fit.campaign.moves, axis)
-        _, first, own = np.unique([rests[spot.move].move for spot in spots], return_index=True, return_inverse=True)
-        error_rad = fit.linearised.stop_variance[first, index] * np.bincount(own, told[:, index])
-        left = left + slope[..., index] * error_rad[own, None]
+        _, first, stop_of = np.unique([rests[spot.move].move for spot in spots], return_index=True, return_inverse=True)
+        error_rad = fit.linearised.stop_variance[first, index] * np.bincount(stop_of, projected[:, index])
+        left = left + slope[..., index] * error_rad[stop_of, None]
     return left
 
 
 def _seen_rests(fit: JointFit, axis: str, residual: np.ndarray) -> list[_SeenRest]:
     """Rests of an axis that usable spots tell of, in order, by whitened residuals (spots, 4)."""
     index, rests = AXES.index(axis), rests_of(fit.campaign.moves, axis)
-    seen = replace(fit.linearised, residual=residual).spot_deviations()
-    deviation, variance = seen.deviation_rad[:, index], seen.covariance_rad2[:, index, index]
+    deviations = replace(fit.linearised, residual=residual).spot_deviations()
+    deviation, variance = deviations.deviation_rad[:, index], deviations.covariance_rad2[:, index, index]
     valid = np.asarray(fit.arrays.spots.valid)
     rows_of: dict[Rest, list[int]] = {}
     for row, spot in enumerate(ordered_spots(fit.campaign)):
         rows_of.setdefault(rests[spot.move], []).append(row)
-    found = []
+    entries = []
     for rest, every in rows_of.items():
         # A variance of 0: the spot tells neither angle.
         rows = np.array([row for row in every if valid[row] > 0 and variance[row] > 0], dtype=int)
@@ -89,8 +89,8 @@ def _seen_rests(fit: JointFit, axis: str, residual: np.ndarray) -> list[_SeenRes
             weight = 1 / variance[rows]
             total = float(weight.sum())
             mean = float(deviation[rows] @ weight) / total
-            found.append(_SeenRest(rest, every[0], rows, deviation[rows], variance[rows], mean, 1 / total))
-    return found
+            entries.append(_SeenRest(rest, every[0], rows, deviation[rows], variance[rows], mean, 1 / total))
+    return entries
 
 
 def stop_readings(fit: JointFit, axis: str) -> StopReadings:
@@ -107,8 +107,8 @@ def stop_readings(fit: JointFit, axis: str) -> StopReadings:
     """
     values = dict(zip(fit.names, np.asarray(fit.mode.physical, dtype=float).tolist(), strict=True))
     needed = values[f"backlash_deg.{axis}"] / abs(values[f"degrees_per_step.{axis}"])
-    seen = _seen_rests(fit, axis, np.asarray(fit.linearised.residual))
-    kept = [one for one in seen if one.rest.sign != 0 and one.rest.leg >= needed]
+    rests = _seen_rests(fit, axis, np.asarray(fit.linearised.residual))
+    kept = [one for one in rests if one.rest.sign != 0 and one.rest.leg >= needed]
     first = [one.rows[0] for one in kept]
     predicted = np.asarray(fit.linearised.mirror_angles_rad)[first, AXES.index(axis)]
     pan, tilt = np.degrees(fit.reference_pose_rad).tolist()
@@ -118,7 +118,7 @@ def stop_readings(fit: JointFit, axis: str) -> StopReadings:
         side=np.array([one.rest.sign for one in kept], dtype=int),
         mirror_deg=np.degrees(predicted + [one.mean_rad for one in kept]),
         u_deg=np.degrees(np.sqrt([one.mean_variance_rad2 for one in kept])),
-        play_left_out=len(seen) - len(kept),
+        play_left_out=len(rests) - len(kept),
         reference_pose_deg=(pan, tilt),
         values=values,
     )
@@ -133,12 +133,12 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
     spots, moves = ordered_spots(fit.campaign), fit.campaign.moves
     # A direction has no depth.
     depth_mm = np.asarray(fit.arrays.spots.triangulated_mm)[:, 0] * (not fit.space.mechanism.sightings)
-    left, found = _left_to_stops(fit), list[StopResidual]()
+    left, residuals = _left_to_stops(fit), list[StopResidual]()
     for index, axis in enumerate(AXES):
         for one in _seen_rests(fit, axis, left):
             # The row that drew the stop error has its variance, whether that spot is used or not.
             variance = one.mean_variance_rad2 + fit.linearised.stop_variance[one.first, index]
-            found.append(
+            residuals.append(
                 StopResidual(
                     axis=axis,
                     spots=tuple(spots[row].spot for row in one.rows),
@@ -146,13 +146,13 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
                     direction=direction_of(axis, one.rest.sign),
                     leg_steps=abs(one.rest.distance),
                     depth_mm=tuple(depth_mm[one.rows].tolist()),
-                    within=recursive_residuals(one.deviation_rad, one.variance_rad2, backwards=len(found) % 2 == 1),
+                    within=recursive_residuals(one.deviation_rad, one.variance_rad2, backwards=len(residuals) % 2 == 1),
                     time_s=moves[spots[one.rows[0]].move].time_s,
                     deviation_deg=float(np.degrees(one.mean_rad)),
                     u_deg=float(np.degrees(np.sqrt(variance))),
                 )
             )
-    return tuple(found)
+    return tuple(residuals)
 
 
 def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
@@ -168,7 +168,7 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
         "time": lambda r: r.time_s,
     }
     units = {"N": " steps", "time": " s"}
-    found = []
+    causes = []
     for axis in AXES:
         mine = [r for r in residuals if r.axis == axis]
         scaled = np.array([r.deviation_deg / r.u_deg for r in mine])
@@ -192,9 +192,9 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
                 members.append(part)
             testable = [part for part in members if len(part) > 1 and np.ptp(part) > 0]
             p = one_way_chance(testable) if len(testable) > 1 else None
-            found.append(Cause(name, axis, tuple(groups), p, False))
-    tests = sum(cause.p is not None for cause in found)
-    return tuple(structs.replace(c, suspicious=c.p is not None and c.p * tests < CAUSE_LIMIT) for c in found)
+            causes.append(Cause(name, axis, tuple(groups), p, False))
+    tests = sum(cause.p is not None for cause in causes)
+    return tuple(structs.replace(c, suspicious=c.p is not None and c.p * tests < CAUSE_LIMIT) for c in causes)
 
 
 def _placed(depths_mm: Sequence[float]) -> list[tuple[str, np.ndarray]]:

@@ -62,13 +62,13 @@ class _SeenAxis:
 
 def _seen_axes(fit: JointFit) -> list[_SeenAxis]:
     slope, angle = np.asarray(fit.linearised.slope), np.degrees(fit.linearised.mirror_angles_rad)
-    found = []
+    axes = []
     for index, axis in enumerate(AXES):
         rests = rests_of(fit.campaign.moves, axis)
         at = [rests[spot.move] for spot in ordered_spots(fit.campaign)]
         counter, leg = (np.array([getattr(rest, field) for rest in at]) for field in ("steps", "distance"))
-        found.append(_SeenAxis(axis, slope[:, :, index : index + 1], angle[:, index], counter, leg))
-    return found
+        axes.append(_SeenAxis(axis, slope[:, :, index : index + 1], angle[:, index], counter, leg))
+    return axes
 
 
 def _epipolar(fit: JointFit) -> np.ndarray:
@@ -80,8 +80,8 @@ def _epipolar(fit: JointFit) -> np.ndarray:
     readings = -jacobian[:, :, INDEX["aperture_zero_deg"]]
     # Without a reading the last of the four components is empty.
     readings = np.where(np.any(readings, axis=1, keepdims=True), readings, np.eye(4)[3])
-    taken = np.concatenate([slope.transpose(0, 2, 1), readings[:, None]], axis=1)
-    normal = np.linalg.svd(taken)[2][:, -1]
+    slopes = np.concatenate([slope.transpose(0, 2, 1), readings[:, None]], axis=1)
+    normal = np.linalg.svd(slopes)[2][:, -1]
     row = np.linalg.pinv(np.asarray(fit.space.stereo_root))[:, STEREO_PARAMETER_NAMES.index("stereo.right.cy")]
     shift = -jacobian[:, :, len(RIG_NAMES) :] @ row
     shift = normal * np.sum(normal * shift, axis=1, keepdims=True)
@@ -105,8 +105,8 @@ def _defects_in_time(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]:
     apart = _epipolar(fit)
 
     def rows(count: int) -> np.ndarray:
-        found = np.unique(np.linspace(0, len(spots), count + 2)[1:-1].astype(int))
-        return found[found > 0]
+        edges = np.unique(np.linspace(0, len(spots), count + 2)[1:-1].astype(int))
+        return edges[edges > 0]
 
     def since(row: int) -> np.ndarray:
         return (order >= row).astype(float)
@@ -230,12 +230,14 @@ class _Asked:
 
 
 def _ask(fit: JointFit, defects: Sequence[_Defect]) -> _Asked:
-    own = np.where(fit.held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
-    asked = np.concatenate([own, *(columns for defect in defects for columns in defect.columns)], axis=2)
-    information = stop_information(linear_spots(fit.linearised, fit.arrays, asked))
+    columns_of_fit = np.where(fit.held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
+    columns_of_all = np.concatenate(
+        [columns_of_fit, *(columns for defect in defects for columns in defect.columns)], axis=2
+    )
+    information = stop_information(linear_spots(fit.linearised, fit.arrays, columns_of_all))
     errors = np.concatenate([group.residual for group in information.groups])
-    score = asked.reshape(-1, asked.shape[2]).T @ errors
-    p = own.shape[2]
+    score = columns_of_all.reshape(-1, columns_of_all.shape[2]).T @ errors
+    p = columns_of_fit.shape[2]
     fisher, cross = information.fisher[:p, :p], information.fisher[:p, p:]
     values, vectors = np.linalg.eigh(fisher)
     kept = values > KNOWN_DIRECTION
@@ -274,35 +276,35 @@ def validate(fit: JointFit) -> Validation:
     """
     axes = _seen_axes(fit)
     defects = [*_defects_in_time(fit, axes), *_defects_in_place(fit, axes)]
-    asked = _ask(fit, defects)
-    found = [_single_spots(fit, asked)]
+    question = _ask(fit, defects)
+    results = [_single_spots(fit, question)]
     start = 0
     for defect in defects:
         answers = []
         for place, columns in zip(defect.places, defect.columns, strict=True):
             rows = slice(start, start + columns.shape[2])
             start = rows.stop
-            answer = asked.scores.answer(defect.name, place, rows)
+            answer = question.scores.answer(defect.name, place, rows)
             if answer is not None:
                 answers.append(answer)
         if answers:
             worst = min(answers, key=lambda a: a.log_p)
-            found.append(replace(worst, log_p=worst.log_p + np.log(len(answers)), places=len(answers)))
-    return _holm(found)
+            results.append(replace(worst, log_p=worst.log_p + np.log(len(answers)), places=len(answers)))
+    return _holm(results)
 
 
-def _single_spots(fit: JointFit, asked: _Asked) -> _Answer:
+def _single_spots(fit: JointFit, question: _Asked) -> _Answer:
     """The spot that all others foretell worst; how far it moves a headline is not asked (`--robust` drops it).
 
     As `linear_spots.leave_one_out_chi2`, less what the fit can follow.
     """
     spots = ordered_spots(fit.campaign)
-    p, shift = len(asked.own_score), asked.followed @ asked.own_score
-    errors = np.concatenate([(g.residual - g.jacobian[:, :p] @ shift).reshape(-1, 4) for g in asked.groups])
+    p, shift = len(question.own_score), question.followed @ question.own_score
+    errors = np.concatenate([(g.residual - g.jacobian[:, :p] @ shift).reshape(-1, 4) for g in question.groups])
     blocks = []
-    for group in asked.groups:
-        own = group.jacobian[:, :p]
-        left = group.precision - own @ asked.followed @ own.T
+    for group in question.groups:
+        fitted = group.jacobian[:, :p]
+        left = group.precision - fitted @ question.followed @ fitted.T
         blocks += [left[k : k + 4, k : k + 4] for k in range(0, len(left), 4)]
     values, vectors = np.linalg.eigh(np.stack(blocks))
     kept = values > ABSORBED
@@ -324,11 +326,11 @@ def _single_spots(fit: JointFit, asked: _Asked) -> _Answer:
     )
 
 
-def _holm(found: Sequence[_Answer]) -> Validation:
+def _holm(answers: Sequence[_Answer]) -> Validation:
     """All tests together at `VALIDATION_LEVEL`; the defect with the least p is named as the cause."""
-    found = sorted(found, key=lambda a: a.log_p)
+    answers = sorted(answers, key=lambda a: a.log_p)
     bad = 0
-    while bad < len(found) and found[bad].log_p <= np.log(VALIDATION_LEVEL / (len(found) - bad)):
+    while bad < len(answers) and answers[bad].log_p <= np.log(VALIDATION_LEVEL / (len(answers) - bad)):
         bad += 1
     tests = tuple(
         ValidationTest(
@@ -341,7 +343,7 @@ def _holm(found: Sequence[_Answer]) -> Validation:
             failed=rank < bad,
             shift_sd=a.shift_sd,
         )
-        for rank, a in enumerate(found)
+        for rank, a in enumerate(answers)
     )
     cause = f"{tests[0].name}: {tests[0].where}" if bad else ""
     inflation = float(np.hypot(1.0, max((t.shift_sd for t in tests[:bad]), default=0.0)))

@@ -91,10 +91,10 @@ def equal_laplace_draws(fit: JointFit) -> Derived:
     """`laplace_draws` that weigh the same, as many as the fit has of its own; its own where there is one way."""
     if len(fit.mixture) == 1:
         return fit.draws
-    found, count = laplace_draws(fit), len(fit.draws.physical)
+    weighted, count = laplace_draws(fit), len(fit.draws.physical)
     # In order, the first of them would be of one way alone.
-    places = np.random.default_rng(MIXING_SEED).permutation(systematic(found.weights, count, 0.5))
-    return jax.tree.map(lambda x: x[places], found.draws)
+    places = np.random.default_rng(MIXING_SEED).permutation(systematic(weighted.weights, count, 0.5))
+    return jax.tree.map(lambda x: x[places], weighted.draws)
 
 
 class _Source:
@@ -114,9 +114,12 @@ class _Source:
         plain = _estimate(float(self.centre[name]), self.draws[name], self.weights, self.prior[name])
         if self.posterior is None:
             return plain
-        found = self.posterior.convergence
+        convergence = self.posterior.convergence
         return structs.replace(
-            plain, rhat=found.rhat.get(name), ess_bulk=found.ess_bulk.get(name), ess_tail=found.ess_tail.get(name)
+            plain,
+            rhat=convergence.rhat.get(name),
+            ess_bulk=convergence.ess_bulk.get(name),
+            ess_tail=convergence.ess_tail.get(name),
         )
 
 
@@ -160,8 +163,8 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
 
 def _by_part(source: _Source, block: str, moved: set[str]) -> dict[str, Estimate | None]:
     """Quantities of a block by the last part of their names; None of directions that never moved."""
-    found = (QUANTITIES[name] for name in QUANTITIES.blocks[block])
-    return {of.parts[-1]: source.estimate(of.name) if of.applies(moved) else None for of in found}
+    quantities = (QUANTITIES[name] for name in QUANTITIES.blocks[block])
+    return {of.parts[-1]: source.estimate(of.name) if of.applies(moved) else None for of in quantities}
 
 
 def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
@@ -177,19 +180,19 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
     if not len(selection.experiments):
         return result
     rows = experiment_rows(fit.campaign, selection)
-    asked = selection.steps, selection.axis, fit.campaign.stereo
+    experiment = selection.steps, selection.axis, fit.campaign.stereo
     if source.posterior is None:
-        found = ratio_slopes(np.asarray(fit.linearised.predicted)[rows][..., :4], *asked)
+        slopes = ratio_slopes(np.asarray(fit.linearised.predicted)[rows][..., :4], *experiment)
         push = np.asarray(fit.linearised.predicted_jacobian)[rows][..., :4, :]
-        centre, slope = found.ratio, np.einsum("epq,epqz->ez", found.by_pixel, push)
+        centre, slope = slopes.ratio, np.einsum("epq,epqz->ez", slopes.by_pixel, push)
         draws = centre + (fit.draws_z[:CLASSIC_DRAWS] - fit.z) @ slope.T
     else:
-        draws = four_point_ratios(ideal_pixels(source.posterior, CLASSIC_DRAWS)[:, rows], *asked)
+        draws = four_point_ratios(ideal_pixels(source.posterior, CLASSIC_DRAWS)[:, rows], *experiment)
         centre = np.where(np.isfinite(draws), draws, 0.0).sum(axis=0) / np.maximum(np.isfinite(draws).sum(axis=0), 1)
-    seen = np.isfinite(draws).mean(axis=0) > SEEN_SHARE
+    finite = np.isfinite(draws).mean(axis=0) > SEEN_SHARE
     for direction in DIRECTIONS:
         # Pixels far from the image, of a fit or draw that went astray, cannot be undistorted: there is no ratio then.
-        chosen = (selection.direction == direction) & seen
+        chosen = (selection.direction == direction) & finite
         values = draws[:, chosen].mean(axis=1) if chosen.any() else np.zeros(0)
         values = values[np.isfinite(values)]
         if len(values):
@@ -214,9 +217,11 @@ def _along(posterior: Posterior, axis: int, moved: set[str]) -> tuple[CurvePoint
         pose = np.degrees(posterior.fit.reference_pose_rad)
         pose[axis] = angle
         pan, tilt = pose.tolist()
-        found = posterior.local_deg_per_step(pan, tilt)
+        estimates = posterior.local_deg_per_step(pan, tilt)
         ratios = {
-            direction: RatioAt(float(found.mean[k]), float(found.sd[k]), tuple(found.interval95[:, k].tolist()))
+            direction: RatioAt(
+                float(estimates.mean[k]), float(estimates.sd[k]), tuple(estimates.interval95[:, k].tolist())
+            )
             for k, direction in enumerate(DIRECTIONS)
             if direction in moved
         }
@@ -229,9 +234,9 @@ def _lost_motion(posterior: Posterior, direction: str) -> tuple[LostMotion, ...]
     used = sorted(set(legs_of(posterior.fit.campaign.moves)[direction]))
     chosen = np.unique(np.linspace(0, len(used) - 1, min(CURVE_POINTS, len(used))).astype(int))
     steps = [used[i] for i in chosen]
-    found = posterior.lost_motion_deg(direction, np.array(steps))
+    motion = posterior.lost_motion_deg(direction, np.array(steps))
     return tuple(
-        LostMotion(n, float(found.mean[k]), float(found.sd[k]), tuple(found.interval95[:, k].tolist()))
+        LostMotion(n, float(motion.mean[k]), float(motion.sd[k]), tuple(motion.interval95[:, k].tolist()))
         for k, n in enumerate(steps)
     )
 
@@ -241,7 +246,7 @@ def seen_range(fit: JointFit) -> dict[str, tuple[int, int]]:
     used = np.asarray(fit.arrays.spots.valid) > 0
     moves = np.unique(np.asarray(fit.arrays.spots.move_index)[used])
     steps = {axis: [getattr(fit.campaign.moves[move], f"{axis}_steps") for move in moves] for axis in AXES}
-    return {axis: (min(seen), max(seen)) for axis, seen in steps.items()}
+    return {axis: (min(counters), max(counters)) for axis, counters in steps.items()}
 
 
 def worth_sampling(fit: JointFit) -> bool:

@@ -67,12 +67,15 @@ def _counters_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
     ratio = np.radians(physical[[INDEX[f"degrees_per_step.{a}"] for a in AXES]])
     scales = scales_at(physical, np.asarray(fit.space.harmonic_period_deg))
     known = KnownPlaces(np.asarray(places.steps)[valid], np.asarray(places.on_tilt)[valid], ratio, scales)
-    both = with_places(fit.z, fit.covariance, fit.information).covariance
-    own = count + np.flatnonzero(valid)
+    covariance = with_places(fit.z, fit.covariance, fit.information).covariance
+    error_columns = count + np.flatnonzero(valid)
     widest = int(np.argmax(np.diff(counters)))
     at = known.between(np.array([counters[widest : widest + 2]]).mean(axis=1), AXES.index(axis))
-    share, rest = at.error[0], at.error_rest[0]
-    left, prior = share @ both[np.ix_(own, own)] @ share + rest**2, share @ share + rest**2
+    share, remainder = at.error[0], at.error_rest[0]
+    left, prior = (
+        share @ covariance[np.ix_(error_columns, error_columns)] @ share + remainder**2,
+        share @ share + remainder**2,
+    )
     if left < WEAK_VARIANCE * prior or prior <= LEAST_ERROR_RAD**2:
         return None
     wanted = int(np.clip(np.ceil(np.ptp(counters) * abs(np.degrees(ratio[AXES.index(axis)])) / SPACING_DEG) + 1, 4, 7))
@@ -120,7 +123,7 @@ def _shift_directions(fit: JointFit, axis: Axis) -> list[WeakDirection]:
         f"the {axis} ratio": (0.5 * (negative + positive), f"degrees_per_step.{axis}"),
         f"the {axis} backlash": (backlash, f"backlash_deg.{axis}"),
     }
-    found = []
+    directions = []
     for block, (words, cure) in SHIFTS.items():
         shift = f"{block}.{axis}"
         if not fit.free[INDEX[shift]]:
@@ -131,28 +134,28 @@ def _shift_directions(fit: JointFit, axis: Axis) -> list[WeakDirection]:
                 correlation = float(np.corrcoef(values, draws)[0, 1])
                 if inseparable(correlation):
                     text = f"{what} and {words} are hardly told apart (correlation {correlation:+.2f}): {cure}"
-                    found.append(WeakDirection(text, {name: 1.0, shift: correlation}))
-    return found
+                    directions.append(WeakDirection(text, {name: 1.0, shift: correlation}))
+    return directions
 
 
 def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]:
     """Combinations of parameters that data and priors leave wide, in words: axes never moved, play, priors alone."""
-    found = []
+    directions = []
     for axis, pair in SENSES.items():
         if not moved & set(pair):
             text = f"the {axis} axis was never moved: its ratio and backlash are the prior's; add moves on that axis"
-            found.append(WeakDirection(text, {f"degrees_per_step.{axis}": 1.0}))
+            directions.append(WeakDirection(text, {f"degrees_per_step.{axis}": 1.0}))
             continue
         weak = _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])
-        rest = _counters_direction(fit, axis), _scatter_direction(fit, axis)
-        found += [one for one in (weak, *rest, *_shift_directions(fit, axis)) if one is not None]
+        of_axis = _counters_direction(fit, axis), _scatter_direction(fit, axis)
+        directions += [one for one in (weak, *of_axis, *_shift_directions(fit, axis)) if one is not None]
     noise = {*NOISE_NAMES, *STEREO_PARAMETER_NAMES, *names_of("creep_minutes")}
     rows = np.array([i for i, name in enumerate(fit.names) if fit.free[i] and name not in noise])
     if rows.size == 0:
-        return tuple(found)
+        return tuple(directions)
     eigenvalues, vectors = np.linalg.eigh(fit.covariance[np.ix_(rows, rows)])
     for value, vector in list(zip(eigenvalues, vectors.T, strict=True))[::-1]:
-        if value < WEAK_VARIANCE or len(found) >= LISTED:
+        if value < WEAK_VARIANCE or len(directions) >= LISTED:
             break
         order = np.argsort(-np.abs(vector))
         loadings = {fit.names[rows[i]]: float(vector[i]) for i in order if abs(vector[i]) > LOADING_LIMIT}
@@ -167,8 +170,8 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
             listed = ", ".join(names[:-1]) + " and " + names[-1]
             text = f"{listed} move together, set by the prior: {left} that direction's variance is left; "
             text += "state one of them better or accept it"
-        found.append(WeakDirection(text, loadings))
-    return tuple(found)
+        directions.append(WeakDirection(text, loadings))
+    return tuple(directions)
 
 
 def headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.ndarray]:
@@ -229,11 +232,11 @@ def leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
 
 def prior_conflicts(fit: JointFit) -> tuple[str, ...]:
     """Parameters whose mode lies where their prior hardly allows: a wrong sign or unit, or a prior stated too tight."""
-    found = []
+    conflicts = []
     for index in np.flatnonzero(fit.free & (np.abs(fit.z) > CONFLICT_LIMIT)):
         value, distance = fit.mode.physical[index], abs(fit.z[index])
-        found.append(conflict_sentence(f"{fit.names[index]} = {value:.4g}", distance))
-    return tuple(found)
+        conflicts.append(conflict_sentence(f"{fit.names[index]} = {value:.4g}", distance))
+    return tuple(conflicts)
 
 
 def poorly_known_stops(fit: JointFit) -> dict[str, int]:

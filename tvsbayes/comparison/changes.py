@@ -24,11 +24,11 @@ COMPARED = tuple(of.name for of in TARGETS.values() if of.judged)
 """What is compared, by the names that JSON gives it; the ratios are local ones."""
 
 
-def _draws_at(found: JointFit, pose_rad: np.ndarray) -> np.ndarray:
+def _draws_at(fit: JointFit, pose_rad: np.ndarray) -> np.ndarray:
     """`COMPARED` at a pose, shape (1 + draws, quantities): the estimate, then the Laplace draws."""
     from tvsbayes.posterior.draws import local_at
 
-    drawn = local_at(found, np.vstack([found.z, found.draws_z]), pose_rad)
+    drawn = local_at(fit, np.vstack([fit.z, fit.draws_z]), pose_rad)
     return np.stack([drawn[name.replace("effective_deg_per_step", "local_deg_per_step")] for name in COMPARED], axis=1)
 
 

@@ -55,7 +55,7 @@ def _ideal(space: ParameterSpace, names: Sequence[str]) -> ParameterSpace:
     return space
 
 
-def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int = GAP_DRAWS) -> dict[str, Gap | None]:
+def explain_gap(fit: JointFit, posterior: Posterior | None = None, draws: int = GAP_DRAWS) -> dict[str, Gap | None]:
     """The gap between both estimators, term by term (formulation 1).
 
     On every draw the model takes the classic estimator's spots without noise, and again without backlash, then with
@@ -65,28 +65,28 @@ def explain_gap(found: JointFit, posterior: Posterior | None = None, draws: int 
     their order, and they add up.
 
     Args:
-        found: a converged fit of the campaign.
+        fit: a converged fit of the campaign.
         posterior: its sample, for its draws in place of the Laplace approximation's.
         draws: that the intervals of the terms rest on, at least two; ratio and gap rest on all.
 
     Returns:
         By direction; None without complete experiments.
     """
-    selection = select_experiments(found.campaign)
+    selection = select_experiments(fit.campaign)
     result: dict[str, Gap | None] = dict.fromkeys(DIRECTIONS)
     if not len(selection.experiments):
         return result
-    measured = classic_of(found.campaign)
+    measured = classic_of(fit.campaign)
     if measured is None:
         return result
-    chosen = _chosen_draws(found, posterior, draws)
-    idealised = _idealised(found, selection, chosen)
+    chosen = _chosen_draws(fit, posterior, draws)
+    idealised = _idealised(fit, selection, chosen)
     # An experiment whose spots lie on one another, or beyond the lens model, has no ratio.
     sound = np.all([np.isfinite(r).all(axis=0) for r in idealised.classic], axis=0)
     for k, direction in enumerate(DIRECTIONS):
-        rows, own = (selection.direction == direction) & sound, measured.directions[direction]
-        if rows.any() and own is not None:
-            result[direction] = _gap(own.mean_deg_per_step, chosen, idealised, k, rows)
+        rows, classic = (selection.direction == direction) & sound, measured.directions[direction]
+        if rows.any() and classic is not None:
+            result[direction] = _gap(classic.mean_deg_per_step, chosen, idealised, k, rows)
     return result
 
 
@@ -111,14 +111,14 @@ class _Chosen:
     ways: tuple[OneWay, ...]
 
 
-def _chosen_draws(found: JointFit, posterior: Posterior | None, draws: int) -> _Chosen:
+def _chosen_draws(fit: JointFit, posterior: Posterior | None, draws: int) -> _Chosen:
     from tvsbayes.posterior.predictive import OneWay, ways_of
 
     if posterior is None:
-        z = np.vstack([found.z, found.draws_z[:draws]])
-        errors_rad = np.vstack([found.mode.place_errors_rad, found.draws.place_errors_rad[:draws]])
-        ratios = np.asarray(found.draws.effective_deg_per_step)
-        alone = (OneWay(found, np.arange(len(z))),)
+        z = np.vstack([fit.z, fit.draws_z[:draws]])
+        errors_rad = np.vstack([fit.mode.place_errors_rad, fit.draws.place_errors_rad[:draws]])
+        ratios = np.asarray(fit.draws.effective_deg_per_step)
+        alone = (OneWay(fit, np.arange(len(z))),)
         return _Chosen(z, errors_rad, True, ratios, np.full(len(ratios), 1 / len(ratios)), alone)
     errors_rad = np.asarray(posterior.thinned(draws).place_errors_rad)
     ratios = np.asarray(posterior.joined.effective_deg_per_step)
@@ -162,47 +162,47 @@ def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Ideal
     for space in spaces:
         repeating_rad = errors_rad if space is spaces[0] else straight_rad
 
-        def of_way(fit: JointFit, own: np.ndarray, space=space, repeating_rad=repeating_rad) -> np.ndarray:
-            return looks(replace(fit, space=space), z[own], repeated_rad(fit, repeating_rad[own]))[:, rows]
+        def of_way(fit: JointFit, values: np.ndarray, space=space, repeating_rad=repeating_rad) -> np.ndarray:
+            return looks(replace(fit, space=space), z[values], repeated_rad(fit, repeating_rad[values]))[:, rows]
 
         pixels = by_way(chosen.ways, of_way)
         ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, found.campaign.stereo))
     return _Idealised(tuple(ratios), full, ideal)
 
 
-def _gap(seen: float, chosen: _Chosen, idealised: _Idealised, k: int, rows: np.ndarray) -> Gap:
+def _gap(reported: float, chosen: _Chosen, idealised: _Idealised, k: int, rows: np.ndarray) -> Gap:
     """The gap of direction k, whose experiments are `rows`, to the classic mean that was seen."""
     whole, unplayed, scaled, straight = (r[:, rows].mean(axis=1) for r in idealised.classic)
-    own, ideal = idealised.full[:, k], idealised.ideal[:, k]
+    full, ideal = idealised.full[:, k], idealised.ideal[:, k]
     parts = {
         BACKLASH: whole - unplayed,
         STEREO_SCALE: unplayed - scaled,
-        SKEW: scaled - straight - (own - ideal),
+        SKEW: scaled - straight - (full - ideal),
         PROJECTION: straight - ideal,
-        CHANCE: seen - whole,
+        CHANCE: reported - whole,
     }
     # The ratio itself as every table states it, from all draws; its mean is a control variate for those of the
     # terms, which then add up to the gap.
     ratio, weights = chosen.ratios[:, k], chosen.weights
     mean = weighted_mean(ratio, weights)
-    centre = float(own[0] if chosen.mode_first else mean)
+    centre = float(full[0] if chosen.mode_first else mean)
 
     def term(name: str, values: np.ndarray) -> GapTerm:
         if chosen.mode_first:
             value, sampled = values[0], values[1:]
         else:
-            slope = np.cov(values, own)[0, 1] / own.var(ddof=1) if np.ptp(own) > 0 else 0.0
-            value, sampled = values.mean() + slope * (centre - own.mean()), values
+            slope = np.cov(values, full)[0, 1] / full.var(ddof=1) if np.ptp(full) > 0 else 0.0
+            value, sampled = values.mean() + slope * (centre - full.mean()), values
         return GapTerm(name, float(value), float(sampled.std()), interval95(sampled))
 
     sd = float(np.sqrt(weights @ (ratio - mean) ** 2))
     low, high = weighted_quantiles(ratio, weights, TAILS).tolist()
     joint = GapTerm("effective ratio", centre, sd, (low, high))
-    total = GapTerm("classic - joint", float(seen - centre), sd, (seen - high, seen - low))
-    return Gap(seen, joint, total, tuple(term(name, values) for name, values in parts.items()))
+    total = GapTerm("classic - joint", float(reported - centre), sd, (reported - high, reported - low))
+    return Gap(reported, joint, total, tuple(term(name, values) for name, values in parts.items()))
 
 
-def camera_influence(found: JointFit, values: np.ndarray) -> np.ndarray:
+def camera_influence(fit: JointFit, values: np.ndarray) -> np.ndarray:
     """Shift of quantities with draws (n, q) if a camera parameter is off by the sd of its prior, shape (q, cameras).
 
     Of the focal scale and the stereo calibration's coordinates: the prior of coordinate j moves the mode by S e_j.
@@ -210,12 +210,12 @@ def camera_influence(found: JointFit, values: np.ndarray) -> np.ndarray:
     from tvsbayes.assessment.weaknesses import gradients
     from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
 
-    fisher = found.information.fisher
+    fisher = fit.information.fisher
     cameras = [INDEX["focal_scale"], *range(len(RIG_NAMES), len(NAMES))]
-    return (gradients(found, values) @ np.linalg.inv(fisher + np.eye(len(fisher))))[:, cameras]
+    return (gradients(fit, values) @ np.linalg.inv(fisher + np.eye(len(fisher))))[:, cameras]
 
 
-def camera_u(found: JointFit) -> np.ndarray:
+def camera_u(fit: JointFit) -> np.ndarray:
     """Standard uncertainty (4,) of the effective ratios that stereo calibration and focal scale alone cause."""
-    shift = camera_influence(found, np.asarray(found.draws.effective_deg_per_step))
+    shift = camera_influence(fit, np.asarray(fit.draws.effective_deg_per_step))
     return np.sqrt(np.sum(shift**2, axis=1))

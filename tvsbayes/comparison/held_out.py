@@ -119,8 +119,8 @@ def refit(fit_of_all: JointFit, without: frozenset[int], progress: Show | None =
 
     rig, space = fit_of_all.campaign.rig, fit_of_all.space
     priors = priors_used(rig.priors, np.asarray(space.value), np.asarray(space.u))
-    held = replace(fit_of_all.campaign, rig=replace(rig, priors=priors))
-    return fit(held, without=without | set(fit_of_all.excluded_spots), progress=progress)
+    reduced = replace(fit_of_all.campaign, rig=replace(rig, priors=priors))
+    return fit(reduced, without=without | set(fit_of_all.excluded_spots), progress=progress)
 
 
 class ClassicAngle(NamedTuple):
@@ -137,21 +137,21 @@ def foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -
     Its uncertainty is the scatter of angles (e,) about N times the mean, and that of the mean.
     Experiments without a finite angle (pixels beyond the lens model) neither teach nor are asked.
     """
-    found: dict[int, ClassicAngle] = {}
-    seen = np.isfinite(angle)
+    angles: dict[int, ClassicAngle] = {}
+    finite = np.isfinite(angle)
     for direction in DIRECTIONS:
-        mine = seen & (selection.direction == direction)
-        taught, asked = np.flatnonzero(mine & ~out), np.flatnonzero(mine & out)
+        mine = finite & (selection.direction == direction)
+        taught, left = np.flatnonzero(mine & ~out), np.flatnonzero(mine & out)
         if len(taught) < 2:
             continue
         ratios = angle[taught] / selection.steps[taught]
         mean, sd = ratios.mean(), ratios.std(ddof=1)
         noise = np.sum((angle[taught] - mean * selection.steps[taught]) ** 2) / (len(taught) - 1)
-        for e in asked:
+        for e in left:
             steps = float(selection.steps[e])
             u = float(np.sqrt(noise + (steps * sd) ** 2 / len(taught)))
-            found[int(e)] = ClassicAngle(float(mean * steps), u, len(taught) - 1)
-    return found
+            angles[int(e)] = ClassicAngle(float(mean * steps), u, len(taught) - 1)
+    return angles
 
 
 class JointAngle(NamedTuple):
@@ -176,9 +176,9 @@ def foretell_joint(
     pixels = pixels[:, experiment_rows(taught.campaign, selection)[out]]
     steps, axis = selection.steps[out], selection.axis[out]
     draws = four_point_ratios(pixels, steps, axis, taught.campaign.stereo) * steps
-    found = {}
+    angles = {}
     for k, e in enumerate(np.flatnonzero(out).tolist()):
-        told = draws[np.isfinite(draws[:, k]), k]
-        if len(told) > 1:
-            found[e] = JointAngle(float(told.mean()), float(told.std(ddof=1)))
-    return found
+        finite = draws[np.isfinite(draws[:, k]), k]
+        if len(finite) > 1:
+            angles[e] = JointAngle(float(finite.mean()), float(finite.std(ddof=1)))
+    return angles

@@ -56,7 +56,7 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
             file="moves.csv",
             remedy="look from at least three counters of an axis",
         )
-    found: list[HeldOutPosition] = []
+    positions: list[HeldOutPosition] = []
     with Job(dict.fromkeys(folds, 1.0), progress) as job:
         for name, (number, out, sign) in folds.items():
             try:
@@ -67,16 +67,16 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
             if not taught.converged:
                 warnings.append(f"without {name} the fit does not converge: {'; '.join(taught.problems)}")
                 continue
-            found += foretold(fit_of_all, taught, number, int(name.split()[1]), out, sign)
-    z = [(position.mean - position.predicted) / position.u for position in found]
+            positions += foretold(fit_of_all, taught, number, int(name.split()[1]), out, sign)
+    z = [(position.mean - position.predicted) / position.u for position in positions]
     rms = float(np.sqrt(np.mean(np.square(z)))) if z else None
-    return PositionHoldOut("positions", tuple(found), rms, tuple(warnings))
+    return PositionHoldOut("positions", tuple(positions), rms, tuple(warnings))
 
 
 def _of_all_looks(fit_of_all: JointFit, taught: JointFit) -> Linearised:
     """All looks linearised at the mode that some of them taught."""
-    held = fit_of_all.held
-    fixed = Fixed(held, taught.z, np.array(1.0))
+    constant = fit_of_all.held
+    fixed = Fixed(constant, taught.z, np.array(1.0))
     return stage(taught.z, fit_of_all.space, fit_of_all.arrays, fixed, NO_STEP)
 
 
@@ -94,29 +94,29 @@ def foretold(
         sign: side from which the axis came, shape (spots,).
     """
     lin = _of_all_looks(fit_of_all, taught)
-    held = fit_of_all.held
-    own, rows = np.where(held, 0.0, -np.asarray(lin.residual_jacobian)), np.flatnonzero(out)
+    fixed = fit_of_all.held
+    columns, rows = np.where(fixed, 0.0, -np.asarray(lin.residual_jacobian)), np.flatnonzero(out)
     free = np.zeros((len(out), 4, 2 * len(rows)))
     for k, row in enumerate(rows.tolist()):
         free[row, :, 2 * k : 2 * k + 2] = np.asarray(lin.slope)[row]
-    linear = linear_spots(lin, fit_of_all.arrays, np.concatenate([own, free], axis=2))
-    told, count = stop_information(linear), len(NAMES)
+    linear = linear_spots(lin, fit_of_all.arrays, np.concatenate([columns, free], axis=2))
+    information, count = stop_information(linear), len(NAMES)
     # Coordinates have their priors; angles of the looks left out have none.
-    precision = told.fisher + np.diag(np.arange(len(told.fisher)) < count)
+    precision = information.fisher + np.diag(np.arange(len(information.fisher)) < count)
     score = np.zeros(len(precision))
-    for group in told.groups:
+    for group in information.groups:
         score += np.einsum("nic,ni->c", linear.jacobian[group.rows], group.residual.reshape(-1, 4))
     score[:count] -= taught.z
     mine = slice(count + axis, None, 2)
     deviation, covariance = np.linalg.solve(precision, score)[mine], np.linalg.inv(precision)[mine, mine]
-    seen = lin.mirror_angles_rad[rows, axis] + lin.spot_deviations().deviation_rad[rows, axis]
+    angles = lin.mirror_angles_rad[rows, axis] + lin.spot_deviations().deviation_rad[rows, axis]
     names = dict(zip((1, -1, 0), (*SENSES[AXES[axis]], "unknown"), strict=True))
-    found = []
+    entries = []
     for side, direction in names.items():
         weight = (sign[rows] == side) / max(np.sum(sign[rows] == side), 1)
         if not weight.any():
             continue
-        mean, off, u = np.degrees([weight @ seen, weight @ deviation, np.sqrt(weight @ covariance @ weight)]).tolist()
+        mean, off, u = np.degrees([weight @ angles, weight @ deviation, np.sqrt(weight @ covariance @ weight)]).tolist()
         n = int(np.sum(weight > 0))
-        found.append(HeldOutPosition(AXES[axis], counter, direction, n, mean, mean - off, u))
-    return found
+        entries.append(HeldOutPosition(AXES[axis], counter, direction, n, mean, mean - off, u))
+    return entries

@@ -32,9 +32,9 @@ def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: d
         "joint": [np.inf] * len(predictions),
     }
     for name in ("classic", "joint"):
-        told = np.array([getattr(p, f"{name}_deg") for p in predictions])
+        predicted = np.array([getattr(p, f"{name}_deg") for p in predictions])
         u = np.array([getattr(p, f"{name}_u_deg") for p in predictions])
-        error = angle - told
+        error = angle - predicted
         means[name] = np.array([error[rows].mean() for rows in of_block.values()])
         scores[name] = Score(
             rms_deg=float(np.sqrt(np.mean(error**2))),

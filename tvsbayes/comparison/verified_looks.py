@@ -55,8 +55,8 @@ def accepted_calibration(campaign: Campaign) -> Calibration:
         NotConverged: the fit is not accepted.
     """
     document = stored_document(campaign, "fit.json", FIT_FORMATS, input_hashes(campaign))
-    found = stored_calibration(campaign)
-    if document is None or found is None:
+    calibration = stored_calibration(campaign)
+    if document is None or calibration is None:
         raise InputError(
             "missing-file",
             "results/ hold no calibration of these data: nothing can have been aimed with it",
@@ -65,7 +65,7 @@ def accepted_calibration(campaign: Campaign) -> Calibration:
         )
     old = "accepted" if document.values.get("estimator") == "posterior" else "laplace"
     refuse_answer(str(document.values.get("answer") or old))
-    return found
+    return calibration
 
 
 @dataclass(frozen=True)
@@ -82,19 +82,19 @@ class AimedLooks:
         rests = {
             axis: dict(zip((m.move for m in looks.moves), rests_of(looks.moves, axis), strict=True)) for axis in AXES
         }
-        seen = [spot.move for spot, use in zip(ordered_spots(looks), used, strict=True) if use]
-        steps = [[rests[axis][move].steps for axis in AXES] for move in seen]
-        sides = [[rests[axis][move].sign for axis in AXES] for move in seen]
+        looked = [spot.move for spot, use in zip(ordered_spots(looks), used, strict=True) if use]
+        steps = [[rests[axis][move].steps for axis in AXES] for move in looked]
+        sides = [[rests[axis][move].sign for axis in AXES] for move in looked]
         return cls(calibration, np.array(steps, dtype=float), np.array(sides, dtype=float))
 
     def angles_deg(self, sides: np.ndarray) -> np.ndarray:
         """Mirror angles (m, 2) at the counters, reached from sides (m, 2)."""
-        found = []
+        angles = []
         for k, axis in enumerate(AXES):
             values = self.calibration.estimates_at((self.steps[:, 0], self.steps[:, 1]))
             period = self.calibration.period_deg.get(axis)
-            found.append(output_deg(values, axis, self.steps[:, k], sides[:, k], period))
-        return np.stack(found, axis=1)
+            angles.append(output_deg(values, axis, self.steps[:, k], sides[:, k], period))
+        return np.stack(angles, axis=1)
 
     def nominal_steps(self, nominal: dict[str, float]) -> np.ndarray:
         """Counters (m, 2) that the nominal degrees per step send to the same directions (formulation 5)."""
@@ -165,37 +165,39 @@ class SeenAngles:
         values = physical_at(noise.centre, watched.problem.space).value
         visit = []
         for k, place in enumerate(watched.usable):
-            seen = spots.jacobian[place, :, -2 * watched.looks :][:, 2 * k : 2 * k + 2]
+            slopes = spots.jacobian[place, :, -2 * watched.looks :][:, 2 * k : 2 * k + 2]
             stops = []
             for axis, side in zip(AXES, sides[k], strict=True):
                 ends = [float(values[INDEX[f"stop_sd_deg.{name}"]]) ** 2 for name in SIDES[axis]]
                 stops.append(ends[1] if side > 0 else ends[0] if side < 0 else 0.5 * sum(ends))
-            visit.append(np.diag(np.linalg.inv(seen.T @ seen)) + stops)
+            visit.append(np.diag(np.linalg.inv(slopes.T @ slopes)) + stops)
         return cls(covariance @ centre.score, np.array([each[k] for k in places.tolist()]), np.ravel(visit))
 
 
 def _other(aimed: AimedLooks) -> np.ndarray:
     """Shape (2 m, 2 m) of the covariance of what another scanner adds: two other axes."""
     count = len(aimed.steps)
-    found = np.zeros((2 * count, 2 * count))
+    covariance = np.zeros((2 * count, 2 * count))
     for k in range(2):
-        found[k::2, k::2] = other_axis(aimed.ratios[k] * aimed.steps[:, k], aimed.sides[:, k])
-    return found
+        covariance[k::2, k::2] = other_axis(aimed.ratios[k] * aimed.steps[:, k], aimed.sides[:, k])
+    return covariance
 
 
-def _millimetres(aimed: AimedLooks, seen: SeenAngles, before: np.ndarray, distance_mm: float, seed: int) -> Millimetres:
+def _millimetres(
+    aimed: AimedLooks, measured: SeenAngles, before: np.ndarray, distance_mm: float, seed: int
+) -> Millimetres:
     """Errors of points at a distance, beside what 95 % of them are promised not to exceed."""
     slopes = aimed.slopes_mm(distance_mm)
 
     def lengths(angles: np.ndarray) -> np.ndarray:
         return np.linalg.norm(np.einsum("mxa,...ma->...mx", slopes, angles.reshape(*angles.shape[:-1], -1, 2)), axis=-1)
 
-    promised = PredictedStops(np.zeros((len(seen.covariance), len(seen.value))), seen.covariance, {})
+    promised = PredictedStops(np.zeros((len(measured.covariance), len(measured.value))), measured.covariance, {})
     drawn = lengths(promised.drawn(PROMISED_DRAWS, np.random.default_rng([seed, 24])))
     return Millimetres(
         distance_mm=distance_mm,
         before=size_of(lengths(before)),
-        after=size_of(lengths(seen.value)),
+        after=size_of(lengths(measured.value)),
         promised95=float(np.quantile(drawn, 0.95)),
     )
 
@@ -225,30 +227,30 @@ def verify_looks(
         )
     aimed = AimedLooks.of(calibration, looks, used)
     nominal = aimed.nominal_steps({name: prior.value for name, prior in fit.campaign.rig.priors.items()})
-    seen = SeenAngles.of(fit, WatchedLooks(fit, looks), aimed.sides, seed)
+    angles = SeenAngles.of(fit, WatchedLooks(fit, looks), aimed.sides, seed)
 
     @cache
     def at(common: float, play: float) -> PredictedStops:
         off = aimed.off_deg(nominal, common, play).ravel()
-        return PredictedStops(np.tile(off, (len(seen.covariance), 1)), seen.covariance, {})
+        return PredictedStops(np.tile(off, (len(angles.covariance), 1)), angles.covariance, {})
 
-    aim = np.zeros(len(seen.value))
+    aim = np.zeros(len(angles.value))
     travel = float(np.max(np.ptp(aimed.ratios * aimed.steps, axis=0)))
-    trial = Trial(at, seen.value, aim, _other(aimed), travel, np.zeros((len(aim), len(aim))), seen.noise)
-    found = judged(trial, seed)
-    before = found.without.pooled()[0]
+    trial = Trial(at, angles.value, aim, _other(aimed), travel, np.zeros((len(aim), len(aim))), angles.noise)
+    judgement = judged(trial, seed)
+    before = judgement.without.pooled()[0]
     return Verification(
-        verdict=found.verdict,
-        p=found.p,
-        worlds=found.worlds,
+        verdict=judgement.verdict,
+        p=judgement.p,
+        worlds=judgement.worlds,
         before=size_of(before),
-        after=size_of(seen.value),
-        promised95=bound_of(found.promised, aim, np.arange(len(aim))),
+        after=size_of(angles.value),
+        promised95=bound_of(judgement.promised, aim, np.arange(len(aim))),
         readings=len(aimed.steps),
         # A head that says where it points has no lengths.
-        millimetres=None if looks.rig.mechanism.sightings else _millimetres(aimed, seen, before, distance_mm, seed),
+        millimetres=None if looks.rig.mechanism.sightings else _millimetres(aimed, angles, before, distance_mm, seed),
         unit="deg",
-        needed=None if found.needed is None else -(-found.needed // 2),
+        needed=None if judgement.needed is None else -(-judgement.needed // 2),
         looks=True,
         remarks=_remarks(fit.campaign, looks, aimed),
     )
@@ -325,18 +327,18 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
     noise = np.array([calibration.noise_variance[f"stop_sd_deg.{SIDES[AXES[k]][int(s > 0)]}"] for s in sides[:, k]])
     common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + HOME_SD_DEG**2
     # A play smaller than what every look leaves open is not told from its loss, and harms no promise.
-    seen = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
-    worlds = off if seen else off[:1]
+    visible = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
+    worlds = off if visible else off[:1]
     spread = np.isin(np.arange(CANDIDATES), [0, CANDIDATES // 2, CANDIDATES - 1])
-    found = telling_visits(worlds, common, noise, np.repeat(spread, 2))
-    chosen = [i for i in range(2 * CANDIDATES) for _ in range(int(found.visits[i]))]
-    return _AxisStops([(int(steps[i, k]), int(sides[i, k])) for i in chosen], found.reached)
+    visits = telling_visits(worlds, common, noise, np.repeat(spread, 2))
+    chosen = [i for i in range(2 * CANDIDATES) for _ in range(int(visits.visits[i]))]
+    return _AxisStops([(int(steps[i, k]), int(sides[i, k])) for i in chosen], visits.reached)
 
 
 def _drawn_angles(calibration: Calibration, aimed: AimedLooks, k: int) -> np.ndarray:
     """Mirror angles (draws, m) of one axis by the draws of the calibration."""
-    own, gears = np.split(calibration.inputs[:DRAWS], [len(INPUT_NAMES)], axis=1)
-    values = dict(zip(calibration.names, own.T[..., None], strict=True))
+    inputs, gears = np.split(calibration.inputs[:DRAWS], [len(INPUT_NAMES)], axis=1)
+    values = dict(zip(calibration.names, inputs.T[..., None], strict=True))
     values |= calibration.gears.at(gears, (aimed.steps[:, 0], aimed.steps[:, 1]))
     axis = AXES[k]
     return np.asarray(output_deg(values, axis, aimed.steps[:, k], aimed.sides[:, k], calibration.period_deg.get(axis)))
@@ -344,16 +346,16 @@ def _drawn_angles(calibration: Calibration, aimed: AimedLooks, k: int) -> np.nda
 
 def _remarks(campaign: Campaign, looks: Campaign, aimed: AimedLooks) -> tuple[str, ...]:
     """What else is to be said."""
-    found = []
+    remarks = []
     outside = sum(not aimed.calibration.covers(*steps) for steps in aimed.steps.tolist())
     if outside:
-        found.append(
+        remarks.append(
             f"{outside} of {len(aimed.steps)} looks lie outside the counters of the campaign: less is promised there"
         )
     if input_hashes(campaign)["stereo"] != input_hashes(looks)["stereo"]:
-        found.append("the fresh looks state other cameras; those of the campaign are used")
+        remarks.append("the fresh looks state other cameras; those of the campaign are used")
     named = looks.header.get("serial") or looks.header.get("instrument")
     known = campaign.header.get("serial") or campaign.header.get("instrument")
     if named and known and named != known:
-        found.append("the fresh looks name another machine than the campaign: is it the right one?")
-    return tuple(found)
+        remarks.append("the fresh looks name another machine than the campaign: is it the right one?")
+    return tuple(remarks)

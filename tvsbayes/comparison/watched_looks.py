@@ -116,8 +116,8 @@ def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
         replace(m, move=m.move + moves, segment=m.segment + last.segment + 1, time_s=m.time_s + last.time_s)
         for m in looks.moves
     )
-    seen = tuple(s.renumbered(s.spot + spots, s.move + moves) for s in looks.spots)
-    return replace(campaign, moves=(*campaign.moves, *later), spots=(*campaign.spots, *seen))
+    second = tuple(s.renumbered(s.spot + spots, s.move + moves) for s in looks.spots)
+    return replace(campaign, moves=(*campaign.moves, *later), spots=(*campaign.spots, *second))
 
 
 @dataclass(frozen=True)
@@ -212,16 +212,16 @@ class _Told:
     @classmethod
     def of(cls, spots: LinearSpots, prior: np.ndarray) -> _Told:
         """Of spots whose first columns are coordinates that stand at `prior`, shape (p,), before N(0, 1)."""
-        found, count = stop_information(spots), len(prior)
-        errors = np.concatenate([group.residual for group in found.groups])
+        information, count = stop_information(spots), len(prior)
+        errors = np.concatenate([group.residual for group in information.groups])
         score = spots.jacobian.reshape(len(errors), -1).T @ errors
-        own, cross = score[:count] - prior, found.fisher[:count, count:]
-        precision = found.fisher[:count, :count] + np.eye(count)
-        left = np.linalg.solve(precision, np.column_stack([own, cross]))
+        gradient, cross = score[:count] - prior, information.fisher[:count, count:]
+        precision = information.fisher[:count, :count] + np.eye(count)
+        left = np.linalg.solve(precision, np.column_stack([gradient, cross]))
         return cls(
-            chi2=float(spots.residual.ravel() @ errors - own @ left[:, 0]),
+            chi2=float(spots.residual.ravel() @ errors - gradient @ left[:, 0]),
             score=score[count:] - cross.T @ left[:, 0],
-            information=found.fisher[count:, count:] - cross.T @ left[:, 1:],
+            information=information.fisher[count:, count:] - cross.T @ left[:, 1:],
         )
 
 
@@ -231,14 +231,14 @@ class WatchedLooks:
     def __init__(self, fit: JointFit, looks: Campaign):
         campaign = homed(fit.campaign, fit.sides)
         self.fit, self.first = fit, len(ordered_spots(campaign))
-        both = after_each_other(campaign, homed(looks, fit.sides))
-        seen, used = in_sight(both), np.asarray(fit.arrays.spots.valid)[: self.first] > 0
-        used = np.append(used, seen[self.first :])
+        joined = after_each_other(campaign, homed(looks, fit.sides))
+        visible, used = in_sight(joined), np.asarray(fit.arrays.spots.valid)[: self.first] > 0
+        used = np.append(used, visible[self.first :])
         table = replace(
             campaign.rig,
             priors=priors_used(campaign.rig.priors, np.asarray(fit.space.value), np.asarray(fit.space.u)),
         )
-        self.problem = Problem(both, table, used)
+        self.problem = Problem(joined, table, used)
         weight = np.array(self.problem.arrays.spots.weight)
         weight[: self.first] = np.asarray(fit.arrays.spots.weight)[: self.first]
         self.problem.arrays = eqx.tree_at(lambda a: a.spots.weight, self.problem.arrays, placed(weight))
@@ -255,8 +255,8 @@ class WatchedLooks:
         Of the shifts of the changes, or with `angles` of the mirror angles (pan, tilt) of every usable look, deg.
         """
         linear, prior = self.linear(z, angles=angles), np.where(self.problem.held, 0.0, z)
-        both, before = (_Told.of(spots, prior) for spots in (linear, rows_of(linear, slice(self.first))))
-        return Departure(both.chi2 - before.chi2, self.dof, both.score, both.information, self.changes)
+        whole, before = (_Told.of(spots, prior) for spots in (linear, rows_of(linear, slice(self.first))))
+        return Departure(whole.chi2 - before.chi2, self.dof, whole.score, whole.information, self.changes)
 
     def linear(self, z: np.ndarray, *, angles: bool = False) -> LinearSpots:
         """Both days at z, with columns for the coordinates and, behind them, for the changes or the looks' angles.
@@ -274,16 +274,16 @@ class WatchedLooks:
         )
         still = np.zeros(len(NAMES))
         fixed = Fixed(np.zeros(len(NAMES), dtype=bool), still, np.array(1.0))
-        found = stage(still, plain, self.problem.arrays, fixed, NO_STEP)
-        physical = -np.asarray(found.residual_jacobian)
-        own = np.where(self.problem.held, 0.0, physical @ at.slope)
+        staged = stage(still, plain, self.problem.arrays, fixed, NO_STEP)
+        physical = -np.asarray(staged.residual_jacobian)
+        slope = np.where(self.problem.held, 0.0, physical @ at.slope)
         if angles:
-            shifts = self._of_angles(np.asarray(found.slope))
+            shifts = self._of_angles(np.asarray(staged.slope))
         else:
             shifted = [COORDINATES[name] for change in self.changes for name in change.names]
             shifts = physical[:, :, shifted] * self._unit_sizes(at.value)
             shifts[: self.first] = 0.0
-        return linear_spots(found, self.problem.arrays, np.concatenate([own, shifts], axis=2))
+        return linear_spots(staged, self.problem.arrays, np.concatenate([slope, shifts], axis=2))
 
     @property
     def usable(self) -> np.ndarray:
@@ -293,10 +293,10 @@ class WatchedLooks:
 
     def _of_angles(self, slope: np.ndarray) -> np.ndarray:
         """Columns for the mirror angles of every usable new look, pan and tilt in turn, per degree."""
-        found = np.zeros((*slope.shape[:2], 2 * self.looks))
+        columns = np.zeros((*slope.shape[:2], 2 * self.looks))
         for k, place in enumerate(self.usable):
-            found[place, :, 2 * k : 2 * k + 2] = np.radians(1.0) * slope[place]
-        return found
+            columns[place, :, 2 * k : 2 * k + 2] = np.radians(1.0) * slope[place]
+        return columns
 
     def _unit_sizes(self, value: np.ndarray) -> np.ndarray:
         """Physical values of a shift by one unit of the changes, shape (q,)."""
@@ -321,16 +321,16 @@ def rows_of(spots: LinearSpots, rows: slice) -> LinearSpots:
 
 def log_chances(believed: Believed, known: list[slice]) -> np.ndarray:
     """Log p of all residuals, then of every change given those known, averaged over noise scales; shape (1 + c,)."""
-    found = []
+    chances = []
     for departure in believed.drawn:
-        left, own = departure.given(known), [log_chance(departure.chi2, departure.dof)]
+        left, logs = departure.given(known), [log_chance(departure.chi2, departure.dof)]
         for rows in departure.columns:
             chi2, dof = _test(left.score[rows], left.information[rows, rows])
-            own.append(np.zeros(()) if rows in known or not dof else log_chance(chi2, dof))
-        found.append(np.array(own))
+            logs.append(np.zeros(()) if rows in known or not dof else log_chance(chi2, dof))
+        chances.append(np.array(logs))
     with np.errstate(divide="ignore"):
         weights = np.log(believed.weights)
-    return np.logaddexp.reduce(np.array(found) + weights[:, None], axis=0)
+    return np.logaddexp.reduce(np.array(chances) + weights[:, None], axis=0)
 
 
 @dataclass(frozen=True)
@@ -380,19 +380,19 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
     """
     from scipy import special
 
-    generator, found = np.random.default_rng(seed), []
+    generator, shares = np.random.default_rng(seed), []
     for change, rows in zip(departure.changes, departure.columns, strict=True):
-        own = departure.information[rows, rows]
-        dof = len(_directions(own)[0])
+        block = departure.information[rows, rows]
+        dof = len(_directions(block)[0])
         if not dof:
-            found.append(0.0)
+            shares.append(0.0)
             continue
         ways = generator.standard_normal((DIRECTIONS_ASKED, len(change.names)))
         ways *= times * change.size / np.linalg.norm(ways, axis=1, keepdims=True)
         critical = special.chdtri(dof, np.exp(limit))
-        off = np.einsum("ni,ij,nj->n", ways, own, ways)
-        found.append(float(np.mean(1 - special.chndtr(critical, dof, off))))
-    return found
+        off = np.einsum("ni,ij,nj->n", ways, block, ways)
+        shares.append(float(np.mean(1 - special.chndtr(critical, dof, off))))
+    return shares
 
 
 def _moved(believed: Believed, limit: float) -> tuple[MovedPart, ...]:
@@ -414,13 +414,13 @@ def _moved(believed: Believed, limit: float) -> tuple[MovedPart, ...]:
     parts: list[MovedPart] = []
     start = 0
     for columns in known:
-        own = slice(start, start := start + columns.stop - columns.start)
-        value, u = shift.value[own], np.sqrt(np.diag(shift.covariance)[own])
+        rows_of_change = slice(start, start := start + columns.stop - columns.start)
+        value, u = shift.value[rows_of_change], np.sqrt(np.diag(shift.covariance)[rows_of_change])
         ratio = np.abs(value) / u
-        told = [k for k in np.argsort(-ratio).tolist() if ratio[k] > TOLD_U] or [int(np.argmax(ratio))]
+        significant = [k for k in np.argsort(-ratio).tolist() if ratio[k] > TOLD_U] or [int(np.argmax(ratio))]
         parts += [
             MovedPart(named[columns.start + k][0], float(value[k]), float(u[k]), named[columns.start + k][1])
-            for k in told
+            for k in significant
         ]
     return tuple(parts)
 
@@ -454,15 +454,15 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
         for change, power, log_p in zip(watched.changes, able, logs[1:], strict=True)
     )
     # All residuals together raise no alarm: much that moves nothing makes single looks bad.
-    found = bool(logs[1:].min() <= null.limit)
-    verdict: Verdict = MOVED if found else OK if min(able) >= POWER_MIN else CANNOT_TELL
+    moved = bool(logs[1:].min() <= null.limit)
+    verdict: Verdict = MOVED if moved else OK if min(able) >= POWER_MIN else CANNOT_TELL
     hashes = input_hashes(fit.campaign)["stereo"], input_hashes(looks)["stereo"]
     return Watch(
         verdict=verdict,
         p=null.probability(float(logs[1:].min())),
         false_alarm_rate=FALSE_ALARM_RATE,
         p_all=float(np.exp(logs[0])),
-        moved=_moved(believed, null.limit) if found else (),
+        moved=_moved(believed, null.limit) if moved else (),
         changes=changes,
         looks=watched.looks,
         same_cameras=hashes[0] == hashes[1],

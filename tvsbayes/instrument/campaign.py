@@ -264,11 +264,11 @@ class Campaign(Shown):
 
         Not a number where there is no spot, and where the lens model does not reach.
         """
-        found = np.full((len(self.spots), 3), np.nan)
+        points = np.full((len(self.spots), 3), np.nan)
         usable = np.array([spot.status == "ok" for spot in self.spots], dtype=bool)
-        found[usable] = triangulate(self.stereo, pixels_of(spot for spot in self.spots if spot.status == "ok"))
-        found.flags.writeable = False
-        return found
+        points[usable] = triangulate(self.stereo, pixels_of(spot for spot in self.spots if spot.status == "ok"))
+        points.flags.writeable = False
+        return points
 
     @property
     def usable_points_mm(self) -> np.ndarray:
@@ -508,9 +508,11 @@ def head_templates(sightings: bool) -> dict[str, bytes]:
     """The commented files of an empty campaign of a pan-tilt head, with its rig file."""
     files = templates("head_templates", MOVES, SIGHTINGS if sightings else SPOTS)
     # Lines that begin with #sightings or #spots belong to heads of that kind alone.
-    own, other = (b"#sightings ", b"#spots ") if sightings else (b"#spots ", b"#sightings ")
+    chosen, other = (b"#sightings ", b"#spots ") if sightings else (b"#spots ", b"#sightings ")
     return {
-        name: b"".join(line.removeprefix(own) for line in data.splitlines(keepends=True) if not line.startswith(other))
+        name: b"".join(
+            line.removeprefix(chosen) for line in data.splitlines(keepends=True) if not line.startswith(other)
+        )
         for name, data in files.items()
     }
 

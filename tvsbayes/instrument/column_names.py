@@ -89,13 +89,13 @@ def words_of(name: str) -> list[str]:
     name = re.sub("(?<![A-Za-z])\u00b0(?![ ]*[CF])", " deg ", name)
     # Of microseconds, and of all other millionths, the ascii letters alone would be another unit.
     plain = re.sub("\u03bc(?=[A-Za-z])", "u", unicodedata.normalize("NFKD", name)).encode("ascii", "ignore").decode()
-    found = []
+    words = []
     for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+", plain):
         word = part.lower()
         # XL, ur, su: an axis and a camera written together.
         glued = re.fullmatch(r"(s?)([xyuv])([lr])|([lr])([xyuv])|(s)([xyuv])", word)
-        found += [piece for piece in glued.groups() if piece] if glued else [word]
-    return found
+        words += [piece for piece in glued.groups() if piece] if glued else [word]
+    return words
 
 
 def unit_of_name(name: str, units: Iterable[str]) -> str | None:
@@ -113,8 +113,8 @@ def _field_of(name: str) -> str | None:
     if len(axes) == len(sides) == 1:
         return f"{'s' if words & SPREAD else ''}{axes[0]}_{sides[0]}_px"
     for axis in AXES:
-        both = (_COLUMNS[f"{axis}_approach"], _COLUMNS[f"{axis}_steps"])
-        if all(words.intersection(column.names.split()) for column in both):
+        fields = (_COLUMNS[f"{axis}_approach"], _COLUMNS[f"{axis}_steps"])
+        if all(words.intersection(column.names.split()) for column in fields):
             return f"{axis}_approach"
     return field_by_word(listed, _NAMED)
 
@@ -151,18 +151,18 @@ def understand(
         if name and name not in names:
             allowed, remedy = ", ".join(map(escaped, names)), closest(name, names)
             raise InputError("usage", f"{option}: no such column; allowed: {allowed}", allowed=allowed, remedy=remedy)
-    found = {field: name for field, name in stated.items() if name}
-    free = [name for name in names if name not in found.values()]
-    found |= {name: name for name in free if name in fields and name not in stated}
+    understood = {field: name for field, name in stated.items() if name}
+    free = [name for name in names if name not in understood.values()]
+    understood |= {name: name for name in free if name in fields and name not in stated}
     claims: dict[str, list[str]] = {}
-    for name in (n for n in free if n not in found.values()):
-        told = field_of(name)
-        if told is not None and told not in found and told not in stated:
-            claims.setdefault(told, []).append(name)
-    found |= {field: own[0] for field, own in claims.items() if len(own) == 1}
-    claimed = {field: tuple(own) for field, own in claims.items() if len(own) > 1}
-    used = {*found.values(), *(name for own in claimed.values() for name in own)}
-    return Understood(found, claimed, tuple(name for name in names if name not in used))
+    for name in (n for n in free if n not in understood.values()):
+        named = field_of(name)
+        if named is not None and named not in understood and named not in stated:
+            claims.setdefault(named, []).append(name)
+    understood |= {field: candidates[0] for field, candidates in claims.items() if len(candidates) == 1}
+    claimed = {field: tuple(candidates) for field, candidates in claims.items() if len(candidates) > 1}
+    used = {*understood.values(), *(name for candidates in claimed.values() for name in candidates)}
+    return Understood(understood, claimed, tuple(name for name in names if name not in used))
 
 
 def missing(columns: Iterable[str], moves_known: bool) -> list[str]:
@@ -173,6 +173,6 @@ def missing(columns: Iterable[str], moves_known: bool) -> list[str]:
         moves_known: whether moves are listed elsewhere already.
     """
     given = set(columns)
-    seen, moved = bool(given & set(PIXELS)), bool(given & set(COUNTERS))
-    needed = [*(PIXELS if seen or not moved else ()), *(COUNTERS if moved or not moves_known else ())]
+    looked, moved = bool(given & set(PIXELS)), bool(given & set(COUNTERS))
+    needed = [*(PIXELS if looked or not moved else ()), *(COUNTERS if moved or not moves_known else ())]
     return [field for field in needed if field not in given]

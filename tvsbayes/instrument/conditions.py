@@ -69,8 +69,8 @@ def kelvin(moves: Sequence[TimedMove]) -> np.ndarray:
     """Temperatures less that of the first move, shape (moves,); as `kelvin_at`, zero where it knows none."""
     times_s = np.array([move.time_s for move in moves], dtype=float)
     clock = times_s if np.ptp(times_s) > 0 else np.arange(len(moves), dtype=float)
-    found = kelvin_at(moves, clock, clock)
-    return np.zeros(len(moves)) if found is None else found
+    temperatures = kelvin_at(moves, clock, clock)
+    return np.zeros(len(moves)) if temperatures is None else temperatures
 
 
 def kelvin_at(moves: Sequence[TimedMove], times: np.ndarray, clock: np.ndarray) -> np.ndarray | None:
@@ -88,8 +88,8 @@ def kelvin_at(moves: Sequence[TimedMove], times: np.ndarray, clock: np.ndarray) 
     if len(known) < 2:
         return None
     at, degC = np.array(known, dtype=float).T
-    found: np.ndarray = np.interp(times, at, degC)
-    return found - float(np.interp(clock[0], at, degC))
+    temperatures: np.ndarray = np.interp(times, at, degC)
+    return temperatures - float(np.interp(clock[0], at, degC))
 
 
 def interpolated(moves: Sequence[TimedMove]) -> int:
@@ -104,5 +104,5 @@ def unseen_shifts(moves: Sequence[TimedMove], priors: Mapping[str, Prior]) -> tu
     Moves without times tell no creep, those of one temperature no expansion, and zeros that do not creep no time.
     """
     still = all(priors[name].value == 0 == priors[name].u for name in names_of("creep_deg"))
-    found = CREEP_NAMES if not warm_minutes(moves).any() else names_of("creep_minutes") if still else ()
-    return found if kelvin(moves).any() else (*found, *names_of("thermal_deg_per_K"))
+    names = CREEP_NAMES if not warm_minutes(moves).any() else names_of("creep_minutes") if still else ()
+    return names if kelvin(moves).any() else (*names, *names_of("thermal_deg_per_K"))

@@ -80,11 +80,11 @@ def shift_of(text: str) -> Shift:
     Raises:
         InputError: anything else, or 0.
     """
-    found = _SHIFT.fullmatch(text)
-    if found is None or int(found[1]) == 0:
+    match = _SHIFT.fullmatch(text)
+    if match is None or int(match[1]) == 0:
         allowed, remedy = "N or N@SPOT, N not 0", "write --shift-moves 1, or --shift-moves 1@60 from spot 60 on"
         raise InputError("usage", f"--shift-moves {escaped(text)}; allowed: {allowed}", allowed=allowed, remedy=remedy)
-    return Shift(int(found[1]), None if found[2] is None else int(found[2]))
+    return Shift(int(match[1]), None if match[2] is None else int(match[2]))
 
 
 def corrected(
@@ -118,8 +118,8 @@ def corrected(
         changes.append(f"{name}: written with the other sign; approaches stay, they say how the beam moved")
     looks = None if spots is None else tuple(spots)
     for shift in correction.shifts if looks is not None else ():
-        looks, said = _shifted(looks or (), shift, count if changed is None else len(changed))
-        changes.append(said)
+        looks, sentence = _shifted(looks or (), shift, count if changed is None else len(changed))
+        changes.append(sentence)
     if looks is not None and correction.swapped:
         looks = tuple(map(_swapped, looks))
         changes.append("left and right: centres exchanged, with their uncertainties")
@@ -131,12 +131,12 @@ def corrected(
 
 def _absolute(moves: tuple[Move, ...]) -> tuple[Move, ...]:
     """Counters after each move of counters that are its steps; a segment begins with where homing ended."""
-    found = list(moves[:1])
+    absolute = list(moves[:1])
     for before, move in pairwise(moves):
-        start = found[-1] if move.segment == before.segment else None
+        start = absolute[-1] if move.segment == before.segment else None
         added = {} if start is None else {n: getattr(start, n) + getattr(move, n) for n in _COUNTERS}
-        found.append(replace(move, **added))
-    return tuple(found)
+        absolute.append(replace(move, **added))
+    return tuple(absolute)
 
 
 _COUNTERS = tuple(f"{axis}_steps" for axis in AXES)
@@ -146,23 +146,23 @@ def _shifted(spots: tuple[Spot, ...], shift: Shift, count: int | None) -> tuple[
     """Looks with other moves; one whose move is not listed keeps its number and is left out by its status."""
     begin = (-1, -1)
     if shift.spot is not None:
-        own = [(spot.move, spot.spot) for spot in spots if spot.spot == shift.spot]
-        if not own:
+        first = [(spot.move, spot.spot) for spot in spots if spot.spot == shift.spot]
+        if not first:
             remedy = "name a number of the column spot"
             raise InputError("usage", f"--shift-moves {shift.moves}@{shift.spot}: no such spot", remedy=remedy)
-        begin = own[0]
+        begin = first[0]
     last = max((spot.move for spot in spots), default=0) if count is None else count - 1
-    found, lost = [], 0
+    shifted, lost = [], 0
     for spot in spots:
         if (spot.move, spot.spot) < begin:
-            found.append(spot)
+            shifted.append(spot)
         elif 0 <= spot.move + shift.moves <= last:
-            found.append(replace(spot, move=spot.move + shift.moves))
+            shifted.append(replace(spot, move=spot.move + shift.moves))
         else:
             lost += 1
-            found.append(replace(spot, status=f"refused: move {spot.move + shift.moves} is not listed"))
-    said = f"move: {shift.moves:+d} for {'all looks' if shift.spot is None else f'looks from spot {shift.spot} on'}"
-    return tuple(found), said + f"; {lost} left out, whose move is not listed" * bool(lost)
+            shifted.append(replace(spot, status=f"refused: move {spot.move + shift.moves} is not listed"))
+    sentence = f"move: {shift.moves:+d} for {'all looks' if shift.spot is None else f'looks from spot {shift.spot} on'}"
+    return tuple(shifted), sentence + f"; {lost} left out, whose move is not listed" * bool(lost)
 
 
 def _swapped(spot: Spot) -> Spot:

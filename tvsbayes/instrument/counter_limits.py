@@ -15,14 +15,14 @@ HOME_KEYS = {axis: f"{axis}_home_steps" for axis in AXES}
 """Entries of `[positioner]` that give the counter at the home switch."""
 
 
-def unseen(counters: Sequence[float], seen: Iterable[Sequence[float]]) -> str:
+def unseen(counters: Sequence[float], ranges: Iterable[Sequence[float]]) -> str:
     """Which counters (pan, tilt) lie outside the lowest and highest ones seen, in words; "" where none does."""
-    found = [
+    outside = [
         f"{axis} {counter:g} lies outside {low:g} to {high:g}"
-        for axis, counter, (low, high) in zip(AXES, counters, seen, strict=True)
+        for axis, counter, (low, high) in zip(AXES, counters, ranges, strict=True)
         if not low <= counter <= high
     ]
-    return " and ".join(found)
+    return " and ".join(outside)
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class CounterLimits:
     @classmethod
     def of(cls, positioner: Mapping[str, object]) -> CounterLimits:
         """The limits among the entries of `[positioner]`, which its reader has checked."""
-        found = {key: value for key, value in positioner.items() if isinstance(value, int)}
-        return cls({axis: (found.get(low), found.get(high)) for axis, (low, high) in LIMIT_KEYS.items()})
+        limits = {key: value for key, value in positioner.items() if isinstance(value, int)}
+        return cls({axis: (limits.get(low), limits.get(high)) for axis, (low, high) in LIMIT_KEYS.items()})
 
     @property
     def unstated(self) -> tuple[str, ...]:

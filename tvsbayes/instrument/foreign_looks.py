@@ -119,22 +119,22 @@ class FieldCells:
         """
         field, empty = column.name, empty or column.may_be_empty
         default = column.default if column.may_be_empty else None
-        least, most = column.low if low is None else low, column.high if high is None else high
-        found: list[Any] = []
+        least, greatest = column.low if low is None else low, column.high if high is None else high
+        values: list[Any] = []
         for row, text in enumerate(self.text(field)):
             cell = "" if text.lower() in NO_NUMBER else text
             value = float(cell) if NUMBER.fullmatch(cell) else math.nan
             if not cell and empty:
-                found.append(default)
-            elif not least <= value <= most:
+                values.append(default)
+            elif not least <= value <= greatest:
                 remedy = "correct the cell, or name another column"
-                raise self.refuse(row, field, f"a number from {least:g} to {most:g} for {field}", remedy)
+                raise self.refuse(row, field, f"a number from {least:g} to {greatest:g} for {field}", remedy)
             elif column.kind is int and not value.is_integer():
                 remedy = "give the counters of the motors; angles are what the fit finds" if field in COUNTERS else ""
                 raise self.refuse(row, field, f"a whole number for {field}", remedy or "correct the cell")
             else:
-                found.append(column.kind(value))
-        return found
+                values.append(column.kind(value))
+        return values
 
     def refuse(self, row: int, field: str, allowed: str, remedy: str) -> InputError:
         """The error of one cell."""
@@ -176,12 +176,12 @@ def temperatures_of(cells: FieldCells, assumed: list[str]) -> list[float | None]
         return [None] * len(cells.table)
     words = set(words_of(cells.columns["temperature_degC"]))
     unit = "Fahrenheit" if words & {"f", "fahrenheit"} else "kelvin" if words & {"k", "kelvin"} else ""
-    found = cells.read(MOVES["temperature_degC"])
+    temperatures = cells.read(MOVES["temperature_degC"])
     if unit:
         factor, zero = (1 / 1.8, 32.0) if unit == "Fahrenheit" else (1.0, 273.15)
-        found = [None if value is None else factor * (value - zero) for value in found]
+        temperatures = [None if value is None else factor * (value - zero) for value in temperatures]
         assumed.append(f"temperature: degrees of {unit}, as the column's name says, turned into deg C")
-    return found
+    return temperatures
 
 
 def _listed_moves(cells: FieldCells, listed: Sequence[Move]) -> list[int]:
@@ -222,7 +222,7 @@ def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[t
         if not same:
             at = (at[0] + step[0], at[1] + step[1]) if notation.relative and row and not homed else step
             first = row == 0 or homed
-            pan_side, tilt_side = (own[row] if first else "" for own in approaches)
+            pan_side, tilt_side = (sides[row] if first else "" for sides in approaches)
             time_s = float(len(moves)) if times_s is None else times_s[row]
             move = next_move(moves, segment, time_s, at, (pan_side, tilt_side))  # type: ignore[arg-type]
             moves.append(replace(move, temperature_degC=warm[row]))
@@ -250,12 +250,12 @@ def _renumbered(cells: FieldCells, of_row: Sequence[int]) -> list[str]:
     field = "move" if "move" in cells else "spot"
     if field not in cells or any(name in cells for name in PIXELS):
         return []
-    own = [float(cell) if NUMBER.fullmatch(cell) else None for cell in cells.text(field)]
-    apart = [row for row, number in enumerate(own) if number is not None and number != of_row[row]]
+    numbers = [float(cell) if NUMBER.fullmatch(cell) else None for cell in cells.text(field)]
+    apart = [row for row, number in enumerate(numbers) if number is not None and number != of_row[row]]
     if not apart:
         return []
     name, row = escaped(cells.columns[field]), apart[0]
-    count = f"{len(apart)} of {len(own)} rows"
+    count = f"{len(apart)} of {len(numbers)} rows"
     other = f"{name} {escaped(cells.text(field)[row])} is move {of_row[row]}"
     paired = f"pictures are paired by the move, not by {name}"
     return [f"move: counted from 0, not as {name} does in {count}: {other}; {paired}"]
@@ -264,11 +264,11 @@ def _renumbered(cells: FieldCells, of_row: Sequence[int]) -> list[str]:
 def _approaches(cells: FieldCells, axis: Axis, default: str) -> list[str]:
     """The side from which an axis came, of every row."""
     field, allowed = f"{axis}_approach", (*SENSES[axis], "unknown")
-    found = [word.lower() or default for word in cells.text(field)]
-    for row, word in enumerate(found):
+    words = [word.lower() or default for word in cells.text(field)]
+    for row, word in enumerate(words):
         if word not in allowed:
             raise cells.refuse(row, field, ", ".join(allowed), "name the direction of the last move of the axis")
-    return found
+    return words
 
 
 def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
@@ -283,11 +283,11 @@ def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
     flags = [_FLAGS.get(word) for word in words]
     marked = None not in flags and any(before and not after for before, after in pairwise(flags))
     later = map(bool, flags[1:]) if marked else (before != after for before, after in pairwise(words))
-    found = [False, *later]
-    count, name = sum(found), escaped(cells.columns["segment"])
+    homings = [False, *later]
+    count, name = sum(homings), escaped(cells.columns["segment"])
     how = "at each 1" if marked else "where it changes"
     assumed.append(f"segment: {count} homing{'s' * (count != 1)} after the first row, by column {name} {how}")
-    return found
+    return homings
 
 
 def _iso_date(dotted: re.Match[str]) -> str:
@@ -303,34 +303,34 @@ def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
     if all(NUMBER.fullmatch(cell) for cell in texts):
         unit = unit_of_name(cells.columns["time_s"], SECONDS)
         scale = SECONDS.get(unit or "", 1.0)
-        found = [scale * float(cell) for cell in texts]
-        since_1970 = next((each for least, each in EPOCH_SCALES.items() if found and found[0] >= least), None)
+        seconds = [scale * float(cell) for cell in texts]
+        since_1970 = next((each for least, each in EPOCH_SCALES.items() if seconds and seconds[0] >= least), None)
         if unit is None and since_1970 is not None:
-            found = [since_1970 * (value - found[0]) for value in found]
+            seconds = [since_1970 * (value - seconds[0]) for value in seconds]
             assumed.append(f"time_s: counted in {since_1970:g} s since 1970, so seconds since the first row")
     else:
-        found = []
+        seconds = []
         for row, cell in enumerate(texts):
             try:
                 if _CLOCK.fullmatch(cell):
                     clock = datetime.time.fromisoformat(cell.zfill(8))
                     day = datetime.datetime.combine(datetime.date(1970, 1, 1), clock, datetime.UTC).timestamp()
-                    later = found and day < found[-1] % DAY_S
-                    found.append(day + DAY_S * ((found[-1] // DAY_S if found else 0) + bool(later)))
+                    later = seconds and day < seconds[-1] % DAY_S
+                    seconds.append(day + DAY_S * ((seconds[-1] // DAY_S if seconds else 0) + bool(later)))
                     continue
                 when = datetime.datetime.fromisoformat(_DOTTED_DATE.sub(_iso_date, cell, count=1))
                 # Without a zone every hour has its length: this machine's summer time is not the logger's.
-                found.append((when if when.tzinfo else when.replace(tzinfo=datetime.UTC)).timestamp())
+                seconds.append((when if when.tzinfo else when.replace(tzinfo=datetime.UTC)).timestamp())
             except ValueError as error:
                 allowed = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
                 raise cells.refuse(row, "time_s", allowed, "correct the cell, or write --column time_s=") from error
-        found = [value - found[0] for value in found]
+        seconds = [value - seconds[0] for value in seconds]
         assumed.append("time_s: seconds since the first row")
-    for row in range(1, len(found)):
-        if found[row] < found[row - 1]:
+    for row in range(1, len(seconds)):
+        if seconds[row] < seconds[row - 1]:
             remedy = "sort the rows as they happened: play remembers the order"
             raise cells.refuse(row, "time_s", "times that do not decrease", remedy)
-    return found
+    return seconds
 
 
 def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed: list[str]) -> tuple[Spot, ...]:
@@ -349,8 +349,8 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
         bool(status) or any(value is not None for value in centre)
         for status, *centre in zip(statuses, *pixels, strict=True)
     ]
-    own = [number for number, seen in zip(numbers, looked, strict=True) if seen]
-    unique = None not in own and len(set(own)) == len(own)
+    looked_numbers = [number for number, look in zip(numbers, looked, strict=True) if look]
+    unique = None not in looked_numbers and len(set(looked_numbers)) == len(looked_numbers)
     if "spot" in cells and not unique:
         assumed.append("spot: numbers are missing or stand twice, so looks are numbered by their rows")
     half = sum((a is None) != (b is None) for a, b in zip(experiments, points, strict=True))
@@ -367,7 +367,7 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
         status = _status(statuses[row], centre, cells, row)
         number = numbers[row] if unique else row
         reading = None if (read := readings[row]) is None else scale_deg * read
-        both = (experiments[row], points[row]) if None not in (experiments[row], points[row]) else (None, None)
+        of_experiment = (experiments[row], points[row]) if None not in (experiments[row], points[row]) else (None, None)
         values = {name: column[row] for name, column in others.items()}
         if status == "ok":
             sds = [_sd_px(cells, row, field, column, notation) for field, column in zip(PIXEL_SDS, stated, strict=True)]
@@ -378,8 +378,8 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
                 spot=number,
                 move=move,
                 target=readable(targets[row], "sheet", 100),
-                experiment=both[0],
-                point=both[1],
+                experiment=of_experiment[0],
+                point=of_experiment[1],
                 aperture_deg=reading,
                 status=status,
                 **values,
@@ -393,10 +393,10 @@ def _sd_px(cells: FieldCells, row: int, field: str, column: Sequence[float | Non
     """The standard uncertainty of a centre: rows without one may hold whatever they like there."""
     if column is None:
         return notation.sd_px
-    if (found := column[row]) is None or found < PIXEL_SD_MIN:
+    if (sd := column[row]) is None or sd < PIXEL_SD_MIN:
         allowed = f"a number from {PIXEL_SD_MIN:g} to {PIXEL_SD_MAX:g} where the look is ok"
         raise cells.refuse(row, field, allowed, f"complete the cell, or write --column {field}= and --sd-px")
-    return found
+    return sd
 
 
 def word_of(status: str) -> str:
@@ -420,11 +420,11 @@ def left_out(cells: FieldCells, statuses: Iterable[str], what: str) -> list[str]
 
 def _status(text: str, centre: Sequence[float | None], cells: FieldCells, row: int) -> str:
     """The word "ok", or why a look is of no use."""
-    seen = None not in centre
+    complete = None not in centre
     word = word_of(text)
     if word in GOOD or not word:
-        if seen or not word:
-            return "ok" if seen else "no centre in the table"
+        if complete or not word:
+            return "ok" if complete else "no centre in the table"
         field = PIXELS[centre.index(None)]
         raise cells.refuse(row, field, "a number where the look is ok", "complete the cell, or its status")
     return refused_status(text)

@@ -48,12 +48,12 @@ def prior_chance(sides: Sides) -> float:
 
 def homed(campaign: Campaign, sides: Sides) -> Campaign:
     """The campaign as if its axes had come home in these ways."""
-    told = {f"{axis}_approach": side for axis, side in sides.items() if side != ANYWHERE}
-    if not told:
+    stated = {f"{axis}_approach": side for axis, side in sides.items() if side != ANYWHERE}
+    if not stated:
         return campaign
 
     def one(move: Move) -> Move:
-        first: dict[str, Any] = {name: side for name, side in told.items() if getattr(move, name) == "unknown"}
+        first: dict[str, Any] = {name: side for name, side in stated.items() if getattr(move, name) == "unknown"}
         return replace(move, **first) if first else move
 
     return replace(campaign, moves=tuple(map(one, campaign.moves)))

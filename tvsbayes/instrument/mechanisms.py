@@ -50,7 +50,7 @@ class Mechanism:
     @cached_property
     def parameters(self) -> dict[str, Parameter]:
         """Every parameter by its name, in the order of the coordinates."""
-        return {(own := self.terms.get(name, REGISTRY[name])).name: own for name in NAMES}
+        return {(parameter := self.terms.get(name, REGISTRY[name])).name: parameter for name in NAMES}
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -65,10 +65,10 @@ class Mechanism:
     def prior_groups(self) -> dict[str, list[int]]:
         """Coordinates of every prior that can be a cause of uncertainty, the stereo calibration first."""
         every = list(enumerate(self.parameters.values()))
-        found: dict[str, list[int]] = {}
+        groups: dict[str, list[int]] = {}
         for column, parameter in (*every[len(RIG_NAMES) :], *every[: len(RIG_NAMES)]):
-            found.setdefault(parameter.cause, []).append(column)
-        return found
+            groups.setdefault(parameter.cause, []).append(column)
+        return groups
 
     @cached_property
     def rig_names(self) -> tuple[str, ...]:

@@ -87,12 +87,15 @@ def _cameras() -> tuple[Parameter, ...]:
     """The stereo calibration, named and ordered as OpenCV does; its file has a reader and limits of its own."""
     units: dict[str, Unit] = {name: "px" for name in ("fx", "fy", "cx", "cy")}
     units |= {name: "1" for name in ("k1", "k2", "p1", "p2", "k3")}
-    found = {f"stereo.{side}": units for side in ("left", "right")}
-    found |= {"stereo.rotation_rad": dict.fromkeys("xyz", "rad"), "stereo.translation_mm": dict.fromkeys("xyz", "mm")}
+    units_of = {f"stereo.{side}": units for side in ("left", "right")}
+    units_of |= {
+        "stereo.rotation_rad": dict.fromkeys("xyz", "rad"),
+        "stereo.translation_mm": dict.fromkeys("xyz", "mm"),
+    }
     return tuple(
         Parameter(name=f"{block}.{part}", block=block, unit=unit, place="stereo")
-        for block, own in found.items()
-        for part, unit in own.items()
+        for block, block_units in units_of.items()
+        for part, unit in block_units.items()
     )
 
 
@@ -259,7 +262,7 @@ def parameter_of(name: str) -> Parameter | None:
 
 def unit_of(name: str) -> str:
     """Unit of a parameter or a derived quantity: `backlash_deg.pan` -> deg; "1" where it has none."""
-    found = QUANTITIES.of(name)
-    if found is None:
+    quantity = QUANTITIES.of(name)
+    if quantity is None:
         raise KeyError(name)
-    return found.unit
+    return quantity.unit

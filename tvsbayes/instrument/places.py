@@ -68,9 +68,9 @@ def interpolation(counters: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         for other in range(count):
             if other != k:
                 share[:, k] *= (counters - at[:, other]) / (at[:, k] - at[:, other])
-    found = np.zeros((len(counters), len(nodes)))
-    np.put_along_axis(found, near, share, axis=1)
-    return found
+    weights = np.zeros((len(counters), len(nodes)))
+    np.put_along_axis(weights, near, share, axis=1)
+    return weights
 
 
 def places_of(counters: np.ndarray, deg_per_step: float) -> np.ndarray:
@@ -117,31 +117,31 @@ def too_few_counters(axis: str, counters: Sequence[int], telling: Sequence[int])
         counters: at which it is seen.
         telling: others.
     """
-    seen = ", ".join(map(str, counters))
+    listed = ", ".join(map(str, counters))
     text = (
-        f"{axis} is seen at {len(counters)} counters only ({seen}), which cannot tell gear error from ratio: the ratio "
-        "holds between them, elsewhere the gear error of the prior is added"
+        f"{axis} is seen at {len(counters)} counters only ({listed}), which cannot tell gear error from ratio: "
+        "the ratio holds between them, elsewhere the gear error of the prior is added"
     )
     return f"{text}; looks at {axis} {', '.join(map(str, telling))} would tell" if telling else text
 
 
-def line_share(seen: SeenPlaces, used: np.ndarray) -> np.ndarray:
+def line_share(places: SeenPlaces, used: np.ndarray) -> np.ndarray:
     """Share of the value at each place in the slope of the least-squares line through the looks used, steps^-1.
 
     Args:
-        seen: places of all looks.
+        places: those of all looks.
         used: looks, shape (looks,), boolean.
 
     Returns:
         Shape (c,); nought for an axis that was seen at one counter alone.
     """
-    found = np.zeros(len(seen.steps))
+    shares = np.zeros(len(places.steps))
     for axis in (False, True):
-        own = seen.on_tilt == axis
-        share = seen.error_share[np.ix_(used, own)]
-        counters = share @ seen.steps[own]
+        of_axis = places.on_tilt == axis
+        share = places.error_share[np.ix_(used, of_axis)]
+        counters = share @ places.steps[of_axis]
         off = counters - counters.mean()
         square = off @ off
         if np.ptp(counters) > 0:
-            found[own] = (off / square) @ share
-    return found
+            shares[of_axis] = (off / square) @ share
+    return shares

@@ -76,13 +76,13 @@ class Quantity:
 
         Texts may name parts as {0}, {1} ..., the axis as {axis}, and both of its directions as {sides}.
         """
-        found = []
+        quantities = []
         for name in [f"{block}.{part}" for part in parts] or [block]:
             bare = cls(name=name, block=block, **more)
             named = {"axis": bare.axis, "sides": " - ".join(bare.sides)}
             texts = {key: getattr(bare, key).format(*bare.parts, **named) for key in ("label", "target", "stated")}
-            found.append(replace(bare, **texts))
-        return found
+            quantities.append(replace(bare, **texts))
+        return quantities
 
 
 class Quantities[Q: Quantity](dict[str, Q]):
@@ -94,10 +94,10 @@ class Quantities[Q: Quantity](dict[str, Q]):
     @cached_property
     def blocks(self) -> dict[str, tuple[str, ...]]:
         """Names by block."""
-        found: dict[str, tuple[str, ...]] = {}
+        blocks: dict[str, tuple[str, ...]] = {}
         for entry in self.values():
-            found[entry.block] = (*found.get(entry.block, ()), entry.name)
-        return found
+            blocks[entry.block] = (*blocks.get(entry.block, ()), entry.name)
+        return blocks
 
     @cached_property
     def words(self) -> dict[str, str]:

@@ -218,7 +218,7 @@ def _in_blocks(names: Iterable[str]) -> str:
 
 def _named_entries(table: Keys, allowed: tuple[str, ...]) -> dict[str, tuple[Keys, str]]:
     """Where each name of a table stands; `allowed` lists those that may."""
-    found: dict[str, tuple[Keys, str]] = {}
+    entries: dict[str, tuple[Keys, str]] = {}
     for keys, key, name in _entries(table):
         if name not in allowed:
             # Keys of [rig] itself that are no priors are read before.
@@ -226,10 +226,10 @@ def _named_entries(table: Keys, allowed: tuple[str, ...]) -> dict[str, tuple[Key
             names = "only " + _in_blocks((*allowed, *more))
             stands = f"the name {escaped(name)}"
             raise keys.refuse(key, "unknown-key", names, _explanation(name, allowed), stands)
-        if name in found:
+        if name in entries:
             raise keys.refuse(key, "duplicate-key", "every name once", "remove one", f"{name} twice")
-        found[name] = keys, key
-    return found
+        entries[name] = keys, key
+    return entries
 
 
 def _parse_priors(entries: Mapping[str, tuple[Keys, str]]) -> dict[str, Prior]:
@@ -297,8 +297,8 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
     """
     mechanism = _mechanism(table, sightings)
     declared_names, prior_names = (_names_at(place, mechanism) for place in ("rig", "rig.prior"))
-    own = {k: v for k, v in table.values.items() if k not in _OWN_KEYS}
-    own_keys = Keys(own, table.file, table.text, table.path)
+    extra = {k: v for k, v in table.values.items() if k not in _OWN_KEYS}
+    own_keys = Keys(extra, table.file, table.text, table.path)
     own_entries = _named_entries(own_keys, (*declared_names, *_PERIOD_NAMES))
     period_deg: dict[str, tuple[float, ...]] = {
         axis: _parse_periods(*own_entries.pop(n)) for n, axis in _PERIOD_NAMES.items() if n in own_entries
@@ -337,7 +337,9 @@ def rig_table_toml(table: RigTable) -> str:
     )
     stated = {name: table.harmonic_period_deg.get(axis, ()) for name, axis in _PERIOD_NAMES.items()}
     periods = [
-        toml_line(name, {"value": own[0] if len(own) == 1 else own, "u": 0.0}) for name, own in stated.items() if own
+        toml_line(name, {"value": numbers[0] if len(numbers) == 1 else numbers, "u": 0.0})
+        for name, numbers in stated.items()
+        if numbers
     ]
     periodic = [entry(name) for name in PERIODIC_NAMES if _has_period(name, table.harmonic_period_deg)]
     declared = map(entry, _names_at("rig", kind))
@@ -454,8 +456,8 @@ def read_rig(path: Path) -> Rig:
             raise sheets.refuse(name, "text", "a printable name of 1 to 100 characters", "rename the sheet")
     costs = keys.table("costs")
     costs.only(COSTS_S)
-    told = tuple(name for name in table.mechanism.rig_names if name in table.mechanism.told)
-    truth = {**table.priors, **_parse_priors(_named_entries(keys.table("truth"), told))}
+    names = tuple(name for name in table.mechanism.rig_names if name in table.mechanism.told)
+    truth = {**table.priors, **_parse_priors(_named_entries(keys.table("truth"), names))}
     _check_periods(keys.table("truth"), truth, table.harmonic_period_deg)
     return Rig(
         table=table,

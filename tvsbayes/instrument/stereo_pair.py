@@ -87,10 +87,10 @@ def project_pair(stereo: Stereo, points_S_mm: np.ndarray) -> np.ndarray:
     """Raw pixels (n, 4: u_left, v_left, u_right, v_right) of points (n, 3) in frame S, mm: `triangulate` back."""
     points = np.asarray(points_S_mm, float).reshape(-1, 3)
     left = np.column_stack((-points[:, 1], -points[:, 2], points[:, 0]))
-    seen = []
-    for M, D, own in ((stereo.M1, stereo.D1, left), (stereo.M2, stereo.D2, left @ stereo.R.T + stereo.T)):
-        seen.append(distort(own[:, :2] / own[:, 2:], D) @ M[:2, :2].T + M[:2, 2])
-    return np.hstack(seen)
+    pixels = []
+    for M, D, in_camera in ((stereo.M1, stereo.D1, left), (stereo.M2, stereo.D2, left @ stereo.R.T + stereo.T)):
+        pixels.append(distort(in_camera[:, :2] / in_camera[:, 2:], D) @ M[:2, :2].T + M[:2, 2])
+    return np.hstack(pixels)
 
 
 @dataclass(frozen=True)
@@ -475,6 +475,6 @@ def pair_doubts(stereo: Stereo, places: Mapping[str, str] | None = None) -> tupl
         fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
         if abs(fx / fy - 1) > ASPECT_SHARE_MAX:
             doubts.append(f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are seldom so oblong")
-        number, own = ("1", stereo.D1) if side == "left" else ("2", stereo.D2)
-        doubts += _lens_doubts(matrix, own, size_px, place[f"M{number}"], place[f"D{number}"])
+        number, distortion = ("1", stereo.D1) if side == "left" else ("2", stereo.D2)
+        doubts += _lens_doubts(matrix, distortion, size_px, place[f"M{number}"], place[f"D{number}"])
     return tuple(doubts)

@@ -73,12 +73,12 @@ def rests_of(moves: Sequence[Move], axis: str) -> list[Rest]:
 
 def legs_of(moves: Sequence[Move]) -> dict[str, list[int]]:
     """Lengths of the moves in each direction, steps, in order; directions never moved in are absent."""
-    found: dict[str, list[int]] = {}
+    legs: dict[str, list[int]] = {}
     for axis in AXES:
         for rest in dict.fromkeys(rests_of(moves, axis)):
             if rest.distance:
-                found.setdefault(direction_of(axis, rest.distance), []).append(abs(rest.distance))
-    return found
+                legs.setdefault(direction_of(axis, rest.distance), []).append(abs(rest.distance))
+    return legs
 
 
 def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) -> tuple[Stop, ...]:
@@ -89,9 +89,9 @@ def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) 
         observed: numbers of the moves after which a usable spot was seen.
         axis: "pan" or "tilt".
     """
-    found = zip(moves, rests_of(moves, axis), strict=True)
-    seen = dict.fromkeys(rest for move, rest in found if move.move in observed)
-    return tuple(Stop(rest.segment, rest.steps, rest.sign) for rest in seen)
+    rests = zip(moves, rests_of(moves, axis), strict=True)
+    observed_rests = dict.fromkeys(rest for move, rest in rests if move.move in observed)
+    return tuple(Stop(rest.segment, rest.steps, rest.sign) for rest in observed_rests)
 
 
 FEW_STOPS = 12
@@ -105,9 +105,9 @@ def too_few(stops: Mapping[str, int]) -> dict[str, int]:
 
 def few_stops(moves: Sequence[Move], observed: Collection[int]) -> dict[str, int]:
     """Directions moved in with too few observed stops, and their number; see `observed_stops`."""
-    seen = Counter(direction_of(axis, stop.sign) for axis in AXES for stop in observed_stops(moves, observed, axis))
+    counts = Counter(direction_of(axis, stop.sign) for axis in AXES for stop in observed_stops(moves, observed, axis))
     moved = legs_of(moves)
-    return too_few({direction: seen[direction] for direction in DIRECTIONS if direction in moved})
+    return too_few({direction: counts[direction] for direction in DIRECTIONS if direction in moved})
 
 
 INSEPARABLE = 0.5
