@@ -1,4 +1,4 @@
-"""How far a wait has come: never backwards, to the end, and whoever listens may stop it."""
+"""How far a wait has come: never backwards, to the end, and anyone who listens may stop it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_what_goes_backwards_is_not_told_so():
 
 
 def test_time_left_of_an_even_job_is_right_from_the_beginning():
-    """A hundred steps of half a second: 50 s less what has passed, once there is something to foretell by."""
+    """A hundred steps of half a second: 50 s less what has passed, once there is something to predict by."""
     told = followed({"all": 1.0}, [(0.5, (k + 1) / 100) for k in range(100)])
     known = [state for state in told if state.seconds_left is not None]
     assert known[0].share >= FORESEEN_SHARE and known[0].seconds >= FORESEEN_SECONDS and len(known) >= 99
@@ -92,7 +92,7 @@ def test_what_was_not_needed_foretells_nothing(asked):
             job.at(k / 10)
     check_forward(told)
     known = [state for state in told if state.seconds_left is not None]
-    # A step is a hundredth of the whole: two of them are enough to foretell by.
+    # A step is a hundredth of the whole: two of them are enough to predict by.
     assert len(known) == 10
     for state in known:
         assert state.seconds_left == pytest.approx(10 - state.seconds, abs=1e-9), "shares rounded to 1e-16"

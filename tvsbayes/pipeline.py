@@ -1,6 +1,6 @@
 """From a campaign to everything said of it: fit, posterior, calibration, evidence, made whole, kept in `results/`.
 
-What the commands call, for whoever calls from Python. Units are those of the contract names; JAX is loaded by what
+What the commands call, for anyone who calls from Python. Units are those of the contract names; JAX is loaded by what
 fits.
 """
 
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 
 
 Tell = Callable[[str], None]
-"""Shows a line to whoever waits."""
+"""Shows a line to the user."""
 FITTING, SAMPLING, FILING, SUMMARISING = "fit", "posterior", "writing posterior.nc", "summarising"
 MAX_MINUTES = 10.0
 """For sampling, where nobody says otherwise."""
 FILED_SECONDS, SUMMARISED_SECONDS = 3.0, 1.5
-"""For posterior.nc and for the results: what progress foretells with."""
+"""For posterior.nc and for the results: what progress predicts with."""
 RESIDUALS_LISTED = 4096
 """Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
 FITTING_FIRST = "fitting first (Laplace approximation) ..."
@@ -52,11 +52,11 @@ HASHED = {"moves": "moves.csv", "spots": "spots.csv", "stereo": "stereo.json", "
 
 
 def untold(line: str) -> None:
-    """For whoever does not want to be told."""
+    """For callers that show nothing."""
 
 
 def compile_for(tell: Tell) -> None:
-    """Use the compilation cache; whoever waits at a terminal for the first compilation is told so, once a process."""
+    """Use the compilation cache; say once a process that the first compilation takes time."""
     from tvsbayes.model.compilation_cache import own_cache_folder, use_compilation_cache
 
     empty, folder = use_compilation_cache(), own_cache_folder()

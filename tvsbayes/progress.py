@@ -1,7 +1,7 @@
 """How far a wait has come: what is being done, how far, time left; it never goes backwards.
 
-A `Job` is a wait in named stages, each with the share of the time that it is expected to take. Whoever does the work
-says where it stands, and whoever waits is told by a callback, in the thread that works. An exception of the callback
+A `Job` is a wait in named stages, each with the share of the time that it is expected to take. Anyone who does the work
+says where it stands, and a callback tells the user, in the thread that works. An exception of the callback
 passes through and so ends the work. Where nobody gave a callback and somebody types (a Python prompt, IPython, a
 notebook), a wait that has lasted two seconds shows itself in one line and takes it away at its end; scripts are silent.
 """
@@ -38,7 +38,7 @@ Show = Callable[[Progress], None]
 Advance = Callable[[float], None]
 """Takes the share of a stage that is done, from 0 to 1."""
 FORESEEN_SHARE, FORESEEN_SECONDS = 0.02, 0.5
-"""Share done and time passed from which the rest is foretold."""
+"""Share done and time passed from which the rest is predicted."""
 MEMORY = 0.2
 """Part of the time passed over which the speed is averaged: stages are not equally well foreseen."""
 EXPECTED_LAST = 0.8
@@ -136,7 +136,7 @@ class DelayedDisplay:
 
 
 def unshown(share: float) -> None:
-    """For whoever need not know how far a stage is."""
+    """For callers that show no progress."""
 
 
 class Job:
@@ -186,7 +186,7 @@ class Job:
     def begin(self, doing: str) -> None:
         """Begin a stage; those before it are done, or were not needed. `KeyError` where there is no such stage."""
         before, done = self._ends[self._stage]
-        # What was passed over, or had nothing to tell, took no time by which the rest could be foretold.
+        # What was passed over, or had nothing to tell, took no time by which the rest could be predicted.
         self._skipped += max(self._ends[doing][0] - (before if self._silent else done), 0.0)
         self._stage = doing
         self.at(0.0)

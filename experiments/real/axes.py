@@ -5,7 +5,7 @@
     python -m experiments.real.axes table > experiments/real/axes.md
     python -m experiments.real.axes figure                            # of what `run` found, for data/docs/real.md
 
-`run` leaves every position of every table out in turn and foretells the mean of its readings in each direction: by the
+`run` leaves every position of every table out in turn and predicts the mean of its readings in each direction: by the
 model with error and play as processes of position, and by the first edition's: offset, scale, play and independent
 stops (least squares, as `classic_predicted` of `compare`). `simulate` draws axes from the default priors and counts how
 often the intervals of a fit hold the truth.
@@ -120,7 +120,7 @@ def _held_lines(name: str, rows: list[dict]) -> str:
 HELD_TEXT = """Made by `python -m experiments.real.axes`. Axes: figures printed in the test reports of the public
 repository anderssandstrom/ecmc_target_muts_logger (commit ee350e4c81): ISO 230-2 runs of stepper-driven screw axes read
 by laser triangulation. Every position left out in turn, the axis fitted without it, the mean of its readings in each
-direction foretold. z = (mean - predicted) / u; first edition: offset, scale, play, independent stops.
+direction predicted. z = (mean - predicted) / u; first edition: offset, scale, play, independent stops.
 
 | axis | inner means | RMS z | worst | in 1.96 u | readings in 95 % | ends: RMS z | first edition: RMS z |
 |---|---|---|---|---|---|---|---|"""
@@ -137,7 +137,7 @@ z = (mean - truth) / sd. Bounds are two-sided at 1e-4 for so many axes.
 def table(_: argparse.Namespace) -> None:
     """Both tables."""
     held, drawn = read_rows(HELD), read_rows(DRAWN)
-    words = "Left-out means less those foretold, in u, by axis and model"
+    words = "Left-out means less those predicted, in u, by axis and model"
     print(title_and_figure(__file__, "Real axes, positions left out", FIGURE, words))
     print(HELD_TEXT)
     for axis in dict.fromkeys(r["axis"] for r in held):

@@ -107,7 +107,7 @@ def whitening(density, z: np.ndarray, covariance: np.ndarray, latent: int):
     """Centre and root of coordinates in which the density is nearly standard normal.
 
     At the mode of the marginal density, where stop errors and ranges have a mode of their own: the mode of all
-    together has stop sds of nought, as that of every hierarchy has.
+    together has stop sds of zero, as that of every hierarchy has.
     """
     known = len(z)
     climb, curve = jax.jit(jax.value_and_grad(density)), jax.jit(jax.hessian(density))

@@ -34,7 +34,7 @@ def linear_fit(mounted_rig):
     rng = np.random.default_rng(12)
     draws_z = laplace_draws(fit.z, covariance, 1)
     gradient = rng.normal(size=(6, len(NAMES))) * 1e-3
-    # Nothing hangs on a coordinate that is fixed, and noise scales carry no headline.
+    # Nothing depends on a coordinate that is fixed, and noise scales carry no headline.
     gradient[:, : len(RIG_NAMES)][:, np.asarray(fit.space.u) == 0] = 0.0
     physical = np.full((len(draws_z), len(NAMES)), 0.5)
     values = draws_z @ gradient.T

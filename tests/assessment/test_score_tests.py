@@ -236,7 +236,7 @@ def test_the_larger_of_two_gross_defects_is_the_cause():
 
 
 def test_an_axis_that_a_search_has_left_without_motion_has_no_waves(clean):
-    """A ratio of nought, where a search ended that fits no rig: its misfit refuses it, not a division by 0."""
+    """A ratio of zero, where a search ended that fits no rig: its misfit refuses it, not a division by 0."""
     n = len(ordered_spots(clean.campaign))
     moving, still = (
         _SeenAxis("pan", np.ones((n, 4, 1)), angle, np.arange(n), np.ones(n)) for angle in (np.arange(n), np.zeros(n))

@@ -319,7 +319,7 @@ def test_prior_sensitivity_is_what_a_refit_finds(paper, fitted, summary):
     }
     stereo = replace(paper.stereo, parameter_covariance=4.0 * np.asarray(paper.stereo.parameter_covariance))
     refit = fit(replace(paper, stereo=stereo))
-    assert doubled, "some effective ratio hangs on the cameras"
+    assert doubled, "some effective ratio depends on the cameras"
     for k, direction in enumerate(("left", "right", "up", "down")):
         if f"effective {direction}" not in doubled:
             continue

@@ -192,7 +192,7 @@ def test_cameras_of_a_rig_file():
 
 @pytest.mark.parametrize("wanted", (None, "7"))
 def test_opencv_is_silent_only_while_cameras_are_opened(monkeypatch, wanted):
-    """And not at all for whoever asked for its messages; FFmpeg's variable is nobody else's afterwards."""
+    """And not at all for anyone who asked for its messages; FFmpeg's variable is nobody else's afterwards."""
     logging, levels = cv2.utils.logging, []
     names = ("OPENCV_LOG_LEVEL", "OPENCV_FFMPEG_LOGLEVEL")
     for name in names:

@@ -181,7 +181,7 @@ def test_a_line_is_pulsed_by_the_positioner(mounted_rig):
     connect_trigger(positioner, camera)
     with pytest.raises(DeviceFault, match="no frame"):
         camera.grab()
-    assert instrument.mechanics.trigger_on, "the line is high, and these cameras do not hang on it"
+    assert instrument.mechanics.trigger_on, "the line is high, and these cameras do not depend on it"
 
     def pulse():
         for acquirer in maker.acquirers:

@@ -1,4 +1,4 @@
-"""Results made whole, and taken up again by whoever needs them."""
+"""Results made whole, and taken up again by anyone who needs them."""
 
 from __future__ import annotations
 

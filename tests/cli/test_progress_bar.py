@@ -1,4 +1,4 @@
-"""The bar is seen by whoever sits at a terminal and waits; nobody else gets a byte of it."""
+"""The bar is seen by anyone who sits at a terminal and waits; nobody else gets a byte of it."""
 
 from __future__ import annotations
 

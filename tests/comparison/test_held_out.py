@@ -1,4 +1,4 @@
-"""Experiments left out: folds, refits, what each estimator foretells."""
+"""Experiments left out: folds, refits, what each estimator predicts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 from support.waits import check_forward, doings
 
-from tvsbayes.comparison.held_out import folds_of, foretell_classic, hold_out
+from tvsbayes.comparison.held_out import folds_of, hold_out, predict_classic
 from tvsbayes.comparison.scores import judge
 from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.four_point import Selection, classic, select_experiments
@@ -98,9 +98,9 @@ def test_experiments_beyond_the_lens_model_neither_teach_nor_are_asked():
     rows, nothing = np.zeros((4, 4), dtype=int), np.zeros((4, 4, 4))
     selection = Selection(np.arange(4), rows, nothing, np.full(4, 200), np.full(4, "pan"), ())
     angle = np.array([12.0, 12.1, 11.9, np.nan])
-    told = foretell_classic(angle, selection, np.array([True, False, False, False]))
+    told = predict_classic(angle, selection, np.array([True, False, False, False]))
     assert told[0][0] == pytest.approx(12.0) and np.isfinite(told[0][1]) and told[0][2] == 1
-    assert foretell_classic(angle, selection, np.array([False, False, False, True])) == {}
+    assert predict_classic(angle, selection, np.array([False, False, False, True])) == {}
 
 
 def test_a_fold_without_a_fit_decides_nothing(mixed_fit, monkeypatch):
@@ -121,7 +121,7 @@ def test_few_experiments_foretell_with_the_width_of_their_own_scatter():
     predictions = []
     for index in range(sets):
         angle = 12.0 + 0.05 * generator.standard_normal(3)
-        ((_, told),) = foretell_classic(angle, selection, np.array([True, False, False])).items()
+        ((_, told),) = predict_classic(angle, selection, np.array([True, False, False])).items()
         assert told[2] == 1
         predictions.append(Prediction(index, "one", "left", 200, float(angle[0]), *told, 12.0, 0.05))
     held = judge("steps", predictions, np.array([100, 200]), {})

@@ -1,4 +1,4 @@
-"""Counters left out and foretold: with errors of gears that repeat, and without."""
+"""Counters left out and predicted: with errors of gears that repeat, and without."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy import stats
 from support.coarse_planning import with_priors
 from support.waits import check_forward, doings
 
-from tvsbayes.comparison.held_positions import _of_all_looks, foretold, hold_out_positions
+from tvsbayes.comparison.held_positions import _of_all_looks, hold_out_positions, predicted_positions
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.axes import DIRECTIONS
@@ -53,7 +53,7 @@ def unfitted(monkeypatch):
 
 
 @pytest.mark.usefixtures("unfitted")
-def test_counters_are_foretold_within_their_u_where_the_model_knows_that_gears_err(worn, whole):
+def test_counters_are_predicted_within_their_u_where_the_model_knows_that_gears_err(worn, whole):
     """Four counters, two sides of which say the same: rms of z below the 99.9 % quantile of four; else beyond it."""
     rig, campaign = worn
     told = []
@@ -79,13 +79,13 @@ def test_counters_are_foretold_within_their_u_where_the_model_knows_that_gears_e
 
 
 def test_looks_left_out_teach_nothing_of_themselves(worn, whole):
-    """One counter's looks moved by a degree move what is seen of it by as much, and what is foretold by nothing."""
+    """One counter's looks moved by a degree move what is seen of it by as much, and what is predicted by nothing."""
     campaign = worn[1]
     spots = ordered_spots(campaign)
     rests = rests_of(campaign.moves, "pan")
     out = np.array([rests[spot.move].steps == PAN[2] for spot in spots])
     sign = np.array([rests[spot.move].sign for spot in spots])
-    plain = foretold(whole, whole, 0, PAN[2], out, sign)
+    plain = predicted_positions(whole, whole, 0, PAN[2], out, sign)
     slope = np.asarray(whole.linearised.slope)[..., 0]
     moved = eqx.tree_at(
         lambda lin: lin.residual,
@@ -94,7 +94,7 @@ def test_looks_left_out_teach_nothing_of_themselves(worn, whole):
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tvsbayes.comparison.held_positions._of_all_looks", lambda *_: moved)
-        other = foretold(whole, whole, 0, PAN[2], out, sign)
+        other = predicted_positions(whole, whole, 0, PAN[2], out, sign)
     for before, after in zip(plain, other, strict=True):
         assert after.mean - before.mean == pytest.approx(1.0, rel=1e-6)
         assert after.predicted == pytest.approx(before.predicted, abs=1e-6) and after.u == pytest.approx(before.u)

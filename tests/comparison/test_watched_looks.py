@@ -67,7 +67,7 @@ def test_the_departure_is_that_of_a_dense_gaussian(mounted_rig, mixed_fit, truth
     columns = spots.jacobian.reshape(4 * size, -1)
     own, shifts = columns[:, :count], columns[:, count:]
     dense = dense_covariance(spots) + own @ own.T
-    # A priori the coordinates are N(0, 1): z of them is taken back to nought.
+    # A priori the coordinates are N(0, 1): z of them is taken back to zero.
     residual = spots.residual.ravel() + own @ np.where(watched.problem.held, 0.0, mixed_fit.z)
     new = np.arange(4 * size) >= 4 * watched.first
     gain = dense[np.ix_(new, ~new)] @ np.linalg.inv(dense[np.ix_(~new, ~new)])

@@ -276,7 +276,7 @@ def test_each_cause_alone_has_its_sensitivity(cause):
     slope = sensitivities()[quantity]
     expected = u**2 * np.outer(slope, slope)
     law = locate_linear(one, settings_of(steps, 0.0, B_DEG, approach))
-    # The mirror offset is nought and the elevation level: what is left is rounding.
+    # The mirror offset is zero and the elevation level: what is left is rounding.
     scale = np.abs(expected).max()
     np.testing.assert_allclose(law.covariance[0] / scale, expected / scale, atol=1e-9)
     np.testing.assert_allclose(law.value[0], published_point(B_DEG, C_DEG, 0.0, A_MM), atol=ROUNDING_MM)

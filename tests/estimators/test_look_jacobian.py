@@ -43,7 +43,7 @@ def both(dozen):
 
 
 def test_parts_make_the_whole(both, dozen):
-    """Gears, optics, frames, cameras, receiver; harmonics have u = 0 here and columns of nought."""
+    """Gears, optics, frames, cameras, receiver; harmonics have u = 0 here and columns of zero."""
     parts, whole, _ = both
     count = len(dozen.campaign.spots)
     scale = np.abs(whole[:, :, :count]).max(axis=2, keepdims=True)

@@ -164,7 +164,7 @@ def test_draws_of_errors_at_places_have_the_conditional_gaussians_moments(varyin
     scale = np.sqrt(np.diag(prior)) + 1e-12
     np.testing.assert_allclose(mean / scale, gain @ residual.ravel() / scale, atol=ALGEBRA * 100)
     left = prior - gain @ load @ prior
-    # Covariances by prior sds; of a scale of nought the floor of 1e-12 rad is left.
+    # Covariances by prior sds; of a scale of zero the floor of 1e-12 rad is left.
     np.testing.assert_allclose(moved.T @ moved / np.outer(scale, scale), left / np.outer(scale, scale), atol=1e-6)
     gears = varying.arrays.gears
     assert not np.asarray(gears.error_share)[:, ~valid].any() and not np.asarray(gears.play_share)[:, ~valid].any()
@@ -188,7 +188,7 @@ def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying,
 
 
 def test_scales_of_nought_are_perfect_gears(varying, dozen, evaluate):
-    """With all scales nought the density is that of a campaign that has no places at all."""
+    """With all scales zero the density is that of a campaign that has no places at all."""
     table = perfect_gears(dozen.campaign.rig)
     assert not campaign_arrays(dozen.campaign, table).gears.filled
     with jax.enable_x64(True):

@@ -38,7 +38,7 @@ def test_a_reflection_takes_its_direction_to_the_first_axis_and_keeps_products()
 
 
 def test_without_a_direction_a_reflection_is_finite_and_still_one():
-    """Padding has no slopes: lengths stay, the load is nought, and so is every derivative by the direction."""
+    """Padding has no slopes: lengths stay, the load is zero, and so is every derivative by the direction."""
     vector = drawn(4, 4)
     with jax.enable_x64(True):
         reflection = Reflection.of(numbers(np.zeros((4, 40))))

@@ -52,7 +52,7 @@ def test_without_a_name_it_is_the_users_cache_folder(tmp_path, monkeypatch):
 
 @posix
 def test_a_folder_into_which_others_write_is_not_used(folder, capsys):
-    """Neither JAX's own entries, which are code too; whoever runs a command is told."""
+    """Neither JAX's own entries, which are code too; anyone who runs a command is told."""
     folder.mkdir()
     folder.chmod(0o777)
     before = jax.config.jax_compilation_cache_dir

@@ -77,7 +77,7 @@ def test_a_full_turn_waits_until_the_ratio_is_known(mounted_rig):
     stop_deg = 0.04
     assert k < 2 * stop_deg / 6000
     at = sensitivity(ratio, vague.z, vague.space, vague.rig.table, information.pose_rad)
-    assert at.value(covariance) > 10 * k, "the slope of the beam still hangs on the mirrors"
+    assert at.value(covariance) > 10 * k, "the slope of the beam still depends on the mirrors"
 
 
 def test_limits_too_narrow_for_a_run_up_are_refused_with_its_length(mounted_rig):

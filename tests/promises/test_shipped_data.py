@@ -220,7 +220,7 @@ def test_make_twins_writes_what_is_shipped():
 
 
 def test_schemas_are_those_of_the_records():
-    """Whoever changes a record runs `python -m experiments.inputs.make_schemas`."""
+    """Anyone who changes a record runs `python -m experiments.inputs.make_schemas`."""
     shipped = {path.name: path.read_text(encoding="utf-8") for path in (DATA / "schemas").iterdir()}
     assert shipped == make_schemas.files()
 

@@ -49,7 +49,7 @@ def test_fit_text_shows_what_the_reader_must_know():
     assert "left - right" not in text
     assert "chi2 31.0 for 30.5 degrees of freedom" in text
     assert "weak (the data leave it to the priors): the tilt axis was never moved" in text
-    assert "hangs on one stop: without move 0 it is lost" in text
+    assert "depends on one stop: without move 0 it is lost" in text
     assert "excluded spots: 17\n" in text
     # A flood of ids helps nobody.
     assert "spots that disagree with all others: 0, 1, 2" in text

@@ -88,7 +88,7 @@ def test_a_search_that_lost_its_way_is_not_converged():
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("scales", [FIRST_EDITION, {}], ids=["held", "free"])
 def test_readings_without_a_density_are_not_converged(scales):
-    """A scale of readings of nought, which no folder may state."""
+    """A scale of readings of zero, which no folder may state."""
     moves = runs(2)
     values = [0.01 * m.command + 0.002 * (k % 3) for k, m in enumerate(moves)]
     found = fit_axis(campaign(moves, values, 0.001, **{**scales, "reading_scale": AxisPrior(0.0, 0.0)}), sampled=False)
@@ -118,5 +118,5 @@ def test_a_reversal_of_the_wrong_sign_is_said():
 def test_a_constant_unit_is_held():
     made = drawn(2, None, per_command=AxisPrior(0.01, 0.0)).campaign
     found = fit_axis(AxisCampaign("deg", made.moves, made.readings, made.stated), tier="importance")
-    # What rounding leaves of a variance that is nought.
+    # What rounding leaves of a variance that is zero.
     assert np.ptp(found.draws["per_command"]) < 1e-10

@@ -77,11 +77,11 @@ def test_rows_left_out_are_the_conditional_of_the_dense_gaussian():
     gain = np.linalg.solve(total[np.ix_(others, others)], total[np.ix_(others, left)]).T
     wanted = total[np.ix_(left, left)] - gain @ total[np.ix_(others, left)]
     np.testing.assert_allclose(covariance[0], wanted, rtol=1e-5, atol=1e-10)
-    foretold = model.rows.value[left] - residual[left] + gain @ residual[others]
-    np.testing.assert_allclose(mean[0], foretold, atol=1e-6)
+    predicted = model.rows.value[left] - residual[left] + gain @ residual[others]
+    np.testing.assert_allclose(mean[0], predicted, atol=1e-6)
 
 
-def test_places_that_no_row_hangs_on_are_foretold_from_those_that_rows_do():
+def test_places_that_no_row_depends_on_are_predicted_from_those_that_rows_do():
     """Against the conditional of the process, given the posterior at the places of the rows."""
     asked = np.array([-1500.0, 37.0, 1200.0])
     plain, model = model_of(a_campaign()), model_of(a_campaign(), asked)

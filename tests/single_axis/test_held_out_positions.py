@@ -1,4 +1,4 @@
-"""Positions left out: foretold within their u on drawn axes, and beside the classic where errors repeat."""
+"""Positions left out: predicted within their u on drawn axes, and beside the classic where errors repeat."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.held_out_positions import hold_out_positions
 
 
-def test_positions_are_foretold_and_the_first_edition_is_too_sure():
+def test_positions_are_predicted_and_the_first_edition_is_too_sure():
     """Errors by position ten times the scatter: independent stops are too sure, processes are not."""
     stated = {
         "backlash": AxisPrior(0.0, 0.1),

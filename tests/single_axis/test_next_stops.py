@@ -133,7 +133,7 @@ def test_true_play_has_the_stated_mean_and_is_never_negative():
         return np.array([axis.parameters["backlash"] for axis in axes])
 
     far, near = true(0.5, 0.1), true(0.0, 0.1)
-    # Means of 400 numbers of sd 0.1, 0.06 where folded at nought: five standard errors.
+    # Means of 400 numbers of sd 0.1, 0.06 where folded at zero: five standard errors.
     assert far.mean() == pytest.approx(0.5, abs=0.025) and far.std() == pytest.approx(0.1, rel=0.2)
     assert near.mean() == pytest.approx(0.1 * np.sqrt(2 / np.pi), abs=0.015) and near.min() >= 0
 

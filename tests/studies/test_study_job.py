@@ -63,7 +63,7 @@ def test_a_chain_answers_where_weights_are_not_sound(sound):
 
 @pytest.mark.slow
 def test_the_planner_predicts_what_a_fit_of_real_gears_reports(mounted_rig):
-    """Ratios, lines over the looks with the gears' errors: sds of a fit within 15 % of those foretold at its truth.
+    """Ratios, lines over the looks with the gears' errors: sds of a fit within 15 % of those predicted at its truth.
 
     Stop errors are estimated from 40 stops a direction, to 11 % each.
     """

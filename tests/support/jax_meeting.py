@@ -112,7 +112,7 @@ def meeting(
     range_mm = jnp.where(azimuth_convention, plane, cone)
     seen = w + d * range_mm
     in_sight = jnp.where(azimuth_convention, seen.x * sin_b, 0.0) + seen.y * cos_b
-    # At B = 90 deg both nappes are one plane, and y is nought but for rounding.
+    # At B = 90 deg both nappes are one plane, and y is zero but for rounding.
     faces = in_sight >= -ROUNDING * jnp.abs(range_mm * cos_b)
     points = rays.at(range_mm)
     # Behind the baseline there is no triangle for the aperture to close.

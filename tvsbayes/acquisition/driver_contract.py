@@ -55,7 +55,7 @@ def positioner_violations(
         positioner.laser(True)
         expect(not positioner.home().state.laser_on, "the laser is off behind home")
         positioner.laser(True)
-        expect(not positioner.move_to(*targets[0]).laser_on, "the laser is off in motion, whoever left it on")
+        expect(not positioner.move_to(*targets[0]).laser_on, "the laser is off in motion, no matter who left it on")
         positioner.laser(True)
     finally:
         positioner.close()

@@ -1,4 +1,4 @@
-"""A run as it is looked at while it goes on: the engine publishes, whoever looks reads the latest and may ask.
+"""A run as it is looked at while it goes on: the engine publishes, anyone who looks reads the latest and may ask.
 
 Publication goes one way and is one assignment: a reader that is slow, many or dead costs the engine nothing, and
 misses what it did not read. The only way back is the queue of `live_control`. Pictures are made small by the reader.

@@ -1,4 +1,4 @@
-"""A campaign as one NeXus file (HDF5), for whoever reads such files and not ours.
+"""A campaign as one NeXus file (HDF5), for anyone who reads such files and not ours.
 
 `/entry/looks` is the default plot: centroids with their uncertainties over the looks, with the counters behind each;
 `/entry/moves` has the counters over time, `/entry/instrument` axes and cameras. The campaign's own files and the

@@ -1,6 +1,6 @@
 """The people of a run: the operator who is asked, the key that stops, and what is shown meanwhile.
 
-The hazard is told before the laser can come on, and whoever cannot be asked has to state its class. Ctrl-C ends a run
+The hazard is stated before the laser can come on; where nobody can be asked its class is required. Ctrl-C ends a run
 in good order; what ends the process from outside is turned into an interrupt, so that the laser goes off.
 """
 

@@ -60,7 +60,7 @@ def acquire(
         adapt: that the looks which are left are chosen from that fit; `estimate` must have a target.
         vision: how pictures are made and seen; by default they wait for `detect`, and a simulation states centroids.
         terminal: where to speak and to ask; by default nothing is shown.
-        live: where the run is published for whoever looks on, and what is asked of it.
+        live: where the run is published for anyone who looks on, and what is asked of it.
         place_command: a program that places the sheet instead of a person.
 
     Raises:

@@ -84,7 +84,7 @@ class SimulatedDevice:
 class ModelLink:
     """A `Link` to a simulated device; subclasses bend what passes through `to_device` and `to_host`.
 
-    Bytes to the device arrive when their time has come, whoever moves the clock next.
+    Bytes to the device arrive when their time has come, no matter who moves the clock next.
     """
 
     def __init__(self, device: SimulatedDevice):

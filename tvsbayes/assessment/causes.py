@@ -124,7 +124,7 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None) -> Causes:
     if by_places is not None:
         spread = np.concatenate([spread, by_places @ information.posterior[len(NAMES) :]])
     covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
-    # A prior that was fixed, or that no coordinate hangs on, is no cause.
+    # A prior that was fixed, or that no coordinate depends on, is no cause.
     kept = {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
     return Causes(tuple(kept), np.stack(list(kept.values())))
 
@@ -211,7 +211,7 @@ def _noise_causes(fit: JointFit, information: _Told, quantities: tuple[str, ...]
 
 
 def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
-    """Every stated prior of the rig that a quantity hangs on."""
+    """Every stated prior of the rig that a quantity depends on."""
     causes = []
     stated = (np.asarray(x).tolist() for x in (fit.space.value, fit.space.u, fit.space.kind))
     for column, (name, centre, u, kind) in enumerate(zip(fit.space.mechanism.rig_names, *stated, strict=True)):

@@ -61,7 +61,7 @@ class NormalModel:
         values, vectors = np.linalg.eigh(precision)
         # Data only add to the precision of the priors: draws that scatter more than these do not say otherwise.
         covariance = (vectors / np.maximum(values, min(1.0, factor**-2))) @ vectors.T
-        # The data's share of the slope at nought stays.
+        # The data's share of the slope at zero stays.
         mean = covariance @ (self.precision @ self.mean)
         variance = np.einsum("qi,ij,qj->q", self.gradient, covariance, self.gradient)
         before = np.einsum("qi,ij,qj->q", self.gradient, np.linalg.inv(self.precision), self.gradient)

@@ -294,7 +294,7 @@ def validate(fit: JointFit) -> Validation:
 
 
 def _single_spots(fit: JointFit, question: _Asked) -> _Answer:
-    """The spot that all others foretell worst; how far it moves a headline is not asked (`--robust` drops it).
+    """The spot that all others predict worst; how far it moves a headline is not asked (`--robust` drops it).
 
     As `linear_spots.leave_one_out_chi2`, less what the fit can follow.
     """

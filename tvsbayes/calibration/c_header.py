@@ -75,7 +75,7 @@ def _origin_lines(calibration: Calibration, origin: Origin | None) -> str:
 
 
 def _header_gears(calibration: Calibration) -> list[str]:
-    """Counters seen, and the table of the gears' errors; of gears that do not vary a table of nought."""
+    """Counters seen, and the table of the gears' errors; of gears that do not vary a table of zero."""
     lines: list[str] = []
     errors: Mapping[str, Mapping[str, Any]] = gear_errors(calibration)
     none: Mapping[str, Any] = {

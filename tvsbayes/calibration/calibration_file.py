@@ -129,7 +129,7 @@ def _plain(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Origin:
-    """Of what an exported calibration is, so that whoever finds it on a controller knows.
+    """Of what an exported calibration is, so that anyone who finds it on a controller knows.
 
     Attributes:
         campaign: its name.
@@ -152,7 +152,7 @@ class Origin:
 
 
 def content_sha256(document: Mapping[str, object]) -> str:
-    """SHA-256 of an exported calibration, whoever exports it and when."""
+    """SHA-256 of an exported calibration, no matter who exports it and when."""
     content = {key: value for key, value in document.items() if key != "origin"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

@@ -181,7 +181,7 @@ def range_components(
         return math.inf
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = reach / closing
-        # At B = 90 deg both nappes are one plane, and y is nought but for rounding.
+        # At B = 90 deg both nappes are one plane, and y is zero but for rounding.
         faces = (y + reach * v) * cos_b >= -ROUNDING * abs(reach * cos_b)
     return (reach if faces else -math.inf) if m is math else np.where(faces | np.isnan(reach), reach, -np.inf)
 

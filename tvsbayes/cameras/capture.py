@@ -5,7 +5,7 @@ frame says when it was exposed. So every `grab` first empties the buffers: a buf
 decoded, a live one at the camera's own rate, which is measured at opening; only behind the first live frames, which
 may still have been in the pipe, one is taken. A camera that never makes us wait is refused: its frames could be of any
 age. Where decoding takes as long as the camera's period the two cannot be told apart; then the proof by light holds
-that whoever drives the laser adds. Streams of the network are read all the time (`network_stream`).
+that the driver of the laser adds. Streams of the network are read all the time (`network_stream`).
 
 Pictures are (height, width, 3), blue, green, red, uint8 or uint16 as the camera gives them; raw pixels, nothing
 rectified, no depth lost.
@@ -78,7 +78,7 @@ class CameraSettings:
 
 
 class StereoCamera(Protocol):
-    """A pair of cameras, whatever they hang on."""
+    """A pair of cameras, whatever they depend on."""
 
     def grab(self) -> StereoImage:
         """A pair whose exposure began after this call."""
@@ -94,7 +94,7 @@ class StereoCamera(Protocol):
 def _quiet_opencv() -> Iterator[None]:
     """OpenCV and its FFmpeg write no warnings to stderr meanwhile: what fails is raised, with a remedy.
 
-    Whoever has set their variables OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL wants to read them. FFmpeg's is read
+    Anyone who has set their variables OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL wants to read them. FFmpeg's is read
     once, at the first stream that a process opens, and stays.
     """
     import cv2

@@ -1,7 +1,7 @@
 """A camera on the network, read all the time by a thread of its own, so that only the newest frame is ever handed on.
 
 A stream that nobody reads fills the buffers of both computers with old frames, and many servers drop a viewer who is
-idle for some seconds, as during a homing. The thread takes every frame as it comes and lets it go; whoever waits gets
+idle for some seconds, as during a homing. The thread takes every frame as it comes and lets it go; a caller gets
 the next one that arrives. Where the stream ends it is opened again, once for every frame that came.
 
 The capture belongs to the thread: everything else is asked of it. Seconds where a name says `_s`.
@@ -125,7 +125,7 @@ class NetworkStream:
                 else:
                     break
         except TvsError:
-            # It cannot be opened again: whoever waits hears of it as of any camera without frames.
+            # It cannot be opened again: anyone who waits hears of it as of any camera without frames.
             pass
         finally:
             self._capture.release()

@@ -44,7 +44,7 @@ WIDE_FLOOR_SHARE = 0.02
 """Of the height: what stands for the background in the weights of wide spots, whose noise is mostly shot noise."""
 REACH, REACH_PX = 4.0, 9.0
 """Where pixels fade out of a fit, in sds of the spot and px beyond: no real beam is Gaussian in its wings, and with an
-edge there the centre would hang on which pixels happen to be inside."""
+edge there the centre would depend on which pixels happen to be inside."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
         residual = pixels.data - signal - p[6:] @ jacobian[6:]
         # Far from the solution the weights of a wrong model mislead: equal ones first.
         if patch.wide and noise.speckle_contrast < SPECKLED:
-            # No real beam is Gaussian, and a wide spot shows it: its centre must not hang on a guess of the noise.
+            # No real beam is Gaussian, and a wide spot shows it: its centre must not depend on a guess of the noise.
             variance = signal + WIDE_FLOOR_SHARE * np.exp(p[0]) if settled else 1.0
         else:
             variance = patch.background_variance + (

@@ -40,7 +40,7 @@ OUTLIER_Z, OUTLIER_SPREAD_MIN = 4.0, 0.2
 at least 0.2) above the median: never below 2.2 times the median rms. On clean views the logarithm scatters by 0.05."""
 FINDING, ADJUSTING = "finding corners", "adjusting all corners"
 STAGES = {FINDING: 2.0, ADJUSTING: 3.0}
-"""Of a calibration, with seconds: what progress foretells with."""
+"""Of a calibration, with seconds: what progress predicts with."""
 VIEWS_ADVISED = 10
 """Zhang (2000), figure 3: the errors have fallen to a floor by about ten views."""
 TILT_ADVISED_DEG = 15.0

@@ -84,7 +84,7 @@ def _print(text: str) -> None:
         # What is still in its buffer must not fail again while Python ends.
         sys.stdout = open(os.devnull, "w", encoding="utf-8")
         if isinstance(error, BrokenPipeError):
-            # Whoever read has gone, like `head`; the work is done, and its exit code stands.
+            # Anyone who read has gone, like `head`; the work is done, and its exit code stands.
             return
         raise OutputFailed(error.strerror or str(error)) from error
 

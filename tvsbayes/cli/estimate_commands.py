@@ -183,7 +183,7 @@ def compare(
         allowed = "steps, regions and positions"
         raise InputError("usage", f"--by {escaped(by)}: allowed are {allowed}", remedy="choose one of them")
     if by == "positions":
-        refuse_options("for steps and regions: positions are foretold without draws", "leave it out", seed=seed)
+        refuse_options("for steps and regions: positions are predicted without draws", "leave it out", seed=seed)
         _compare_positions(campaign, as_json)
         return
     folders = [campaign] if other is None else [campaign, other]
@@ -218,7 +218,7 @@ def compare(
 
 
 def _compare_positions(campaign: Path, as_json: bool) -> None:
-    """Every counter left out and foretold by the looks at all others."""
+    """Every counter left out and predicted by the looks at all others."""
     from tvsbayes.comparison.held_positions import hold_out_positions
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.command_text import positions_text
@@ -253,12 +253,12 @@ def _no_experiments() -> NothingToEstimate:
         "the campaign has no complete four-point experiment: there is no classic estimate to compare with",
         file="spots.csv",
         remedy="number the looks in the columns experiment and point; without them `tvsbayes fit --details` says what "
-        "ratio, backlash and mirrors are, and `compare CAMPAIGN --by positions` how well they foretell looks",
+        "ratio, backlash and mirrors are, and `compare CAMPAIGN --by positions` how well they predict looks",
     )
 
 
 def _classic_against_joint(found: JointFit, by: str, seed: int, progress: Show | None) -> ComparisonRecord:
-    """Why both estimators differ, and which foretells what it has not seen.
+    """Why both estimators differ, and which predicts what it has not seen.
 
     Raises:
         NothingToEstimate: no complete experiment has an angle.

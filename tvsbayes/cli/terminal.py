@@ -16,7 +16,7 @@ COLOUR_OF = (
     ("red", ("error:", "VALIDATION FAILED", "NOT CONVERGED", "UNCONVERGED", "EXTRAPOLATED", "verdict: NOT CONVERGED")),
     ("red", ("verdict: VALIDATION FAILED", "verdict: UNCONVERGED", "verdict: PRIOR CONFLICT", "NO NUMBER OF LOOKS")),
     ("red", ("MOVED (p ",)),
-    ("yellow", ("warning:", "weak", "prior conflict:", "hangs on one stop:", "few stops", "spots that disagree")),
+    ("yellow", ("warning:", "weak", "prior conflict:", "depends on one stop:", "few stops", "spots that disagree")),
     ("yellow", ("CANNOT TELL (p ",)),
     ("green", ("verdict: usable", "OK (p ")),
     ("cyan", ("next:", "what to do:", "what helps:")),

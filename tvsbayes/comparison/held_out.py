@@ -1,4 +1,4 @@
-"""Classic against joint on experiments that neither had seen: folds left out, refitted and foretold.
+"""Classic against joint on experiments that neither had seen: folds left out, refitted and predicted.
 
 Four-point angles in degrees, counters in steps. Loads JAX when a fold is refitted, not when imported.
 """
@@ -56,8 +56,8 @@ def folds_of(campaign: Campaign, selection: Selection, by: str) -> dict[str, np.
 def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress: Show | None = None) -> HoldOut:
     """Leave experiments out, fold by fold, refit, and ask both estimators for their four-point angles.
 
-    The classic foretells N times its mean of the direction; its uncertainty is the scatter of angles about N times
-    the mean, and that of the mean. The joint foretells what the classic chain would measure on its beams, with
+    The classic predicts N times its mean of the direction; its uncertainty is the scatter of angles about N times
+    the mean, and that of the mean. The joint predicts what the classic chain would measure on its beams, with
     stop errors and pixel noise drawn anew: the same quantity for both. Noise common to all experiments (the cameras)
     moves both predictions and the measured angle alike and is reported beside.
 
@@ -82,14 +82,14 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress
         if by == "steps":
             what = f"all experiments have |N| = {lengths[0]}: a constant lost motion looks like a ratio there"
             return undecided(f"{what}; measure a second |N|")
-        what = "all experiments start at one counter: no other region is left to foretell it from"
+        what = "all experiments start at one counter: no other region is left to predict it from"
         return undecided(f"{what}; measure experiments from a second starting counter")
     angle = four_point_ratios(selection.pixels, selection.steps, selection.axis, campaign.stereo) * selection.steps
     predictions: list[Prediction] = []
     with Job(dict.fromkeys(folds, 1.0), progress) as job:
         for index, (name, out) in enumerate(folds.items()):
-            foretold = foretell_classic(angle, selection, out)
-            if not foretold:
+            predicted = predict_classic(angle, selection, out)
+            if not predicted:
                 continue
             left_out = frozenset(campaign.spots[r].spot for r in selection.spot_rows[out].ravel())
             without = f"without the experiments {name}"
@@ -99,11 +99,11 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress
                 return undecided(f"{without} there is no fit: {error.message}")
             if not taught.converged:
                 return undecided(f"{without} the fit does not converge: {'; '.join(taught.problems)}")
-            by_model = foretell_joint(taught, selection, out, np.random.default_rng([seed, index]))
+            by_model = predict_joint(taught, selection, out, np.random.default_rng([seed, index]))
             for e, joint in by_model.items():
-                if e in foretold:
+                if e in predicted:
                     about = (int(selection.experiments[e]), name, str(selection.direction[e]), int(selection.steps[e]))
-                    predictions.append(Prediction(*about, float(angle[e]), *foretold[e], *joint))
+                    predictions.append(Prediction(*about, float(angle[e]), *predicted[e], *joint))
     if not predictions:
         return undecided("no direction has two experiments outside of every fold")
     return judge(by, predictions, lengths, unseen)
@@ -124,14 +124,14 @@ def refit(fit_of_all: JointFit, without: frozenset[int], progress: Show | None =
 
 
 class ClassicAngle(NamedTuple):
-    """An angle as the classic foretells it, deg: its standard uncertainty has few degrees of freedom."""
+    """An angle as the classic predicts it, deg: its standard uncertainty has few degrees of freedom."""
 
     angle_deg: float
     u_deg: float
     dof: int
 
 
-def foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, ClassicAngle]:
+def predict_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, ClassicAngle]:
     """What N times the mean of a direction says of each left-out experiment with two others there, by row.
 
     Its uncertainty is the scatter of angles (e,) about N times the mean, and that of the mean.
@@ -155,13 +155,13 @@ def foretell_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -
 
 
 class JointAngle(NamedTuple):
-    """An angle as the joint foretells it, deg."""
+    """An angle as the joint predicts it, deg."""
 
     angle_deg: float
     u_deg: float
 
 
-def foretell_joint(
+def predict_joint(
     taught: JointFit, selection: Selection, out: np.ndarray, generator: np.random.Generator
 ) -> dict[int, JointAngle]:
     """What the classic chain would measure on the joint's beams for each left-out experiment, by row.

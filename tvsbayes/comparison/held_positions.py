@@ -1,6 +1,6 @@
-"""Hold-out by position: every counter of an axis left out in turn with all its looks, fitted without, foretold.
+"""Hold-out by position: every counter of an axis left out in turn with all its looks, fitted without, predicted.
 
-A rest is foretold by all other looks: ratio and mirrors, and what the gears repeat at neighbouring counters. The
+A rest is predicted by all other looks: ratio and mirrors, and what the gears repeat at neighbouring counters. The
 looks left out are given angles of their own, free in the linear model about the mode that was found without them; what
 these add to the prediction, and how well they are known, is the deviation of the position and its u. Mirror angles in
 deg, counters in steps.
@@ -67,7 +67,7 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
             if not taught.converged:
                 warnings.append(f"without {name} the fit does not converge: {'; '.join(taught.problems)}")
                 continue
-            positions += foretold(fit_of_all, taught, number, int(name.split()[1]), out, sign)
+            positions += predicted_positions(fit_of_all, taught, number, int(name.split()[1]), out, sign)
     z = [(position.mean - position.predicted) / position.u for position in positions]
     rms = float(np.sqrt(np.mean(np.square(z)))) if z else None
     return PositionHoldOut("positions", tuple(positions), rms, tuple(warnings))
@@ -80,7 +80,7 @@ def _of_all_looks(fit_of_all: JointFit, taught: JointFit) -> Linearised:
     return stage(taught.z, fit_of_all.space, fit_of_all.arrays, fixed, NO_STEP)
 
 
-def foretold(
+def predicted_positions(
     fit_of_all: JointFit, taught: JointFit, axis: int, counter: int, out: np.ndarray, sign: np.ndarray
 ) -> list[HeldOutPosition]:
     """A counter from each side from which its looks came.

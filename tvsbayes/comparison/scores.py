@@ -1,4 +1,4 @@
-"""Who foretold better: errors, coverage and density of predictions, and the interval of the ratio of two errors.
+"""Who predicted better: errors, coverage and density of predictions, and the interval of the ratio of two errors.
 
 Angles in degrees; a block is the predictions of one fold and direction, whose errors go together.
 """

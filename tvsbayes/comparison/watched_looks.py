@@ -122,10 +122,10 @@ def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
 
 @dataclass(frozen=True)
 class Departure:
-    """What new looks say beyond what the first day foretells of them, at one set of noise scales.
+    """What new looks say beyond what the first day predicts of them, at one set of noise scales.
 
     Attributes:
-        chi2: squared length of the foretold residuals in units of their covariance.
+        chi2: squared length of the predicted residuals in units of their covariance.
         dof: observations in it.
         score: of the shifts, in the units of `changes`, shape (q,).
         information: that the looks have of them, shape (q, q).

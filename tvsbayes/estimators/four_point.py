@@ -188,7 +188,7 @@ def four_point_ratios(
 
 @dataclass(frozen=True)
 class RatioSlopes:
-    """Ratios of experiments and how they hang on their pixels, for propagation to first order.
+    """Ratios of experiments and how they depend on their pixels, for propagation to first order.
 
     Attributes:
         ratio: (e,) deg/step.

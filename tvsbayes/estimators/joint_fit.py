@@ -48,7 +48,7 @@ counters, not noise."""
 
 NEWTON, DIAGNOSING = "Newton steps to the mode", "diagnosing the fit"
 LAST_SECONDS = {NEWTON: 0.8, DIAGNOSING: 0.3}
-"""After the search: what progress foretells with."""
+"""After the search: what progress predicts with."""
 HOMING = "weighing ways of homing"
 HOMING_SECONDS = 1.5
 """Of the fit under one way."""

@@ -391,7 +391,7 @@ def innovations(
     Args:
         model: parameters.
         arrays: the campaign.
-        normal: what moves the errors at places from their means, in units of their sds: nought, or a draw's numbers.
+        normal: what moves the errors at places from their means, in units of their sds: zero, or a draw's numbers.
         blocks: of spots to look at, by default all of them. A number that is no constant of the compiled function
             (`blocks_filled`) saves what padding costs, and has no derivative in reverse mode.
 

@@ -55,10 +55,10 @@ HUBER_CORE = 0.8214
 ROUNDS_MAX, WEIGHTS_SETTLED = 20, 0.02
 """Rounds of the robust option, and the largest change of a weight at which they end."""
 ALTERNATIONS_MAX, ROUNDS_FORESEEN = 6, 6
-"""Of geometry and noise in turn at most, and rounds of the robust option as progress foretells them."""
+"""Of geometry and noise in turn at most, and rounds of the robust option as progress predicts them."""
 COMPILING, SEARCHING = "compiling the model", "searching the mode"
 COMPILED_SECONDS, SEARCHED_SECONDS = 40.0, 1.0
-"""What progress foretells with."""
+"""What progress predicts with."""
 
 
 def search_stages(robust: bool) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 At the mode of everything together they are too small: geometry and cameras have followed the noise of the same looks,
 and what they took is missing there, as n is for n - p in a variance (restricted likelihood: Patterson and Thompson,
-Biometrika 58 (1971) 545). Whoever foretells new looks needs the scales without that loss.
+Biometrika 58 (1971) 545). Anyone who predicts new looks needs the scales without that loss.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ def spot_residuals(looks: Looks, noise: NoiseScales, model: Model, spots: SpotAr
 
 
 def _unit(direction: Numbers) -> tuple[Numbers, Float[Array, " spots"]]:
-    """Directions of length 1 and the lengths; nought where there is no direction (padding)."""
+    """Directions of length 1 and the lengths; zero where there is no direction (padding)."""
     length2 = _dot(direction, direction)
     there = length2 > 0
     length = jnp.sqrt(jnp.where(there, length2, 1.0))

@@ -2,7 +2,7 @@
 
 A file begins with a magic and the SHA-256 of what follows. It is read only where file and folder belong to the user
 who runs this and neither may be written by anybody else (POSIX; Windows keeps a user's folders apart by itself). A
-cache that cannot be read or written is no error: whoever asked makes its content anew.
+cache that cannot be read or written is no error: the caller makes its content anew.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The line of sight of a head on two geared axes, once for Python floats, NumPy and JAX, by exact rotations.
 
 Lengths in mm, angles in rad. The frame is P of `instrument.mirrors`: z up, azimuth counted from x towards y, as pan
-counts. The azimuth axis stands in it as two small angles say; elevation axis and beam hang on it. To first order what
+counts. The azimuth axis stands in it as two small angles say; elevation axis and beam depend on it. To first order what
 is added to the angles of the axes are TPOINT's terms (P. T. Wallace, TPOINT - Telescope Pointing Analysis System,
 terms IA IE AN AW NPAE CA TF TX), with their signs, A the azimuth from north (x) through east (y) and E the elevation:
 

@@ -92,7 +92,7 @@ class Mechanism:
 
 
 _LASER = dict.fromkeys(("azimuth_zero_deg", "azimuth_axis_tilt_deg.north", "azimuth_axis_tilt_deg.east"), 0.0)
-"""Gauge of a head whose spots a stereo pair sees: its frame P hangs on the azimuth axis, and its pose is fitted."""
+"""Gauge of a head whose spots a stereo pair sees: its frame P depends on the azimuth axis, and its pose is fitted."""
 _RECEIVER = {name: REGISTRY[name].prior.value for name in RECEIVER_NAMES} | {"baseline_mm": 0.0}
 """No receiver: frame T is frame P."""
 _SIGHT = {

@@ -133,7 +133,7 @@ def line_share(places: SeenPlaces, used: np.ndarray) -> np.ndarray:
         used: looks, shape (looks,), boolean.
 
     Returns:
-        Shape (c,); nought for an axis that was seen at one counter alone.
+        Shape (c,); zero for an axis that was seen at one counter alone.
     """
     shares = np.zeros(len(places.steps))
     for axis in (False, True):

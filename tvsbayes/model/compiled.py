@@ -32,7 +32,7 @@ LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
 BATCH = 32
 """Points per call of a function of many: half an ensemble of 64, the calls of a differential-evolution step."""
 KEPT_SHARE = 0.1
-"""Of the time of a first call, where another process has left trace and code: what progress foretells with."""
+"""Of the time of a first call, where another process has left trace and code: what progress predicts with."""
 PACKAGE = Path(__file__).resolve().parents[1]
 LOADED_TIME_S = time.time()
 """When this process read its code, seconds since the epoch: source written later is not what it runs."""

@@ -18,7 +18,7 @@ from tvsbayes.instrument.parameters import PERIODS_MAX
 from tvsbayes.statistics.gaussian_process import JITTER, matern52, repeated
 
 FLOOR_RAD2 = 1e-24
-"""Least variance of a place: below every angle that anybody measures, above nought."""
+"""Least variance of a place: below every angle that anybody measures, above zero."""
 
 
 class GearScales(eqx.Module):
@@ -82,7 +82,7 @@ def place_root(
         functions: jax.numpy or numpy.
 
     Returns:
-        Rad; nought but on the diagonal for padding.
+        Rad; zero but on the diagonal for padding.
     """
     xp, size = functions, len(angle_rad)
     distance = angle_rad[:, None] - angle_rad[None, :]

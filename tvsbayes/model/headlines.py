@@ -54,7 +54,7 @@ def effective_deg_per_step(gears: Transmission, angles: BeamAngles) -> Float[Arr
 
 
 def _contrast(at: AtPose) -> Array:
-    """By parameters of its own: what priors hold fixed shall hang on nothing, not even by rounding."""
+    """By parameters of its own: what priors hold fixed shall depend on nothing, not even by rounding."""
     gears = at.model.transmission
     return gears.contrast_rad_per_step / gears.ratio_rad_per_step * (at.effective[::2] + at.effective[1::2]) / 2
 

@@ -129,7 +129,7 @@ def half_normal_coordinate(value: np.ndarray) -> np.ndarray:
 def half_normal_sd(mean: float, sd: float) -> float:
     """Sd of a half-normal of scale 1 whose coordinate is N(mean, sd^2), by Gauss-Hermite quadrature.
 
-    Near nought the map from coordinate to quantity is flat on one side: a slope there would promise a certainty that
+    Near zero the map from coordinate to quantity is flat on one side: a slope there would promise a certainty that
     no fit has.
     """
     nodes, weights = np.polynomial.hermite_e.hermegauss(48)

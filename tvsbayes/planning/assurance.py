@@ -207,7 +207,7 @@ class Assurance:
         return _Scene(first + chosen, every[chosen], seen[chosen], gradient, own_variance)
 
     def _aimed(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray, gears: GearPlaces) -> Sensitivity:
-        """How the target hangs on the coordinates of an instrument; of lines, by each place with a leading axis c + 1.
+        """How the target depends on the coordinates of an instrument; of lines, by place (leading axis c + 1).
 
         Raises:
             InputError: no beam reaches the target's point.
@@ -232,7 +232,7 @@ class Assurance:
         return self._hangs(scene, chosen).values(judged, self.target.factor)
 
     def _hangs(self, scene: _Scene, chosen: np.ndarray) -> Sensitivity:
-        """How what is wanted hangs on the coordinates: ratios along the lines through the looks that are seen."""
+        """How what is wanted depends on the coordinates: ratios along the lines through the looks that are seen."""
         if not self._of_lines:
             return Sensitivity(scene.gradient, {"at the point": scene.own_variance})
         gears, rows = self.family.knowledge.gears, list(self.target.indices)

@@ -67,7 +67,7 @@ class GearPlaces(KnownPlaces):
             weight: how often each is taken, shape (..., m).
 
         Returns:
-            Shape (..., c); nought for an axis that is seen at one counter alone.
+            Shape (..., c); zero for an axis that is seen at one counter alone.
         """
         found = np.zeros((*weight.shape[:-1], len(self.steps)))
         for axis in range(2):
@@ -165,7 +165,7 @@ def place_headlines(
 
 
 def believed_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> GearScales:
-    """Scales of the gears' errors at coordinates; before any data root mean squares of those that may be nought.
+    """Scales of the gears' errors at coordinates; before any data root mean squares of those that may be zero.
 
     What sampling reports is a variance over all that a scale may be, E s^2: of a half-normal u^2.
     """

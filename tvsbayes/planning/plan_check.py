@@ -38,7 +38,7 @@ CURE_LOOKS = 24
 """Looks beyond which an addition is no small cure."""
 JUDGING, CURING = "judging the plan", "seeking a cure"
 JUDGED_SECONDS, EXPECT_COMPILED_SECONDS, CURED_SECONDS = 0.2, 12.0, 1.0
-"""What progress foretells with."""
+"""What progress predicts with."""
 
 
 def judging_seconds() -> float:

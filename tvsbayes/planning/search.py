@@ -25,7 +25,7 @@ from tvsbayes.progress import Advance, unshown
 
 CRITERIA = ("c", "D", "A")
 EXCHANGED_SHARE = 0.6
-"""Of the time of `refine`, for the exchanges themselves: what progress foretells with."""
+"""Of the time of `refine`, for the exchanges themselves: what progress predicts with."""
 MEAN_WEIGHT = 0.05
 """Of the mean variance beside the worst: looks that help only the others still count a little."""
 
@@ -251,7 +251,7 @@ class Question:
         found: candidates.
         seen: what they show.
         target: what is wanted.
-        at_centre: how the target hangs on the coordinates.
+        at_centre: how the target depends on the coordinates.
         warming: the zeros creep while the looks are taken; False where `seen` has the creep of the whole session.
     """
 

@@ -1,4 +1,4 @@
-"""What a measurement is for: its target in words, and how that quantity hangs on the coordinates.
+"""What a measurement is for: its target in words, and how that quantity depends on the coordinates.
 
 Ratios in deg/step, backlashes in deg, mirror offset and coordinates of a point (frame T) in mm.
 """
@@ -132,7 +132,7 @@ def parse_target(text: str) -> Target:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """How a target hangs on the coordinates, at one point of parameter space or with a leading axis at several.
+    """How a target depends on the coordinates, at one point of parameter space or with a leading axis at several.
 
     Attributes:
         gradient: d(quantity)/d(coordinates, errors of gears) of each quantity whose worst is meant, shape (q, p + e).

@@ -143,7 +143,7 @@ class SerialPositioner:
 
     def laser(self, on: bool) -> DeviceState:
         """See `Positioner.laser`."""
-        # Before the order: whoever interrupts it does not know whether it has arrived.
+        # Before the order: an interruption does not say whether it has arrived.
         self._lit = self._lit or on
         state = self._command("L", int(on)).state
         if state.laser_on != on:
@@ -170,7 +170,7 @@ class SerialPositioner:
             if self._boot >= 0:
                 self._switch_off()
             else:
-                # Whoever is there and understands it: a run before this one may have left the light on.
+                # Anyone who is there and understands it: a run before this one may have left the light on.
                 self._link.write(b"\n" + request(0, "L", 0))
                 self._link.read(NAK_S)
         except (DeviceFault, OSError):

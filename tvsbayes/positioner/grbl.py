@@ -1,4 +1,4 @@
-"""A positioner on a GRBL board: pan is X, tilt is Y, the laser hangs on spindle or coolant (`driver = "grbl"`).
+"""A positioner on a GRBL board: pan is X, tilt is Y, spindle or coolant output switches the laser (`driver = "grbl"`).
 
 Counters are motor steps: machine position times `$100` (`$101`). Zero is where the board's homing puts it. GRBL 1.1 has
 no checksum, no sequence numbers and no boot id, so it promises less than our firmware: lost steps are not found at the
@@ -92,7 +92,7 @@ class Wishes:
                 raise _refused(f"options.{key}", escaped(str(value)), ", ".join(OPTIONS), "remove it")
         laser = str(options.get("laser", "M3"))
         if laser not in LASER_ORDERS:
-            remedy = "name what the laser hangs on: M3 the spindle, M7 mist, M8 flood coolant"
+            remedy = "name what switches the laser: M3 the spindle, M7 mist, M8 flood coolant"
             raise _refused("options.laser", escaped(laser), ", ".join(LASER_ORDERS), remedy)
         speed, unwatched = table.get("speed_steps_per_s"), options.get("unwatched_laser", 0)
         # Text would be true, also "false" and "no": the light would be free with nobody having said so.
@@ -197,7 +197,7 @@ class GrblPositioner:
                     "a GRBL board leaves the laser on when this computer dies",
                     "have something else cut it, then write unwatched_laser = true into [positioner.options]",
                 )
-        # Before the order: whoever interrupts it does not know whether it has arrived.
+        # Before the order: an interruption does not say whether it has arrived.
         self._lit = self._lit or on
         try:
             self._order(self._laser_order(on), REPLY_S)

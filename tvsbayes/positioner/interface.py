@@ -1,4 +1,4 @@
-"""What a positioner is to whoever drives it: orders, what they promise, and the faults in which they end.
+"""What a positioner is to anyone who drives it: orders, what they promise, and the faults in which they end.
 
 Drivers of other hardware keep these promises too (data/docs/instrument.md, "Your own hardware"): `move_to` and `home`
 return only after the device has said that this very motion has ended at the counters asked for; what else happens ends

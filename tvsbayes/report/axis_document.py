@@ -243,13 +243,13 @@ def axis_verdict(summary: AxisSummary) -> str:
 
 
 def hold_out_table(found: AxisHoldOut, unit: str) -> TableView:
-    """Positions left out, beside what was foretold of them."""
+    """Positions left out, beside what was predicted of them."""
     rows = []
     for p in found.positions:
         z, classic_z = (p.mean - p.predicted) / p.u, (p.mean - p.classic_predicted) / max(p.classic_u, 1e-300)
         row = [f"{p.position:.10g}", p.direction, str(p.n), f"{p.mean:.6g}", concise(p.predicted, p.u), f"{z:+.1f}"]
         rows.append([*row, f"{classic_z:+.1f}"])
-    caption = f"positions left out and foretold, {escaped(unit)}; z in stated uncertainties"
+    caption = f"positions left out and predicted, {escaped(unit)}; z in stated uncertainties"
     return TableView(caption, ["position", "direction", "n", "mean", "predicted(u)", "z", "z classic"], rows)
 
 

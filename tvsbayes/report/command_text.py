@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 def extrapolated_text(unseen: str) -> str:
     """What counters that no look reached mean for a result; `unseen` names them."""
-    return f"EXTRAPOLATED: {unseen}, where looks were; errors of the gears are foretold there by their size alone"
+    return f"EXTRAPOLATED: {unseen}, where looks were; errors of the gears are predicted there by their size alone"
 
 
 HELD_WORDS = {
@@ -294,7 +294,7 @@ def cloud_text(found: CloudFile, law: LawChecked, calibration: Calibration) -> s
         seen = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in calibration.seen_steps.items())
         lines.append(
             f"{_points(found.extrapolated)} EXTRAPOLATED: outside {seen}, where looks were; errors of the gears are "
-            "foretold there by their size alone"
+            "predicted there by their size alone"
         )
     if found.refused_path is not None:
         name = escaped(str(found.refused_path), 200)
@@ -341,7 +341,7 @@ def gap_text(gaps: Mapping[str, Gap | None]) -> str:
 
 
 def hold_out_text(held: HoldOut) -> str:
-    """Who foretells left-out angles better, and what no hold-out can see."""
+    """Who predicts left-out angles better, and what no hold-out can see."""
     common = ", ".join(f"{d} {u:.1e}" for d, u in held.unseen.items())
     return terminal(
         hold_out_table(held),
@@ -351,12 +351,12 @@ def hold_out_text(held: HoldOut) -> str:
 
 
 def positions_text(found: PositionHoldOut) -> str:
-    """Counters left out, beside what was foretold of them."""
+    """Counters left out, beside what was predicted of them."""
     rows = []
     for p in found.positions:
         z = f"{(p.mean - p.predicted) / p.u:+.1f}"
         rows.append([p.axis, str(p.position), p.direction, str(p.n), f"{p.mean:.4f}", concise(p.predicted, p.u), z])
-    caption = "counters left out and foretold, mirror angles in deg; z in stated uncertainties"
+    caption = "counters left out and predicted, mirror angles in deg; z in stated uncertainties"
     table = TableView(caption, ["axis", "counter", "direction", "n", "mean", "predicted(u)", "z"], rows)
     told = [] if found.rms_z is None else [f"RMS z {found.rms_z:.2f}"]
     return terminal(table, *told, *(f"warning: {text}" for text in found.warnings))

@@ -203,7 +203,7 @@ def _view(band: GearBand, stops: Sequence[StopResidual]) -> FigureView:
 
 
 def identifiability_section(e: Evidence) -> Section:
-    """What the campaign cannot separate, which stops and priors it hangs on."""
+    """What the campaign cannot separate, which stops and priors it depends on."""
     names, matrix = e.fit.covariance.names, e.fit.covariance.matrix
     kept = [n for n in CORRELATED if n in names and matrix[names.index(n), names.index(n)] > 0]
     views, rows = [], []
@@ -285,7 +285,7 @@ def _causes(causes: tuple[Cause, ...]) -> TableView:
 
 
 def validation_section(e: Evidence) -> Section:
-    """Signs of model errors, the sampler's diagnosis, and what was foretold of the classic and of left-out angles."""
+    """Signs of model errors, the sampler's diagnosis, and what was predicted of the classic and of left-out angles."""
     text, items, validation, sampling = [], [], e.fit.summary.validation, e.fit.summary.sampling
     tables: list[TableView | None] = []
     if validation is None:
@@ -331,7 +331,7 @@ def _foretold(e: Evidence) -> TableView | None:
         cells = [concise(told.value, told.sd), concise(seen.mean_deg_per_step, u), f"{z:+.1f}"]
         rows.append([direction, *cells])
     caption = "What the joint model says the classic estimator should report, and what it reports, deg/step"
-    columns = ["direction", "foretold", "reported, type A", "difference / u"]
+    columns = ["direction", "predicted", "reported, type A", "difference / u"]
     return TableView(caption, columns, rows) if rows else None
 
 

@@ -114,7 +114,7 @@ def detail_lines(summary: FitSummary) -> list[Part]:
             f"sd changes by a factor {entry.sd_ratio:.2f}"
         )
     lines += [f"weak (the data leave it to the priors): {weak.text}" for weak in summary.weak_directions]
-    lines += [f"hangs on one stop: {entry.text}" for entry in summary.leverage]
+    lines += [f"depends on one stop: {entry.text}" for entry in summary.leverage]
     return lines
 
 
@@ -146,7 +146,7 @@ def astray_text(summary: FitSummary, causes: Sequence[Finding] = ()) -> str:
 
 
 def suspect_line(spots: Sequence[int]) -> str:
-    """Spots that others foretell badly, at most `SPOTS_LISTED` by their ids."""
+    """Spots that others predict badly, at most `SPOTS_LISTED` by their ids."""
     return f"spots that disagree with all others: {listed(spots, SPOTS_LISTED)}"
 
 

@@ -124,7 +124,7 @@ SIGNS = (("+-", "\u00b1"), ("<=", "\u2264"), (">=", "\u2265"))
 
 
 def typeset(text: str) -> str:
-    """Text with true signs: minus before numbers, plus-minus, not more than, and no minus before nought."""
+    """Text with true signs: minus before numbers, plus-minus, not more than, and no minus before zero."""
     for plain, sign in SIGNS:
         text = text.replace(plain, sign)
     return MINUS.sub("\u2212", NOUGHT.sub(r"\1", text))

@@ -1,4 +1,4 @@
-"""Tables that texts and the page print alike: both estimators, their gap, what they foretell, budgets of a point.
+"""Tables that texts and the page print alike: both estimators, their gap, what they predict, budgets of a point.
 
 Units stand in captions and heads; numbers carry two digits of their uncertainty (GUM 7.2.6).
 """
@@ -160,7 +160,7 @@ def gap_table(gaps: Mapping[str, Gap | None]) -> TableView:
 
 
 def hold_out_table(held: HoldOut) -> TableView | None:
-    """How well both estimators foretell angles that were left out; None where nothing could be judged."""
+    """How well both estimators predict angles that were left out; None where nothing could be judged."""
     if held.classic is None or held.joint is None:
         return None
     rows = [

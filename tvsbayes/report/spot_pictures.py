@@ -62,7 +62,7 @@ def _crops(folder: Path, spot: Spot) -> Iterator[SpotCrop]:
         try:
             picture = read_image(folder / frame_name(spot.spot, camera), folder)
         except InputError:
-            # The report of good centroids does not hang on a picture that was moved away since.
+            # The report of good centroids does not depend on a picture that was moved away since.
             continue
         u, v = float(getattr(spot, f"u_{camera}_px")), float(getattr(spot, f"v_{camera}_px"))
         left, top = max(round(u) - HALF_PX, 0), max(round(v) - HALF_PX, 0)

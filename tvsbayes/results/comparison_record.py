@@ -53,7 +53,7 @@ class Gap(ClosedRecord, frozen=True):
 
 
 class Prediction(Record, frozen=True):
-    """The four-point angle of one experiment as others foretold it, deg.
+    """The four-point angle of one experiment as others predicted it, deg.
 
     `classic_u_deg` rests on the scatter of few experiments and has `classic_dof` degrees of freedom; `joint_u_deg` is
     the spread of many predictive draws.
@@ -72,7 +72,7 @@ class Prediction(Record, frozen=True):
 
 
 class Score(Record, frozen=True):
-    """How well one estimator foretold the angles.
+    """How well one estimator predicted the angles.
 
     Attributes:
         rms_deg: root mean square error.
@@ -93,7 +93,7 @@ class HoldOut(Shown, Record, frozen=True):
 
     Attributes:
         by: "steps" (a whole |N| left out) or "regions" (a part of the range of start counters).
-        predictions: of every experiment that could be foretold by both.
+        predictions: of every experiment that could be predicted by both.
         classic: score.
         joint: score.
         ratio: rms_block_deg of the classic / that of the joint.
@@ -128,7 +128,7 @@ class HoldOut(Shown, Record, frozen=True):
 
 
 class HeldOutPosition(Record, frozen=True):
-    """One counter of an axis from one side, foretold by the looks at all others; mirror angles, deg.
+    """One counter of an axis from one side, predicted by the looks at all others; mirror angles, deg.
 
     Attributes:
         axis: "pan" or "tilt".
@@ -149,12 +149,12 @@ class HeldOutPosition(Record, frozen=True):
 
 
 class PositionHoldOut(Record, frozen=True):
-    """All counters foretold.
+    """All counters predicted.
 
     Attributes:
         by: "positions".
         positions: each from each side.
-        rms_z: root mean square of (mean - predicted) / u; None where nothing could be foretold.
+        rms_z: root mean square of (mean - predicted) / u; None where nothing could be predicted.
         warnings: sentences on what could not.
     """
 
@@ -231,7 +231,7 @@ class ComparisonRecord(Shown, Record, frozen=True, kw_only=True, tag_field="kind
     Attributes:
         estimator: of the joint model.
         directions: why both differ, by direction; None without complete experiments.
-        held_out: how both foretell what neither had seen.
+        held_out: how both predict what neither had seen.
         inputs: hashes of what the campaign's estimates depend on.
         seed: of the predictive draws.
     """
@@ -244,7 +244,7 @@ class ComparisonRecord(Shown, Record, frozen=True, kw_only=True, tag_field="kind
     seed: int
 
     def shown(self) -> View:
-        """How both estimators foretell what neither had seen."""
+        """How both estimators predict what neither had seen."""
         return self.held_out.shown()
 
 

@@ -1,4 +1,4 @@
-"""What a fit says and how it was examined: estimates, what they hang on, tests and residuals of its model.
+"""What a fit says and how it was examined: estimates, what they depend on, tests and residuals of its model.
 
 Values in the units of the contract names: deg, deg/step, mm, rad, px; time in s, counters in steps.
 """

@@ -1,4 +1,4 @@
-"""One geared axis and whoever reads it: `campaign.toml`, `moves.csv`, `readings.csv` of an axis folder.
+"""One geared axis and its readings: `campaign.toml`, `moves.csv`, `readings.csv` of an axis folder.
 
 Readings in the unit that the folder states, commands in steps or in whatever the controller counts; s. Columns are
 found by name. No JAX.

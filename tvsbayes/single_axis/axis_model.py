@@ -324,14 +324,14 @@ class AxisModel:
 
     @cached_property
     def informed(self) -> np.ndarray:
-        """Columns that any row hangs on; the others are places where the processes are foretold."""
+        """Columns that any row depends on; the others are places where the processes are predicted."""
         seen = np.any(self._weights != 0, axis=0)
         return np.flatnonzero(np.concatenate((np.ones(self.processes, bool), seen, seen)))
 
     def _factor(self, values: Mapping[str, np.ndarray], scales: Sequence[np.ndarray], told_first: bool) -> np.ndarray:
         """Factor of the prior covariance of the columns, shape (n, columns, columns); `scales` (n,) are of the waves.
 
-        Cholesky's, places in order; or with the places that rows hang on before the others: then these places depend
+        Cholesky's, places in order; or with the places that rows depend on before the others: then these places depend
         on no unit of the others.
         """
         count, n = len(self.places.command), len(values["backlash"])
@@ -369,7 +369,7 @@ class AxisModel:
     def _blocks(
         self, w: np.ndarray, extra: np.ndarray | None = None, *, informed: bool = False
     ) -> Iterator[tuple[slice, _Block]]:
-        """The draws w (n, d) in blocks that fit into memory; products of those columns alone that rows hang on."""
+        """The draws w (n, d) in blocks that fit into memory; products of those columns alone that rows depend on."""
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
         size = max(1, NUMBERS_MAX // (width * max(len(self.rows.move), width)))
         for start in range(0, len(w), size):
@@ -463,7 +463,7 @@ class AxisModel:
         """What is linear, given coordinates (n, d); means are whole, not deviations from the priors'."""
         means, covariances = np.empty((len(w), self.columns)), np.empty((len(w), self.columns, self.columns))
         informed, others = self.informed, np.setdiff1d(np.arange(self.columns), self.informed)
-        # Rows tell nothing of the units of places between them: a matrix of those that they hang on is inverted.
+        # Rows tell nothing of the units of places between them: a matrix of those that they depend on is inverted.
         for part, block in self._blocks(w, informed=len(others) > 0):
             small = replace(block, factor=block.factor[:, informed[:, None], informed]) if len(others) else block
             information, towards = _information(small, 0)
@@ -479,7 +479,7 @@ class AxisModel:
         return LinearPosterior(means + self._prior_means(w), covariances)
 
     def left_out(self, w: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What is foretold of some rows by all others, given the scales.
+        """What is predicted of some rows by all others, given the scales.
 
         A row with an unknown of its own and a flat prior counts as not read; the unknown is the reading less what the
         others predict.

@@ -235,7 +235,7 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
 def _untold(fit: AxisFit) -> dict[str, Estimate]:
     """The backlash as its prior has it, where every stop was reached from one side.
 
-    Draws of it then hang on how a start of unknown side was taken, which is no knowledge of the play.
+    Draws of it then depend on how a start of unknown side was taken, which is no knowledge of the play.
     """
     prior = fit.model.priors["backlash"]
     if fit.rows.both_sides or not prior.u:

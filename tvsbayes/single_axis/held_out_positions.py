@@ -1,4 +1,4 @@
-"""Hold-out of one axis: every commanded position left out in turn, fitted without it, foretold."""
+"""Hold-out of one axis: every commanded position left out in turn, fitted without it, predicted."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ DRAWS, HELD_ROUNDS = 300, 2
 POSITIONS_MIN, POSITIONS_MAX = 3, 200
 REFITTED_MAX, WEIGHED, WEIGHED_MIN = 30, 400, 80
 """Positions up to which each has a fit of its own; beyond, draws of one fit are weighted, as long as so many of them
-count. `POSITIONS_MAX` are foretold at most."""
+count. `POSITIONS_MAX` are predicted at most."""
 
 
 @dataclass(frozen=True)
 class HeldOutPosition:
-    """One position from one side, foretold by all others.
+    """One position from one side, predicted by all others.
 
     Attributes:
         position: command.
@@ -40,7 +40,7 @@ class HeldOutPosition:
         n: readings in the mean.
         mean: of the readings, unit.
         predicted, u: of that mean; stop errors and noise of its readings in u.
-        rows, inside: moves in it, and how many of their readings lie within 95 % of what was foretold of each.
+        rows, inside: moves in it, and how many of their readings lie within 95 % of what was predicted of each.
         classic_predicted, classic_u: by the least-squares line with one reversal and independent stops.
         end: whether nothing was read beyond it on one side.
     """
@@ -60,7 +60,7 @@ class HeldOutPosition:
 
 @dataclass(frozen=True, repr=False)
 class AxisHoldOut(Shown):
-    """All positions foretold.
+    """All positions predicted.
 
     Attributes:
         by: "positions".
@@ -78,7 +78,7 @@ class AxisHoldOut(Shown):
     warnings: tuple[str, ...]
 
     def shown(self) -> View:
-        """Every position beside what was foretold of it."""
+        """Every position beside what was predicted of it."""
         rows = [
             (p.position, p.direction, p.n, p.mean, p.predicted, p.u, p.classic_predicted, p.classic_u)
             for p in self.positions
@@ -181,14 +181,14 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
             if len(np.unique(rows.command[~out])) < 2 or (~out).sum() < 3:
                 warnings.append(f"position {position:.10g}: too few readings elsewhere to predict it")
                 continue
-            left, foretold = np.flatnonzero(out), None
+            left, predicted = np.flatnonzero(out), None
             if len(positions) > REFITTED_MAX:
                 drawn = _whole_draws(model, seed) if drawn is None else drawn
-                foretold = _reweighted(model, drawn, left)
-            foretold = foretold or _refitted(model, out, seed + number)
-            if foretold.fault:
-                warnings.append(f"position {position:.10g}: {foretold.fault}")
-            found += _scored(rows, position, left, foretold.mean, foretold.covariance)
+                predicted = _reweighted(model, drawn, left)
+            predicted = predicted or _refitted(model, out, seed + number)
+            if predicted.fault:
+                warnings.append(f"position {position:.10g}: {predicted.fault}")
+            found += _scored(rows, position, left, predicted.mean, predicted.covariance)
     return AxisHoldOut(
         "positions",
         tuple(found),

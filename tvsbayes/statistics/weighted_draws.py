@@ -83,7 +83,7 @@ def weighted_quantiles(values: np.ndarray, weights: np.ndarray, probabilities: S
 def weighted_summary(values: np.ndarray, weights: np.ndarray) -> WeightedSummary:
     """Moments, interval, errors and effective draws of values (n, ...) with weights (n,)."""
     shape = values.shape[1:]
-    # Where a proposal went astray a value may be beyond all numbers, and nought times that is none.
+    # Where a proposal went astray a value may be beyond all numbers, and zero times that is none.
     counts = weights > WEIGHTLESS * weights.max()
     values, weights = values[counts], weights[counts]
     flat, square = values.reshape(len(values), -1), weights**2
@@ -194,7 +194,7 @@ def smoothed_weights(log_ratios: np.ndarray) -> SmoothedWeights:
     """Pareto smoothed importance sampling (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72).
 
     Args:
-        log_ratios: log (target / proposal) of n >= 25 draws up to a constant; -inf where the target is nought.
+        log_ratios: log (target / proposal) of n >= 25 draws up to a constant; -inf where the target is zero.
     """
     ratios = np.exp(log_ratios - np.max(log_ratios))
     count = _tail_count(len(ratios))

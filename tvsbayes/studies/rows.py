@@ -143,7 +143,7 @@ class StudyRows:
 
     @contextmanager
     def _open(self) -> Iterator[BinaryIO]:
-        """The file, for whole lines at its end, whoever else writes there; made where there is none."""
+        """The file, for whole lines at its end, no matter who else writes there; made where there is none."""
         try:
             with self.path.open("ab") as file:
                 yield file

@@ -40,7 +40,7 @@ LINGER_S, LINGER_POLL_S = 2.0, 0.05
 PICTURES_S = 0.5
 """For the pictures that they fetch after it."""
 READER_S = 2.0
-"""Whoever has not asked for so long has gone."""
+"""Anyone who has not asked for so long has gone."""
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
