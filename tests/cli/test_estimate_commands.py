@@ -363,7 +363,7 @@ def test_a_report_for_a_browser_that_is_not_there_ends_at_once(ask, grid_folder,
     assert (code, document["error"]["code"]) == (2, "no-browser")
 
 
-def test_counters_of_a_scanner_are_left_out_and_foretold(ask, say, grid_folder, monkeypatch):
+def test_counters_of_a_scanner_are_left_out_and_predicted(ask, say, grid_folder, monkeypatch):
     """Three counters of pan; two of tilt are too few. No experiments are needed, nothing is kept."""
     monkeypatch.setattr("tvsbayes.comparison.held_positions.refit", lambda fit_of_all, *_: fit_of_all)
     code, document = ask("compare", grid_folder, "--by", "positions")
