@@ -61,6 +61,15 @@ def same(found: Stereo, stereo: Stereo) -> None:
         (("ros_message_dump/right.yaml", "ros_message_dump/left.yaml"), "ros"),
         (("euroc_sensor_pair/cam0.yaml", "euroc_sensor_pair/cam1.yaml"), "euroc"),
         (("fisheye_advice/fisheye.yaml",), "kalibr"),
+        (("orb_slam3/o.yaml",), "orb-slam"),
+        (("kalibr_chain/camchain.yaml",), "kalibr"),
+        (("kalibr_imu/camchain-imucam.yaml",), "kalibr"),
+        (("vins_fusion/cam0.yaml", "vins_fusion/cam1.yaml", "vins_fusion/euroc_stereo.yaml"), "euroc"),
+        (("caliscope/c.toml",), "opencv"),
+        (("matlab_json/c.json",), "matlab"),
+        (("poses_in_world/c.json",), "opencv"),
+        (("pasted_messages/both.yaml",), "ros"),
+        (("bouguet/Calib_Results_stereo.mat",), "opencv"),
     ),
 )
 def test_foreign_files_are_read_as_they_are(names, source):
@@ -69,6 +78,13 @@ def test_foreign_files_are_read_as_they_are(names, source):
     np.testing.assert_allclose(found.stereo.T, T_MM, atol=1e-9)
     assert (found.stereo.image_width, found.stereo.image_height) == (640, 480)
     np.testing.assert_allclose(found.stereo.M2[[0, 1, 0, 1], [0, 1, 2, 2]], [809.1, 808.8, 325.6, 239.4], atol=1e-9)
+
+
+def test_a_transposed_rotation_is_known_by_the_fundamental_matrix():
+    path = FOREIGN / "transposed" / "c.json"
+    with pytest.raises(InputError, match=r"R transposed, by what else the file says.*--key R=R\.T"):
+        read_calibration([path])
+    np.testing.assert_allclose(read_calibration([path], keys={"R": "R.T"}).stereo.T, T_MM, atol=1e-9)
 
 
 def test_centimetres_are_asked_for():

@@ -190,6 +190,7 @@ class _Reader:
         matrices = self.matrices = [self._matrix(side) for side in (0, 1)]
         size = self._size(matrices)
         if self._of_matlab():
+            self.source = "matlab"
             matrices = [matrix - np.outer([1, 1, 0], [0, 0, 1]) for matrix in matrices]
             self.notes.append("MATLAB counts pixels from 1: 1 px is taken off cx and cy of both cameras")
         sizes = (size, self.right_size or size)
@@ -251,8 +252,7 @@ class _Reader:
         if entry is not None and entry.numbers.size == 9:
             matrix = entry.numbers.reshape(3, 3)
             if matrix[0, 2] == matrix[1, 2] == 0 and matrix[2, :2].all():
-                matrix, self.source = matrix.T, "matlab"
-                self.transposed = entry
+                matrix, self.transposed = matrix.T, entry
         elif entry is not None or all(one is not None for one in parts):
             entries = [one for one in (parts if entry is None else [entry]) if one is not None]
             fx, fy, cx, cy = np.concatenate([one.numbers for one in entries])
