@@ -229,7 +229,6 @@ def test_opencvs_own_sample_files():
 
 HOSTILE = {
     "tag": "M1: !!python/object/apply:os.system [ 'true' ]",
-    "anchor": "a: &x [1, 2]\nb: *x",
     "alias": "b: *x",
     "merge": "<<: {a: 1}",
     "twice": "a: 1\na: 2",

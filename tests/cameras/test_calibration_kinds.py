@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import scipy.io
+import yaml
 
 from tvsbayes.cameras.calibration_containers import read_container
 from tvsbayes.cameras.calibration_export import exported
@@ -449,6 +450,20 @@ def test_two_picture_sizes_of_one_proportion(mounted, tmp_path):
         read_calibration([path])
 
 
+def test_what_python_dumps_as_yaml(mounted, tmp_path):
+    """A list that two tables share is an alias, a tuple has a tag; arrays of NumPy are refused with the mend."""
+    size, good = [1280, 720], {name: value.tolist() for name, value in plain(mounted, "K D K2 D2 R T").items()}
+    tables = {"left": {"K": good["K"], "D": good["D"], "size": size}}
+    tables["right"] = {"K": good["K2"], "D": tuple(good["D2"]), "size": size}
+    path = tmp_path / "dump.yaml"
+    path.write_text(yaml.dump({**tables, "R": good["R"], "T": good["T"]}))
+    assert "&id001" in path.read_text() and "!!python/tuple" in path.read_text()
+    same(read_calibration([path]).stereo, mounted)
+    path.write_text(yaml.dump({"M1": mounted.M1}))
+    with pytest.raises(InputError, match="save lists"):
+        read_calibration([path])
+
+
 @pytest.mark.parametrize("key", ("ret", "retStereo", "mean_reprojection_error", "metadata.error"))
 def test_an_rms_is_used_under_the_names_that_it_has(mounted, tmp_path, key):
     good = {name: value.tolist() for name, value in plain(mounted, "M1 D1 M2 D2 R T").items()} | {"size": [1280, 720]}
@@ -521,6 +536,13 @@ def mistaken(mounted: Stereo) -> dict[str, tuple[dict[str, object], str]]:
             },
             "do not rename the model",
         ),
+        "master and slave": (
+            {
+                **{"master": {"K": good["M1"], "D": good["D1"]}, "slave": {"K": good["M2"], "D": good["D2"]}},
+                **{"R": good["R"], "T": good["T"]},
+            },
+            "--key M1=master.K --key M2=slave.K --key D1=master.D --key D2=slave.D",
+        ),
         "one camera": ({"camera_matrix": good["M1"], "dist_coeffs": good["D1"]}, "calibration of one camera"),
         "nothing": ({"a": 1}, "no other numbers"),
     }
@@ -581,7 +603,10 @@ HOSTILE = {
     "entity.xml": b'<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><opencv_storage><M1>&b;</M1></opencv_storage>',
     "open.xml": b"<opencv_storage><M1>",
     "deep.xml": b"<opencv_storage>" + 2000 * b"<a>" + 2000 * b"</a>" + b"</opencv_storage>",
-    "laughs.yml": b"a: &a [1,1]\nb: [*a,*a]\n",
+    "laughs.yml": b"".join(
+        b"a%d: &a%d [%s]\n" % (k, k, b",".join(10 * [b"*a%d" % (k - 1) if k else b"1"])) for k in range(9)
+    ),
+    "itself.yml": b"a: &a [*a, 1]\n",
     "h5.mat": b"\x89HDF\r\n\x1a\n" + 50 * b"\0",
     "short.npz": b"PK\x03\x04 nothing",
     "short.mat": b"MATLAB 5.0 MAT-file" + 150 * b"\0",

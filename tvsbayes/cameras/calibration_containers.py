@@ -4,7 +4,7 @@ What cameras' own programs print is text of other kinds: `maker_calibrations` kn
 
 Every container comes out as nested maps, lists and numbers, `Keys` that know file and line. OpenCV's matrices stay maps
 of rows, cols, data. OpenCV's FileStorage has had memory errors on hostile files (CVE-2019-5063, -5064; opencv #28619):
-libraries of the formats read instead, under caps: bytes, entries and depth; no aliases, entities or pickles.
+libraries of the formats read instead, under caps: bytes, entries (aliases written out), depth; no entities, pickles.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ _ALLOWED = (
     "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, .mat of MATLAB up to version 7, a ZED's SN*.conf,"
     " what rs-enumerate-devices -c prints"
 )
+AS_WRITTEN = "write it as its own program does"
 _TEXT_REMEDY = "name a calibration file; from Python save the matrices by numpy.savez, not as pickles or pictures"
 MAT_SECONDS_MAX = 60.0
 _MAT_HEADER_BYTES, _MAT_COMPRESSED = 128, 15
@@ -73,12 +74,12 @@ def read_container(data: bytes, file: str) -> list[Keys]:
         return [Keys(_plain(_xml(text, file), file), file, "")]
     if first == "{":
         return [parse_json(text.encode(), file)]
-    if re.search(r"^\s*\[[\w.\"-]+\]\s*(#.*)?$|^\s*[\w.-]+\s*=", text, re.MULTILINE) and not text.startswith("%YAML"):
+    if re.match(r"(\s|#.*\n)*(\[[\w.\"-]+\]\s*(#.*)?$|[\w.-]+\s*=)", text, re.MULTILINE):
         return [parse_toml(text.encode(), file)]
     return [Keys(_plain(one, file), file, text) for one in _yaml(text, file)]
 
 
-def bad(file: str, line: int | None, found: str, remedy: str = "write it as its own program does") -> InputError:
+def bad(file: str, line: int | None, found: str, remedy: str = AS_WRITTEN) -> InputError:
     """The refusal of a container."""
     return refusal("container", file=file, line=line, found=escaped(found, 120), allowed=_ALLOWED, remedy=remedy)
 
@@ -233,7 +234,8 @@ def _yaml(text: str, file: str) -> list[dict[str, Any]]:
     Loader.yaml_constructors = {"tag:yaml.org,2002:map": mapping, "tag:yaml.org,2002:str": scalar}
     for kind in ("int", "float", "bool", "null", "timestamp", "merge", "value"):
         Loader.yaml_constructors[f"tag:yaml.org,2002:{kind}"] = scalar
-    Loader.yaml_constructors["tag:yaml.org,2002:seq"] = yaml.SafeLoader.construct_yaml_seq
+    for kind in ("seq", "python/tuple"):
+        Loader.yaml_constructors[f"tag:yaml.org,2002:{kind}"] = yaml.SafeLoader.construct_yaml_seq
     for kind in ("opencv-matrix", "opencv-nd-matrix"):
         Loader.yaml_constructors[f"tag:yaml.org,2002:{kind}"] = mapping
     Loader.yaml_constructors[None] = yaml.SafeLoader.construct_undefined
@@ -245,7 +247,8 @@ def _yaml(text: str, file: str) -> list[dict[str, Any]]:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         told = getattr(error, "problem", None) or str(error)
-        raise bad(file, None if mark is None else mark.line + 1, str(told)) from error
+        remedy = "save lists, M.tolist(), or the matrices by numpy.savez" if "python/" in told else AS_WRITTEN
+        raise bad(file, None if mark is None else mark.line + 1, str(told), remedy) from error
     except (RecursionError, ValueError) as error:
         raise bad(file, None, "YAML that is nested too deeply") from error
     kept: list[dict[str, Any]] = []
@@ -259,14 +262,12 @@ def _yaml(text: str, file: str) -> list[dict[str, Any]]:
 
 
 def _counted(events: Iterable[Any], file: str) -> None:
-    """Refuse aliases, which multiply, depth and number of entries before anything is built."""
+    """Refuse depth and number of entries before anything is built; what aliases multiply is counted by `_plain`."""
     depth = count = 0
     for event in events:
         name, line = type(event).__name__, event.start_mark.line + 1
         count += 1
         depth += name.endswith("StartEvent") - name.endswith("EndEvent")
-        if name == "AliasEvent" or getattr(event, "anchor", None):
-            raise bad(file, line, "an anchor or alias", "write the values out")
         if depth > DEPTH_MAX or count > ENTRIES_MAX:
             raise bad(
                 file, line, f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"

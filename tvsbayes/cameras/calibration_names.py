@@ -48,7 +48,7 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
     "to_body": ((16,), "tbs timucam tbc tbodycam bodyt"),
     "camera_R": ((9, 3), "rotation rvec rotationvector"),
     "camera_T": ((3,), "translation tvec translationvector t trans"),
-    "size": ((2,), "size resolution imagesize imgsize imagesizewh imageshape"),
+    "size": ((2,), "size resolution imagesize imgsize imagesizewh imageshape shape framesize"),
     "width": ((1,), "width imagewidth imgwidth w sizex nx"),
     "height": ((1,), "height imageheight imgheight h sizey ny"),
     "fx": ((1,), "fx intrinsicsfx"),
@@ -345,7 +345,17 @@ class Found:
 
     def missing(self, wanted: Sequence[str]) -> InputError:
         """The refusal of files that lack something, with what there is."""
-        if len(self.files) == 1 and any(("M", "") in meanings(entry) for entry in self.entries):
+        nobodys = {f: [e.path for e in self.entries if (f, "") in meanings(e)] for f in ("M", "D")}
+        if len(self.files) == 1 and len(nobodys["M"]) > 1 and "M1" in wanted:
+            stated = [f"--key {field}{k}={name}" for field in nobodys for k, name in enumerate(nobodys[field][:2], 1)]
+            return refusal(
+                "missing-key",
+                file=self.files[0].file,
+                found=f"camera matrices that no name gives to left and right: {listed(nobodys['M'], NAMES_LISTED)}",
+                allowed="names with left and right, 0 and 1 or 1 and 2",
+                remedy=f"say which is which: {' '.join(stated)}",
+            )
+        if len(self.files) == 1 and nobodys["M"]:
             return refusal(
                 "missing-file",
                 file=self.files[0].file,
