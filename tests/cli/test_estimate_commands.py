@@ -27,7 +27,7 @@ from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.protocols import mixed_protocol
 from tvsbayes.twin.simulated_campaign import simulate
 
-pytestmark = pytest.mark.usefixtures("own_compilation_cache")
+pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once")
 
 
 def test_classic_document_has_the_contracts_keys(ask):
@@ -339,12 +339,10 @@ def test_noise_above_the_stated_is_no_misfit(ask, grid_campaign, tmp_path, u, sw
 
 
 def test_a_fit_that_did_not_converge_is_exit_4(ask, say, grid_folder, monkeypatch):
-    import tvsbayes
-
-    fitted = tvsbayes.fit(read_campaign(grid_folder))
+    from tvsbayes.estimators.joint_fit import fit
 
     def astray(*arguments, **options):
-        return replace(fitted, converged=False, problems=("it went astray",))
+        return replace(fit(*arguments, **options), converged=False, problems=("it went astray",))
 
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", astray)
     code, document = ask("fit", grid_folder, "--no-sample")

@@ -10,7 +10,7 @@ from support.axes import drawn, runs
 
 from tvsbayes.instrument.campaign import write_campaign
 
-pytestmark = pytest.mark.usefixtures("own_compilation_cache")
+pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once")
 
 
 @pytest.fixture

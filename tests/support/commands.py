@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -71,6 +72,30 @@ def caching_in(folder: str | Path, at_once: bool = False) -> Iterator[None]:
 def own_compilation_cache():
     """`fit` and `demo` point JAX at the folder of the tests."""
     with caching_in(os.environ["JAX_COMPILATION_CACHE_DIR"], at_once=True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def fits() -> dict[bytes, Any]:
+    """Fits by what they were made of."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def each_fitted_once(fits):
+    """Commands that fit what another has fitted get that fit: what is looked at is what they make of it."""
+    from tvsbayes.estimators import joint_fit
+
+    fit = joint_fit.fit
+
+    def kept(campaign, *, progress=None, **choices):
+        key = pickle.dumps((replace(campaign, path=None), sorted(choices.items())))
+        if key not in fits:
+            fits[key] = fit(campaign, progress=progress, **choices)
+        return replace(fits[key], campaign=campaign)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(joint_fit, "fit", kept)
         yield
 
 
