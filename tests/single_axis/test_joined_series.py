@@ -126,6 +126,12 @@ def test_what_angle_calibrate_saves():
         (b"[angle a]\ncalibrate = 1.0\n", "a calibration of 1 angles"),
         # Long, so that a search which tries every division of it does not end.
         (b"[angle a]\nsensor_type: a1333\n" + 60 * b"#*# nothing more\n", "a calibration of 0 angles"),
+        (
+            b"\x03".join(
+                json.dumps(m).encode() for m in [*klipper()[:2], {"q": "angle:s", "params": {"data": [[0, 1]]}}]
+            ),
+            "no angle after a step",
+        ),
         (json.dumps({"q": "stepq:x", "params": {"data": 3}}).encode(), "a queue of steps of another form"),
     ],
 )

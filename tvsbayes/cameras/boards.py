@@ -21,11 +21,10 @@ import numpy as np
 
 from tvsbayes.cameras.camera_marks import paired_pictures, unnamed_pictures
 from tvsbayes.cameras.marker_boards import MARKERS_MIN, Markers, as_seen, marker_board_corners, most_markers, spread
-from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, Size, natural_order, usual_sizes
+from tvsbayes.cameras.picture_pairs import NAMING, Picture, Size, natural_order, sizes_of, usual_sizes
 from tvsbayes.cameras.seen_boards import why_no_board
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
-from tvsbayes.files.disk import read_bytes
-from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size, in_grey_levels, read_image
+from tvsbayes.files.images import in_grey_levels, read_image
 from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.instrument.stereo_pair import same_shape, scaled_px
 from tvsbayes.progress import Advance, unshown
@@ -450,22 +449,10 @@ def _refuse_two_shapes(usual: Mapping[str, Size], folder: Path) -> None:
 
 
 def _sizes(folder: Path, pairing: Pairing) -> dict[Picture, Size]:
-    """Width and height of one camera's image in every picture of a board, by their headers.
-
-    The pictures of the majority are one calibration, and only those are decoded.
-    """
-    sizes, refused = {}, []
+    """Sizes of the pictures of a board; those of the majority are one calibration, and only those are decoded."""
     stated = {"swap": pairing.swap, "globs": pairing.globs, "in_order": pairing.in_order}
-    for picture in paired_pictures(folder, most=PICTURES_MAX, **stated):  # type: ignore[arg-type]
-        try:
-            width, height = _size(picture.path, folder)
-        except InputError as error:
-            refused.append(error)
-            continue
-        if len(picture.sides) == 1 or width >= SIDE_BY_SIDE_RATIO * height:
-            sizes[picture] = width // len(picture.sides), height
-    if refused:
-        raise all_of(refused)
+    pictures = paired_pictures(folder, most=PICTURES_MAX, **stated)  # type: ignore[arg-type]
+    sizes = sizes_of(pictures, folder, PIXELS_MAX)
     if not sizes:
         raise NothingToEstimate(
             "no-pictures",
@@ -475,16 +462,6 @@ def _sizes(folder: Path, pairing: Pairing) -> dict[Picture, Size]:
             'or --left "cam_a/*.png" --right "cam_b/*.png"',
         )
     return sizes
-
-
-def _size(path: Path, folder: Path) -> tuple[int, int]:
-    """Width and height of a picture, by its header."""
-    width, height = image_size(read_bytes(path, IMAGE_BYTES_MAX, folder), escaped(path.name))
-    if width * height > PIXELS_MAX:
-        place, found = escaped(path.name), f"{width} x {height} pixels"
-        allowed = f"at most {PIXELS_MAX // 1_000_000} million pixels"
-        raise refusal("image-size", file=place, found=found, allowed=allowed, remedy="record smaller pictures")
-    return width, height
 
 
 def _detections(

@@ -15,10 +15,10 @@ from typing import Literal
 import numpy as np
 
 from tvsbayes.cameras.camera_marks import OTHER_SUFFIXES, paired_pictures, unnamed_pictures
-from tvsbayes.cameras.picture_pairs import NAMING, SIDE_BY_SIDE_RATIO, Picture, Size, natural_order, usual_sizes
+from tvsbayes.cameras.picture_pairs import NAMING, Picture, Size, natural_order, sizes_of, usual_sizes
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
-from tvsbayes.files.images import IMAGE_BYTES_MAX, PNG_SIGNATURE, decode_image, image_size, png_bytes
+from tvsbayes.files.images import IMAGE_BYTES_MAX, IMAGE_PIXELS_MAX, PNG_SIGNATURE, decode_image, png_bytes
 from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, Spot, frame_name
 from tvsbayes.progress import Advance, unshown
 
@@ -106,12 +106,7 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
         InputError: no folder, no pair, an unreadable picture.
     """
     pictures = paired_pictures(folder, swap=swap, most=2 * LOOKS_MAX)
-    sizes: dict[Picture, Size] = {}
-    for picture in pictures:
-        data = read_bytes(picture.path, IMAGE_BYTES_MAX, folder)
-        width, height = image_size(data, escaped(picture.path.name))
-        if len(picture.sides) == 1 or width >= SIDE_BY_SIDE_RATIO * height:
-            sizes[picture] = width // len(picture.sides), height
+    sizes = sizes_of(pictures, Path(folder), IMAGE_PIXELS_MAX)
     unread = [path.name for path in sorted(Path(folder).iterdir()) if path.suffix.lower() in OTHER_SUFFIXES]
     usual = usual_sizes(sizes)
     used = [picture for picture, own in sizes.items() if all(own == usual[side] for side in picture.sides)]

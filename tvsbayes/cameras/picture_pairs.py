@@ -1,7 +1,7 @@
 """Pictures of two cameras in a folder: which file is of which camera, and which belong together.
 
-A view is one moment of both cameras; its name is what is left of a file's name without the word for the camera. Nothing
-is decoded here.
+A view is one moment of both cameras; its name is what is left of a file's name without the word for the camera. Headers
+tell sizes; nothing is decoded here.
 """
 
 from __future__ import annotations
@@ -9,11 +9,13 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from tvsbayes.errors import escaped, refusal
+from tvsbayes.errors import InputError, all_of, escaped, refusal
+from tvsbayes.files.disk import read_bytes
+from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size
 from tvsbayes.instrument.campaign import CAMERAS
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -45,6 +47,36 @@ class Picture:
     view: str
     path: Path
     sides: tuple[str, ...]
+
+
+def sizes_of(pictures: Iterable[Picture], folder: Path, most: int) -> dict[Picture, Size]:
+    """The size of one camera's image in every picture, by its header.
+
+    Args:
+        pictures: those that are named after no camera count where they are wide enough for both.
+        folder: where they lie.
+        most: pixels that a picture may have.
+
+    Raises:
+        InputError: pictures that cannot be read or are too large, all of them.
+    """
+    sizes: dict[Picture, Size] = {}
+    refused = []
+    for picture in pictures:
+        try:
+            name = escaped(picture.path.name)
+            width, height = image_size(read_bytes(picture.path, IMAGE_BYTES_MAX, folder), name)
+            if width * height > most:
+                found, allowed = f"{width} x {height} pixels", f"at most {most // 1_000_000} million pixels"
+                raise refusal("image-size", file=name, found=found, allowed=allowed, remedy="record smaller pictures")
+        except InputError as error:
+            refused.append(error)
+            continue
+        if len(picture.sides) == 1 or width >= SIDE_BY_SIDE_RATIO * height:
+            sizes[picture] = width // len(picture.sides), height
+    if refused:
+        raise all_of(refused)
+    return sizes
 
 
 def usual_sizes(sizes: Mapping[Picture, Size]) -> dict[str, Size]:

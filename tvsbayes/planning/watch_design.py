@@ -272,8 +272,7 @@ class WatchDesigns:
         log = run_plan([step for step, _ in ordered], self.rig)
         seen = [spot for _, spot in ordered if spot is not None]
         spots = tuple(
-            spot.renumbered(number, look.move)
-            for number, (spot, look) in enumerate(zip(seen, log.looks, strict=True))
+            spot.renumbered(number, look.move) for number, (spot, look) in enumerate(zip(seen, log.looks, strict=True))
         )
         planned = replace(self.fit.campaign, moves=tuple(log.moves), spots=spots)
         departure = WatchedLooks(self.fit, planned).departure(self.z)

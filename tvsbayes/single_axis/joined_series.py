@@ -155,19 +155,25 @@ def _joined(series: Mapping[str, Series], command: str, value: str, file: str, k
         found, remedy = f"no value of {escaped(value)} between the first and the last of {escaped(command)}", ""
         remedy = "name two series of one time with --column command=NAME --column value=NAME"
         raise refusal("empty", file=file, found=found, allowed="series that overlap in time", remedy=remedy)
-    times, values = read.times_s[inside], read.values[inside]
-    commands, interpolated = command_at(ordered, times)
-    every = -(-len(times) // ROWS_KEPT)
-    times, values, commands = times[::every], values[::every], commands[::every]
+    commands, interpolated = command_at(ordered, read.times_s[inside])
     words = [kind, f"command {escaped(command)}, reading {escaped(value)}"]
     words.append(f"{interpolated} commands interpolated in time, {int((~inside).sum())} readings outside left out")
-    words += [f"every {every}th reading kept"] * (every > 1)
+    return _pairs_table(file, words, Series(read.times_s[inside], commands), read.values[inside], (command, value))
+
+
+def _pairs_table(
+    file: str, words: Sequence[str], commands: Series, values: np.ndarray, names: tuple[str, str]
+) -> ForeignTable:
+    """Commands and readings of the same times as a table, of many every n-th; `names` are those of both."""
+    every = -(-len(values) // ROWS_KEPT)
+    times = commands.times_s[::every] - commands.times_s[0]
     columns: dict[str, Sequence[object]] = {
-        "time_s": [f"{t:.6f}" for t in times - times[0]],
-        command: [repr(float(f"{c:.10g}")) for c in commands],
-        value: [f"{v:.12g}" for v in values],
+        "time_s": [f"{t:.6f}" for t in times],
+        names[0]: [repr(float(f"{c:.10g}")) for c in commands.values[::every]],
+        names[1]: [f"{v:.12g}" for v in values[::every]],
     }
-    return table_of(file, "; ".join(words), columns, range(1, len(times) + 1))
+    kept = [f"every {every}th reading kept"] * (every > 1)
+    return table_of(file, "; ".join([*words, *kept]), columns, range(1, len(times) + 1))
 
 
 POLLED_S = 2.0
@@ -246,25 +252,19 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
         found, allowed = f"series {', '.join(map(escaped, names)) or 'none'}", "one angle:NAME and one stepq:NAME"
         remedy = "log one sensor and its stepper with data_logger.py; or name it in a table of your own"
         raise refusal("missing-column", file=file, found=found, allowed=allowed, remedy=remedy)
-    command, value = "steps", "angle (deg)"
     times, positions = (np.concatenate(part) for part in zip(*steps, strict=True))
     order = np.argsort(times, kind="stable")
-    read = _series(angles_s)
+    read, held = _series(angles_s), Series(times[order], positions[order])
     # Steps are commands at once; nothing is interpolated between them.
-    held = Series(times[order], positions[order])
-    inside = read.times_s >= held.times_s[0]
     at = np.searchsorted(held.times_s, read.times_s, side="right") - 1
-    joined = Series(read.times_s, np.where(inside, held.values[np.maximum(at, 0)], np.nan))
-    every = -(-int(inside.sum()) // ROWS_KEPT) or 1
-    rows = np.flatnonzero(inside)[::every]
-    kind = f"Klipper, {', '.join(map(escaped, names))}; {int((~inside).sum())} angles before the first step left out"
-    kind += f"; every {every}th angle kept" * (every > 1)
-    columns = {
-        "time_s": [f"{t:.6f}" for t in read.times_s[rows] - read.times_s[rows][0]],
-        command: [f"{c:.12g}" for c in joined.values[rows]],
-        value: [repr(float(v)) for v in read.values[rows]],
-    }
-    return table_of(file, kind, columns, range(1, len(rows) + 1))
+    inside = at >= 0
+    if not inside.any():
+        remedy = "log both at once, while the stepper moves"
+        raise refusal("empty", file=file, found="no angle after a step", allowed="steps and angles", remedy=remedy)
+    words = [f"Klipper, {', '.join(map(escaped, names))}"]
+    words.append(f"{int((~inside).sum())} angles before the first step left out")
+    commands = Series(read.times_s[inside], held.values[at[inside]])
+    return _pairs_table(file, words, commands, read.values[inside], ("steps", "angle (deg)"))
 
 
 def _messages(data: bytes, file: str) -> Iterator[dict]:
