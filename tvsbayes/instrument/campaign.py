@@ -445,11 +445,7 @@ def sighted_campaign(
     header: dict[str, object] | None = None,
     path: Path | None = None,
 ) -> Campaign:
-    """A campaign of a head that says where it points: sightings stand where those of a stereo pair have spots.
-
-    What every look has (`spot`, `move`, `target`, `status`, ...) a sighting has too; pixels are asked for by nobody who
-    has asked the mechanism.
-    """
+    """A campaign of a head that says where it points: sightings, which have all that looks share, stand for spots."""
     looks = cast(tuple[Spot, ...], tuple(sightings))
     return Campaign(tuple(moves), looks, NO_STEREO, rig, header or {}, path)
 
