@@ -57,7 +57,7 @@ FAULTS = (
           "test_projection_is_opencvs"),
     Fault("the effective ratio leaves out the slope of the beam", "headlines.effective_deg_per_step",
           Local("slope", "value**0"), "test_headlines_of_a_fit"),
-    Fault("the play's variation has the sign of the other side", "seen_places", Local("sign", "-value"),
+    Fault("the play's variation has the sign of the other side", "places.seen_places", Local("sign", "-value"),
           "test_looks_have_the_error_of_their_counter_and_half_the_play_of_their_side"),
     Fault("the transmission error is rougher than stated", "matern52", Returns("(1 + scaled) * functions.exp(-scaled)"),
           "test_the_factor_is_that_of_the_covariance_of_both_processes"),
