@@ -42,6 +42,13 @@ def test_pairs_of_png_and_jpeg_are_found_where_they_are(six_views):
         assert min(misses) < FOUND_PX
 
 
+def test_pictures_of_one_camera_alone_are_named(tmp_path):
+    for k, pose in enumerate(POSES[:3]):
+        cv2.imwrite(str(tmp_path / f"left{k}.png"), pictures(pose)[0])
+    with pytest.raises(NothingToEstimate, match="no picture of the right camera"):
+        find_views(tmp_path, BOARD)
+
+
 @pytest.mark.parametrize("proportion", ("the same", "another"))
 def test_cameras_of_two_picture_sizes(tmp_path, proportion):
     """Corners of right pictures of half the size are scaled to the left one's; those of another proportion named."""

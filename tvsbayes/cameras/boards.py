@@ -336,8 +336,8 @@ def find_views(
     folder = Path(folder)
     sizes = _sizes(folder, pairing)
     usual = usual_sizes(sizes)
-    _refuse_two_shapes(usual, folder)
-    size = usual["left"] if min(usual["left"]) else usual["right"]
+    _refuse_unlike(usual, folder)
+    size = usual["left"]
     used = [picture for picture, own in sizes.items() if all(own == usual[side] for side in picture.sides)]
     tried = spread(used, TRIED_MAX)
     if board.markers is not None:
@@ -381,7 +381,7 @@ def find_views(
         unnamed=unnamed_pictures(folder, sizes),
         without_board=tuple(without),
         other_size=tuple(p.path.relative_to(folder).as_posix() for p in sizes if p not in used),
-        right_image_size=None if usual["right"] in (size, (0, 0)) else usual["right"],
+        right_image_size=None if usual["right"] == size else usual["right"],
         by_fallback=tuple(fallback),
         reordered=tuple(reordered),
     )
@@ -435,9 +435,17 @@ def _greys(picture: Picture, folder: Path, size: Size) -> dict[str, np.ndarray]:
     }
 
 
-def _refuse_two_shapes(usual: Mapping[str, Size], folder: Path) -> None:
-    """Refuses two cameras whose pictures differ in proportion: the right one's are not the left one's, scaled."""
-    if min(usual["left"] + usual["right"]) > 0 and not same_shape(usual["left"], usual["right"]):
+def _refuse_unlike(usual: Mapping[str, Size], folder: Path) -> None:
+    """Refuses pictures of one camera alone, and of two proportions: the right ones are not the left ones, scaled."""
+    for side, size in usual.items():
+        if size == (0, 0):
+            raise NothingToEstimate(
+                "no-pictures",
+                f"{escaped(folder.resolve().name)}: no picture of the {side} camera",
+                allowed=f"{NAMING} (PNG or JPEG)",
+                remedy="put those of both cameras there; names that tell no camera: --left GLOB --right GLOB",
+            )
+    if not same_shape(usual["left"], usual["right"]):
         (left, right) = (f"{width} x {height}" for width, height in usual.values())
         raise refusal(
             "image-size",
