@@ -84,7 +84,7 @@ def predicted(campaign: Campaign) -> dict[str, object]:
 
 def night(file: Path) -> dict[str, object]:
     """All that is said of one table."""
-    began, stars = time.process_time(), read_stars(file)
+    began, stars = time.process_time(), read_stars(file).stars
     terms, errors, left = small_angles(stars)
     campaign = campaign_of(stars, file.stem)
     classic = pointing_model(campaign)
@@ -123,7 +123,7 @@ def _weak(found) -> list[str]:
 
 def between(folder: Path) -> dict[str, object]:
     """Night one's least-squares terms on night two: arcsec before, after, and after with zeros of its own."""
-    one, two = (campaign_of(read_stars(file), file.stem) for file in sorted(folder.glob("*.dat"))[:2])
+    one, two = (campaign_of(read_stars(file).stars, file.stem) for file in sorted(folder.glob("*.dat"))[:2])
     taught, own = pointing_model(one), pointing_model(two)
     rows = sightings_of(ordered_spots(two))
     bare = PointingModel((), np.zeros(0), np.zeros(0), np.zeros((0, 2)), {**own.known, **dict.fromkeys(own.names, 0.0)})

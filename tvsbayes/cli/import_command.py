@@ -171,14 +171,17 @@ def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
     from tvsbayes.head.pointing_table import STEP_DEG, U_ARCSEC, campaign_of, read_stars
     from tvsbayes.instrument.campaign import write_campaign
 
-    campaign = campaign_of(read_stars(file), file.stem)
+    table = read_stars(file)
+    campaign = campaign_of(table.stars, file.stem)
     moves, sightings = len(campaign.moves), len(campaign.spots)
     assumed = [
         f"counters are the encoders' degrees in steps of {STEP_DEG:g} deg, whose scale is known to 1e-6",
-        "the azimuth axis went the shorter way from star to star, and came to the first from an unknown side",
+        "the azimuth axis stands on the turn that a star's azimuth states, and came to the first from an unknown side",
         f"a star's place is known to {U_ARCSEC:g} arcsec; refraction is as the table has it",
         "no transmission error and no play of more than arcseconds: state another scale in [rig.prior]",
     ]
+    if table.left_out:
+        assumed.append(f"{table.left_out} blocks without RAA:, TAA: or LST: are no pointings")
     lines = [f"gives: {moves} moves, {sightings} sightings", *(f"assumed: {text}" for text in assumed)]
     if not (yes or as_json) and somebody_there():
         typer.echo("\n".join(lines))

@@ -32,6 +32,8 @@ SIDEREAL_S = 86164.0905 / 86400
 """Of mean solar time in a second of sidereal time (IERS conventions)."""
 DAY_S = 86400.0
 AZIMUTH_FROM_DEG = 180.0
+NEEDED = {"RAA", "TAA", "LST"}
+"""Tags of a block that is a pointing."""
 
 
 def encoder_priors() -> dict[str, Prior]:
@@ -84,15 +86,24 @@ def _numbers(text: str, count: int) -> tuple[float, ...]:
     return found
 
 
-def read_stars(path: Path) -> tuple[Star, ...]:
-    """The stars of a pointing table, in the order of the file.
+@dataclass(frozen=True)
+class PointingTable:
+    """The stars of a table, in its order, and how many blocks were left out: pointings that were broken off."""
+
+    stars: tuple[Star, ...]
+    left_out: int
+
+
+def read_stars(path: Path) -> PointingTable:
+    """A pointing table.
 
     Raises:
         InputError: a file that is none, with the line where it fails.
     """
     text = read_bytes(path, CSV_BYTES_MAX).decode("utf-8", "replace")
-    stars = []
-    for line, block in _blocks(text):
+    blocks, stars = list(_blocks(text)), []
+    whole = [(line, block) for line, block in blocks if NEEDED <= block.keys()]
+    for line, block in whole or blocks or [(1, {})]:
         try:
             (el, az), (true_el, true_az) = (_numbers(block[tag], 2) for tag in ("RAA", "TAA"))
             hours, minutes, seconds = _numbers(block["LST"], 3)
@@ -106,16 +117,17 @@ def read_stars(path: Path) -> tuple[Star, ...]:
                 remedy="give a pointing table as the MMT writes it",
             ) from error
         stars.append(Star((el, az), (true_el, true_az), 3600 * hours + 60 * minutes + seconds))
-    return tuple(stars)
+    return PointingTable(tuple(stars), len(blocks) - len(stars))
 
 
 def campaign_of(stars: tuple[Star, ...], name: str, u_arcsec: float = U_ARCSEC) -> Campaign:
     """The campaign of a night: encoders as counters of `STEP_DEG`, stars as sightings.
 
-    The azimuth axis is taken to have gone the shorter way from star to star.
+    An encoder tells no whole turns; the azimuth axis is taken to be on the turn of the star's azimuth, as stated.
     """
     elevation, azimuth = np.array([star.encoder_deg for star in stars]).T
-    azimuth = np.unwrap(AZIMUTH_FROM_DEG - azimuth, period=360.0)
+    stated = np.array([star.true_deg[1] for star in stars])
+    azimuth = AZIMUTH_FROM_DEG - azimuth - 360.0 * np.round((stated - azimuth) / 360.0)
     sidereal = np.unwrap([star.sidereal_s for star in stars], period=DAY_S)
     time_s = (sidereal - sidereal[0]) * SIDEREAL_S
     pan, tilt = (np.rint(angle / STEP_DEG).astype(int).tolist() for angle in (azimuth, elevation))
