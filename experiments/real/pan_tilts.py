@@ -2,7 +2,7 @@
 
     python -m experiments.real.pan_tilts FOLDER > experiments/real/pan_tilts.md
 
-FOLDER holds camera.csv, servo_pan.csv and servo_tilt.csv. A picture of a known point says where the optical axis points,
+FOLDER holds camera.csv, servo_pan.csv, servo_tilt.csv. A picture of a known point says where the optical axis points,
 if the camera's place is known: a row becomes a sighting, counters are the commanded degrees with the other sign. The
 height of the camera over the floor is the one at which least squares leave least.
 """
