@@ -1,4 +1,4 @@
-"""The bench from end to end: the twin through the virtual camera, hardware from the rig file to the campaign."""
+"""The bench from end to end: the twin and its pictures, hardware from the rig file to the campaign."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.bench_runs import small_plan
 from support.pseudo_terminal import needs_pseudo_terminals, served
+from support.streamed_camera import StreamedCamera
 from support.varying_gears import perfect_rig
 
 from tvsbayes.acquisition.bench import Vision
@@ -19,7 +20,6 @@ from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.session import acquire
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cameras.capture import StereoImage
-from tvsbayes.cameras.virtual_camera import VirtualCamera
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.plan import PlanStep
@@ -73,8 +73,8 @@ def test_truth_file_is_that_of_the_run(mounted_rig, tmp_path):
     assert turned[3][0] - turned[2][0] == pytest.approx(100 * k - truth.parameters["backlash_deg.pan"], abs=1e-9)
 
 
-def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
-    """Renderer, MJPEG server, OpenCV, background, detection, journal: spots where the twin has them."""
+def test_pictures_of_the_twin(small_rig, tmp_path):
+    """Renderer, background, detection, journal: spots where the twin has them."""
     small_rig = perfect_rig(small_rig)
     instrument = Instrument(small_rig, 7)
     rng = np.random.default_rng(0)
@@ -94,7 +94,7 @@ def test_pictures_through_the_virtual_camera(small_rig, tmp_path):
     campaign, truth = read_campaign(folder), json.loads((folder / "truth.json").read_text())
     for spot in campaign.spots:
         pixels = (spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px)
-        # JPEG and the threshold move a centroid of a 2 px spot by less than 0.1 px.
+        # Noise and the threshold move a centroid of a 2 px spot by less than 0.1 px.
         assert np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels).max() < 0.1
 
 
@@ -110,8 +110,13 @@ def test_rendered_pictures_are_detected_while_the_plan_runs(small_rig, tmp_path)
         pixels = np.array([spot.u_left_px, spot.v_left_px, spot.u_right_px, spot.v_right_px])
         sds = np.array([spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px])
         assert 0.01 < sds.min() and sds.max() < 0.2
-        # Eight coordinates in all, five sds each: JPEG's blocks add to the noise that is stated.
+        # Eight coordinates in all, five sds each.
         assert np.all(np.abs(centroids_of_the_twin(small_rig, truth, spot.move) - pixels) < 5 * sds)
+    acquire(small_rig, TWO_LOOKS, tmp_path / "d", simulate=True, seed=7, vision=vision)
+    pictures = sorted(path.relative_to(folder) for path in folder.glob("*/*.png"))
+    assert len(pictures) == 8
+    for name in ("spots.csv", *pictures):
+        assert (folder / name).read_bytes() == (tmp_path / "d" / name).read_bytes(), "same seed, same bytes"
 
 
 def cameras_before(instrument: Instrument):
@@ -152,7 +157,7 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
     plan = [PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")]
     plan += [PlanStep(3, "move", 60, 10), PlanStep(4, "look"), PlanStep(5, "place", target="d2"), PlanStep(6, "look")]
     with (
-        VirtualCamera(cameras_before(instrument), frames_per_s=30) as virtual,
+        StreamedCamera(cameras_before(instrument), frames_per_s=30) as virtual,
         served(instrument.device, 1_000_000) as port,
     ):
         table = {"driver": "serial", "port": port, "settle_s": 0.0}
@@ -197,7 +202,7 @@ def test_a_run_goes_on_at_another_port_with_another_camera(small_rig, tmp_path):
 
     def go(resume):
         with (
-            VirtualCamera(cameras_before(instrument), frames_per_s=30) as virtual,
+            StreamedCamera(cameras_before(instrument), frames_per_s=30) as virtual,
             served(instrument.device, 1_000_000) as port,
         ):
             # Another name of the same line, should the system give the same one twice.

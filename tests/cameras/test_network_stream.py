@@ -6,11 +6,11 @@ import threading
 
 import numpy as np
 import pytest
+from support import streamed_camera
+from support.streamed_camera import StreamedCamera
 
-from tvsbayes.cameras import virtual_camera
 from tvsbayes.cameras.capture import StereoImage, open_cameras
 from tvsbayes.cameras.network_stream import NetworkStream
-from tvsbayes.cameras.virtual_camera import VirtualCamera
 from tvsbayes.errors import DeviceFault
 
 WAIT_S = 20.0
@@ -93,7 +93,7 @@ def test_a_stream_that_does_not_come_back_delivers_no_frame(again):
 
 def test_a_server_that_drops_idle_viewers_keeps_us(monkeypatch):
     """As during a homing: nobody grabs until the server has sent more than all buffers between hold."""
-    monkeypatch.setattr(virtual_camera, "VIEWER_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(streamed_camera, "VIEWER_TIMEOUT_S", 0.3)
     rng = np.random.default_rng(0)
     # Noise does not compress: 120 kB a frame, of which sockets hold a hundred at most.
     pair = StereoImage(*(rng.integers(0, 255, (240, 320, 3), dtype=np.uint8) for _ in range(2)))
@@ -105,7 +105,7 @@ def test_a_server_that_drops_idle_viewers_keeps_us(monkeypatch):
             much.set()
         return pair
 
-    with VirtualCamera(render, frames_per_s=200.0) as virtual:
+    with StreamedCamera(render, frames_per_s=200.0) as virtual:
         camera = open_cameras({"source": virtual.address}, 320, 240)
         assert much.wait(WAIT_S), "the server sends as long as we read"
         assert camera.grab().left.shape == (240, 320, 3)

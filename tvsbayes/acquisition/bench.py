@@ -1,8 +1,8 @@
 """Everything a run needs beside its plan and its journal: the bench of a rig file, or its twin on a virtual clock.
 
 A simulated bench draws its true rig from the seed; what its cameras see comes from the twin as centroids, or, with a
-`renderer`, as pictures through a virtual MJPEG camera and the same camera code as on the bench. Its time goes on where
-the last run of its journal stood.
+`renderer`, as pictures that are looked at as those of the bench are. Its time goes on where the last run of its journal
+stood.
 """
 
 from __future__ import annotations
@@ -25,9 +25,8 @@ from tvsbayes.acquisition.journal_events import Homed, Moved
 from tvsbayes.acquisition.observation import CameraObserver, Detector, Observer, TwinObserver, wait_for_detection
 from tvsbayes.acquisition.operator import Operator, SimulatedOperator
 from tvsbayes.acquisition.recorder import Recorded, recorded
+from tvsbayes.acquisition.simulated_drivers import SimulatedCamera
 from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer, reference_pose_deg
-from tvsbayes.cameras.capture import StereoImage, open_cameras
-from tvsbayes.cameras.virtual_camera import VirtualCamera
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.rig import Rig
@@ -114,7 +113,7 @@ def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench
 def simulated(
     rig: Rig, seed: int, before: Recorded, vision: Vision, board: EmulatedBoard | None = None
 ) -> Iterator[Bench]:
-    """The twin on the device model; with a renderer, seen through a virtual camera.
+    """The twin on the device model; with a renderer, seen by its cameras.
 
     Args:
         rig: the declared rig.
@@ -145,26 +144,9 @@ def simulated(
         if vision.renderer is None:
             yield bench(TwinObserver(instrument, rig.spot_sd_px))
             return
-        with VirtualCamera(_exposures(instrument, vision.renderer)) as virtual:
-            camera = open_cameras({"source": virtual.address}, rig.stereo.image_width, rig.stereo.image_height)
-            try:
-                yield bench(CameraObserver(camera, vision.detector))
-            finally:
-                camera.close()
+        yield bench(CameraObserver(SimulatedCamera(instrument, vision.renderer), vision.detector))
     finally:
         positioner.close()
-
-
-def _exposures(instrument: Instrument, renderer: Renderer) -> Callable[[], StereoImage]:
-    """One picture after the other of what the laser does at that moment."""
-    frame = 0
-
-    def render() -> StereoImage:
-        nonlocal frame
-        frame += 1
-        return renderer(instrument.light(), instrument.motions, frame)
-
-    return render
 
 
 def write_truth(folder: Path, instrument: Instrument) -> None:

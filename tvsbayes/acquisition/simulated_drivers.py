@@ -10,7 +10,7 @@ from __future__ import annotations
 from weakref import WeakValueDictionary
 
 from tvsbayes.acquisition.observation import twin_renderer
-from tvsbayes.acquisition.simulated_instrument import Instrument
+from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer
 from tvsbayes.cameras.capture import CameraSettings, StereoImage
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.rig import Rig, Setting
@@ -27,15 +27,15 @@ def simulated_positioner(rig: Rig) -> SerialPositioner:
 
 def simulated_cameras(rig: Rig) -> SimulatedCamera:
     """What the twin's cameras see."""
-    return SimulatedCamera(_twin(rig, rig.cameras, "cameras"))
+    instrument = _twin(rig, rig.cameras, "cameras")
+    return SimulatedCamera(instrument, twin_renderer(rig, instrument.seed))
 
 
 class SimulatedCamera:
     """See `StereoCamera`: a new exposure of the twin for every pair that is asked for."""
 
-    def __init__(self, instrument: Instrument):
-        self._instrument, self._frame = instrument, 0
-        self._render = twin_renderer(instrument.rig, instrument.seed)
+    def __init__(self, instrument: Instrument, renderer: Renderer):
+        self._instrument, self._render, self._frame = instrument, renderer, 0
 
     def grab(self) -> StereoImage:
         """See `StereoCamera.grab`."""

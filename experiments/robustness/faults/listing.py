@@ -176,7 +176,7 @@ FAULTS = (
           "test_no_output_replaces_the_data_of_a_campaign"),
     # Acquisition: light, positions, lost events.
     Fault("the laser stays on when a camera fails", "CameraObserver.observe", Call("laser", "value if arg0 else None"),
-          "test_pictures_through_the_virtual_camera"),
+          "test_pictures_of_the_twin"),
     Fault("a laser that was left on stays on in motion", "SerialPositioner.move_to", Never("_lit"),
           "test_a_laser_left_on_is_off_in_motion"),
     Fault("the live page's laser-off waits for the end of the look", "HeedingPositioner.laser", Never("darken"),

@@ -1,19 +1,16 @@
 """A stereo camera in software: serves what is rendered as an MJPEG stream over HTTP on this computer.
 
-So the twin is seen through the same camera code as the bench. The path of the stream is a secret: other users of the
-computer get no picture. Seconds where a name says `_s`.
+A simulated instrument is seen by it through the camera code of the bench. Seconds where a name says `_s`.
 """
 
 from __future__ import annotations
 
 import os
-import secrets
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
 
 import numpy as np
 
@@ -21,13 +18,11 @@ from tvsbayes.cameras.capture import StereoImage
 
 VIEWER_TIMEOUT_S = 10.0
 """A viewer that takes nothing for so long has gone."""
-VIEWERS_MAX = 8
-"""Connections at a time: each takes a thread and a descriptor of the process that acquires."""
 JPEG_QUALITY = 97
 
 
 @dataclass
-class VirtualCamera:
+class StreamedCamera:
     """A camera in software: serves what `render` returns as an MJPEG stream over HTTP on this computer.
 
     Each frame is rendered when it is due, as a sensor would expose it. Use it as a context manager.
@@ -46,14 +41,13 @@ class VirtualCamera:
     _stop: threading.Event = field(default_factory=threading.Event, init=False, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False, repr=False)
     _no_proxy: str | None = field(default=None, init=False, repr=False)
-    _path: str = field(default_factory=lambda: f"/{secrets.token_urlsafe()}.mjpg", init=False, repr=False)
 
     @property
     def address(self) -> str:
         """Where the stream is served, for `[cameras] source`."""
         if self._server is None:
-            raise RuntimeError("the virtual camera is not running")
-        return f"http://127.0.0.1:{self._server.server_address[1]}{self._path}"
+            raise RuntimeError("the streamed camera is not running")
+        return f"http://127.0.0.1:{self._server.server_address[1]}/stereo.mjpg"
 
     def jpeg(self) -> bytes:
         """The next frame: both pictures side by side."""
@@ -64,7 +58,7 @@ class VirtualCamera:
         both = np.hstack((pair.left, pair.right))
         return cv2.imencode(".jpg", both, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
-    def __enter__(self) -> VirtualCamera:
+    def __enter__(self) -> StreamedCamera:
         camera = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -77,20 +71,8 @@ class VirtualCamera:
             def log_message(self, format: str, *arguments: object) -> None:
                 """Requests are no news."""
 
-        class Server(ThreadingHTTPServer):
-            viewers = threading.BoundedSemaphore(VIEWERS_MAX)
-
-            def verify_request(self, request: Any, address: Any) -> bool:
-                return self.viewers.acquire(blocking=False)
-
-            def process_request_thread(self, request: Any, address: Any) -> None:
-                try:
-                    super().process_request_thread(request, address)
-                finally:
-                    self.viewers.release()
-
         self._stop.clear()
-        self._server = Server(("127.0.0.1", 0), Handler)
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = False
         # Behind the bind, which may fail: then nobody would put it back.
         # FFmpeg, which OpenCV opens the address with, asks the proxy of the environment even for this computer.
@@ -116,7 +98,7 @@ class VirtualCamera:
             raise self.failure
 
     def _serve(self, request: BaseHTTPRequestHandler) -> None:
-        if not secrets.compare_digest(request.path.encode(), self._path.encode()):
+        if not request.path.endswith(".mjpg"):
             request.send_error(404)
             return
         request.send_response(200)

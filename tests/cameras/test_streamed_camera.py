@@ -1,25 +1,24 @@
-"""The virtual camera: its MJPEG stream over the loopback, to the pictures of a camera."""
+"""The streamed camera: its MJPEG stream over the loopback, to the pictures of a camera."""
 
 from __future__ import annotations
 
 import itertools
 import os
 import socket
-import threading
 
 import numpy as np
 import pytest
+from support.streamed_camera import StreamedCamera
 
 from tvsbayes.cameras.capture import StereoImage, open_cameras, open_capture
-from tvsbayes.cameras.virtual_camera import VIEWERS_MAX, VirtualCamera
 from tvsbayes.errors import DeviceFault
 
 WIDTH, HEIGHT = 64, 48
 
 
-def test_viewer_that_says_nothing_does_not_hold_the_virtual_camera(monkeypatch):
-    monkeypatch.setattr("tvsbayes.cameras.virtual_camera.VIEWER_TIMEOUT_S", 0.2)
-    with VirtualCamera(lambda: None) as virtual:
+def test_viewer_that_says_nothing_does_not_hold_the_streamed_camera(monkeypatch):
+    monkeypatch.setattr("support.streamed_camera.VIEWER_TIMEOUT_S", 0.2)
+    with StreamedCamera(lambda: None) as virtual:
         host, port = virtual.address.split("/")[2].split(":")
         silent = socket.create_connection((host, int(port)))
         # Connections are accepted in order: an answer to the second means that the first is being served.
@@ -29,33 +28,14 @@ def test_viewer_that_says_nothing_does_not_hold_the_virtual_camera(monkeypatch):
     silent.close()
 
 
-def test_strangers_get_no_picture_and_no_more_threads_than_a_few():
-    """Each connection takes a thread and a descriptor of the process that drives the laser."""
-    rendered = []
-    with VirtualCamera(lambda: rendered.append(1)) as virtual:
-        host, port = virtual.address.split("/")[2].split(":")
-        for path in ("stereo.mjpg", virtual.address.rsplit("/", 1)[1][1:]):
-            with socket.create_connection((host, int(port))) as stranger:
-                stranger.sendall(f"GET /{path} HTTP/1.0\r\n\r\n".encode())
-                assert b"404" in stranger.recv(100)
-        before = threading.active_count()
-        crowd = [socket.create_connection((host, int(port))) for _ in range(3 * VIEWERS_MAX)]
-        # The last ones are closed at once: nothing is read from them.
-        assert crowd[-1].recv(1) == b""
-        assert threading.active_count() <= before + VIEWERS_MAX
-        for one in crowd:
-            one.close()
-    assert not rendered
-
-
-def test_virtual_camera_without_a_port_leaves_the_environment_alone(monkeypatch):
+def test_streamed_camera_without_a_port_leaves_the_environment_alone(monkeypatch):
     monkeypatch.setenv("no_proxy", "example.org")
 
     def no_port(*_):
         raise OSError("no port is free")
 
-    monkeypatch.setattr("tvsbayes.cameras.virtual_camera.ThreadingHTTPServer.server_bind", no_port)
-    with pytest.raises(OSError, match="no port"), VirtualCamera(lambda: None):
+    monkeypatch.setattr("support.streamed_camera.ThreadingHTTPServer.server_bind", no_port)
+    with pytest.raises(OSError, match="no port"), StreamedCamera(lambda: None):
         pass
     assert os.environ["no_proxy"] == "example.org"
 
@@ -75,7 +55,7 @@ def test_stream_over_http_from_rendering_to_pictures(monkeypatch):
         pair = [np.full((HEIGHT, WIDTH, 3), 3 * (number % 80) + offset, np.uint8) for offset in (0, 10)]
         return StereoImage(*pair)
 
-    with VirtualCamera(render, frames_per_s=40) as virtual:
+    with StreamedCamera(render, frames_per_s=40) as virtual:
         camera = open_cameras({"source": virtual.address}, WIDTH, HEIGHT)
         for _ in range(3):
             before = rendered[-1]
