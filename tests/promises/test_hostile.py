@@ -489,6 +489,7 @@ def test_boards_of_too_many_pixels_are_refused_before_they_are_decoded(tmp_path,
     with pytest.raises(InputError) as caught:
         boards.find_views(tmp_path, boards.Board.named("9x6", 20.0))
     assert caught.value.code == "image-size" and "20 million" in caught.value.message
-    (tmp_path / "left01.png").write_bytes(png(5000, 4000, raw=b""))
+    for name in ("left01.png", "right01.png"):
+        (tmp_path / name).write_bytes(png(5000, 4000, raw=b""))
     with pytest.raises(AssertionError, match="decoded"):
         boards.find_views(tmp_path, boards.Board.named("9x6", 20.0))

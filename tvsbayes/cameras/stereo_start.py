@@ -164,8 +164,8 @@ def camera_start(
         raise NothingToEstimate(
             "few-views",
             f"the board was found in {len(corners)} pictures of the {side} camera; {VIEWS_MIN} are the least",
-            remedy="check --board (inner corners: where four squares meet), that the whole board is in the picture, sharpness "
-            "and light; take 15 to 25 views",
+            remedy="check --board (inner corners: where four squares meet), that the whole board is in the picture, "
+            "sharpness and light; take 15 to 25 views",
         )
     keys = sorted(corners)
     chosen = [keys[k] for k in np.unique(np.linspace(0, len(keys) - 1, START_VIEWS).astype(int))]
