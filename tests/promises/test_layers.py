@@ -21,6 +21,7 @@ from support.package_imports import (
     room,
     running,
 )
+from support.tests_of import tests_of
 
 ROOT = Path(__file__).resolve().parents[2]
 HARDWARE = ("positioner", "cameras", "acquisition")
@@ -70,6 +71,11 @@ def test_parser_sees_every_way_to_import():
     found = imported(ast.parse(code), frozenset({"b", "g", "h.i"}))
     assert found == {"a", "tvsbayes.b", "tvsbayes.c", "tvsbayes.h.i"}
     assert imported(running(ast.parse(code)), frozenset({"b", "g", "h.i"})) == found - {"a"}
+
+
+def test_tests_of_a_module_are_those_that_import_it():
+    assert tests_of("head.chain", "tests/head") == ["tests/head/test_chain.py"]
+    assert tests_of("files.disk", "tests/head") == []
 
 
 def test_every_module_has_its_room():
