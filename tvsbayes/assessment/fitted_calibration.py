@@ -24,6 +24,7 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
 from tvsbayes.instrument.parameters import RECEIVER_NAMES
 from tvsbayes.posterior.draws import Posterior
+from tvsbayes.statistics.streams import Stream, random_stream
 
 CLEARED_PROBABILITY = 0.99
 """With this probability an overshoot takes up all the play."""
@@ -55,7 +56,7 @@ def calibration_of_draws(
         gears: errors of the gears that the draws allow; None where gears do not vary.
     """
     column = {name: physical[:, i] for i, name in enumerate(names)}
-    generator = np.random.default_rng([seed, 5])
+    generator = random_stream(seed, Stream.CALIBRATION_NOISE)
 
     def standard() -> np.ndarray:
         # Exactly mean 0 and sd 1: the prior is known, its few draws need not be noise.

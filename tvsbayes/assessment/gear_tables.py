@@ -20,6 +20,7 @@ from tvsbayes.instrument.parameters import INDEX, PERIODS_MAX
 from tvsbayes.model.gear_processes import FLOOR_RAD2
 from tvsbayes.model.headlines import DEGREES
 from tvsbayes.statistics.gaussian_process import JITTER, repeated
+from tvsbayes.statistics.streams import Stream, random_stream
 
 MARGIN_LENGTHS = 3.0
 """A table reaches as many correlation lengths beyond the counters seen: 97 % of a process has forgotten them there."""
@@ -181,7 +182,7 @@ def drawn_gears(
     table = _table(physical, {axis: steps[seen_of[axis]] for axis in AXES})
     # The fit's own scales too: how its table follows the places, in units in which they are N(0, 1) a priori.
     mode, root = np.asarray(fit.mode.physical), np.asarray(fit.linearised.place_root) * DEGREES
-    generator = np.random.default_rng([seed, 7])
+    generator = random_stream(seed, Stream.GEAR_TABLES)
     expected, left_open = np.zeros((count, table.size)), np.zeros((count, table.size))
     by_places = np.zeros((table.size, errors))
     for name, part in table.parts.items():

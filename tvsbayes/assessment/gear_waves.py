@@ -17,6 +17,7 @@ from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.headlines import DEGREES
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.estimates import GearPeriod, Measured
+from tvsbayes.statistics.streams import Stream, random_stream
 
 DRAWS = 2048
 """Of equal weight: the error of a mean is a forty-fifth of its sd, that of a probability at most 0.011."""
@@ -105,7 +106,7 @@ def _measured(draws: np.ndarray) -> Measured:
 
 def gear_periods(posterior: Posterior) -> tuple[GearPeriod, ...]:
     """Every wave whose period `[rig]` states and whose amplitude is not held at 0, given that it is there."""
-    fit, rng = posterior.fit, np.random.default_rng([posterior.seed, 13])
+    fit, rng = posterior.fit, random_stream(posterior.seed, Stream.WAVES)
     drawn = posterior.resampled(1, DRAWS).joined
     physical, errors_deg = np.asarray(drawn.physical), np.asarray(drawn.place_errors_rad) * DEGREES
     periods: list[GearPeriod] = []

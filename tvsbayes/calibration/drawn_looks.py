@@ -11,6 +11,7 @@ from tvsbayes.calibration.optics import Number
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, NOISES, Calibration, Counters
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import SIDES
+from tvsbayes.statistics.streams import Stream, random_stream
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
             "this calibration keeps moments only, as exported for a robot",
             remedy="locate from the campaign folder, or use calibration.locate, which needs no draws",
         )
-    generator = np.random.default_rng([seed, 6])
+    generator = random_stream(seed, Stream.LOOKS)
     # Fewer draws than are stored: evenly chosen; more: all, again and again, with new noises.
     chosen = np.arange(draws) % stored if draws > stored else np.linspace(0, stored - 1, draws).astype(int)
     inputs, gears = np.split(calibration.inputs[chosen], [len(INPUT_NAMES)], axis=1)

@@ -33,6 +33,7 @@ from tvsbayes.results.compensation_record import Millimetres, Verification
 from tvsbayes.results.fit_record import FIT_FORMATS
 from tvsbayes.results.records import stored_document
 from tvsbayes.single_axis.predicted_stops import PredictedStops
+from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
 NOISE_DRAWS = 32
@@ -193,7 +194,7 @@ def _millimetres(
         return np.linalg.norm(np.einsum("mxa,...ma->...mx", slopes, angles.reshape(*angles.shape[:-1], -1, 2)), axis=-1)
 
     promised = PredictedStops(np.zeros((len(measured.covariance), len(measured.value))), measured.covariance, {})
-    drawn = lengths(promised.drawn(PROMISED_DRAWS, np.random.default_rng([seed, 24])))
+    drawn = lengths(promised.drawn(PROMISED_DRAWS, random_stream(seed, Stream.PROMISED_LENGTHS)))
     return Millimetres(
         distance_mm=distance_mm,
         before=size_of(lengths(before)),

@@ -28,6 +28,7 @@ from tvsbayes.single_axis.axis_record import AxisResults, results_for
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_of
 from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
 from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.statistics.streams import Stream, random_stream
 
 NODES_FEW, NODES_MANY = 13, 41
 """Fewest and most lines of a table: positions read, and halfway between where these are few."""
@@ -224,7 +225,7 @@ def _line_draws(fit: AxisFit) -> np.ndarray:
     slope = model.head(slope=1.0) + line_weights(model, fit.w)
     level = model.head(offset=1.0) + model.functional(fit.rows.command, fit.w).mean(axis=-2)
     both = np.stack([level - model.middle * slope, slope], axis=-2)
-    return fit.linear.drawn(both, np.random.default_rng([fit.seed, 22]))
+    return fit.linear.drawn(both, random_stream(fit.seed, Stream.PROMISE))
 
 
 def _joint(line: np.ndarray) -> dict[str, float]:

@@ -42,6 +42,7 @@ from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import results_for
 from tvsbayes.single_axis.axis_rows import rows_of
 from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
+from tvsbayes.statistics.streams import Stream, random_stream
 
 SURE, UNLIKELY, P_MIN = 0.95, 0.01, 0.003
 """Probability with which a world is named; below which the table counts as not applied as promised; of readings this
@@ -184,7 +185,7 @@ def _p_value(promised: PredictedStops, value: np.ndarray, shift: np.ndarray, see
     """Of the readings' squared distance, by readings drawn from the prediction."""
     mean, covariance = promised.pooled()
     inverse = np.linalg.inv(covariance + shift)
-    drawn = promised.drawn(REPLICATES, np.random.default_rng([seed, 23]))
+    drawn = promised.drawn(REPLICATES, random_stream(seed, Stream.WORLDS))
 
     def squares(values: np.ndarray) -> np.ndarray:
         off = np.atleast_2d(values) - mean

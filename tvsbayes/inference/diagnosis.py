@@ -17,6 +17,7 @@ from tvsbayes.inference.density import Density, columns_of
 from tvsbayes.inference.importance import ImportanceRun, Sample, uncertain
 from tvsbayes.inference.summaries import monte_carlo_errors, propagated
 from tvsbayes.results.convergence import Agreement, Convergence, MonteCarloError, extreme
+from tvsbayes.statistics.streams import Stream, random_stream
 
 GROUPS = 4
 """Of walkers that share no partners: chains that know nothing of each other, for R-hat."""
@@ -193,7 +194,7 @@ def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
     thin = max(1, (len(chain.w) - discarded) // STORED_DRAWS)
     w = chain.w[discarded:][::thin].transpose(1, 0, 2)
     shape = walkers, draws = w.shape[:2]
-    points = density.valued(w.reshape(walkers * draws, -1), np.random.default_rng([start.seed, 5]))
+    points = density.valued(w.reshape(walkers * draws, -1), random_stream(start.seed, Stream.CHAIN_PLACES))
     points = replace(points, log_target=chain.log_density[discarded:][::thin].T.ravel())
     own = density.quantities(points)
     quality = quality_of(chain, discarded, columns_of(density, points), shape)

@@ -29,6 +29,7 @@ from tvsbayes.results.convergence import (
     Reweighted,
     extreme,
 )
+from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import (
     SmoothedWeights,
     WeightedSummary,
@@ -103,7 +104,7 @@ class Pool:
         proposal, before = self.next_proposal, density.invalid
         w = proposal.draw(ROUND, generator)
         # A stream of its own: what was integrated out leaves the draws of w as they are.
-        valued = density.valued(w, np.random.default_rng([0 if self.points is None else len(self.points), 4]))
+        valued = density.valued(w, random_stream(0 if self.points is None else len(self.points), Stream.POOLED_ROUNDS))
         proposals, counts = self.proposals, self.counts
         if proposals and proposals[-1] is proposal:
             counts = (*counts[:-1], counts[-1] + ROUND)

@@ -13,6 +13,7 @@ import numpy as np
 from tvsbayes.calibration.optics import Number, beam_angle_deg, output_deg
 from tvsbayes.calibration.pointing import INPUT_NAMES, NOISE_NAMES, Calibration
 from tvsbayes.instrument.axes import AXES, SIDES
+from tvsbayes.statistics.streams import Stream, random_stream
 
 RUNS = 5
 """Runs per side of the standard test cycle of ISO 230-2."""
@@ -44,7 +45,7 @@ def target_steps(low: float, high: float, deg_per_step: float, seed: int = 0) ->
         Rising counters, at least two where the range has three steps; empty for a smaller range.
     """
     count = targets_wanted((high - low) * deg_per_step)
-    places = np.arange(count) + 0.5 + np.random.default_rng([seed, 230]).uniform(-0.2, 0.2, count)
+    places = np.arange(count) + 0.5 + random_stream(seed, Stream.CYCLE_COUNTERS).uniform(-0.2, 0.2, count)
     targets = sorted({round(low + (high - low) * p / count) for p in places} - {round(low), round(high)})
     return tuple(targets) if len(targets) >= TARGETS_MIN else ()
 
@@ -110,7 +111,7 @@ def simulated_runs(
     # Upwards a step is k + c/2, downwards k - c/2 (formulation 3.1): a whole cycle of 2 L steps gains c L.
     before = contrast * (high - low) * np.arange(runs)
     gained = {1.0: before + 0.5 * contrast * (steps - low), -1.0: before + 0.5 * contrast * (2 * high - low - steps)}
-    generator = np.random.default_rng([seed, 2302])
+    generator = random_stream(seed, Stream.CYCLES)
     result = []
     for side, name in ((1.0, SIDES[axis][1]), (-1.0, SIDES[axis][0])):
         counted = steps + gained[side] / ratio

@@ -24,6 +24,7 @@ from tvsbayes.planning.gear_places import GearPlaces
 from tvsbayes.planning.looks import Arranged, LookArrays, Looks, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.progress import Advance, unshown
+from tvsbayes.statistics.streams import Stream, random_stream
 
 PIXEL_COLUMN = INDEX["pixel_scale"]
 SCALES = [*STOP_COLUMNS.ravel(), PIXEL_COLUMN]
@@ -159,7 +160,7 @@ class Assurance:
         # After data a fit's line goes through the looks of both, of which the places know the sum alone.
         before = not family.knowledge.after_data
         self._of_lines = before and target.point_mm is None and family.knowledge.gears.size > 0
-        self.noise = np.random.default_rng([seed, 37]).standard_normal((len(instruments), len(SCALES)))
+        self.noise = random_stream(seed, Stream.INSTRUMENT_SCALES).standard_normal((len(instruments), len(SCALES)))
         self.distinct, self.index = np.unique(family.picks, return_inverse=True)
         self.looks = family.found.looks[self.distinct]
         self.arrays = LookArrays(self.looks, family.knowledge, family.aperture)

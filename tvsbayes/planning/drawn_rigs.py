@@ -10,6 +10,7 @@ import numpy as np
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, physical_at
 from tvsbayes.planning.expectation import PARAMETERS, Knowledge
+from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.twin.true_rig import Truth, draw_truth
 
 
@@ -66,7 +67,7 @@ def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -
 
 def draw_instruments(knowledge: Knowledge, count: int, seed: int) -> Instruments:
     """Instruments from `[truth]` of the rig file (the design prior), or from the posterior where there are data."""
-    generator = np.random.default_rng([seed, 31])
+    generator = random_stream(seed, Stream.INSTRUMENTS)
     if knowledge.after_data:
         z = draws_of(knowledge, count, generator)
         value = np.asarray(knowledge.space.value)

@@ -39,6 +39,7 @@ from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.planning.candidates import BACKLASH_COLUMNS, run_up_steps
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2
+from tvsbayes.statistics.streams import Stream, random_stream
 
 PATTERN_MAX = 12
 """Looks after one homing at most."""
@@ -181,7 +182,7 @@ class WatchDesigns:
         rows = np.array(shown)
         self.each = np.einsum("mia,mib->mab", rows, rows)
         self.shifts = shifts
-        generator = np.random.default_rng([self.seed, 5])
+        generator = random_stream(self.seed, Stream.WATCHED_CHANGES)
         self._ways = []
         for change in self.changes:
             ways = generator.standard_normal((DIRECTIONS, len(change.names)))

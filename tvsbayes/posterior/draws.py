@@ -24,6 +24,7 @@ from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import DERIVED, Derived, derived_quantities
 from tvsbayes.results.convergence import Convergence, Reweighted
+from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic, weighted_mean
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ class Posterior(Shown):
 
     def chosen(self, count: int) -> np.ndarray:
         """Places of at most `count` draws that weigh the same, chains joined; evenly spaced in a chain."""
-        offset = np.random.default_rng([self.seed, 2]).uniform()
+        offset = random_stream(self.seed, Stream.EQUAL_DRAWS).uniform()
         return systematic(self.weights.ravel(), min(count, self.weights.size), float(offset))
 
     def thinned(self, count: int) -> Derived:
@@ -156,7 +157,7 @@ class Posterior(Shown):
         """Draws that weigh the same, in chains; a draw of much weight is repeated."""
         places = systematic(self.weights.ravel(), chains * draws, 0.5)
         # In order, the repeats of a draw would stand in one chain.
-        places = np.random.default_rng([self.seed, 3]).permutation(places).reshape(chains, draws)
+        places = random_stream(self.seed, Stream.ORDER_OF_DRAWS).permutation(places).reshape(chains, draws)
         return replace(
             self,
             z=self.z.reshape(-1, self.z.shape[-1])[places],

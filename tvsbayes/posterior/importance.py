@@ -18,6 +18,7 @@ from tvsbayes.posterior.target import Target
 from tvsbayes.posterior.transport import Mapped, transport
 from tvsbayes.progress import Advance, unshown
 from tvsbayes.results.convergence import Reweighted
+from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import weighted_summary
 
 MAPPED_SHARE = 0.25
@@ -74,7 +75,7 @@ def run_beside(fit: JointFit, run: ImportanceRun[Target], seed: int) -> Posterio
 def _weighed_anew(fit: JointFit, run: ImportanceRun[Target], count: int, seed: int) -> Weighing:
     """The first draws of a run, weighted by the density under another way of homing."""
     target, some = Target(fit, run.density.path), run.pool.drawn.taken(slice(count))
-    normal = target.place_normals(count, np.random.default_rng([seed, 6]))
+    normal = target.place_normals(count, random_stream(seed, Stream.OTHER_HOMING))
     points = target.at(some.w, Mapped(some.parts["z"], some.parts["log_jacobian"]), normal)
     return Weighing(target, replace(run.pool, points=points, counts=(count,), invalid=target.invalid))
 

@@ -32,6 +32,7 @@ from tvsbayes.instrument.parameters import INDEX, names_of
 from tvsbayes.model.compiled import compiled, in_batches
 from tvsbayes.model.parameter_space import SCATTER_COLUMNS, STOP_COLUMNS, ParameterSpace
 from tvsbayes.posterior.draws import Posterior
+from tvsbayes.statistics.streams import Stream, random_stream
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -247,7 +248,7 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
     import xarray as xr
 
     fit = posterior.fit
-    generator = np.random.default_rng([posterior.seed, 1])
+    generator = random_stream(posterior.seed, Stream.PREDICTED_MOVES)
     chains, draws = posterior.z.shape[:2]
     chosen = np.unique(np.linspace(0, draws - 1, min(draws_per_chain, draws)).astype(int))
     z, drawn = posterior.z.reshape(-1, posterior.z.shape[-1]), posterior.joined

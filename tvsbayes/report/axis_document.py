@@ -48,6 +48,7 @@ from tvsbayes.single_axis.axis_record import (
 from tvsbayes.single_axis.classic_line import ClassicAxis
 from tvsbayes.single_axis.held_out_positions import AxisHoldOut
 from tvsbayes.single_axis.next_stops import AxisPlan, unit_of
+from tvsbayes.statistics.streams import AxisStream, random_stream
 
 DEVIATIONS_SHOWN = 40
 TABLE_ROWS = 60
@@ -305,7 +306,7 @@ def _error_figures(fit: AxisFit) -> list[FigureView]:
     if fit.rows.in_motion:
         return []
     commands = curve_commands(float(fit.rows.command.min()), float(fit.rows.command.max()))
-    drawn = drawn_deviations(fit, commands, np.random.default_rng([fit.seed, 6]))
+    drawn = drawn_deviations(fit, commands, random_stream(fit.seed, AxisStream.ERROR_CURVE))
     alt = "The error that repeats by position over the command as a curve with a band, and every stop as a marker."
     caption = "Deviation from the line through the stops: what repeats by position with its 95 % band, and the stops."
     return [FigureView(axis_errors(fit, commands, drawn), alt, caption)]

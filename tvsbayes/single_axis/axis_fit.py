@@ -22,6 +22,7 @@ from tvsbayes.single_axis.axis_parameters import AxisPrior, axis_priors
 from tvsbayes.single_axis.axis_rows import AxisRows, rows_of
 from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.period_search import waves_of
+from tvsbayes.statistics.streams import AxisStream, random_stream
 
 MODE, WEIGHING, WALKING, TELLING = "mode", "weighted draws", "chain", "summarising"
 EQUAL_DRAWS = 2000
@@ -115,7 +116,7 @@ class AxisFit(Shown):
     @cached_property
     def draws(self) -> dict[str, np.ndarray]:
         """Equal draws (draws,) of every sampled parameter, of the linear ones, and of the line through the stops."""
-        rng = np.random.default_rng([self.seed, 3])
+        rng = random_stream(self.seed, AxisStream.LINEAR_TERMS)
         found = {name: v for name, v in self.model.coordinates.values(self.w).items() if name in self.free}
         linear = self.linear.drawn(headline_functionals(self.model, self.w), rng)
         return found | dict(zip(HEADLINE_DRAWS, linear.T, strict=True)) | self._shift_draws(rng)
@@ -193,7 +194,7 @@ def fit_axis(
                 job.begin(WALKING)
                 sample = better(sample, Run(run, None, None, job.at, began).until_converged(60.0 * max_minutes))
         job.begin(TELLING)
-        rng = np.random.default_rng([seed, 1])
+        rng = random_stream(seed, AxisStream.RESAMPLING)
         if sample is not None and sample.convergence.converged:
             w = sample.equal(EQUAL_DRAWS, rng)
         elif len(mode.w):

@@ -13,6 +13,7 @@ from tvsbayes.results.estimates import Measured, PeriodEstimate
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import LinearPosterior
 from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, absent_at, wave_columns
+from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
 WITH_WAVE_MIN, WITH_WAVE = 200, 1000
@@ -103,7 +104,7 @@ def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
 
     In order: stated ones, the strongest of every range that was asked for, further ones by strength, the encoder's.
     """
-    model, rng = fit.model, np.random.default_rng([fit.seed, 9])
+    model, rng = fit.model, random_stream(fit.seed, AxisStream.PERIODS)
     found = []
     for k, wave in enumerate(model.coordinates.waves):
         probability = float(np.mean(model.coordinates.wave_draws(fit.w)[k].scale > 0))

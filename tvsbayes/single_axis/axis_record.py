@@ -42,6 +42,7 @@ from tvsbayes.single_axis.axis_periods import period_estimate, wave_samples, wav
 from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
 from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.statistics.streams import AxisStream, random_stream
 
 AXIS_FIT_FORMAT = "tvsbayes-axis-fit/1"
 type PeriodClock = Literal["unit", "seconds"]
@@ -275,7 +276,7 @@ def _deviations(fit: AxisFit) -> tuple[PositionDeviation, ...]:
         return ()
     if len(positions) > POSITIONS_LISTED:
         positions = positions[np.linspace(0, len(positions) - 1, POSITIONS_LISTED).astype(int)]
-    drawn = drawn_deviations(fit, positions, np.random.default_rng([fit.seed, 4]))
+    drawn = drawn_deviations(fit, positions, random_stream(fit.seed, AxisStream.DEVIATIONS))
     low, high = np.percentile(drawn, TAILS_PERCENT, axis=0)
     return tuple(
         PositionDeviation(float(p), float(v.mean()), float(v.std()), (float(a), float(b)))

@@ -20,6 +20,7 @@ from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.predicted_stops import carried_scales
 from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
 DRAWS, HELD_ROUNDS = 300, 2
@@ -201,7 +202,7 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
 
 def _whole_draws(model: AxisModel, seed: int) -> np.ndarray:
     """Coordinates (`WEIGHED`, d) of the scales by all rows."""
-    rng = np.random.default_rng([seed, 8])
+    rng = random_stream(seed, AxisStream.HELD_OUT_BY_WEIGHTS)
     return _drawn(model, WEIGHED, seed, rng).w
 
 
@@ -229,7 +230,7 @@ def _rms(z: list[float]) -> float:
 def _fitted_without(model: AxisModel, out: np.ndarray, seed: int) -> tuple[np.ndarray, str]:
     """Coordinates of the scales, for the whole model, from the rows not left out; what is wrong with them, or ""."""
     without = AxisModel.of(model.rows.without(out), model.priors, None, model.coordinates.waves)
-    rng = np.random.default_rng([seed, 5])
+    rng = random_stream(seed, AxisStream.HELD_OUT)
     found = _drawn(without, DRAWS, seed, rng)
     return carried_scales(without, found.w, model, rng), found.fault
 

@@ -17,6 +17,7 @@ from tvsbayes.single_axis.axis_campaign import AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import rows_of
+from tvsbayes.statistics.streams import AxisStream, random_stream
 
 DRAWS = 160
 """Of the scales, in a prediction."""
@@ -97,7 +98,7 @@ def predicted_stops(
             file="campaign.toml",
             remedy="read stops from both directions into a folder without `rate`",
         )
-    known, rng = fit.campaign, np.random.default_rng([seed, 21])
+    known, rng = fit.campaign, random_stream(seed, AxisStream.PREDICTED_STOPS)
     last, number = known.moves[-1], max(r.reading for r in known.readings) + 1
     count, begins = len(known.moves), moves[0].time_s
     joined = [
