@@ -14,7 +14,6 @@ from support.small_campaign import small_stereo
 
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
-    BLOCKS,
     GEAR_ERROR_NAMES,
     HARMONIC_NAMES,
     INDEX,
@@ -143,7 +142,7 @@ def test_free_parameters():
     """Those with u > 0; the receiver's only with readings; zero rows of the stereo covariance never."""
     space = parameter_space(table(), small_stereo())
     unstated = {name for name in GEAR_ERROR_NAMES if RIG_PRIORS[name].u == 0 or name in AMPLITUDE_NAMES}
-    fixed = {"stereo.left.k3", "stereo.right.k3", *HARMONIC_NAMES, *BLOCKS["creep_deg"], *unstated}
+    fixed = {"stereo.left.k3", "stereo.right.k3", *HARMONIC_NAMES, *unstated}
     for has_aperture in (True, False):
         free = {name for name, yes in zip(NAMES, free_mask(space, has_aperture), strict=True) if yes}
         assert set(NAMES) - free == fixed | (set() if has_aperture else set(RECEIVER_NAMES))

@@ -21,7 +21,7 @@ from tvsbayes.estimators.campaign_arrays import CampaignArrays, campaign_arrays
 from tvsbayes.estimators.linear_spots import Linearised, linear_spots, stop_information
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, Prior, names_of
+from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, names_of
 from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, free_mask, parameter_space, physical_at
 from tvsbayes.posterior.transport import SCALE_NAMES, Transport, transport
 
@@ -51,7 +51,6 @@ def linearised(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays) -> 
 def fit_of(dozen, campaign: Campaign, values: dict[str, float], held: tuple[str, ...], redraw: bool) -> SimpleNamespace:
     """What the map reads of a fit, at values; `redraw`: every look has stop errors of its own."""
     table = varying_gears(campaign.rig)
-    table = replace(table, priors={**table.priors, **dict.fromkeys(names_of("creep_deg"), Prior(0.0, 0.05))})
     with jax.enable_x64(True):
         space = jax.tree.map(jnp.asarray, parameter_space(table, campaign.stereo))
         arrays = jax.tree.map(jnp.asarray, campaign_arrays(campaign, table))

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, Prior
+from tvsbayes.instrument.parameters import BLOCKS, GEAR_ERROR_NAMES, INDEX, NAMES, Prior
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, physical_at
 
@@ -18,9 +18,10 @@ OFF, ON = Prior(0.0, 0.0, "half-normal"), Prior(0.0, SCALE_U_DEG, "half-normal")
 
 
 def perfect_gears(table: RigTable) -> RigTable:
-    """Gears that repeat no error and do not drift."""
+    """Gears that repeat no error, do not drift and do not creep."""
     scales = {name: replace(LENGTH, u=0.0) if "length" in name else OFF for name in GEAR_ERROR_NAMES}
-    return replace(table, priors={**table.priors, **scales}, harmonic_period_deg={})
+    still = dict.fromkeys(BLOCKS["creep_deg"], Prior(0.0, 0.0))
+    return replace(table, priors={**table.priors, **scales, **still}, harmonic_period_deg={})
 
 
 def perfect_rig(rig: Rig) -> Rig:
