@@ -15,9 +15,9 @@ from tvsbayes.single_axis.axis_record import summarise_axis
 
 
 def test_truths_lie_where_the_fit_says():
-    """Twelve drawn axes of two protocols; a sum of squares that 1 in 1e4 sets of honest z exceeds."""
+    """Six drawn axes of two protocols; a sum of squares that 1 in 1e4 sets of honest z exceeds."""
     z = []
-    for seed in range(6):
+    for seed in range(3):
         for moves in (runs(3), random_moves(seed, 40, 2)):
             made = drawn(seed, moves, backlash=AxisPrior(0.0, 0.1))
             found = fit_axis(made.campaign, tier="importance", seed=seed)
@@ -27,9 +27,8 @@ def test_truths_lie_where_the_fit_says():
                 for name in ("per_command", "backlash")
                 for draws in [found.draws[name]]
             ]
-    # 24 numbers: chi-square at 1e-4 is 59.
-    assert np.sum(np.square(z)) < 59
-    assert np.sum(np.square(z)) > 4
+    # 12 numbers: chi-square at 1e-4 is 39.1, at 1 - 1e-4 1.4.
+    assert 1.4 < np.sum(np.square(z)) < 39.1
 
 
 def test_both_tiers_agree_and_a_seed_gives_the_same():
