@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.drawn_boards import BOARD, FOUND_PX, POSES, SIZE, pictures, true_corners, write_pair
 
-from tvsbayes.cameras import boards
+from tvsbayes.cameras import boards, seen_boards
 from tvsbayes.cameras.boards import Board, Pairing, find_corners, find_views
 from tvsbayes.errors import InputError, NothingToEstimate
 
@@ -162,7 +162,7 @@ def test_other_finder_steps_in_by_name(six, monkeypatch, tmp_path):
 @pytest.mark.parametrize("share", [0.5, 0.2])
 def test_large_pictures_are_searched_in_a_smaller_copy(monkeypatch, share):
     """The size of the copy is no whole part of the picture's; corners are refined in the picture itself."""
-    monkeypatch.setattr(boards, "SECTOR_PIXELS_MAX", int(share * SIZE[0] * SIZE[1]))
+    monkeypatch.setattr(seen_boards, "SECTOR_PIXELS_MAX", int(share * SIZE[0] * SIZE[1]))
     picture = pictures(POSES[0])[0][:-3, :-1]
     corners, fallback = find_corners(np.ascontiguousarray(picture), BOARD, "sector")
     assert not fallback

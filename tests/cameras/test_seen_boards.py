@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.drawn_boards import BOARD, POSES, pictures
 
+from tvsbayes.cameras import seen_boards
 from tvsbayes.cameras.seen_boards import inner_corners, why_no_board
 
 
@@ -26,6 +27,18 @@ def test_the_size_of_a_board_is_seen(greys):
     assert (
         f"{size[0]}x{size[1]} inner corners are seen in 2 of 2" in reason and f"--board {size[0]}x{size[1]}?" in remedy
     )
+
+
+def test_large_pictures_are_searched_in_a_smaller_copy(greys, monkeypatch):
+    """Of 20 million pixels a search by sectors takes gigabytes."""
+    sizes, search = [], seen_boards.cv2.findChessboardCornersSBWithMeta
+    monkeypatch.setattr(
+        seen_boards.cv2,
+        "findChessboardCornersSBWithMeta",
+        lambda grey, *more: sizes.append(grey.size) or search(grey, *more),
+    )
+    monkeypatch.setattr(seen_boards, "SECTOR_PIXELS_MAX", greys[0].size // 2)
+    assert inner_corners(greys[0]) is not None and sizes[0] <= greys[0].size // 2
 
 
 @pytest.mark.parametrize(

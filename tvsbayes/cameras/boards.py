@@ -7,7 +7,6 @@ they are decoded. OpenCV's corner arrays have another rank in 5.x than in 4.x: e
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +21,7 @@ import numpy as np
 from tvsbayes.cameras.camera_marks import paired_pictures, unnamed_pictures
 from tvsbayes.cameras.marker_boards import MARKERS_MIN, Markers, as_seen, marker_board_corners, most_markers, spread
 from tvsbayes.cameras.picture_pairs import NAMING, Picture, Size, natural_order, sizes_of, usual_sizes
-from tvsbayes.cameras.seen_boards import why_no_board
+from tvsbayes.cameras.seen_boards import shrunk, why_no_board
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
 from tvsbayes.files.images import in_grey_levels, read_image
 from tvsbayes.instrument.campaign import CAMERAS
@@ -41,9 +40,6 @@ WORKERS_MAX = 8
 PICTURES_MAX = 2000
 PIXELS_MAX = 20_000_000
 """Of one picture, and of those that are searched at the same time: one of 20 million takes 0.8 GB to search."""
-SECTOR_PIXELS_MAX = 3_000_000
-"""Larger pictures are searched by sectors in a smaller copy, then refined: 20 million pixels would take 3.8 GB and half
-a minute."""
 
 
 TRIED_MAX, TRIED_AT_ONCE = 12, 4
@@ -231,13 +227,12 @@ def _refined(grey: np.ndarray, corners: np.ndarray, board: Board) -> np.ndarray:
 
 def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    shrink = math.ceil(math.sqrt(grey.size / SECTOR_PIXELS_MAX))
-    small = grey if shrink == 1 else cv2.resize(grey, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+    small = shrunk(grey)
     found, corners = cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags)
     if not found or corners is None or np.size(corners) != 2 * board.corners:
         return None
     corners = np.asarray(corners, float).reshape(-1, 2)
-    if shrink == 1:
+    if small is grey:
         return corners
     scale = np.array(grey.shape[::-1]) / small.shape[::-1]
     return _refined(grey, ((corners + 0.5) * scale - 0.5).astype(np.float32), board)
