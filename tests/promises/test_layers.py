@@ -46,7 +46,6 @@ JAX_FREE_MODULES = (
 )
 """Free of JAX until a function that fits is called, in packages that are not."""
 JAX_FAMILY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping"}
-HEAVY = ("jax", "arviz", "emcee", "cv2", "matplotlib", "scipy", "equinox", "optimistix")
 LINES_MAX = 600
 """Of a module: a longer one has two subjects."""
 
@@ -157,15 +156,6 @@ def test_importing_the_estimator_changes_no_jax_setting():
         "print(jax.config.jax_enable_x64, before == dict(jax.config.values))"
     )
     assert in_new_process(code) == "False True"
-
-
-def test_command_line_loads_nothing_heavy():
-    """`tvsbayes --help` must answer at once: heavy modules are imported by the commands that need them.
-
-    NumPy among them: `main` sets the number of OpenBLAS' threads, which is read when NumPy is first imported.
-    """
-    code = f"import sys, tvsbayes.cli.main; print([name for name in ('numpy', *{HEAVY!r}) if name in sys.modules])"
-    assert in_new_process(code) == "[]"
 
 
 def test_readers_load_no_jax():
