@@ -142,9 +142,16 @@ def plain(stereo: Stereo, names: str) -> dict[str, np.ndarray]:
         "K_l d_l K_r d_r stereo_R stereo_T",
     ),
 )
-def test_names_in_every_container(mounted, tmp_path, names):
+def test_names_of_programs(mounted, tmp_path, names):
+    lists = {name: value.tolist() for name, value in plain(mounted, names).items()}
+    size = [mounted.image_width, mounted.image_height]
+    (tmp_path / "a.json").write_text(json.dumps(lists | {"image_size": size}))
+    same(read_calibration([tmp_path / "a.json"]).stereo, mounted)
+
+
+def test_every_container(mounted, tmp_path):
     """JSON, YAML of nested lists, .npz, .mat and TOML by their own writers, OpenCV's XML and JSON by its own."""
-    values = plain(mounted, names)
+    values = plain(mounted, "cameraMatrixL distCoeffsL cameraMatrixR distCoeffsR Rot Trans")
     size = [mounted.image_width, mounted.image_height]
     lists = {name: value.tolist() for name, value in values.items()} | {"image_size": size}
     (tmp_path / "a.json").write_text(json.dumps(lists))
