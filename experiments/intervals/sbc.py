@@ -50,7 +50,6 @@ from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.parameter_space import coordinates_of, parameter_space
 from tvsbayes.posterior.draws import Posterior, derived_of
 from tvsbayes.posterior.sampling import TIERS, sample
@@ -151,7 +150,7 @@ def ranks(simulated, result, z: np.ndarray, place_errors_rad: np.ndarray) -> dic
         # What the fit does not estimate, without readings the aperture's, has one value in all draws.
         both[0, ~result.free] = both[1, ~result.free]
         still = no_draw(len(both), arrays)
-        log_posterior = in_batches(lambda *block: evaluate(*block, space, arrays).log_density, both, still)
+        log_posterior = evaluate(both, still, space, arrays).log_density
     log_likelihood = log_posterior + 0.5 * np.sum(both**2, axis=1)
     values = {"log-likelihood": log_likelihood, "log-posterior": log_posterior}
     values |= {NAMES[i]: np.append(true[i], physical[:, i]) for i in np.flatnonzero(result.free)}

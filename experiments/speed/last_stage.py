@@ -18,7 +18,7 @@ from experiments.common.fits import without_padding
 from tvsbayes.estimators.annealed_stage import Fixed, innovations, stage
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.likelihood import innovations as exact_innovations
-from tvsbayes.estimators.likelihood import no_belief
+from tvsbayes.estimators.likelihood import no_belief, root_at_places
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
@@ -49,13 +49,14 @@ def exact_residuals(z, args) -> LinearResidual:
 def stage_residuals(z, args) -> LinearResidual:
     """With the Jacobian of the fit's stage, which holds slopes and projections."""
     space, arrays, fixed = args
-    lin = linearise(jnp.where(fixed.held, fixed.value, z), space, arrays)
-    places = len(lin.place_root)
+    full = jnp.where(fixed.held, fixed.value, z)
+    lin, root = linearise(space.point(full), space, arrays), root_at_places(space.model(full), arrays.gears)
+    places = len(root)
     columns = innovations(lin, arrays, no_belief(1 + z.size + places)).standardised.reshape(-1, 1 + z.size + places)
     prior = jnp.where(fixed.held, z - fixed.value, z)
     # The errors at places are least squares in every step.
     own = jnp.concatenate([columns[:, : 1 + z.size], jnp.zeros((places, 1 + z.size))])
-    repeated = columns[:, 1 + z.size :] @ lin.place_root
+    repeated = columns[:, 1 + z.size :] @ root
     across = jnp.linalg.qr(jnp.concatenate([repeated, jnp.eye(places)]))[0]
     own = own - across @ (across.T @ own)
     jacobian = jnp.where(fixed.held, 0.0, own[:, 1:])

@@ -46,7 +46,7 @@ def test_innovations_are_those_of_the_density(dozen, found):
 
 def test_reduced_residuals_have_length_slope_and_curvature_of_all(dozen, found):
     """Against the smoother in NumPy: r'C^-1 r + z'z, J'C^-1 r and J'C^-1 J + 1, held coordinates without a part."""
-    lin = found.reduced.also.of_spots(len(dozen.campaign.spots))
+    lin = found.reduced.also
     jacobian = np.where(NOISE, 0.0, -lin.residual_jacobian)
     whole = stop_information(linear_spots(lin, dozen.arrays, jacobian))
     residual = lin.residual.reshape(-1)

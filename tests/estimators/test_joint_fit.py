@@ -19,7 +19,7 @@ from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, HARMONIC_NAMES, INDEX, NAMES, Prior
 from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol
 from tvsbayes.instrument.rig import read_rig
-from tvsbayes.model.compiled import Compiled, in_batches
+from tvsbayes.model.compiled import Compiled
 from tvsbayes.statistics.least_squares import laplace_draws
 from tvsbayes.twin.physics import effective_mirror_offset_mm
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
@@ -236,7 +236,7 @@ def test_the_mode_is_a_stationary_maximum(fitted):
 
     def density(points):
         still = no_draw(len(points), fitted.arrays)
-        return in_batches(lambda at, n: evaluate(at, n, fitted.space, fitted.arrays).log_density, points, still)
+        return evaluate(points, still, fitted.space, fitted.arrays).log_density
 
     value = density(fitted.z[None])[0]
     assert value == pytest.approx(fitted.log_density)

@@ -34,7 +34,7 @@ def both(dozen):
     @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     def compute(z):
         looks = standing(dozen.space.model(z), dozen.arrays).looks
-        parts = jnp.stack(look_jacobian(z, dozen.space.physical(z), dozen.space, looks, dozen.arrays))
+        parts = jnp.stack(look_jacobian(dozen.space.point(z), dozen.space, looks, dozen.arrays))
         return parts, jax.jacfwd(whole)(z, looks.range_mm).transpose(0, 2, 1), looks
 
     z = dozen.z + 0.5 * np.random.default_rng(61).standard_normal(len(NAMES))

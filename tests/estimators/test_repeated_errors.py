@@ -172,7 +172,7 @@ def test_draws_of_errors_at_places_have_the_conditional_gaussians_moments(varyin
 
 def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying, found):
     """r'C^-1 r + z'z, J'C^-1 r and J'C^-1 J + 1, held coordinates without a part."""
-    lin = found.reduced.also.of_spots(len(ordered_spots(varying.campaign)))
+    lin = found.reduced.also
     # The scatter of looks is in the unit noise of the linearised campaign.
     values = {n: 0.0 if n.startswith("look_scatter") else value for n, value in found.values.items()}
     covariance = residual_covariance(angle_covariances(varying.campaign, values), lin.slope)

@@ -17,11 +17,11 @@ from scipy import linalg
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.likelihood import STATES, Belief, Seen, filter_rows, filtered
-from tvsbayes.estimators.linear_spots import Linearised, linearise
+from tvsbayes.estimators.linear_spots import Linearised, LinearLooks, linearise
 from tvsbayes.estimators.spot_residuals import ToStates
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.descent import descend
-from tvsbayes.model.parameter_space import ParameterSpace
+from tvsbayes.model.parameter_space import ParameterSpace, Point
 from tvsbayes.statistics.least_squares import LinearResidual
 
 STAGE_TOLERANCE = 1e-2
@@ -42,7 +42,7 @@ class Fixed(eqx.Module):
     inflation: Float[Array | np.ndarray, ""]
 
 
-def innovations(lin: Linearised, arrays: CampaignArrays, before: Belief) -> Seen:
+def innovations(lin: LinearLooks, arrays: CampaignArrays, before: Belief) -> Seen:
     """Standardised innovations of linearised spots; in the further columns how coordinates move them.
 
     The errors at places stand last among them, as coordinates in rad. Behind the two components that the filter sees
@@ -58,7 +58,7 @@ def innovations(lin: Linearised, arrays: CampaignArrays, before: Belief) -> Seen
     return eqx.tree_at(lambda f: f.standardised, found, jnp.concatenate([found.standardised, free], axis=1))
 
 
-class Part(Linearised):
+class Part(LinearLooks):
     """Some spots linearised; products of the columns of their innovations, and the filter's belief after them."""
 
     gram: Float[Array, "columns columns"]
@@ -68,16 +68,16 @@ class Part(Linearised):
 
 @compiled(Part)
 def linear_part(
-    z: Float[Array, " parameters"],
+    at: Point,
     space: ParameterSpace,
     arrays: CampaignArrays,
-    fixed: Fixed,
+    inflation: Float[Array, ""],
     first: Int[Array, ""],
     before: Belief,
 ) -> Part:
-    """`PART` spots from the first on, at the noise of `fixed`."""
+    """`PART` spots from the first on; `inflation` is a factor on their noise."""
     own = arrays.of_spots(first, min(PART, len(arrays.spots.valid)))
-    lin = linearise(jnp.where(fixed.held, fixed.value, z), space, own, fixed.inflation)
+    lin = linearise(at, space, own, inflation)
     seen = innovations(lin, own, before)
     columns = seen.standardised.reshape(-1, seen.standardised.shape[2])
     given = {field.name: getattr(lin, field.name) for field in fields(lin)}
@@ -93,14 +93,15 @@ def linear_campaign(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
     are least squares in every step: they stand before the coordinates in N, and what L has of them is left out.
     Besides comes the campaign linearised there, as NumPy arrays, without padding.
     """
-    count, places, filled = int(arrays.count), len(arrays.gears.places.steps), arrays.gears.errors_filled
+    places, filled = len(arrays.gears.places.steps), arrays.gears.errors_filled
+    point = space.known_point(np.where(fixed.held, fixed.value, z))
     before = Belief(np.zeros((STATES, 1 + z.size + 2 * places)), np.zeros((STATES, STATES)))
     parts = []
-    for first in range(0, count, PART):
-        parts.append(linear_part(z, space, arrays, fixed, np.int32(first), before))
+    for first in range(0, int(arrays.count), PART):
+        parts.append(linear_part(point, space, arrays, fixed.inflation, np.int32(first), before))
         before = Belief(parts[-1].mean, parts[-1].covariance)
     gram = np.sum([np.asarray(part.gram) for part in parts], axis=0)
-    lin = Linearised.joined(parts, count, filled)
+    lin = Linearised.joined(parts, point, space, arrays)
     mixed = linalg.block_diag(lin.place_root, np.diag(np.where(fixed.held, 0.0, 1.0)))
     own = np.concatenate([1 + z.size + filled, np.arange(1, 1 + z.size)])
     prior = np.concatenate([np.zeros(len(lin.place_root)), np.where(fixed.held, z - fixed.value, z)])

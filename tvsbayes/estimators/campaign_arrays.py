@@ -6,6 +6,7 @@ of their own. px, counters in steps, aperture readings in rad; padded rows are n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -26,9 +27,9 @@ from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.laser_path import MoveArrays
 
-PLACES = (0, 6, 12, 24, 2 * PLACES_MAX)
-"""Numbers of places of both axes together that functions are compiled for, side by side in each. Columns of the filter
-are what a density costs: the paper's protocol has these six counters."""
+PLACES_TOGETHER = 6
+"""Places of both axes whose columns go through the filter together: columns are what a density costs, and the paper's
+protocol has these six counters."""
 SMALLEST_BUCKET = 4096
 """Spots and moves are padded to this size or the next power of two above it: campaigns up to it share their compiled
 functions, and cost what their own rows need."""
@@ -79,16 +80,29 @@ class GearArrays(eqx.Module):
     error_share: Float[Array | np.ndarray, "spots places"]
     play_share: Float[Array | np.ndarray, "spots places"]
 
-    def first(self, count: int) -> GearArrays:
-        """The first places alone."""
-        places = jax.tree.map(lambda of_place: of_place[:count], self.places)
-        return GearArrays(places, self.error_share[:, :count], self.play_share[:, :count])
+    def some(self, start: Int[Array, ""] | int, count: int) -> GearArrays:
+        """So many places from one on."""
+
+        def part(array):
+            return jax.lax.dynamic_slice_in_dim(array, start, count, axis=-1)
+
+        return jax.tree.map(part, self)
+
+    @property
+    def together(self) -> int:
+        """Places of a group: `PLACES_TOGETHER`, or what divides their padded number evenly."""
+        return math.gcd(len(self.places.steps), PLACES_TOGETHER)
+
+    @property
+    def groups(self) -> int:
+        """Of places, padding included."""
+        return len(self.places.steps) // max(self.together, 1)
 
     @property
     def filled(self) -> int:
-        """Places that functions are run for: the least of `PLACES` that holds all; for NumPy's side."""
-        count = int(np.asarray(self.places.valid).sum())
-        return next(size for size in sizes_of(len(self.places.steps)) if size >= count)
+        """Places of the groups that hold one; for NumPy's side."""
+        together = max(self.together, 1)
+        return together * -(-int(np.asarray(self.places.valid).sum()) // together)
 
     @property
     def errors_filled(self) -> np.ndarray:
@@ -96,8 +110,9 @@ class GearArrays(eqx.Module):
         return np.add.outer([0, len(self.places.steps)], np.arange(self.filled)).ravel()
 
     def without_padding(self) -> GearArrays:
-        """As NumPy arrays, of the places that functions are run for."""
-        return jax.tree.map(np.asarray, self).first(self.filled)
+        """As NumPy arrays, of the `filled` places."""
+        count = self.filled
+        return jax.tree.map(lambda array: np.asarray(array)[..., :count], self)
 
 
 class CampaignArrays(eqx.Module):
@@ -155,14 +170,9 @@ def move_arrays(moves: Sequence[Move], size: int | None = None, powered_on_s: fl
     )
 
 
-def sizes_of(size: int) -> tuple[int, ...]:
-    """Numbers of `PLACES` up to a padded number of places, itself the last."""
-    return (*(places for places in PLACES if places < size), size)
-
-
 def place_arrays(seen: SeenPlaces) -> Places:
     """Pad places to the largest number of them."""
-    count, size = len(seen.steps), PLACES[-1]
+    count, size = len(seen.steps), 2 * PLACES_MAX
     return Places(
         padded(seen.steps, size), padded(seen.on_tilt, size, False, bool), padded(np.ones(count), size, False, bool)
     )

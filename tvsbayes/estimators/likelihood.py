@@ -12,9 +12,10 @@ in units of its standard deviation.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,17 +23,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, SpotArrays, sizes_of
+from tvsbayes.estimators.campaign_arrays import CampaignArrays, GearArrays, SpotArrays
 from tvsbayes.estimators.looks import WINDOW, Looks, looks_at, spot_angles
 from tvsbayes.estimators.spot_residuals import NoiseScales, SpotResiduals, ToStates, noise_scales, spot_residuals
 from tvsbayes.instrument.axes import HOME_SD_DEG
-from tvsbayes.model.compiled import compiled
-from tvsbayes.model.gear_processes import errors_at, place_root
-from tvsbayes.model.geometry import Scalar
+from tvsbayes.instrument.parameters import INDEX, names_of
+from tvsbayes.model.compiled import compiled, in_batches
+from tvsbayes.model.gear_kriging import scales_at
+from tvsbayes.model.gear_processes import place_root
+from tvsbayes.model.geometry import Scalar, materialise
 from tvsbayes.model.laser_path import MirrorAngles, Stretch, angles_at, mirror_angles, no_moves
 from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 STATES = 6
+RATIO_COLUMNS = np.array([INDEX[name] for name in names_of("degrees_per_step")])
+POINTS_TOGETHER = 256
+"""Points whose errors at places are taken out together: many, since NumPy's calls cost more than small matrices; few
+enough for their memory."""
 BLOCK = 64
 """Spots that go through the filter together: their numbers stay in the processor's cache, and a campaign costs what its
 own spots need, not what it was padded to."""
@@ -124,18 +131,26 @@ class Belief(eqx.Module):
         return Belief(self.mean * _along(row.keep, self.mean), self.covariance * (row.keep[:, None] * row.keep) + new)
 
 
+class Gains(eqx.Module):
+    """How a spot's components, one after the other, move the means: `gain` times a standardised error of this `sd`."""
+
+    gain: Float[Array, "*spots components 6"]
+    sd: Float[Array, "*spots components"]
+
+
 class KalmanUpdate(eqx.Module):
     """A spot seen by the filter: the state after it, standardised errors and the log of their variances' product."""
 
     belief: Belief
     standardised: Float[Array, "components *columns"]
     log_variance: Scalar
+    gains: Gains
 
 
 def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
     """Update with one spot: its components have independent unit noise, so a scalar update each and no inverse."""
     mean, covariance = belief.mean, belief.covariance
-    errors, variances = [], []
+    errors, variances, gains = [], [], []
     for component in range(len(row.load)):
         # Sums instead of products: a call into a matrix library costs more than six numbers.
         gain = jnp.sum(covariance * row.load[component], axis=1)
@@ -145,7 +160,10 @@ def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
         covariance = covariance - gain[:, None] * (gain / variance_ahead)
         errors.append(error / jnp.sqrt(variance_ahead))
         variances.append(variance_ahead)
-    return KalmanUpdate(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(jnp.stack(variances))))
+        gains.append(gain / jnp.sqrt(variance_ahead))
+    variance = jnp.stack(variances)
+    found = Gains(jnp.stack(gains), jnp.sqrt(variance))
+    return KalmanUpdate(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(variance)), found)
 
 
 def no_belief(*columns: int) -> Belief:
@@ -227,40 +245,100 @@ def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | No
 class Seen(eqx.Module):
     """Spots seen by the filter: standardised errors (spots, components, ...), and logs of their variances' products.
 
-    `belief` is that after the last of them.
+    `belief` is that after the last of them; `gains` are theirs.
     """
 
     standardised: Float[Array, "..."]
     log_variance: Float[Array, "*spots"]
     belief: Belief
+    gains: Gains
 
 
-def filtered(rows: FilterRows, before: Belief | None = None) -> Seen:
+def filtered(rows: FilterRows, before: Belief) -> Seen:
     """Run the filter over spots in time order, from the belief before them."""
 
     def step(belief, row):
         seen = kalman_update(belief.renewed(row), row)
-        return seen.belief, (seen.standardised, seen.log_variance)
+        return seen.belief, (seen.standardised, seen.log_variance, seen.gains)
 
-    start = no_belief(*rows.residual.shape[2:]) if before is None else before
-    after, (standardised, log_variance) = jax.lax.scan(step, start, rows)
-    return Seen(standardised, log_variance, after)
+    after, (standardised, log_variance, gains) = jax.lax.scan(step, before, rows)
+    return Seen(standardised, log_variance, after, gains)
+
+
+class Sums(eqx.Module):
+    """What a campaign says of the errors at its places, summed over spots, many points with a leading axis.
+
+    Places stand in groups of `PLACES_TOGETHER`, of each a column for every transmission error, then for every play.
+    `log_density` is that of the spots if all those errors were zero; `along` holds the products of the standardised
+    columns with the standardised residuals, `gram` those of the columns of two groups, for the pairs (0, 0), (1, 0),
+    (1, 1), (2, 0) ...
+    """
+
+    log_density: Float[Array | np.ndarray, "*batch"]
+    along: Float[Array | np.ndarray, "*batch groups columns"]
+    gram: Float[Array | np.ndarray, "*batch pairs columns columns"]
+
+
+def pairs_of(groups: Any) -> Any:
+    """How many pairs there are of so many groups of places, each with itself and with those before it."""
+    return groups * (groups + 1) // 2
+
+
+class ColumnsSeen(eqx.Module):
+    """Columns that the filter standardised, and the means of its state for them after the last spot."""
+
+    standardised: Float[Array, "spots components columns"]
+    mean: Float[Array, "6 columns"]
+
+
+def columns_filtered(
+    columns: Float[Array, "spots components columns"],
+    rows: FilterRows,
+    gains: Gains,
+    before: Float[Array, "6 columns"],
+) -> ColumnsSeen:
+    """Send further columns through a filter whose gains are known: a product of few numbers before and after."""
+    load, own = rows.load / gains.sd[..., None], columns / gains.sd[..., None]
+    loads: list[Any] = []
+    residuals: list[Any] = []
+    # What earlier components have moved stands in the load of later ones.
+    for component in range(own.shape[1]):
+        slope, residual = load[:, component], own[:, component]
+        for earlier in range(component):
+            share = jnp.sum(load[:, component] * gains.gain[:, earlier], axis=1)[:, None]
+            slope, residual = slope - share * loads[earlier], residual - share * residuals[earlier]
+        loads.append(slope)
+        residuals.append(residual)
+    whole = jnp.stack(loads, axis=1) * rows.keep[:, None], jnp.stack(residuals, axis=1)
+
+    def step(mean, row):
+        load, residual, keep, gain = row
+        # Sums spelled out: loops over whole rows of columns.
+        moved = sum(load[:, state, None] * mean[state] for state in range(STATES))
+        standardised = materialise(residual - moved)
+        followed = sum(gain[component, :, None] * standardised[component] for component in range(len(gain)))
+        return keep[:, None] * mean + followed, standardised
+
+    mean, standardised = jax.lax.scan(step, before, materialise((*whole, rows.keep, gains.gain)))
+    return ColumnsSeen(standardised, mean)
 
 
 class Passed(eqx.Module):
     """A campaign on its way through the filter, block by block; rows of spots ahead are zero.
 
-    Columns are the residual, then how the errors at places move it: those at the places that are filled come first,
-    behind them nothing. `gram` holds the products of the standardised columns with each other, summed over the spots
-    passed; `log_density` is that of the spots passed without squares of what the filter standardised. A caller that
-    needs the gram alone does not pay for the columns: the compiler drops what nobody reads.
+    `belief` is that of the residuals and of the first group's columns, which tell how errors at places move them,
+    `means` are those of the other groups; `block` holds all these columns, standardised, in the last block. A caller
+    that needs the sums alone does not pay for `standardised`, `columns` and `free`: the compiler drops what nobody
+    reads.
     """
 
     belief: Belief
-    standardised: Float[Array, "spots 2 columns"]
+    means: Float[Array, "groups 6 columns"]
+    block: Float[Array, "groups rows columns"]
+    standardised: Float[Array, "spots 2"]
+    columns: Float[Array, "groups spots 2 columns"]
     free: Float[Array, "spots 4"]
-    gram: Float[Array, "columns columns"]
-    log_density: Scalar
+    sums: Sums
     stretch: Stretch
 
 
@@ -275,26 +353,18 @@ def blocks_filled(arrays: CampaignArrays) -> Int[Array, ""]:
     return -(-arrays.count // block_size(arrays.spots))
 
 
-def with_filled[Result](gears: GearArrays, of: Callable[[int], Result]) -> Result:
-    """What a function gives of the number of places that are filled: one of `sizes_of`.
-
-    It is traced for each of them, and run for one: columns cost what a campaign's own places need.
-    """
-    sizes = sizes_of(len(gears.places.steps))
-    if len(sizes) == 1:
-        return of(sizes[0])
-    number = jnp.searchsorted(np.array(sizes), jnp.sum(gears.places.valid))
-    return jax.lax.switch(number, [partial(of, size) for size in sizes])
-
-
 def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -> Passed:
     """Send the first blocks of spots through the filter; nothing depends on how they are cut.
 
-    Moves are followed as far as the spots go; all of them where the number of blocks is a constant.
+    Moves are followed as far as the spots go, and columns are those of groups with a place; all of them where the
+    number of blocks is a constant.
     """
-    count, size = len(arrays.spots.valid), block_size(arrays.spots)
+    count, size, together = len(arrays.spots.valid), block_size(arrays.spots), arrays.gears.together
     gears, zero = model.transmission, model.tilt_zero_rad
     every = mirror_angles(gears, zero, arrays.moves) if isinstance(blocks, int) else None
+    most, columns = arrays.gears.groups, 2 * together
+    groups = most if isinstance(blocks, int) else -(-jnp.sum(arrays.gears.places.valid) // max(together, 1))
+    one, two = (jnp.asarray(each) for each in np.tril_indices(most))
 
     def through(number, so_far):
         start = jnp.asarray(number) * size
@@ -306,66 +376,102 @@ def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -
         else:
             angles = jax.tree.map(lambda of_moves: of_moves[index], every)
         given = filter_input(model, part, angles)
+        # The first group goes along with the residuals: its columns cost no loop of their own.
+        both = [given.rows.residual[..., None], place_columns(given.slope, part.gears.some(0, together))]
+        rows = eqx.tree_at(lambda r: r.residual, given.rows, jnp.concatenate(both, axis=2))
+        seen = filtered(rows, so_far.belief)
+        standardised, leading = seen.standardised[..., 0], seen.standardised[..., 1:].reshape(-1, columns)
 
-        def seen(places):
-            columns = 1 + 2 * places
-            own = jnp.concatenate(
-                [given.rows.residual[..., None], place_columns(given.slope, part.gears.first(places))], axis=2
-            )
-            rows = eqx.tree_at(lambda r: r.residual, given.rows, own)
-            before = Belief(so_far.belief.mean[:, :columns], so_far.belief.covariance)
-            found = filtered(rows, before)
+        def along_with(flat):
+            return jnp.sum(flat * standardised.reshape(-1, 1), axis=0)
+
+        def of_group(group, of_places):
+            means, block, along = of_places
+            own = place_columns(given.slope, part.gears.some(group * together, together))
+            found = columns_filtered(own, given.rows, seen.gains, means[group])
             flat = found.standardised.reshape(-1, columns)
-            standardised = jnp.zeros((size, 2, so_far.standardised.shape[2])).at[..., :columns].set(found.standardised)
-            return Passed(
-                Belief(so_far.belief.mean.at[:, :columns].set(found.belief.mean), found.belief.covariance),
-                jax.lax.dynamic_update_slice_in_dim(so_far.standardised, standardised, start, 0),
-                jax.lax.dynamic_update_slice_in_dim(so_far.free, given.free, start, 0),
-                so_far.gram.at[:columns, :columns].add(flat.T @ flat),
-                so_far.log_density + jnp.sum(given.log_scale) - 0.5 * jnp.sum(found.log_variance),
-                stretch,
-            )
+            return means.at[group].set(found.mean), block.at[group].set(flat), along.at[group].add(along_with(flat))
 
-        return with_filled(arrays.gears, seen)
+        def of_pair(pair, gram):
+            return gram.at[pair].add(block[one[pair]].T @ block[two[pair]])
 
-    columns = 1 + 2 * len(arrays.gears.places.steps)
-    empty = jnp.zeros((count, 2, columns)), jnp.zeros((count, 4)), jnp.zeros((columns, columns)), jnp.zeros(())
-    begin = Passed(no_belief(columns), *empty, no_moves(arrays.moves))
+        means, block, along, gram = so_far.means, so_far.block, so_far.sums.along, so_far.sums.gram
+        if most:
+            block, along = block.at[0].set(leading), along.at[0].add(along_with(leading))
+            means, block, along = jax.lax.fori_loop(1, groups, of_group, (means, block, along))
+            gram = jax.lax.fori_loop(0, pairs_of(groups), of_pair, gram)
+        squares = jnp.sum(seen.log_variance) + jnp.sum(standardised**2)
+        log_density = so_far.sums.log_density + jnp.sum(given.log_scale) - 0.5 * squares
+        return Passed(
+            seen.belief,
+            means,
+            block,
+            jax.lax.dynamic_update_slice_in_dim(so_far.standardised, standardised, start, 0),
+            jax.lax.dynamic_update_slice_in_dim(so_far.columns, block.reshape(most, size, 2, columns), start, 1),
+            jax.lax.dynamic_update_slice_in_dim(so_far.free, given.free, start, 0),
+            Sums(log_density, along, gram),
+            stretch,
+        )
+
+    sums = Sums(jnp.zeros(()), jnp.zeros((most, columns)), jnp.zeros((pairs_of(most), columns, columns)))
+    begin = Passed(
+        no_belief(1 + columns),
+        jnp.zeros((most, STATES, columns)),
+        jnp.zeros((most, 2 * size, columns)),
+        jnp.zeros((count, 2)),
+        jnp.zeros((most, count, 2, columns)),
+        jnp.zeros((count, 4)),
+        sums,
+        no_moves(arrays.moves),
+    )
     return jax.lax.fori_loop(0, blocks, through, begin)
 
 
 class RepeatedErrors(eqx.Module):
     """What all looks say of the errors at places: those divided by `root` are N(mean, (factor factor')^-1).
 
-    A priori they are N(0, 1). `log_determinant` is that of the variance which they add to all looks.
+    A priori they are N(0, 1). `explained` is the mean times the transposed factor. Many points with leading axes.
     """
 
-    root: Float[Array, "errors errors"]
-    mean: Float[Array, " errors"]
-    factor: Float[Array, "errors errors"]
-    log_determinant: Scalar
+    root: Float[Array | np.ndarray, "*batch errors errors"]
+    factor: Float[Array | np.ndarray, "*batch errors errors"]
+    explained: Float[Array | np.ndarray, "*batch errors"]
 
-    @property
-    def errors_rad(self) -> Float[Array, " errors"]:
-        """Their mean, rad."""
-        return self.root @ self.mean
+    @classmethod
+    def of(cls, sums: Sums, root: Any, functions: ModuleType = jnp) -> RepeatedErrors:
+        """Normal equations of the errors at places.
 
-    def drawn_rad(self, normal: Float[Array, " errors"]) -> Float[Array, " errors"]:
-        """One draw of them, rad, from standard normal numbers."""
-        return self.root @ (self.mean + jax.scipy.linalg.solve_triangular(self.factor, normal, lower=True, trans=1))
+        Args:
+            sums: of all groups, or of the first of them.
+            root: of the prior covariance of their errors, rad.
+            functions: jax.numpy or numpy.
+        """
+        xp, groups = functions, sums.along.shape[-2]
+        one, two = np.indices((groups, groups))
+        given = sums.gram[..., pairs_of(np.maximum(one, two)) + np.minimum(one, two), :, :]
+        whole = xp.where((one < two)[:, :, None, None], given.swapaxes(-2, -1), given)
+        size, half = root.shape[-1], sums.along.shape[-1] // 2
+        batch = sums.along.shape[:-2]
+        along = xp.einsum("...gkp->...kgp", sums.along.reshape(*batch, groups, 2, half)).reshape(*batch, size)
+        whole = xp.einsum("...ghkplq->...kgplhq", whole.reshape(*batch, groups, groups, 2, half, 2, half))
+        back = root.swapaxes(-2, -1)
+        precision = xp.eye(size) + back @ whole.reshape(*batch, size, size) @ root
+        slope = (back @ along[..., None])[..., 0]
+        # Its last row divides the slope by the factor; its last pivot, which nobody reads, is positive.
+        corner = 1 + xp.sum(slope**2, axis=-1)[..., None, None]
+        below = xp.concatenate([slope[..., None, :], corner], axis=-1)
+        bordered = xp.concatenate([xp.concatenate([precision, slope[..., None]], axis=-1), below], axis=-2)
+        factor = xp.linalg.cholesky(bordered)
+        return cls(root, factor[..., :-1, :-1], factor[..., -1, :-1])
 
+    def log_density(self, functions: ModuleType = jnp) -> Any:
+        """What the errors add to the log density of the spots (least squares: r'r - b' P^-1 b)."""
+        logs = functions.log(functions.diagonal(self.factor, axis1=-2, axis2=-1))
+        return 0.5 * functions.sum(self.explained**2, axis=-1) - functions.sum(logs, axis=-1)
 
-def repeated_errors(gram: Float[Array, "columns columns"], root: Float[Array, "errors errors"]) -> RepeatedErrors:
-    """Normal equations of the errors at places.
-
-    Args:
-        gram: products of the standardised residual and of the columns of those errors, as in `Passed`.
-        root: of their prior covariance.
-    """
-    precision = jnp.eye(len(root)) + root.T @ gram[1:, 1:] @ root
-    factor = jnp.linalg.cholesky(precision)
-    mean = jax.scipy.linalg.cho_solve((factor, True), root.T @ gram[1:, 0])
-    return RepeatedErrors(root, mean, factor, 2 * jnp.sum(jnp.log(jnp.diagonal(factor))))
+    def drawn(self, normal: Any, functions: ModuleType = jnp) -> Any:
+        """One draw of them from standard normal numbers, divided by `root`; zeros give their mean."""
+        return functions.linalg.solve(self.factor.swapaxes(-2, -1), (self.explained + normal)[..., None])[..., 0]
 
 
 class Innovations(eqx.Module):
@@ -400,38 +506,30 @@ def innovations(
     """
     every = len(arrays.spots.valid) // block_size(arrays.spots)
     seen = passed(model, arrays, every if blocks is None else blocks)
-    log_density = seen.log_density - 0.5 * seen.gram[0, 0]
-    size = len(arrays.gears.places.steps)
-
-    def without_places(places):
-        if not places:
-            return Innovations(whole(seen.standardised[..., 0]), jnp.zeros(2 * size), jnp.zeros(2 * size), log_density)
-        columns = 1 + 2 * places
-        root = root_at_places(model, arrays.gears.first(places))
-        found = repeated_errors(seen.gram[:columns, :columns], root)
-        own = seen.standardised[..., 0] - seen.standardised[..., 1:columns] @ found.errors_rad
-        # The errors at places explain this much of the squares (least squares: r'r - b' P^-1 b).
-        explained = jnp.dot(seen.gram[1:columns, 0], found.errors_rad) - found.log_determinant
-        drawn = found.drawn_rad(cut(normal, places))
-        return Innovations(whole(own), filled_up(found.mean), filled_up(drawn), log_density + 0.5 * explained)
-
-    def whole(own):
-        return jnp.concatenate([own, seen.free], axis=1)
-
-    def filled_up(errors):
-        return jnp.pad(errors.reshape(2, -1), ((0, 0), (0, size - len(errors) // 2))).ravel()
-
-    def cut(errors, places):
-        return errors.reshape(2, -1)[:, :places].ravel()
-
-    return with_filled(arrays.gears, without_places)
+    standardised, log_density, none = seen.standardised, jnp.asarray(seen.sums.log_density), jnp.zeros(0)
+    if not arrays.gears.groups:
+        return Innovations(jnp.concatenate([standardised, seen.free], axis=1), none, none, log_density)
+    found = RepeatedErrors.of(seen.sums, root_at_places(model, arrays.gears))
+    mean = jnp.asarray(found.drawn(jnp.zeros_like(normal)))
+    by_group = (found.root @ mean).reshape(2, arrays.gears.groups, -1).swapaxes(0, 1).reshape(arrays.gears.groups, -1)
+    standardised = standardised - jnp.einsum("gsce,ge->sc", seen.columns, by_group)
+    drawn = jnp.asarray(found.root @ found.drawn(normal))
+    whole = jnp.concatenate([standardised, seen.free], axis=1)
+    return Innovations(whole, mean, drawn, jnp.asarray(log_density + found.log_density()))
 
 
-@compiled(jax.Array)
-def _prior_errors(
-    z: Float[Array, "batch parameters"], normal: Float[Array, "batch errors"], space: ParameterSpace, gears: GearArrays
-) -> Float[Array, "batch errors"]:
-    return jax.vmap(lambda z, normal: root_at_places(space.model(z), gears) @ normal)(z, normal)
+def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> np.ndarray:
+    """Factors of the covariance of errors at places as in `root_at_places`, shape (n, errors, errors).
+
+    Args:
+        values: of all parameters in the units of their names, shape (n, p).
+        space: priors.
+        gears: as NumPy arrays.
+    """
+    places, ratio = gears.places, np.radians(values[:, RATIO_COLUMNS])
+    angle_rad = places.steps * np.where(places.on_tilt, ratio[:, 1:], ratio[:, :1])
+    scales = scales_at(values, np.asarray(space.harmonic_period_deg))
+    return np.asarray(place_root(scales, angle_rad, places.on_tilt, places.valid, np))
 
 
 def prior_errors_at_places(
@@ -445,8 +543,12 @@ def prior_errors_at_places(
         space: priors.
         arrays: the campaign.
     """
-    given = errors_at(normal, len(arrays.gears.places.steps))
-    return np.asarray(_prior_errors(z, given, space, arrays.gears))[:, arrays.gears.errors_filled]
+    gears = arrays.gears.without_padding()
+
+    def drawn(z: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        return (roots_at(space.values(z), space, gears) @ normal[..., None])[..., 0]
+
+    return in_batches(drawn, z, normal)
 
 
 def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Scalar:
@@ -455,36 +557,27 @@ def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: C
     return innovations(space.model(z), arrays, still).log_density - 0.5 * jnp.dot(z, z)
 
 
-class Evaluation(eqx.Module):
-    """Log posterior density and errors at places as in `Innovations`; many points give every field a leading axis."""
-
-    log_density: Float[Array | np.ndarray, "*batch"]
-    place_errors_rad: Float[Array | np.ndarray, "*batch errors"]
-
-
-@compiled(Evaluation)
-def _evaluate(
-    z: Float[Array, "batch parameters"],
-    normal: Float[Array, "batch errors"],
-    space: ParameterSpace,
-    arrays: CampaignArrays,
-) -> Evaluation:
+@compiled(Sums)
+def _sums(values: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Sums:
     blocks = blocks_filled(arrays)
+    return jax.vmap(lambda values: passed(space.model_at(values), arrays, blocks).sums)(values)
 
-    def one(z, normal):
-        seen = innovations(space.model(z), arrays, normal, blocks)
-        return Evaluation(seen.log_density - 0.5 * jnp.dot(z, z), seen.place_errors_rad)
 
-    return jax.vmap(one)(z, normal)
+@dataclass(frozen=True)
+class Evaluation:
+    """Of many points: log posterior density (n,) and errors at places (n, e) as in `Innovations`."""
+
+    log_density: np.ndarray
+    place_errors_rad: np.ndarray
 
 
 def evaluate(
-    z: Float[Array | np.ndarray, "batch parameters"],
-    normal: Float[Array | np.ndarray, "batch errors"],
+    z: Float[Array | np.ndarray, "points parameters"],
+    normal: Float[Array | np.ndarray, "points errors"],
     space: ParameterSpace,
     arrays: CampaignArrays,
 ) -> Evaluation:
-    """`log_density` of many points in one call; call it with one batch size, each compiles anew.
+    """`log_density` of many points; NaN where the model has no value.
 
     Args:
         z: coordinates, shape (n, p).
@@ -492,21 +585,56 @@ def evaluate(
         space: priors.
         arrays: the campaign.
     """
-    found = _evaluate(z, errors_at(np.asarray(normal), len(arrays.gears.places.steps)), space, arrays)
-    errors_rad = np.asarray(found.place_errors_rad)[:, arrays.gears.errors_filled]
-    return Evaluation(np.asarray(found.log_density), errors_rad)
+    gears = arrays.gears.without_padding()
+    pairs = pairs_of(gears.groups)
+
+    def sums(values: np.ndarray) -> Sums:
+        found = _sums(values, space, arrays)
+        along, gram = np.asarray(found.along), np.asarray(found.gram)
+        return Sums(np.asarray(found.log_density), along[:, : gears.groups], gram[:, :pairs])
+
+    def added(values: np.ndarray, sums: Sums, normal: np.ndarray) -> Evaluation:
+        try:
+            found = RepeatedErrors.of(sums, roots_at(values, space, gears), np)
+        except np.linalg.LinAlgError:
+            if len(values) == 1:
+                return Evaluation(np.full(1, np.nan), np.zeros(normal.shape))
+            rows = [slice(k, k + 1) for k in range(len(values))]
+            return _joined([added(values[k], jax.tree.map(lambda x, k=k: x[k], sums), normal[k]) for k in rows])
+        errors_rad = (found.root @ found.drawn(normal, np)[..., None])[..., 0]
+        return Evaluation(sums.log_density + found.log_density(np), errors_rad)
+
+    def block(z: np.ndarray, normal: np.ndarray) -> Evaluation:
+        values = space.values(z)
+        found = in_batches(sums, values)
+        finite = np.isfinite(found.log_density) & np.isfinite(values).all(axis=1)
+        log_density, errors_rad = np.where(finite, found.log_density, np.nan), np.zeros(normal.shape)
+        if gears.groups and finite.any():
+            own = added(values[finite], jax.tree.map(lambda x: x[finite], found), normal[finite])
+            log_density[finite], errors_rad[finite] = own.log_density, own.place_errors_rad
+        return Evaluation(log_density - 0.5 * np.sum(z**2, axis=1), errors_rad)
+
+    given = [np.asarray(z), np.asarray(normal)]
+    parts = [[x[k : k + POINTS_TOGETHER] for x in given] for k in range(0, len(z), POINTS_TOGETHER)]
+    return _joined([block(*part) for part in parts])
+
+
+def _joined(parts: Sequence[Evaluation]) -> Evaluation:
+    return Evaluation(
+        np.concatenate([part.log_density for part in parts]), np.concatenate([part.place_errors_rad for part in parts])
+    )
 
 
 @compiled(jax.Array)
 def _residuals(
-    z: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays, first: Int[Array, ""]
+    values: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays, first: Int[Array, ""]
 ) -> Float[Array, "batch spots 4"]:
     """Of `WINDOW` spots from the first on."""
     size, window = block_size(arrays.spots), min(WINDOW, len(arrays.spots.valid))
     blocks = jnp.minimum(blocks_filled(arrays) - first // size, window // size)
 
-    def one(z):
-        model = space.model(z)
+    def one(values):
+        model = space.model_at(values)
 
         def through(number, so_far):
             seen, stretch = so_far
@@ -518,11 +646,11 @@ def _residuals(
 
         return jax.lax.fori_loop(0, blocks, through, (jnp.zeros((window, 4)), no_moves(arrays.moves)))[0]
 
-    return jax.vmap(one)(z)
+    return jax.vmap(one)(values)
 
 
 def residuals(
-    z: Float[Array | np.ndarray, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays
+    z: Float[Array | np.ndarray, "points parameters"], space: ParameterSpace, arrays: CampaignArrays
 ) -> np.ndarray:
     """Observed - predicted of all spots in units of their noise, ranges projected out, before any filter.
 
@@ -534,8 +662,8 @@ def residuals(
     Returns:
         Shape (n, spots, 4), without padding.
     """
-    count = int(arrays.count)
-    parts = [np.asarray(_residuals(z, space, arrays, np.int32(first))) for first in range(0, count, WINDOW)]
+    count, values = int(arrays.count), space.values(z)
+    parts = [np.asarray(_residuals(values, space, arrays, np.int32(first))) for first in range(0, count, WINDOW)]
     return np.concatenate(parts, axis=1)[:, :count]
 
 

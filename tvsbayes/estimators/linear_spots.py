@@ -20,20 +20,18 @@ from jaxtyping import Array, Float
 from scipy import linalg
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.estimators.likelihood import filter_rows, place_columns, root_at_places, standing
+from tvsbayes.estimators.likelihood import filter_rows, place_columns, roots_at, standing
 from tvsbayes.estimators.look_jacobian import look_jacobian
-from tvsbayes.model.geometry import materialise
-from tvsbayes.model.parameter_space import ParameterSpace
+from tvsbayes.model.parameter_space import ParameterSpace, Point
 
 
-class Linearised(eqx.Module):
-    """The campaign linearised at coordinates `z`; first axis of the Jacobians is the spot.
+class LinearLooks(eqx.Module):
+    """Spots linearised at a point; first axis of the Jacobians, as of everything, is the spot.
 
     Residuals, slopes and what follows from them are in units of the noise of a look, its scatter included.
-    `place_columns` is d(predicted)/d(errors at places, rad), `place_root` the factor of their prior covariance.
+    `place_columns` is d(predicted)/d(errors at places, rad).
     """
 
-    z: Float[Array | np.ndarray, " parameters"]
     residual: Float[Array | np.ndarray, "spots 4"]
     slope: Float[Array | np.ndarray, "spots 4 2"]
     play_sd_rad: Float[Array | np.ndarray, "spots 2"]
@@ -43,31 +41,37 @@ class Linearised(eqx.Module):
     drift_variance: Float[Array | np.ndarray, "spots 2"]
     scatter_variance: Float[Array | np.ndarray, "spots 2"]
     place_columns: Float[Array | np.ndarray, "spots 4 errors"]
-    place_root: Float[Array | np.ndarray, "errors errors"]
     residual_jacobian: Float[Array | np.ndarray, "spots 4 parameters"]
     predicted_jacobian: Float[Array | np.ndarray, "spots 5 parameters"]
 
+
+class Linearised(LinearLooks):
+    """A campaign linearised at coordinates `z`, without padding; `place_root` is the prior's of the errors at places.
+
+    It is the factor of their covariance, rad.
+    """
+
+    z: Float[Array | np.ndarray, " parameters"]
+    place_root: Float[Array | np.ndarray, "errors errors"]
+
     @classmethod
-    def joined(cls, parts: Sequence[Linearised], count: int, errors: np.ndarray) -> Linearised:
-        """One after the other: the first `count` spots, and some of the errors at places, as NumPy arrays."""
+    def joined(
+        cls, parts: Sequence[LinearLooks], point: Point, space: ParameterSpace, arrays: CampaignArrays
+    ) -> Linearised:
+        """One after the other, at the places that are filled, as NumPy arrays."""
+        count, gears = int(arrays.count), arrays.gears.without_padding()
         given = {
             field.name: np.concatenate([np.asarray(getattr(part, field.name)) for part in parts])[:count]
-            for field in fields(cls)
-            if field.name not in ("z", "place_root")
+            for field in fields(LinearLooks)
         }
-        root = np.asarray(parts[0].place_root)[np.ix_(errors, errors)]
-        given["place_columns"] = given["place_columns"][..., errors]
-        return cls(z=np.asarray(parts[0].z), place_root=root, **given)
+        given["place_columns"] = given["place_columns"][..., arrays.gears.errors_filled]
+        root = roots_at(np.asarray(point.values)[None], space, gears)[0] if gears.filled else np.zeros((0, 0))
+        return cls(**given, z=np.asarray(point.z), place_root=root)
 
     @property
     def place_load(self) -> Float[Array | np.ndarray, "spots 4 errors"]:
         """d(predicted)/d(errors at places) in units in which they are N(0, 1) a priori."""
         return self.place_columns @ self.place_root
-
-    def of_spots(self, count: int) -> Linearised:
-        """The first `count` spots, as NumPy arrays: padding comes last."""
-        parts = {field.name: np.asarray(getattr(self, field.name)) for field in fields(self)}
-        return Linearised(**{n: part if n in ("z", "place_root") else part[:count] for n, part in parts.items()})
 
     def spot_deviations(self) -> SpotDeviations:
         """Least squares of the whitened residuals, spot by spot; covariance 0 where a spot tells neither angle."""
@@ -91,30 +95,27 @@ class SpotDeviations:
 
 
 def linearise(
-    z: Float[Array, " parameters"],
+    at: Point,
     space: ParameterSpace,
     arrays: CampaignArrays,
     inflation: Float[Array | np.ndarray, ""] | float = 1.0,
-) -> Linearised:
+) -> LinearLooks:
     """Residuals, ideal observations at the observed ranges, and d/d(coordinates) of both; noise scales are held.
 
     Args:
-        z: coordinates.
+        at: coordinates and the values that they stand for.
         space: priors.
         arrays: the campaign.
         inflation: factor on pixel and aperture noise.
     """
-    physical = materialise(space.physical(z))
-    model = space.model_at(physical)
+    model = space.model_at(jnp.asarray(at.values))
     found = standing(model, arrays, inflation)
     looks, terms = found.looks, found.terms
-    by_coordinates = look_jacobian(z, physical, space, looks, arrays)
+    by_coordinates = look_jacobian(at, space, looks, arrays)
     unit_noise = found.to_states.in_place
     residuals = unit_noise(terms.range_out.of_many(found.noise.whitened(by_coordinates, arrays.spots))[1:])
     slope = jnp.stack([jnp.stack(unit_noise(own), axis=1) for own in (terms.by_pan, terms.by_tilt)], axis=2)
-    root = root_at_places(model, arrays.gears)
-    return Linearised(
-        z=z,
+    return LinearLooks(
         residual=jnp.stack(unit_noise(terms.residual), axis=1),
         slope=slope,
         play_sd_rad=found.play_sd_rad,
@@ -124,7 +125,6 @@ def linearise(
         drift_variance=found.drift_variance,
         scatter_variance=found.scatter_variance,
         place_columns=place_columns(slope, arrays.gears),
-        place_root=root,
         residual_jacobian=-jnp.stack(residuals).transpose(2, 0, 1),
         predicted_jacobian=jnp.stack(by_coordinates).transpose(2, 0, 1),
     )

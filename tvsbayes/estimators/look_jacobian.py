@@ -27,7 +27,7 @@ from tvsbayes.instrument.parameters import (
 )
 from tvsbayes.model.geometry import materialise, rotation_matrix, transform
 from tvsbayes.model.laser_path import trace
-from tvsbayes.model.parameter_space import Model, ParameterSpace
+from tvsbayes.model.parameter_space import Model, ParameterSpace, Point
 
 
 def _columns(*blocks: str) -> np.ndarray:
@@ -47,18 +47,11 @@ IN_ORDER = np.argsort(np.concatenate([GEARS, OPTICS, FRAMES, CAMERAS, RECEIVER, 
 """Places of the coordinates in these blocks, one after the other: every coordinate has one."""
 
 
-def look_jacobian(
-    z: Float[Array, " parameters"],
-    physical: Float[Array, " parameters"],
-    space: ParameterSpace,
-    looks: Looks,
-    arrays: CampaignArrays,
-) -> Numbers:
+def look_jacobian(at: Point, space: ParameterSpace, looks: Looks, arrays: CampaignArrays) -> Numbers:
     """d(predicted)/d(coordinates) at held ranges, shape (parameters, spots) for each of the five components.
 
     Args:
-        z: coordinates.
-        physical: the values that they stand for.
+        at: coordinates and the values that they stand for.
         space: priors.
         looks: at these coordinates.
         arrays: the campaign.
@@ -68,11 +61,11 @@ def look_jacobian(
         """How a part of the model moves with some parameters in the units of their names, columns first."""
 
         def along(direction: Float[Array, " parameters"]) -> PyTree:
-            return jax.jvp(lambda at: part(space.model_at(at)), (physical,), (direction,))[1]
+            return jax.jvp(lambda values: part(space.model_at(values)), (jnp.asarray(at.values),), (direction,))[1]
 
         return materialise(jax.vmap(along)(jnp.asarray(np.eye(len(NAMES))[columns])))
 
-    turn = rotation_matrix(space.model_at(physical).extrinsics.rotation_rad)
+    turn = rotation_matrix(space.model_at(jnp.asarray(at.values)).extrinsics.rotation_rad)
     pan, tilt = jnp.moveaxis(moved(GEARS, lambda m: spot_angles(m, arrays).angle_rad), 2, 0)
     ways_p = moved(OPTICS, lambda m: trace(m.optics, looks.pan_rad, looks.tilt_rad)).at(looks.range_mm)
     ways_s = moved(FRAMES, lambda m: in_frame_s(m.extrinsics, looks.points_p_mm))
@@ -88,7 +81,7 @@ def look_jacobian(
         [by_gears[4], by_optics[4], still[1], still[2], reading, still[0]]
     ]
     rig = len(RIG_NAMES)
-    slope = materialise(space.slopes(z, physical)[:, None])
+    slope = at.slopes[:, None]
 
     def by_coordinates(by_values: Float[Array, "parameters spots"]) -> Float[Array, "parameters spots"]:
         # Of the rig every value has a coordinate of its own; the cameras' values share theirs.

@@ -180,7 +180,7 @@ def spot_angles(model: Model, arrays: CampaignArrays) -> MirrorAngles:
 
 @compiled(jax.Array)
 def _observed(
-    z: Float[Array, "batch parameters"],
+    values: Float[Array, "batch parameters"],
     turned_rad: Float[Array, "batch spots 2"],
     space: ParameterSpace,
     arrays: CampaignArrays,
@@ -188,8 +188,8 @@ def _observed(
 ) -> Float[Array, "batch spots 5"]:
     part = arrays.of_spots(first, turned_rad.shape[1])
 
-    def one(z, turned):
-        model = space.model(z)
+    def one(values, turned):
+        model = space.model_at(values)
         pan, tilt = spot_angles(model, part).angle_rad.T + turned.T
         if part.spots.tangents is not None:
             angles_rad = angles_seen(trace(model.optics, pan, tilt).direction, part.spots)
@@ -198,7 +198,7 @@ def _observed(
         ranges_mm = nearest_range(model.extrinsics, trace(model.optics, pan, tilt), triangulated)
         return observe(model, jnp.stack([pan, tilt, ranges_mm]), part.azimuth_convention).T
 
-    return jax.vmap(one)(z, turned_rad)
+    return jax.vmap(one)(values, turned_rad)
 
 
 def observe_with_stop_errors(
@@ -217,9 +217,10 @@ def observe_with_stop_errors(
         u_left, v_left, u_right, v_right (px), aperture reading (rad), shape (n, spots, 5), without padding.
     """
     count, window, found = int(arrays.count), min(WINDOW, len(arrays.spots.valid)), []
+    values = space.values(z)
     for first in range(0, count, window):
         own = stop_error_rad[:, first : min(first + window, count)]
         filled = np.zeros((len(z), window, 2))
         filled[:, : own.shape[1]] = own
-        found.append(np.asarray(_observed(z, filled, space, arrays, np.int32(first)))[:, : own.shape[1]])
+        found.append(np.asarray(_observed(values, filled, space, arrays, np.int32(first)))[:, : own.shape[1]])
     return np.concatenate(found, axis=1)

@@ -28,7 +28,7 @@ from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.conditions import unseen_shifts
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, NOISE_NAMES, names_of
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.compiled import in_batches, placed
+from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import Places, place_root
 from tvsbayes.model.parameter_space import ParameterSpace, free_mask, parameter_space, physical_at
@@ -150,7 +150,7 @@ class Problem:
     def negative_log_density(self, z: np.ndarray) -> np.ndarray:
         """Of many points (n, p); infinite where the model has no value."""
         still = no_draw(len(z), self.arrays)
-        found = in_batches(lambda at, draw: evaluate(at, draw, self.space, self.arrays).log_density, z, still)
+        found = evaluate(z, still, self.space, self.arrays).log_density
         return np.where(np.isfinite(found), -found, np.inf)
 
     def noise_scales(self, z: np.ndarray) -> np.ndarray:

@@ -16,7 +16,6 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, NOISE_NAMES
-from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.parameter_space import ParameterSpace
 
 STEP = 0.05
@@ -57,7 +56,7 @@ class ScalesAlone:
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """At points (n, p) that differ in their noise scales, shape (n,)."""
         arrays, still = self.fit.arrays, no_draw(len(z), self.fit.arrays)
-        joint = in_batches(lambda at, draw: evaluate(at, draw, self._space, arrays).log_density, z, still)
+        joint = evaluate(z, still, self._space, arrays).log_density
         found = joint + np.array([self._room(point) for point in z])
         return np.where(np.isfinite(found), found, -np.inf)
 

@@ -76,7 +76,7 @@ def place_root(
 
     Args:
         scales: of the processes, fields with any leading axes.
-        angle_rad: k n of the places, shape (places,).
+        angle_rad: k n of the places, shape (..., places).
         on_tilt: as in `Places`.
         valid: likewise.
         functions: jax.numpy or numpy.
@@ -84,8 +84,8 @@ def place_root(
     Returns:
         Rad; zero but on the diagonal for padding.
     """
-    xp, size = functions, len(angle_rad)
-    distance = angle_rad[:, None] - angle_rad[None, :]
+    xp, size = functions, angle_rad.shape[-1]
+    distance = angle_rad[..., :, None] - angle_rad[..., None, :]
     together = (on_tilt[:, None] == on_tilt[None, :]) & valid[:, None] & valid[None, :]
 
     def rows(of_axis: Any) -> Any:

@@ -18,7 +18,6 @@ from tvsbayes.instrument.parameters import BLOCKS, COLUMNS, INDEX, QUANTITIES, T
 from tvsbayes.instrument.quantities import Quantity
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.gear_processes import Places, errors_at
-from tvsbayes.model.geometry import materialise
 from tvsbayes.model.laser_path import BeamAngles, Transmission, beam_angles, trace
 from tvsbayes.model.parameter_space import Model, ParameterSpace
 
@@ -141,10 +140,10 @@ class Derived(eqx.Module):
         place_errors_rad: transmission errors, then plays, at the places; empty where gears do not vary.
     """
 
-    physical: Float[Array, " parameters"]
-    modelled: Float[Array, " modelled"]
-    jacobian: Float[Array, "2 2"]
-    place_errors_rad: Float[Array, " errors"]
+    physical: Float[Array | np.ndarray, "*draws parameters"]
+    modelled: Float[Array | np.ndarray, "*draws modelled"]
+    jacobian: Float[Array | np.ndarray, "*draws 2 2"]
+    place_errors_rad: Float[Array | np.ndarray, "*draws errors"]
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Of a parameter or of `DERIVED`, with the leading axes of the fields."""
@@ -206,21 +205,27 @@ def line_deg_per_step(
     return jnp.stack([whole + half, whole - half], axis=1).ravel() * DEGREES
 
 
-@compiled(Derived)
-def _derived(
-    z: Float[Array, "draws parameters"],
+class _Modelled(eqx.Module):
+    """The fields of `Derived` that the model gives."""
+
+    modelled: Float[Array, "*draws modelled"]
+    jacobian: Float[Array, "*draws 2 2"]
+
+
+@compiled(_Modelled)
+def _modelled(
+    values: Float[Array, "draws parameters"],
     place_errors_rad: Float[Array, "draws errors"],
     space: ParameterSpace,
     seen: SeenLine,
-) -> Derived:
-    def one(z, errors):
-        physical = materialise(space.physical(z))
-        model = space.model_at(physical)
+) -> _Modelled:
+    def one(values, errors):
+        model = space.model_at(values)
         angles = beam_angles(model.optics, seen.pose_rad[0], seen.pose_rad[1])
         at = AtPose(model, angles, line_deg_per_step(model, seen, errors, angles))
-        return Derived(physical, values_of(at, _MODELLED_BLOCKS), angles.jacobian, errors)
+        return _Modelled(values_of(at, _MODELLED_BLOCKS), angles.jacobian)
 
-    return jax.vmap(one)(z, place_errors_rad)
+    return jax.vmap(one)(values, place_errors_rad)
 
 
 def derived_quantities(
@@ -237,6 +242,6 @@ def derived_quantities(
         space: priors.
         seen: lines.
     """
-    given = np.asarray(place_errors_rad)
-    found = _derived(z, errors_at(given, max(len(seen.places.steps), given.shape[1] // 2)), space, seen)
-    return eqx.tree_at(lambda of: of.place_errors_rad, jax.tree.map(np.asarray, found), given)
+    given, values = np.asarray(place_errors_rad), space.values(z)
+    found = _modelled(values, errors_at(given, max(len(seen.places.steps), given.shape[1] // 2)), space, seen)
+    return Derived(values, np.asarray(found.modelled), np.asarray(found.jacobian), given)

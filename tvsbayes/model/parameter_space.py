@@ -143,6 +143,14 @@ FARTHEST_SD = 36.0
 """Coordinates of half-normals beyond are taken for this."""
 
 
+class Point(eqx.Module):
+    """Coordinates, values in the units of `NAMES`, and d(value)/d(coordinate) of the rig's parameters."""
+
+    z: Float[Array | np.ndarray, " parameters"]
+    values: Float[Array | np.ndarray, " parameters"]
+    slopes: Float[Array | np.ndarray, " rig"]
+
+
 class ParameterSpace(eqx.Module):
     """Priors of one rig as arrays; an argument of the jitted functions, never a constant in them.
 
@@ -167,9 +175,21 @@ class ParameterSpace(eqx.Module):
         """Coordinates -> values in the units of `NAMES`."""
         return _values(self, z, jnp, _half_normal)
 
-    def slopes(self, z: Float[Array, " parameters"], physical: Float[Array, " parameters"]) -> Float[Array, " rig"]:
-        """d(value)/d(coordinate) of the rig's parameters, at coordinates and the values that they stand for."""
-        return _slopes(self, z, physical, jnp)
+    def values(self, z: Float[Array | np.ndarray, "*points parameters"]) -> np.ndarray:
+        """The same of many points (..., p), in NumPy."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(_values(jax.tree.map(np.asarray, self), np.asarray(z), np, half_normal))
+
+    def point(self, z: Float[Array, " parameters"]) -> Point:
+        """A point by its coordinates."""
+        values = materialise(self.physical(z))
+        return Point(z, values, _slopes(self, z, values, jnp))
+
+    def known_point(self, z: np.ndarray) -> Point:
+        """The same in NumPy."""
+        known, values = jax.tree.map(np.asarray, self), self.values(z)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return Point(z, values, np.asarray(_slopes(known, z, values, np)))
 
     def model(self, z: Float[Array, " parameters"]) -> Model:
         """Coordinates -> model."""
@@ -182,7 +202,7 @@ class ParameterSpace(eqx.Module):
 
 def _values(space: ParameterSpace, z: Any, functions: ModuleType, half_normal: Callable[[Any], Any]) -> Any:
     """Coordinates -> values in the units of `NAMES`, by functions of JAX or of NumPy."""
-    rig_z, stereo_z = z[: len(RIG_NAMES)], z[len(RIG_NAMES) :]
+    rig_z, stereo_z = z[..., : len(RIG_NAMES)], z[..., len(RIG_NAMES) :]
     half, log = (space.kind == KINDS.index(kind) for kind in ("half-normal", "log-normal"))
     # Unused branches are fed harmless numbers: `where` lets their infinities into the gradient.
     # Beyond 37 sd Phi underflows and its inverse has no value: a fit may stray there, and must come back.
@@ -190,7 +210,7 @@ def _values(space: ParameterSpace, z: Any, functions: ModuleType, half_normal: C
     log_normal = space.value * functions.exp(functions.where(log, space.u, 0.0) * rig_z)
     other = functions.where(log, log_normal, space.value + space.u * rig_z)
     rig = functions.where(half, space.u * half_normal(w), other)
-    return functions.concatenate([rig, space.stereo_mean + space.stereo_root @ stereo_z])
+    return functions.concatenate([rig, space.stereo_mean + stereo_z @ space.stereo_root.T], axis=-1)
 
 
 def _slopes(space: ParameterSpace, z: Any, values: Any, functions: ModuleType) -> Any:
@@ -329,12 +349,11 @@ class Physical:
 
 def physical_at(z: np.ndarray, space: ParameterSpace) -> Physical:
     """Values and slopes at a point (p,), in NumPy: nothing is compiled for one point."""
-    known: ParameterSpace = jax.tree.map(np.asarray, space)
-    value = _values(known, z, np, half_normal)
+    point = space.known_point(z)
     slope = np.zeros((len(z), len(z)))
-    slope[: len(RIG_NAMES), : len(RIG_NAMES)] = np.diag(_slopes(known, z, value, np))
-    slope[len(RIG_NAMES) :, len(RIG_NAMES) :] = known.stereo_root
-    return Physical(value, slope)
+    slope[: len(RIG_NAMES), : len(RIG_NAMES)] = np.diag(point.slopes)
+    slope[len(RIG_NAMES) :, len(RIG_NAMES) :] = np.asarray(space.stereo_root)
+    return Physical(np.asarray(point.values), slope)
 
 
 def coordinates_of(space: ParameterSpace, physical: np.ndarray) -> np.ndarray:

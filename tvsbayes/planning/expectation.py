@@ -248,7 +248,7 @@ def expect(
     if image_px is None:
         arrays = eqx.tree_at(lambda a: a.spots.tangents, arrays, tangents_at(arrays.spots.triangulated_mm))
     spots = arrays.spots
-    lin = linearise(z, space, arrays)
+    lin = linearise(space.point(z), space, arrays)
     jacobian = jnp.where(NOISE_COLUMNS, 0.0, -lin.residual_jacobian)
     jacobian = jnp.concatenate([jacobian, lin.slope @ turning], axis=2)
     columns = jnp.concatenate([jacobian, lin.slope], axis=2)

@@ -17,7 +17,7 @@ from tvsbayes.inference.density import Points
 from tvsbayes.inference.importance import Sample
 from tvsbayes.inference.proposal import Independence, first_proposal
 from tvsbayes.instrument.campaign import ordered_spots
-from tvsbayes.model.compiled import BATCH, in_batches
+from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names
 from tvsbayes.posterior.transport import Mapped, Transport
 
@@ -89,16 +89,12 @@ class Target:
 
     def at(self, w: np.ndarray, found: Mapped, normal: np.ndarray) -> Points:
         """Of points that are mapped already, with draws of the errors from standard normal numbers (n, e)."""
-
-        def value_and_errors(z: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            seen = evaluate(z, normal, self.fit.space, self.fit.arrays)
-            return np.asarray(seen.log_density), np.asarray(seen.place_errors_rad)
-
-        value, errors_rad = in_batches(value_and_errors, found.z, normal)
+        seen = evaluate(found.z, normal, self.fit.space, self.fit.arrays)
+        value, errors_rad = seen.log_density, seen.place_errors_rad
         invalid = np.isnan(value)
         self.invalid += int(invalid.sum())
         log_target = np.where(invalid, -np.inf, value - self.fit.log_density + found.log_jacobian)
-        parts = {"z": found.z, "log_jacobian": found.log_jacobian, "place_errors_rad": np.asarray(errors_rad)}
+        parts = {"z": found.z, "log_jacobian": found.log_jacobian, "place_errors_rad": errors_rad}
         return Points(w, log_target, parts)
 
     def log_density(self, points: Points) -> np.ndarray:
