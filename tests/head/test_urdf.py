@@ -103,6 +103,14 @@ def test_an_estimated_head_is_what_another_parser_reads():
         assert np.allclose(other[:3, 0], beam_of(terms, math.degrees(pan), -math.degrees(tilt)), atol=ROUNDING)
 
 
+def test_a_joint_without_an_origin_gets_one():
+    origin = b'    <origin rpy="0 0 -1.5707963267948966" xyz="0 -0.02 0.01" />\n'
+    head = head_joints(UNIT.replace(origin, b"").replace(b"1.5707963267948966", b"0"), "unit.urdf", BY_NAME)
+    found = head_joints(model(head, **OFF).urdf(head), "unit.urdf", BY_NAME).terms
+    for name, off in OFF.items():
+        assert found[name] == pytest.approx(head.terms[name] + off, abs=1e-7), name
+
+
 def test_a_later_correction_takes_the_place_of_an_earlier_one():
     head = head_joints(UNIT, "unit.urdf", BY_NAME)
     once = model(head, **OFF)

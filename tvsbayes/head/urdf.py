@@ -373,7 +373,8 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
     # The sense in which the joint counts stays.
     axis = link.inv().apply(new.axis * -head.sign["tilt"])
     if np.max(np.abs(axis - tilt.axis)) > SAME:
-        edits.append(_attribute(head.urdf, tilt.parts["axis"], "xyz", axis))
+        tag = tilt.parts["axis"]
+        edits.append((tag.begin, tag.end, _attribute(head.urdf.data[tag.begin : tag.end], "xyz", axis)))
     for name, value in reductions.items():
         text, at = head.urdf.transmissions[head.names[name]].texts["mechanicalReduction"]
         edits.append((at, at + len(text.encode()), f"{value:.12g}".encode()))
@@ -392,16 +393,15 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
     return data
 
 
-def _attribute(urdf: Urdf, tag: _Tag, name: str, values: np.ndarray) -> tuple[int, int, bytes]:
+def _attribute(text: bytes, name: str, values: np.ndarray) -> bytes:
     """A start tag with other numbers in an attribute."""
-    text = urdf.data[tag.begin : tag.end]
-    words = " ".join(f"{0.0 if abs(value) < SAME else value:.12g}" for value in values.tolist())
+    words = " ".join(f"{0.0 if abs(value) < SAME else value:.12g}" for value in values.tolist()).encode()
     found = re.compile(rb"(\b" + name.encode() + rb"\s*=\s*)(\"[^\"]*\"|'[^']*')")
-    written, count = found.subn(rb'\1"' + words.encode() + b'"', text)
-    if not count:
-        end = -2 if text.endswith(b"/>") else -1
-        written = text[:end].rstrip() + f' {name}="{words}"'.encode() + text[end:]
-    return tag.begin, tag.end, written
+    written, count = found.subn(rb'\1"' + words + b'"', text)
+    if count:
+        return written
+    end = -2 if text.endswith(b"/>") else -1
+    return text[:end].rstrip() + b" " + name.encode() + b'="' + words + b'"' + text[end:]
 
 
 def _origin(urdf: Urdf, joint: _Element, turn: Rotation, shift_m: np.ndarray) -> list[tuple[int, int, bytes]]:
@@ -410,16 +410,11 @@ def _origin(urdf: Urdf, joint: _Element, turn: Rotation, shift_m: np.ndarray) ->
     moved = bool(np.max(np.abs(shift_m - joint.shift_m)) > SAME)
     if not (turned or moved):
         return []
-    rpy = turn.as_euler("xyz")
-    if "origin" not in joint.parts:
-        words = [" ".join(f"{value:.12g}" for value in row) for row in (shift_m.tolist(), rpy.tolist())]
-        return [(joint.tag.end, joint.tag.end, f'\n    <origin xyz="{words[0]}" rpy="{words[1]}"/>'.encode())]
-    tag = joint.parts["origin"]
-    begin, end, text = tag.begin, tag.end, urdf.data[tag.begin : tag.end]
-    for name, values, changed in (("xyz", shift_m, moved), ("rpy", rpy, turned)):
-        if changed:
-            shifted = Urdf(text, urdf.root, {}, {}, {})
-            text = _attribute(shifted, _Tag({}, 0, len(text)), name, values)[2]
+    tag = joint.parts.get("origin")
+    begin, end = (joint.tag.end, joint.tag.end) if tag is None else (tag.begin, tag.end)
+    text = b"\n    <origin/>" if tag is None else urdf.data[begin:end]
+    for name, values, changed in (("xyz", shift_m, moved), ("rpy", turn.as_euler("xyz"), turned)):
+        text = _attribute(text, name, values) if changed else text
     return [(begin, end, text)]
 
 
