@@ -20,7 +20,7 @@ import numpy as np
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.rigs import mounted_rig, shipped_plan
-from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.rows import commit, output, read_rows, run_rows
 from tvsbayes.errors import TvsError
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
@@ -77,7 +77,7 @@ def one_head(task: tuple[str, int]) -> dict[str, object]:
     use_compilation_cache()
     simulated = simulate(head_of(kind), plan_of(kind, seed), seed)
     campaign, began = simulated.campaign, time.process_time()
-    row: dict[str, object] = {"kind": kind, "seed": seed, "answer": "none", "problems": []}
+    row: dict[str, object] = {"kind": kind, "seed": seed, "commit": commit(), "answer": "none", "problems": []}
     try:
         found = fit(campaign)
         row["problems"] = list(found.problems)
@@ -127,7 +127,12 @@ TEXT = """# Coverage over drawn pan-tilt heads
 Made by `python -m experiments.intervals.heads`. Heads drawn from the default priors of their kind (ratios 0.05(2)
 deg/step of heads with sightings), simulated with the twin's optics, fitted and sampled by importance. Coverage of the
 95 % interval and RMS z of the truth, of heads whose answer was accepted or rough; *prior*: the data take away less than
-a tenth of the prior's variance in the median head, which is not judged. Bounds are two-sided at 1e-4."""
+a tenth of the prior's variance in the median head, which is not judged. Bounds are two-sided at 1e-4.
+
+The line through the looks of one axis is taken with the other at its mean: the twin takes the mean by counters and mean
+ratio, the estimate the mean angle, which a difference of directions moves by degrees over 20 000 steps of travel. Where
+axes are not square that is another slope, and sightings are sharp enough to see it: `effective_deg_per_step` of
+sightings is held against the wrong line here."""
 
 
 def table(arguments: argparse.Namespace) -> None:
@@ -141,9 +146,10 @@ def table(arguments: argparse.Namespace) -> None:
         answers = Counter(row["answer"] for row in rows)
         told = ", ".join(f"{count} {word}" for word, count in answers.most_common())
         cpu = np.median([row["cpu_s"] for row in rows])
+        commits = ", ".join(dict.fromkeys(str(row.get("commit", "?")) for row in rows))
         low, high = (100 * share for share in binomial_bounds(len(good), LEVEL))
         least, most = rms_bounds(len(good))
-        print(f"\n## Heads with {kind}\n\n{len(rows)} heads: {told}; median {cpu:.0f} CPU s. ", end="")
+        print(f"\n## Heads with {kind}\n\n{len(rows)} heads: {told}; median {cpu:.0f} CPU s; commit {commits}. ", end="")
         print(f"Bounds {low:.0f} to {high:.0f} % and {least:.2f} to {most:.2f}.\n")
         print("| quantity | 95 % interval holds | RMS z | prior's variance taken away |\n|---|---|---|---|")
         every = []
