@@ -149,8 +149,8 @@ def table(arguments: argparse.Namespace) -> None:
         commits = ", ".join(dict.fromkeys(str(row.get("commit", "?")) for row in rows))
         low, high = (100 * share for share in binomial_bounds(len(good), LEVEL))
         least, most = rms_bounds(len(good))
-        print(f"\n## Heads with {kind}\n\n{len(rows)} heads: {told}; median {cpu:.0f} CPU s; commit {commits}. ", end="")
-        print(f"Bounds {low:.0f} to {high:.0f} % and {least:.2f} to {most:.2f}.\n")
+        print(f"\n## Heads with {kind}\n\n{len(rows)} heads: {told}; median {cpu:.0f} CPU s. ", end="")
+        print(f"Commit {commits}. Bounds {low:.0f} to {high:.0f} % and {least:.2f} to {most:.2f}.\n")
         print("| quantity | 95 % interval holds | RMS z | prior's variance taken away |\n|---|---|---|---|")
         every = []
         for name in good[0]["quantities"]:
