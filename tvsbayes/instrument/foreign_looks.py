@@ -19,7 +19,7 @@ from typing import Any
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.csv_kind import ID_MAX, Column
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.files.foreign_table import ForeignTable
+from tvsbayes.files.foreign_table import DAY_S, ForeignTable
 from tvsbayes.instrument.axes import AXES, SENSES, Axis
 from tvsbayes.instrument.campaign import (
     APERTURE_MAX_DEG,
@@ -52,7 +52,6 @@ NO_NUMBER = {"nan", "n/a", "#n/a", "null"}
 """What programs write into a cell that has no number, in small letters."""
 EPOCH_SCALES = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3}
 """Seconds of a unit by the least number that counts it since 1970; smaller ones are seconds."""
-DAY_S = 86400.0
 _FLAGS = {"": False, "0": False, "false": False, "1": True, "true": True}
 """Cells of a column that marks homings, in small letters."""
 _CLOCK = re.compile(r"[0-9]{1,2}:[0-9]{2}:[0-9]{2}(?:\.[0-9]{1,6})?")
