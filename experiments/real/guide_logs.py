@@ -81,7 +81,7 @@ ste7e/PHD2Insight, commit 7de4df4d1e), uncorrected motion as `import --axis` mak
 that it writes. Value(u) with 95 % interval, given that there is the wave, strongest first; P/2N: period / (2 N) for N
 periods in the run; arcsec: amplitude on the axis. The log names a driver, not a model: the worm is that of the
 driver's mount that is published; the strongest wave of 02 is not its worm's, which its record does not show. Ten runs
-at commit a7d7a1d.
+at commit fa06a88.
 
 | log, run | frames | strongest, s | 95 % | P/2N | arcsec | published | inside | further waves: arcsec every s | CPU s |
 |---|---|---|---|---|---|---|---|---|---|"""
