@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from support.axes import campaign, drawn, random_moves, runs
 
+from tvsbayes.single_axis import axis_mode
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis, model_of
+from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_periods import WaveSample, separate_periods, strong_harmonics
 from tvsbayes.single_axis.axis_record import summarise_axis
@@ -220,3 +222,18 @@ def test_a_period_at_the_end_of_its_range_is_doubted():
         asked = AskedPeriods(between=((60.0, high),), in_seconds=True)
         found = summarise_axis(fit_axis(drive(4, 5.0, asked), tier="importance"))
         assert any("lies at the end of the range" in text for text in found.warnings) == doubted, (high, found.periods)
+
+
+def test_a_search_that_gets_lost_begins_anew_within_bounds(monkeypatch):
+    """A long record with sharp waves sent it far out: there, and here by force, the bounded one finds the mode."""
+    model = model_of(drive(4, AMPLITUDE, AskedPeriods((PERIOD,), (), True)))
+    there, search = find_mode(model), axis_mode._searched
+
+    def lost(*arguments, bounded=False):
+        found = search(*arguments, bounded=bounded)
+        return found if bounded else replace(found, missing=("lost",), log_density=-1e9)
+
+    monkeypatch.setattr(axis_mode, "_searched", lost)
+    found = find_mode(model)
+    # Both end where the slope is small: within a tenth of a sd.
+    assert not there.missing and not found.missing and found.log_density == pytest.approx(there.log_density, abs=0.01)

@@ -17,6 +17,8 @@ STEP, CURVATURE_STEP = 1e-2, 5e-2
 CURVATURE_MIN = 0.3
 """Least curvature taken, in units of the prior's: where a scale is not needed the density is bent the other way."""
 
+BOUND = 5.0
+"""Standard normal coordinates beyond it are one in two million."""
 OFF_MAX = 1.0
 """Standard deviations from where a search ended to where slope and curvature there place the mode. A search that got
 there ends within 0.01, at a kink of the play (8.1) within 0.7; one that got lost ends beyond 3, 2.8 or more in log
@@ -103,13 +105,19 @@ def find_mode(model: AxisModel, near: Mapping[str, float] | None = None) -> Axis
     start = np.array([(near or {}).get(name, at) for name, at in zip(model.coordinates.names, start, strict=True)])
     found = _searched(model, start, width)
     if found.missing and len(found.w):
+        bounded = _searched(model, *_start(model, _repeat_sd(model)), bounded=True)
+        if not bounded.missing:
+            return bounded
         again = _searched(model, *_start(model, max(fit_line(model.rows).scatter, 1e-4 * model.rows.travel)))
         found = max(found, again, key=lambda mode: (not mode.missing, mode.log_density))
     return found
 
 
-def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray) -> AxisMode:
-    """The mode that a search finds from coordinates (d,) whose expected widths are (d,)."""
+def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray, bounded: bool = False) -> AxisMode:
+    """The mode that a search finds from coordinates (d,) whose expected widths are (d,).
+
+    A `bounded` one stays within `BOUND` of the priors' centres: a long step over a steep density ends far out.
+    """
     from scipy.optimize import minimize
 
     if not len(start):
@@ -123,7 +131,11 @@ def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray) -> AxisMod
     def slope(v: np.ndarray) -> np.ndarray:
         return -_gradients(model, (start + width * v)[None], width, STEP)[0]
 
-    best = minimize(value, np.zeros(len(start)), jac=slope, method="BFGS", options={"gtol": 1e-2, "maxiter": 200})
+    how, bounds = "BFGS", None
+    if bounded:
+        how, bounds = "L-BFGS-B", list(zip((-BOUND - start) / width, (BOUND - start) / width, strict=True))
+    options = {"gtol": 1e-2, "maxiter": 200}
+    best = minimize(value, np.zeros(len(start)), jac=slope, method=how, bounds=bounds, options=options)
     v = np.asarray(best.x)
     w = start + width * v
     shift = np.concatenate([np.diag(CURVATURE_STEP * width), np.diag(-CURVATURE_STEP * width)])

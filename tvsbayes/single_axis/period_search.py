@@ -211,10 +211,11 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], asked: AskedPeriod
     unknown = [replace(Wave.fixed(clock, low, unit), high=high) for low, high in asked.between]
     encoder = [] if asked.encoder is None else [_of_stated("encoder", asked.encoder, unit, rows, priors)]
     known = [Wave.fixed(wave.clock, wave.peak, unit) for wave in (*stated, *encoder)]
-    unknown, peaks = _inferred(rows, priors, known, unknown)
+    near: dict[str, float] = {}
+    unknown, peaks = _inferred(rows, priors, known, unknown, near)
     every = [*known[: len(stated)], *peaks, *known[len(stated) :]]
     model = AxisModel.of(rows, priors, None, every)
-    mode, names, final = find_mode(model).w, model.coordinates.names, []
+    mode, names, final = find_mode(model, near).w, model.coordinates.names, []
     for k, wave in enumerate([*stated, *unknown, *encoder]):
         without = mode[None].copy()
         without[0, names.index(f"wave_scale.{k + 1}")] = absent_at(every[k])
@@ -223,16 +224,20 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], asked: AskedPeriod
 
 
 def _inferred(
-    rows: AxisRows, priors: Mapping[str, AxisPrior], known: Sequence[Wave], asked: Sequence[Wave]
+    rows: AxisRows,
+    priors: Mapping[str, AxisPrior],
+    known: Sequence[Wave],
+    asked: Sequence[Wave],
+    near: dict[str, float],
 ) -> tuple[list[Wave], list[Wave]]:
     """The waves of unknown period, and each at its peak: one after the other, the strongest evidence first.
 
     Every range gets the waves that it was asked for, and further ones while the evidence for another is `FURTHER`: a
-    gear train has more periods than its owner knows of, and the one that is asked for may not be the strongest.
+    gear train has more periods than its owner knows of, and the one that is asked for may not be the strongest. `near`
+    holds the coordinates of the last mode by name.
     """
     found: list[Wave] = []
     peaks: list[Wave] = []
-    near: dict[str, float] = {}
 
     def strongest(ranges: Sequence[Wave]) -> _Searched:
         model = AxisModel.of(rows, priors, None, [*known, *peaks])
