@@ -21,7 +21,7 @@ from support.package_imports import (
     room,
     running,
 )
-from support.tests_of import tests_of
+from support.tests_of import files_importing
 
 ROOT = Path(__file__).resolve().parents[2]
 HARDWARE = ("positioner", "cameras", "acquisition")
@@ -73,7 +73,7 @@ def test_parser_sees_every_way_to_import():
 
 
 def test_tests_of_a_module_are_those_that_import_it():
-    found = tests_of("head.chain", "tests/head")
+    found = files_importing("head.chain", "tests/head")
     assert "tests/head/test_chain.py" in found and "tests/head/test_pointing_table.py" not in found
 
 

@@ -11,7 +11,7 @@ if __package__ is None:
 from support.package_imports import imported
 
 
-def tests_of(module: str, folder: str = "tests") -> list[str]:
+def files_importing(module: str, folder: str = "tests") -> list[str]:
     """Files below a folder, helpers of tests among them, that import it or name it in a string of code."""
     root = Path(__file__).resolve().parents[2]
     files = {path: imported(ast.parse(path.read_text(encoding="utf-8"))) for path in (root / folder).rglob("*.py")}
@@ -19,4 +19,4 @@ def tests_of(module: str, folder: str = "tests") -> list[str]:
 
 
 if __name__ == "__main__":
-    print("\n".join(tests_of(sys.argv[1])))
+    print("\n".join(files_importing(sys.argv[1])))

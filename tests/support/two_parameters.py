@@ -11,8 +11,9 @@ from support.partial_arrays import no_gears, partial_arrays
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.instrument.parameters import INDEX, NAMES, PERIODS_MAX
+from tvsbayes.posterior.linear_campaign import LinearCampaign
 from tvsbayes.posterior.stop_states import StopStates
-from tvsbayes.posterior.transport import GEAR_SCALES, LinearCampaign, Transport, bends
+from tvsbayes.posterior.transport import GEAR_SCALES, Transport, bends
 
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
 STRETCH = 0.3
