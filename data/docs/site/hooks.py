@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[3]
-OUTSIDE = ("CONTRIBUTING.md", "CHANGELOG.md", "LICENSE", "tvsbayes/positioner/firmware/README.md")
+OUTSIDE = ("CONTRIBUTING.md", "CHANGELOG.md", "CITATION.cff", "LICENSE", "tvsbayes/positioner/firmware/README.md")
 """Pages and files from outside data/ that stand in the site where they stand in the repository."""
 LINK = re.compile(r"(\]\()([^)#\s]+)")
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
