@@ -17,8 +17,9 @@ from scipy import optimize
 from experiments.common.fits import without_padding
 from tvsbayes.estimators.annealed_stage import Fixed, innovations, stage
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
+from tvsbayes.estimators.kalman_filter import no_belief
 from tvsbayes.estimators.likelihood import innovations as exact_innovations
-from tvsbayes.estimators.likelihood import no_belief, root_at_places
+from tvsbayes.estimators.likelihood import root_at_places
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign, ordered_spots

@@ -12,7 +12,7 @@ from support.varying_gears import perfect_gears
 
 from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, innovations, stage
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
-from tvsbayes.estimators.likelihood import no_belief
+from tvsbayes.estimators.kalman_filter import no_belief
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, NAMES
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import linalg
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.estimators.likelihood import STATES, Belief, Seen, filter_rows, filtered
+from tvsbayes.estimators.kalman_filter import STATES, Belief, Seen, filter_rows, filtered
 from tvsbayes.estimators.linear_spots import Linearised, LinearLooks, linearise
 from tvsbayes.estimators.spot_residuals import ToStates
 from tvsbayes.model.compiled import compiled

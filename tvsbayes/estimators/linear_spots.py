@@ -20,7 +20,8 @@ from jaxtyping import Array, Float
 from scipy import linalg
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
-from tvsbayes.estimators.likelihood import filter_rows, place_columns, roots_at, standing
+from tvsbayes.estimators.kalman_filter import filter_rows
+from tvsbayes.estimators.likelihood import place_columns, roots_at, standing
 from tvsbayes.estimators.look_jacobian import look_jacobian
 from tvsbayes.model.parameter_space import ParameterSpace, Point
 

@@ -30,7 +30,7 @@ from tvsbayes.estimators.campaign_arrays import (
     padded,
 )
 from tvsbayes.estimators.joint_fit import JointFit, with_places
-from tvsbayes.estimators.likelihood import filter_rows, kalman_update, no_belief
+from tvsbayes.estimators.kalman_filter import filter_rows, kalman_update, no_belief
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.looks import in_frame_s
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG

@@ -17,14 +17,8 @@ from jaxtyping import Array, Float
 
 from tvsbayes.estimators.campaign_arrays import CampaignArrays, bucket, spot_constants
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.likelihood import (
-    STATES,
-    Belief,
-    FilterRows,
-    filter_input,
-    kalman_update,
-    no_belief,
-)
+from tvsbayes.estimators.kalman_filter import STATES, Belief, FilterRows, kalman_update, no_belief
+from tvsbayes.estimators.likelihood import filter_input
 from tvsbayes.estimators.looks import WINDOW, observe_with_stop_errors
 from tvsbayes.instrument.axes import HOME_SD_DEG
 from tvsbayes.instrument.campaign import PIXELS, ordered_spots

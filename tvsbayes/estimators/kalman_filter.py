@@ -1,0 +1,187 @@
+"""The Kalman filter of a campaign: spots in time order, the belief after each, and columns that follow them.
+
+Its state: stop error (pan, tilt), home offset (pan, tilt), position in the unknown play band (pan, tilt) in units of
+its standard deviation. Angles rad; residuals in units of their noise (formulation 4.1).
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tvsbayes.estimators.campaign_arrays import SpotArrays
+from tvsbayes.instrument.axes import HOME_SD_DEG
+from tvsbayes.model.geometry import Scalar, materialise
+
+STATES = 6
+
+
+class FilterRows(eqx.Module):
+    """What the filter meets at each spot, in time order: its residual, how its states move it, which are new.
+
+    `residual` has the shape (spots, components), or (spots, components, columns) where several are filtered at once;
+    `load` is d(predicted)/d(state), `keep` is 0 for a state drawn anew since the previous spot and 1 otherwise,
+    `variance` what is added to its variance since then: that of the draw, or of a random walk.
+    """
+
+    residual: Float[Array | np.ndarray, "..."]
+    load: Float[Array | np.ndarray, "*spots components 6"]
+    keep: Float[Array | np.ndarray, "*spots 6"]
+    variance: Float[Array | np.ndarray, "*spots 6"]
+
+
+def filter_rows(
+    residual: Float[Array | np.ndarray, "spots components *columns"],
+    slope: Float[Array | np.ndarray, "spots components 2"],
+    play_sd_rad: Float[Array | np.ndarray, "spots 2"],
+    stop_variance: Float[Array | np.ndarray, "spots 2"],
+    drift_variance: Float[Array | np.ndarray, "spots 2"],
+    spots: SpotArrays,
+    functions: ModuleType = jnp,
+) -> FilterRows:
+    """States of the filter at every spot: stop errors, home offsets with their drift, places in an unknown play.
+
+    Args:
+        residual: observed - predicted, or whatever else goes through the filter.
+        slope: d(predicted)/d(pan, tilt).
+        play_sd_rad: of the place in the play, zero where it is known.
+        stop_variance: from `stop_variances`.
+        drift_variance: from `drift_variances`.
+        spots: which of them re-home and draw stop errors anew.
+        functions: jax.numpy or numpy.
+    """
+    xp, pairs = functions, (len(spots.valid), 2)
+    home = xp.where(spots.homed, (HOME_SD_DEG * np.pi / 180) ** 2, 0.0)[:, None]
+    segment = xp.broadcast_to(spots.new_segment[:, None], pairs)
+    drawn = xp.where(spots.redraw, stop_variance, 0.0)
+    return FilterRows(
+        residual=xp.asarray(residual),
+        load=xp.concatenate([slope, slope, slope * play_sd_rad[:, None]], axis=2),
+        keep=xp.where(xp.concatenate([spots.redraw, segment, segment], axis=1), 0.0, 1.0),
+        variance=xp.concatenate([drawn, home + drift_variance, xp.where(segment, 1.0, 0.0)], axis=1),
+    )
+
+
+def _along(states: Float[Array | np.ndarray, "6"], like: Array | np.ndarray) -> Float[Array, "6 ..."]:
+    """Numbers of the six states for every column of `like`."""
+    return jnp.reshape(states, (STATES,) + (1,) * (like.ndim - 1))
+
+
+class Belief(eqx.Module):
+    """Mean, one for every column of residuals, and covariance of the filter's state."""
+
+    mean: Float[Array | np.ndarray, "6 *columns"]
+    covariance: Float[Array | np.ndarray, "6 6"]
+
+    def renewed(self, row: FilterRows) -> Belief:
+        """The state as the spot finds it, before the spot is looked at."""
+        new = jnp.diag(row.variance)
+        return Belief(self.mean * _along(row.keep, self.mean), self.covariance * (row.keep[:, None] * row.keep) + new)
+
+
+class Gains(eqx.Module):
+    """How a spot's components, one after the other, move the means: `gain` times a standardised error of this `sd`."""
+
+    gain: Float[Array, "*spots components 6"]
+    sd: Float[Array, "*spots components"]
+
+
+class KalmanUpdate(eqx.Module):
+    """A spot seen by the filter: the state after it, standardised errors and the log of their variances' product."""
+
+    belief: Belief
+    standardised: Float[Array, "components *columns"]
+    log_variance: Scalar
+    gains: Gains
+
+
+def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
+    """Update with one spot: its components have independent unit noise, so a scalar update each and no inverse."""
+    mean, covariance = belief.mean, belief.covariance
+    errors, variances, gains = [], [], []
+    for component in range(len(row.load)):
+        # Sums instead of products: a call into a matrix library costs more than six numbers.
+        gain = jnp.sum(covariance * row.load[component], axis=1)
+        variance_ahead = 1 + jnp.sum(row.load[component] * gain)
+        error = row.residual[component] - jnp.sum(_along(row.load[component], mean) * mean, axis=0)
+        mean = mean + _along(gain, mean) * (error / variance_ahead)
+        covariance = covariance - gain[:, None] * (gain / variance_ahead)
+        errors.append(error / jnp.sqrt(variance_ahead))
+        variances.append(variance_ahead)
+        gains.append(gain / jnp.sqrt(variance_ahead))
+    variance = jnp.stack(variances)
+    found = Gains(jnp.stack(gains), jnp.sqrt(variance))
+    return KalmanUpdate(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(variance)), found)
+
+
+def no_belief(*columns: int) -> Belief:
+    """Before the first spot, whose states are all new."""
+    return Belief(jnp.zeros((STATES, *columns)), jnp.zeros((STATES, STATES)))
+
+
+class Seen(eqx.Module):
+    """Spots seen by the filter: standardised errors (spots, components, ...), and logs of their variances' products.
+
+    `belief` is that after the last of them; `gains` are theirs.
+    """
+
+    standardised: Float[Array, "..."]
+    log_variance: Float[Array, "*spots"]
+    belief: Belief
+    gains: Gains
+
+
+def filtered(rows: FilterRows, before: Belief) -> Seen:
+    """Run the filter over spots in time order, from the belief before them."""
+
+    def step(belief, row):
+        seen = kalman_update(belief.renewed(row), row)
+        return seen.belief, (seen.standardised, seen.log_variance, seen.gains)
+
+    after, (standardised, log_variance, gains) = jax.lax.scan(step, before, rows)
+    return Seen(standardised, log_variance, after, gains)
+
+
+class ColumnsSeen(eqx.Module):
+    """Columns that the filter standardised, and the means of its state for them after the last spot."""
+
+    standardised: Float[Array, "spots components columns"]
+    mean: Float[Array, "6 columns"]
+
+
+def columns_filtered(
+    columns: Float[Array, "spots components columns"],
+    rows: FilterRows,
+    gains: Gains,
+    before: Float[Array, "6 columns"],
+) -> ColumnsSeen:
+    """Send further columns through a filter whose gains are known: a product of few numbers before and after."""
+    load, own = rows.load / gains.sd[..., None], columns / gains.sd[..., None]
+    loads: list[Any] = []
+    residuals: list[Any] = []
+    # What earlier components have moved stands in the load of later ones.
+    for component in range(own.shape[1]):
+        slope, residual = load[:, component], own[:, component]
+        for earlier in range(component):
+            share = jnp.sum(load[:, component] * gains.gain[:, earlier], axis=1)[:, None]
+            slope, residual = slope - share * loads[earlier], residual - share * residuals[earlier]
+        loads.append(slope)
+        residuals.append(residual)
+    whole = jnp.stack(loads, axis=1) * rows.keep[:, None], jnp.stack(residuals, axis=1)
+
+    def step(mean, row):
+        load, residual, keep, gain = row
+        # Sums spelled out: loops over whole rows of columns.
+        moved = sum(load[:, state, None] * mean[state] for state in range(STATES))
+        standardised = materialise(residual - moved)
+        followed = sum(gain[component, :, None] * standardised[component] for component in range(len(gain)))
+        return keep[:, None] * mean + followed, standardised
+
+    mean, standardised = jax.lax.scan(step, before, materialise((*whole, rows.keep, gains.gain)))
+    return ColumnsSeen(standardised, mean)
