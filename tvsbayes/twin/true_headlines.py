@@ -32,7 +32,10 @@ def looks_steps(campaign: Campaign) -> np.ndarray:
 
 
 def effective_deg_per_step(
-    parameters: Mapping[str, float], errors: GearErrors, campaign: Campaign
+    parameters: Mapping[str, float],
+    errors: GearErrors,
+    campaign: Campaign,
+    pose_deg: tuple[float, float] | None = None,
 ) -> dict[str, float] | None:
     """True headline of every direction over the looks of a campaign; None where it has none.
 
@@ -43,6 +46,8 @@ def effective_deg_per_step(
         parameters: of the true rig, by contract name.
         errors: of its gears.
         campaign: whose looks count; its rig states the period of `harmonic_deg`.
+        pose_deg: mean angles of (pan, tilt), where either axis stands for the line of the other; by default those of
+            the mean ratio.
     """
     steps = looks_steps(campaign)
     if not len(steps):
@@ -54,7 +59,8 @@ def effective_deg_per_step(
     ]
     ratios: dict[str, float] = {}
     for i, axis in enumerate(AXES):
-        angle_deg, others_deg = mirrors[i], float(np.mean(mirrors[1 - i]))
+        angle_deg = mirrors[i]
+        others_deg = float(np.mean(mirrors[1 - i])) if pose_deg is None else pose_deg[1 - i]
         slope = float(np.mean(_mirror_slope(parameters, i, angle_deg, others_deg)))
         offset = counters[i] - counters[i].mean()
         if offset.any():

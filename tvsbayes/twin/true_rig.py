@@ -99,7 +99,10 @@ class Truth:
 
     def effective_deg_per_step(self, campaign: Campaign) -> dict[str, float] | None:
         """Of every direction over the looks of a campaign, see `true_headlines`; None where it has no looks."""
-        return effective_deg_per_step(self.parameters, self.gear_errors or PERFECT, campaign)
+        # A difference of directions turns a head's axes by degrees over long travel, and where they lean its lines
+        # depend on where the other one stands; a scanner's do by 1e-5 of themselves.
+        pose_deg = self.reference_pose_deg if campaign.rig.mechanism.terms else None
+        return effective_deg_per_step(self.parameters, self.gear_errors or PERFECT, campaign, pose_deg)
 
     def headlines(self, campaign: Campaign, pose_deg: Pair) -> dict[str, float] | None:
         """Parameters and all that follows from them by contract name, over the looks of a campaign and at a pose."""
