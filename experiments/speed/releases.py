@@ -41,10 +41,10 @@ FEATURES = (
     ("mechanisms", "scanner, one axis", "also pan-tilt heads and mounts"),
     (
         "foreign files",
-        "OpenCV, ROS, Kalibr, EuRoC, MATLAB",
-        "also ChArUco, DepthAI, ZED, RealSense, BoofCV, PHD2, EPICS, Klipper",
+        "OpenCV, ROS, Kalibr",
+        "also EuRoC, ORB-SLAM3, MATLAB, TOML, makers of cameras; ChArUco; PHD2, EPICS, Klipper",
     ),
-    ("stereo without a covariance", "refused or 1 % for all", "the covariance of such a calibration"),
+    ("stereo without a covariance", "1 % and 10 mrad, independent", "the covariance of such a calibration"),
     ("mistakes in tables", "warned of", "those that are certain stop `fit` and name the command that mends them"),
     ("view", "a server", "one HTML file"),
 )
