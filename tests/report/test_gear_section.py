@@ -68,7 +68,8 @@ def test_the_section_states_scales_range_and_both_ratios(geared_evidence, eviden
     titles = [[part.title for part in fit_sections(e)] for e in (replace(evidence, gears=()), geared_evidence)]
     assert section.title not in titles[0] and section.title in titles[1]
     assert "pan -60 to 280, tilt -140 to 140 steps" in section.text[0] and len(section.figures) == 2
-    scales, ratios = section.tables
+    waves, scales, ratios = section.tables
+    assert waves is None, "no period is stated"
     assert [row[0] for row in scales.rows[:2]] == [
         "transmission error sd, pan, deg",
         "transmission error sd, tilt, deg",
