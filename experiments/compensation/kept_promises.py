@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.rows import git, output, read_rows, run_rows
 from experiments.compensation.drawn_axes import fresh_moves, read, stands, up_and_down
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.promise import Wish, compensation_of
@@ -76,10 +76,10 @@ def one_axis(task: tuple[int]) -> dict[str, object]:
     row: dict[str, object] = {"seed": seed}
     try:
         results = results_for(campaign, seed=seed)
+        compensations = {name: compensation_of(results, wish, seed=seed) for name, wish in WISHES.items()}
     except TvsError as error:
         return {**row, "error": error.code, "seconds": time.perf_counter() - began}
-    for name, wish in WISHES.items():
-        made = compensation_of(results, wish, seed=seed)
+    for name, made in compensations.items():
         applied = Correction.of(made)
         new = driven(truth, applied, (1.0, 1.0), 2 * PROMISED, rng)
         at = {m.move: m for m in new.moves}
@@ -130,9 +130,9 @@ def table(arguments: argparse.Namespace) -> None:
     good = [row for row in rows if "error" not in row]
     print("# Promised, applied, kept: drawn axes\n")
     print(
-        f"By `experiments.compensation.kept_promises`: {len(rows)} drawn axes, {len(rows) - len(good)} refused as not"
+        f"By `experiments.compensation.kept_promises`, commit {git('rev-parse', '--short', 'HEAD')}: {len(rows)} drawn"
     )
-    print("converged.\n")
+    print(f"axes, {len(rows) - len(good)} refused, since no table is made of an answer that is not accepted.\n")
     print("## Readings after applying within the promise, wanted 93 to 97 %\n")
     print("| format | forward | backward | promised, median mm | left, median RMS mm |\n|---|---|---|---|---|")
     for name in WISHES:

@@ -127,12 +127,7 @@ TEXT = """# Coverage over drawn pan-tilt heads
 Made by `python -m experiments.intervals.heads`. Heads drawn from the default priors of their kind (ratios 0.05(2)
 deg/step of heads with sightings), simulated with the twin's optics, fitted and sampled by importance. Coverage of the
 95 % interval and RMS z of the truth, of heads whose answer was accepted or rough; *prior*: the data take away less than
-a tenth of the prior's variance in the median head, which is not judged. Bounds are two-sided at 1e-4.
-
-The line through the looks of one axis is taken with the other at its mean: the twin takes the mean by counters and mean
-ratio, the estimate the mean angle, which a difference of directions moves by degrees over 20 000 steps of travel. Where
-axes are not square that is another slope, and sightings are sharp enough to see it: `effective_deg_per_step` of
-sightings is held against the wrong line here."""
+a tenth of the prior's variance in the median head, which is not judged. Bounds are two-sided at 1e-4."""
 
 
 def table(arguments: argparse.Namespace) -> None:
