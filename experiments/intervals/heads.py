@@ -37,6 +37,8 @@ ROWS = output(__file__, "heads.jsonl")
 KINDS = ("sightings", "spots")
 PAN_STEPS, TILT_STEPS = (-1500, -800, -200, 400, 900, 1500), (100, 400, 800, 1200)
 LEVEL = 0.95
+FAR = 4.0
+"""Standard uncertainties beyond which a head is named."""
 SETTLED = 0.1
 """Share of a prior's variance that the data must take away for a quantity to be judged."""
 
@@ -135,7 +137,7 @@ def table(arguments: argparse.Namespace) -> None:
     print(TEXT)
     for kind in KINDS:
         rows = [row for row in read_rows(arguments.rows) if row["kind"] == kind]
-        good = [row for row in rows if "quantities" in row]
+        good = [row for row in rows if row["answer"] in ("accepted", "rough")]
         if not good:
             continue
         answers = Counter(row["answer"] for row in rows)
@@ -159,6 +161,9 @@ def table(arguments: argparse.Namespace) -> None:
             cells = (share, score) if taken >= SETTLED else ("*prior*", "")
             print(f"| `{name}` | {cells[0]} | {cells[1]} | {100 * taken:.0f} % |")
         print(f"| all judged | {100 * np.mean(every):.1f} % of {len(every)} | | |")
+        for row in good:
+            if far := [f"`{name}` {q['z']:+.1f}" for name, q in row["quantities"].items() if abs(q["z"]) > FAR]:
+                print(f"\nHead {row['seed']} lies beyond {FAR:g} u: {', '.join(far)}.")
 
 
 if __name__ == "__main__":
