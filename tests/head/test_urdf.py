@@ -138,7 +138,7 @@ def test_without_a_model_there_are_properties():
     [
         (b"unit", b"unit", {"pan": "pn_joint"}, "did you mean pan_joint"),
         (b"unit", b"unit", {"pan": "foot"}, "joint foot is fixed"),
-        (b"unit", b"unit", {"pan": "tilt_joint", "tilt": "pan_joint"}, "does not hang on the pan joint"),
+        (b"unit", b"unit", {"pan": "tilt_joint", "tilt": "pan_joint"}, "is not mounted on the pan joint"),
         (b'<axis xyz="0 1 0"/>', b'<axis xyz="0 0 1"/>', {}, "axes that cross"),
         (b'<axis xyz="0 1 0"/>', b'<axis xyz="1 0 0"/>', {}, "x looks ahead"),
         (b'name="unit"', b'name="${name}"', {}, "run `xacro FILE"),

@@ -106,6 +106,15 @@ def somebody_there() -> bool:
     return sys.stdin is not None and sys.stdin.isatty()
 
 
+def confirmed(lines: list[str], to: Path, yes: bool, as_json: bool) -> bool:
+    """Whether an import may be written; somebody who can answer is shown the `lines`, which are empty then."""
+    if yes or as_json or not somebody_there():
+        return yes
+    typer.echo("\n".join(lines))
+    lines.clear()
+    return typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
+
+
 def report_error(error: TvsError) -> None:
     """An error for people, with what to do where the message does not say it."""
     report_line(f"error: {error.message}")

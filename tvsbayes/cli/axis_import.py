@@ -7,9 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
-from tvsbayes.cli.app import finish, refuse_options, somebody_there
+from tvsbayes.cli.app import confirmed, finish, refuse_options
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, write_atomically
@@ -101,18 +99,13 @@ def _finish_import(understood: _Understood, to: Path, *, yes: bool, as_json: boo
     lines = [*understood.lines, *found.notes, *(f"assumed: {text}" for text in assumed)]
     ok = sum(reading.status == "ok" for reading in found.readings)
     lines.append(f"gives: {len(found.moves)} moves, {len(found.readings)} readings{_minutes(found)}")
-    shown = "\n".join(lines)
-    if not (yes or as_json) and somebody_there():
-        typer.echo(shown)
-        yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
-        shown = ""
-    written = _write(to, found, named) if yes else []
+    written = _write(to, found, named) if confirmed(lines, to, yes, as_json) else []
     document = {**understood.document, "notes": list(found.notes), "assumed": assumed, "moves": len(found.moves)}
     following = f"tvsbayes calibrate {typed(to)}" if written else None
     document |= {"readings": len(found.readings), "ok": ok, "campaign": str(to), "files": written, "next": following}
     said = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
     after = f"\nnext: `{following}`" * bool(written)
-    finish(document, f"{shown}\n{said}{after}".lstrip("\n"), as_json)
+    finish(document, "\n".join([*lines, f"{said}{after}"]), as_json)
 
 
 def _minutes(found: ForeignReadings) -> str:

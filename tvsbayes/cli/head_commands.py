@@ -9,9 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
-from tvsbayes.cli.app import command_line, finish, report_line, somebody_there, spared, tell_removed
+from tvsbayes.cli.app import command_line, confirmed, finish, report_line, spared, tell_removed
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, typed
 from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically
@@ -94,10 +92,7 @@ def import_urdf(
     files[HEAD_URDF] = data
     lines = [f"nominal: {name} = {prior.value:.6g}" for name, prior in priors.items()]
     lines += [f"assumed: {text}" for text in assumed]
-    if not (yes or as_json) and somebody_there():
-        typer.echo("\n".join(lines))
-        yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
-        lines = []
+    yes = confirmed(lines, to, yes, as_json)
     said = "nothing written: add --yes"
     if yes:
         if kind is SIGHTING_HEAD:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import Json, finish, refuse_options, report_line, somebody_there
+from tvsbayes.cli.app import Json, confirmed, finish, refuse_options, report_line, somebody_there
 from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
 from tvsbayes.cli.head_commands import import_urdf
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
@@ -151,19 +151,15 @@ def import_(
     looks = replace(looks, moves=mended.moves, spots=mended.spots, assumed=(*looks.assumed, *mended.changes))
     _refuse_listed(to, looks)
     document = _understood_document(table, known, looks)
-    shown = _understood_text(table, known, notation, looks)
-    if asking:
-        typer.echo(shown)
-        yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
-        shown = ""
-    written = _write_looks(to, looks) if yes else []
+    lines = [_understood_text(table, known, notation, looks)]
+    written = _write_looks(to, looks) if confirmed(lines, to, yes, as_json) else []
     document |= {"campaign": str(to), "files": written}
     said = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
     cameras = f"tvsbayes stereo --import CALIBRATION -o {typed(to / 'stereo.json')}"
     after = f"\nnext: `{cameras}`, or of pictures of a board, then `tvsbayes check {typed(to)}`" * bool(written)
     if (to / "stereo.json").is_file():
         after = f"\nnext: `tvsbayes check {typed(to)}`" * bool(written)
-    finish(document, f"{shown}\n{said}{after}".lstrip("\n"), as_json)
+    finish(document, "\n".join([*lines, f"{said}{after}"]), as_json)
 
 
 def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
@@ -183,10 +179,7 @@ def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
     if table.left_out:
         assumed.append(f"{table.left_out} blocks without RAA:, TAA: or LST: are no pointings")
     lines = [f"gives: {moves} moves, {sightings} sightings", *(f"assumed: {text}" for text in assumed)]
-    if not (yes or as_json) and somebody_there():
-        typer.echo("\n".join(lines))
-        yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
-        lines = []
+    yes = confirmed(lines, to, yes, as_json)
     said = "nothing written: add --yes"
     if yes:
         write_campaign(campaign, to)
@@ -243,10 +236,7 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
     ok = sum(spot.status == "ok" for spot in spots)
     lines = [f"corrected: {text}" for text in found.changes]
     lines.append(f"gives: {len(moves)} moves, {len(spots)} looks, {ok} with a spot")
-    if not (yes or as_json) and somebody_there():
-        typer.echo("\n".join(lines))
-        yes = typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
-        lines = []
+    yes = confirmed(lines, to, yes, as_json)
     written = []
     if yes:
         make_folder(to, empty=True)

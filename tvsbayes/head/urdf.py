@@ -239,8 +239,8 @@ def head_joints(data: bytes, file: str, names: Mapping[str, str | None]) -> Head
         names: of the joints by axis, None where the file is to say it.
 
     Raises:
-        InputError: a joint that is missing, does not turn, or does not hang on the other; axes that are parallel, or no
-            pan axis upwards.
+        InputError: a joint that is missing, does not turn, or is not mounted on the other; axes that are parallel, or
+            no pan axis upwards.
     """
     urdf = read_urdf(data, file)
     try:
@@ -345,7 +345,7 @@ def _between(urdf: Urdf, pan: _Element, tilt: _Element, refuse: _Refuse) -> tupl
             break
         turn, shift = joint.rotation * turn, joint.shift_m + joint.rotation.apply(shift)
         link = joint.named("parent", "link")
-    found, remedy = "a tilt joint that does not hang on the pan joint", "exchange the names, or name other joints"
+    found, remedy = "a tilt joint that is not mounted on the pan joint", "exchange the names, or name other joints"
     raise refuse(found, "a tilt joint on the child link of the pan joint, fixed joints between them", remedy)
 
 
