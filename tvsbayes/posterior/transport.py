@@ -56,7 +56,7 @@ FAR_ABOVE = 1e200
 """A last diagonal element that keeps a matrix positive definite whatever stands in its row; nothing reads its root."""
 BLOCK_ROWS = 64
 """Points that are mapped at a time: their matrices stay in the processor's cache."""
-NARROW, NARROW_PLAY = 0.2, 0.15
+NARROW, NARROW_PLAY = 0.225, 0.15
 """Conditional posterior sd, in prior sds, below which a coordinate is centred anew at every draw: where the others take
 it, it is known so well that a step of Gauss and Newton is as good as exact. A play that reaches zero is bent there."""
 
