@@ -17,6 +17,7 @@ from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.model.headlines import DEGREES
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.results.estimates import GearPeriod, Measured
+from tvsbayes.statistics.intervals import interval95, phases_deg
 from tvsbayes.statistics.streams import Stream, random_stream
 
 DRAWS = 2048
@@ -54,9 +55,7 @@ class WaveDraws:
     @property
     def phase_deg(self) -> np.ndarray:
         """Within half a turn of the circular mean, shape (draws,)."""
-        phase = np.arctan2(self.sine, self.cosine)
-        middle = np.angle(np.mean(np.exp(1j * phase)))
-        return np.degrees(middle + np.angle(np.exp(1j * (phase - middle))))
+        return phases_deg(self.cosine, self.sine)
 
 
 def wave_draws(
@@ -100,8 +99,7 @@ def _log_root(root: np.ndarray) -> np.ndarray:
 
 
 def _measured(draws: np.ndarray) -> Measured:
-    low, high = np.percentile(draws, (2.5, 97.5))
-    return Measured(float(draws.mean()), float(draws.std()), (float(low), float(high)))
+    return Measured(float(draws.mean()), float(draws.std()), interval95(draws))
 
 
 def gear_periods(posterior: Posterior) -> tuple[GearPeriod, ...]:

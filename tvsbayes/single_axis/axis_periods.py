@@ -13,12 +13,12 @@ from tvsbayes.results.estimates import Measured, PeriodEstimate
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import LinearPosterior
 from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, absent_at, wave_columns
+from tvsbayes.statistics.intervals import interval95, phases_deg
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
 WITH_WAVE_MIN, WITH_WAVE = 200, 1000
 """Draws with a wave that its numbers come from; where the posterior has fewer, so many are drawn and weighted."""
-TAILS_PERCENT = (2.5, 97.5)
 ALIKE = 0.02
 """Draws of a period that lie farther apart than this share of it belong to different waves that explain the same."""
 
@@ -54,9 +54,7 @@ class WaveSample:
 
     def phase_deg(self) -> np.ndarray:
         """Phase within half a turn of its circular mean, shape (n,)."""
-        phase = np.arctan2(self.coefficients[:, 1], self.coefficients[:, 0])
-        middle = np.angle(np.mean(np.exp(1j * phase)))
-        return np.degrees(middle + np.angle(np.exp(1j * (phase - middle))))
+        return phases_deg(self.coefficients[:, 0], self.coefficients[:, 1])
 
     @property
     def likeliest(self) -> np.ndarray:
@@ -130,9 +128,8 @@ def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
 
 
 def _measured(draws: np.ndarray, likeliest: np.ndarray) -> Measured:
-    low, high = np.percentile(draws, TAILS_PERCENT)
     chosen = draws[likeliest]
-    return Measured(float(chosen.mean()), float(chosen.std()), (float(low), float(high)))
+    return Measured(float(chosen.mean()), float(chosen.std()), interval95(draws))
 
 
 def period_estimate(sample: WaveSample) -> PeriodEstimate:
@@ -202,7 +199,7 @@ def waves_at_an_end(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
         wave = sample.wave
         if wave.known is not None or not sample.probability > 0.5:
             continue
-        low, high = np.percentile(sample.period, TAILS_PERCENT)
+        low, high = interval95(sample.period)
         if low < wave.low * (1 + ALIKE) or high > wave.high * (1 - ALIKE):
             of = sample.period_unit(unit)
             found.append(

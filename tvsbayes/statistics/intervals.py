@@ -55,6 +55,13 @@ def interval95(draws: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def phases_deg(cosine: np.ndarray, sine: np.ndarray) -> np.ndarray:
+    """Phases of waves with these parts (n,), each within half a turn of their circular mean, deg."""
+    phase = np.arctan2(sine, cosine)
+    middle = np.angle(np.mean(np.exp(1j * phase)))
+    return np.degrees(middle + np.angle(np.exp(1j * (phase - middle))))
+
+
 def numerical_tolerance(u: np.ndarray, digits: int) -> np.ndarray:
     """Half a unit of the last of `digits` significant digits of a standard uncertainty (JCGM 101 7.9.2)."""
     u = np.asarray(u, dtype=float)
