@@ -1,37 +1,43 @@
 """The calibration certificate as DCC XML (schema 3.3.0 of PTB): unsigned, not accredited, of a campaign's own words.
 
-Ratios in degrees per step, backlash in degrees, lengths in mm; uncertainties to two digits (GUM 7.2.6). Every text is
-escaped by ElementTree and stays text.
+`data/export/certificate.xml` is its template. Ratios in degrees per step, backlash in degrees, lengths in mm;
+uncertainties to two digits (GUM 7.2.6). Every text is escaped and stays text.
 """
 
 from __future__ import annotations
 
 import base64
 import datetime
+import math
 import re
 import xml.etree.ElementTree as ET
-from dataclasses import astuple, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, field
+from xml.parsers import expat
+from xml.sax.saxutils import escape
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 
 from tvsbayes.errors import InputError, NotConverged, escaped
+from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign, input_hashes
-from tvsbayes.metrology.dcc_elements import UNIT_SI, add, add_contact, add_real, add_words
+from tvsbayes.metrology.budget_tables import PROBABILITY
 from tvsbayes.metrology.traceability import (
     NOT_STATED,
     Performance,
     header_table,
     performed,
+    plain_text,
     stated_value,
     traceability,
 )
 from tvsbayes.results.estimates import Estimate
-from tvsbayes.results.fit_record import FitRecord, Provenance
+from tvsbayes.results.fit_record import FitRecord
 from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning
 from tvsbayes.statistics.intervals import NORMAL_95
 
-DCC_VERSION = "3.3.0"
-DCC_NAMESPACES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
-"""DCC 3.3.0 imports D-SI 2.2.1, whose namespace carries no version."""
 COUNTRY_NOT_STATED = "ZZ"
 """User-assigned in ISO 3166-1: valid for the schema, named by PTB's Schematron."""
 NOT_ACCREDITED = (
@@ -49,9 +55,19 @@ METHOD = (
     "standard measured them. Effective degrees of the beam per motor step hold at the stated pose of the mirrors. "
     "U is half the 95 % interval, k = U/u."
 )
-REFERENCE, NORMS = "doi:10.3390/metrology5040058", ("JCGM 100:2008", "JCGM 101:2008")
+DEG_PER_STEP, DEG, MM = r"\degree\per\one", r"\degree", r"\milli\metre"
+"""Units in the notation of D-SI, which has none for a count: steps are `\\one`."""
+CONDITIONS = {
+    "basic_temperature": ("temperature_degC", "temperature", r"\degreecelsius"),
+    "basic_humidityRelative": ("humidity_percent", "relative humidity", r"\percent"),
+}
+"""Key of `[environment]`, name and unit of the conditions that a certificate states, by their kind in the DCC."""
+EXPANDED_SYMMETRY = 0.25
+"""Standard uncertainties by which the middle of the 95 % interval may lie off the value before an interval is given
+instead of an expanded uncertainty."""
 _RELEASE = re.compile(r"(?:[0-9]{1,3}\.){0,3}[0-9]{1,3}(?![0-9])")
-_RESULT_TITLE = "degrees of beam per motor step, and backlash"
+_FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that XML 1.0 cannot hold, escaped or not."""
 
 
 @dataclass(frozen=True)
@@ -78,140 +94,148 @@ class Embedded:
     number: str
     html: bytes
 
+    @property
+    def encoded(self) -> str:
+        """The report in base64."""
+        return base64.b64encode(self.html).decode()
+
 
 @dataclass(frozen=True)
-class _Core:
-    """By what a certificate is known: its identifier, its day of issue, the number of the report that it carries."""
+class _Statement:
+    """A declaration with its name; `traceable` where it says whether the results are."""
 
-    identifier: str
-    issued: datetime.date
-    report: str | None
-
-
-def _software(parent: ET.Element, tag: str, made: Provenance, **attributes: str) -> None:
-    software = add(add(parent, tag), "dcc:software", **attributes)
-    add_words(software, "dcc:name", "tvsbayes")
-    # PTB's Schematron wants a letter and up to four numbers; the whole version stands in the description.
-    release = _RELEASE.match(made.versions["tvsbayes"])
-    add(software, "dcc:release", f"v{release.group() if release else '0'}")
-    listed = ", ".join(f"{name} {version}" for name, version in made.versions.items())
-    add_words(software, "dcc:description", f"{listed}; seed {made.seed}; command: {made.command}")
+    name: str
+    text: str
+    traceable: bool | None = None
 
 
-def _administrative(root: ET.Element, campaign: Campaign, fit: FitRecord, core: _Core, parties: Parties) -> None:
-    data = add(root, "dcc:administrativeData")
-    _software(data, "dcc:dccSoftware", fit.provenance)
-    when = performed(campaign, core.issued)
-    _core_data(data, core, when, parties.country)
-    _item(data, campaign)
-    place = add(data, "dcc:calibrationLaboratory")
-    add_contact(place, "dcc:contact", parties.laboratory, parties.country)
-    for name in ("dcc:cryptElectronicSeal", "dcc:cryptElectronicSignature", "dcc:cryptElectronicTimeStamp"):
-        add(place, name, "false")
-    person = add(add(data, "dcc:respPersons"), "dcc:respPerson")
-    add_contact(person, "dcc:person", str(campaign.header.get("operator") or NOT_STATED))
-    add(person, "dcc:role", "operator of the campaign")
-    add(person, "dcc:mainSigner", "false")
-    add_contact(data, "dcc:customer", parties.customer, parties.customer_country)
-    _statements(data, campaign, fit, when, parties)
+@dataclass(frozen=True)
+class _Real:
+    """An `si:real` of D-SI 2.2.1, and the entries of its uncertainty in the element `kind`; "" for none."""
+
+    value: str
+    unit: str
+    kind: str = ""
+    entries: Mapping[str, str] = field(default_factory=dict)
 
 
-def _core_data(data: ET.Element, named: _Core, when: Performance, country: str) -> None:
-    core = add(data, "dcc:coreData")
-    add(core, "dcc:countryCodeISO3166_1", country)
-    add(core, "dcc:usedLangCodeISO639_1", "en")
-    add(core, "dcc:mandatoryLangCodeISO639_1", "en")
-    add(core, "dcc:uniqueIdentifier", named.identifier)
-    if named.report is not None:
-        number = add(add(core, "dcc:identifications"), "dcc:identification")
-        add(number, "dcc:issuer", "calibrationLaboratory")
-        add(number, "dcc:value", named.report)
-        add_words(number, "dcc:name", "number of the report")
-    add(core, "dcc:beginPerformanceDate", when.begin.isoformat())
-    add(core, "dcc:endPerformanceDate", when.end.isoformat())
-    add(core, "dcc:performanceLocation", "other")
-    add(core, "dcc:issueDate", named.issued.isoformat())
+@dataclass(frozen=True)
+class _Quantity:
+    """A named value; None where there is none."""
+
+    name: str
+    real: _Real | None
 
 
-def _item(data: ET.Element, campaign: Campaign) -> None:
-    header = campaign.header
-    item = add(add(data, "dcc:items"), "dcc:item", id="item")
-    add_words(item, "dcc:name", header.get("instrument") or "stepper-driven two-mirror laser positioner")
-    serials = add(item, "dcc:identifications")
-    for value, name in ((header.get("serial") or NOT_STATED, "serial"), (campaign.title, "campaign")):
-        identification = add(serials, "dcc:identification")
-        add(identification, "dcc:issuer", "other")
-        add(identification, "dcc:value", value)
-        add_words(identification, "dcc:name", name)
+@dataclass(frozen=True)
+class _Result:
+    """A result: its quantities, and a description where it needs one."""
+
+    name: str
+    quantities: Sequence[_Quantity]
+    description: str = ""
 
 
-def _statements(data: ET.Element, campaign: Campaign, fit: FitRecord, when: Performance, parties: Parties) -> None:
-    statements = add(data, "dcc:statements")
+def dcc_real(
+    unit: str,
+    value: float,
+    u: float | None,
+    interval95: tuple[float, float] | None = None,
+    distribution: str = "normal",
+) -> _Real:
+    """A number with no, a standard, an expanded uncertainty or an interval, two digits of uncertainty."""
+    numbers = [value, *(() if u is None else (u,)), *(interval95 or ())]
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(f"a certificate needs finite numbers, not {numbers}")
+    if not u:
+        return _Real(repr(float(value)), unit)
+    low, high = interval95 or (value, value)
+    expanded, middle = 0.5 * (high - low), 0.5 * (high + low)
+    k = expanded / u
+    # A coverage factor below 1 is no D-SI coverage factor.
+    symmetric = interval95 is not None and k >= 1 and abs(middle - value) <= EXPANDED_SYMMETRY * u
+    # Decimals at which the uncertainty keeps two significant digits (GUM 7.2.6).
+    places = max(0, 1 - int(f"{expanded if symmetric else u:.1e}".split("e")[1]))
+    text, standard = f"{value:.{places}f}", f"{u:.{places}f}"
+    covered = {"coverageProbability": f"{PROBABILITY:.2f}", "distribution": distribution}
+    if interval95 is None:
+        return _Real(text, unit, "standardMU", {"valueStandardMU": standard, "distribution": distribution})
+    if symmetric:
+        half = {"valueExpandedMU": f"{expanded:.{places}f}", "coverageFactor": f"{k:.2f}"}
+        return _Real(text, unit, "expandedMU", {**half, **covered})
+    ends = {"intervalMin": f"{low:.{places}f}", "intervalMax": f"{high:.{places}f}"}
+    return _Real(text, unit, "coverageIntervalMU", {"valueStandardMU": standard, **ends, **covered})
 
-    def state(name: str, text: str, traceable: bool | None = None) -> None:
-        statement = add(statements, "dcc:statement")
-        add_words(statement, "dcc:name", name)
-        if traceable is not None:
-            add(statement, "dcc:traceable", "true" if traceable else "false")
-        add_words(statement, "dcc:declaration", text)
 
-    state("accreditation", NOT_ACCREDITED)
+def _statements(campaign: Campaign, fit: FitRecord, when: Performance, parties: Parties) -> Iterator[_Statement]:
+    yield _Statement("accreditation", NOT_ACCREDITED)
     trace = traceability(campaign)
-    state("traceability", trace.statement, trace.declared)
-    state("scope", ITEM_ONLY)
+    yield _Statement("traceability", trace.statement, trace.declared)
+    yield _Statement("scope", ITEM_ONLY)
     validation = fit.summary.validation
     if validation is not None and not validation.passed:
         text = f"VALIDATION FAILED: {validation.cause}. Uncertainties are stated as fitted; multiply every one of "
-        state("validation", f"{text}them by {validation.inflation:.2f}.")
+        yield _Statement("validation", f"{text}them by {validation.inflation:.2f}.")
     if campaign.header.get("synthetic"):
-        state("synthetic data", "The campaign was simulated: no instrument was measured.")
+        yield _Statement("synthetic data", "The campaign was simulated: no instrument was measured.")
     if not when.recorded:
-        state("dates", "The campaign does not record its date; the date of issue stands for it.")
+        yield _Statement("dates", "The campaign does not record its date; the date of issue stands for it.")
     for name, country in (("country", parties.country), ("country of the customer", parties.customer_country)):
         if country == COUNTRY_NOT_STATED:
-            state(name, f"The {name} was not stated; {COUNTRY_NOT_STATED} stands for it.")
+            yield _Statement(name, f"The {name} was not stated; {COUNTRY_NOT_STATED} stands for it.")
 
 
-def _equipment(parent: ET.Element, campaign: Campaign) -> None:
+def _cameras(campaign: Campaign) -> str:
+    """The camera pair in words."""
     declared, stereo = header_table(campaign, "traceability"), campaign.stereo
-    listed = add(parent, "dcc:measuringEquipments")
-    cameras = add(listed, "dcc:measuringEquipment", id="cameras")
-    add_words(cameras, "dcc:name", "stereo camera pair")
     text = f"2 x {stereo.image_width} x {stereo.image_height} px, calibration residual {stereo.rms_px:.3g} px rms"
     if stereo.assumed:
         text += "; covariance of the calibration assumed, not estimated"
     if "stereo_calibrated" in declared:
         text += f"; calibrated {declared['stereo_calibrated']}"
-    add_words(cameras, "dcc:description", text)
-    board = add(listed, "dcc:measuringEquipment", id="board", refType="basic_normalUsed")
-    add_words(board, "dcc:name", "calibration board (length standard)")
-    identification = add(add(board, "dcc:identifications"), "dcc:identification")
-    add(identification, "dcc:issuer", "other")
-    add(identification, "dcc:value", declared.get("board_certificate", NOT_STATED))
-    add_words(identification, "dcc:name", "certificate as declared by the user")
-    pitch = stated_value(campaign, "traceability", "pitch_mm")
-    if pitch is not None:
-        quantity = add(add(board, "dcc:measuringEquipmentQuantities"), "dcc:measuringEquipmentQuantity")
-        add_words(quantity, "dcc:name", "pitch")
-        add_real(quantity, UNIT_SI["mm"], pitch.value, pitch.u)
+    return text
 
 
-def _conditions(parent: ET.Element, campaign: Campaign) -> None:
-    conditions = add(parent, "dcc:influenceConditions")
-    for key, name, unit, kind in (
-        ("temperature_degC", "temperature", r"\degreecelsius", "basic_temperature"),
-        ("humidity_percent", "relative humidity", r"\percent", "basic_humidityRelative"),
-    ):
-        condition = add(conditions, "dcc:influenceCondition", refType=kind)
-        add_words(condition, "dcc:name", name)
-        data = add(condition, "dcc:data")
-        stated = stated_value(campaign, "environment", key)
-        if stated is not None:
-            quantity = add(data, "dcc:quantity", refType="basic_measuredValue")
-            add_words(quantity, "dcc:name", name)
-            add_real(quantity, unit, stated.value, stated.u)
-        else:
-            add_words(data, "dcc:text", "not recorded")
+def _stated(campaign: Campaign, table: str, key: str, unit: str) -> _Real | None:
+    """A quantity of a table of `campaign.toml`; None where it is not stated."""
+    stated = stated_value(campaign, table, key)
+    return None if stated is None else dcc_real(unit, stated.value, stated.u)
+
+
+def _results(fit: FitRecord) -> Iterator[_Result]:
+    """Ratios, backlash, and the ISO 230-2-style figures that were predicted."""
+    summary = fit.summary
+    shape = "normal" if summary.estimator == "laplace" else "sampled posterior"
+
+    def quantity(name: str, estimate: Estimate | None, unit: str) -> _Quantity:
+        if estimate is None:
+            return _Quantity(name, None)
+        return _Quantity(name, dcc_real(unit, estimate.value, estimate.sd, estimate.interval95, shape))
+
+    ratios = [
+        quantity(f"effective degrees per step, {direction}", entry, DEG_PER_STEP)
+        for direction, entry in summary.effective.items()
+    ]
+    yield _Result("effective degrees of beam per motor step", ratios)
+    plays = []
+    for axis in AXES:
+        moved = any(summary.effective[d] is not None for d in SIDES[axis])
+        play = summary.parameters[f"backlash_deg.{axis}"] if moved else None
+        plays.append(quantity(f"backlash of the {axis} axis", play, DEG))
+    yield _Result("backlash", plays)
+    for table in () if fit.evidence is None else fit.evidence.positioning:
+        if table.predicted is not None:
+            title = f"ISO 230-2-style figures of the {table.axis} axis, posterior predictive"
+            yield _Result(title, list(_figures(table)), "; ".join(table.notes))
+
+
+def _figures(table: AxisPositioning) -> Iterator[_Quantity]:
+    for name, (symbol, term) in FIGURES.items():
+        figure = (table.predicted or {})[name]
+        low, high = figure.interval95
+        # Medians and intervals of a simulation: the half width over 1.96 stands for u.
+        u = (high - low) / (2 * NORMAL_95)
+        yield _Quantity(f"{symbol}, {term}", dcc_real(DEG, figure.median, u, figure.interval95, "simulated tests"))
 
 
 def _check_certifiable(campaign: Campaign, fit: FitRecord, parties: Parties) -> None:
@@ -262,87 +286,58 @@ def dcc_bytes(
         NotConverged: the fit behind the results has not converged.
     """
     _check_certifiable(campaign, fit, parties)
-    names = {f"xmlns:{prefix}": uri for prefix, uri in DCC_NAMESPACES.items()}
-    # Prefixes are written out: registering them would change ElementTree for the whole process.
-    root = ET.Element("dcc:digitalCalibrationCertificate", {**names, "schemaVersion": DCC_VERSION})
-    number = None if report is None else report.number
-    besides = [campaign.title, *astuple(parties), number]
-    core = _Core(identifier or fit.certificate_id(issued, besides), issued, number)
-    _administrative(root, campaign, fit, core, parties)
-    _measurement(root, campaign, fit)
-    if report is not None:
-        embedded = add(root, "dcc:document")
-        add_words(embedded, "dcc:name", f"report {report.number}")
-        add(embedded, "dcc:fileName", "report.html")
-        add(embedded, "dcc:mimeType", "text/html")
-        add(embedded, "dcc:dataBase64", base64.b64encode(report.html).decode())
+    summary, made, when = fit.summary, fit.provenance, performed(campaign, issued)
+    besides = [campaign.title, *astuple(parties), None if report is None else report.number]
+    # PTB's Schematron wants a letter and up to four numbers; the whole version stands in the description.
+    release = _RELEASE.match(made.versions["tvsbayes"])
+    listed = ", ".join(f"{name} {version}" for name, version in made.versions.items())
+    pose = summary.reference_pose_deg
+    kind = "posterior draws" if summary.estimator == "posterior" else "the Laplace approximation of the posterior"
+    where = f"at mirror angles pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
+    named = campaign.header.get("method")
+    return _rendered(
+        campaign=campaign,
+        header=campaign.header,
+        parties=parties,
+        report=report,
+        issued=issued,
+        identifier=identifier or fit.certificate_id(issued, besides),
+        performance=when,
+        release=f"v{release.group() if release else '0'}",
+        software=f"{listed}; seed {made.seed}; command: {made.command}",
+        statements=_statements(campaign, fit, when, parties),
+        scope=f"Effective ratios hold {where}. Values and intervals from {kind}. {COVERAGE}",
+        method=METHOD + (f" Method as named by the user: {named}" if named else ""),
+        cameras=_cameras(campaign),
+        board_certificate=header_table(campaign, "traceability").get("board_certificate", NOT_STATED),
+        pitch=_stated(campaign, "traceability", "pitch_mm", MM),
+        conditions={
+            refers: _Quantity(name, _stated(campaign, "environment", key, unit))
+            for refers, (key, name, unit) in CONDITIONS.items()
+        },
+        results=_results(fit),
+    )
+
+
+def _text(value: object) -> Markup:
+    """A value as the schema takes it: escaped, on one line, never empty, no character that XML cannot hold."""
+    return value if isinstance(value, Markup) else Markup(escape(plain_text(_FORBIDDEN.sub("\ufffd", str(value)))))
+
+
+def _rendered(**content: object) -> bytes:
+    """The template with its content, indented; that it is well-formed is seen on the way."""
+    environment = Environment(
+        loader=FileSystemLoader(str(shipped_data() / "export")),
+        autoescape=True,
+        finalize=_text,
+        undefined=StrictUndefined,
+    )
+    builder = ET.TreeBuilder()
+    # Not ElementTree's parser: it would take the prefixes for names of its own.
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler = builder.data
+    parser.Parse(environment.get_template("certificate.xml").render(**content), True)
+    root = builder.close()
     ET.indent(root)
     return ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
-
-
-def _measurement(root: ET.Element, campaign: Campaign, fit: FitRecord) -> None:
-    """Method, equipment, conditions and the results themselves."""
-    summary = fit.summary
-    part = add(add(root, "dcc:measurementResults"), "dcc:measurementResult", refId="item")
-    add_words(part, "dcc:name", _RESULT_TITLE)
-    pose = summary.reference_pose_deg
-    where = f"at mirror angles pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
-    kind = "posterior draws" if summary.estimator == "posterior" else "the Laplace approximation of the posterior"
-    scope = f"Effective ratios hold {where}. Values and intervals from {kind}. {COVERAGE}"
-    add_words(part, "dcc:description", scope)
-    method = add(add(part, "dcc:usedMethods"), "dcc:usedMethod", id="method")
-    add_words(method, "dcc:name", "joint estimate from stereo spots")
-    texts = [METHOD, *(f"Method as named by the user: {t}" for t in [campaign.header.get("method")] if t)]
-    add_words(method, "dcc:description", *texts)
-    for norm in NORMS:
-        add(method, "dcc:norm", norm)
-    add(method, "dcc:reference", REFERENCE)
-    _software(part, "dcc:usedSoftware", fit.provenance, id="software")
-    _equipment(part, campaign)
-    _conditions(part, campaign)
-    results = add(part, "dcc:results")
-    data = _result(results, "effective degrees of beam per motor step")
-    for direction, entry in summary.effective.items():
-        _quantity(data, f"effective degrees per step, {direction}", entry, "deg/step", summary.estimator)
-    data = _result(results, "backlash")
-    for axis in AXES:
-        moved = any(summary.effective[d] is not None for d in SIDES[axis])
-        play = summary.parameters[f"backlash_deg.{axis}"] if moved else None
-        _quantity(data, f"backlash of the {axis} axis", play, "deg", summary.estimator)
-    for table in () if fit.evidence is None else fit.evidence.positioning:
-        _positioning_result(results, table)
-
-
-def _result(results: ET.Element, name: str, *texts: str) -> ET.Element:
-    """A result with its data element; it refers to method, software and equipment of the section."""
-    result = add(results, "dcc:result", refId="method software cameras board")
-    add_words(result, "dcc:name", name)
-    if texts:
-        add_words(result, "dcc:description", *texts)
-    return add(result, "dcc:data")
-
-
-def _quantity(parent: ET.Element, name: str, estimate: Estimate | None, unit: str, estimator: str) -> None:
-    """A measured value; one that was never moved or never estimated says so instead of a number."""
-    quantity = add(parent, "dcc:quantity", refType="basic_measuredValue")
-    add_words(quantity, "dcc:name", name)
-    if estimate is None:
-        add_words(quantity, "dcc:noQuantity", "no value: the axis was never moved in this direction")
-        return
-    shape = "normal" if estimator == "laplace" else "sampled posterior"
-    add_real(quantity, UNIT_SI[unit], estimate.value, estimate.sd, estimate.interval95, shape)
-
-
-def _positioning_result(results: ET.Element, table: AxisPositioning) -> None:
-    if table.predicted is None:
-        return
-    title = f"ISO 230-2-style figures of the {table.axis} axis, posterior predictive"
-    data = _result(results, title, "; ".join(table.notes))
-    for name, (symbol, term) in FIGURES.items():
-        figure = table.predicted[name]
-        quantity = add(data, "dcc:quantity", refType="basic_measuredValue")
-        add_words(quantity, "dcc:name", f"{symbol}, {term}")
-        low, high = figure.interval95
-        # Medians and intervals of a simulation: the half width over 1.96 stands for u.
-        u = (high - low) / (2 * NORMAL_95)
-        add_real(quantity, UNIT_SI["deg"], figure.median, u, figure.interval95, "simulated tests")

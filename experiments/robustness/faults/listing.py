@@ -154,7 +154,7 @@ FAULTS = (
     # Reports, certificates, exit codes.
     Fault("ISO 230-2 accuracy is taken with one sd", "figures_of", Local("high_up", "mean_up + sd_up"),
           "test_figures_of_the_published_readings"),
-    Fault("a certificate states the whole width as expanded uncertainty", "add_real", Local("expanded", "2 * value"),
+    Fault("a certificate states the whole width as expanded uncertainty", "dcc_real", Local("expanded", "2 * value"),
           "test_ratios_stand_with_expanded_uncertainty_and_backlash_with_its_own"),
     Fault("uncertainties are printed twice as large", "tables.concise", Argument("sd", "2 * value"),
           "test_concise_shows_two_digits_of_the_uncertainty"),
