@@ -15,7 +15,7 @@ from tvsbayes.files.csv_table import parse_table
 def test_message_tells_place_found_allowed_and_remedy():
     table = parse_table(b"a,b\n1,2\n3,nan\n", "spots.csv", ("a", "b"))
     with pytest.raises(InputError) as caught:
-        table.numbers("b", 0.0, 10.0)
+        table.numbers("b", float, 0.0, 10.0)
     error = caught.value
     assert error.message == (
         'spots.csv line 3, b: found "nan"; allowed: a finite decimal number from 0 to 10; '

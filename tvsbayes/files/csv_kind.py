@@ -66,8 +66,7 @@ class Column:
             return table.columns[self.name]
         if self.kind is str:
             return table.texts(self.name, self.chars_max, not self.filled)
-        read: Callable[..., list[Any]] = table.integers if self.kind is int else table.numbers
-        values = read(self.name, self.low, self.high, self.may_be_empty)
+        values = table.numbers(self.name, self.kind, self.low, self.high, self.may_be_empty)
         filled = self.default is MISSING or self.default is None
         return values if filled else [self.default if value is None else value for value in values]
 

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import overload
 
 from tvsbayes.errors import INTEGER, InputError, closest, escaped, refusal, shown
 from tvsbayes.files.disk import decode, line_in_file, opened
@@ -56,7 +55,7 @@ def number_remedy(cell: str, *, whole: bool = False) -> str:
     return "write a whole number such as 200" if whole else "write a decimal number such as 9.47"
 
 
-def _plain(cells: Sequence[str], kind: type[float] | type[int], low: float, high: float) -> list | None:
+def _plain[N: (int, float)](cells: Sequence[str], kind: type[N], low: float, high: float) -> list[N] | None:
     """The numbers of a column without a single odd cell, fast; else None, and each cell is looked at."""
     # Of what these characters can spell, float() and int() take exactly NUMBER and INTEGER.
     if not cells or not set().union(*cells) <= set("0123456789+-" if kind is int else "0123456789+-.eE"):
@@ -95,52 +94,37 @@ class Table:
         line = self.lines[row]
         return refusal(code, file=self.file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
 
-    @overload
-    def numbers(self, column: str, low: float, high: float) -> list[float]: ...
-
-    @overload
-    def numbers(self, column: str, low: float, high: float, empty: bool) -> list[float | None]: ...
-
-    def numbers(self, column: str, low: float, high: float, empty: bool = False) -> list[float] | list[float | None]:
-        """Finite numbers in [low, high]; None for an empty cell where `empty` allows it."""
-        if (plain := _plain(self.columns[column], float, low, high)) is not None:
+    def numbers[N: (int, float)](
+        self, column: str, kind: type[N], low: float, high: float, empty: bool = False
+    ) -> Sequence[N | None]:
+        """Finite numbers in [low, high], whole ones of the kind int; None for an empty cell where `empty` allows it."""
+        if (plain := _plain(self.columns[column], kind, low, high)) is not None:
             return plain
-        values: list[float | None] = []
-        match, isfinite = NUMBER.fullmatch, math.isfinite
+        values: list[N | None] = []
+        match = (INTEGER if kind is int else NUMBER).fullmatch
         for row, cell in enumerate(self.columns[column]):
             if not cell and empty:
                 values.append(None)
                 continue
-            value = float(cell) if match(cell) else math.nan
-            if not (isfinite(value) and low <= value <= high):
-                allowed = f"a finite decimal number from {low:g} to {high:g}{', or an empty cell' * empty}"
-                remedy = "mind the unit of the column" if isfinite(value) else number_remedy(cell)
-                raise self.refuse(row, column, "number", allowed, remedy)
-            values.append(value)
+            value = kind(cell) if match(cell) else math.nan
+            if not (math.isfinite(value) and low <= value <= high):
+                raise self._no_number(row, column, kind, low, high, empty)
+            values.append(kind(value))
         return values
 
-    @overload
-    def integers(self, column: str, low: int, high: int) -> list[int]: ...
-
-    @overload
-    def integers(self, column: str, low: int, high: int, empty: bool) -> list[int | None]: ...
-
-    def integers(self, column: str, low: int, high: int, empty: bool = False) -> list[int] | list[int | None]:
-        """Whole numbers in [low, high]; None for an empty cell where `empty` allows it."""
-        if (plain := _plain(self.columns[column], int, low, high)) is not None:
-            return plain
-        values: list[int | None] = []
-        for row, cell in enumerate(self.columns[column]):
-            if not cell and empty:
-                values.append(None)
-                continue
-            value = int(cell) if INTEGER.fullmatch(cell) else None
-            if value is None or not low <= value <= high:
-                allowed = f"a whole number from {low} to {high}{', or an empty cell' * empty}"
-                remedy = "write a whole number, no point" if NUMBER.fullmatch(cell) else number_remedy(cell, whole=True)
-                raise self.refuse(row, column, "integer", allowed, remedy)
-            values.append(value)
-        return values
+    def _no_number(
+        self, row: int, column: str, kind: type[int] | type[float], low: float, high: float, empty: bool
+    ) -> InputError:
+        """The error of a cell that is no number of a kind and range."""
+        cell = self.columns[column][row]
+        matched = NUMBER.fullmatch(cell) is not None
+        if kind is int:
+            code, allowed = "integer", f"a whole number from {low} to {high}"
+            remedy = "write a whole number, no point" if matched else number_remedy(cell, whole=True)
+        else:
+            code, allowed = "number", f"a finite decimal number from {low:g} to {high:g}"
+            remedy = "mind the unit of the column" if matched and math.isfinite(float(cell)) else number_remedy(cell)
+        return self.refuse(row, column, code, allowed + ", or an empty cell" * empty, remedy)
 
     def texts(self, column: str, chars_max: int = 100, empty: bool = True) -> list[str]:
         """Printable text that a spreadsheet does not take for a formula."""

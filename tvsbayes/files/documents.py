@@ -14,6 +14,7 @@ import numbers
 import re
 import tomllib
 from collections.abc import Iterable
+from functools import partial
 
 from tvsbayes.errors import INTEGER, InputError, closest, escaped, other_format, refusal, shown
 from tvsbayes.files.disk import decode
@@ -35,20 +36,18 @@ _TOKEN = re.compile(rf"{_TOML_STRING_OR_COMMENT.pattern}|[\[\]{{}}=:,.\n]|[^\s\[
 """What keys are found by: strings and comments whole, marks, and words between them."""
 
 
+def _bad(file: str, code: str, found: str, allowed: str, remedy: str, line: int | None = None) -> InputError:
+    return refusal(code, file=file, line=line, found=found, allowed=allowed, remedy=remedy)
+
+
 def _check_nesting(bare: str, file: str) -> None:
     """Refuses brackets nested too deeply for a recursive parser; `bare` is text without its strings."""
     depth = 0
     for bracket in re.finditer(r"[\[\]{}]", bare):
         depth = depth + 1 if bracket.group() in "[{" else max(depth - 1, 0)
         if depth > NESTING_MAX:
-            raise refusal(
-                "nesting",
-                file=file,
-                line=bare.count("\n", 0, bracket.start()) + 1,
-                found=f"brackets nested more than {NESTING_MAX} deep",
-                allowed=f"at most {NESTING_MAX} levels",
-                remedy="flatten the file",
-            )
+            found, allowed = f"brackets nested more than {NESTING_MAX} deep", f"at most {NESTING_MAX} levels"
+            raise _bad(file, "nesting", found, allowed, "flatten the file", bare.count("\n", 0, bracket.start()) + 1)
 
 
 def _key_lines(text: str) -> dict[str, int]:
@@ -125,15 +124,8 @@ class Keys:
         if found is None:
             found = shown(self.values[key]) if key in self.values else "nothing"
         keys = (*self.path, key)
-        return refusal(
-            code,
-            file=self.file,
-            line=self._line(keys),
-            column=".".join(escaped(k) for k in keys),
-            found=found,
-            allowed=allowed,
-            remedy=remedy,
-        )
+        place = partial(refusal, file=self.file, line=self._line(keys), column=".".join(map(escaped, keys)))
+        return place(code, found=found, allowed=allowed, remedy=remedy)
 
     def _line(self, keys: tuple[str, ...]) -> int | None:
         """The line of the innermost of `keys` that stands in the text."""
@@ -229,60 +221,35 @@ class Keys:
 
 def parse_toml(data: bytes, file: str) -> Keys:
     """The top table of a TOML file; size, nesting and dotted keys are capped before parsing."""
+    bad = partial(_bad, file)
     if len(data) > TOML_BYTES_MAX:
-        raise refusal(
-            "size",
-            file=file,
-            found=f"{len(data)} bytes",
-            allowed=f"at most {TOML_BYTES_MAX} bytes",
-            remedy="shorten it",
-        )
+        raise bad("size", f"{len(data)} bytes", f"at most {TOML_BYTES_MAX} bytes", "shorten it")
     text = decode(data, file)
     bare = _TOML_STRING_OR_COMMENT.sub(lambda m: "Q" + "\n" * m.group().count("\n"), text)
     _check_nesting(bare, file)
     for number, line in enumerate(bare.split("\n"), start=1):
         if any(part.count(".") >= DOTTED_PARTS_MAX for part in re.split(r"[^\w.\- \t]", line)):
-            raise refusal(
-                "nesting",
-                file=file,
-                line=number,
-                found=f"a key of more than {DOTTED_PARTS_MAX} dotted parts",
-                allowed=f"at most {DOTTED_PARTS_MAX}",
-                remedy="use the keys of the format only",
-            )
+            found, allowed = f"a key of more than {DOTTED_PARTS_MAX} dotted parts", f"at most {DOTTED_PARTS_MAX}"
+            raise bad("nesting", found, allowed, "use the keys of the format only", number)
     try:
         values = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         place = re.search(r"\(at line (\d+), column \d+\)", str(error))
-        twice = re.match(r"Cannot declare \((.*?),?\) twice", str(error))
-        if twice and place:
+        at = int(place[1]) if place else None
+        if place and (twice := re.match(r"Cannot declare \((.*?),?\) twice", str(error))):
             name = ".".join(re.findall(r"'([^']*)'", twice[1]))
             first = _key_lines(text).get(name)
-            raise refusal(
-                "toml",
-                file=file,
-                line=int(place[1]),
-                found=f"the table [{escaped(name, 60)}] a second time" + (f", first in line {first}" if first else ""),
-                allowed="every table once",
-                remedy="put the entries below the first header, and remove the second",
-            ) from error
-        raise refusal(
-            "toml",
-            file=file,
-            line=int(place.group(1)) if place else None,
-            found=escaped(re.sub(r" \(at .*\)", "", str(error)), 120),
-            allowed="TOML 1.0",
-            remedy="correct the syntax; text needs quotes, numbers a decimal point",
-        ) from error
+            found = f"the table [{escaped(name, 60)}] a second time" + (f", first in line {first}" if first else "")
+            remedy = "put the entries below the first header, and remove the second"
+            raise bad("toml", found, "every table once", remedy, at) from error
+        remedy = "correct the syntax; text needs quotes, numbers a decimal point"
+        raise bad("toml", escaped(re.sub(r" \(at .*\)", "", str(error)), 120), "TOML 1.0", remedy, at) from error
     return Keys(values, file, text)
 
 
 def parse_json(data: bytes, file: str) -> Keys:
     """The top object of a JSON file: capped, no duplicate keys, finite numbers only."""
-
-    def bad(code: str, found: str, allowed: str, remedy: str, line: int | None = None) -> InputError:
-        return refusal(code, file=file, line=line, found=found, allowed=allowed, remedy=remedy)
-
+    bad = partial(_bad, file)
     if len(data) > JSON_BYTES_MAX:
         raise bad("size", f"{len(data)} bytes", f"at most {JSON_BYTES_MAX} bytes", "shorten it")
     text = decode(data, file)
