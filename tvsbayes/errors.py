@@ -92,6 +92,11 @@ class DeviceFault(TvsError):
     exit_code = 5
 
 
+def fault(code: str, found: str, remedy: str) -> DeviceFault:
+    """The `DeviceFault` whose message says what was found and what to do."""
+    return DeviceFault(code, f"{found}; {remedy}", found=found, remedy=remedy)
+
+
 INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
@@ -124,6 +129,12 @@ def refusal(
     where = file + (f" line {line}" if line else "") + (f", {escaped(column)}" if column else "")
     message = f"{where}: found {found}; allowed: {allowed}; {remedy}"
     return InputError(code, message, file=file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
+
+
+def entry_refusal(code: str, table: str, key: str, found: str, allowed: str, remedy: str) -> InputError:
+    """The same of an entry in a table of the rig file."""
+    message = f"[{table}] {key}: found {found}; allowed: {allowed}; {remedy}"
+    return InputError(code, message, column=f"{table}.{key}", found=found, allowed=allowed, remedy=remedy)
 
 
 def all_of(refused: Sequence[InputError], most: int = 5) -> InputError:

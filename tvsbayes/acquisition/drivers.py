@@ -13,7 +13,7 @@ from importlib import metadata
 from typing import Any
 
 from tvsbayes.cameras.capture import StereoCamera
-from tvsbayes.errors import DeviceFault, InputError, TvsError, closest, escaped
+from tvsbayes.errors import InputError, TvsError, closest, entry_refusal, escaped, fault
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import DEFAULT_DRIVER, Positioner, Triggering
 
@@ -87,24 +87,21 @@ def _made(group: str, name: str, rig: Rig) -> Any:
         raise
     except Exception as error:
         found = f"driver {escaped(name)} failed: {type(error).__name__}: {escaped(str(error), 200)}"
-        remedy = "see the manual of the package that brought it"
-        raise DeviceFault("driver", f"{found}; {remedy}", found=found, remedy=remedy) from error
+        raise fault("driver", found, "see the manual of the package that brought it") from error
 
 
 def _factory(group: str, name: str) -> Callable[[Rig], Any]:
     drivers = known(group)
-    column = f"{_TABLES[group]}.driver"
     if name not in drivers:
         remedy = f"{closest(name, tuple(drivers))}, or install the package that brings it"
-        message = f"[{_TABLES[group]}] driver: found {escaped(name)}; allowed: {', '.join(drivers)}; {remedy}"
-        raise InputError(
-            "driver", message, column=column, found=escaped(name), allowed=", ".join(drivers), remedy=remedy
-        )
+        raise entry_refusal("driver", _TABLES[group], "driver", escaped(name), ", ".join(drivers), remedy)
     module, _, function = drivers[name].partition(":")
     try:
         made: Callable[[Rig], Any] = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
         found = f"driver {escaped(name)} cannot be loaded: {escaped(str(error), 200)}"
         remedy = "install the package that brings it anew, with all that it needs"
-        raise InputError("driver", f"{found}; {remedy}", column=column, found=found, remedy=remedy) from error
+        raise InputError(
+            "driver", f"{found}; {remedy}", column=f"{_TABLES[group]}.driver", found=found, remedy=remedy
+        ) from error
     return made

@@ -30,7 +30,7 @@ from tvsbayes.acquisition.replanning import Proposal, Replanning, adapted_entrie
 from tvsbayes.acquisition.run_identity import setup_entries
 from tvsbayes.acquisition.run_log import Outcome, RunLog
 from tvsbayes.acquisition.running_estimate import Aim, RunningEstimate
-from tvsbayes.errors import DeviceFault, InputError, TvsError
+from tvsbayes.errors import InputError, TvsError, fault
 from tvsbayes.instrument.axes import AXES, direction_of
 from tvsbayes.instrument.campaign import UNDETECTED, Spot, pixels_of
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
@@ -271,7 +271,7 @@ class Acquisition:
             self._place(self._log.recorder.state.target, self._placement, wrong, None)
         else:
             remedy = "check the sheet and [sheets] of the rig file, then go on with --resume"
-            raise DeviceFault("placement", f"the sheet is not where it should be: {wrong}; {remedy}", remedy=remedy)
+            raise fault("placement", f"the sheet is not where it should be: {wrong}", remedy)
         frames = tuple(self.journal.store(name, data) for name, data in observation.pictures.items())
         found = observation.sighting
         more = {} if reference is None else self._compared(reference, found.pixels_px)

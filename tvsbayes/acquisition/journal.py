@@ -26,7 +26,7 @@ from pathlib import Path
 import msgspec
 
 from tvsbayes.acquisition.journal_events import FRAME_NAME, Event, Frame
-from tvsbayes.errors import DeviceFault, InputError, escaped, refusal
+from tvsbayes.errors import DeviceFault, InputError, escaped, fault, refusal
 from tvsbayes.files.disk import flush_folder, make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import parse_json
 
@@ -364,8 +364,7 @@ class Journal:
         line = encode(len(self.records), self._crc, event, data)
         with self._guarded() as descriptor:
             if len(self.records) >= LOG_EVENTS_MAX or self._size + len(line) > LOG_BYTES_MAX:
-                message, remedy = "the journal is full", "begin a new campaign for the rest of the plan"
-                raise DeviceFault("journal-full", f"{message}; {remedy}", remedy=remedy)
+                raise fault("journal-full", "the journal is full", "begin a new campaign for the rest of the plan")
             for folder in sorted(self._dirty):
                 flush_folder(folder, self._disk)
             self._dirty.clear()

@@ -24,7 +24,7 @@ from tvsbayes.cameras.contour import epipolar_refused
 from tvsbayes.cameras.detection import pair_status
 from tvsbayes.cameras.spot_fit import find_spot
 from tvsbayes.cameras.spot_noise import SpotNoise
-from tvsbayes.errors import DeviceFault
+from tvsbayes.errors import fault
 from tvsbayes.files.images import in_grey_levels, png_bytes
 from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, frame_name
 from tvsbayes.instrument.rig import Rig
@@ -124,7 +124,7 @@ class CameraObserver:
             positioner.laser(False)
         if not on:
             remedy = "raise the frame rate of the cameras, or the watchdog time of the firmware"
-            raise DeviceFault("watchdog", f"the laser went off during the exposure; {remedy}", remedy=remedy)
+            raise fault("watchdog", "the laser went off during the exposure", remedy)
         self._wait_for_darkness(dark)
         pictures = {}
         if self.keep_pictures:
@@ -155,8 +155,7 @@ class CameraObserver:
             # Sensor noise makes two exposures differ, whatever they show.
             if np.array_equal(lit.left, dark.left) or np.array_equal(lit.right, dark.right):
                 remedy = "unplug the camera and plug it in again, then go on with --resume"
-                message = f"a camera delivers the same picture again and again; {remedy}"
-                raise DeviceFault("frozen", message, remedy=remedy)
+                raise fault("frozen", "a camera delivers the same picture again and again", remedy)
             if min(rises_dn(dark, lit)) > CHANGE_DN:
                 if number:
                     # Light came on during the first lit exposure, or in one still older: take a whole one.
@@ -173,14 +172,14 @@ class CameraObserver:
             return
         if max(abs(a - b) for a, b in zip(before, found.pixels_px, strict=True)) < SAME_PLACE_PX:
             remedy = "cut the laser's supply at once; if it is off, cover what else shines in the picture"
-            raise DeviceFault("light", f"the spot is there with the laser off, too; {remedy}", remedy=remedy)
+            raise fault("light", "the spot is there with the laser off, too", remedy)
 
     def _wait_for_darkness(self, dark: StereoImage) -> None:
         for _ in range(WAIT_GRABS):
             if max(rises_dn(dark, self._grab())) <= CHANGE_DN:
                 return
         remedy = "cut the laser's supply at once; if it is off, something else in the room has become bright"
-        raise DeviceFault("light", f"the spot does not vanish with the laser off; {remedy}", remedy=remedy)
+        raise fault("light", "the spot does not vanish with the laser off", remedy)
 
 
 def rises_dn(before: StereoImage, after: StereoImage) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import IO
 
 from tvsbayes.acquisition.journal_events import PlaceCommanded
-from tvsbayes.errors import DeviceFault, InputError, escaped
+from tvsbayes.errors import InputError, escaped, fault
 
 LIMIT_S = 600.0
 """Default longest time of one placement."""
@@ -117,9 +117,8 @@ def require_placed(done: PlaceCommanded) -> None:
     code, limit_s = done.exit_code, done.limit_s
     how = f"was ended after {done.seconds:g} s (limit {limit_s:g} s)" if code is None else f"ended with code {code}"
     said = escaped(done.words.strip()[-200:], 300) or "nothing"
-    remedy = "bring the sheet into reach, then go on with --resume"
-    message = f"the place command for {escaped(done.target)} {how} and said: {said}; {remedy}"
-    raise DeviceFault("place-command", message, remedy=remedy)
+    found = f"the place command for {escaped(done.target)} {how} and said: {said}"
+    raise fault("place-command", found, "bring the sheet into reach, then go on with --resume")
 
 
 def _last_words(output: IO[bytes]) -> str:

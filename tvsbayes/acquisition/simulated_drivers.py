@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 from tvsbayes.acquisition.observation import twin_renderer
 from tvsbayes.acquisition.simulated_instrument import Instrument, Renderer
 from tvsbayes.cameras.capture import CameraSettings, StereoImage
-from tvsbayes.errors import InputError
+from tvsbayes.errors import entry_refusal
 from tvsbayes.instrument.rig import Rig, Setting
 from tvsbayes.positioner.driver import SerialPositioner
 
@@ -56,8 +56,7 @@ def _twin(rig: Rig, table: dict[str, Setting], name: str) -> Instrument:
     if unknown or not isinstance(seed, int) or seed < 0:
         remedy = "leave out what a simulated instrument does not have"
         found, allowed = ", ".join(unknown) or f"seed {seed}", "options.seed, a whole number from 0"
-        message = f"[{name}] options: found {found}; allowed: {allowed}; {remedy}"
-        raise InputError("options", message, column=f"{name}.options", found=found, allowed=allowed, remedy=remedy)
+        raise entry_refusal("options", name, "options", found, allowed, remedy)
     key = str(rig.path), seed
     twin = _TWINS.get(key)
     if twin is None:

@@ -26,7 +26,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from tvsbayes.cameras.network_stream import Capture, NetworkStream
-from tvsbayes.errors import DeviceFault, InputError, escaped
+from tvsbayes.errors import DeviceFault, InputError, escaped, fault
 from tvsbayes.files.images import white_level
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import Clock
@@ -150,8 +150,7 @@ def _opened(capture: Any, source: str | int) -> Capture:
     if not capture.isOpened():
         capture.release()
         remedy = "check [cameras] in the rig file, the cable, and that no other program has the camera"
-        found = escaped(without_password(str(source)))
-        raise DeviceFault("camera", f"camera {found} cannot be opened; {remedy}", remedy=remedy)
+        raise fault("camera", f"camera {escaped(without_password(str(source)))} cannot be opened", remedy)
     return capture
 
 
@@ -250,7 +249,7 @@ class OpenCVCamera:
         if not done or abs(read - exposure) > max(0.05 * abs(exposure), 1.0):
             found = f"{name}: exposure {exposure:g} was set and {read:g} read back"
             remedy = "leave [cameras] exposure out and fix it at the camera, or give a value the driver takes"
-            raise DeviceFault("exposure", f"{found}; {remedy}", found=found, remedy=remedy)
+            raise fault("exposure", found, remedy)
 
     def settings(self) -> CameraSettings:
         """See `StereoCamera.settings`."""
@@ -310,7 +309,7 @@ class OpenCVCamera:
                 break
             before = now
         remedy = "lower the frame rate of the camera, or serve its stream at the rate of the exposures"
-        raise DeviceFault("stale", f"the camera's frames never have to be waited for; {remedy}", remedy=remedy)
+        raise fault("stale", "the camera's frames never have to be waited for", remedy)
 
     def _retrieve(self, name: str, capture: Capture) -> np.ndarray:
         good, picture = capture.retrieve()
@@ -320,7 +319,7 @@ class OpenCVCamera:
         if picture.shape[:2] != expected or picture.dtype not in (np.uint8, np.uint16):
             found = f"{name}: pictures of {picture.shape[1]} x {picture.shape[0]} px"
             remedy = f"{expected[1]} x {expected[0]} px were calibrated: set the camera to that size"
-            raise DeviceFault("image-size", f"{found}; {remedy}", found=found, remedy=remedy)
+            raise fault("image-size", found, remedy)
         # Monochrome cameras give one channel.
         return (
             picture if picture.ndim == 3 and picture.shape[2] == 3 else np.repeat(picture.reshape(*expected, 1), 3, 2)
@@ -349,4 +348,4 @@ def _manual_exposure(capture: Capture) -> int:
 
 def _no_frame(name: str) -> DeviceFault:
     remedy = "check its cable and USB port, and that no other program has it; then go on with --resume"
-    return DeviceFault("no-frame", f"camera {name} delivers no frame; {remedy}", remedy=remedy)
+    return fault("no-frame", f"camera {name} delivers no frame", remedy)

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tvsbayes.cameras.capture import PIPELINE_FRAMES, CameraSettings, StereoImage
-from tvsbayes.errors import DeviceFault, InputError, escaped
+from tvsbayes.errors import DeviceFault, InputError, entry_refusal, escaped, fault
 from tvsbayes.instrument.rig import Rig, Setting
 
 FETCH_S = 5.0
@@ -35,6 +36,7 @@ STEPS = {"ExposureTime": 1.0, "Gain": 0.1}
 """A camera rounds to steps of its own: it has taken a value that reads back within this share or this much of it, us
 and the camera's unit of gain, mostly dB."""
 _NAMES = ("left", "right")
+_refused = partial(entry_refusal, "cameras", "cameras")
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ class GenicamCamera:
             self.close()
             if isinstance(error, DeviceFault):
                 raise
-            raise _fault(
+            raise fault(
                 "camera", f"the GenTL producer: {_said(error)}", "check the .cti file and the cables"
             ) from error
 
@@ -148,7 +150,7 @@ class GenicamCamera:
             if len(fits) != 1:
                 there = ", ".join(_text(d, "serial_number") for d in known) or "none"
                 found = f"{name}: {len(fits)} cameras are {escaped(wanted)}; there are: {escaped(there, 200)}"
-                raise _fault("camera", found, "correct [cameras], check cable and supply, close other programs")
+                raise fault("camera", found, "correct [cameras], check cable and supply, close other programs")
             acquirer = self._harvester.create(fits[0])
             self._acquirers.append(acquirer)
             self._fix(name, acquirer.remote_device.node_map)
@@ -163,7 +165,7 @@ class GenicamCamera:
         elif wishes.trigger == SOFTWARE:
             self._warnings.append(f"{name}: runs freely, without a trigger; buffers are emptied before every look")
         else:
-            raise _fault("camera-setting", f"{name}: no trigger", "leave out [cameras.options] trigger")
+            raise fault("camera-setting", f"{name}: no trigger", "leave out [cameras.options] trigger")
         if wishes.exposure_us is not None:
             must["ExposureTime"] = wishes.exposure_us
         if wishes.gain is not None:
@@ -174,7 +176,7 @@ class GenicamCamera:
         for node, value in must.items():
             if not _set(nodes, node, value):
                 found = f"{name}: {node} = {value} was not taken"
-                raise _fault("camera-setting", found, "see what the maker's program allows, correct [cameras]")
+                raise fault("camera-setting", found, "see what the maker's program allows, correct [cameras]")
 
     @property
     def wants_pulse(self) -> bool:
@@ -204,7 +206,7 @@ class GenicamCamera:
         """
         if self.wants_pulse and self._pulse is None:
             remedy = "use a positioner that offers one (driver serial), or leave out [cameras.options] trigger"
-            raise _fault("trigger", f"the cameras wait for {self._wishes.trigger} and nobody pulses it", remedy)
+            raise fault("trigger", f"the cameras wait for {self._wishes.trigger} and nobody pulses it", remedy)
         try:
             for acquirer in self._acquirers:
                 _drain(acquirer)
@@ -217,7 +219,7 @@ class GenicamCamera:
         except DeviceFault:
             raise
         except Exception as error:
-            raise _fault("no-frame", f"a camera delivers no frame: {_said(error)}", "check its cable") from error
+            raise fault("no-frame", f"a camera delivers no frame: {_said(error)}", "check its cable") from error
         return StereoImage(left, right, 2 ** PIXEL_BITS[self._wishes.pixel_format] - 1)
 
     def _expose(self, free: Sequence[bool]) -> None:
@@ -238,7 +240,7 @@ class GenicamCamera:
             size = int(part.width), int(part.height)
             if size != self._size:
                 found = f"{name}: pictures of {size[0]} x {size[1]} px"
-                raise _fault("image-size", found, f"{self._size[0]} x {self._size[1]} px were calibrated")
+                raise fault("image-size", found, f"{self._size[0]} x {self._size[1]} px were calibrated")
             # The memory belongs to the producer again once the buffer is given back.
             data = np.array(part.data)
         return _as_bgr(data, self._size, self._wishes.pixel_format)
@@ -295,12 +297,3 @@ def _text(device: Any, name: str) -> str:
 
 def _said(error: Exception) -> str:
     return f"{type(error).__name__}: {escaped(str(error), 200)}"
-
-
-def _refused(key: str, found: str, allowed: str, remedy: str) -> InputError:
-    message = f"[cameras] {key}: found {found}; allowed: {allowed}; {remedy}"
-    return InputError("cameras", message, column=f"cameras.{key}", found=found, allowed=allowed, remedy=remedy)
-
-
-def _fault(code: str, found: str, remedy: str) -> DeviceFault:
-    return DeviceFault(code, f"{found}; {remedy}", found=found, remedy=remedy)

@@ -15,8 +15,9 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
-from tvsbayes.errors import DeviceFault, InputError, escaped
+from tvsbayes.errors import DeviceFault, entry_refusal, escaped
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.positioner.grbl_messages import (
@@ -55,6 +56,7 @@ FOREIGN_KEYS = ("pan_home_steps", "tilt_home_steps", "acceleration_steps_per_s2"
 """Entries of `[positioner]` that are settings of the board here ($23, $27, $120), or that it does not have."""
 UNLIMITED = CounterLimits({axis: (None, None) for axis in AXES})
 _MOVING = ("Run", "Home", "Jog", "Hold")
+_refused = partial(entry_refusal, "positioner", "positioner")
 
 
 @dataclass(frozen=True)
@@ -433,8 +435,3 @@ def _power(stated: str | int | float | None) -> float | None:
         remedy = "write a number without quotes, up to the board's $30, or leave it out for full power"
         raise _refused("options.laser_power", escaped(str(stated)), "a number of 0 or more", remedy)
     return float(stated)
-
-
-def _refused(key: str, found: str, allowed: str, remedy: str) -> InputError:
-    message = f"[positioner] {key}: found {found}; allowed: {allowed}; {remedy}"
-    return InputError("positioner", message, column=f"positioner.{key}", found=found, allowed=allowed, remedy=remedy)
