@@ -12,7 +12,8 @@ import pytest
 from support.drawn_boards import BOARD, FOUND_PX, POSES, SIZE, pictures, true_corners, write_pair
 
 from tvsbayes.cameras import boards, seen_boards
-from tvsbayes.cameras.boards import Board, Pairing, find_corners, find_views
+from tvsbayes.cameras.boards import Board, find_corners, find_views
+from tvsbayes.cameras.picture_pairs import Pairing
 from tvsbayes.errors import InputError, NothingToEstimate
 
 

@@ -7,9 +7,10 @@ they are decoded. OpenCV's corner arrays have another rank in 5.x than in 4.x: e
 
 from __future__ import annotations
 
+import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +19,17 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from tvsbayes.cameras.camera_marks import paired_pictures, unnamed_pictures
 from tvsbayes.cameras.marker_boards import MARKERS_MIN, Markers, as_seen, marker_board_corners, most_markers, spread
-from tvsbayes.cameras.picture_pairs import NAMING, Picture, Size, natural_order, sizes_of, usual_sizes
+from tvsbayes.cameras.picture_pairs import (
+    AS_NAMED,
+    NAMING,
+    Pairing,
+    Picture,
+    PictureFolder,
+    Size,
+    natural_order,
+    read_folder,
+)
 from tvsbayes.cameras.seen_boards import shrunk, why_no_board
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal
 from tvsbayes.files.images import in_grey_levels, read_image
@@ -286,24 +295,6 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
-@dataclass(frozen=True)
-class Pairing:
-    """Which picture is of which camera, where somebody has said it.
-
-    Attributes:
-        swap: the left camera's image is the right half of a wide frame, or has the larger number or later folder.
-        globs: patterns of the pictures of the left and of the right camera.
-        in_order: pictures are paired by the order of their names.
-    """
-
-    swap: bool = False
-    globs: tuple[str, str] | None = None
-    in_order: bool = False
-
-
-AS_NAMED = Pairing()
-
-
 def find_views(
     folder: Path,
     board: Board,
@@ -328,27 +319,25 @@ def find_views(
         InputError: no folder, an unreadable picture, or two for one camera and view.
         NothingToEstimate: no picture of a camera, or no board in any.
     """
-    folder = Path(folder)
-    sizes = _sizes(folder, pairing)
-    usual = usual_sizes(sizes)
-    _refuse_unlike(usual, folder)
-    size = usual["left"]
-    used = [picture for picture, own in sizes.items() if all(own == usual[side] for side in picture.sides)]
+    pictures = read_folder(folder, PICTURES_MAX, PIXELS_MAX, pairing)
+    usual, used = pictures.usual, pictures.used
+    _refuse_unlike(pictures)
     tried = spread(used, TRIED_MAX)
     if board.markers is not None:
-        greys = [part for picture in tried for part in _greys(picture, folder, sizes[picture]).values()]
+        greys = [part for picture in tried for part in _greys(picture, pictures).values()]
         board = replace(board, markers=as_seen(greys, board.markers))
-    if len(used) > len(tried) and not _any_board(folder, tried, sizes, board, finder):
-        raise _without_board(folder, tried, len(used), sizes, board)
+    if len(used) > len(tried) and not _any_board(tried, pictures, board, finder):
+        raise _without_board(tried, pictures, board)
     boards: dict[str, dict[str, _Detection]] = {}
     names: dict[tuple[str, str], str] = {}
     without, fallback = [], []
     for count, (picture, detections) in enumerate(
-        zip(used, _detections(folder, used, sizes, board, finder), strict=True), 1
+        zip(used, _detections(used, pictures, board, finder), strict=True), start=1
     ):
         advance(count / len(used))
         for side, detection in detections.items():
-            name = picture.path.relative_to(folder).as_posix() + (f" ({side})" if len(picture.sides) > 1 else "")
+            name = picture.path.relative_to(pictures.folder).as_posix()
+            name += f" ({side})" if len(picture.sides) > 1 else ""
             names[picture.view, side] = name
             if detection is None:
                 without.append(name)
@@ -357,7 +346,7 @@ def find_views(
             if detection.by_fallback:
                 fallback.append(name)
     if not boards:
-        raise _without_board(folder, tried, len(used), sizes, board)
+        raise _without_board(tried, pictures, board)
     views, reordered = [], []
     for name in sorted(boards, key=natural_order):
         left, right = (boards[name].get(side) for side in CAMERAS)
@@ -365,40 +354,37 @@ def find_views(
         if left is not None and right is not None:
             corners, turned = _agreeing(left, right, board)
             reordered += [name] * turned
-        corners = None if corners is None else scaled_px(corners, usual["right"], size)
+        corners = None if corners is None else scaled_px(corners, usual["right"], usual["left"])
         views.append(View(name, None if left is None else left.corners, corners))
     lonely = [n for (view, side), n in names.items() if (view, CAMERAS[side == "left"]) not in names]
     return Views(
         views=tuple(views),
-        image_width=size[0],
-        image_height=size[1],
+        image_width=usual["left"][0],
+        image_height=usual["left"][1],
         unpaired=tuple(sorted(lonely, key=natural_order)),
-        unnamed=unnamed_pictures(folder, sizes),
+        unnamed=pictures.unnamed,
         without_board=tuple(without),
-        other_size=tuple(p.path.relative_to(folder).as_posix() for p in sizes if p not in used),
-        right_image_size=None if usual["right"] == size else usual["right"],
+        other_size=tuple(path.as_posix() for path in pictures.other_size),
+        right_image_size=None if usual["right"] == usual["left"] else usual["right"],
         by_fallback=tuple(fallback),
         reordered=tuple(reordered),
     )
 
 
-def _any_board(
-    folder: Path, tried: Sequence[Picture], sizes: Mapping[Picture, Size], board: Board, finder: Finder
-) -> bool:
+def _any_board(tried: Sequence[Picture], pictures: PictureFolder, board: Board, finder: Finder) -> bool:
     """Whether one of some pictures shows the board: all would take minutes."""
     for k in range(0, len(tried), TRIED_AT_ONCE):
-        found = _detections(folder, tried[k : k + TRIED_AT_ONCE], sizes, board, finder)
-        if any(one is not None for detections in found for one in detections.values()):
+        some = _detections(tried[k : k + TRIED_AT_ONCE], pictures, board, finder)
+        if any(one is not None for detections in some for one in detections.values()):
             return True
     return False
 
 
-def _without_board(
-    folder: Path, tried: Sequence[Picture], count: int, sizes: Mapping[Picture, Size], board: Board
-) -> NothingToEstimate:
+def _without_board(tried: Sequence[Picture], pictures: PictureFolder, board: Board) -> NothingToEstimate:
     """That pictures do not show the board, and what they show instead."""
-    greys = [part for picture in tried for part in _greys(picture, folder, sizes[picture]).values()]
-    of_sizes = " and ".join(f"{width} x {height}" for width, height in dict.fromkeys(sizes[one] for one in tried))
+    count, sizes = len(pictures.used), dict.fromkeys(pictures.sizes[one] for one in tried)
+    greys = [part for picture in tried for part in _greys(picture, pictures).values()]
+    of_sizes = " and ".join(f"{width} x {height}" for width, height in sizes)
     reason, remedy = why_no_board(greys, board.columns, board.rows)
     if board.markers is None:
         looked = spread(greys)
@@ -418,75 +404,65 @@ def _without_board(
     )
 
 
-def _greys(picture: Picture, folder: Path, size: Size) -> dict[str, np.ndarray]:
+def _greys(picture: Picture, pictures: PictureFolder) -> dict[str, np.ndarray]:
     """The grey images in a picture by their camera, uint8."""
-    pixels = in_grey_levels(read_image(picture.path, folder))
+    pixels, width = in_grey_levels(read_image(picture.path, pictures.folder)), pictures.sizes[picture][0]
     # The finders want 8 bits; a corner is an average over hundreds of pixels.
     if pixels.dtype != np.uint8:
         pixels = np.rint(pixels).astype(np.uint8)
     grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
-    return {
-        side: np.ascontiguousarray(grey[:, k * size[0] : (k + 1) * size[0]]) for k, side in enumerate(picture.sides)
-    }
+    return {side: np.ascontiguousarray(grey[:, k * width : (k + 1) * width]) for k, side in enumerate(picture.sides)}
 
 
-def _refuse_unlike(usual: Mapping[str, Size], folder: Path) -> None:
-    """Refuses pictures of one camera alone, and of two proportions: the right ones are not the left ones, scaled."""
+def _refuse_unlike(pictures: PictureFolder) -> None:
+    """Refuses pictures of one camera alone and of two proportions: the right ones are not the left ones, scaled."""
+    if not pictures.sizes:
+        raise NothingToEstimate(
+            "no-pictures",
+            f"{escaped(str(pictures.folder), 200)}: no checkerboard picture",
+            allowed=f"{NAMING} (PNG or JPEG); or frames of both cameras side by side",
+            remedy="name the pictures left01.png, right01.png, left02.png ...; or --pair order with a folder a camera, "
+            'or --left "cam_a/*.png" --right "cam_b/*.png"',
+        )
+    usual, place = pictures.usual, escaped(pictures.folder.resolve().name)
     for side, size in usual.items():
         if size == (0, 0):
             raise NothingToEstimate(
                 "no-pictures",
-                f"{escaped(folder.resolve().name)}: no picture of the {side} camera",
+                f"{place}: no picture of the {side} camera",
                 allowed=f"{NAMING} (PNG or JPEG)",
                 remedy="put those of both cameras there; names that tell no camera: --left GLOB --right GLOB",
             )
     if not same_shape(usual["left"], usual["right"]):
-        (left, right) = (f"{width} x {height}" for width, height in usual.values())
+        left, right = (f"{width} x {height}" for width, height in usual.values())
         raise refusal(
             "image-size",
-            file=escaped(folder.resolve().name),
+            file=place,
             found=f"left and right have two sizes: {left} and {right}",
             allowed="pictures of one size, or of one proportion of width to height",
             remedy="take the pictures of both cameras at such sizes, for the board and for the spots",
         )
 
 
-def _sizes(folder: Path, pairing: Pairing) -> dict[Picture, Size]:
-    """Sizes of the pictures of a board; those of the majority are one calibration, and only those are decoded."""
-    stated = {"swap": pairing.swap, "globs": pairing.globs, "in_order": pairing.in_order}
-    pictures = paired_pictures(folder, most=PICTURES_MAX, **stated)  # type: ignore[arg-type]
-    sizes = sizes_of(pictures, folder, PIXELS_MAX)
-    if not sizes:
-        raise NothingToEstimate(
-            "no-pictures",
-            f"{escaped(str(folder), 200)}: no checkerboard picture",
-            allowed=f"{NAMING} (PNG or JPEG); or frames of both cameras side by side",
-            remedy="name the pictures left01.png, right01.png, left02.png ...; or --pair order with a folder a camera, "
-            'or --left "cam_a/*.png" --right "cam_b/*.png"',
-        )
-    return sizes
-
-
 def _detections(
-    folder: Path, pictures: Sequence[Picture], sizes: Mapping[Picture, Size], board: Board, finder: Finder
+    some: Sequence[Picture], pictures: PictureFolder, board: Board, finder: Finder
 ) -> Iterator[dict[str, _Detection | None]]:
     """The boards in pictures, by the camera whose image holds it."""
 
     def detect(picture: Picture) -> dict[str, _Detection | None] | InputError:
         try:
-            parts = _greys(picture, folder, sizes[picture])
-            return {side: _detection(part, board, finder) for side, part in parts.items()}
+            return {side: _detection(part, board, finder) for side, part in _greys(picture, pictures).items()}
         except InputError as error:
             return error
 
-    at_once = PIXELS_MAX // max(sizes[p][0] * sizes[p][1] * len(p.sides) for p in pictures)
+    at_once = PIXELS_MAX // max(len(one.sides) * math.prod(pictures.sizes[one]) for one in some)
     with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, at_once))) as pool:
         refused = []
-        for found in pool.map(detect, pictures):
-            if isinstance(found, InputError):
-                refused.append(found)
+        for detections in pool.map(detect, some):
+            if isinstance(detections, InputError):
+                refused.append(detections)
             else:
-                yield found
+                yield detections
     if refused:
         raise all_of(refused)
 

@@ -14,8 +14,15 @@ from typing import Literal
 
 import numpy as np
 
-from tvsbayes.cameras.camera_marks import OTHER_SUFFIXES, paired_pictures, unnamed_pictures
-from tvsbayes.cameras.picture_pairs import NAMING, Picture, Size, natural_order, sizes_of, usual_sizes
+from tvsbayes.cameras.picture_pairs import (
+    NAMING,
+    OTHER_SUFFIXES,
+    Pairing,
+    Picture,
+    Size,
+    natural_order,
+    read_folder,
+)
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.images import IMAGE_BYTES_MAX, IMAGE_PIXELS_MAX, PNG_SIGNATURE, decode_image, png_bytes
@@ -99,29 +106,26 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
     """The pairs of pictures in a folder.
 
     Args:
-        folder: where they lie; see `picture_pairs` and `camera_marks` for names.
+        folder: where they lie; see `picture_pairs` for names.
         swap: the left camera's image is the right half of a wide picture.
 
     Raises:
         InputError: no folder, no pair, an unreadable picture.
     """
-    pictures = paired_pictures(folder, swap=swap, most=2 * LOOKS_MAX)
-    sizes = sizes_of(pictures, Path(folder), IMAGE_PIXELS_MAX)
-    unread = [path.name for path in sorted(Path(folder).iterdir()) if path.suffix.lower() in OTHER_SUFFIXES]
-    usual = usual_sizes(sizes)
-    used = [picture for picture, own in sizes.items() if all(own == usual[side] for side in picture.sides)]
+    pictures = read_folder(folder, 2 * LOOKS_MAX, IMAGE_PIXELS_MAX, Pairing(swap))
+    unread = [path.name for path in sorted(pictures.folder.iterdir()) if path.suffix.lower() in OTHER_SUFFIXES]
     by_view: dict[str, dict[str, Picture]] = {}
-    for picture in used:
+    for picture in pictures.used:
         by_view.setdefault(picture.view, {}).update(dict.fromkeys(picture.sides, picture))
     whole = {name: both for name, both in by_view.items() if len(both) == 2}
     if not whole:
-        raise _no_pairs(folder, len(pictures))
+        raise _no_pairs(folder, pictures.count)
     return ViewedFolder(
         views=tuple(View(n, (whole[n]["left"], whole[n]["right"])) for n in sorted(whole, key=natural_order)),
-        image_sizes=usual,
+        image_sizes=dict(pictures.usual),
         unpaired=tuple(p.path.name for both in by_view.values() if len(both) == 1 for p in both.values()),
-        unnamed=unnamed_pictures(Path(folder), sizes),
-        other_size=tuple(picture.path.name for picture in sizes if picture not in used),
+        unnamed=pictures.unnamed,
+        other_size=tuple(path.name for path in pictures.other_size),
         unread=tuple(unread),
     )
 

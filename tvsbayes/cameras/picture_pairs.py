@@ -1,7 +1,9 @@
 """Pictures of two cameras in a folder: which file is of which camera, and which belong together.
 
-A view is one moment of both cameras; its name is what is left of a file's name without the word for the camera. Headers
-tell sizes; nothing is decoded here.
+A view is one moment of both cameras; its name is what is left of a file's name without the mark of the camera. The
+documented names (`NAMING`) come first. Recorders number their cameras too, `cam0_3` and `cam1_3`, say it in the middle
+of a name or twice, keep a folder for each view, or name pictures by the time: each way is tried in turn, the most
+explicit first, and counts if its names pair up. Links are not followed. Headers tell sizes; nothing is decoded here.
 """
 
 from __future__ import annotations
@@ -9,8 +11,9 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from tvsbayes.errors import InputError, all_of, escaped, refusal
@@ -19,20 +22,37 @@ from tvsbayes.files.images import IMAGE_BYTES_MAX, image_size
 from tvsbayes.instrument.campaign import CAMERAS
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+OTHER_SUFFIXES = (".bmp", ".pgm", ".ppm", ".pnm", ".tif", ".tiff", ".webp")
+"""Pictures too, but none that `files.images` reads."""
 SIDE_BY_SIDE_RATIO = 2.0
 """Width over height from which a picture that is named neither left nor right holds both cameras' images."""
 Size = tuple[int, int]
 """Width and height, px."""
 NAMING = "left01.png with right01.png, 01_left.png with 01_right.png, or folders left/ and right/"
 """How pictures of two cameras are named, for messages."""
-_LETTERS = {"l": "left", "r": "right", "left": "left", "right": "right"}
-_WORDS = (
+DEPTH_MAX = 3
+"""Folders below the one that was named: set/left/, set/01/cam0/."""
+NUMBERED_PAIRS_MIN = 3
+"""A number tells cameras apart only where it does so this often: two frames may be called 0 and 1 by chance."""
+_SIDES = {"l": "left", "r": "right", "left": "left", "right": "right"}
+_DOCUMENTED = (
     # left01, then 01_left, L01 or l_01, 01L or 01_l: a letter alone counts beside a digit or a separator only.
     re.compile(r"(?P<side>left|right)(?P<view>.*)", re.IGNORECASE | re.DOTALL),
     re.compile(r"(?P<view>.*?)[ _.-]*(?P<side>left|right)", re.IGNORECASE | re.DOTALL),
     re.compile(r"(?P<side>[lr])(?P<view>[ _.-]*[0-9].*)", re.IGNORECASE | re.DOTALL),
     re.compile(r"(?P<view>.*[0-9])[ _.-]*(?P<side>[lr])", re.IGNORECASE | re.DOTALL),
 )
+_WORDS = re.compile("left|right", re.IGNORECASE)
+_LETTERS = re.compile(r"(?<![A-Za-z])[lLrR](?![A-Za-z])|(?<=[a-z0-9])[LR](?![A-Za-z])")
+_NUMBERS = (
+    *(
+        re.compile(rf"(?<![a-z]){word}[_ -]?0*([0-9]{{1,9}})(?![0-9])", re.IGNORECASE)
+        for word in ("camera", "cam", "c", "sensor", "image", "img")
+    ),
+    re.compile(r"[_-]0*([0-9]{1,9})$"),
+)
+_Key = tuple[str, str]
+"""A name without the marks of the camera, and the side that they tell."""
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
@@ -49,25 +69,86 @@ class Picture:
     sides: tuple[str, ...]
 
 
-def sizes_of(pictures: Iterable[Picture], folder: Path, most: int) -> dict[Picture, Size]:
-    """The size of one camera's image in every picture, by its header.
+@dataclass(frozen=True)
+class Pairing:
+    """Which picture is of which camera, where somebody has said it.
+
+    Attributes:
+        swap: the left camera's image is the right half of a wide frame, or has the larger number or later folder.
+        globs: patterns of the pictures of the left and of the right camera, below the folder.
+        in_order: the first of the left belongs to the first of the right camera, whatever their names.
+    """
+
+    swap: bool = False
+    globs: tuple[str, str] | None = None
+    in_order: bool = False
+
+    @property
+    def sides(self) -> tuple[str, str]:
+        """The cameras of the left half and the right one, of the smaller number and the larger one."""
+        return CAMERAS[::-1] if self.swap else CAMERAS
+
+
+AS_NAMED = Pairing()
+
+
+@dataclass(frozen=True)
+class PictureFolder:
+    """The pictures of two cameras in a folder, by their headers.
+
+    Attributes:
+        folder: where they lie.
+        count: of the pictures that were looked at.
+        sizes: of one camera's image, px, in every picture that tells its camera or holds both.
+        usual: the size that most pictures of each camera have; of equally many the larger; (0, 0) without any.
+    """
+
+    folder: Path
+    count: int
+    sizes: Mapping[Picture, Size]
+    usual: Mapping[str, Size]
+
+    @property
+    def used(self) -> list[Picture]:
+        """Those of the usual size."""
+        return [one for one, size in self.sizes.items() if all(size == self.usual[side] for side in one.sides)]
+
+    @property
+    def other_size(self) -> list[Path]:
+        """Files of another size than most, from the folder."""
+        used = set(self.used)
+        return [picture.path.relative_to(self.folder) for picture in self.sizes if picture not in used]
+
+    @property
+    def unnamed(self) -> tuple[str, ...]:
+        """Pictures that lie in the folder or beside its pairs and are no part of them, from the folder, in order."""
+        known = {picture.path for picture in self.sizes}
+        places = {self.folder, *(path.parent for path in known)}
+        names = [name for name in _names(self.folder) if name.lower().endswith(SUFFIXES)]
+        left = [name for name in names if (path := self.folder / name).parent in places and path not in known]
+        return tuple(sorted(left, key=natural_order))
+
+
+def read_folder(folder: Path, most: int, pixels_max: int, pairing: Pairing = AS_NAMED) -> PictureFolder:
+    """The pictures of a folder with their sizes; those that name no camera count where they are wide enough for both.
 
     Args:
-        pictures: those that are named after no camera count where they are wide enough for both.
         folder: where they lie.
-        most: pixels that a picture may have.
+        most: how many there may be.
+        pixels_max: of one of them.
+        pairing: which picture is of which camera.
 
     Raises:
-        InputError: pictures that cannot be read or are too large, all of them.
+        InputError: as `paired_pictures`; pictures that cannot be read or are too large, all of them.
     """
-    sizes: dict[Picture, Size] = {}
-    refused = []
+    folder, sizes, refused = Path(folder), {}, []
+    pictures = paired_pictures(folder, most, pairing)
     for picture in pictures:
         try:
             name = escaped(picture.path.name)
             width, height = image_size(read_bytes(picture.path, IMAGE_BYTES_MAX, folder), name)
-            if width * height > most:
-                found, allowed = f"{width} x {height} pixels", f"at most {most // 1_000_000} million pixels"
+            if width * height > pixels_max:
+                found, allowed = f"{width} x {height} pixels", f"at most {pixels_max // 1_000_000} million pixels"
                 raise refusal("image-size", file=name, found=found, allowed=allowed, remedy="record smaller pictures")
         except InputError as error:
             refused.append(error)
@@ -76,81 +157,215 @@ def sizes_of(pictures: Iterable[Picture], folder: Path, most: int) -> dict[Pictu
             sizes[picture] = width // len(picture.sides), height
     if refused:
         raise all_of(refused)
-    return sizes
-
-
-def usual_sizes(sizes: Mapping[Picture, Size]) -> dict[str, Size]:
-    """The size, px, that most pictures of each camera have; of equally many the larger."""
-    found: dict[str, Size] = {}
+    usual: dict[str, Size] = {}
     for side in CAMERAS:
         counted = Counter(size for picture, size in sizes.items() if side in picture.sides)
-        found[side] = max(counted, key=lambda one: (counted[one], one), default=(0, 0))
-    return found
+        usual[side] = max(counted, key=lambda one: (counted[one], one), default=(0, 0))
+    return PictureFolder(folder, len(pictures), sizes, usual)
 
 
-def _sided(stem: str) -> tuple[str, str] | None:
-    """Camera and view of a name without suffix; None where it tells no camera."""
-    for pattern in _WORDS:
-        if found := pattern.fullmatch(stem):
-            return _LETTERS[found["side"].lower()], found["view"]
-    return None
+def paired_pictures(folder: Path, most: int, pairing: Pairing = AS_NAMED) -> list[Picture]:
+    """The pictures of a folder: by the documented names where these give a pair, else by other marks, else wide ones.
 
+    Args:
+        folder: with pictures in it or in folders below.
+        most: how many pictures there may be.
+        pairing: which picture is of which camera.
 
-def _camera_of(folder: str) -> str | None:
-    """The camera whose pictures a folder of this name holds."""
-    name = folder.lower()
-    sides = [side for side in CAMERAS if name.startswith(side) or name.endswith(side)]
-    return _LETTERS.get(name) or (sides[0] if len(sides) == 1 else None)
+    Raises:
+        InputError: no readable folder, too many pictures, two of one camera and view, or none of a format that is read;
+            where pairs are stated, no two cameras or unlike numbers of pictures.
+    """
+    folder = Path(folder)
+    bad = partial(refusal, file=escaped(str(folder), 200))
+    if pairing.globs is not None or pairing.in_order:
+        return _stated_pairs(folder, pairing, most, bad)
+
+    def few(images: Sequence[object]) -> None:
+        if len(images) > most:
+            found, remedy = f"{len(images)} pictures", "move those that are not needed elsewhere"
+            raise bad("size", found=found, allowed=f"at most {most}", remedy=remedy)
+
+    top = [folder / entry.name for entry in _entries(folder) if _is_picture(entry)]
+    documented = [Picture(key[0], path, (key[1],)) for path in top if (key := _documented(path.stem))]
+    documented = documented or _in_side_folders(folder)
+    few(documented or top)
+    places: dict[tuple[str, tuple[str, ...]], Path] = {}
+    for picture in documented:
+        first = places.setdefault((picture.view, picture.sides), picture.path)
+        if first != picture.path:
+            found = f"{escaped(first.name)} and {escaped(picture.path.name)}, two pictures of one camera and view"
+            raise bad("duplicate", found=found, allowed="one", remedy="keep one file per camera and view")
+    if any(count > 1 for count in Counter(picture.view for picture in documented).values()):
+        return documented
+    names = sorted(_names(folder), key=natural_order)
+    images = [name for name in names if name.lower().endswith(SUFFIXES)]
+    others = [name for name in names if name.lower().endswith(OTHER_SUFFIXES)]
+    if not images and others:
+        found = f"{len(others)} pictures such as {escaped(others[0], 100)}"
+        remedy = "convert them without loss, for example: mogrify -format png *" + Path(others[0]).suffix
+        raise bad("image", found=found, allowed="PNG or JPEG", remedy=remedy)
+    few(images)
+    otherwise = _paired_otherwise(folder, images, pairing.sides)
+    return otherwise or documented or [Picture(path.stem, path, pairing.sides) for path in top]
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    """What lies in a folder, in natural order, but for what is hidden."""
     try:
-        return sorted(os.scandir(folder), key=lambda entry: natural_order(entry.name))
+        entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")]
     except OSError as error:
-        place, remedy = escaped(str(folder), 200), "name the folder of the pictures"
         found, allowed = escaped(error.strerror or str(error)), "a readable folder"
+        remedy, place = "name the folder of the pictures", escaped(str(folder), 200)
         raise refusal("unreadable", file=place, found=found, allowed=allowed, remedy=remedy) from error
+    return sorted(entries, key=lambda entry: natural_order(entry.name))
 
 
-def _images(entries: list[os.DirEntry[str]]) -> list[Path]:
-    """Pictures by their suffix; a name that begins with a dot is hidden."""
-    return [Path(e.path) for e in entries if e.name.lower().endswith(SUFFIXES) and not e.name.startswith(".")]
+def _is_picture(entry: os.DirEntry[str]) -> bool:
+    return entry.name.lower().endswith(SUFFIXES)
 
 
-def _in_folders(entries: list[os.DirEntry[str]]) -> list[Picture]:
-    """Pictures in folders that are named after their camera, by their own names."""
-    found = []
+def _names(folder: Path, below: str = "", depth: int = 0) -> Iterator[str]:
+    """Files of a folder and of those in it, as paths from the outermost; links to folders are left out."""
+    try:
+        entries = _entries(folder)
+    except InputError:
+        # What cannot be read holds no pictures for us; the outermost was read before.
+        return
     for entry in entries:
-        side = _camera_of(entry.name) if entry.is_dir(follow_symlinks=False) else None
-        for path in _images(_entries(Path(entry.path))) if side else ():
-            own = _sided(path.stem)
-            found.append(Picture(own[1] if own and own[0] == side else path.stem, path, (str(side),)))
-    return found
+        if not entry.is_dir(follow_symlinks=False):
+            yield below + entry.name
+        elif depth < DEPTH_MAX:
+            yield from _names(Path(entry.path), f"{below}{entry.name}/", depth + 1)
 
 
-def pictures_of(folder: Path, *, swap: bool = False, most: int) -> list[Picture]:
-    """The pictures of a folder: those named left or right, else those in folders so named, else wide ones of both.
+def _documented(stem: str) -> _Key | None:
+    """View and camera of a name without suffix that is one of `NAMING`; None where it tells no camera."""
+    matches = (match for pattern in _DOCUMENTED if (match := pattern.fullmatch(stem)))
+    return next(((match["view"], _SIDES[match["side"].lower()]) for match in matches), None)
 
-    Args:
-        folder: where they lie.
-        swap: the left camera's image is the right half of a wide picture.
-        most: how many there may be.
 
-    Raises:
-        InputError: no readable folder, too many pictures, or two of one camera and view.
+def _in_side_folders(folder: Path) -> list[Picture]:
+    """Pictures in folders that are named after their camera, by their own names."""
+    pictures = []
+    for entry in _entries(folder):
+        name = entry.name.lower()
+        ends = [side for side in CAMERAS if name.startswith(side) or name.endswith(side)]
+        side = _SIDES.get(name) or (ends[0] if len(ends) == 1 else None)
+        if side is None or not entry.is_dir(follow_symlinks=False):
+            continue
+        for path in (Path(one.path) for one in _entries(Path(entry.path)) if _is_picture(one)):
+            key = _documented(path.stem)
+            pictures.append(Picture(key[0] if key and key[1] == side else path.stem, path, (side,)))
+    return pictures
+
+
+def _stated_pairs(folder: Path, pairing: Pairing, most: int, bad: Callable[..., InputError]) -> list[Picture]:
+    """Pictures in the order of their names, the first of one camera with the first of the other.
+
+    The cameras are those of two patterns, else of two folders, else of the names.
     """
-    entries = _entries(Path(folder))
-    images = _images(entries)
-    sided = [Picture(own[1], path, (own[0],)) for path in images if (own := _sided(path.stem))] or _in_folders(entries)
-    place = escaped(str(folder), 200)
-    if len(sided or images) > most:
-        found, remedy = f"{len(sided or images)} pictures", "move those that are not needed elsewhere"
-        raise refusal("size", file=place, found=found, allowed=f"at most {most}", remedy=remedy)
-    seen: dict[tuple[str, tuple[str, ...]], Path] = {}
-    for picture in sided:
-        first = seen.setdefault((picture.view, picture.sides), picture.path)
-        if first != picture.path:
-            found = f"{escaped(first.name)} and {escaped(picture.path.name)}, two pictures of one camera and view"
-            remedy = "keep one file per camera and view"
-            raise refusal("duplicate", file=place, found=found, allowed="one", remedy=remedy)
-    return sided or [Picture(path.stem, path, CAMERAS[::-1] if swap else CAMERAS) for path in images]
+    if pairing.globs is not None:
+        # Of a pattern that leaves the folder nothing is taken.
+        inside = [one for one in pairing.globs if not Path(one).is_absolute() and ".." not in Path(one).parts]
+        matches = [[p.relative_to(folder).as_posix() for p in folder.glob(one) if p.is_file()] for one in inside]
+        groups = [sorted(names, key=natural_order) for names in matches]
+    else:
+        names = sorted((n for n in _names(folder) if n.lower().endswith(SUFFIXES)), key=natural_order)
+        stems = [name[: name.rindex(".")] for name in names]
+        by_name = ([_by_words(stem) for stem in stems], [_by_letter(stem) for stem in stems])
+        keys = next((keys for keys in by_name if any(keys)), _by_folder(stems, pairing.sides))
+        groups = list(_by_side(names, keys).values())
+    counts = [len(group) for group in groups]
+    if len(groups) < 2 or not all(counts):
+        found = f"{' and '.join(str(count) for count in counts) or 'no'} pictures of the left and the right camera"
+        remedy = 'name them: --left "cam_a/*.png" --right "cam_b/*.png"'
+        raise bad("no-pictures", found=found, allowed="pictures of two cameras", remedy=remedy)
+    if counts[0] != counts[1] or sum(counts) > most:
+        found, allowed = f"{counts[0]} left and {counts[1]} right pictures", f"as many of both, together {most} at most"
+        remedy = "take out those without their counterpart: pictures are paired by their order"
+        raise bad("size", found=found, allowed=allowed, remedy=remedy)
+    return _in_order(folder, groups)
+
+
+def _by_side(names: Sequence[str], keys: Sequence[_Key | None]) -> dict[str, list[str]]:
+    """Names of each camera."""
+    sided = [(name, key[1]) for name, key in zip(names, keys, strict=True) if key is not None]
+    return {side: [name for name, own in sided if own == side] for side in CAMERAS}
+
+
+def _in_order(folder: Path, groups: Sequence[Sequence[str]]) -> list[Picture]:
+    """The first of the left camera with the first of the right one."""
+    views = [_plain(Path(name).stem) for name in groups[0]]
+    views = views if len(set(views)) == len(views) else [f"pair {k}" for k in range(1, len(views) + 1)]
+    return [
+        Picture(view, folder / name, (side,))
+        for side, names in zip(CAMERAS, groups, strict=True)
+        for view, name in zip(views, names, strict=True)
+    ]
+
+
+def _paired_otherwise(folder: Path, images: Sequence[str], numbered: tuple[str, str]) -> list[Picture]:
+    """The pictures with a side, by the first way in which names pair up; `numbered` are the sides of 0 and 1.
+
+    Where sides are known and no names are alike (times, say) the first belongs to the first.
+    """
+    stems = [name[: name.rindex(".")] for name in images]
+    by_name = [[_by_words(stem) for stem in stems], [_by_letter(stem) for stem in stems]]
+    ways = [
+        *((keys, 1) for keys in by_name),
+        *((_by_number(stems, pattern, numbered), NUMBERED_PAIRS_MIN) for pattern in _NUMBERS),
+        (_by_folder(stems, numbered), NUMBERED_PAIRS_MIN),
+    ]
+    for keys, least in ways:
+        sided = [(key, name) for key, name in zip(keys, images, strict=True) if key is not None]
+        cameras = Counter(view for view, _ in {key for key, _ in sided})
+        if sum(count == 2 for count in cameras.values()) >= least:
+            return [Picture(_plain(view), folder / name, (side,)) for (view, side), name in sided]
+    for keys in by_name:
+        left, right = _by_side(images, keys).values()
+        if len(left) == len(right) >= NUMBERED_PAIRS_MIN:
+            return _in_order(folder, (left, right))
+    return []
+
+
+def _plain(key: str) -> str:
+    """A view's name: what the names of its pictures have in common."""
+    return re.sub(r"\*+", "", key).strip("/_- ") or key
+
+
+def _key(stem: str, pattern: re.Pattern[str]) -> _Key | None:
+    """The stem without its marks and the side that they name; None where they name none or both."""
+    sides = {_SIDES[match.group().lower()] for match in pattern.finditer(stem)}
+    return (pattern.sub("*", stem), sides.pop()) if len(sides) == 1 else None
+
+
+def _by_words(stem: str) -> _Key | None:
+    key = _key(stem, _WORDS)
+    # stereoLeft/imageL0 says it twice.
+    return None if key is None else (_LETTERS.sub("*", key[0]), key[1])
+
+
+def _by_letter(stem: str) -> _Key | None:
+    return _key(stem, _LETTERS)
+
+
+def _by_number(stems: Sequence[str], pattern: re.Pattern[str], sides: tuple[str, str]) -> list[_Key | None]:
+    """Sides by the last number of a kind, where there are exactly two such numbers."""
+    last = [next(reversed(list(pattern.finditer(stem))), None) for stem in stems]
+    numbers = sorted({int(match[1]) for match in last if match is not None})
+    if len(numbers) != 2:
+        return [None] * len(stems)
+    return [
+        None if m is None else (f"{stem[: m.start()]}*{stem[m.end() :]}", sides[numbers.index(int(m[1]))])
+        for stem, m in zip(stems, last, strict=True)
+    ]
+
+
+def _by_folder(stems: Sequence[str], sides: tuple[str, str]) -> list[_Key | None]:
+    """Sides by the folder, where there are exactly two; equal names in both are a pair."""
+    parts = [stem.rpartition("/") for stem in stems]
+    folders = sorted({place for place, _, _ in parts}, key=natural_order)
+    if len(folders) != 2:
+        return [None] * len(stems)
+    return [(name, sides[folders.index(place)]) for place, _, name in parts]

@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 
 from tvsbayes.cameras.board_errors import board_errors
-from tvsbayes.cameras.boards import AS_NAMED, Board, Finder, Pairing, View, Views, find_views
+from tvsbayes.cameras.boards import Board, Finder, View, Views, find_views
 from tvsbayes.cameras.bundle_adjustment import Adjustment, bundle_adjustment
+from tvsbayes.cameras.picture_pairs import AS_NAMED, Pairing
 from tvsbayes.cameras.stereo_start import (
     DOUBTFUL_START_PX,
     Start,

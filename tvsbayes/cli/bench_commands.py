@@ -23,8 +23,9 @@ from tvsbayes.pipeline import compile_for
 
 if TYPE_CHECKING:
     from tvsbayes.cameras.assumed_covariance import Known
-    from tvsbayes.cameras.boards import Board, Finder, Pairing
+    from tvsbayes.cameras.boards import Board, Finder
     from tvsbayes.cameras.calibration_export import Format
+    from tvsbayes.cameras.picture_pairs import Pairing
     from tvsbayes.instrument.stereo_pair import Stereo
 
 IMAGE_SIDE_MAX = 65_535
@@ -149,7 +150,7 @@ def stereo(
 
 def _pairing(pair: str | None, left: str | None, right: str | None, swap: bool) -> Pairing:
     """Which picture is of which camera, by the options."""
-    from tvsbayes.cameras.boards import Pairing
+    from tvsbayes.cameras.picture_pairs import Pairing
 
     if (left is None) != (right is None):
         remedy = 'give both: --left "cam_a/*.png" --right "cam_b/*.png"'
