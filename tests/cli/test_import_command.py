@@ -265,3 +265,28 @@ def test_a_urdf_becomes_a_head_with_sightings_or_keeps_its_spots(ask, say, tmp_p
     assert laser.rig.priors["elevation_axis_offset_mm"].value == pytest.approx(30.0)
     code, document = ask("import", unit, "--to", tmp_path / "x", "--pan-joint", "pan_joint")
     assert code == 2 and "--urdf" in document["error"]["remedy"]
+
+
+def test_a_log_of_sightings_becomes_a_head(ask, say, tmp_path):
+    """Semicolons, decimal commas, German names; a folder that `new` or a URDF made keeps what it says."""
+    steps = [(400 * k, 100 * (k * k % 7)) for k in range(12)]
+    rows = [f"{k};{pan};{tilt};{0.045 * pan:.4f};{0.05 * tilt + 3:.4f}" for k, (pan, tilt) in enumerate(steps)]
+    text = "\n".join(["Zeit;Motor Az;Motor El;Az gemessen [deg];Hoehe gemessen [deg]", *rows]).replace(".", ",")
+    (tmp_path / "log.csv").write_text(text)
+    words = "import", tmp_path / "log.csv", "--sightings", "--to"
+    code, printed, _ = say(*words, tmp_path / "mount")
+    assert code == 0 and "nothing written" in printed and not (tmp_path / "mount").exists()
+    code, document = ask(*words, tmp_path / "mount", "--yes", "--assume", "u_deg=0.002")
+    assert (code, document["moves"], document["ok"]) == (0, 12, 12)
+    found = read_campaign(tmp_path / "mount")
+    assert found.rig.priors["degrees_per_step.pan"].value == pytest.approx(0.045)
+    code, printed, _ = say("check", tmp_path / "mount")
+    assert code == 0 and "usable sightings" in printed and "aperture" not in printed
+    assert ask(*words, tmp_path / "mount", "--yes")[0] == 2, "nothing is overwritten"
+    assert ask("new", tmp_path / "new", "--mechanism", "pan-tilt", "--sightings")[0] == 0
+    header = (tmp_path / "new" / "campaign.toml").read_bytes()
+    assert ask("import", tmp_path / "log.csv", "--to", tmp_path / "new", "--yes")[0] == 0
+    assert (tmp_path / "new" / "campaign.toml").read_bytes() == header
+    code, document = ask(*words, tmp_path / "x", "--column", "azimuth_deg=")
+    assert code == 2 and "azimuth_deg" in assert_error(document, "missing-column")["remedy"]
+    assert ask(*words, tmp_path / "x", "--sd-px", "0.1")[0] == 2

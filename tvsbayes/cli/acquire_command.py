@@ -109,7 +109,7 @@ def acquire(
         refuse_options("for --live", "add --live, or leave it out", port=port, no_browser=no_browser)
     in_order(rig, plan)
     instrument = read_rig(rig)
-    refuse_sightings("acquire", instrument.table.mechanism.sightings)
+    refuse_sightings(instrument.table.mechanism.sightings)
     steps = read_plan(plan)
     if dry_run:
         unfit = {"live": live, "place_command": place_command}

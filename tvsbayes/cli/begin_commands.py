@@ -14,6 +14,7 @@ import typer
 from tvsbayes.cli.app import Json, finish, refuse_options
 from tvsbayes.cli.instruments import INSTRUMENTS
 from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.cli.understood_columns import few
 from tvsbayes.errors import InputError, escaped, listed, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
@@ -245,9 +246,3 @@ def _unpaired_lines(seen: ViewedFolder, found: PairedLooks, rows: str) -> list[s
     if found.without:
         lines.append(f"{rows} {listed(found.without, NAMES_LISTED)}: no pictures, which they need not have")
     return lines
-
-
-def few(names: tuple[str, ...]) -> str:
-    """The first of them, fit to print, and how many more there are."""
-    more = f" and {len(names) - NAMES_LISTED} more" if len(names) > NAMES_LISTED else ""
-    return ", ".join(escaped(name) for name in names[:NAMES_LISTED]) + more

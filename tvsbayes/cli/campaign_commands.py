@@ -22,7 +22,6 @@ from tvsbayes.cli.app import (
     is_part,
     report_line,
 )
-from tvsbayes.cli.head_commands import refuse_sightings
 from tvsbayes.cli.instruments import instrument_of, serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, escaped, typed
@@ -210,12 +209,13 @@ def check(
         lines = [f"{key}: {value}" for key, value in repaired.items()]
         finish(repaired, "\n".join([*lines, f"{escaped(str(repair_to), 200)}: written"]), as_json)
         return
+    from tvsbayes.instrument.sightings import SIGHTINGS
     from tvsbayes.report.command_text import held_text
 
     document = _held(path, plan_file)
-    warnings = document["warnings"]
+    warnings, is_sighted = document["warnings"], (path / SIGHTINGS.file).is_file()
     end = f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}"
-    finish(document, f"{held_text(document)}\n{end}", as_json)
+    finish(document, f"{held_text(document, is_sighted)}\n{end}", as_json)
 
 
 def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
@@ -226,8 +226,7 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
     if plan_file is not None:
         _refuse_other_than_rig(path, plan_file)
         rig = read_rig(path)
-        refuse_sightings("check of a plan", rig.table.mechanism.sightings)
-        steps = read_plan(plan_file)
+        steps = read_plan(plan_file, not rig.table.mechanism.sightings)
         from tvsbayes.planning.plan_check import check_plan
 
         compile_for(report_line)
@@ -239,7 +238,9 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         raise InputError("usage", f"{found}, checked as a whole", allowed="a campaign folder", remedy=remedy)
     kind = path.suffix.lower()
     if kind == ".csv" and not path.is_dir():
-        steps = read_plan(path)
+        steps = read_plan(path, sheets=False)
+        if any(step.action == "place" for step in steps):
+            steps = read_plan(path)
         actions = {action: sum(s.action == action for s in steps) for action in ("home", "place", "move", "look")}
         return {"kind": "plan", "steps": len(steps), **actions, "warnings": []}
     if kind == ".toml" and not path.is_dir():

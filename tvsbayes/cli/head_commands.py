@@ -5,13 +5,14 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tvsbayes.cli.app import command_line, confirmed, finish, report_line, spared, tell_removed
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.errors import InputError, escaped, typed
+from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
+from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically
 from tvsbayes.files.documents import toml_line
 from tvsbayes.instrument.axes import AXES
@@ -22,6 +23,8 @@ from tvsbayes.progress import Job
 if TYPE_CHECKING:
     from tvsbayes.calibration.pointing import Calibration
     from tvsbayes.head.urdf import HeadJoints
+    from tvsbayes.instrument.corrections import Correction
+    from tvsbayes.instrument.foreign_looks import Notation
     from tvsbayes.instrument.parameters import Prior
     from tvsbayes.report.document import Issue
 
@@ -32,19 +35,18 @@ PARTS = ("campaign.toml", "moves.csv", "spots.csv")
 """Of a campaign that `new` made."""
 RATIO_U = 0.01
 """Relative u of a nominal ratio."""
-OF_SIGHTINGS = "check, classic, fit, compare, report, steps-for --azimuth-deg --elevation-deg"
-"""Commands that such a head has."""
 
 
-def refuse_sightings(command: str, sightings: bool) -> None:
-    """A command that needs spots does not take the rig file of a head that says where it points.
+def refuse_sightings(sightings: bool) -> None:
+    """`acquire` does not take the rig file of a head that says where it points: it has no cameras to look with.
 
     Raises:
         InputError: `sightings`.
     """
     if sightings:
-        message = f"{command} needs spots that a stereo pair sees, and this head says where it points"
-        raise InputError("usage", message, remedy=f"of such a head: simulate, {OF_SIGHTINGS}")
+        message = "acquire looks at spots through a stereo pair, and this head says where it points"
+        remedy = "check RIG PLAN, drive the plan yourself, then `tvsbayes import LOG --sightings --to FOLDER`"
+        raise InputError("usage", message, remedy=f"{remedy}; the twin of the head: simulate RIG PLAN FOLDER")
 
 
 def refuse_head(command: str, calibration: Calibration) -> None:
@@ -106,13 +108,84 @@ def import_urdf(
     finish({**document, "written": yes, "files": list(files) if yes else []}, "\n".join([*lines, said]), as_json)
 
 
+def import_sightings(
+    file: Path,
+    to: Path,
+    stated: Mapping[str, str],
+    sheet: str | None,
+    notation: Notation,
+    correction: Correction,
+    u_deg: float | None,
+    *,
+    yes: bool,
+    as_json: bool,
+) -> None:
+    """A table of moves and sightings into a new campaign of a head, or into one without rows."""
+    from tvsbayes.files.foreign_table import read_foreign
+    from tvsbayes.head.foreign_sightings import NEEDED, SIGHTING_FIELDS, sighting_field, sightings_of_table
+    from tvsbayes.instrument.campaign import MOVES, head_templates
+    from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, understand, unit_of_name
+    from tvsbayes.instrument.sightings import SIGHTINGS
+
+    def unit(field: str, name: str) -> str:
+        of_name = unit_of_name(name, SECONDS if field == "time_s" else DEGREES)
+        usual = "s" if field == "time_s" else "steps" if field in COUNTERS else notation.angle_unit or "deg"
+        return (of_name or usual) if field in ("time_s", "u_deg", *NEEDED) else ""
+
+    table = read_foreign(file, sheet)
+    known = understand(table.columns, stated, SIGHTING_FIELDS, sighting_field)
+    missing = [field for field in NEEDED if field not in known.columns]
+    if missing or known.claimed:
+        wanted = [*missing, *(field for field in known.claimed if field not in missing)]
+        raise not_sure(table, known, wanted, SIGHTING_FIELDS, NEEDED)
+    found = sightings_of_table(table, known.columns, notation, correction, u_deg)
+    templates, fresh = head_templates(True), not (to / "campaign.toml").is_file()
+    if fresh and to.exists():
+        make_folder(to, empty=True)
+    for name in (MOVES.file, SIGHTINGS.file):
+        place = to / name
+        if place.is_file() and place.read_bytes() != templates[name]:
+            allowed, remedy = "no rows yet", "name another folder with --to; nothing is overwritten"
+            raise refusal("occupied", file=escaped(str(place), 200), found="rows", allowed=allowed, remedy=remedy)
+    assumed = list(found.assumed) if fresh else [text for text in found.assumed if "[rig.prior]" not in text]
+    ok = sum(sighting.status == "ok" for sighting in found.sightings)
+    lines = [*table_lines(table, known, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in assumed)]
+    lines.append(f"gives: {len(found.moves)} moves, {len(found.sightings)} sightings, {ok} of use")
+    files = {MOVES.file: MOVES.content(found.moves), SIGHTINGS.file: SIGHTINGS.content(found.sightings)}
+    if fresh:
+        files = {**templates, **files, **with_priors(templates, found.priors)}
+    yes = confirmed(lines, to, yes, as_json)
+    said = "nothing written: add --yes, or correct it with --column"
+    if yes:
+        to.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            write_atomically(to / name, data)
+        said = f"written: {', '.join(str(to / name) for name in files)}\nnext: `tvsbayes check {typed(to)}`"
+    document = {**table_document(table, known), "assumed": assumed, "moves": len(found.moves)}
+    document |= {"sightings": len(found.sightings), "ok": ok, "campaign": str(to)}
+    document |= {"files": [str(to / name) for name in files] if yes else []}
+    finish(document, "\n".join([*lines, said]), as_json)
+
+
+def with_priors(
+    templates: Mapping[str, bytes], priors: Mapping[str, Prior], more: Mapping[str, Sequence[str]] | None = None
+) -> dict[str, bytes]:
+    """Templates of campaign and rig with priors in [rig.prior], and further lines at their ends."""
+    entries = [
+        toml_line(name, {"value": float(f"{p.value:.9g}"), "u": float(f"{p.u:.3g}")}) for name, p in priors.items()
+    ]
+    files = {}
+    for name in ("campaign.toml", "rig.toml"):
+        kept = [line for line in templates[name].decode().splitlines() if not _states(line, priors)]
+        at, table = kept.index("[rig.prior]") + 1, (more or {}).get(name, ())
+        files[name] = "\n".join([*kept[:at], *entries, *kept[at:], *([""] if table else []), *table, ""]).encode()
+    return files
+
+
 def _urdf_files(
     templates: Mapping[str, bytes], priors: Mapping[str, Prior], head: HeadJoints, steps_per_turn: float | None
 ) -> dict[str, bytes]:
     """Templates of a head with nominal values, joints and limits."""
-    entries = [
-        toml_line(name, {"value": float(f"{p.value:.9g}"), "u": float(f"{p.u:.3g}")}) for name, p in priors.items()
-    ]
     joints: dict[str, object] = {f"{axis}_joint": head.names[axis] for axis in AXES}
     joints |= {} if steps_per_turn is None else {"steps_per_turn": float(steps_per_turn)}
     tables = {"campaign.toml": ["[urdf]", *(toml_line(key, value) for key, value in joints.items())], "rig.toml": []}
@@ -122,12 +195,7 @@ def _urdf_files(
             tables["rig.toml"] += [toml_line(key, round(end / ratio)) for key, end in zip(keys, ends, strict=True)]
     if tables["rig.toml"]:
         tables["rig.toml"].insert(0, "[positioner]")
-    files = dict(templates)
-    for name, table in tables.items():
-        kept = [line for line in files[name].decode().splitlines() if not _states(line, priors)]
-        at = kept.index("[rig.prior]") + 1
-        files[name] = "\n".join([*kept[:at], *entries, *kept[at:], *([""] if table else []), *table, ""]).encode()
-    return files
+    return {**templates, **with_priors(templates, priors, tables)}
 
 
 def _states(line: str, priors: Mapping[str, Prior]) -> bool:

@@ -14,7 +14,7 @@ import typer
 
 from tvsbayes.cli.app import Json, confirmed, finish, refuse_options, report_line, somebody_there
 from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
-from tvsbayes.cli.head_commands import import_urdf
+from tvsbayes.cli.head_commands import import_sightings, import_urdf
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, closest, escaped, refusal, typed
@@ -45,12 +45,15 @@ def import_(
         int, typer.Option("--pixels-from", min=0, max=1, help="Number of the first pixel: 0, or 1 as in MATLAB.")
     ] = 0,
     angles: Annotated[
-        str | None, typer.Option("--angles", help="deg or rad: unit of aperture readings (default: by the name).")
+        str | None, typer.Option("--angles", help="deg or rad: of aperture readings, sightings (default: by name).")
     ] = None,
     sd_px: Annotated[
         float | None, typer.Option("--sd-px", min=1e-4, max=100.0, help="Of centroids, where no column has it: 0.1.")
     ] = None,
     axis: Annotated[bool, typer.Option("--axis", help="Of one axis: commands and readings.")] = False,
+    sightings: Annotated[
+        bool, typer.Option("--sightings", help="Of a head: counters or encoders, and where it was found to point.")
+    ] = False,
     kind: Annotated[
         str,
         typer.Option("--format", help="auto, pointing (telescope); of an axis csv, phd2, epics (camonitor), klipper."),
@@ -64,7 +67,8 @@ def import_(
         typer.Option("--counts-per-turn", min=0.0, max=1e12, help="Of an axis: where readings begin anew; 0: nowhere."),
     ] = None,
     assume: Annotated[
-        list[str] | None, typer.Option("--assume", help="NAME=NUMBER: what a guide log does not state; repeatable.")
+        list[str] | None,
+        typer.Option("--assume", help="NAME=NUMBER that a guide log, or sightings (u_deg), lack; repeatable."),
     ] = None,
     relative: Annotated[bool, typer.Option("--relative", help="Counters are the steps of each move.")] = False,
     flip: Annotated[
@@ -119,8 +123,16 @@ def import_(
     if not urdf:
         refuse_options("for a URDF", "add --urdf, or leave it out", **of_urdf)
     if urdf or kind == POINTING:
-        others = {"column": column, "sheet": sheet, "angles": angles, "axis": axis, "relative": relative, "flip": flip}
-        refuse_options("for other tables", "leave it out", **others, shift_moves=shift_moves, swap=swap, sd_px=sd_px)
+        others: dict[str, object] = {
+            "column": column,
+            "sheet": sheet,
+            "angles": angles,
+            "axis": axis,
+            "relative": relative,
+            "flip": flip,
+        }
+        others |= {"shift_moves": shift_moves, "swap": swap, "sd_px": sd_px, "sightings": sightings}
+        refuse_options("for other tables", "leave it out", **others)
     if urdf:
         refuse_options("for other tables", "leave it out", format=kind if kind != "auto" else None)
         import_urdf(file, to, {"pan": pan_joint, "tilt": tilt_joint}, steps_per_turn, yes=yes, as_json=as_json)
@@ -130,17 +142,27 @@ def import_(
         return
     if axis or instrument_of(to) is INSTRUMENTS["axis"]:
         from tvsbayes.cli.axis_import import AxisNotation, import_readings
+        from tvsbayes.single_axis.guide_log import ASSUMPTIONS
 
         unfit = {"pixels_from": pixels_from or None, "angles": angles, "sd_px": sd_px, "relative": relative}
         unfit |= {"flip": flip, "shift_moves": shift_moves, "swap": swap}
         sides = {f"{a}_approach": None if side == "unknown" else side for a, side in zip(AXES, approach, strict=True)}
         refuse_options("for a scanner, and this is an axis folder", "leave it out", **unfit, **sides)
-        meant = AxisNotation(_word(kind), run, deviations, counts_per_turn, dict(map(_assumption, assume or ())))
+        given = dict(_assumption(text, ASSUMPTIONS, "declination_deg=45.9") for text in assume or ())
+        meant = AxisNotation(_word(kind), run, deviations, counts_per_turn, given)
         import_readings(file, to, stated, sheet, meant, yes=yes, as_json=as_json)
         return
-    of_axis: dict[str, object] = {"run": run, "deviations": deviations, "assume": assume}
-    of_axis |= {"format": None if kind == "auto" else kind, "counts_per_turn": counts_per_turn}
+    of_axis: dict[str, object] = {"run": run, "deviations": deviations, "counts_per_turn": counts_per_turn}
+    of_axis |= {"format": None if kind == "auto" else kind}
     refuse_options("for files of an axis", "add --axis, or leave it out", **of_axis)
+    if sightings or instrument_of(to) is INSTRUMENTS["pan-tilt-sightings"]:
+        unfit = {"pixels_from": pixels_from or None, "sd_px": sd_px, "swap": swap}
+        refuse_options("for spots in pictures, and these are sightings", "leave it out", **unfit)
+        given = dict(_assumption(text, {"u_deg": "standard uncertainty"}, "u_deg=0.005") for text in assume or ())
+        notation = Notation(0, angles, SD_PX, relative, approach)
+        import_sightings(file, to, stated, sheet, notation, correction, given.get("u_deg"), yes=yes, as_json=as_json)
+        return
+    refuse_options("for a guide log or sightings", "add --axis or --sightings, or leave it out", assume=assume)
     listed = _listed_moves(to)
     table = read_foreign(file, sheet)
     asking = not (yes or as_json) and somebody_there()
@@ -208,14 +230,12 @@ def _word(kind: str) -> str:
     return kind
 
 
-def _assumption(text: str) -> tuple[str, float]:
-    """The two sides of --assume NAME=NUMBER."""
-    from tvsbayes.single_axis.guide_log import ASSUMPTIONS
-
+def _assumption(text: str, known: Mapping[str, str], example: str) -> tuple[str, float]:
+    """The two sides of --assume NAME=NUMBER, of names with their meanings."""
     name, _, number = text.partition("=")
-    allowed = ", ".join(f"{known}=NUMBER ({what})" for known, what in ASSUMPTIONS.items())
-    if name.strip() not in ASSUMPTIONS or not NUMBER.fullmatch(number.strip()):
-        remedy = "write --assume declination_deg=45.9"
+    allowed = ", ".join(f"{key}=NUMBER ({what})" for key, what in known.items())
+    if name.strip() not in known or not NUMBER.fullmatch(number.strip()):
+        remedy = f"write --assume {example}"
         raise InputError("usage", f"--assume {escaped(text)}; allowed: {allowed}", allowed=allowed, remedy=remedy)
     return name.strip(), float(number)
 
@@ -304,7 +324,8 @@ def _completed(
         if not open_fields:
             return known
     strange = set(known.columns).isdisjoint((*PIXELS, *COUNTERS))
-    besides = "; or --axis, where one axis and its readings are meant" * strange
+    besides = "; or --axis, where one axis and its readings are meant, --sightings, where a head says where it points"
+    besides *= strange
     raise not_sure(table, known, list(dict.fromkeys(open_fields)), FIELDS, (*PIXELS, *COUNTERS), besides)
 
 

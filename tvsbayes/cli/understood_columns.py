@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.begin_commands import few
 from tvsbayes.errors import InputError, escaped, refusal
 
 if TYPE_CHECKING:
@@ -17,9 +16,19 @@ SAMPLES = 3
 """First values of a column that are shown."""
 
 
+NAMES_LISTED = 6
+"""Of columns that are not used, in a line."""
+
+
 def first_values(cells: Sequence[str]) -> list[str]:
     """The first cells of a column that hold anything: rows without a look begin many tables."""
     return list(islice(filter(None, cells), SAMPLES))
+
+
+def few(names: Sequence[str]) -> str:
+    """The first of them, fit to print, and how many more there are."""
+    more = f" and {len(names) - NAMES_LISTED} more" if len(names) > NAMES_LISTED else ""
+    return ", ".join(escaped(name) for name in names[:NAMES_LISTED]) + more
 
 
 def table_document(table: ForeignTable, known: Understood) -> dict[str, Any]:

@@ -161,10 +161,11 @@ def looks_of(
     assumed: list[str] = []
     moves: tuple[Move, ...] | None = None
     if all(field in cells for field in COUNTERS):
-        moves, of_row = _moves(cells, notation, assumed)
+        listing = moves_of_rows(cells, notation, assumed)
+        moves, of_row = listing.moves, listing.of_row
         assumed += _renumbered(cells, of_row)
     else:
-        of_row = _listed_moves(cells, listed or ())
+        of_row = tuple(_listed_moves(cells, listed or ()))
     spots = _spots(cells, of_row, notation, assumed) if any(field in cells for field in PIXELS) else None
     return ForeignLooks(moves, spots, tuple(assumed))
 
@@ -200,8 +201,20 @@ def _listed_moves(cells: FieldCells, listed: Sequence[Move]) -> list[int]:
     return numbers
 
 
-def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[tuple[Move, ...], list[int]]:
-    """The moves of a table with counters, and the move of every row."""
+@dataclass(frozen=True)
+class RowMoves:
+    """Moves of a table, and the number of the move of every row."""
+
+    moves: tuple[Move, ...]
+    of_row: tuple[int, ...]
+
+
+def moves_of_rows(cells: FieldCells, notation: Notation, assumed: list[str]) -> RowMoves:
+    """The moves of a table with counters; adds to `assumed` what the table does not say.
+
+    Raises:
+        InputError: a cell that is no value of its field.
+    """
     count = len(cells.table)
     pairs = list(zip(*(cells.read(MOVES[field]) for field in COUNTERS), strict=True))
     numbers = cells.text("move") if "move" in cells else None
@@ -241,7 +254,7 @@ def _moves(cells: FieldCells, notation: Notation, assumed: list[str]) -> tuple[t
         )
     if notation.relative:
         assumed.append("counters: summed up, because --relative says that each is the steps of its move")
-    return tuple(moves), of_row
+    return RowMoves(tuple(moves), tuple(of_row))
 
 
 def _renumbered(cells: FieldCells, of_row: Sequence[int]) -> list[str]:

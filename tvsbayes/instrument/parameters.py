@@ -128,7 +128,7 @@ _PARAMETERS = (
     *_block("stop_sd_deg", DIRECTIONS, "deg", Prior(0.04, 1.0, "log-normal"), _SD,
             "the scatter of stops", "stop scatter {0}", noise=True),
     *_block("pixel_scale", (), "1", Prior(1.0, 0.5, "log-normal"), (1e-3, 1e3, 5.0),
-            "the pixel noise over the stated one", "pixel noise / stated", noise=True),
+            "the noise of looks over the stated one", "noise / stated", noise=True),
     *_block("focal_scale", (), "1", Prior(1.0, 0.002), (0.5, 2.0, 0.5), "the focal scale", place="rig"),
     *_block("baseline_mm", (), "mm", Prior(200.0, 0.1), (1.0, 1e5, 1e4), "the baseline", place="rig", receiver=True),
     *_block("pan_zero_emission_deg", (), "deg", Prior(90.0, 0.2), (0.0, 180.0, 180.0),

@@ -87,7 +87,8 @@ _TARGET = re.compile(
 SMALLEST_LIMIT, LARGEST_NUMBER = 1e-12, 1e9
 """Limits and coordinates of a target: beyond these a number is a slip of the pen, and squares of it overflow."""
 _NAMED = {
-    unit: ", ".join(name for name in (*DIRECTIONS, "worst", *TARGETS) if UNITS[name] == unit) for unit in UNITS.values()
+    unit: ", ".join(name for name in dict.fromkeys((*DIRECTIONS, "worst", *TARGETS)) if UNITS[name] == unit)
+    for unit in UNITS.values()
 }
 TARGET_FORMS = (
     "u(NAME) <= NUMBER UNIT or U95(NAME) <= NUMBER UNIT with NAME "

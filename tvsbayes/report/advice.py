@@ -97,10 +97,13 @@ def noise_line(summary: FitSummary) -> str | None:
     if USUAL_SCALE[0] <= scale <= USUAL_SCALE[1]:
         return None
     worse = "larger" if scale > 1 else "smaller"
-    return (
-        f"the spots scatter {scale:.2g} times as much as su and sv of spots.csv say; the fit allows for it: "
-        f"state {worse} ones if you know them"
+    sightings = "azimuth_zero_deg" in summary.parameters
+    stated = (
+        "sightings scatter {} times as much as u_deg of sightings.csv says"
+        if sightings
+        else ("the spots scatter {} times as much as su and sv of spots.csv say")
     )
+    return f"{stated.format(f'{scale:.2g}')}; the fit allows for it: state {worse} ones if you know them"
 
 
 def assumed_stereo(stereo: Stereo, budgets: Sequence[BudgetTable]) -> str | None:

@@ -47,20 +47,37 @@ HELD_WORDS = {
     "move": "moves",
     "home": "homings",
     "place": "placements of the sheet",
-    "seen": "looks in view of both cameras",
+    "seen": "looks in view",
     "range_command": "commands, from and to",
 }
 """What `check` calls its keys."""
+SIGHTED_WORDS = {
+    "spots": "sightings",
+    "ok_spots": "usable sightings",
+    "refused": "refused sightings, by reason",
+    **dict.fromkeys(("aperture_readings", "experiments"), ""),
+}
+"""The same of a head that says where it points; "" of what it does not have."""
 UNSEEN_SHOWN = 5
 """Counters that no look reached, of a file of points."""
 PLAN_UNIT = {"contrast": "deg/step", "backlash": "deg", "mirror_offset": "mm"}
 """Units of what a plan will tell, by how their names begin; the ratios' is deg/step."""
 
 
-def held_text(document: Mapping[str, Any]) -> str:
-    """What `check` found in a campaign, rig, plan, axis or journal: a table, and warnings."""
+def held_text(document: Mapping[str, Any], sightings: bool = False) -> str:
+    """What `check` found in a campaign, rig, plan, axis or journal: a table, and warnings.
+
+    Args:
+        document: of `check --json`.
+        sightings: whether the campaign is of a head that says where it points.
+    """
     left_out = ("kind", "findings", "warnings", "faults", "expected", "contraction", "journal")
-    rows = [[HELD_WORDS.get(key, key), _held_value(value)] for key, value in document.items() if key not in left_out]
+    words = HELD_WORDS | (SIGHTED_WORDS if sightings else {})
+    rows = [
+        [words.get(key, key), _held_value(value)]
+        for key, value in document.items()
+        if key not in left_out and words.get(key) != ""
+    ]
     parts: list[Part] = [TableView(document["kind"], [], rows)]
     if "expected" in document:
         parts.append(_foreseen_table(document["expected"], document["contraction"]))
@@ -89,8 +106,10 @@ def _foreseen_table(expected: Mapping[str, float], contraction: Mapping[str, flo
     rows = []
     for name, u in expected.items():
         unit = next((unit for begin, unit in PLAN_UNIT.items() if name.startswith(begin)), "deg/step")
-        told = contraction.get(name)
-        rows.append([name, two_digits(u), unit, "fixed" if told is None else f"{100 * told:.0f} %"])
+        share = contraction.get(name)
+        # What an instrument does not have is exactly known.
+        if u > 0 or share is not None:
+            rows.append([name, two_digits(u), unit, "fixed" if share is None else f"{round(100 * share)} %"])
     columns = ["result", "u expected", "unit", "set by the data"]
     return TableView("what the plan will tell (100 %: the priors no longer matter)", columns, rows)
 

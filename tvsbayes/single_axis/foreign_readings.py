@@ -17,6 +17,7 @@ import numpy as np
 
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.foreign_table import ForeignTable
+from tvsbayes.instrument.cell_notation import plain_column
 from tvsbayes.instrument.column_names import (
     READING_UNITS,
     Understood,
@@ -37,7 +38,7 @@ from tvsbayes.instrument.foreign_looks import (
 )
 from tvsbayes.single_axis.axis_campaign import AXIS_MOVES, READINGS, TURNS, Approach, AxisMove, Reading
 from tvsbayes.single_axis.axis_rows import turn_jumps
-from tvsbayes.single_axis.foreign_columns import plain_column, positions_of_deviations
+from tvsbayes.single_axis.foreign_columns import positions_of_deviations
 
 WHOLE = 0.1
 """Of a turn, by which play and errors of gears may make a jump differ from whole turns."""

@@ -1,0 +1,223 @@
+"""Moves and sightings of somebody's table of a head: counters or angles of encoders, and where it was found to point.
+
+One row is a move, a sighting, or both. Angles of an encoder become counters of `STEP_DEG`. What a table does not say is
+assumed and listed in words. Degrees, u standard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+
+from tvsbayes.errors import refusal
+from tvsbayes.files.csv_table import NUMBER
+from tvsbayes.files.foreign_table import ForeignTable
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import MOVES, SPOTS, Move, Spot
+from tvsbayes.instrument.cell_notation import plain_column
+from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SPREAD, field_by_word, unit_of_name, words_of
+from tvsbayes.instrument.corrections import Correction, corrected
+from tvsbayes.instrument.foreign_looks import (
+    GOOD,
+    FieldCells,
+    Notation,
+    left_out,
+    moves_of_rows,
+    refused_status,
+    word_of,
+)
+from tvsbayes.instrument.parameters import Prior
+from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, sightings_of
+
+STEP_DEG = 1e-5
+"""Of a counter: encoders are read in degrees, and 0.04 arcsec is far below what a telescope is pointed to."""
+U_DEG = 0.01
+"""Standard uncertainty of a sighting where a table states none; the fit scales it by what the sightings show."""
+ENCODER_U, LINE_U, CONTRAST_U = 0.01, 0.1, 0.003
+"""Relative u of a ratio: of an encoder's scale, and of a line through the table; and of a contrast of directions."""
+OFF_LINE_DEG = 10.0
+"""Median distance of sightings from the line over their counters, above which it says no ratio."""
+ANGLES = ("azimuth_deg", "elevation_deg")
+SIGHTING_FIELDS = (*MOVES.columns, *ANGLES, "u_deg", "status")
+"""All that a table of sightings can give."""
+NEEDED = (*COUNTERS, *ANGLES)
+_AXIS_WORDS = (
+    {"azimuth", "az", "azm", "azi", "azimut", "acimut", "pan", "yaw", "horizontal", "horiz", "hor", "schwenk"},
+    {"elevation", "el", "elev", "alt", "altitude", "tilt", "pitch", "vertical", "vert", "hohe", "hoehe", "elevacion"}
+    | {"neigung", "altura", "hauteur", "inclinacion"},
+)
+_OF_COUNTERS = {
+    *("pan", "tilt", "yaw", "pitch", "step", "steps", "count", "counts", "counter", "ticks", "encoder", "enc", "joint"),
+    *("motor", "axis", "raw", "command", "commanded", "cmd", "demand", "schritte", "zahler", "achse", "pasos", "pas"),
+}
+"""Words that tell what an axis was sent to, or read, from where it was found to point."""
+_OTHERS = [*(MOVES[name] for name in ("move", "segment", "time_s", "temperature_degC")), SPOTS["status"]]
+
+
+def sighting_field(name: str) -> str | None:
+    """The field that a column's name tells of."""
+    listed = words_of(name)
+    words = set(listed)
+    of_axis = [k for k, spellings in enumerate(_AXIS_WORDS) if words & spellings]
+    if words & SPREAD or words == {"u"} or (words & {"u"} and len(of_axis) != 1):
+        return "u_deg"
+    if len(of_axis) != 1:
+        return field_by_word(listed, _OTHERS)
+    if "approach" in words:
+        return f"{AXES[of_axis[0]]}_approach"
+    return COUNTERS[of_axis[0]] if words & _OF_COUNTERS else ANGLES[of_axis[0]]
+
+
+@dataclass(frozen=True)
+class ForeignSightings:
+    """What a table gives.
+
+    Attributes:
+        moves: rows of `moves.csv`.
+        sightings: rows of `sightings.csv`.
+        priors: of ratios, by their names, as encoders or a line through the table say them.
+        assumed: what it does not say, in words.
+    """
+
+    moves: tuple[Move, ...]
+    sightings: tuple[Sighting, ...]
+    priors: dict[str, Prior]
+    assumed: tuple[str, ...]
+
+
+def sightings_of_table(
+    table: ForeignTable,
+    columns: dict[str, str],
+    notation: Notation,
+    correction: Correction,
+    u_deg: float | None = None,
+) -> ForeignSightings:
+    """Moves and sightings of a table.
+
+    Args:
+        table: as it was read.
+        columns: its columns by field, `NEEDED` among them.
+        notation: how its numbers are meant; `angle_unit` where names of columns say none.
+        correction: of moves and sightings.
+        u_deg: of a sighting where no column has it.
+
+    Raises:
+        InputError: a cell that is no value of its field, or no row.
+    """
+    if not len(table):
+        found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
+        raise refusal("empty", file=table.file, found=found, allowed="at least one row", remedy=remedy)
+    assumed: list[str] = []
+    plain = _plain_numbers(table, columns, notation, assumed)
+    table, units = plain.table, plain.units
+    cells_of = FieldCells(table, columns)
+    listing = moves_of_rows(cells_of, notation, assumed)
+    angles = []
+    for field in (*ANGLES, *(["u_deg"] * ("u_deg" in columns))):
+        scale, column = DEGREES[units[field]], SIGHTINGS[field]
+        read = cells_of.read(column, column.low / scale, column.high / scale, empty=True)
+        angles.append([None if value is None else scale * value for value in read])
+    stated_u = angles[2] if len(angles) > 2 else [U_DEG if u_deg is None else u_deg] * len(table)
+    if "u_deg" not in columns:
+        how = "; --assume u_deg=NUMBER states another, and the fit finds the scale"
+        assumed.append(f"standard uncertainty of a sighting: {stated_u[0]:g} deg{how}")
+    statuses, sightings = cells_of.text("status"), []
+    for row, (azimuth, elevation, u) in enumerate(zip(*angles[:2], stated_u, strict=True)):
+        if azimuth is None and elevation is None and not statuses[row]:
+            continue
+        good = not statuses[row] or word_of(statuses[row]) in GOOD
+        if good and None in (azimuth, elevation, u):
+            empty = ANGLES[0] if azimuth is None else ANGLES[1] if elevation is None else "u_deg"
+            raise cells_of.refuse(row, empty, f"a number for {empty} where the sighting is ok", "complete the cell")
+        status = "ok" if good else refused_status(statuses[row])
+        sightings.append(
+            Sighting(
+                sighting=row,
+                move=listing.of_row[row],
+                azimuth_deg=azimuth,
+                elevation_deg=elevation,
+                u_deg=u,
+                status=status,
+            )
+        )
+    assumed += left_out(cells_of, statuses, "sighting")
+    changed = corrected(listing.moves, cast(list[Spot], sightings), correction)
+    moves, sightings = changed.moves or (), sightings_of(changed.spots or ())
+    told = frozenset(field for field in COUNTERS if field in units)
+    priors = _ratios(moves, sightings, told, assumed)
+    return ForeignSightings(moves, tuple(sightings), priors, (*assumed, *changed.changes))
+
+
+@dataclass(frozen=True)
+class _PlainTable:
+    """A table of plain numbers, and the units of its angles by field; counters that are whole have none."""
+
+    table: ForeignTable
+    units: dict[str, str]
+
+
+def _plain_numbers(table: ForeignTable, columns: dict[str, str], notation: Notation, assumed: list[str]) -> _PlainTable:
+    """A table with plain numbers, and encoders' angles as counters."""
+    units: dict[str, str] = {}
+    for field in (name for name in (*NEEDED, "u_deg") if name in columns):
+        plain = plain_column(columns[field], table.columns[columns[field]])
+        assumed += [plain.remark] * bool(plain.remark)
+        unit = plain.unit or unit_of_name(columns[field], DEGREES)
+        if field in COUNTERS and unit is None and any(not _is_whole(cell) for cell in plain.cells):
+            unit = notation.angle_unit or "deg"
+        elif field not in COUNTERS:
+            unit = unit or (units["azimuth_deg"] if field == "u_deg" else notation.angle_unit) or "deg"
+        if unit is not None:
+            units[field] = unit
+        cells = plain.cells
+        if field in COUNTERS and unit is not None:
+            per_unit = DEGREES[unit] / STEP_DEG
+            cells = tuple(str(round(per_unit * float(cell))) if NUMBER.fullmatch(cell) else cell for cell in cells)
+            assumed.append(
+                f"{field}: angles in {unit} as they stand, without whole turns, in steps of {STEP_DEG:g} deg"
+            )
+        table = replace(table, columns={**table.columns, columns[field]: cells})
+    return _PlainTable(table, units)
+
+
+def _ratios(
+    moves: Sequence[Move], sightings: Sequence[Sighting], encoders: frozenset[str], assumed: list[str]
+) -> dict[str, Prior]:
+    """Ratios and contrasts of encoders' steps, and of counters by a line through what was sighted there."""
+    priors: dict[str, Prior] = {}
+    ok = [s for s in sightings if s.status == "ok"]
+    for axis, field, angle in zip(AXES, COUNTERS, ANGLES, strict=True):
+        ratio, u = STEP_DEG, ENCODER_U
+        if field not in encoders:
+            counters = np.array([getattr(moves[s.move], field) for s in ok], float)
+            slope = line_slope(counters, np.array([getattr(s, angle) for s in ok], float))
+            if slope is None:
+                continue
+            ratio, u = abs(slope), LINE_U
+            line = f"{ratio:.3g} deg, u {LINE_U:.0%}, by a line through the table"
+            assumed.append(f"degrees_per_step.{axis}: {line}; correct it in [rig.prior]")
+            if slope < 0:
+                remedy = f"add --flip {field}, or exchange two columns by --column"
+                assumed.append(f"{field}: falls where {angle} grows; {remedy}")
+        priors[f"degrees_per_step.{axis}"] = Prior(ratio, u * ratio)
+        priors[f"ratio_contrast_deg_per_step.{axis}"] = Prior(0.0, CONTRAST_U * ratio)
+    return priors
+
+
+def _is_whole(cell: str) -> bool:
+    """Whether a cell is empty, no number, or a whole one."""
+    return NUMBER.fullmatch(cell) is None or float(cell).is_integer()
+
+
+def line_slope(counters: np.ndarray, angles_deg: np.ndarray) -> float | None:
+    """Degrees a step of a line through angles of any turn, shape (n,) each; None where there is none."""
+    order = np.argsort(counters, kind="stable")
+    steps, angles = counters[order], np.unwrap(angles_deg[order], period=360.0)
+    if len(np.unique(steps)) < 3:
+        return None
+    slope, level = np.polyfit(steps, angles, 1).tolist()
+    off = float(np.median(np.abs(angles - slope * steps - level)))
+    return slope if off < OFF_LINE_DEG and slope != 0.0 else None
