@@ -83,7 +83,7 @@ def test_small_differences_that_all_looks_share_are_found_together():
         shifts = signs * size * 2 * np.array([0.1, 0.2])
         shifts[:, 1] = 0.0
         found = widening(list(shifts), covariances)
-        assert [(one.lines, one.spots) for one in found.found] == ([("rows", 40)] if expected else [])
+        assert [(one.lines, one.spots) for one in found.lines] == ([("rows", 40)] if expected else [])
         if expected:
             np.testing.assert_allclose(found.added_px2[3], np.outer(shifts[3, 0], shifts[3, 0]) / 12, rtol=1e-12)
         else:
@@ -96,7 +96,7 @@ def test_one_look_alone_is_widened_alone():
     shifts = [np.zeros((2, 2))] * 30
     shifts[4] = np.array([[0.0, 0.0], [2.0, 0.0]])
     found = widening(shifts, [0.01 * np.eye(2)] * 30)
-    assert [(one.lines, one.spots, one.apart_px) for one in found.found] == [("columns", 1, 2.0)]
+    assert [(one.lines, one.spots, one.apart_px) for one in found.lines] == [("columns", 1, 2.0)]
     assert np.flatnonzero(found.added_px2.any(axis=(1, 2))).tolist() == [4]
 
 

@@ -49,7 +49,7 @@ class Widening:
     """What is added to the covariances of a camera's centres (n, 2, 2), px^2, and why."""
 
     added_px2: np.ndarray
-    found: tuple[AlternateLines, ...]
+    lines: tuple[AlternateLines, ...]
 
 
 def shift_of_lines(patch: Patch, jacobian: np.ndarray, weights: np.ndarray, residual: np.ndarray) -> np.ndarray:
@@ -90,9 +90,8 @@ def widening(shifts_px: Sequence[np.ndarray], covariances_px2: Sequence[np.ndarr
     """
     from scipy.special import chdtri
 
-    count = len(shifts_px)
-    added, found = np.zeros((count, 2, 2)), []
-    if not count:
+    added, disagreeing = np.zeros((len(shifts_px), 2, 2)), []
+    if not len(shifts_px):
         return Widening(added, ())
     shifts = np.array(shifts_px)
     inverse = np.linalg.inv(4 * np.array(covariances_px2))
@@ -105,8 +104,8 @@ def widening(shifts_px: Sequence[np.ndarray], covariances_px2: Sequence[np.ndarr
         if beyond.any():
             apart = shifts[beyond, number]
             added[beyond] += np.einsum("ni,nj->nij", apart, apart) / 12
-            found.append(AlternateLines(lines, int(beyond.sum()), float(np.median(np.hypot(*apart.T)))))
-    return Widening(added, tuple(found))
+            disagreeing.append(AlternateLines(lines, int(beyond.sum()), float(np.median(np.hypot(*apart.T)))))
+    return Widening(added, tuple(disagreeing))
 
 
 def _high_pass(raw: np.ndarray, axis: int) -> np.ndarray:

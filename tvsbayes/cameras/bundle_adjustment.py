@@ -131,11 +131,11 @@ def reduced_residuals(z: Float[Array, "24"], arrays: BoardArrays) -> Float[Array
     followed.
     """
     parameters = arrays.origin + arrays.root @ z
-    seen = (arrays.corners_px, arrays.weight, arrays.points_mm)
+    views = (arrays.corners_px, arrays.weight, arrays.points_mm)
     fixed = jax.lax.stop_gradient(parameters)
-    poses = jax.lax.stop_gradient(_over_views(_settled_pose)(arrays.poses, fixed, *seen))
-    by_pose, gain, _ = jax.lax.stop_gradient(_over_views(_pose_gain)(poses, fixed, *seen))
-    residuals = _over_views(_view_residuals)(poses, parameters, *seen)
+    poses = jax.lax.stop_gradient(_over_views(_settled_pose)(arrays.poses, fixed, *views))
+    by_pose, gain, _ = jax.lax.stop_gradient(_over_views(_pose_gain)(poses, fixed, *views))
+    residuals = _over_views(_view_residuals)(poses, parameters, *views)
     return (residuals - jnp.einsum("vrp,vps,vs->vr", by_pose, gain, residuals)).ravel()
 
 
@@ -148,8 +148,8 @@ class _Linear(eqx.Module):
 
 @compiled(_Linear)
 def _linearised(z: Float[Array, "24"], arrays: BoardArrays) -> _Linear:
-    found = linear_residual(reduced_residuals, z, arrays)
-    return _Linear(jnp.asarray(found.value), jnp.asarray(found.jacobian))
+    linear = linear_residual(reduced_residuals, z, arrays)
+    return _Linear(jnp.asarray(linear.value), jnp.asarray(linear.jacobian))
 
 
 @dataclass(frozen=True)
@@ -260,19 +260,19 @@ def _padded(views: Sequence[View], board: Board, start: np.ndarray, poses: np.nd
     """The arrays of an adjustment in buckets, its coordinates in the parameters' own units."""
     count = -(-len(views) // VIEWS_PER_BUCKET) * VIEWS_PER_BUCKET
     corners = -(-board.corners // CORNERS_PER_BUCKET) * CORNERS_PER_BUCKET
-    seen, weight = np.zeros((count, 4, corners)), np.zeros((count, 4, corners))
+    pixels, weight = np.zeros((count, 4, corners)), np.zeros((count, 4, corners))
     start_poses, points = np.zeros((count, 6)), np.zeros((3, corners))
     start_poses[:, 5] = 1.0
     start_poses[: len(views)] = poses
     points[:, : board.corners] = board.points_mm.T
     for k, view in enumerate(views):
-        for side, found in enumerate((view.left, view.right)):
-            if found is not None:
-                there = np.isfinite(found.T)
-                seen[k, 2 * side : 2 * side + 2, : board.corners] = np.where(there, found.T, 0.0)
-                weight[k, 2 * side : 2 * side + 2, : board.corners] = there
+        for side, corners_px in enumerate((view.left, view.right)):
+            if corners_px is not None:
+                finite = np.isfinite(corners_px.T)
+                pixels[k, 2 * side : 2 * side + 2, : board.corners] = np.where(finite, corners_px.T, 0.0)
+                weight[k, 2 * side : 2 * side + 2, : board.corners] = finite
     unit = np.diag(free.astype(float))
-    return BoardArrays(*map(placed, (points, seen, weight, start_poses, np.asarray(start, float), unit)))
+    return BoardArrays(*map(placed, (points, pixels, weight, start_poses, np.asarray(start, float), unit)))
 
 
 def _check_minimum(jacobian: np.ndarray, residuals: np.ndarray, apart: np.ndarray, noise_sd: float) -> None:
@@ -331,8 +331,8 @@ def _descended(z: np.ndarray, arrays: BoardArrays) -> _End:
     """Where Levenberg-Marquardt ends."""
 
     def linearised(at: np.ndarray) -> LinearResidual:
-        found = _linearised(at, arrays)
-        residuals, jacobian = np.asarray(found.residuals), np.asarray(found.jacobian)
+        linear = _linearised(at, arrays)
+        residuals, jacobian = np.asarray(linear.residuals), np.asarray(linear.jacobian)
         return LinearResidual(residuals, jacobian, _End(at, residuals, jacobian))
 
     return descend(linearised, z, TOLERANCE, STEPS_MAX).also

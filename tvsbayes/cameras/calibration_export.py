@@ -56,18 +56,20 @@ def _opencv_text(matrices: Mapping[str, np.ndarray], numbers: Mapping[str, int])
     """OpenCV's YAML 1.0 of 2-D matrices: 4.x and 5.x read it alike."""
     lines = ["%YAML:1.0", "---", *(f"{key}: {value}" for key, value in numbers.items())]
     for key, matrix in matrices.items():
-        rows, cols = matrix.shape
-        data = ", ".join(map(repr, map(float, matrix.ravel())))
-        lines += [f"{key}: {MATRIX_TAG}", f"   rows: {rows}", f"   cols: {cols}", "   dt: d", f"   data: [ {data} ]"]
+        lines += [f"{key}: {MATRIX_TAG}", *_entries(matrix, "   ", "[ {} ]", "dt: d")]
     return ("\n".join(lines) + "\n").encode()
 
 
 def _ros_text(name: str, size: tuple[int, int], matrices: Mapping[str, np.ndarray]) -> bytes:
     lines = [f"image_width: {size[0]}", f"image_height: {size[1]}", f"camera_name: {name}"]
     for key, matrix in matrices.items():
-        if key == "distortion_coefficients":
-            lines.append("distortion_model: plumb_bob")
-        rows, cols = matrix.shape
-        data = ", ".join(map(repr, map(float, matrix.ravel())))
-        lines += [f"{key}:", f"  rows: {rows}", f"  cols: {cols}", f"  data: [{data}]"]
+        lines += ["distortion_model: plumb_bob"] * (key == "distortion_coefficients")
+        lines += [f"{key}:", *_entries(matrix, "  ", "[{}]")]
     return ("\n".join(lines) + "\n").encode()
+
+
+def _entries(matrix: np.ndarray, indent: str, form: str, *more: str) -> list[str]:
+    """Rows, columns, what a format says besides, and the numbers in its form of a list."""
+    rows, cols = matrix.shape
+    data = form.format(", ".join(map(repr, map(float, matrix.ravel()))))
+    return [f"{indent}{entry}" for entry in (f"rows: {rows}", f"cols: {cols}", *more, f"data: {data}")]

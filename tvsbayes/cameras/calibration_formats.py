@@ -123,14 +123,6 @@ def read_calibration(
 
 
 @dataclass(frozen=True)
-class _Camera:
-    """Inner parameters of one camera: matrix (3, 3) and k1 k2 p1 p2 k3."""
-
-    matrix: np.ndarray
-    distortion: np.ndarray
-
-
-@dataclass(frozen=True)
 class _Pose:
     """A way to R (3, 3) and T (3,) of x_right = R x_left + T, T in the file's unit.
 
@@ -194,15 +186,12 @@ class _Reader:
             matrices = [matrix - np.outer([1, 1, 0], [0, 0, 1]) for matrix in matrices]
             self.notes.append("MATLAB counts pixels from 1: 1 px is taken off cx and cy of both cameras")
         sizes = (size, self.right_size or size)
-        left, right = (
-            _Camera(m, self._distortion(side, m, own))
-            for side, (m, own) in enumerate(zip(matrices, sizes, strict=True))
-        )
-        scaled = right.matrix * np.array([[size[0] / sizes[1][0]] * 2 + [1.0]] * 2 + [[1.0] * 3])
-        scaled[:2, 2] = scaled_px(right.matrix[:2, 2], sizes[1], size)
+        left, right = (self._distortion(side, matrices[side], sizes[side]) for side in (0, 1))
+        scaled = matrices[1] * np.array([[size[0] / sizes[1][0]] * 2 + [1.0]] * 2 + [[1.0] * 3])
+        scaled[:2, 2] = scaled_px(matrices[1][:2, 2], sizes[1], size)
         rotation, translation = self._extrinsics()
         translation = translation * self._unit(float(np.linalg.norm(translation)))
-        inner = left.matrix, left.distortion, scaled, right.distortion
+        inner = matrices[0], left, scaled, right
         bare = Stereo(*size, *inner, rotation, translation, np.zeros((24, 24)), 0.0, assumed=True)
         bare = replace(bare, right_image_size=self.right_size)
         return parse_stereo(stereo_bytes(bare), "the imported calibration")
@@ -425,12 +414,13 @@ class _Reader:
         for field in ("pose", "pose_backwards"):
             if (entry := pair.get(field)) is not None:
                 source = next((source for source, keys in POSES_OF.items() if entry.key in keys), "")
-                yield _posed(entry.pose() if field == "pose" else np.linalg.inv(entry.pose()), entry, source)
+                pose = entry.pose() if field == "pose" else np.linalg.inv(entry.pose())
+                yield _Pose(pose[:3, :3], pose[:3, 3], entry, entry, source)
         for field, source in (("from_body", "kalibr"), ("to_body", "euroc")):
             if field in left and field in right:
                 one, two = (camera[field].pose() for camera in (left, right))
                 pose = two @ np.linalg.inv(one) if field == "from_body" else np.linalg.inv(two) @ one
-                yield _posed(pose, right[field], source)
+                yield _Pose(pose[:3, :3], pose[:3, 3], right[field], right[field], source)
         turns = [turn for c in (left, right) if (turn := c.get("camera_R", c.get("rectification"))) is not None]
         if all("camera_T" in camera for camera in (left, right)) and len(turns) == 2:
             one, two = (turn.rotation() for turn in turns)
@@ -522,10 +512,6 @@ def _off_middle(matrix: np.ndarray, size: tuple[int, int]) -> float:
 def _named(entry: Entry | None, word: str) -> bool:
     """Whether an entry's own key is a word, marks aside."""
     return entry is not None and entry.key.lower().replace("_", "") == word
-
-
-def _posed(pose: np.ndarray, entry: Entry, source: str) -> _Pose:
-    return _Pose(pose[:3, :3], pose[:3, 3], entry, entry, source)
 
 
 def _of_pose(other: _Pose) -> Callable[[np.ndarray, np.ndarray], float]:

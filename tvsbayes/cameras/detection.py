@@ -30,7 +30,6 @@ from tvsbayes.cameras.contour import Rectified, contour_of, epipolar_refused, re
 from tvsbayes.cameras.picture_pairs import SUFFIXES
 from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skewness, widened, with_own_noise
 from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SHAPE_SPOTS_MIN, SpotNoise, learn_noise, mean_noise
-from tvsbayes.cameras.spot_overlay import overlay_of
 from tvsbayes.cameras.spot_window import CLIPPED_DN, CLIPPED_SHARE_MAX, WIDE_SD_PX, Patch, patch_around
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
@@ -69,6 +68,8 @@ PILOTS_MAX = 24
 """Looks from which the weights of the fits are learned; uncertainties are stated from all."""
 LEARNING_ROUNDS = 3
 SKEW_SPOTS_MAX = 1000
+OVERLAY_HALF_PX, OVERLAY_ZOOM = 32, 8
+"""Half the side of the square that an overlay shows, and how many of its pixels show one."""
 PEDESTAL_DN = 8.0
 """Beside a difference of pictures, so that the noise of a dark background keeps both of its sides."""
 
@@ -381,7 +382,7 @@ class _Looks:
         pictures = {camera: self.frames.read(spot, camera) for camera in CAMERAS}
         left, right = (self._centre(camera, picture) for camera, picture in pictures.items())
         if self.overlay is not None:
-            views = overlay_of(pictures["left"], left), overlay_of(pictures["right"], right)
+            views = _overlay_of(pictures["left"], left), _overlay_of(pictures["right"], right)
             write_atomically(self.overlay / f"{spot.spot:06d}.png", png_bytes(np.hstack(views)))
         return left, right
 
@@ -493,3 +494,32 @@ def _learned(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNo
             return noise
         noise = learn_noise(np.stack([skewness(*pair) for pair in fits]), speckle_contrast)
     return noise
+
+
+def _overlay_of(picture: np.ndarray, centre: Centre) -> np.ndarray:
+    """The surroundings of a spot enlarged: outline green, centre red, the reason of a refusal in words (Figure 9)."""
+    import cv2
+
+    if picture.dtype != np.uint8:
+        picture = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+    half, zoom = OVERLAY_HALF_PX, OVERLAY_ZOOM
+    height, width = picture.shape[:2]
+    middle = centre.centre_px
+    if middle is None:
+        outline = centre.outline_px
+        middle = np.array([width, height]) / 2 if outline is None or not len(outline) else outline.mean(axis=0)
+    low = np.clip(np.round(middle).astype(int) - half, 0, np.maximum((width, height) - np.array(2 * half), 0))
+    crop = picture[low[1] : low[1] + 2 * half, low[0] : low[0] + 2 * half]
+    crop = cv2.copyMakeBorder(crop, 0, 2 * half - crop.shape[0], 0, 2 * half - crop.shape[1], cv2.BORDER_CONSTANT)
+    large = cv2.resize(crop, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
+    if centre.outline_px is not None and len(centre.outline_px):
+        outline = np.round((centre.outline_px - low + 0.5) * zoom).astype(np.int32)
+        cv2.polylines(large, [outline.reshape(-1, 1, 2)], True, (0, 255, 0), 1, cv2.LINE_AA)
+    if centre.centre_px is not None:
+        dot = np.round((centre.centre_px - low + 0.5) * zoom).astype(int)
+        cv2.circle(large, tuple(map(int, dot)), zoom // 2, (0, 0, 255), -1, cv2.LINE_AA)
+    if centre.status != "ok":
+        cv2.putText(
+            large, centre.status, (zoom, 3 * zoom), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 255, 255), 1, cv2.LINE_AA
+        )
+    return large

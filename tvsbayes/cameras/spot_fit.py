@@ -243,14 +243,17 @@ def _covariance_parts(fitted: _Fitted, patch: Patch) -> np.ndarray:
     weighted = fitted.jacobian * fitted.weights
     # Two rows of the inverse; the inverse times every pixel would take longer than all the rest here.
     gains = np.linalg.solve(weighted @ fitted.jacobian.T, np.eye(9)[:, 1:3]).T @ weighted
-    gains = np.vstack((gains, gains.sum(axis=0)))  # var(u + v) gives the covariance
-    signal = fitted.signal
-    parts = []
-    for filters, size in ((gains, patch.background_variance), (gains * np.sqrt(signal), 1.0), (gains * signal, 1.0)):
-        u, v, both = size * through_demosaicing(filters, patch.grey.shape, patch.block)
-        mixed = (both - u - v) / 2
-        parts.append([[u, mixed], [mixed, v]])
-    return np.array(parts)
+    # The variance of u + v gives the covariance.
+    u, v, both = _noise_parts(np.vstack((gains, gains.sum(axis=0))), fitted.signal, patch).T
+    mixed = (both - u - v) / 2
+    return np.array([[u, mixed], [mixed, v]]).transpose(2, 0, 1)
+
+
+def _noise_parts(filters: np.ndarray, signal: np.ndarray, patch: Patch) -> np.ndarray:
+    """Variance (3, k) of filters (k, n) on a patch: from the background's noise, per gain and per contrast^2."""
+    by_noise = (filters, filters * np.sqrt(signal), filters * signal)
+    background, *others = (through_demosaicing(one, patch.grey.shape, patch.block) for one in by_noise)
+    return np.array([patch.background_variance * background, *others])
 
 
 def skewness(fitted: _Fitted, patch: Patch) -> np.ndarray:
@@ -266,12 +269,7 @@ def skewness(fitted: _Fitted, patch: Patch) -> np.ndarray:
     taken = np.linalg.solve(weighted @ fitted.jacobian.T, weighted @ shapes.T)
     filters = (shapes - taken.T @ fitted.jacobian) * fitted.weights
     filters /= np.maximum(np.einsum("kn,kn->k", filters, shapes), 1e-300)[:, None]
-    parts = [
-        patch.background_variance * through_demosaicing(filters, patch.grey.shape, patch.block),
-        through_demosaicing(filters * np.sqrt(signal), patch.grey.shape, patch.block),
-        through_demosaicing(filters * signal, patch.grey.shape, patch.block),
-    ]
-    return np.column_stack((filters @ fitted.residual, *parts))
+    return np.column_stack((filters @ fitted.residual, *_noise_parts(filters, signal, patch)))
 
 
 def with_own_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
@@ -335,10 +333,9 @@ def widened(centres: Sequence[Centre]) -> Widened:
     shifts = [lines for k in good if (lines := centres[k].lines_px) is not None]
     more = widening(shifts, [centres[k].located.covariance_px2 for k in good])
     result = list(centres)
-    if more.found:
-        for k, added in zip(good, more.added_px2, strict=True):
-            result[k] = replace(result[k], covariance_px2=result[k].located.covariance_px2 + added)
-    return Widened(tuple(result), more.found)
+    for k, added in zip(good, more.added_px2, strict=True):
+        result[k] = replace(result[k], covariance_px2=result[k].located.covariance_px2 + added)
+    return Widened(tuple(result), more.lines)
 
 
 def _at_border(centre: np.ndarray, reach: np.ndarray | float, size: tuple[int, int]) -> str | None:
