@@ -6,23 +6,18 @@ once a homing is logged. A reader finds a whole campaign at any moment.
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from msgspec import UNSET
-
-from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, Journal, event_of, read_journal, require_journal
+from tvsbayes.acquisition.journal import EMPTY_REMEDY, LOG, read_journal, require_journal
 from tvsbayes.acquisition.journal_check import repair, verify
-from tvsbayes.acquisition.journal_events import Created
-from tvsbayes.acquisition.recorder import LOST_STEPS, Recorded, Recorder, recorded
-from tvsbayes.errors import InputError, TvsError
+from tvsbayes.acquisition.recorder import LOST_STEPS, Recorded, recorded
+from tvsbayes.errors import InputError
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
-from tvsbayes.files.disk import read_bytes, remove_unfinished, write_atomically
+from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, parse_toml
 from tvsbayes.instrument.campaign import (
-    NAME_ACQUIRED,
     UNDETECTED,
     Campaign,
     Spot,
@@ -34,73 +29,13 @@ from tvsbayes.instrument.campaign import (
     spots_bytes,
 )
 from tvsbayes.instrument.campaign_header import parse_header
-from tvsbayes.instrument.rig import Rig, parse_rig_table
+from tvsbayes.instrument.rig import parse_rig_table
 from tvsbayes.instrument.stereo_pair import read_stereo, stereo_bytes
 
-DERIVED_EVERY = 100
-"""Up to this many spots the campaign files are written after every look, then ever more rarely: at least 99 % of the
-looks are in them at any time, all of them in the journal."""
-_DERIVED = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "truth.json")
+DERIVED = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "truth.json")
 
 
-class CampaignFiles:
-    """The files of a running acquisition.
-
-    Args:
-        journal: of the run.
-        recorder: follows it.
-        rig: the rig.
-
-    Attributes:
-        behind: why the files lack what the journal has, "" where they do not.
-    """
-
-    def __init__(self, journal: Journal, recorder: Recorder, rig: Rig):
-        self._journal, self._recorder, self._rig = journal, recorder, rig
-        self.behind = ""
-
-    def derive(self, always: bool = False) -> None:
-        """Writes them anew, unless it is no time for that yet (see `DERIVED_EVERY`)."""
-        count = len(self._recorder.spots)
-        if not always and count > DERIVED_EVERY and count % (count // DERIVED_EVERY):
-            return
-        if not self._recorder.moves:
-            return
-        try:
-            write_derived(self._campaign(), self._journal.folder, tables_only=not always)
-            self.behind = ""
-        except TvsError as error:
-            # Somebody has the table open, say. The journal has everything, and the next look tries again; after the
-            # last one --resume does.
-            self.behind = error.message
-
-    def keep_edited(self) -> list[str]:
-        """Copies files that hold what the journal does not, before they are written anew; what to say about each.
-
-        What killed runs left unfinished of these files is removed.
-        """
-        folder, campaign = self._journal.folder, self._campaign()
-        remove_unfinished(folder, _DERIVED)
-        return [
-            f"{name} had rows that {LOG} lacks, which has lost its end: they are kept in {copy.name}, lost looks are "
-            "taken again"
-            if copy.stem.rpartition("-")[0].endswith(".longer")
-            else f"{name} was edited since: what stood in it is kept in {copy.name}"
-            for name, copy in keep_edited(campaign, folder).items()
-        ]
-
-    def _campaign(self) -> Campaign:
-        """What the journal holds so far; there has been a homing."""
-        created = event_of(self._journal.records[0], Created)
-        assert created is not None
-        start = datetime.datetime.fromisoformat(created.created).astimezone(datetime.UTC)
-        header: dict[str, object] = {"name": NAME_ACQUIRED if created.name is UNSET else created.name, "created": start}
-        stated = {"synthetic": created.synthetic, "seed": created.seed}
-        header |= {name: value for name, value in stated.items() if value is not UNSET}
-        return _campaign_of(self._recorder.result(), Campaign((), (), self._rig.stereo, self._rig.table, header))
-
-
-def _campaign_of(record: Recorded, settings: Campaign) -> Campaign:
+def campaign_of(record: Recorded, settings: Campaign) -> Campaign:
     """The campaign of a journal with the stereo calibration, rig and header of `settings`."""
     return Campaign(record.moves, record.spots, settings.stereo, settings.rig, settings.header)
 
@@ -309,7 +244,7 @@ def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
     records = read_journal(to).records
     record = recorded(records)
     if record.moves:
-        write_derived(_campaign_of(record, before), to)
+        write_derived(campaign_of(record, before), to)
     ignored = set(record.ignored_lines)
     return {
         **asdict(done),

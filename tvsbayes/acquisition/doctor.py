@@ -56,6 +56,11 @@ class Check:
     found: str
     remedy: str = ""
 
+    @classmethod
+    def judged(cls, name: str, found: str, remedy: str) -> Check:
+        """A warning where there is something to do, else "ok"."""
+        return cls(name, "warning" if remedy else "ok", found, remedy)
+
 
 def examine(
     rig: Rig,
@@ -160,10 +165,8 @@ def _disk(folder: Path, clock: Clock) -> list[Check]:
         place = place.parent
     try:
         free = shutil.disk_usage(place).free
-        room = Check("disk", "ok", f"{free / 1e9:.1f} GB free")
-        if free < DISK_FREE_BYTES:
-            remedy = f"free at least {DISK_FREE_BYTES / 1e9:.0f} GB for 700 looks"
-            room = Check("disk", "warning", f"{free / 1e9:.1f} GB free", remedy)
+        remedy = f"free at least {DISK_FREE_BYTES / 1e9:.0f} GB for 700 looks" * (free < DISK_FREE_BYTES)
+        room = Check.judged("disk", f"{free / 1e9:.1f} GB free", remedy)
         disk, name = Disk(), place / f".tvsbayes-doctor-{os.getpid()}"
         start = clock.monotonic()
         descriptor = disk.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
@@ -177,10 +180,8 @@ def _disk(folder: Path, clock: Clock) -> list[Check]:
     except OSError as error:
         found = escaped(error.strerror or str(error))
         return [Check("disk", "fault", found, f"make {escaped(str(place), 200)} writable, or name another folder")]
-    slow = seconds > FLUSH_SLOW_S
-    remedy = "write to a local disk, not to a network or a memory card" if slow else ""
-    flush = Check("disk flush", "warning" if slow else "ok", f"{1000 * seconds:.1f} ms", remedy)
-    return [room, flush]
+    remedy = "write to a local disk, not to a network or a memory card" * (seconds > FLUSH_SLOW_S)
+    return [room, Check.judged("disk flush", f"{1000 * seconds:.1f} ms", remedy)]
 
 
 def _ports(rig: Rig) -> Check:
@@ -209,10 +210,10 @@ def _positioner(open_positioner: Callable[[], Positioner], clock: Clock) -> tupl
     except TvsError as error:
         return None, [_failed("firmware", error)]
     version = escaped(positioner.identity.get("fw", "unknown"))
-    checks = [Check("firmware", "ok", f"version {version}")]
-    if version != FIRMWARE_VERSION and "driver" not in positioner.identity:
-        remedy = "flash the firmware shipped with tvsbayes; this one speaks the same protocol"
-        checks = [Check("firmware", "warning", f"version {version}, shipped is {FIRMWARE_VERSION}", remedy)]
+    other = version != FIRMWARE_VERSION and "driver" not in positioner.identity
+    found = f"version {version}" + f", shipped is {FIRMWARE_VERSION}" * other
+    remedy = "flash the firmware shipped with tvsbayes; this one speaks the same protocol" * other
+    checks = [Check.judged("firmware", found, remedy)]
     for warning in getattr(positioner, "warnings", ()):
         checks.append(Check("positioner", "warning", warning, "see data/docs/instrument.md, Your own hardware"))
     times = []
@@ -225,30 +226,26 @@ def _positioner(open_positioner: Callable[[], Positioner], clock: Clock) -> tupl
             state = positioner.laser(False)
             checks.append(Check("laser line", "warning", "it was on", "look for a program that left it on"))
         checks.append(_switches(state))
-        homed = state.status == "idle"
-        remedy = "" if homed else "acquire homes by itself; for the laser check let a short plan run first"
-        checks.append(Check("homing", "ok" if homed else "warning", state.status, remedy))
+        remedy = "acquire homes by itself; for the laser check let a short plan run first" * (state.status != "idle")
+        checks.append(Check.judged("homing", state.status, remedy))
     except TvsError as error:
         positioner.close()
         return None, [*checks, _failed("positioner", error)]
     trip, repeats = statistics.median(times), positioner.repeats
-    bad = trip > ROUND_TRIP_SLOW_S or repeats > 0
-    remedy = "use a short USB cable, away from motor wires; no hub" if bad else ""
+    remedy = "use a short USB cable, away from motor wires; no hub" * (trip > ROUND_TRIP_SLOW_S or repeats > 0)
     found = f"{1000 * trip:.1f} ms, {repeats} of {ROUND_TRIPS} repeated"
-    return positioner, [*checks, Check("timing", "warning" if bad else "ok", found, remedy)]
+    return positioner, [*checks, Check.judged("timing", found, remedy)]
 
 
 def _switches(state: DeviceState) -> Check:
     """Home and limit switches, so that their wiring shows before anything moves; press them by hand and ask again."""
     pairs = zip(AXES, state.home_pressed, state.limit_open, strict=True)
-    told = (
+    words = (
         f"{axis}: home {'pressed' if home else 'free'}, limit {'open' if limit else 'closed'}"
         for axis, home, limit in pairs
     )
-    remedy = "turn the axis back by hand; if it stands free, check the wire of its limit switches" * any(
-        state.limit_open
-    )
-    return Check("switches", "warning" if remedy else "ok", "; ".join(told), remedy)
+    remedy = "turn the axis back by hand; if it stands free, check the wire of its limit switches"
+    return Check.judged("switches", "; ".join(words), remedy * any(state.limit_open))
 
 
 def _camera(
@@ -290,12 +287,12 @@ def _picture(side: str, picture: np.ndarray, white: int) -> list[Check]:
         remedy = "darken the room or shorten the exposure: the spot must stand out"
     elif mean < DARK_MEAN_MIN:
         remedy = "take the cap off, or lengthen the exposure"
-    exposure = Check(f"exposure {side}", "warning" if remedy else "ok", found, remedy)
+    exposure = Check.judged(f"exposure {side}", found, remedy)
     sharpness = float(cv2.Laplacian(grey.astype(np.float64), cv2.CV_64F).var())
-    blurred = sharpness < SHARPNESS_MIN
-    remedy = "focus on the sheet with the checkerboard at its place, then calibrate again" if blurred else ""
-    focus = Check(f"focus {side}", "warning" if blurred else "ok", f"Laplacian variance {sharpness:.1f}", remedy)
-    return [exposure, focus]
+    blurred = "focus on the sheet with the checkerboard at its place, then calibrate again" * (
+        sharpness < SHARPNESS_MIN
+    )
+    return [exposure, Check.judged(f"focus {side}", f"Laplacian variance {sharpness:.1f}", blurred)]
 
 
 def _laser(positioner: Positioner | None, camera: StereoCamera | None, wanted: bool) -> Check:
@@ -320,7 +317,5 @@ def _laser(positioner: Positioner | None, camera: StereoCamera | None, wanted: b
         return _failed("laser", error)
     rises = rises_dn(dark, lit)
     found = f"brightest pixel rises by {rises[0]} (left) and {rises[1]} (right) of 255"
-    if min(rises) < CHANGE_DN:
-        remedy = "put the sheet into both views; check the laser's supply, and that the lenses have no infrared filter"
-        return Check("laser", "warning", found, remedy)
-    return Check("laser", "ok", found)
+    remedy = "put the sheet into both views; check the laser's supply, and that the lenses have no infrared filter"
+    return Check.judged("laser", found, remedy * (min(rises) < CHANGE_DN))

@@ -156,7 +156,7 @@ class Acquisition:
         resumed = self._log.recorder.result()
         # Before the first homing nothing counts, whatever was placed.
         next_row = resumed.next_step if resumed.moves else 0
-        self._log.warnings += self._log.files.keep_edited()
+        self._log.keep_edited()
         self._recover(resumed, next_row)
         reason = self._followed(next_row)
         if reason != "interrupted" and self._log.recorder.moves:
@@ -294,7 +294,7 @@ class Acquisition:
         sheet = self._log.recorder.state.target
         self._live.looked(SeenLook(self._spot, found.status, sheet, found.pixels_px, found.sds_px, pictures))
         self._spot += 1
-        self._log.files.derive()
+        self._log.derive()
 
     def _compared(self, reference: Spot, pixels_px: Four | None) -> dict[str, Any]:
         """What a look at a spot seen before says of it; a large change is worth a word."""

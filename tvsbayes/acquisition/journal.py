@@ -75,12 +75,21 @@ class Disk:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A line of the journal: its number from 0, the kind of event, its data, its line in the file from 1."""
+    """A whole line of a journal.
+
+    Attributes:
+        number: of the event, from 0.
+        event, data: its kind and its entries.
+        line: in the file, from 1.
+        previous, crc: CRC of the line before and its own.
+    """
 
     number: int
     event: str
     data: dict[str, object]
     line: int
+    previous: int = 0
+    crc: int = 0
 
 
 def refused(record: Record, found: object) -> InputError:
@@ -141,19 +150,8 @@ def encode(number: int, previous: int, event: str, data: dict[str, object]) -> b
     return line
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A whole line of a journal: number of the event, CRC of the line before and its own, event and data."""
-
-    number: int
-    previous: int
-    crc: int
-    event: str
-    data: dict[str, object]
-
-
-def parse_line(line: bytes) -> Line | str:
-    """A line without its line feed, or what is wrong with it, whatever stands before it."""
+def parse_line(line: bytes, place: int) -> Record | str:
+    """The line of a file, without its line feed, or what is wrong with it, whatever stands before it."""
     match = LOG_LINE.fullmatch(line) if len(line) < LINE_BYTES_MAX else None
     if match is None:
         return "no event"
@@ -165,19 +163,17 @@ def parse_line(line: bytes) -> Line | str:
     except InputError:
         return "no JSON"
     event = data.pop("event", None)
-    return Line(int(match[2]), int(match[3], 16), crc, event, data) if isinstance(event, str) else "no event"
+    return Record(int(match[2]), event, data, place, int(match[3], 16), crc) if isinstance(event, str) else "no event"
 
 
-def _following(line: bytes, number: int, previous: int) -> Line | str:
+def _following(line: bytes, number: int, previous: int) -> Record | str:
     """The line that belongs behind `number` others, the last of which has the CRC `previous`; or what is wrong."""
-    found = parse_line(line)
-    if isinstance(found, str):
-        return found
-    if found.number != number:
-        return f"event {found.number} where {number} belongs"
-    if found.previous != previous:
-        return "a line that does not follow on the one before"
-    return found
+    record = parse_line(line, number + 1)
+    if isinstance(record, str):
+        return record
+    if record.number != number:
+        return f"event {record.number} where {number} belongs"
+    return record if record.previous == previous else "a line that does not follow on the one before"
 
 
 def _is_torn(tail: bytes, number: int, previous: int) -> bool:
@@ -228,18 +224,18 @@ def read_journal(folder: Path) -> Reading:
     while position < len(data):
         end = data.find(b"\n", position)
         line = data[position:] if end < 0 else data[position:end]
-        found = _following(line, len(records), previous) if end >= 0 else "a line without its end"
-        if isinstance(found, str):
+        record = _following(line, len(records), previous) if end >= 0 else "a line without its end"
+        if isinstance(record, str):
             tail = data[position:]
             if (end < 0 or end + 1 == len(data)) and _is_torn(tail, len(records), previous):
                 return Reading(tuple(records), tail, position, previous)
             number, allowed = len(records) + 1, "events in their order, each with its CRC"
-            raise refusal("journal", file=LOG, line=number, found=found, allowed=allowed, remedy=REPAIR_REMEDY)
-        if not records and (found.event != "created" or found.data.get("format") != FORMAT):
-            allowed, event = f"the event created of the format {FORMAT}", escaped(found.event)
+            raise refusal("journal", file=LOG, line=number, found=record, allowed=allowed, remedy=REPAIR_REMEDY)
+        if not records and (record.event != "created" or record.data.get("format") != FORMAT):
+            allowed, event = f"the event created of the format {FORMAT}", escaped(record.event)
             raise refusal("journal", file=LOG, line=1, found=event, allowed=allowed, remedy=REPAIR_REMEDY)
-        previous = found.crc
-        records.append(Record(len(records), found.event, found.data, len(records) + 1))
+        previous = record.crc
+        records.append(record)
         position = end + 1
     return Reading(tuple(records), b"", position, previous)
 

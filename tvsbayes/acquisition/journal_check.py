@@ -19,7 +19,6 @@ from tvsbayes.acquisition.journal import (
     LOG,
     REPAIR_REMEDY,
     Journal,
-    Line,
     Record,
     event_of,
     parse_line,
@@ -75,8 +74,7 @@ def frames_of(record: Record) -> list[Frame]:
         return msgspec.convert(record.data.get("frames", []), list[Frame])
     except msgspec.ValidationError as error:
         allowed, line = "frames as { name, sha256, bytes }", record.line
-        found = "another"
-        raise refusal("journal", file=LOG, line=line, found=found, allowed=allowed, remedy=REPAIR_REMEDY) from error
+        raise refusal("journal", file=LOG, line=line, found="another", allowed=allowed, remedy=REPAIR_REMEDY) from error
 
 
 def _frame_problem(folder: Path, frame: Frame) -> str | None:
@@ -149,10 +147,10 @@ IN_MOTION, ENDS_OF_MOTION = {"created", "gap", "intent", "verified"}, {"homed", 
 """Events after which, and before which, a single lost line may be part of a motion: one has two lines at least."""
 
 
-def _in_written_order(events: list[tuple[int, Line]]) -> list[tuple[int, Line]]:
+def _in_written_order(records: list[Record]) -> list[Record]:
     """Whole lines by their numbers, which their checksums hold; as they stand where two have one number."""
-    numbers = {line.number for _, line in events}
-    return sorted(events, key=lambda each: each[1].number) if len(numbers) == len(events) else events
+    numbers = {record.number for record in records}
+    return sorted(records, key=lambda record: record.number) if len(numbers) == len(records) else records
 
 
 def repair(folder: Path, to: Path) -> Repair:
@@ -168,39 +166,39 @@ def repair(folder: Path, to: Path) -> Repair:
     """
     folder, to = Path(folder), Path(to)
     data = read_log(folder)
-    lines = [parse_line(line) for line in data.split(b"\n")[:-1]]
+    lines = [parse_line(line, place) for place, line in enumerate(data.split(b"\n")[:-1], start=1)]
     done = Repair(torn_bytes=len(data) - data.rfind(b"\n") - 1)
-    events = _in_written_order([(place, line) for place, line in enumerate(lines, start=1) if isinstance(line, Line)])
+    events = _in_written_order([line for line in lines if isinstance(line, Record)])
     done.lost_lines = [place for place, line in enumerate(lines, start=1) if isinstance(line, str)]
     if not events:
         allowed, remedy = "at least one whole line", "take the campaign again"
         raise refusal("journal", file=LOG, found="nothing whole", allowed=allowed, remedy=remedy)
     make_folder(to, empty=True)
-    first = events[0][1].data if events[0][1].event == "created" else {}
+    first = events[0].data if events[0].event == "created" else {}
     created = {key: value for key, value in first.items() if key != "format"}
     journal = Journal.create(to, **{**created, "repaired": True})
     expected, ended, last = 1 if first else 0, False, "created"
     named: set[str] = set()
     try:
-        for place, line in events[1:] if first else events:
-            if line.number != expected:
-                lost = line.number - expected != 1 or last in IN_MOTION or line.event in ENDS_OF_MOTION
-                journal.append("gap", before_line=place, **({} if lost else {"motion_lost": False}))
-            expected, last = line.number + 1, line.event
+        for record in events[1:] if first else events:
+            if record.number != expected:
+                lost = record.number - expected != 1 or last in IN_MOTION or record.event in ENDS_OF_MOTION
+                journal.append("gap", before_line=record.line, **({} if lost else {"motion_lost": False}))
+            expected, last = record.number + 1, record.event
             kept = []
-            for frame in frames_of(Record(line.number, line.event, line.data, place)):
+            for frame in frames_of(record):
                 twice = frame.name in named
                 named.add(frame.name)
                 if not twice and _frame_problem(folder, frame) is None:
                     kept.append(journal.store(frame.name, read_bytes(folder / frame.name, FRAME_BYTES_MAX, folder)))
                 else:
                     done.lost_frames.append(frame.name)
-            content = {key: value for key, value in line.data.items() if key != "frames"}
-            if "frames" in line.data:
+            content = {key: value for key, value in record.data.items() if key != "frames"}
+            if "frames" in record.data:
                 content["frames"] = [frame.as_json() for frame in kept]
-            journal.append(line.event, **content)
+            journal.append(record.event, **content)
             done.kept += 1
-            ended = line.event == "stop"
+            ended = record.event == "stop"
         if not ended:
             journal.append("gap", before_line=len(lines) + 1)
     finally:

@@ -9,14 +9,17 @@ import datetime
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from tvsbayes.acquisition.campaign_files import CampaignFiles
-from tvsbayes.acquisition.journal import Journal, kind_of
+from msgspec import UNSET
+
+from tvsbayes.acquisition.campaign_files import DERIVED, campaign_of, keep_edited, write_derived
+from tvsbayes.acquisition.journal import LOG, Journal, event_of, kind_of
 from tvsbayes.acquisition.journal_check import orphans
-from tvsbayes.acquisition.journal_events import FRAME_NAME, Event, Homed, Stop, Verified
+from tvsbayes.acquisition.journal_events import FRAME_NAME, Created, Event, Homed, Stop, Verified
 from tvsbayes.acquisition.recorder import HOME_TOLERANCE_STEPS, Recorder
 from tvsbayes.acquisition.running_estimate import Estimate
-from tvsbayes.errors import DeviceFault
-from tvsbayes.instrument.campaign import UNDETECTED
+from tvsbayes.errors import DeviceFault, TvsError
+from tvsbayes.files.disk import remove_unfinished
+from tvsbayes.instrument.campaign import NAME_ACQUIRED, UNDETECTED, Campaign
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import HomeReport
 from tvsbayes.results.records import plain
@@ -54,6 +57,11 @@ class Outcome:
         return {**plain(self), "estimate": None if self.estimate is None else self.estimate.as_json()}
 
 
+DERIVED_EVERY = 100
+"""Up to this many spots the campaign files are written after every look, then ever more rarely: at least 99 % of the
+looks are in them at any time, all of them in the journal."""
+
+
 class RunLog:
     """Journal, recorder and campaign files in step.
 
@@ -64,16 +72,16 @@ class RunLog:
 
     Attributes:
         recorder: the campaign so far, of all runs.
-        files: the campaign files.
+        behind: why the campaign files lack what the journal has, "" where they do not.
         warnings: what the user should know.
     """
 
     def __init__(self, journal: Journal, rig: Rig, utc: Callable[[], datetime.datetime]):
-        self._journal, self._utc = journal, utc
+        self._journal, self._rig, self._utc = journal, rig, utc
         self.recorder = Recorder()
         for record in journal.records:
             self.recorder.add(record)
-        self.files = CampaignFiles(journal, self.recorder, rig)
+        self.behind = ""
         self.warnings: list[str] = []
         self._time_s = max((move.time_s for move in self.recorder.moves), default=0.0)
 
@@ -90,7 +98,7 @@ class RunLog:
         """
         self.recorder.add(self._journal.append(kind_of(type(event)), **event.entries()))
         if isinstance(event, Homed | Verified):
-            self.files.derive(always=True)
+            self.derive(always=True)
 
     def now_s(self) -> float:
         """Seconds since the campaign was created, never going back, whatever the clock of the computer does."""
@@ -132,9 +140,47 @@ class RunLog:
             pass
         finally:
             self._journal.close()
-        self.files.derive(always=True)
-        if self.files.behind:
-            self.warnings.append(f"the campaign files are behind the journal: {self.files.behind}")
+        self.derive(always=True)
+        if self.behind:
+            self.warnings.append(f"the campaign files are behind the journal: {self.behind}")
+
+    def derive(self, always: bool = False) -> None:
+        """Writes the campaign files anew, unless it is no time for that yet (see `DERIVED_EVERY`)."""
+        count = len(self.recorder.spots)
+        if not self.recorder.moves or (not always and count > DERIVED_EVERY and count % (count // DERIVED_EVERY)):
+            return
+        try:
+            write_derived(self._campaign(), self._journal.folder, tables_only=not always)
+            self.behind = ""
+        except TvsError as error:
+            # Somebody has the table open, say. The journal has everything, and the next look tries again; after the
+            # last one --resume does.
+            self.behind = error.message
+
+    def keep_edited(self) -> None:
+        """Copies files that hold what the journal does not, before they are written anew, and warns of each.
+
+        What killed runs left unfinished of these files is removed.
+        """
+        folder, campaign = self._journal.folder, self._campaign()
+        remove_unfinished(folder, DERIVED)
+        self.warnings += [
+            f"{name} had rows that {LOG} lacks, which has lost its end: they are kept in {copy.name}, lost looks are "
+            "taken again"
+            if copy.stem.rpartition("-")[0].endswith(".longer")
+            else f"{name} was edited since: what stood in it is kept in {copy.name}"
+            for name, copy in keep_edited(campaign, folder).items()
+        ]
+
+    def _campaign(self) -> Campaign:
+        """What the journal holds so far; there has been a homing."""
+        created = event_of(self._journal.records[0], Created)
+        assert created is not None
+        start = datetime.datetime.fromisoformat(created.created).astimezone(datetime.UTC)
+        header: dict[str, object] = {"name": NAME_ACQUIRED if created.name is UNSET else created.name, "created": start}
+        stated = {"synthetic": created.synthetic, "seed": created.seed}
+        header |= {name: value for name, value in stated.items() if value is not UNSET}
+        return campaign_of(self.recorder.result(), Campaign((), (), self._rig.stereo, self._rig.table, header))
 
     def outcome(self, reason: str, retries: int) -> Outcome:
         """How the run ended, for this reason and after so many repeated looks."""
