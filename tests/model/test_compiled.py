@@ -92,6 +92,23 @@ def test_every_shape_is_traced_once(traces):
     assert function.traces == 2 and len(stored(traces)) == 2
 
 
+def test_its_own_results_as_arguments_are_compiled_for_once(traces):
+    """A filter's belief goes from call to call: results of a stored trace must not differ from other arrays."""
+    compilations = []
+
+    def listen(event: str, seconds: float, **_) -> None:
+        compilations.extend([seconds] if event.endswith("backend_compile_duration") else [])
+
+    function = compiled(Sums)(sums)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        found = function(Pair(np.linspace(0.0, 1.0, 5), np.array(3.0)), 1.0)
+        function(Pair(found.double, found.total), 1.0)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert len(compilations) == 1
+
+
 def test_without_a_folder_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr(Traces, "used", None)
     monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path / "cache"))

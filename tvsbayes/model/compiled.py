@@ -139,8 +139,13 @@ class Kind:
 
 
 def _as_array(leaf: Any) -> np.ndarray | jax.Array:
-    """An array of a type of its own: Python's numbers, and what JAX took from them, would fit in with any."""
-    found = leaf if isinstance(leaf, jax.Array) and not leaf.weak_type else np.asarray(leaf)
+    """An array of a type of its own, bound to no device.
+
+    Python's numbers, and what JAX took from them, would fit in with any type. Results of a stored trace are bound to
+    their device: for them as arguments JAX would compile the same function once more.
+    """
+    free = isinstance(leaf, jax.Array) and not leaf.weak_type and not leaf.committed
+    found = leaf if free else np.asarray(leaf)
     if found.dtype == object or found.dtype.kind in "USV":
         raise TypeError(f"a compiled function takes arrays, not {type(leaf).__name__}")
     return found
