@@ -6,6 +6,7 @@ pandas is loaded by `to_dataframe` alone.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,20 @@ type Cell = str | float | int | bool | None
 """One entry of a view: a number as it is, text, or nothing."""
 ROWS = 24
 """Shown of a long table, at most; `to_dataframe` has all."""
+
+
+def concise(value: float, sd: float) -> str:
+    """`0.059394(81)`: the standard uncertainty's two digits in units of the last place (GUM 7.2.2).
+
+    From 1 on the uncertainty keeps its decimal point, as in `21.3(1.5)`.
+    """
+    if not 0 < sd < math.inf:
+        return f"{value:.6g}"
+    # Of the rounded sd: 0.0996 has the digits 10, not 100.
+    mantissa, exponent = f"{sd:.1e}".split("e")
+    decimals = max(0, 1 - int(exponent))
+    digits = mantissa.replace(".", "") if int(exponent) < 0 else f"{float(f'{sd:.1e}'):.{decimals}f}"
+    return f"{value:.{decimals}f}({digits})"
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,7 @@ def test_the_command_says_by_what_it_ended(tmp_path, monkeypatch, capsys):
     assert (told["tier"], told["looks"]) == ("importance", 15)
     assert told["effective_deg_per_step"]["up"] == {"value": 0.061, "sd": pytest.approx(8e-4)}
     assert run([*map(str, [*words[:3], tmp_path / "d", *words[4:]])]) == 0
-    line = "deg/step by the sampled posterior of 15 looks: left 0.061000 u 8.0e-04"
+    line = "deg/step by the sampled posterior of 15 looks: left 0.06100(80)"
     assert line in capsys.readouterr().out
 
 

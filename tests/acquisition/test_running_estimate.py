@@ -35,7 +35,7 @@ def test_run_ends_when_the_running_estimate_meets_its_target(mounted_rig, tmp_pa
         run_ = Run(mounted_rig, tmp_path / "c", plan, estimate=estimate, show=lambda p: texts.append(p.estimate))
         outcome = run_.engine.run()
     assert (outcome.reason, outcome.looks, estimate.latest.looks) == ("target met", 27, 27) and run_.dark()
-    assert texts[0] == "" and texts[-1].startswith("left 0.060000 u 5.")
+    assert texts[0] == "" and texts[-1].startswith("left 0.06000(5")
     assert recorded(read_journal(tmp_path / "c").records).unverified == (), "the closing homing took place"
     for needed in ({"left", "up"}, set()):
         with RunningEstimate(tmp_path / "c", two_directions, 1.0, needed, wait=True) as estimate:
@@ -55,7 +55,7 @@ def test_estimate_is_shown_without_a_target(mounted_rig, tmp_path, asked, shown)
         mounted_rig, small_plan(4), tmp_path / "c", simulate=True, seed=4, estimate=wish, terminal=Terminal(show=show)
     )
     assert (outcome.reason, outcome.looks) == ("done", 16)
-    assert texts[-1] == ("left 0.060000 u 1.0e-03, right 0.060000 u 1.0e-03" if shown else "")
+    assert texts[-1] == ("left 0.0600(10), right 0.0600(10)" if shown else "")
 
 
 def test_running_estimate_does_not_hold_up_the_run_and_dies_with_it(mounted_rig, tmp_path):

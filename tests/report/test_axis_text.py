@@ -24,7 +24,7 @@ from tvsbayes.single_axis.next_stops import AxisPlan, NextStop
 def test_a_plan_that_hardly_helps_says_so(after, said):
     stop = NextStop(1_250_000.0, "forward", None, after, 1.0 - after, 0.1)
     text = axis_plan_text(AxisPlan("per_command", 1.0, (stop,), 0.5), "mm")
-    assert ("they hardly help" in text) is said
+    assert ("these stops hardly help: u falls by" in text) is said
     assert "1250000 " in text, "a counter is no power of ten"
 
 

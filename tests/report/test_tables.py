@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from tvsbayes.report.tables import TableView, chance_text, concise, interval_text, two_digits
+from tvsbayes.display import concise
+from tvsbayes.report.tables import TableView, chance_text, interval_text, two_digits
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from tvsbayes.display import concise
+
 FIRST_LOOKS = 12
 """Fewer looks than three experiments of four points say next to nothing."""
 GROWTH = 1.2
@@ -44,10 +46,7 @@ class Estimate:
     @property
     def text(self) -> str:
         """For the live line."""
-        parts = (
-            f"{name} {self.deg_per_step[name]:.6f} u {self.u_deg_per_step[name]:.1e}" for name in self.deg_per_step
-        )
-        return ", ".join(parts)
+        return ", ".join(f"{name} {concise(v, self.u_deg_per_step[name])}" for name, v in self.deg_per_step.items())
 
     def as_json(self) -> dict[str, object]:
         """As part of the document of `acquire`."""

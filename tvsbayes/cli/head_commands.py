@@ -212,9 +212,9 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
 
     from tvsbayes.calibration.calibration_file import Origin
     from tvsbayes.comparison.verified_looks import accepted_calibration
+    from tvsbayes.display import concise
     from tvsbayes.head.urdf import URDF_BYTES_MAX, HeadModel, head_joints
     from tvsbayes.instrument.campaign import input_hashes, read_campaign
-    from tvsbayes.report.tables import concise
 
     data = read_campaign(folder)
     calibration, origin = accepted_calibration(data), Origin.of(data)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tvsbayes.compensation.verification import compensation_in
+from tvsbayes.display import concise
 from tvsbayes.errors import escaped, typed
 from tvsbayes.instrument.campaign import title_of
 from tvsbayes.report.advice import ROUGH, UNSAMPLED
@@ -30,7 +31,7 @@ from tvsbayes.report.document import (
 from tvsbayes.report.page import digest_number, numbered
 from tvsbayes.report.position_figures import CURVE_POINTS, axis_errors, wave
 from tvsbayes.report.result_tables import WAVE_COLUMNS, WAVES, percent, wave_row
-from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
+from tvsbayes.report.tables import TableView, interval_text, two_digits
 from tvsbayes.results.compensation_record import stored_verification
 from tvsbayes.results.estimates import Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import provenance
@@ -57,6 +58,12 @@ LIKELY = 0.5
 """Probability of a wave from which on its curve is drawn."""
 HARDLY = 0.95
 """Stops that leave more than this share of an uncertainty are not worth their time."""
+MORE_HELPS = "many more stops (--minutes) help, or readings of smaller u"
+HELPS = {
+    "per_command": "a longer travel helps, over which errors by position count less; the line over the commands read "
+    "is known better: --target effective_per_command"
+}
+"""By target, instead of stops that hardly help."""
 CONFLICTING = "the numbers hold only if the readings, not the priors, are wrong"
 """Of a fit whose priors the readings contradict."""
 METHOD = (
@@ -277,9 +284,10 @@ def axis_plan_text(plan: AxisPlan, unit: str) -> str:
     """What next, in words."""
     if not plan.next:
         return "there is no time for a single stop"
-    hardly = f"they hardly help: what is left of {plan.target} does not come from too few stops"
-    idle = plan.next[-1].u > HARDLY * plan.u_now
-    return terminal(next_table(plan, unit), f"{plan.minutes:.1f} minutes in all", hardly if idle else None)
+    left = plan.next[-1].u / plan.u_now
+    hardly = f"these stops hardly help: u falls by {100 * (1 - left):.1f} %; {HELPS.get(plan.target, MORE_HELPS)}"
+    minutes = f"{plan.minutes:.1f} minutes in all"
+    return terminal(next_table(plan, unit), minutes, hardly if left > HARDLY else None)
 
 
 def _wave_figures(fit: AxisFit) -> list[FigureView]:

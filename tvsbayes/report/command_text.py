@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tvsbayes.calibration.pointing import Steps
+from tvsbayes.display import concise
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.report.document import Part, terminal
 from tvsbayes.report.parameter_words import MADE_BY, name_in_words
 from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
-from tvsbayes.report.tables import COLUMNS, TableView, concise, two_digits
+from tvsbayes.report.tables import COLUMNS, TableView, two_digits
 from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut, PositionHoldOut
 from tvsbayes.statistics.chances import ASSURED, BOUND, LEVELS, binomial_bounds, rms_bounds
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tvsbayes.display import concise
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, Axis
 from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
@@ -28,7 +29,7 @@ from tvsbayes.report.result_tables import (
     waves_table,
 )
 from tvsbayes.report.spot_pictures import spot_gallery
-from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
+from tvsbayes.report.tables import TableView, interval_text, two_digits
 from tvsbayes.results.estimates import Cause, StopResidual, Validation
 
 if TYPE_CHECKING:

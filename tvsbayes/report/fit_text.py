@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 
+from tvsbayes.display import concise
 from tvsbayes.errors import NotConverged, listed
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult
@@ -21,7 +22,7 @@ from tvsbayes.report.result_tables import (
     range_text,
     waves_table,
 )
-from tvsbayes.report.tables import TableView, concise
+from tvsbayes.report.tables import TableView
 from tvsbayes.results.convergence import Importance, Sampling
 from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
 

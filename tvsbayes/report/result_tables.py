@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tvsbayes.display import concise
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import HEAD_TERMS, HEADLINES, QUANTITIES, names_of
 from tvsbayes.metrology.look_budget import Budget
 from tvsbayes.report.parameter_words import name_in_words, share_in_words
-from tvsbayes.report.tables import TableView, concise, interval_text, signed, two_digits
+from tvsbayes.report.tables import TableView, interval_text, signed, two_digits
 from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
 from tvsbayes.results.estimates import Estimate, FitSummary, PeriodEstimate
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
+from tvsbayes.display import concise
 from tvsbayes.errors import typed
 from tvsbayes.estimators.plausibility import misfit_causes
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
@@ -25,7 +26,7 @@ from tvsbayes.report.fit_sections import fit_sections
 from tvsbayes.report.fit_text import validation_lines
 from tvsbayes.report.page import numbered
 from tvsbayes.report.parameter_words import cause_in_words, sentence_in_words
-from tvsbayes.report.tables import TableView, chance_text, concise, interval_text, two_digits
+from tvsbayes.report.tables import TableView, chance_text, interval_text, two_digits
 from tvsbayes.report.uncertainty_sections import uncertainty_sections
 from tvsbayes.results.comparison_record import CANNOT_TELL
 from tvsbayes.results.estimates import Estimate, FitSummary

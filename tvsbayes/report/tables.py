@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from tvsbayes.display import concise
+
 COLUMNS, GAP = 80, 2
 """Of a terminal; between two columns of a table."""
 
@@ -21,20 +23,6 @@ COLUMNS, GAP = 80, 2
 def two_digits(value: float) -> str:
     """An uncertainty to two significant digits, a 0 among them, without an exponent (GUM 7.2.6)."""
     return f"{Decimal(f'{value:.1e}'):f}" if math.isfinite(value) and value else f"{value:g}"
-
-
-def concise(value: float, sd: float) -> str:
-    """`0.059394(81)`: the standard uncertainty's two digits in units of the last place (GUM 7.2.2).
-
-    From 1 on the uncertainty keeps its decimal point, as in `21.3(1.5)`.
-    """
-    if not 0 < sd < math.inf:
-        return f"{value:.6g}"
-    # Of the rounded sd: 0.0996 has the digits 10, not 100.
-    mantissa, exponent = f"{sd:.1e}".split("e")
-    decimals = max(0, 1 - int(exponent))
-    digits = mantissa.replace(".", "") if int(exponent) < 0 else f"{float(f'{sd:.1e}'):.{decimals}f}"
-    return f"{value:.{decimals}f}({digits})"
 
 
 def signed(value: float, sd: float) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tvsbayes.display import concise
 from tvsbayes.instrument.axes import SENSES
 from tvsbayes.instrument.parameters import parameter_of
 from tvsbayes.metrology.traceability import header_table, stated_text
@@ -19,7 +20,7 @@ from tvsbayes.report.document import FigureView, Section, sentence
 from tvsbayes.report.drawing import SMALLEST_SHARE
 from tvsbayes.report.parameter_words import MADE_BY, name_in_words, share_in_words, source_in_words
 from tvsbayes.report.result_tables import point_budget_table
-from tvsbayes.report.tables import TableView, concise, interval_text, two_digits
+from tvsbayes.report.tables import TableView, interval_text, two_digits
 from tvsbayes.results.metrology_tables import FIGURES, BudgetRow, BudgetTable, Predicted
 from tvsbayes.statistics.intervals import NORMAL_95
 

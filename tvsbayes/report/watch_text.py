@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
+from tvsbayes.display import concise
 from tvsbayes.report.document import terminal
-from tvsbayes.report.tables import TableView, concise
+from tvsbayes.report.tables import TableView
 from tvsbayes.results.watch_record import CANNOT_TELL, LOOKS_MAX, MOVED, MovedPart, PlannedChange, Watch, WatchPlan
 
 HELPS = {
