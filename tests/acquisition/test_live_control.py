@@ -27,7 +27,7 @@ def asked(folder) -> list[tuple[str, bool]]:
 
 
 def states(live: LiveRun) -> list[tuple[str, str]]:
-    return [(request.what, request.state) for request in live.requests.told()]
+    return [(request.what, request.state) for request in live.requests.recent()]
 
 
 def run_with(rig, folder, live, at, *whats, **options) -> Run:
@@ -51,7 +51,7 @@ def test_pause_and_resume_lose_nothing(mounted_rig, tmp_path):
     assert seen == [("paused", False)]
     assert asked(tmp_path / "c") == [("pause", False), ("resume", False)]
     assert states(live) == [("pause", "acknowledged"), ("resume", "acknowledged")]
-    assert all("laser off" in request.answer and request.waited_s >= 0 for request in live.requests.told())
+    assert all("laser off" in request.answer and request.waited_s >= 0 for request in live.requests.recent())
     times = [r.data["time_s"] for r in read_journal(tmp_path / "c").records if "time_s" in r.data]
     assert times == sorted(times) and run.dark() and verify(tmp_path / "c").stopped == "done"
 
@@ -75,7 +75,7 @@ def test_laser_off_breaks_off_the_look_which_is_taken_again(mounted_rig, tmp_pat
     laser = run.positioner.laser
 
     def watched(on):
-        lit.append((on, [r.what for r in live.requests.told() if r.state == "requested"]))
+        lit.append((on, [r.what for r in live.requests.recent() if r.state == "requested"]))
         return laser(on)
 
     run.positioner.laser = watched
@@ -153,7 +153,7 @@ def test_device_that_fails_at_the_request_itself(mounted_rig, tmp_path):
     run.positioner.laser = broken
     with pytest.raises(DeviceFault, match="nothing answers"):
         run.engine.run()
-    [request] = live.requests.told()
+    [request] = live.requests.recent()
     assert (request.state, request.answer) == ("failed", "nothing answers") and run.dark()
 
 

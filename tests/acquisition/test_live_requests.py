@@ -32,7 +32,7 @@ def test_requests_come_in_order_and_laser_off_first():
 def test_a_double_click_is_one_request():
     requests = Requests()
     first = requests.ask("pause")
-    assert requests.ask("pause") == first and len(requests.told()) == 1
+    assert requests.ask("pause") == first and len(requests.recent()) == 1
     requests.settle(first, ACKNOWLEDGED, "")
     assert requests.ask("pause").number == 2
 
@@ -42,15 +42,15 @@ def test_unknown_request_is_refused():
     for what in ("laser on", "", None, 3):
         with pytest.raises(ValueError):
             requests.ask(what)
-    assert requests.told() == ()
+    assert requests.recent() == ()
 
 
 def test_settled_requests_are_kept_but_not_all():
     requests = Requests()
     for _ in range(3 * KEPT_MAX):
         requests.settle(requests.ask("pause"), ACKNOWLEDGED, "")
-    assert len(requests.told()) <= KEPT_MAX + 1
-    assert requests.told()[-1].number == 3 * KEPT_MAX
+    assert len(requests.recent()) <= KEPT_MAX + 1
+    assert requests.recent()[-1].number == 3 * KEPT_MAX
 
 
 def test_after_the_end_nothing_waits_and_nothing_is_taken():
@@ -59,7 +59,7 @@ def test_after_the_end_nothing_waits_and_nothing_is_taken():
         requests.ask(what)
     requests.close("the run has ended")
     assert requests.next() is None and requests.ask("stop") is None
-    assert {(r.state, r.answer) for r in requests.told()} == {(FAILED, "the run has ended")}
+    assert {(r.state, r.answer) for r in requests.recent()} == {(FAILED, "the run has ended")}
 
 
 def test_waiting_ends_with_a_request_of_another_thread():
@@ -79,6 +79,6 @@ def test_a_resume_that_waits_is_withdrawn_by_what_stops(what: str) -> None:
     requests.ask(what)
     requests.ask(RESUME)
     requests.ask(what)
-    waiting = [request.what for request in requests.told() if request.state == REQUESTED]
+    waiting = [request.what for request in requests.recent() if request.state == REQUESTED]
     assert waiting == [what]
-    assert [request.state for request in requests.told() if request.what == RESUME] == [FAILED]
+    assert [request.state for request in requests.recent() if request.what == RESUME] == [FAILED]

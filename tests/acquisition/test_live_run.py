@@ -32,13 +32,13 @@ def test_a_run_tells_where_it_stands(mounted_rig, tmp_path):
 
     class Told(TwinObserver):
         def observe(self, positioner, spot):
-            told.append(live.told())
+            told.append(live.document())
             return super().observe(positioner, spot)
 
     Run(mounted_rig, tmp_path / "c", observer=lambda i: Told(i, 0.08), live=live).engine.run()
     assert [one["progress"]["looks"] for one in told] == list(range(8))
     assert all(one["state"] == "running" and one["simulated"] and one["name"] == "test" for one in told)
-    third, last = told[2], live.told()
+    third, last = told[2], live.document()
     assert third["progress"]["doing"] == "looking" and third["coming"][0] == "placing d1"
     assert third["progress"]["seconds_left"] > told[3]["progress"]["seconds_left"] > 0
     assert third["look"]["spot"] == 1 and third["look"]["pictured"] == [] and len(third["trail"]) == 2
@@ -63,7 +63,7 @@ def test_faults_and_repeated_looks_are_told_in_words(mounted_rig, tmp_path):
 
     with pytest.raises(DeviceFault):
         Run(mounted_rig, tmp_path / "c", observer=lambda i: Dies(i, 0.08), live=live).engine.run()
-    told = live.told()
+    told = live.document()
     assert told["fault"] == {"code": "no-frame", "message": "the left camera delivers nothing", "remedy": "plug it in"}
     assert told["remarks"] == tuple(f"look {spot}: no-spot; taken again" for spot in (0, 0, 1, 1))
     assert told["look"]["status"] == "no-spot" and told["trail"] == []
@@ -76,7 +76,7 @@ def test_darkness_is_not_promised_after_a_fault():
         live = LiveRun()
         live.ask("laser off")
         live.ended("done" if error is None else "unplugged", error)
-        told.append(live.told()["requests"][0]["answer"])
+        told.append(live.document()["requests"][0]["answer"])
     assert "cut the laser's supply" in told[1] and "supply" not in told[0] and "is off" not in " ".join(told)
 
 

@@ -45,7 +45,7 @@ def test_run_ends_when_the_running_estimate_meets_its_target(mounted_rig, tmp_pa
 @pytest.mark.parametrize(("asked", "shown"), [(None, False), (True, True), (False, False)])
 def test_estimate_is_shown_without_a_target(mounted_rig, tmp_path, asked, shown):
     """What is known so far belongs into the live line whether or not it ends the run; simulations must ask for it."""
-    wish = EstimateWish(two_directions, asked=asked)
+    wish = EstimateWish(two_directions, enabled=asked)
     texts = []
 
     def show(progress):

@@ -12,7 +12,7 @@ import pytest
 from support.drawn_boards import PAIR, POSES, SIZE, pictures, true_corners, write_pair
 
 from tvsbayes.cameras.boards import Board, find_views
-from tvsbayes.cameras.marker_boards import CORNERS_MIN, as_seen, marker_board_corners
+from tvsbayes.cameras.marker_boards import CORNERS_MIN, fitted_markers, marker_board_corners
 from tvsbayes.cameras.stereo_calibration import calibrate_stereo
 from tvsbayes.errors import InputError, NothingToEstimate
 
@@ -59,7 +59,7 @@ def test_corners_of_parts_are_found_where_they_are(found):
 
 def test_a_pair_is_calibrated_from_parts(found):
     """Within four of its own sds, the largest of 24; the sds are those of tenths of a pixel."""
-    result = calibrate_stereo(found.views, NAMED, SIZE, fix_k3=True, found=found)
+    result = calibrate_stereo(found.views, NAMED, SIZE, fix_k3=True, pictures=found)
     sds = np.sqrt(np.diag(result.stereo.parameter_covariance))
     free = sds > 0
     assert np.abs((result.stereo.vector - PAIR.vector)[free] / sds[free]).max() < 4
@@ -90,7 +90,7 @@ def test_markers_where_a_plain_board_is_named(few):
 def test_too_few_corners_are_no_view(folder):
     """Two columns in the picture leave the tilt open."""
     grey = cv2.imread(str(folder / "left_0.png"), 0)
-    markers = as_seen([grey], NAMED.markers)
+    markers = fitted_markers([grey], NAMED.markers)
     corners = true_corners(POSES[0], DRAWN)[:, :2].reshape(NAMED.rows, NAMED.columns, 2)
     cut = grey.copy()
     cut[:, int(corners[:, 2, 0].min()) - 4 :] = 128

@@ -74,7 +74,7 @@ def pairs() -> Views:
 
 @pytest.fixture(scope="module")
 def pairs_calibration(pairs) -> StereoCalibration:
-    return calibrate_stereo(pairs.views, BOARD, PAIRS_SIZE, found=pairs)
+    return calibrate_stereo(pairs.views, BOARD, PAIRS_SIZE, pictures=pairs)
 
 
 def sds(covariance: np.ndarray) -> np.ndarray:

@@ -219,7 +219,7 @@ def test_second_browser_watches_and_may_make_the_run_safer(going, browsed):
         browsed.driver.switch_to.window(browsed.driver.window_handles[0])
     browsed.driver.refresh()
     browsed.until("document.body?.dataset.controls === 'true'")
-    assert going.live.requests.told() == () and going.finish().ok == 8
+    assert going.live.requests.recent() == () and going.finish().ok == 8
 
 
 def test_control_comes_to_who_is_there_once_the_other_browser_is_gone(going, browsed, tmp_path_factory, monkeypatch):
@@ -265,7 +265,7 @@ def test_another_origin_asks_for_nothing(going, browsed):
         browsed.driver.get(own.replace("127.0.0.1", "localhost."))
         assert "403" in browsed.driver.page_source
     assert browsed.opened(going.link) == "running"
-    assert going.live.requests.told() == ()
+    assert going.live.requests.recent() == ()
 
 
 def test_browser_that_is_killed_changes_nothing(going, tmp_path_factory, tmp_path):

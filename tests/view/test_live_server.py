@@ -79,7 +79,7 @@ def test_first_browser_controls_and_others_make_it_safer(asker, live):
     assert asker.now(first)["controls"] is True and asker.now(second)["controls"] is False
     for what in ("stop", "resume"):
         status, content = asker.answer("/ask", "POST", {"what": what}, **second)
-        assert status == 403 and b"this browser only watches" in content and live.requests.told() == ()
+        assert status == 403 and b"this browser only watches" in content and live.requests.recent() == ()
     for what in ("pause", "laser off"):
         assert asker.answer("/ask", "POST", {"what": what}, **second)[0] == 202
     assert asker.answer("/ask", "POST", {"what": "stop"}, **first)[0] == 202
@@ -89,13 +89,13 @@ def test_first_browser_controls_and_others_make_it_safer(asker, live):
 
 def test_control_passes_on_and_is_written_down(asker, live, monkeypatch):
     first, second = asker.key(), asker.key()
-    assert asker.now(first)["controls"] and live.requests.told() == ()
+    assert asker.now(first)["controls"] and live.requests.recent() == ()
     # From now on everybody who does not ask this very moment is silent.
     monkeypatch.setattr(access, "SILENT_S", -1.0)
     assert asker.now(second)["controls"] is True
     monkeypatch.undo()
     assert asker.now(first)["controls"] is False
-    assert [request.what for request in live.requests.told()] == ["control passed on"]
+    assert [request.what for request in live.requests.recent()] == ["control passed on"]
     assert asker.answer("/ask", "POST", {"what": "stop"}, **second)[0] == 202
 
 
@@ -105,7 +105,7 @@ def test_nobody_without_a_key_sees_or_asks_anything(asker, live):
             assert asker.answer(path, **key)[0] == 403
         assert asker.answer("/ask", "POST", {"what": "pause"}, **key)[0] == 403
     assert asker.answer("/key", "POST", {"token": asker.token + "x"})[0] == 403
-    assert live.requests.told() == ()
+    assert live.requests.recent() == ()
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_another_page_with_the_key_asks_for_nothing(asker, live, headers):
     key = asker.key()
     assert asker.answer("/ask", "POST", {"what": "resume"}, **key, **headers)[0] == 403
     assert asker.answer("/live", **key, **headers)[0] == 403
-    assert live.requests.told() == ()
+    assert live.requests.recent() == ()
 
 
 @pytest.mark.parametrize(
@@ -128,14 +128,14 @@ def test_another_page_with_the_key_asks_for_nothing(asker, live, headers):
 )
 def test_what_cannot_be_asked_for_is_refused(asker, live, body):
     assert asker.answer("/ask", "POST", body, **asker.key())[0] == 400
-    assert live.requests.told() == ()
+    assert live.requests.recent() == ()
 
 
 def test_requests_are_posted_only(asker, live):
     key = asker.key()
     for method in ("GET", "PUT", "DELETE", "OPTIONS"):
         assert asker.answer("/ask", method, b"" if method == "PUT" else None, **key)[0] == 405
-    assert live.requests.told() == ()
+    assert live.requests.recent() == ()
 
 
 @pytest.mark.parametrize(
@@ -252,15 +252,15 @@ def test_a_server_that_dies_does_not_disturb_the_run(mounted_rig, tmp_path):
 def test_a_reader_that_never_reads_and_one_that_hangs_delay_nothing(mounted_rig, tmp_path):
     """The server's thread stands still in the middle of an answer as long as the run goes."""
     live, ended, hanging = LiveRun(), threading.Event(), threading.Event()
-    told = live.told
+    document = live.document
 
     def hangs():
         if threading.current_thread() is not threading.main_thread():
             hanging.set()
             ended.wait(60)
-        return told()
+        return document()
 
-    live.told = hangs
+    live.document = hangs
     with LivePage(live, 0) as page:
         address, _, token = page.link.partition("/#")
         asker = Asker(int(address.rpartition(":")[2]), token)

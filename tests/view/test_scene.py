@@ -14,14 +14,14 @@ from support.viewed_twin import PICTURED, UNDETECTED
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import ordered_spots, read_campaign, with_pixels
 from tvsbayes.instrument.parameters import names_of
-from tvsbayes.view.gathering import NOT_FITTED, NOT_OF_THESE, found_in, look_at
+from tvsbayes.view.gathering import NOT_FITTED, NOT_OF_THESE, look_at, stored_campaign
 from tvsbayes.view.page import KINDS, document
 from tvsbayes.view.scene import Looked, scene
 
 
 @pytest.fixture(scope="module")
 def found(viewed):
-    return found_in(viewed.folder)
+    return stored_campaign(viewed.folder)
 
 
 @pytest.fixture(scope="module")
@@ -120,11 +120,11 @@ def test_results_of_other_data_are_not_used(viewed, tmp_path):
     shutil.copytree(viewed.folder, folder)
     table = (folder / "spots.csv").read_text()
     (folder / "spots.csv").write_text(table.replace(",ok", ",blurred", 1))
-    assert found_in(folder).note == NOT_OF_THESE
+    assert stored_campaign(folder).note == NOT_OF_THESE
     (folder / "results" / "fit.json").write_text("{")
     shutil.copyfile(viewed.folder / "spots.csv", folder / "spots.csv")
     with pytest.raises(InputError, match=r"fit\.json"):
-        found_in(folder)
+        stored_campaign(folder)
 
 
 def test_campaign_without_a_usable_spot(viewed):

@@ -159,12 +159,12 @@ def write_truth(folder: Path, instrument: Instrument) -> None:
     counted = [r for r in reading.records if r.line not in set(record.ignored_lines)]
     events = [event_of(r, Homed) or event_of(r, Moved) for r in counted]
     motions = [event.twin for event in events if event is not None and event.twin is not UNSET]
-    seen = [motions[spot.move] for spot in record.spots if spot.status == "ok" and spot.move < len(motions)]
+    looks = [motions[spot.move] for spot in record.spots if spot.status == "ok" and spot.move < len(motions)]
     truth = replace(
         instrument.truth,
         mirror_angles_deg=pan_and_tilt(m.mirror_angles_deg for m in motions),
         stop_errors_deg=pan_and_tilt(m.stop_errors_deg for m in motions),
-        reference_pose_deg=reference_pose_deg(seen),
+        reference_pose_deg=reference_pose_deg(looks),
     )
     campaign = Campaign(record.moves, record.spots, instrument.rig.stereo, instrument.rig.table)
     text = json.dumps(truth.as_json(campaign), indent=1, allow_nan=False) + "\n"

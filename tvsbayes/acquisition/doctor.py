@@ -83,7 +83,7 @@ def examine(
     """
     checks = [_rig(rig), *_disk(folder, clock)]
     positioner: Positioner | None = None
-    found: list[Check] = []
+    more: list[Check] = []
     try:
         if open_positioner is None:
             on_port = rig.positioner.get("driver", DEFAULT_DRIVER) in ON_PORTS
@@ -92,10 +92,10 @@ def examine(
             if rig.positioner.get("port") or not on_port:
                 open_positioner = partial(positioner_of, rig)
         if open_positioner is not None:
-            positioner, found = _positioner(open_positioner, clock)
-        checks += found
-        camera, found = _camera(rig, open_camera, positioner, clock)
-        checks += found
+            positioner, more = _positioner(open_positioner, clock)
+        checks += more
+        camera, more = _camera(rig, open_camera, positioner, clock)
+        checks += more
         try:
             checks.append(_laser(positioner, camera, laser))
         finally:

@@ -42,10 +42,10 @@ def positioner_violations(
         report = positioner.home()
         expect(isinstance(report, HomeReport) and report.state.status == "idle", "home ends at rest: status idle")
         for target in [*targets, targets[-1]]:
-            told, asked = positioner.move_to(*target), positioner.state()
-            for state, order in ((told, "move_to"), (asked, "state behind it")):
+            reached, state_now = positioner.move_to(*target), positioner.state()
+            for state, order in ((reached, "move_to"), (state_now, "state behind it")):
                 expect(_at(state) == target, f"{order} tells the counters ordered, {target}, and told {_at(state)}")
-            expect(asked.status == "idle" and not asked.laser_on, "behind a motion it is idle and dark")
+            expect(state_now.status == "idle" and not state_now.laser_on, "behind a motion it is idle and dark")
         for on in (True, False):
             expect(positioner.laser(on).laser_on is on, f"laser({on}) returns once the device has said so")
             expect(positioner.state().laser_on is on, f"state tells the laser behind laser({on})")

@@ -74,8 +74,8 @@ def connect_trigger(positioner: Positioner, camera: StereoCamera) -> None:
 
 def known(group: str) -> dict[str, str]:
     """Drivers of a group, ours first, as "module:function" by name; no other package replaces one of ours."""
-    found = {entry.name: entry.value for entry in metadata.entry_points(group=group)}
-    return {**OWN[group], **{name: value for name, value in found.items() if name not in OWN[group]}}
+    installed = {entry.name: entry.value for entry in metadata.entry_points(group=group)}
+    return {**OWN[group], **{name: value for name, value in installed.items() if name not in OWN[group]}}
 
 
 def _made(group: str, name: str, rig: Rig) -> Any:

@@ -106,7 +106,7 @@ class Acquisition:
         self._place_command, self._retries, self._check_depth, self._placement = place_command, 0, False, -1
         self._log = RunLog(journal, rig, bench.utc)
         self._live = live or LiveRun()
-        self._control = Control(self._live.requests, bench.positioner, self._stop, self._write_asked, self._publish)
+        self._control = Control(self._live.requests, bench.positioner, self._stop, self._write_request, self._publish)
         if estimate is not None:
             estimate.meanwhile = self._control.meanwhile
         self.bench = replace(bench, positioner=HeedingPositioner(bench.positioner, self._control))
@@ -172,7 +172,7 @@ class Acquisition:
                 return "interrupted"
             if isinstance(self._estimate, Replanning) and self._minutes(row + 1) > self._estimate.minutes:
                 return "time over"
-            self._tell(step)
+            self._report(step)
             self._do(step)
             row += 1
             if step.action == "look" and self._estimate is not None and self._estimated(row, self._estimate):
@@ -273,18 +273,18 @@ class Acquisition:
             remedy = "check the sheet and [sheets] of the rig file, then go on with --resume"
             raise fault("placement", f"the sheet is not where it should be: {wrong}", remedy)
         frames = tuple(self.journal.store(name, data) for name, data in observation.pictures.items())
-        found = observation.sighting
-        more = {} if reference is None else self._compared(reference, found.pixels_px)
+        sighting = observation.sighting
+        more = {} if reference is None else self._compared(reference, sighting.pixels_px)
         event = Looked(
             step=step,
             spot=self._spot,
             target=self._log.recorder.state.target,
             experiment=experiment,
             point=point,
-            status=found.status,
-            pixels_px=found.pixels_px,
-            sds_px=found.sds_px,
-            correlations=found.correlations,
+            status=sighting.status,
+            pixels_px=sighting.pixels_px,
+            sds_px=sighting.sds_px,
+            correlations=sighting.correlations,
             frames=frames,
             time_s=self._log.now_s(),
             **more,
@@ -292,7 +292,7 @@ class Acquisition:
         self._log.write(event)
         pictures = {name: data for name, data in observation.pictures.items() if name.startswith("frames/")}
         sheet = self._log.recorder.state.target
-        self._live.looked(SeenLook(self._spot, found.status, sheet, found.pixels_px, found.sds_px, pictures))
+        self._live.looked(SeenLook(self._spot, sighting.status, sheet, sighting.pixels_px, sighting.sds_px, pictures))
         self._spot += 1
         self._log.derive()
 
@@ -300,8 +300,8 @@ class Acquisition:
         """What a look at a spot seen before says of it; a large change is worth a word."""
         shift_px = None if pixels_px is None else _shift_px(reference, pixels_px)
         if shift_px is None or shift_px > REFERENCE_SHIFT_MAX_PX:
-            seen = "is not seen" if shift_px is None else f"has moved by {shift_px:.0f} px"
-            self._log.warnings.append(f"the reference spot {reference.spot} {seen}: have camera or sheet been moved?")
+            change = "is not seen" if shift_px is None else f"has moved by {shift_px:.0f} px"
+            self._log.warnings.append(f"the reference spot {reference.spot} {change}: have camera or sheet been moved?")
         return {"reference_of": reference.spot, "shift_px": shift_px}
 
     def _observe(self) -> Observation:
@@ -380,7 +380,7 @@ class Acquisition:
     def _retake(self, step: PlanStep) -> None:
         """Takes a look of the plan that a repair of the journal lost, reached as the plan reached it."""
         self._heed_stop()
-        self._tell(step)
+        self._report(step)
         scene = self._scene(step.step)
         self._put_sheet(scene, "for a look that was lost")
         # From the counters before: the same sense, so the same side of the play.
@@ -397,7 +397,7 @@ class Acquisition:
         if self._stop.requested:
             raise _Stopped
 
-    def _tell(self, step: PlanStep) -> None:
+    def _report(self, step: PlanStep) -> None:
         left = self.plan[step.step :]
         spots = self._log.recorder.spots
         latest = None if self._estimate is None else self._estimate.latest
@@ -417,8 +417,8 @@ class Acquisition:
         self._live.publish(progress=progress, coming=tuple(map(_doing, left[1 : 1 + COMING_MAX])))
         self._publish()
 
-    def _write_asked(self, asked: Asked) -> None:
-        self._log.write(structs.replace(asked, time_s=self._log.now_s()))
+    def _write_request(self, event: Asked) -> None:
+        self._log.write(structs.replace(event, time_s=self._log.now_s()))
 
     def _begin_live(self) -> None:
         """What does not change while the run goes on."""

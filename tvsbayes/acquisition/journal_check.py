@@ -91,8 +91,8 @@ def _frame_problem(folder: Path, frame: Frame) -> str | None:
 def orphans(folder: Path, records: tuple[Record, ...]) -> list[str]:
     """Frames on the disk that no event names, sorted."""
     named = {frame.name for record in records for frame in frames_of(record)}
-    there = (f"{name}/{p.name}" for name in FRAME_FOLDERS for p in sorted((Path(folder) / name).glob("*.png")))
-    return [name for name in there if name not in named]
+    stored = (f"{name}/{p.name}" for name in FRAME_FOLDERS for p in sorted((Path(folder) / name).glob("*.png")))
+    return [name for name in stored if name not in named]
 
 
 def verify(folder: Path) -> Verification:

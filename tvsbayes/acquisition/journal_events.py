@@ -26,9 +26,9 @@ class Event(Struct, frozen=True, kw_only=True, tag_field="event", tag=str.lower)
 
     def entries(self) -> dict[str, Any]:
         """The entries of its JSON object but for its kind."""
-        found = to_builtins(self, enc_hook=float)
-        del found["event"]
-        return found
+        content = to_builtins(self, enc_hook=float)
+        del content["event"]
+        return content
 
 
 class Created(Event, frozen=True):

@@ -114,7 +114,7 @@ class Requests:
             for request in self._waiting():
                 self.settle(request, FAILED, answer)
 
-    def told(self) -> tuple[Request, ...]:
+    def recent(self) -> tuple[Request, ...]:
         """The last ones, oldest first."""
         return self._all
 

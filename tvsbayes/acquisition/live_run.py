@@ -199,7 +199,7 @@ class LiveRun:
         """Another browser controls from now on: written down by the engine, as what was asked for is."""
         self.requests.ask(CONTROL_PASSED)
 
-    def told(self) -> dict[str, Any]:
+    def document(self) -> dict[str, Any]:
         """The newest snapshot and the requests, as JSON holds them."""
         now = self.latest
         fields = asdict(replace(now, look=None, trail=()))
@@ -213,7 +213,7 @@ class LiveRun:
             "look": look,
             "trail": [list(centre) for centre in now.trail],
             "temperature": None if moved is None else asdict(moved),
-            "requests": [asdict(request) for request in self.requests.told()],
+            "requests": [asdict(request) for request in self.requests.recent()],
         }
 
     def picture(self, spot: int, camera: str, kind: str) -> bytes | None:

@@ -134,10 +134,10 @@ class CameraObserver:
                 for camera in CAMERAS
             }
         unsteady = max(rises_dn(lit, dark)) > CHANGE_DN
-        found = Sighting(UNSTEADY) if unsteady else self.detector(lit, dark)
-        if found.status == "ok" and min(rises_dn(dark, lit)) <= CHANGE_DN:
-            self._require_new(found, dark)
-        return Observation(found, pictures)
+        sighting = Sighting(UNSTEADY) if unsteady else self.detector(lit, dark)
+        if sighting.status == "ok" and min(rises_dn(dark, lit)) <= CHANGE_DN:
+            self._require_new(sighting, dark)
+        return Observation(sighting, pictures)
 
     def _grab(self) -> StereoImage:
         """A pair that states what is white: by its driver, else by the brightest pixel so far.
@@ -165,12 +165,12 @@ class CameraObserver:
                 return lit, False
         return lit, positioner.state().laser_on
 
-    def _require_new(self, found: Sighting, dark: StereoImage) -> None:
+    def _require_new(self, sighting: Sighting, dark: StereoImage) -> None:
         """Refuses a spot that the picture without laser light shows as well: a laser that is always on, or a lamp."""
         before = self.detector(dark, dark).pixels_px
-        if before is None or found.pixels_px is None:
+        if before is None or sighting.pixels_px is None:
             return
-        if max(abs(a - b) for a, b in zip(before, found.pixels_px, strict=True)) < SAME_PLACE_PX:
+        if max(abs(a - b) for a, b in zip(before, sighting.pixels_px, strict=True)) < SAME_PLACE_PX:
             remedy = "cut the laser's supply at once; if it is off, cover what else shines in the picture"
             raise fault("light", "the spot is there with the laser off, too", remedy)
 
@@ -226,7 +226,7 @@ def live_detector(stereo: Stereo) -> Detector:
         stereo: the calibration, for the epipolar check.
     """
 
-    def found(lit: StereoImage, dark: StereoImage) -> Sighting:
+    def detect(lit: StereoImage, dark: StereoImage) -> Sighting:
         white = max(lit.full_scale, dark.full_scale)
         left, right = (find_spot(picture, SpotNoise(), white) for picture in (lit.left, lit.right))
         status = pair_status(left, right)
@@ -243,7 +243,7 @@ def live_detector(stereo: Stereo) -> Detector:
         su, sv, sx, sy = sds.tolist()
         return Sighting("ok", (u, v, x, y), (su, sv, sx, sy), (float(correlations[0]), float(correlations[1])))
 
-    return found
+    return detect
 
 
 def twin_renderer(rig: Rig, seed: int) -> Renderer:

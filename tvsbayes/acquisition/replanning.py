@@ -83,8 +83,8 @@ class Proposal:
 
     def continued(self, row: int, sheet: str) -> tuple[PlanStep, ...]:
         """The steps as they go on a plan from a row on, where a sheet stands already."""
-        own = self.steps[1:] if self.steps[0].target == sheet else self.steps
-        return tuple(replace(step, step=row + number) for number, step in enumerate(own))
+        steps = self.steps[1:] if self.steps[0].target == sheet else self.steps
+        return tuple(replace(step, step=row + number) for number, step in enumerate(steps))
 
 
 @dataclass(frozen=True)
@@ -173,13 +173,13 @@ class Replanning(RunningEstimate):
 
     def proposal(self) -> Proposal | None:
         """The newest one, once."""
-        found, self._proposal = self._proposal, None
-        return found
+        newest, self._proposal = self._proposal, None
+        return newest
 
     def confirmed(self) -> Confirmed | None:
         """The newest event of a sampled posterior, once."""
-        found, self._confirmed = self._confirmed, None
-        return found
+        newest, self._confirmed = self._confirmed, None
+        return newest
 
     def last(self, looks: int) -> bool:
         """At the end of the plan: one more estimate of all looks, waited for; whether the target is met."""
@@ -204,7 +204,7 @@ def _step(number: int, entry: Mapping[str, Any]) -> PlanStep:
 def adapted_entries(proposal: Proposal, row: int, steps: Sequence[PlanStep]) -> Adapted:
     """The event of a change of plan: from which row on, the steps, and why each look was chosen."""
     looks = iter(proposal.after_each)
-    before, told = proposal.now, []
+    before, entries = proposal.now, []
     for step in steps:
         entry = step_json(step)
         if step.action == "look":
@@ -212,8 +212,8 @@ def adapted_entries(proposal: Proposal, row: int, steps: Sequence[PlanStep]) -> 
             # What this look adds, those before it taken.
             entry |= {"u_before_deg_per_step": before, "u_after_deg_per_step": after}
             before = after
-        told.append(entry)
-    return Adapted(row=row, looks=proposal.looks, why=proposal.why, steps=tuple(told))
+        entries.append(entry)
+    return Adapted(row=row, looks=proposal.looks, why=proposal.why, steps=tuple(entries))
 
 
 def adapted_plan(plan: Sequence[PlanStep], records: Iterable[Record]) -> tuple[PlanStep, ...]:

@@ -51,8 +51,8 @@ def data_entries(rig: Rig, synthetic: bool) -> Entries:
     if synthetic:
         entries |= {f"sheets.{name}": x_mm for name, x_mm in rig.sheets_mm.items()}
         entries["cameras.spot_sd_px"] = rig.spot_sd_px
-        own = {name: prior for name, prior in rig.truth.items() if prior != table.priors[name]}
-        entries |= {f"truth.{name}": [prior.value, prior.u] for name, prior in own.items()}
+        stated = {name: prior for name, prior in rig.truth.items() if prior != table.priors[name]}
+        entries |= {f"truth.{name}": [prior.value, prior.u] for name, prior in stated.items()}
     return _short(entries)
 
 
@@ -62,8 +62,8 @@ def setup_entries(rig: Rig, synthetic: bool) -> Entries:
     entries |= {f"cameras.{key}": value for key, value in rig.cameras.items()}
     entries |= {f"sheets.{name}": x_mm for name, x_mm in rig.sheets_mm.items()}
     fixed = data_entries(rig, synthetic)
-    told = {key: without_password(value) if isinstance(value, str) else value for key, value in entries.items()}
-    return _short({key: value for key, value in told.items() if key not in fixed})
+    shown = {key: without_password(value) if isinstance(value, str) else value for key, value in entries.items()}
+    return _short({key: value for key, value in shown.items() if key not in fixed})
 
 
 def _means_counters(key: str) -> bool:

@@ -61,16 +61,16 @@ class EstimateWish:
     Attributes:
         fit: estimates from a campaign folder with so many looks, as a process of its own can import it.
         target_u_deg_per_step: ends the run once the effective ratio of every direction of its plan is known so well.
-        asked: whether to fit; None: on hardware, and for a target.
+        enabled: whether to fit; None: on hardware, and for a target.
     """
 
     fit: Callable[[Path, int], Estimate]
     target_u_deg_per_step: float | None = None
-    asked: bool | None = None
+    enabled: bool | None = None
 
     def holds(self, simulate: bool) -> bool:
         """Whether a run, simulated or not, is to be fitted."""
-        return self.target_u_deg_per_step is not None or (not simulate if self.asked is None else self.asked)
+        return self.target_u_deg_per_step is not None or (not simulate if self.enabled is None else self.enabled)
 
 
 @dataclass(frozen=True)

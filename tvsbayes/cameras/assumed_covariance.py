@@ -155,22 +155,22 @@ def with_marginal(covariance: np.ndarray, group: list[int], sds: np.ndarray) -> 
     Their correlations stay, and so does the conditional distribution of all others given them (Jeffrey 1965).
     """
     others = np.setdiff1d(np.arange(len(covariance)), group)
-    own = covariance[np.ix_(group, group)]
-    factor = sds / np.sqrt(np.diag(own))
-    new = own * np.outer(factor, factor)
-    gain = np.linalg.solve(own, covariance[np.ix_(group, others)]).T
+    block = covariance[np.ix_(group, group)]
+    factor = sds / np.sqrt(np.diag(block))
+    new = block * np.outer(factor, factor)
+    gain = np.linalg.solve(block, covariance[np.ix_(group, others)]).T
     made = covariance.copy()
     made[np.ix_(group, group)] = new
     made[np.ix_(others, group)] = gain @ new
     made[np.ix_(group, others)] = new @ gain.T
-    made[np.ix_(others, others)] += gain @ (new - own) @ gain.T
+    made[np.ix_(others, others)] += gain @ (new - block) @ gain.T
     return (made + made.T) / 2
 
 
 def _stated_sds(stereo: Stereo, stated: Known) -> list[tuple[str, list[int], np.ndarray]]:
     """Name, parameters and sds of every group whose uncertainty is stated."""
     focal = np.abs(stereo.vector[GROUPS["focal length"]])
-    found = []
+    sds = []
     for name, value, unit in (
         ("focal length", stated.u_focal_percent, focal / 100),
         ("principal point", stated.u_principal_px, np.ones(4)),
@@ -178,8 +178,8 @@ def _stated_sds(stereo: Stereo, stated: Known) -> list[tuple[str, list[int], np.
         ("translation", stated.u_baseline_mm, np.ones(3)),
     ):
         if value is not None:
-            found.append((name, GROUPS[name], value * unit))
-    return found
+            sds.append((name, GROUPS[name], value * unit))
+    return sds
 
 
 def _of_one_view(stereo: Stereo, board: Board, fixed_intrinsics: bool | None) -> np.ndarray:
@@ -252,10 +252,10 @@ def view_information(stereo: Stereo, board: Board, pose: np.ndarray) -> ViewInfo
         pose: board to left camera, (6,): Rodrigues vector, mm.
     """
     turn, shift = np.asarray(pose[:3], float), np.asarray(pose[3:], float)
-    own, extrinsic = rotation_vector(stereo.R), np.asarray(stereo.T, float).ravel()
+    relative, extrinsic = rotation_vector(stereo.R), np.asarray(stereo.T, float).ravel()
     left = cv2.projectPoints(board.points_mm, turn, shift, stereo.M1, stereo.D1)[1]
     # The right camera sees the composed pose; composeRT gives its slopes by both.
-    r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = cv2.composeRT(turn, shift, own, extrinsic)
+    r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = cv2.composeRT(turn, shift, relative, extrinsic)
     right = cv2.projectPoints(board.points_mm, r, t, stereo.M2, stereo.D2)[1]
 
     def by(slopes: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
@@ -298,18 +298,18 @@ def placed_boards(stereo: Stereo, board: Board) -> dict[str, list[np.ndarray]]:
     # From the optical axis to the middle of the pictures, px.
     middle = (size - 1) / 2 - (stereo.M1[:2, 2] + stereo.M2[:2, 2]) / 2
     diagonal = np.hypot(board.columns - 1, board.rows - 1) * board.pitch_mm
-    found: dict[str, list[np.ndarray]] = {name: [] for name in names.tolist()}
+    poses: dict[str, list[np.ndarray]] = {name: [] for name in names.tolist()}
     for name, row in zip(names.tolist(), table, strict=True):
         turn = rotation_vector(half.T @ rotation_matrix(row[3:]))
         depth = focal * diagonal / (row[2] * np.hypot(*size))
         for pull in TOWARDS_MIDDLE:
             along = np.append((pull * row[:2] * size + (1 - pull) * middle) / focal, 1.0)
             shifts = (half.T @ (factor * depth * along) + centre for factor in NEARER_OR_FARTHER)
-            seen = next((shift for shift in shifts if _sees_whole(stereo, board, turn, shift)), None)
-            if seen is not None:
-                found[name].append(np.concatenate([turn, seen]))
+            visible = next((shift for shift in shifts if _sees_whole(stereo, board, turn, shift)), None)
+            if visible is not None:
+                poses[name].append(np.concatenate([turn, visible]))
                 break
-    return found
+    return poses
 
 
 def _sees_whole(stereo: Stereo, board: Board, turn: np.ndarray, shift: np.ndarray) -> bool:

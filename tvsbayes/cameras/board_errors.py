@@ -53,25 +53,25 @@ def board_errors(done: Adjustment, views: Sequence[View], board: Board, stereo: 
         board: whose corners they hold.
         stereo: the pair that it found.
     """
-    seen = np.isfinite(done.residuals_px)
-    residuals = np.where(seen, done.residuals_px, 0.0)
-    by_corner = np.stack([_by_corner(view, board, stereo) for view in views]) * seen[..., None]
+    visible = np.isfinite(done.residuals_px)
+    residuals = np.where(visible, done.residuals_px, 0.0)
+    by_corner = np.stack([_by_corner(view, board, stereo) for view in views]) * visible[..., None]
     # Orthonormal columns: a change of z that costs a squared pixel each.
     free = done.root.shape[1]
     flat = np.linalg.qr(done.jacobian.reshape(-1, free))
-    own = np.reshape(flat.Q, done.jacobian.shape)
-    taken = np.einsum("kqcp,kqca->kpca", own, by_corner, optimize=True)
+    basis = np.reshape(flat.Q, done.jacobian.shape)
+    taken = np.einsum("kqcp,kqca->kpca", basis, by_corner, optimize=True)
     everywhere = taken.sum(axis=0).reshape(free, -1)
     variance = _variance(residuals, by_corner, everywhere, board, done)
     by_z = np.linalg.solve(flat.R, everywhere)
     by_parameter = done.root @ by_z
-    share = np.einsum("kqcp,kqcr->kpr", own, own, optimize=True)
+    share = np.einsum("kqcp,kqcr->kpr", basis, basis, optimize=True)
     scores = taken.reshape(len(views), free, -1) - share @ everywhere
-    kept = seen.ravel()
+    kept = visible.ravel()
     factor = correlation_factor(
         done.jacobian.reshape(-1, free)[kept],
         residuals.ravel()[kept],
-        np.repeat(np.arange(len(seen)), seen[0].size)[kept],
+        np.repeat(np.arange(len(visible)), visible[0].size)[kept],
         done.noise_sd_px,
         explained=variance * float(np.sum(scores**2)),
     )

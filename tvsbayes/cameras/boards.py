@@ -19,7 +19,14 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from tvsbayes.cameras.marker_boards import MARKERS_MIN, Markers, as_seen, marker_board_corners, most_markers, spread
+from tvsbayes.cameras.marker_boards import (
+    MARKERS_MIN,
+    Markers,
+    fitted_markers,
+    marker_board_corners,
+    most_markers,
+    spread,
+)
 from tvsbayes.cameras.picture_pairs import (
     AS_NAMED,
     NAMING,
@@ -196,8 +203,8 @@ def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> 
         fallback found them; None where neither did.
     """
     if board.markers is not None:
-        seen = marker_board_corners(grey, board.markers)
-        return None if seen is None else (seen, False)
+        detected = marker_board_corners(grey, board.markers)
+        return None if detected is None else (detected, False)
     for attempt in (finder, "sector" if finder == "classic" else "classic"):
         corners = _find_classic(grey, board) if attempt == "classic" else _find_sector(grey, board)
         if corners is None or not np.isfinite(corners).all():
@@ -325,7 +332,7 @@ def find_views(
     tried = spread(used, TRIED_MAX)
     if board.markers is not None:
         greys = [part for picture in tried for part in _greys(picture, pictures).values()]
-        board = replace(board, markers=as_seen(greys, board.markers))
+        board = replace(board, markers=fitted_markers(greys, board.markers))
     if len(used) > len(tried) and not _any_board(tried, pictures, board, finder):
         raise _without_board(tried, pictures, board)
     boards: dict[str, dict[str, _Detection]] = {}

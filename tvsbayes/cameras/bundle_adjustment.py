@@ -223,8 +223,8 @@ def bundle_adjustment(
         NotConverged: no minimum was found.
     """
     arrays = _padded(views, board, start, poses, free)
-    seen = np.asarray(arrays.weight) > 0
-    kept = seen.ravel()
+    visible = np.asarray(arrays.weight) > 0
+    kept = visible.ravel()
     dof = int(kept.sum()) - int(free.sum()) - 6 * len(views)
     if dof < 1:
         raise undetermined("fewer corner coordinates than unknowns")
@@ -243,15 +243,15 @@ def bundle_adjustment(
         z_covariance = least_squares_covariance(jacobian)
     except np.linalg.LinAlgError as error:
         raise undetermined(str(error)) from error
-    residuals_px = np.full(seen.shape, np.nan)
-    residuals_px[seen] = residuals
+    residuals_px = np.full(visible.shape, np.nan)
+    residuals_px[visible] = residuals
     return Adjustment(
         vector=start + root @ end.z,
         covariance=noise_sd**2 * root[:, free] @ z_covariance @ root[:, free].T,
         residuals_px=residuals_px[: len(views), :, : board.corners],
         noise_sd_px=noise_sd,
         dof=dof,
-        jacobian=(end.jacobian[:, free] * kept[:, None]).reshape(*seen.shape, -1)[: len(views), :, : board.corners],
+        jacobian=(end.jacobian[:, free] * kept[:, None]).reshape(*visible.shape, -1)[: len(views), :, : board.corners],
         root=root[:, free],
     )
 

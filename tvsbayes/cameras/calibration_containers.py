@@ -156,8 +156,8 @@ def _mat(data: bytes) -> dict[str, Any]:
         done = subprocess.run(command, input=data, capture_output=True, timeout=MAT_SECONDS_MAX, check=True)
     except subprocess.SubprocessError as error:
         raise ValueError("a damaged file, or variables that are no plain matrices and structures") from error
-    found = json.loads(done.stdout)
-    return found if isinstance(found, dict) else {}
+    variables = json.loads(done.stdout)
+    return variables if isinstance(variables, dict) else {}
 
 
 def _hdf5(data: bytes) -> dict[str, Any]:
@@ -198,8 +198,8 @@ def _xml(text: str, file: str) -> dict[str, Any]:
             return (element.text or "").strip().strip('"')
         return numbers if len(numbers) > 1 or element.tag == "data" else numbers[0]
 
-    found = value(root, 0)
-    return found if isinstance(found, dict) else {root.tag: found}
+    content = value(root, 0)
+    return content if isinstance(content, dict) else {root.tag: content}
 
 
 def _number(word: str) -> int | float | None:
@@ -243,16 +243,16 @@ def _yaml(text: str, file: str) -> list[dict[str, Any]]:
     body = re.sub(r"\A%YAML[^\n]*\n", "\n", text)
     try:
         _counted(yaml.parse(body, Loader=Loader), file)
-        found = list(yaml.load_all(body, Loader=Loader))
+        documents = list(yaml.load_all(body, Loader=Loader))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        told = getattr(error, "problem", None) or str(error)
-        remedy = "save lists, M.tolist(), or the matrices by numpy.savez" if "python/" in told else AS_WRITTEN
-        raise bad(file, None if mark is None else mark.line + 1, str(told), remedy) from error
+        problem = getattr(error, "problem", None) or str(error)
+        remedy = "save lists, M.tolist(), or the matrices by numpy.savez" if "python/" in problem else AS_WRITTEN
+        raise bad(file, None if mark is None else mark.line + 1, str(problem), remedy) from error
     except (RecursionError, ValueError) as error:
         raise bad(file, None, "YAML that is nested too deeply") from error
     kept: list[dict[str, Any]] = []
-    for one in found or [None]:
+    for one in documents or [None]:
         if not isinstance(one, dict) and (one or not kept):
             raise bad(file, 1, shown(one) if one else "nothing", "name a calibration file")
         plain = {key: value for key, value in (one or {}).items() if key != "header"}

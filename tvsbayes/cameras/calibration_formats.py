@@ -18,7 +18,7 @@ import numpy as np
 
 from tvsbayes.cameras.assumed_covariance import GUESS_FACTOR, Known, with_assumed_covariance
 from tvsbayes.cameras.calibration_containers import CONTAINER_BYTES_MAX, read_container
-from tvsbayes.cameras.calibration_names import MADE_BY, ROTATION_TOLERANCE, Entry, Found
+from tvsbayes.cameras.calibration_names import MADE_BY, ROTATION_TOLERANCE, Entry, Fields
 from tvsbayes.cameras.lens_models import ERROR_MAX_PX, Kind, fitted_to_five, kind_of
 from tvsbayes.cameras.maker_calibrations import MakersPair, makers_pair
 from tvsbayes.errors import InputError, escaped, refusal
@@ -101,21 +101,21 @@ def read_calibration(
         found, allowed = f"{len(files)} files", "one, two or three"
         raise refusal("usage", file=names[0], found=found, allowed=allowed, remedy="name those of one pair")
     maker = makers_pair(files[0], size) if len(files) == 1 else None
-    reader = _Reader(Found([maker.keys] if maker else files, keys or {}), size, unit_mm)
+    reader = _Reader(Fields([maker.keys] if maker else files, keys or {}), size, unit_mm)
     if maker is not None:
         reader.take(maker)
     bare = reader.pair()
     doubts = (*reader.warnings, *pair_doubts(bare, reader.places))
     try:
         stereo = with_assumed_covariance(
-            bare, stated, _made_by(reader.found.pair, {"ros": True, "kalibr": False}.get(reader.source))
+            bare, stated, _made_by(reader.fields.pair, {"ros": True, "kalibr": False}.get(reader.source))
         )
     except InputError as error:
         if error.code != "no-common-view":
             raise
-        told = "; ".join(doubts) or "look at R, T and the image size"
+        hint = "; ".join(doubts) or "look at R, T and the image size"
         found = "two cameras that do not see one board together"
-        raise refusal("no-common-view", file=", ".join(names), found=found, allowed="a pair", remedy=told) from error
+        raise refusal("no-common-view", file=", ".join(names), found=found, allowed="a pair", remedy=hint) from error
     good_to = f"all its sds together are good to a factor of {GUESS_FACTOR:g}"
     reader.notes.append(f"the file has no covariance: assumed from {stereo.assumed_from}; {good_to}")
     reader.notes.append(f"for a better one {ASSUMED_REMEDY}")
@@ -154,8 +154,8 @@ class _Reader:
         transposed: a camera matrix that the file has by columns.
     """
 
-    def __init__(self, found: Found, size: tuple[int, int] | None, unit_mm: float | None):
-        self.found, self.stated_size, self.unit_mm = found, size, unit_mm
+    def __init__(self, fields: Fields, size: tuple[int, int] | None, unit_mm: float | None):
+        self.fields, self.stated_size, self.unit_mm = fields, size, unit_mm
         self.source = "opencv"
         self.unit: str | None = None
         self.notes: list[str] = []
@@ -172,7 +172,7 @@ class _Reader:
 
     def pair(self) -> Stereo:
         """The pair, without a covariance, checked as `stereo.json` is."""
-        for name, (first, second) in self.found.twice.items():
+        for name, (first, second) in self.fields.twice.items():
             remedy = f"say which: --key {name}={second.path}" if name in STATED else "remove one of them"
             raise first.refuse("twice", "every quantity once", remedy, f"another under {second.place}")
         self._exchange()
@@ -198,11 +198,11 @@ class _Reader:
 
     def _check_model(self, side: int) -> None:
         """Refuses a lens model that nothing here converts."""
-        model = self.found.model(side)
+        model = self.fields.model(side)
         if kind_of(model) is None:
             raise refusal(
                 "lens-model",
-                file=", ".join(keys.file for keys in self.found.files),
+                file=", ".join(keys.file for keys in self.fields.files),
                 found=f"the model {escaped(model, 40)} of the {SIDE_NAMES[side]} camera",
                 allowed="plumb_bob, radtan, rational or equidistant",
                 remedy="calibrate the pair again with five coefficients; renaming the model makes wrong rays",
@@ -210,30 +210,30 @@ class _Reader:
 
     def _of_matlab(self) -> bool:
         """Whether the fields are those of MATLAB's stereoParameters."""
-        pair = self.found.pair
+        pair = self.fields.pair
         structured = (
-            any(_named(camera.get("radial"), "radialdistortion") for camera in self.found.cameras)
+            any(_named(camera.get("radial"), "radialdistortion") for camera in self.fields.cameras)
             or "R_transposed" in pair
         )
         return structured or self.transposed is not None or _named(pair.get("pose"), "a")
 
     def _exchange(self) -> None:
         """Files of one camera in the other order: the left projection alone has no shift."""
-        cameras = self.found.cameras
-        if self.found.by_file and all("P" in camera for camera in cameras):
+        cameras = self.fields.cameras
+        if self.fields.by_file and all("P" in camera for camera in cameras):
             shifts = [np.abs(camera["P"].numbers[[3, 7]]).max() for camera in cameras]
             if shifts[1] == 0 and shifts[0] > 0:
-                self.found.cameras = cameras[::-1]
+                self.fields.cameras = cameras[::-1]
 
     def _take_rectified(self) -> None:
         """One camera and a baseline: the right camera of a rectified pair is as the left one."""
-        left, right = self.found.cameras
-        if "baseline" in self.found.pair and "fx" in left and not {"M", "fx", "P"} & set(right):
+        left, right = self.fields.cameras
+        if "baseline" in self.fields.pair and "fx" in left and not {"M", "fx", "P"} & set(right):
             right.update({key: entry for key, entry in left.items() if key in ("fx", "fy", "cx", "cy")})
 
     def _matrix(self, side: int) -> np.ndarray:
         """The camera matrix, of nine numbers, of four, of two and two, of single ones, or of a projection alone."""
-        camera, name = self.found.cameras[side], f"M{side + 1}"
+        camera, name = self.fields.cameras[side], f"M{side + 1}"
         parts = [camera.get(key) for key in ("fx", "fy", "cx", "cy")]
         if "focal" in camera and "centre" in camera:
             parts = [camera["focal"], camera["centre"]]
@@ -246,13 +246,13 @@ class _Reader:
             entries = [one for one in (parts if entry is None else [entry]) if one is not None]
             fx, fy, cx, cy = np.concatenate([one.numbers for one in entries])
             matrix, entry = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), entries[0]
-        elif "P" in camera and not any({"M", "fx"} & set(one) for one in self.found.cameras):
+        elif "P" in camera and not any({"M", "fx"} & set(one) for one in self.fields.cameras):
             entry = camera["P"]
             matrix = entry.numbers.reshape(3, 4)[:, :3]
             self.notes.append(f"{entry.place} alone: the rectified {SIDE_NAMES[side]} camera, without distortion")
         else:
-            cameras = self.found.cameras
-            raise self.found.missing([f"M{k + 1}" for k in (0, 1) if not {"M", "fx"} & set(cameras[k])])
+            cameras = self.fields.cameras
+            raise self.fields.missing([f"M{k + 1}" for k in (0, 1) if not {"M", "fx"} & set(cameras[k])])
         assert entry is not None
         self.places[name] = entry.place
         skew = abs(matrix[0, 1]) <= 1e-9 * abs(matrix[0, 0])
@@ -267,19 +267,19 @@ class _Reader:
 
     def _distortion(self, side: int, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """k1 k2 p1 p2 k3, fitted where the file has another model."""
-        camera, kind = self.found.cameras[side], kind_of(self.found.model(side))
-        found = self._coefficients(camera, kind)
-        if found is None:
-            if {"M", "fx"} & set(camera) and self.found.model(side) != "rectified":
-                raise self.found.missing([f"D{side + 1}"])
+        camera, kind = self.fields.cameras[side], kind_of(self.fields.model(side))
+        coefficients = self._coefficients(camera, kind)
+        if coefficients is None:
+            if {"M", "fx"} & set(camera) and self.fields.model(side) != "rectified":
+                raise self.fields.missing([f"D{side + 1}"])
             return np.zeros(5)
-        values, entry = found
+        values, entry = coefficients
         self.places[f"D{side + 1}"] = entry.place
         if kind == "fisheye" and not values[4:].any():
             values = values[:4]
         if not values.any() and kind != "fisheye":
             return np.zeros(5)
-        if kind == "five" and values.size == 4 and not self.found.model(side):
+        if kind == "five" and values.size == 4 and not self.fields.model(side):
             said = (
                 "four coefficients without the name of a model, taken as k1 k2 p1 p2; of cv2.fisheye they are others:"
             )
@@ -323,7 +323,7 @@ class _Reader:
     def _size(self, matrices: Sequence[np.ndarray]) -> tuple[int, int]:
         """The size of the left camera's pictures; that of the right one's, where it is another, is kept beside."""
         sizes: list[tuple[tuple[int, int], Entry]] = []
-        for side, camera in enumerate(self.found.cameras):
+        for side, camera in enumerate(self.fields.cameras):
             if "size" in camera:
                 entry = camera["size"]
                 one = entry.numbers
@@ -356,30 +356,30 @@ class _Reader:
         if sizes or self.stated_size is not None:
             return sizes[0][0] if sizes else self.stated_size  # type: ignore[return-value]
         remedy = "give it with --image-size, for example 1280x720"
-        file = self.found.files[0].file
+        file = self.fields.files[0].file
         raise refusal("missing-key", file=file, found="no image size", allowed="image_width", remedy=remedy)
 
     def _extrinsics(self) -> tuple[np.ndarray, np.ndarray]:
         """R and T of x_right = R x_left + T, T in the file's unit: the first way to them, which all others confirm."""
         ways = list(self._ways())
         if not ways:
-            left, pair = self.found.cameras[0], self.found.pair
-            if self.found.by_file or "M" in left or "fx" in left:
-                raise self.found.missing([name for name in ("R", "T") if name not in pair])
-            raise self.found.missing(["M1", "M2", "R", "T"])
+            left, pair = self.fields.cameras[0], self.fields.pair
+            if self.fields.by_file or "M" in left or "fx" in left:
+                raise self.fields.missing([name for name in ("R", "T") if name not in pair])
+            raise self.fields.missing(["M1", "M2", "R", "T"])
         first, *others = ways
         self.places |= {"R": first.turn.place, "T": first.shift.place}
         self.source = first.source or self.source
         checks = [_of_pose(other) for other in others]
-        cameras = self.found.cameras
+        cameras = self.fields.cameras
         if all("rectification" in c for c in cameras) and not any("P" in c for c in cameras):
             one, two = (c["rectification"].rotation() for c in cameras)
             if first.turn not in (c["rectification"] for c in cameras):
                 checks.append(lambda r, t: float(np.abs(two.T @ one - r).max()))
         for name, (one, two) in {"E": (np.eye(3), np.eye(3)), "F": self.matrices}.items():
-            if name in self.found.pair:
-                found = two.T @ self.found.pair[name].numbers.reshape(3, 3) @ one
-                checks.append(partial(_off_essential, found))
+            if name in self.fields.pair:
+                essential = two.T @ self.fields.pair[name].numbers.reshape(3, 3) @ one
+                checks.append(partial(_off_essential, essential))
         for off in checks:
             if off(first.rotation, first.translation) > ROTATION_TOLERANCE:
                 allowed, found_here = "one pose of the right camera", "another pose than the rest of the file says"
@@ -388,13 +388,13 @@ class _Reader:
                     allowed, found_here = "R from left to right", "R transposed, by what else the file says"
                     remedy = f"take its transpose: --key R={first.turn.path}.T"
                 raise first.turn.refuse("rotation", allowed, remedy, found_here)
-        if not checks and first.plain and "R" not in self.found.stated:
+        if not checks and first.plain and "R" not in self.fields.stated:
             self._doubt_turn(first)
         return first.rotation, first.translation
 
     def _ways(self) -> Iterator[_Pose]:
         """Every pose of the right camera that the files hold."""
-        pair, (left, right) = self.found.pair, self.found.cameras
+        pair, (left, right) = self.fields.pair, self.fields.cameras
         for field, of_one in (("R", "rectification"), ("T", "camera_T")):
             # In the file or table of one camera: that of the pair, since both would have a rectification or a pose.
             if field not in pair and (of_one in left) != (of_one in right) and "P" not in left:
@@ -431,7 +431,7 @@ class _Reader:
 
     def _from_projections(self) -> _Pose:
         """Rectified, the right camera sees x' = x + (P03 / P00, P13 / P11, 0): R = R2^T R1, T = R2^T of that."""
-        left, right = self.found.cameras
+        left, right = self.fields.cameras
         one, two = (camera["P"].numbers.reshape(3, 4) for camera in (left, right))
         if np.any(one[:2, 3] != 0) or not np.any(two[:2, 3]) or not (two[0, 0] > 0 and two[1, 1] > 0):
             allowed = "P[0][3] = 0 in the left camera, -fx baseline in the right one"
@@ -442,7 +442,7 @@ class _Reader:
             # The rectified pair itself is what is there.
             turns = [np.eye(3), np.eye(3)]
         shift = np.array([two[0, 3] / two[0, 0], two[1, 3] / two[1, 1], 0.0])
-        source = "ros" if self.found.by_file else ""
+        source = "ros" if self.fields.by_file else ""
         return _Pose(turns[1].T @ turns[0], turns[1].T @ shift, right["P"], right["P"], source)
 
     def _doubt_turn(self, pose: _Pose) -> None:
@@ -458,10 +458,11 @@ class _Reader:
             raise pose.turn.refuse("rotation", "R from left to right", remedy, found)
         if math.degrees(float(np.linalg.norm(rotation_vector(pose.rotation)))) < TURN_SAID_DEG:
             return
-        here, there = (_toe_in_deg(turn, pose.translation) for turn in (pose.rotation, pose.rotation.T))
+        stated_deg, transposed_deg = (_toe_in_deg(r, pose.translation) for r in (pose.rotation, pose.rotation.T))
         said = f"{pose.turn.place} is taken from left to right, x_right = R x_left + T, and nothing else in the file "
-        said += f"says so: the optical axes {_toe_in(here)}; transposed they {_toe_in(there)}: --key R={path}.T"
-        if here < -TURN_SAID_DEG < TURN_SAID_DEG < there:
+        said += f"says so: the optical axes {_toe_in(stated_deg)}; "
+        said += f"transposed they {_toe_in(transposed_deg)}: --key R={path}.T"
+        if stated_deg < -TURN_SAID_DEG < TURN_SAID_DEG < transposed_deg:
             self.warnings.append(f"is R transposed? {said}")
         else:
             self.notes.append(said)

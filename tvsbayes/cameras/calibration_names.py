@@ -103,7 +103,7 @@ MODEL_NAMES = ("distortionmodel", "distmodel", "cameratype", "cameramodel", "mod
 
 def _table() -> dict[str, list[tuple[str, str]]]:
     """Field and side by name; the side "" is none."""
-    found: dict[str, list[tuple[str, str]]] = {}
+    fields: dict[str, list[tuple[str, str]]] = {}
     for field, (_, words) in FIELDS.items():
         names = {(f"{mark}{word}", "") for word in words.split() for mark in _MARKS}
         if field in OF_CAMERA:
@@ -113,8 +113,8 @@ def _table() -> dict[str, list[tuple[str, str]]]:
                         names |= {(f"{mark}{side}{word}", side), (f"{side}{mark}{word}", side)}
                         names |= {(f"{word}{mark}{side}", side), (f"{mark}{word}{side}", side)}
         for name, side in names:
-            found.setdefault(name, []).append((field, side))
-    return found
+            fields.setdefault(name, []).append((field, side))
+    return fields
 
 
 _NAMES = _table()
@@ -199,24 +199,24 @@ def numbers_of(value: Any) -> tuple[np.ndarray, tuple[int, ...]] | None:
     if isinstance(value, bool) or not isinstance(value, int | float | list):
         return None
     try:
-        found = np.array(value, dtype=float)
+        numbers = np.array(value, dtype=float)
     except (ValueError, TypeError, OverflowError):
         return None
-    if not found.size or not (np.abs(found) <= NUMBER_MAX).all():
+    if not numbers.size or not (np.abs(numbers) <= NUMBER_MAX).all():
         return None
-    return found.ravel(), found.shape
+    return numbers.ravel(), numbers.shape
 
 
 def entries_of(keys: Keys, file: int) -> Iterator[Entry]:
     """Every entry of numbers in a file, in its order."""
     for key, value in keys.values.items():
-        found = numbers_of(value)
-        if found is None and isinstance(value, dict) and {"rows", "cols", "data"} <= {name.lower() for name in value}:
+        numbers = numbers_of(value)
+        if numbers is None and isinstance(value, dict) and {"rows", "cols", "data"} <= {name.lower() for name in value}:
             raise keys.refuse(key, "matrix", "rows times cols finite numbers", "take the file as its tool wrote it")
         if isinstance(value, str) and _bare(key) in FIELDS["width"][1].split() + FIELDS["height"][1].split():
             raise keys.refuse(key, "integer", "a whole number of px", "correct the value")
-        if found is not None:
-            yield Entry(keys, key, *found, file)
+        if numbers is not None:
+            yield Entry(keys, key, *numbers, file)
         elif isinstance(value, dict):
             yield from entries_of(keys.table(key), file)
         elif isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
@@ -242,11 +242,11 @@ def meanings(entry: Entry, *, of_any_count: bool = False) -> list[tuple[str, str
         return []
     for count in range(min(4, len(parts)), 0, -1):
         named = _NAMES.get(_bare("".join(parts[-count:])), ())
-        found = [one for one in named if of_any_count or entry.numbers.size in FIELDS[one[0]][0]]
-        if found:
+        matches = [one for one in named if of_any_count or entry.numbers.size in FIELDS[one[0]][0]]
+        if matches:
             # A name without a side may stand in the table of one camera.
             side = next((s for part in reversed(parts[:-count]) if (s := _side_of(part))), "")
-            return [(field, own or (side if field in OF_CAMERA else "")) for field, own in found]
+            return [(field, stated or (side if field in OF_CAMERA else "")) for field, stated in matches]
     return []
 
 
@@ -266,7 +266,7 @@ def _side_in_name(file: str) -> int | None:
     return None
 
 
-class Found:
+class Fields:
     """Entries of all files by field, those of cameras by field and number (0 left, 1 right)."""
 
     def __init__(self, files: Sequence[Keys], stated: Mapping[str, str]):
@@ -319,12 +319,12 @@ class Found:
         return any(e.file == file and field in ("M", "fx") and not side for e, field, side in sided)
 
     def _keep(self, into: dict[str, Entry], field: str, name: str, entry: Entry) -> None:
-        there = into.get(field)
-        if there is None or (there.numbers.size == 3 and entry.numbers.size == 9):
+        kept = into.get(field)
+        if kept is None or (kept.numbers.size == 3 and entry.numbers.size == 9):
             # Of a rotation's vector and its matrix, the matrix.
             into[field] = entry
-        elif there.numbers.size == entry.numbers.size and not np.array_equal(there.numbers, entry.numbers):
-            self.twice[name] = there, entry
+        elif kept.numbers.size == entry.numbers.size and not np.array_equal(kept.numbers, entry.numbers):
+            self.twice[name] = kept, entry
 
     def _named(self, field: str, name: str) -> Entry:
         """The entry that a user named, transposed where NAME.T says so."""
@@ -375,14 +375,14 @@ class Found:
                     f"{entry.numbers.size} numbers" if entry.numbers.size else "no list of finite numbers",
                 )
         unknown = [entry.path for entry in self.entries if not meanings(entry) and entry.numbers.size > 1]
-        there = listed([escaped(path, 40) for path in unknown], NAMES_LISTED) if unknown else "no other numbers"
+        others = listed([escaped(path, 40) for path in unknown], NAMES_LISTED) if unknown else "no other numbers"
         remedy = "a pair needs M D of both cameras and R T between them: name the other file too"
         if unknown:
             remedy = f"name what holds it: --key {wanted[0]}=NAME"
         return refusal(
             "missing-key",
             file=", ".join(keys.file for keys in self.files),
-            found=f"no {' '.join(wanted)} under a name that is known, and {there}",
+            found=f"no {' '.join(wanted)} under a name that is known, and {others}",
             allowed="M1 D1 M2 D2 and R T, or what gives them",
             remedy=remedy,
         )

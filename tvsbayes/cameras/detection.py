@@ -115,7 +115,7 @@ class Detection:
             "kept": self.kept,
             "median_sd_px": self.median_sd_px,
             "noise": noise,
-            "alternate_lines": {side: [asdict(one) for one in found] for side, found in self.lines.items()},
+            "alternate_lines": {side: [asdict(one) for one in lines] for side, lines in self.lines.items()},
         }
 
 
@@ -136,12 +136,12 @@ def _row(spot: Spot, left: Centre, right: Centre) -> Spot:
     sds: list[float] = []
     correlations: list[float] = []
     for one in (left, right):
-        found = one.located
-        sd = np.sqrt(np.diag(found.covariance_px2))
-        pixels += [round(float(value), 6) for value in found.centre_px]
+        located = one.located
+        sd = np.sqrt(np.diag(located.covariance_px2))
+        pixels += [round(float(value), 6) for value in located.centre_px]
         # The format's smallest sd; no spot is known that well.
         sds += [max(round(float(value), 7), 1e-4) for value in sd]
-        correlations.append(round(float(found.covariance_px2[0, 1] / sd[0] / sd[1]), 6))
+        correlations.append(round(float(located.covariance_px2[0, 1] / sd[0] / sd[1]), 6))
     return with_pixels(spot, status, pixels, sds, correlations)
 
 
@@ -161,7 +161,7 @@ class _Frames:
     def path(self, spot: Spot, side: str) -> Path:
         return self.folder / frame_name(spot.spot, side)
 
-    def there(self, spot: Spot) -> bool:
+    def present(self, spot: Spot) -> bool:
         return all(os.path.lexists(self.path(spot, side)) for side in CAMERAS)
 
     def read(self, spot: Spot, side: str) -> np.ndarray:
@@ -182,16 +182,16 @@ class _Frames:
     def _dark_picture(self, spot: Spot, side: str) -> Path:
         """That of a look, else of its camera."""
         assert self.dark is not None
-        own = frame_name(spot.spot, side)
-        names = [Path(own).name, *(f"{side}{suffix}" for suffix in SUFFIXES)]
+        name_of_look = frame_name(spot.spot, side)
+        names = [Path(name_of_look).name, *(f"{side}{suffix}" for suffix in SUFFIXES)]
         for name in names:
             if os.path.lexists(self.dark / name):
                 return self.dark / name
         raise refusal(
             "missing-file",
             file=escaped(str(self.dark), 200),
-            found=f"no dark picture of the {side} camera for {own}",
-            allowed=f"{Path(own).name}, or {side}.png for all looks",
+            found=f"no dark picture of the {side} camera for {name_of_look}",
+            allowed=f"{Path(name_of_look).name}, or {side}.png for all looks",
             remedy="take one with the laser off, at the exposure of the others",
         )
 
@@ -271,20 +271,20 @@ def detect(
     """
     frames = replace(_frames_of(campaign, method), dark=dark)
     rows = [row for row, spot in enumerate(campaign.spots) if _ours(spot.status)]
-    present = [row for row in rows if frames.there(campaign.spots[row])]
+    present = [row for row in rows if frames.present(campaign.spots[row])]
     if not present:
         raise _no_frames(campaign)
     workers = workers or os.cpu_count() or 1
     learning = min(PILOTS_MAX, len(present)) if method == "fit" else 0
-    seen_spots = [campaign.spots[row] for row in present]
+    present_spots = [campaign.spots[row] for row in present]
     try:
-        levelling = len(present) if frames.deep(seen_spots[0]) else 0
+        levelling = len(present) if frames.deep(present_spots[0]) else 0
         with Job({LEVELLING: levelling, LEARNING: learning, DETECTING: len(present)}, progress) as job:
             job.begin(LEVELLING)
             largest = 0
             # All of them: no few looks need hold the brightest, and one level has to serve every look.
-            for count, found in enumerate(_parallel(frames.largest, seen_spots, workers)):
-                largest = max(largest, found)
+            for count, largest_value in enumerate(_parallel(frames.largest, present_spots, workers)):
+                largest = max(largest, largest_value)
                 job.at(count / len(present))
             frames = replace(frames, white=white_level(largest) if largest else None)
             job.begin(LEARNING)
@@ -295,14 +295,14 @@ def detect(
                 pairs.append(pair)
                 job.at(len(pairs) / len(present), f"{len(pairs)} of {len(present)} looks")
     except InputError as first:
-        every = [error for error in _parallel(frames.refused, list(product(seen_spots, CAMERAS)), workers) if error]
+        every = [error for error in _parallel(frames.refused, list(product(present_spots, CAMERAS)), workers) if error]
         raise all_of(every or [first]) from None
     noise = _relearned(looks.noise, pairs, speckle_contrast) if method == "fit" else looks.noise
     sides = {side: widened([pair[k].under(noise[side]) for pair in pairs]) for k, side in enumerate(CAMERAS)}
     sizes = campaign.stereo.image_sizes
     right = [centre.scaled(sizes["right"], sizes["left"]) for centre in sides["right"].centres]
-    seen = list(zip(sides["left"].centres, right, strict=True))
-    spots = _rows(campaign.spots, present, seen, campaign.stereo)
+    centres = list(zip(sides["left"].centres, right, strict=True))
+    spots = _rows(campaign.spots, present, centres, campaign.stereo)
     after = [spots[row] for row in present]
     sds = [
         sd
@@ -408,8 +408,10 @@ def _looks(
     if method == "fit":
         patches = _pilots(campaign.spots, present, frames, workers)
         for number, camera in enumerate(CAMERAS):
-            found = [patch for pair in patches.values() if not isinstance(patch := pair[number], str)]
-            noise[camera] = _learned([one for one in found if one.clipped_share <= CLIPPED_SHARE_MAX], speckle_contrast)
+            usable = [patch for pair in patches.values() if not isinstance(patch := pair[number], str)]
+            noise[camera] = _learned(
+                [one for one in usable if one.clipped_share <= CLIPPED_SHARE_MAX], speckle_contrast
+            )
     else:
         noise["left"] = noise["right"] = SpotNoise(speckle_contrast=_contrast(speckle_contrast))
         rectified["left"], rectified["right"] = rectified_pair(campaign.stereo)
@@ -449,12 +451,12 @@ def _pilots(spots: Sequence[Spot], present: Sequence[int], frames: _Frames, work
 
 
 def _rows(
-    spots: Sequence[Spot], present: Sequence[int], seen: Sequence[tuple[Centre, Centre]], stereo: Stereo
+    spots: Sequence[Spot], present: Sequence[int], centres: Sequence[tuple[Centre, Centre]], stereo: Stereo
 ) -> list[Spot]:
     """All rows of spots.csv, those in `present` with what was seen (left, right); off their epipolar line: refused."""
     rows = list(spots)
     good: list[tuple[int, Located, Located]] = []
-    for row, (left, right) in zip(present, seen, strict=True):
+    for row, (left, right) in zip(present, centres, strict=True):
         rows[row] = _row(rows[row], left, right)
         if rows[row].status == "ok":
             good.append((row, left.located, right.located))

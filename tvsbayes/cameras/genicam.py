@@ -148,8 +148,8 @@ class GenicamCamera:
                 n for n, d in enumerate(known) if wanted in (_text(d, "serial_number"), _text(d, "user_defined_name"))
             ]
             if len(fits) != 1:
-                there = ", ".join(_text(d, "serial_number") for d in known) or "none"
-                found = f"{name}: {len(fits)} cameras are {escaped(wanted)}; there are: {escaped(there, 200)}"
+                serials = ", ".join(_text(d, "serial_number") for d in known) or "none"
+                found = f"{name}: {len(fits)} cameras are {escaped(wanted)}; there are: {escaped(serials, 200)}"
                 raise fault("camera", found, "correct [cameras], check cable and supply, close other programs")
             acquirer = self._harvester.create(fits[0])
             self._acquirers.append(acquirer)

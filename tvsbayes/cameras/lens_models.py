@@ -88,6 +88,6 @@ def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, 
         return FittedLens(np.zeros(5), np.inf)
     wanted = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
     columns = [(distort(rays, one) - rays).ravel() for one in np.eye(5)]
-    found = np.linalg.lstsq(np.stack(columns, axis=1), (wanted - rays).ravel())[0]
-    missed = (distort(rays, found) - wanted) * matrix[[0, 1], [0, 1]]
-    return FittedLens(found, float(np.linalg.norm(missed, axis=1).max()))
+    distortion5 = np.linalg.lstsq(np.stack(columns, axis=1), (wanted - rays).ravel())[0]
+    missed = (distort(rays, distortion5) - wanted) * matrix[[0, 1], [0, 1]]
+    return FittedLens(distortion5, float(np.linalg.norm(missed, axis=1).max()))

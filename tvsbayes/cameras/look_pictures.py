@@ -55,8 +55,8 @@ class View:
 
     def without_number(self, place: int) -> str:
         """Its name without one of its numbers: what else it says, such as the sheet."""
-        found = list(_NUMBER.finditer(self.name))[place]
-        rest = f"{self.name[: found.start()]} {self.name[found.end() :]}"
+        number = list(_NUMBER.finditer(self.name))[place]
+        rest = f"{self.name[: number.start()]} {self.name[number.end() :]}"
         return re.sub(r"[\s_.-]+", " ", rest).strip(" =+-@")
 
 
@@ -142,10 +142,10 @@ def _numbered(views: Sequence[View], ids: Sequence[int] | None) -> int | None:
     """Which number of the names tells the look: the one that differs most, where all of them are among `ids`."""
     places = range(min(len(view.numbers) for view in views))
     known = None if ids is None else set(ids)
-    told = {place: {view.numbers[place] for view in views} for place in places}
-    fitting = [place for place in places if known is None or told[place] <= known]
-    best = max(fitting, key=lambda place: (len(told[place]), place), default=None)
-    return best if best is not None and (len(told[best]) > 1 or len(views) == 1) else None
+    numbers = {place: {view.numbers[place] for view in views} for place in places}
+    fitting = [place for place in places if known is None or numbers[place] <= known]
+    best = max(fitting, key=lambda place: (len(numbers[place]), place), default=None)
+    return best if best is not None and (len(numbers[best]) > 1 or len(views) == 1) else None
 
 
 def pair_looks(
@@ -171,11 +171,11 @@ def pair_looks(
     place = None if matching == "order" else _numbered(views, ids)
     names, renumbered = [""] * len(views), None
     if place is not None:
-        told, names = [view.numbers[place] for view in views], [view.without_number(place) for view in views]
-        ranks = {number: rank for rank, number in enumerate(sorted(set(told)))}
-        numbers = told
-        if ids is None and max(told) >= 2 * len(ranks) + SPARSE_ROWS:
-            numbers, renumbered = [ranks[number] for number in told], (min(told), max(told))
+        stated, names = [view.numbers[place] for view in views], [view.without_number(place) for view in views]
+        ranks = {number: rank for rank, number in enumerate(sorted(set(stated)))}
+        numbers = stated
+        if ids is None and max(stated) >= 2 * len(ranks) + SPARSE_ROWS:
+            numbers, renumbered = [ranks[number] for number in stated], (min(stated), max(stated))
     elif matching == "number" or (ids is not None and len(views) != len(ids)):
         raise _unmatched(views, ids or (), file)
     else:
@@ -195,7 +195,7 @@ def _differences(names: Sequence[str]) -> list[str]:
     """What names say that not all of them say, cut to the length of a target."""
     words = [name.split() for name in names]
     common = set.intersection(*map(set, words))
-    return [" ".join(word for word in own if word not in common)[:100] for own in words]
+    return [" ".join(word for word in of_name if word not in common)[:100] for of_name in words]
 
 
 def _onto_rows(

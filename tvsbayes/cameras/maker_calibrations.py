@@ -117,11 +117,11 @@ def _streams(text: str) -> Values:
     """
     streams, poses = [], []
     parts = _PART.split(text)
-    for name, width, height, rest in (found.groups() for part in parts if (found := _STREAM.match(part))):
+    for name, width, height, rest in (match.groups() for part in parts if (match := _STREAM.match(part))):
         fields = {key.lower(): rest.partition(f"{key}:")[2].split("\n")[0] for key in ("PPX", "PPY", "Fx", "Fy")}
         model, coefficients = (rest.partition(f"{key}:")[2].split("\n")[0] for key in ("Distortion", "Coeffs"))
         streams.append(_stream(name, (width, height), fields, model, coefficients))
-    for one, other, rest in (found.groups() for part in parts if (found := _POSE.match(part))):
+    for one, other, rest in (match.groups() for part in parts if (match := _POSE.match(part))):
         turn, _, shift = rest.partition("Translation Vector:")
         shift = shift.strip().split("\n")[0]
         poses.append({"from": one, "to": other, "R": _numbers(turn), "T": _numbers(shift)})
@@ -135,7 +135,7 @@ def _streams(text: str) -> Values:
 
 
 def _stream(name: str, size: Sequence[str], fields: Mapping[str, str], model: str, coefficients: str) -> Values:
-    numbers = {key: found[0] for key, word in fields.items() if (found := _numbers(word))}
+    numbers = {key: values[0] for key, word in fields.items() if (values := _numbers(word))}
     inner = {**numbers, "distortion_model": model.strip(), "D": _numbers(coefficients)}
     return {"name": name, "width": int(size[0]), "height": int(size[1]), **inner}
 
@@ -164,8 +164,8 @@ def _zed(document: Values, keys: Keys, size: Size | None) -> MakersPair:
     """
     sections = {name: table for name, table in document.items() if isinstance(table, dict)}
     both = {
-        name: own
-        for name, own in ZED_SIZES.items()
+        name: picture_size
+        for name, picture_size in ZED_SIZES.items()
         if f"left_cam_{name}" in sections and f"right_cam_{name}" in sections
     }
     name = _chosen(both, size, keys.file)
@@ -259,8 +259,8 @@ def _realsense(document: Values, keys: Keys, size: Size | None) -> MakersPair:
         )
     by_name = [{(s["width"], s["height"]): s for s in printed["streams"] if s["name"] == name} for name in pair]
     sizes = {f"{width}x{height}": (width, height) for width, height in by_name[0] if (width, height) in by_name[1]}
-    own = sizes[_chosen(sizes, size, keys.file)]
-    values = {side: streams[own] for side, streams in zip(("left", "right"), by_name, strict=True)}
+    chosen = sizes[_chosen(sizes, size, keys.file)]
+    values = {side: streams[chosen] for side, streams in zip(("left", "right"), by_name, strict=True)}
     pose = {"R": np.reshape(between[0]["R"], (3, 3)).tolist(), "T": between[0]["T"]}
     note = f"left is {escaped(pair[0], 30)}, right {escaped(pair[1], 30)}"
     return MakersPair(Keys({**values, **pose}, keys.file, keys.text), "realsense", "m", (note,))

@@ -70,28 +70,28 @@ class Markers:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Detected:
     """Markers of a picture: corners (n, 4, 2) px and numbers (n,)."""
 
     corners_px: np.ndarray
     numbers: np.ndarray
 
 
-def _markers(grey: np.ndarray, dictionary: str) -> _Seen:
-    found = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
-    corners, numbers, _ = cv2.aruco.ArucoDetector(found).detectMarkers(grey)
+def _markers(grey: np.ndarray, dictionary: str) -> _Detected:
+    dictionary_of_markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary_of_markers).detectMarkers(grey)
     if numbers is None or not len(numbers):
-        return _Seen(np.zeros((0, 4, 2)), np.zeros(0, int))
-    return _Seen(np.array(corners, float).reshape(-1, 4, 2), np.ravel(numbers))
+        return _Detected(np.zeros((0, 4, 2)), np.zeros(0, int))
+    return _Detected(np.array(corners, float).reshape(-1, 4, 2), np.ravel(numbers))
 
 
-def _plane_of(seen: _Seen, board: cv2.aruco.CharucoBoard) -> tuple[float, float] | None:
+def _plane_of(detected: _Detected, board: cv2.aruco.CharucoBoard) -> tuple[float, float] | None:
     """How far the centres of markers miss those on a board, and their side, in squares; None where too few are seen."""
     places = np.array([np.asarray(four, float)[:, :2] for four in board.getObjPoints()])
-    kept = seen.numbers < len(places)
+    kept = detected.numbers < len(places)
     if kept.sum() < MARKERS_MIN:
         return None
-    centres, corners = places[seen.numbers[kept]].mean(axis=1), seen.corners_px[kept]
+    centres, corners = places[detected.numbers[kept]].mean(axis=1), detected.corners_px[kept]
     # From pixels to squares, by the centres alone.
     plane, _ = cv2.findHomography(corners.mean(axis=1), centres)
     if plane is None or not np.isfinite(plane).all():
@@ -103,7 +103,7 @@ def _plane_of(seen: _Seen, board: cv2.aruco.CharucoBoard) -> tuple[float, float]
     return missed, float(np.median(sides))
 
 
-def as_seen(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
+def fitted_markers(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
     """The markers with the size and the first square that pictures show.
 
     Args:
@@ -113,30 +113,30 @@ def as_seen(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
     Raises:
         NothingToEstimate: the markers stand otherwise than on that board, or are of another dictionary.
     """
-    seen = [_markers(grey, markers.dictionary) for grey in pictures]
+    detected = [_markers(grey, markers.dictionary) for grey in pictures]
     tried = {}
     for legacy in (markers.legacy, not markers.legacy):
         board = replace(markers, legacy=legacy).board()
-        tried[legacy] = [fit for one in seen if (fit := _plane_of(one, board)) is not None]
+        tried[legacy] = [fit for one in detected if (fit := _plane_of(one, board)) is not None]
     best = min(tried, key=lambda legacy: np.median([fit[0] for fit in tried[legacy]] or [np.inf]))
     if not tried[best]:
         _refuse_other_markers(spread(pictures), markers)
         return replace(markers, share=markers.share or SHARE_USUAL)
     if np.median([fit[0] for fit in tried[best]]) > MISFIT_SQUARES:
-        raise _other_board(seen, markers)
+        raise _other_board(detected, markers)
     share = markers.share or float(np.clip(np.median([fit[1] for fit in tried[best]]), 0.2, 0.98))
     return replace(markers, legacy=best, share=share)
 
 
-def _other_board(seen: Sequence[_Seen], markers: Markers) -> NothingToEstimate:
+def _other_board(detected: Sequence[_Detected], markers: Markers) -> NothingToEstimate:
     """The refusal of a board whose markers are arranged otherwise, with the number of squares that fits."""
     wanted = f"{markers.squares[0]}x{markers.squares[1]}"
     misfits: dict[int, float] = {}
     for across in range(3, SQUARES_MAX + 1):
-        down = -(-2 * (1 + max(int(one.numbers.max(initial=0)) for one in seen)) // across)
+        down = -(-2 * (1 + max(int(one.numbers.max(initial=0)) for one in detected)) // across)
         for legacy in (False, True):
             board = replace(markers, legacy=legacy).board((across, max(3, down + down % 2)))
-            fits = [fit[0] for one in seen if (fit := _plane_of(one, board)) is not None]
+            fits = [fit[0] for one in detected if (fit := _plane_of(one, board)) is not None]
             misfits[across] = min(misfits.get(across, np.inf), float(np.median(fits)) if fits else np.inf)
     best = min(misfits, key=lambda across: misfits[across])
     remedy = "count squares, columns x rows, with the first marker at the upper left"
@@ -172,13 +172,13 @@ def _refuse_other_markers(pictures: Sequence[np.ndarray], markers: Markers) -> N
 
     Of few bits some are seen where none is.
     """
-    own = sum(len(_markers(grey, markers.dictionary).numbers) for grey in pictures)
+    matching = sum(len(_markers(grey, markers.dictionary).numbers) for grey in pictures)
     name, count = most_markers(pictures)
-    if own >= max(1, count):
+    if matching >= max(1, count):
         return
     remedy = "see that light is even and the pictures sharp; is it a checkerboard without markers: --board?"
     found = f"no board of markers of {markers.dictionary} in {len(pictures)} pictures"
-    if count > own + len(pictures):
+    if count > matching + len(pictures):
         found += f"; {count} markers of {name.partition('_')[0]} are seen"
         remedy = f"--dictionary {name}?"
     raise NothingToEstimate("no-board", found, allowed="pictures of the board that is named", remedy=remedy)
@@ -189,14 +189,14 @@ def marker_board_corners(grey: np.ndarray, markers: Markers) -> np.ndarray | Non
 
     Args:
         grey: (height, width) uint8.
-        markers: with their size, of `as_seen`.
+        markers: with their size, of `fitted_markers`.
     """
     columns, rows = markers.squares[0] - 1, markers.squares[1] - 1
-    found, numbers, *_ = cv2.aruco.CharucoDetector(markers.board()).detectBoard(grey)
+    detected, numbers, *_ = cv2.aruco.CharucoDetector(markers.board()).detectBoard(grey)
     if numbers is None or len(numbers) < CORNERS_MIN:
         return None
     corners = np.full((rows * columns, 2), np.nan)
-    corners[np.ravel(numbers)] = np.asarray(found, float).reshape(-1, 2)
+    corners[np.ravel(numbers)] = np.asarray(detected, float).reshape(-1, 2)
     grid = corners.reshape(rows, columns, 2)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2) for axis in (0, 1)]
     if not any(np.isfinite(step).any() for step in steps):

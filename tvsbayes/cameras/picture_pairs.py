@@ -291,7 +291,7 @@ def _stated_pairs(folder: Path, pairing: Pairing, most: int, bad: Callable[..., 
 def _by_side(names: Sequence[str], keys: Sequence[_Key | None]) -> dict[str, list[str]]:
     """Names of each camera."""
     sided = [(name, key[1]) for name, key in zip(names, keys, strict=True) if key is not None]
-    return {side: [name for name, own in sided if own == side] for side in CAMERAS}
+    return {side: [name for name, camera in sided if camera == side] for side in CAMERAS}
 
 
 def _in_order(folder: Path, groups: Sequence[Sequence[str]]) -> list[Picture]:

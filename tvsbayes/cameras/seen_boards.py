@@ -33,8 +33,8 @@ def shrunk(grey: np.ndarray) -> np.ndarray:
 
 def inner_corners(grey: np.ndarray) -> tuple[int, int] | None:
     """Inner corners of the checkerboard in a picture, the longer side first; None where none is seen."""
-    found, _, meta = cv2.findChessboardCornersSBWithMeta(shrunk(grey), SMALLEST, cv2.CALIB_CB_LARGER)
-    if not found or meta is None or np.ndim(meta) != 2:
+    detected, _, meta = cv2.findChessboardCornersSBWithMeta(shrunk(grey), SMALLEST, cv2.CALIB_CB_LARGER)
+    if not detected or meta is None or np.ndim(meta) != 2:
         return None
     rows, columns = sorted(np.shape(meta))
     return int(columns), int(rows)
@@ -49,11 +49,15 @@ def why_no_board(pictures: Sequence[np.ndarray], columns: int, rows: int) -> tup
         rows: along the other.
     """
     wanted = (max(columns, rows), min(columns, rows))
-    seen = Counter(size for grey in pictures if (size := inner_corners(grey)) is not None)
-    if seen:
-        (long, short), count = seen.most_common(1)[0]
-        listed = ", ".join(f"{a}x{b}" for a, b in seen)
-        if len(seen) > 1 and 2 * count <= seen.total() and all(a <= wanted[0] and b <= wanted[1] for a, b in seen):
+    boards = Counter(size for grey in pictures if (size := inner_corners(grey)) is not None)
+    if boards:
+        (long, short), count = boards.most_common(1)[0]
+        listed = ", ".join(f"{a}x{b}" for a, b in boards)
+        if (
+            len(boards) > 1
+            and 2 * count <= boards.total()
+            and all(a <= wanted[0] and b <= wanted[1] for a, b in boards)
+        ):
             return (
                 f"parts of a board are seen, {listed} inner corners of {wanted[0]}x{wanted[1]}: partly outside?",
                 "hold the whole board into both pictures; or is it smaller: count where four squares meet",

@@ -286,10 +286,10 @@ def with_own_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
     y = np.arange(low[1], high[1], dtype=np.float32)[:, None] - np.float32(fitted.centre_px[1] - patch.corner[1])
     (p, q), (_, r) = fitted.precision.astype(np.float32)
     signal = np.float32(fitted.height_dn) * np.exp(-(p * x * x + 2 * q * x * y + r * y * y) / 2)
-    own = pixel_noise(raw - signal, signal, raw < CLIPPED_DN, patch.background_variance, patch.mono)
-    patch = replace(patch, background_variance=own.background_dn2)
+    pixels = pixel_noise(raw - signal, signal, raw < CLIPPED_DN, patch.background_variance, patch.mono)
+    patch = replace(patch, background_variance=pixels.background_dn2)
     skew = skewness(fitted, patch)[:, 0]
-    return patch, replace(own.noise, skew=tuple(np.clip(skew, -SKEW_SHAPE_MAX, SKEW_SHAPE_MAX).tolist()))
+    return patch, replace(pixels.noise, skew=tuple(np.clip(skew, -SKEW_SHAPE_MAX, SKEW_SHAPE_MAX).tolist()))
 
 
 def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:

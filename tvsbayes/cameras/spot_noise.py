@@ -120,18 +120,20 @@ def pixel_noise(
     """
     from scipy.optimize import nnls
 
-    lag, own = (1, 1.0) if mono else (3, float(_CORRELATION[2, 2]))
+    lag, single = (1, 1.0) if mono else (3, float(_CORRELATION[2, 2]))
     rows = []
     for axis in (0, 1):
         length = residual.shape[axis]
         if length <= 2 * lag:
             continue
         parts = [np.arange(k * lag, length - (2 - k) * lag) for k in range(3)]
-        before, here, after = (np.take(residual, part, axis) for part in parts)
-        seen = np.logical_and.reduce([np.take(usable, part, axis) for part in parts])
+        before, middle, after = (np.take(residual, part, axis) for part in parts)
+        counted = np.logical_and.reduce([np.take(usable, part, axis) for part in parts])
         # Of one value and two halves of others: 1 + 1/4 + 1/4.
         rows.append(
-            np.stack(((here - (before + after) / 2)[seen] ** 2 / 1.5 / own, np.take(signal, parts[1], axis)[seen]))
+            np.stack(
+                ((middle - (before + after) / 2)[counted] ** 2 / 1.5 / single, np.take(signal, parts[1], axis)[counted])
+            )
         )
     squares, light = np.hstack(rows) if rows else np.empty((2, 0))
     if len(light) < OWN_PIXELS_MIN:
@@ -150,11 +152,11 @@ def pixel_noise(
     return PixelNoise(SpotNoise(max(float(gain), OWN_GAIN_MIN_DN), float(np.sqrt(contrast2))), background)
 
 
-def mean_noise(found: Sequence[SpotNoise]) -> SpotNoise:
+def mean_noise(noises: Sequence[SpotNoise]) -> SpotNoise:
     """One camera's noise from that of a few pictures: means of variances, the middle of the shapes."""
-    gain = float(np.mean([noise.gain_dn for noise in found]))
-    contrast = float(np.sqrt(np.mean([noise.speckle_contrast**2 for noise in found])))
-    return SpotNoise(gain, contrast, tuple(np.median([noise.skew for noise in found], axis=0).tolist()))
+    gain = float(np.mean([noise.gain_dn for noise in noises]))
+    contrast = float(np.sqrt(np.mean([noise.speckle_contrast**2 for noise in noises])))
+    return SpotNoise(gain, contrast, tuple(np.median([noise.skew for noise in noises], axis=0).tolist()))
 
 
 def is_mono(picture: np.ndarray) -> bool:

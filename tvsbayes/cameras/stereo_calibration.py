@@ -27,8 +27,8 @@ from tvsbayes.cameras.stereo_start import (
     pairs_disagree,
     pixels_of,
     pose_of,
-    seen_in,
     start_of,
+    visible_corners,
 )
 from tvsbayes.errors import TvsError, escaped
 from tvsbayes.instrument.campaign import CAMERAS
@@ -84,7 +84,7 @@ class StereoCalibration:
         covariance_pitch: (24, 24), type B, from the pitch: scales T.
         coverage: share of the image inside the boards, by camera.
         triangulated_pitch_mm: mean and standard deviation of all sides of squares, triangulated.
-        found: what the folder held; None where corners were given.
+        pictures: what the folder held; None where corners were given.
         excluded: names of outlying views that were left out: no pairs at all, or by `robust`.
         reordered: names of views whose right corners were put into another order, to agree with the left ones.
         alone_rms_px: what each camera by itself would leave, rms over corners as in `stereo.rms_px`.
@@ -106,7 +106,7 @@ class StereoCalibration:
     covariance_pitch: np.ndarray
     coverage: dict[str, float]
     triangulated_pitch_mm: tuple[float, float]
-    found: Views | None
+    pictures: Views | None
     excluded: tuple[str, ...]
     reordered: tuple[str, ...]
     alone_rms_px: float
@@ -133,7 +133,6 @@ class StereoCalibration:
             "sd_pitch": np.sqrt(np.diag(self.covariance_pitch)),
         }
         vector = self.stereo.vector
-        found = self.found
         lists = ("unpaired", "without_board", "other_size", "by_fallback")
         return {
             "image_width": self.stereo.image_width,
@@ -163,7 +162,7 @@ class StereoCalibration:
             "outliers": list(self.outliers),
             "excluded": list(self.excluded),
             "reordered": list(self.reordered),
-            **{key: list(getattr(found, key)) if found is not None else [] for key in lists},
+            **{key: list(getattr(self.pictures, key)) if self.pictures is not None else [] for key in lists},
             "warnings": list(self.warnings),
             "assumed": self.stereo.assumed,
             "seconds": self.seconds,
@@ -183,7 +182,7 @@ def calibrate_stereo(
     *,
     fix_k3: bool = False,
     robust: bool = False,
-    found: Views | None = None,
+    pictures: Views | None = None,
 ) -> StereoCalibration:
     """Calibrates a stereo pair from corners.
 
@@ -194,7 +193,7 @@ def calibrate_stereo(
         fix_k3: keep both k3 at 0.
         robust: leave out outlying views and adjust again, once. Views whose two pictures cannot show one board (of
             two moments, say) are left out in any case: nothing fits them.
-        found: what the folder held, for the report.
+        pictures: what the folder held, for the report.
 
     Raises:
         NothingToEstimate: fewer than `VIEWS_MIN` views of a camera, no pair, or views that leave parameters open.
@@ -209,7 +208,7 @@ def calibrate_stereo(
     pitch[21:, 21:] = np.outer(shift, shift)
     rms, nothing = _rms(adjustment.residuals_px), np.zeros(1)
     bare = Stereo(*size, nothing, nothing, nothing, nothing, nothing, nothing, pitch, rms)
-    bare = replace(bare, right_image_size=None if found is None else found.right_image_size)
+    bare = replace(bare, right_image_size=None if pictures is None else pictures.right_image_size)
     stereo = bare.with_vector(adjustment.vector)
     errors = board_errors(adjustment, done.views, board, stereo)
     covariance = errors.correlation_factor * adjustment.covariance + errors.covariance + pitch
@@ -230,9 +229,9 @@ def calibrate_stereo(
         covariance_pitch=pitch,
         coverage={side: _coverage([getattr(v, side) for v in done.views], size) for side in CAMERAS},
         triangulated_pitch_mm=_triangulated_pitch(done.views, board, stereo),
-        found=found,
+        pictures=pictures,
         excluded=done.excluded,
-        reordered=_reordered(found, done.turned),
+        reordered=_reordered(pictures, done.turned),
         alone_rms_px=done.alone_rms_px,
         warnings=(),
         seconds={"adjustment": time.perf_counter() - began},
@@ -303,9 +302,9 @@ def _lowest_adjustment(start: Start, board: Board, size: tuple[int, int], free: 
     return again if failed is not None else min(done, again, key=lambda one: one.noise_sd_px)
 
 
-def _reordered(found: Views | None, turned: tuple[str, ...]) -> tuple[str, ...]:
+def _reordered(pictures: Views | None, turned: tuple[str, ...]) -> tuple[str, ...]:
     """Views that by direction or by agreement, not by both, were put into another order: two half turns are none."""
-    before = () if found is None else found.reordered
+    before = () if pictures is None else pictures.reordered
     return (*(name for name in before if name not in turned), *(name for name in turned if name not in before))
 
 
@@ -331,11 +330,11 @@ def calibrate_folder(
     began = time.perf_counter()
     with Job(STAGES, progress) as job:
         job.begin(FINDING)
-        found = find_views(folder, board, finder=finder, pairing=pairing, advance=job.at)
+        pictures = find_views(folder, board, finder=finder, pairing=pairing, advance=job.at)
         seconds = {"corners": time.perf_counter() - began}
-        size = (found.image_width, found.image_height)
+        size = (pictures.image_width, pictures.image_height)
         job.begin(ADJUSTING)
-        result = calibrate_stereo(found.views, board, size, fix_k3=fix_k3, robust=robust, found=found)
+        result = calibrate_stereo(pictures.views, board, size, fix_k3=fix_k3, robust=robust, pictures=pictures)
         return replace(result, seconds=seconds | result.seconds)
 
 
@@ -374,10 +373,10 @@ def _coverage(corners: Sequence[np.ndarray | None], size: tuple[int, int]) -> fl
     """Share of the image inside the outline of a board in at least one view."""
     scale = 256 / max(size)
     mask = np.zeros([max(1, round(s * scale)) for s in size[::-1]], np.uint8)
-    for seen in corners:
-        if seen is not None:
-            there = seen[np.isfinite(seen).all(axis=1)]
-            outline = cv2.convexHull(np.rint(there * scale).astype(np.int32).reshape(-1, 1, 2))
+    for pixels in corners:
+        if pixels is not None:
+            visible = pixels[np.isfinite(pixels).all(axis=1)]
+            outline = cv2.convexHull(np.rint(visible * scale).astype(np.int32).reshape(-1, 1, 2))
             cv2.fillConvexPoly(mask, outline, 1)
     return float(mask.mean())
 
@@ -389,12 +388,12 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
     for view in views:
         if view.left is None or view.right is None:
             continue
-        both = seen_in(view.left, view.right)
+        both = visible_corners(view.left, view.right)
         if not both.any():
             continue
         rays = [
-            cv2.undistortPoints(pixels_of(seen[both]), M, D).reshape(-1, 2).T
-            for seen, M, D in ((view.left, stereo.M1, stereo.D1), (view.right, stereo.M2, stereo.D2))
+            cv2.undistortPoints(pixels_of(pixels[both]), M, D).reshape(-1, 2).T
+            for pixels, M, D in ((view.left, stereo.M1, stereo.D1), (view.right, stereo.M2, stereo.D2))
         ]
         points = np.asarray(cv2.triangulatePoints(np.eye(3, 4), right, *rays))
         grid = np.full((board.corners, 3), np.nan)

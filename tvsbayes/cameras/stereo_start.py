@@ -82,23 +82,25 @@ def start_of(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3:
         corners = {k: getattr(v, side) for k, v in enumerate(views) if getattr(v, side) is not None}
         cameras.append(camera_start(corners, board, size, side, fix_k3))
     left, right = cameras
-    found = _relation(views, board, left, right, MISMATCH_SHARE * size[0])
-    limit = max(MISMATCH_TIMES * found.usual_px, MISMATCH_SHARE * size[0])
-    off = [k for k, miss in found.misses.items() if miss > limit]
-    if found.usual_px > DISAGREE_SHARE * size[0]:
-        agreeing = [escaped(views[k].name, 40) for k, miss in found.misses.items() if miss <= MISMATCH_SHARE * size[0]]
-        reason = f"most of the {len(found.misses)} pairs miss by {found.usual_px:.0f} px and more"
+    relation = _relation(views, board, left, right, MISMATCH_SHARE * size[0])
+    limit = max(MISMATCH_TIMES * relation.usual_px, MISMATCH_SHARE * size[0])
+    off = [k for k, miss in relation.misses.items() if miss > limit]
+    if relation.usual_px > DISAGREE_SHARE * size[0]:
+        agreeing = [
+            escaped(views[k].name, 40) for k, miss in relation.misses.items() if miss <= MISMATCH_SHARE * size[0]
+        ]
+        reason = f"most of the {len(relation.misses)} pairs miss by {relation.usual_px:.0f} px and more"
         raise pairs_disagree(reason + (f"; only {', '.join(agreeing)} agree" if len(agreeing) > 1 else ""))
-    rotation, shift = rotation_matrix(found.pose[:3]), found.pose[3:]
+    rotation, shift = rotation_matrix(relation.pose[:3]), relation.pose[3:]
     poses, agreed, turned = [], list(views), []
     for k, view in enumerate(views):
         poses.append(left.poses[k] if k in left.poses else left_pose(right.poses[k], rotation, shift))
-        if found.orders.get(k, 0) and k not in off:
+        if relation.orders.get(k, 0) and k not in off:
             assert view.right is not None
-            agreed[k] = replace(view, right=view.right[corner_orders(board)[found.orders[k]]])
+            agreed[k] = replace(view, right=view.right[corner_orders(board)[relation.orders[k]]])
             turned.append(view.name)
     return Start(
-        vector=np.concatenate([left.vector, right.vector, found.pose]),
+        vector=np.concatenate([left.vector, right.vector, relation.pose]),
         poses=np.array(poses),
         views=tuple(agreed),
         turned=tuple(turned),
@@ -115,15 +117,15 @@ def opencv_start(start: Start, board: Board, size: tuple[int, int], fix_k3: bool
     """
     pairs = [k for k, view in enumerate(start.views) if view.left is not None and view.right is not None]
     pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, START_VIEWS).astype(int))]
-    both = [seen_in(start.views[k].left, start.views[k].right) for k in pairs]
-    kept = [place for place, seen in enumerate(both) if seen.sum() >= POSE_CORNERS_MIN]
+    both = [visible_corners(start.views[k].left, start.views[k].right) for k in pairs]
+    kept = [place for place, visible in enumerate(both) if visible.sum() >= POSE_CORNERS_MIN]
     pairs, both = [pairs[place] for place in kept], [both[place] for place in kept]
     left, right = (
-        [np.asarray(getattr(start.views[k], side)[seen], np.float32) for k, seen in zip(pairs, both, strict=True)]
+        [np.asarray(getattr(start.views[k], side)[visible], np.float32) for k, visible in zip(pairs, both, strict=True)]
         for side in CAMERAS
     )
     pair = Stereo(*size, *(np.zeros(1),) * 6, np.zeros((24, 24)), 0.0).with_vector(start.vector)
-    points = [board.points_mm[seen].astype(np.float32) for seen in both]
+    points = [board.points_mm[visible].astype(np.float32) for visible in both]
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
     try:
         _, *inner, turn, shift, _, _, turns, shifts, _ = cv2.stereoCalibrateExtended(
@@ -139,9 +141,11 @@ def opencv_start(start: Start, board: Board, size: tuple[int, int], fix_k3: bool
     vector = np.concatenate([cameras[0].vector, cameras[1].vector, *outer])
     if not np.isfinite(vector).all():
         raise undetermined("OpenCV found no finite pair")
-    found = pair.with_vector(vector)
-    own = {k: np.concatenate([np.ravel(t), np.ravel(s)]) for k, t, s in zip(pairs, turns, shifts, strict=True)}
-    poses = [own[k] if k in own else pose_of(view, board, found) for k, view in enumerate(start.views)]
+    calibrated = pair.with_vector(vector)
+    board_poses = {k: np.concatenate([np.ravel(t), np.ravel(s)]) for k, t, s in zip(pairs, turns, shifts, strict=True)}
+    poses = [
+        board_poses[k] if k in board_poses else pose_of(view, board, calibrated) for k, view in enumerate(start.views)
+    ]
     return replace(start, vector=vector, poses=np.array(poses))
 
 
@@ -169,15 +173,15 @@ def camera_start(
         )
     keys = sorted(corners)
     chosen = [keys[k] for k in np.unique(np.linspace(0, len(keys) - 1, START_VIEWS).astype(int))]
-    points = [board.points_mm[seen_in(corners[k])].astype(np.float32) for k in chosen]
-    found = [np.ascontiguousarray(corners[k][seen_in(corners[k])], np.float32) for k in chosen]
-    start = _zhang(points, found, size, side, cv2.CALIB_FIX_K3 if fix_k3 else 0)
+    points = [board.points_mm[visible_corners(corners[k])].astype(np.float32) for k in chosen]
+    pixels = [np.ascontiguousarray(corners[k][visible_corners(corners[k])], np.float32) for k in chosen]
+    start = _zhang(points, pixels, size, side, cv2.CALIB_FIX_K3 if fix_k3 else 0)
     if start.rms_px > DOUBTFUL_START_PX:
         # Wide lenses have local minima: k1 alone first, then all from there.
         simple = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_PRINCIPAL_POINT
-        first = _zhang(points, found, size, side, simple)
+        first = _zhang(points, pixels, size, side, simple)
         flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
-        start = min(start, _zhang(points, found, size, side, flags, first), key=lambda one: one.rms_px)
+        start = min(start, _zhang(points, pixels, size, side, flags, first), key=lambda one: one.rms_px)
     matrix, distortion = start.matrix, start.distortion
     poses = {k: board_pose(corners[k], board, matrix, distortion) for k in keys}
     return replace(start, poses=poses)
@@ -185,7 +189,7 @@ def camera_start(
 
 def _zhang(
     points: Sequence[np.ndarray],
-    found: Sequence[np.ndarray],
+    pixels: Sequence[np.ndarray],
     size: tuple[int, int],
     side: str,
     flags: int,
@@ -198,7 +202,7 @@ def _zhang(
     """
     matrix, distortion = (None, None) if first is None else (first.matrix.copy(), first.distortion.copy())
     try:
-        rms, matrix, distortion, *_ = cv2.calibrateCamera(points, found, size, matrix, distortion, flags=flags)
+        rms, matrix, distortion, *_ = cv2.calibrateCamera(points, pixels, size, matrix, distortion, flags=flags)
     except cv2.error as error:
         raise undetermined(f"OpenCV found no start for the {side} camera ({escaped(str(error.err), 100)})") from error
     matrix, distortion = np.asarray(matrix, float), np.asarray(distortion, float).ravel()[:5]
@@ -242,12 +246,12 @@ def _relation(views: Sequence[View], board: Board, left: CameraStart, right: Cam
             remedy="name the pictures of one moment alike: left01.png and right01.png",
         )
     orders = corner_orders(board)
-    own = np.linalg.lstsq(board.points_mm[:, :2], np.hstack([board.points_mm[order, :2] for order in orders]))[0]
+    turns = np.linalg.lstsq(board.points_mm[:, :2], np.hstack([board.points_mm[order, :2] for order in orders]))[0]
 
     def relative(k: int, order: int) -> np.ndarray:
         # Corner i in another order is another corner of the board, which is then turned in its plane.
         turn = np.eye(3)
-        turn[:2, :2] = own[:, 2 * order : 2 * order + 2].T
+        turn[:2, :2] = turns[:, 2 * order : 2 * order + 2].T
         rotation = rotation_matrix(right.poses[k][:3]) @ turn @ rotation_matrix(left.poses[k][:3]).T
         return np.concatenate([rotation_vector(rotation), right.poses[k][3:] - rotation @ left.poses[k][3:]])
 
@@ -259,13 +263,13 @@ def _relation(views: Sequence[View], board: Board, left: CameraStart, right: Cam
             misses[k] = float(by_order[nearest[k]])
         return _Relation(pose, misses, nearest)
 
-    found = judged(_median_pose([relative(k, 0) for k in pairs]))
-    if found.usual_px > limit_px and len(pairs) > 2:
+    agreed = judged(_median_pose([relative(k, 0) for k in pairs]))
+    if agreed.usual_px > limit_px and len(pairs) > 2:
         tried = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, START_VIEWS).astype(int))]
         best = min((judged(relative(k, t)) for k in tried for t in range(len(orders))), key=lambda one: one.usual_px)
         near = [k for k in pairs if best.misses[k] <= best.usual_px]
-        found = min(best, judged(_median_pose([relative(k, best.orders[k]) for k in near])), key=lambda r: r.usual_px)
-    return found
+        agreed = min(best, judged(_median_pose([relative(k, best.orders[k]) for k in near])), key=lambda r: r.usual_px)
+    return agreed
 
 
 def _median_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
@@ -276,8 +280,8 @@ def _median_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
 def _misses(view: View, board: Board, pose: np.ndarray, relation: np.ndarray, right: CameraStart) -> np.ndarray:
     """By corner order, how far the right corners lie from where a board's left pose puts them, rms, px."""
     rotation, shift = rotation_matrix(relation[:3]), relation[3:]
-    seen = rotation_vector(rotation @ rotation_matrix(pose[:3])), rotation @ pose[3:] + shift
-    pixels, _ = cv2.projectPoints(board.points_mm, *seen, right.matrix, right.distortion)
+    predicted = rotation_vector(rotation @ rotation_matrix(pose[:3])), rotation @ pose[3:] + shift
+    pixels, _ = cv2.projectPoints(board.points_mm, *predicted, right.matrix, right.distortion)
     assert view.right is not None
     ordered = np.stack([view.right[order] for order in corner_orders(board)])
     return np.sqrt(np.nanmean(np.sum((ordered - np.reshape(pixels, (-1, 2))) ** 2, axis=2), axis=1))
@@ -285,8 +289,8 @@ def _misses(view: View, board: Board, pose: np.ndarray, relation: np.ndarray, ri
 
 def board_pose(corners: np.ndarray, board: Board, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     """Board to camera, shape (6,), from one picture: IPPE (Collins and Bartoli 2014), then least squares in px."""
-    seen = seen_in(corners)
-    points, pixels = board.points_mm[seen], pixels_of(corners[seen])
+    visible = visible_corners(corners)
+    points, pixels = board.points_mm[visible], pixels_of(corners[visible])
     done, turn, shift = cv2.solvePnP(points, pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
     if not done or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
         raise undetermined("a board has no pose that OpenCV can find")
@@ -309,7 +313,7 @@ def left_pose(right_pose: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np
     return np.concatenate([rotation, turn.T @ (right_pose[3:] - shift)])
 
 
-def seen_in(*corners: np.ndarray | None) -> np.ndarray:
+def visible_corners(*corners: np.ndarray | None) -> np.ndarray:
     """Which corners (corners,) all of some pictures show."""
     return np.logical_and.reduce([np.isfinite(one).all(axis=1) for one in corners if one is not None])
 

@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import BinaryIO
 
 import numpy as np
 
@@ -76,17 +76,9 @@ def _numbers(block: CloudBlock, names: Sequence[str]) -> np.ndarray:
     return np.concatenate([*parts, *(block.simple_xyz_mm[name] for name in names)], axis=1)
 
 
-class _Body(Protocol):
-    """How the points of a format are written."""
-
-    def add(self, stream: BinaryIO, block: CloudBlock, names: Sequence[str]) -> None:
-        """A block's."""
-
-    def header(self, names: Sequence[str], points: int) -> bytes:
-        """What comes before all of them."""
-
-
 class _Csv:
+    """Points as lines of text."""
+
     def add(self, stream: BinaryIO, block: CloudBlock, names: Sequence[str]) -> None:
         text = io.StringIO(newline="")
         writer = csv.writer(text, lineterminator="\n")
@@ -103,6 +95,8 @@ class _Csv:
 
 
 class _Ply:
+    """Points as records of binary little-endian PLY."""
+
     def add(self, stream: BinaryIO, block: CloudBlock, names: Sequence[str]) -> None:
         *numbers, flag, line = columns_of(names)
         rows = np.zeros(len(block.lines), [*((name, "<f4") for name in numbers), (flag, "u1"), (line, "<i4")])
@@ -175,7 +169,7 @@ def write_cloud(blocks: Iterable[CloudBlock], path: Path, names: Sequence[str]) 
         InputError: of another ending, or the place cannot be written to or is full; what the blocks raise passes
             through.
     """
-    body: _Body = FORMATS[cloud_place(path).suffix.lower()]()
+    body = FORMATS[cloud_place(path).suffix.lower()]()
     points = extrapolated = 0
     refused: list[tuple[int, str, str]] = []
     # How many points there are stands before them and is known after. They wait on the disk that must hold them anyway.

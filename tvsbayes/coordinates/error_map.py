@@ -168,9 +168,9 @@ def error_map(
         pan_steps=axes[0],
         tilt_steps=axes[1],
         range_mm=axes[2],
-        rms_mm={name: found.rms_mm.reshape(shape) for name, found in errors.items()},
-        bias_mm={name: found.bias_mm.reshape(*shape, 3) for name, found in errors.items()},
+        rms_mm={name: part.rms_mm.reshape(shape) for name, part in errors.items()},
+        bias_mm={name: part.bias_mm.reshape(*shape, 3) for name, part in errors.items()},
         inside=inside.reshape(shape),
-        valid=np.all([found.usable for found in errors.values()], axis=0).reshape(shape),
-        distance_mm={name: found.distance_mm.reshape(-1, *shape) for name, found in errors.items()},
+        valid=np.all([part.usable for part in errors.values()], axis=0).reshape(shape),
+        distance_mm={name: part.distance_mm.reshape(-1, *shape) for name, part in errors.items()},
     )

@@ -188,13 +188,13 @@ def settings_of(
     return Settings(np.stack([pan, tilt], axis=1), side, np.array(reading))
 
 
-def carry(calibration: Calibration, found: Drawn, settings: Settings) -> Carried:
+def carry(calibration: Calibration, rigs: Drawn, settings: Settings) -> Carried:
     """Every draw through the geometry for every point."""
-    noise = found.noise.T[:, :, None]
-    xyz = np.empty((len(found.inputs), len(settings.steps), 3))
+    noise = rigs.noise.T[:, :, None]
+    xyz = np.empty((len(rigs.inputs), len(settings.steps), 3))
     for rows in settings.of_one_approach():
         steps, side = settings.steps[rows].T, settings.side[rows[0]]
-        values = found.values_at(calibration, (steps[0], steps[1]))
+        values = rigs.values_at(calibration, (steps[0], steps[1]))
         points = calibration.points(values, noise, (steps[0], steps[1]), (*side,), settings.aperture_deg[rows])
         xyz[:, rows] = points.transpose(1, 2, 0)
     return Carried(xyz)

@@ -138,7 +138,7 @@ class GrblPositioner:
         try:
             self.identity: dict[str, str] = {"fw": self._greeting(), "driver": "grbl"}
             values: dict[int, float] = {}
-            self._order("$$", REPLY_S, lambda line: values.update([found]) if (found := parse_setting(line)) else None)
+            self._order("$$", REPLY_S, lambda line: values.update([one]) if (one := parse_setting(line)) else None)
             self._board = BoardSettings.of(values, self._wishes.laser)
             if (self._wishes.laser_power or 0.0) > self._board.power_max:
                 # The board would take it for full power.
@@ -305,7 +305,7 @@ class GrblPositioner:
 
     def _laser_on(self) -> bool:
         modes: list[frozenset[str]] = []
-        self._order("$G", REPLY_S, lambda line: modes.append(found) if (found := parse_modes(line)) else None)
+        self._order("$G", REPLY_S, lambda line: modes.append(one) if (one := parse_modes(line)) else None)
         if not modes:
             raise fault("no-answer", "$G was answered without modes", "check the board's firmware: GRBL 1.1 is known")
         # Both coolants may be on at once; M5 and M9 stand for darkness.

@@ -135,17 +135,17 @@ class BoardSettings:
         }
         for number, (value, why) in wanted.items():
             # grblHAL keeps more switches in the bits of $22; the first is the one meant.
-            found = values.get(number)
-            good = found is not None and (int(found) & 1 if number == 22 else found == value)
+            setting = values.get(number)
+            good = setting is not None and (int(setting) & 1 if number == 22 else setting == value)
             if not good:
-                raise _unfit(number, found, f"{value:g}: {why}")
+                raise _unfit(number, setting, f"{value:g}: {why}")
         if not int(values.get(10, 0)) & 1:
             raise _unfit(10, values.get(10), "an odd number, such as 1: machine positions in the status")
         for number in (100, 101, 110, 111, 120, 121):
             high = STEPS_PER_MM_MAX if number < 110 else 1e9
-            found = values.get(number)
-            if found is None or not 0 < found <= high:
-                raise _unfit(number, found, f"more than 0, at most {high:g}")
+            setting = values.get(number)
+            if setting is None or not 0 < setting <= high:
+                raise _unfit(number, setting, f"more than 0, at most {high:g}")
         steps, rates = (values[100], values[101]), (values[110], values[111])
         pairs = zip(rates, (values[120], values[121]), strict=True)
         ramps_s = max(2 * rate / 60 / acceleration for rate, acceleration in pairs)

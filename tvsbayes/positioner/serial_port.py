@@ -40,8 +40,8 @@ def serial_ports() -> list[Port]:
     """The serial ports of this computer, by name."""
     from serial.tools import list_ports
 
-    found = (Port(p.device, p.description or "", p.vid, p.pid, p.serial_number or "") for p in list_ports.comports())
-    return sorted(found, key=lambda port: port.name)
+    ports = (Port(p.device, p.description or "", p.vid, p.pid, p.serial_number or "") for p in list_ports.comports())
+    return sorted(ports, key=lambda port: port.name)
 
 
 def _ports_of(device: Port) -> list[str]:

@@ -217,7 +217,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
         "boards cover "
         + ", ".join(f"{100 * share:.0f} % of the {side} image" for side, share in result.coverage.items()),
     ]
-    if (found := result.found) is not None:
+    if (found := result.pictures) is not None:
         lists = {
             "without their counterpart": found.unpaired,
             "names tell no camera, not used": found.unnamed,

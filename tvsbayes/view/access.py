@@ -70,11 +70,11 @@ class Access:
         Args:
             headers: of the request.
         """
-        own = [f"{host}:{self.port}" for host in HOSTS]
-        if headers.get("Host", "") not in own:
+        hosts = [f"{host}:{self.port}" for host in HOSTS]
+        if headers.get("Host", "") not in hosts:
             return "this server answers to 127.0.0.1 and localhost only"
         origin = headers.get("Origin")
-        if origin is not None and origin not in [f"http://{host}" for host in own]:
+        if origin is not None and origin not in [f"http://{host}" for host in hosts]:
             return "another page asked"
         if headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
             return "another page asked"

@@ -21,7 +21,7 @@ NOT_OF_THESE = (
 
 
 @dataclass(frozen=True)
-class Found:
+class StoredCampaign:
     """A campaign with what its results say; `fitted` is None, and `note` says why, where there are none to use."""
 
     campaign: Campaign
@@ -29,7 +29,7 @@ class Found:
     note: str | None
 
 
-def found_in(folder: Path) -> Found:
+def stored_campaign(folder: Path) -> StoredCampaign:
     """A campaign folder and its results.
 
     Raises:
@@ -41,10 +41,10 @@ def found_in(folder: Path) -> Found:
     fit = None if record is None else results.stored_fit
     if record is None or calibration is None or fit is None:
         stored = (Path(folder) / "results" / "fit.json").exists()
-        return Found(campaign, None, NOT_OF_THESE if stored else NOT_FITTED)
+        return StoredCampaign(campaign, None, NOT_OF_THESE if stored else NOT_FITTED)
     from tvsbayes.assessment.residuals import stop_residuals
 
-    return Found(campaign, Fitted(fit, record, stop_residuals(fit), gear_bands(calibration)), None)
+    return StoredCampaign(campaign, Fitted(fit, record, stop_residuals(fit), gear_bands(calibration)), None)
 
 
 def look_at(folder: Path, beside: Path | None = None, tell: Tell = untold) -> Looked:
@@ -59,9 +59,9 @@ def look_at(folder: Path, beside: Path | None = None, tell: Tell = untold) -> Lo
         InputError: no campaign, or damaged results.
     """
     compile_for(tell)
-    found = [found_in(one) for one in (folder, beside) if one is not None]
-    scenes = tuple(scene(one.campaign, one.fitted, [one.note] if one.note else []) for one in found)
-    fits = [one.fitted.fit for one in found if one.fitted is not None]
+    campaigns = [stored_campaign(one) for one in (folder, beside) if one is not None]
+    scenes = tuple(scene(one.campaign, one.fitted, [one.note] if one.note else []) for one in campaigns)
+    fits = [one.fitted.fit for one in campaigns if one.fitted is not None]
     if len(fits) < 2:
         return Looked(scenes)
     from tvsbayes.comparison.changes import compare

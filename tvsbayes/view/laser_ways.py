@@ -85,5 +85,5 @@ def laser_ways(z: np.ndarray, turned_rad: np.ndarray, space: ParameterSpace, arr
     filled = np.zeros((-(-count // size) * size, 2))
     filled[:count] = turned_rad
     parts = [_window(z, filled[k : k + size], space, arrays, np.int32(k)) for k in range(0, count, size)]
-    joined = jax.tree.map(lambda *own: np.concatenate(own, axis=1)[:, :count], *parts)
+    joined = jax.tree.map(lambda *arrays_of: np.concatenate(arrays_of, axis=1)[:, :count], *parts)
     return replace(joined, origin_mm=np.asarray(parts[0].origin_mm))

@@ -23,7 +23,7 @@ SAFER = ("pause", "laser off")
 class Watched(Protocol):
     """What a page reads of a run and asks of it; called by the server's thread, so no call may wait for the run."""
 
-    def told(self) -> dict[str, Any]:
+    def document(self) -> dict[str, Any]:
         """The newest snapshot, as JSON holds it."""
 
     def picture(self, spot: int, camera: str, kind: str) -> bytes | None:
@@ -123,9 +123,9 @@ class Now(Guarded):
     def get(self) -> None:
         """As JSON; `controls` says whether this browser may ask for everything."""
         self.set_header("Content-Type", "application/json")
-        told = {**self.live.told(), "controls": self.access.controls(self.request.headers)}
-        self.finish(json.dumps(told, allow_nan=False))
-        self.read(told["number"])
+        document = {**self.live.document(), "controls": self.access.controls(self.request.headers)}
+        self.finish(json.dumps(document, allow_nan=False))
+        self.read(document["number"])
 
 
 class Ask(Guarded):
@@ -152,14 +152,14 @@ class LivePicture(Guarded):
 
     def get(self, spot: str, camera: str, kind: str) -> None:
         """As JPEG; nothing where there is none any more."""
-        found = self.live.picture(int(spot), camera, kind)
-        if found is None:
+        picture = self.live.picture(int(spot), camera, kind)
+        if picture is None:
             # A newer look has taken its place meanwhile: no fault of anybody's.
             self.set_status(204)
             self.finish()
             return
         self.set_header("Content-Type", "image/jpeg")
-        self.finish(found)
+        self.finish(picture)
 
 
 def application(files: Files, access: Access, live: Watched, read: Callable[[int], None]) -> web.Application:

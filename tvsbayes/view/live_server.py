@@ -174,7 +174,7 @@ class LivePage:
     def _linger(self) -> None:
         """Let the browsers that are there see how it ended."""
         until = time.monotonic() + LINGER_S
-        last = self._live.told()["number"]
+        last = self._live.document()["number"]
         while time.monotonic() < until and self._thread.is_alive():
             since_s = time.monotonic() - self._read_s
             if since_s > (PICTURES_S if self._number == last else READER_S):

@@ -59,7 +59,7 @@ def _scene(shown: Scene, pictures: Pictures) -> dict[str, object]:
         "notes": list(shown.notes),
         "image_px": list(shown.image_px),
         "looks": _looks(shown.looks),
-        "pictures": {str(spot): plain(own) for spot, own in pictures.items()},
+        "pictures": {str(spot): plain(by_camera) for spot, by_camera in pictures.items()},
         "pictured": len(pictures),
         "rig": {"cameras": plain(shown.cameras), "sheets": plain(shown.sheets), "origin_mm": _bare(shown.origin_mm)},
         "gears": gears,
@@ -77,7 +77,7 @@ def document(looked: Looked, pictures: Sequence[Pictures] = ()) -> bytes:
     """
     held = pictures or [{}] * len(looked.scenes)
     content = {
-        "scenes": [_scene(one, own) for one, own in zip(looked.scenes, held, strict=True)],
+        "scenes": [_scene(one, of_scene) for one, of_scene in zip(looked.scenes, held, strict=True)],
         "changes": None if looked.changes is None else plain(looked.changes),
         "cameras": list(CAMERAS),
         "pixels": list(PIXELS),

@@ -57,25 +57,25 @@ def look_pictures(
         bytes_max: of all data URIs.
         advance: told the share that is done.
     """
-    found: dict[int, dict[str, PagePicture]] = {}
+    pictures: dict[int, dict[str, PagePicture]] = {}
     kept = np.flatnonzero(looks.pictures.any(axis=1))
     # Multiples of the golden ratio lie evenly however few of them there are (Weyl).
     order = sorted(kept.tolist(), key=lambda row: (not looks.suspect[row], row * GOLDEN % 1.0))
     size = 0
     for count, row in enumerate(order if folder is not None else ()):
-        own = _pictures(Path(folder or ""), looks, row)
-        size += sum(picture.size for picture in own.values())
+        of_look = _pictures(Path(folder or ""), looks, row)
+        size += sum(picture.size for picture in of_look.values())
         if size > bytes_max:
             break
-        if own:
-            found[int(looks.spot[row])] = own
+        if of_look:
+            pictures[int(looks.spot[row])] = of_look
         advance((count + 1) / len(order))
-    return found
+    return pictures
 
 
 def _pictures(folder: Path, looks: LookColumns, row: int) -> dict[str, PagePicture]:
     """Those of one look; what is damaged or leads out of the folder is left out."""
-    found = {}
+    pictures = {}
     for k, camera in enumerate(CAMERAS):
         if not looks.pictures[row, k]:
             continue
@@ -88,8 +88,8 @@ def _pictures(folder: Path, looks: LookColumns, row: int) -> dict[str, PagePictu
         if 0 <= u <= image.shape[1] - 1 and 0 <= v <= image.shape[0] - 1:
             spot = _uri(small_picture(image, (u, v)))
             corner = (round(u) - WINDOW_PX / 2 - 0.5, round(v) - WINDOW_PX / 2 - 0.5)
-        found[camera] = PagePicture(_uri(small_picture(image, width_px=WIDTH_PX)), spot, corner)
-    return found
+        pictures[camera] = PagePicture(_uri(small_picture(image, width_px=WIDTH_PX)), spot, corner)
+    return pictures
 
 
 def _uri(jpeg: bytes) -> str:

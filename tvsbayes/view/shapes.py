@@ -74,20 +74,20 @@ def sheets(targets: Sequence[str], points_mm: np.ndarray) -> tuple[Sheet, ...]:
         points_mm: where they are, shape (n, 3); not a number where nobody knows.
     """
     names, known = np.array(targets, dtype=str), np.isfinite(points_mm).all(axis=1)
-    found = []
+    planes = []
     for target in dict.fromkeys(targets):
-        own = points_mm[known & (names == target)]
-        if len(own) < SHEET_SPOTS:
+        spots = points_mm[known & (names == target)]
+        if len(spots) < SHEET_SPOTS:
             continue
-        middle = own.mean(axis=0)
+        middle = spots.mean(axis=0)
         # Rows: along the longer side, along the shorter, across the sheet.
-        along = np.linalg.svd(own - middle, full_matrices=False)[2][:2]
-        flat = (own - middle) @ along.T
+        along = np.linalg.svd(spots - middle, full_matrices=False)[2][:2]
+        flat = (spots - middle) @ along.T
         low, high = flat.min(axis=0), flat.max(axis=0)
         margin = SHEET_MARGIN * (high - low).max()
         (a, c), (b, d) = low - margin, high + margin
-        found.append(Sheet(target, middle + np.array([(a, c), (b, c), (b, d), (a, d)]) @ along))
-    return tuple(found)
+        planes.append(Sheet(target, middle + np.array([(a, c), (b, c), (b, d), (a, d)]) @ along))
+    return tuple(planes)
 
 
 def point_covariance_mm2(stereo: Stereo, points_mm: np.ndarray, covariance_px2: np.ndarray) -> np.ndarray:
@@ -105,10 +105,10 @@ def point_covariance_mm2(stereo: Stereo, points_mm: np.ndarray, covariance_px2: 
     ahead, behind = (np.stack([project_pair(stereo, points_mm + s * step) for step in steps], axis=2) for s in (1, -1))
     slope = (ahead - behind) / (2 * STEP_MM)
     information = np.einsum("nia,nij,njb->nab", slope, np.linalg.inv(covariance_px2), slope)
-    found = np.full(information.shape, np.nan)
+    covariance = np.full(information.shape, np.nan)
     known = np.isfinite(information).all(axis=(1, 2))
-    found[known] = np.linalg.inv(information[known])
-    return found
+    covariance[known] = np.linalg.inv(information[known])
+    return covariance
 
 
 def ellipsoid_axes_mm(covariance_mm2: np.ndarray) -> np.ndarray:
@@ -116,10 +116,10 @@ def ellipsoid_axes_mm(covariance_mm2: np.ndarray) -> np.ndarray:
 
     `covariance_mm2` has shape (n, 3, 3); not a number gives axes that are none.
     """
-    found = np.full(covariance_mm2.shape, np.nan)
+    axes = np.full(covariance_mm2.shape, np.nan)
     known = np.isfinite(covariance_mm2).all(axis=(1, 2))
     values, vectors = np.linalg.eigh(covariance_mm2[known])
     # (p - x)' C^-1 (p - x) is chi-square with three degrees of freedom.
     reach = np.sqrt(special.chdtri(3, 1 - PROBABILITY) * np.maximum(values, 0.0))
-    found[known] = reach[:, :, None] * np.swapaxes(vectors, 1, 2)
-    return found
+    axes[known] = reach[:, :, None] * np.swapaxes(vectors, 1, 2)
+    return axes
