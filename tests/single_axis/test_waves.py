@@ -15,6 +15,7 @@ from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_periods import WaveSample, separate_periods, strong_harmonics
 from tvsbayes.single_axis.axis_record import summarise_axis
+from tvsbayes.single_axis.period_search import APART_MIN, period_grid
 from tvsbayes.single_axis.waves import (
     SECOND,
     WANDER,
@@ -205,6 +206,16 @@ def test_periods_that_lie_apart_are_named():
     found = separate_periods(period)
     assert [(group.mean, group.share) for group in found] == [(pytest.approx(3.7), 0.7), (pytest.approx(12.4), 0.3)]
     assert found[1].between == (12.4, 12.4)
+
+
+def test_periods_of_the_grid_differ_by_more_than_rounding():
+    rng = np.random.default_rng(7)
+    for low, factor, span in zip(
+        rng.uniform(1.0, 500.0, 200), rng.uniform(1.05, 10.0, 200), rng.uniform(1, 9, 200), strict=True
+    ):
+        at = period_grid(replace(Wave.fixed("seconds", low, 1.0), high=low * factor), low * factor * span)
+        assert (np.diff(at) > APART_MIN).all()
+        assert (at[0], at[-1]) == (np.log(low), np.log(low * factor))
 
 
 def test_a_second_harmonic_that_is_stronger_than_the_first_is_named():

@@ -46,8 +46,8 @@ class Correction:
             play: factor of half of what they differ by.
         """
         ahead, back = (np.interp(command, self.command, add) for add in (self.forward, self.backward))
-        found = command + 0.5 * common * (ahead + back) + 0.5 * play * side * (ahead - back)
-        return np.round(found / self.resolution) * self.resolution if self.resolution else found
+        command_sent = command + 0.5 * common * (ahead + back) + 0.5 * play * side * (ahead - back)
+        return np.round(command_sent / self.resolution) * self.resolution if self.resolution else command_sent
 
     def moved(self, moves: Sequence[AxisMove], common: float = 1.0, play: float = 1.0) -> list[AxisMove]:
         """Moves as the mechanics get them."""

@@ -178,9 +178,9 @@ def _urdf_yaml(made: Compensation, origin: Origin) -> str:
     """The same for programs: joint and its covariance, in the unit of readings."""
     import yaml
 
-    found = made.settings
-    variances = [found["u_axis_zero"] ** 2, found["u_axis_reduction"] ** 2]
-    between = found["covariance_zero_reduction"]
+    settings = made.settings
+    variances = [settings["u_axis_zero"] ** 2, settings["u_axis_reduction"] ** 2]
+    between = settings["covariance_zero_reduction"]
     document = {
         "axis_corrects": origin.data_sha256,
         "applied": False,
@@ -189,9 +189,9 @@ def _urdf_yaml(made: Compensation, origin: Origin) -> str:
         "range_command": list(made.range_command),
         "joint": {
             "names": ["zero", "reduction"],
-            "values": [found["axis_zero"], found["axis_reduction"]],
+            "values": [settings["axis_zero"], settings["axis_reduction"]],
             "covariance": [[variances[0], between], [between, variances[1]]],
-            "backlash": found["axis_backlash"],
+            "backlash": settings["axis_backlash"],
         },
         "left_after_applying_95": {side: promise.error95 for side, promise in made.promise.items()},
     }

@@ -80,8 +80,8 @@ class _Expected:
 
 def _expected(fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, seed: int) -> _Expected:
     """At the table's commands, without the noise of a reading."""
-    found, run = _run(fit, commands, overrun, since, None, 0.0, seed)
-    mean, covariance = found.pooled()
+    stops, run = _run(fit, commands, overrun, since, None, 0.0, seed)
+    mean, covariance = stops.pooled()
     order = [np.flatnonzero(run.side == side)[np.argsort(run.index[run.side == side])] for _, side in SIDES]
     u = np.sqrt(np.diag(covariance))
     return _Expected(commands, np.array([mean[o] for o in order]), np.array([u[o] for o in order]), fit.rows.both_sides)
@@ -100,8 +100,8 @@ class Since:
         legs = legs_of(moves)
         time_s = np.array([move.time_s for move in moves])
         each = [np.flatnonzero(legs.segment == segment) for segment in np.unique(legs.segment)]
-        hours = max(float(np.ptp(time_s[own])) for own in each) / HOUR_S
-        return cls(hours, max(float(np.abs(legs.step[own]).sum()) for own in each))
+        hours = max(float(np.ptp(time_s[members])) for members in each) / HOUR_S
+        return cls(hours, max(float(np.abs(legs.step[members]).sum()) for members in each))
 
     def cycles(self, commands: np.ndarray, overrun: float) -> Cycles:
         """Runs through commands, as many as make up the travel."""
@@ -173,12 +173,12 @@ def checked(wish: Wish) -> Format:
 
 def table_commands(rows: AxisRows) -> np.ndarray:
     """Commands of a table: those read, thinned where they are many, halved where they are few."""
-    found = rows.positions
-    if len(found) > NODES_MANY:
-        found = found[np.linspace(0, len(found) - 1, NODES_MANY).round().astype(int)]
-    while len(found) < NODES_FEW:
-        found = np.sort(np.r_[found, 0.5 * (found[1:] + found[:-1])])
-    return found
+    commands = rows.positions
+    if len(commands) > NODES_MANY:
+        commands = commands[np.linspace(0, len(commands) - 1, NODES_MANY).round().astype(int)]
+    while len(commands) < NODES_FEW:
+        commands = np.sort(np.r_[commands, 0.5 * (commands[1:] + commands[:-1])])
+    return commands
 
 
 @dataclass(frozen=True)
@@ -294,16 +294,16 @@ def _bound(mean: np.ndarray, sd: np.ndarray) -> float:
     return 0.0 if top < 1e-200 else float(brentq(beyond, 0.0, top, xtol=1e-6 * top))
 
 
-def bound_of(found: PredictedStops, aim: np.ndarray, members: np.ndarray, shift: bool = False) -> float:
+def bound_of(stops: PredictedStops, aim: np.ndarray, members: np.ndarray, shift: bool = False) -> float:
     """What 95 % of the errors of some stops do not exceed.
 
     Args:
-        found: predicted stops.
+        stops: predicted stops.
         aim: readings aimed at, shape (r,).
         members: numbers of the stops.
         shift: errors count but for one shift common to all.
     """
-    mean, covariance = found.mean - aim, found.covariance
+    mean, covariance = stops.mean - aim, stops.covariance
     if shift:
         centre = np.eye(mean.shape[1]) - 1.0 / mean.shape[1]
         mean, covariance = mean @ centre, centre @ covariance @ centre
@@ -315,7 +315,7 @@ def _promise(
     after: PredictedStops, before: PredictedStops, run: Cycles, aim: np.ndarray, u: float, shift: bool
 ) -> dict[str, SidePromise]:
     """By side: what is left, and what each cause alone would leave."""
-    found = {}
+    sides = {}
     scales = after.scales
     pooled, covariance = after.pooled()
     hours = np.array([run.moves[k].time_s for k in run.read]) / HOUR_S
@@ -337,13 +337,13 @@ def _promise(
                 for cause, sd in (("stops", stops), ("homing", home), ("drift", drift), ("readings", reading))
             },
         }
-        found[name] = SidePromise(
+        sides[name] = SidePromise(
             error95=bound_of(after, aim, mine, shift),
             rms=float(np.sqrt(np.mean((pooled - aim)[mine] ** 2 + np.diag(covariance)[mine]))),
             without95=bound_of(before, aim, mine, shift),
             causes=causes,
         )
-    return found
+    return sides
 
 
 def reading_u(campaign: AxisCampaign) -> float:

@@ -153,14 +153,14 @@ def _log_densities(trial: Trial) -> dict[str, float]:
     promised = trial.at(1.0, 1.0)
     mean, covariance = promised.pooled()
     play_matters = _distance(trial.at(1.0, 0.0).pooled()[0] - mean, covariance + trial.shift) > SEPARATE
-    found = {}
+    log_densities = {}
     for world, factors in SCENARIOS.items():
-        own = [f for f in factors if f[0] == f[1] or play_matters]
-        found[world] = _mean_density([trial.at(*f).log_density(trial.value, trial.shift) for f in own])
+        possible = [f for f in factors if f[0] == f[1] or play_matters]
+        log_densities[world] = _mean_density([trial.at(*f).log_density(trial.value, trial.shift) for f in possible])
     least = OTHER_LEAST * float(np.sqrt(np.median(np.diag(covariance))))
     sizes = np.geomspace(least, max(0.5 * trial.travel, 2 * least), OTHERS)
     others = [promised.log_density(trial.value, trial.shift + size**2 * trial.other) for size in sizes]
-    return found | {OTHER_MACHINE: _mean_density(others)}
+    return log_densities | {OTHER_MACHINE: _mean_density(others)}
 
 
 def judged(trial: Trial, seed: int) -> Judged:
@@ -234,22 +234,22 @@ def _remarks(made: Compensation, fresh: _Fresh, campaign: AxisCampaign) -> tuple
     """What else is to be said."""
     low, high = made.range_command
     outside = int(np.sum((fresh.command < low) | (fresh.command > high)))
-    found = []
+    remarks = []
     if outside:
-        found.append(
+        remarks.append(
             f"{outside} of {len(fresh.command)} stops lie outside {low:.10g} to {high:.10g}: the promise does not hold "
             "there; what is expected of them is wider"
         )
     since = Since.of(campaign.moves)
     if since.hours > BEYOND * made.hours or since.travel > BEYOND * made.travel_command:
-        found.append(
+        remarks.append(
             f"the fresh readings go on for {since.hours:.3g} h and {since.travel:.4g} commands of travel after a "
             f"homing, the promise for {made.hours:.3g} h and {made.travel_command:.4g}: what is expected is wider"
         )
     named = campaign.header.get("serial") or campaign.header.get("name")
     if named and made.machine and named != made.machine:
-        found.append("the fresh readings name another machine or campaign than the table: is it the right one?")
-    return tuple(found)
+        remarks.append("the fresh readings name another machine or campaign than the table: is it the right one?")
+    return tuple(remarks)
 
 
 def verify_readings(
@@ -289,17 +289,17 @@ def verify_readings(
             shift=_shift(made, fit.rows.travel, len(fresh.value)),
             noise=_visit_noise(at(1.0, 1.0), fresh.side, fresh.u),
         )
-        found = judged(trial, seed)
+        judgement = judged(trial, seed)
     return Verification(
-        verdict=found.verdict,
-        p=found.p,
-        worlds=found.worlds,
-        before=size_of(found.without.pooled()[0] - aim, made.zero_free),
+        verdict=judgement.verdict,
+        p=judgement.p,
+        worlds=judgement.worlds,
+        before=size_of(judgement.without.pooled()[0] - aim, made.zero_free),
         after=size_of(fresh.value - aim, made.zero_free),
-        promised95=bound_of(found.promised, aim, np.arange(len(aim)), made.zero_free),
+        promised95=bound_of(judgement.promised, aim, np.arange(len(aim)), made.zero_free),
         readings=len(fresh.value),
         unit=campaign.unit,
-        needed=found.needed,
+        needed=judgement.needed,
         remarks=_remarks(made, fresh, campaign),
     )
 
@@ -323,11 +323,11 @@ def stored_compensation(campaign: AxisCampaign) -> Compensation:
     Raises:
         InputError: there is none, it is of other data, or it is damaged.
     """
-    found = compensation_in(campaign)
-    if found is None:
+    compensation = compensation_in(campaign)
+    if compensation is None:
         what, allowed = "no compensation of these data", "the one whose table is in force"
         raise refusal("missing-file", file="results/compensation.json", found=what, allowed=allowed, remedy=AGAIN)
-    return found
+    return compensation
 
 
 def verify_axis(

@@ -87,7 +87,7 @@ def autocorrelation_steps(w: np.ndarray) -> float:
     moved = np.ptp(w, axis=0) > 0
     if not moved.any(axis=0).all():
         return float("inf")
-    every = (w[:, own, k][:, :, None] for k, own in enumerate(moved.T))
+    every = (w[:, movers, k][:, :, None] for k, movers in enumerate(moved.T))
     return float(max(emcee.autocorr.integrated_time(x, tol=0, quiet=True)[0] for x in every))
 
 
@@ -145,14 +145,14 @@ class Comparison:
 
 
 def compared(
-    first: Sample, own: Mapping[str, np.ndarray], shape: tuple[int, int], names: tuple[str, ...]
+    first: Sample, quantities: Mapping[str, np.ndarray], shape: tuple[int, int], names: tuple[str, ...]
 ) -> Comparison:
     """Draws (chain, draw) with the weighted ones, by the columns of those names that vary; by all if none does."""
     theirs = first.quantities
-    varying = [name for name in own if np.ptp(own[name]) > 0 and np.ptp(theirs[name]) > 0]
+    varying = [name for name in quantities if np.ptp(quantities[name]) > 0 and np.ptp(theirs[name]) > 0]
     # Where nothing that a fit is for is left open, everything else stands for it.
     names = tuple(name for name in names if name in varying) or tuple(varying)
-    ours = propagated(np.stack([own[name].reshape(shape) for name in names], axis=-1))
+    ours = propagated(np.stack([quantities[name].reshape(shape) for name in names], axis=-1))
     weighted = first.summarised(np.stack([theirs[name].reshape(first.weights.shape) for name in names], axis=-1))
     one, other = (np.stack([each.mean, *each.interval95]) for each in (ours, weighted))
     errors = (np.stack([each.mcse_mean, *each.mcse_interval95]) for each in (ours, weighted))
@@ -178,13 +178,13 @@ def quality_of(chain: Chain, discarded: int, columns: Mapping[str, np.ndarray], 
 
 
 def chain_errors(
-    headlines: tuple[str, ...], own: Mapping[str, np.ndarray], shape: tuple[int, int]
+    headlines: tuple[str, ...], quantities: Mapping[str, np.ndarray], shape: tuple[int, int]
 ) -> dict[str, MonteCarloError]:
     """Of the headlines that vary, by draws (walker, draw) of a chain."""
-    names = [name for name in headlines if np.ptp(own[name]) > 0]
+    names = [name for name in headlines if np.ptp(quantities[name]) > 0]
     if not names:
         return {}
-    return monte_carlo_errors(names, propagated(np.stack([own[name].reshape(shape) for name in names], axis=-1)))
+    return monte_carlo_errors(names, propagated(np.stack([quantities[name].reshape(shape) for name in names], axis=-1)))
 
 
 def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
@@ -196,13 +196,13 @@ def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
     shape = walkers, draws = w.shape[:2]
     points = density.valued(w.reshape(walkers * draws, -1), random_stream(start.seed, Stream.CHAIN_PLACES))
     points = replace(points, log_target=chain.log_density[discarded:][::thin].T.ravel())
-    own = density.quantities(points)
+    quantities = density.quantities(points)
     quality = quality_of(chain, discarded, columns_of(density, points), shape)
     missing, same = quality.missing, None
-    errors = chain_errors(density.headlines, own, shape)
+    errors = chain_errors(density.headlines, quantities, shape)
     missing.extend(uncertain(errors))
     if not missing and first.convergence.answer == "accepted":
-        beside = compared(first, own, shape, density.headlines)
+        beside = compared(first, quantities, shape, density.headlines)
         same = beside.agreement
         # What two samplers do not agree on is known no better than they agree.
         errors = errors if same.agrees else errors | beside.gaps
@@ -231,4 +231,4 @@ def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
         ),
     )
     weights = np.full(shape, 1 / (walkers * draws))
-    return Sample(points, own, weights, convergence, chain.seconds)
+    return Sample(points, quantities, weights, convergence, chain.seconds)

@@ -51,8 +51,8 @@ class GroupEvolution(emcee.moves.DEMove):
         """The protocol of `emcee.moves.RedBlueMove`: new places for the half s, given the other."""
         others = np.split(np.concatenate(c), GROUPS)
         moved = [
-            super(GroupEvolution, self).get_proposal(own, [other], random)[0]
-            for own, other in zip(np.split(s, GROUPS), others, strict=True)
+            super(GroupEvolution, self).get_proposal(half, [other], random)[0]
+            for half, other in zip(np.split(s, GROUPS), others, strict=True)
         ]
         return np.concatenate(moved), np.zeros(len(s))
 
@@ -67,17 +67,17 @@ def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
     return [*steps, (GroupEvolution(), rest)] if rest > 0 else steps
 
 
-def lengthening(found: Convergence) -> float:
+def lengthening(convergence: Convergence) -> float:
     """How many times longer a chain must be to have the autocorrelation times and effective draws that are wanted."""
-    wanted = TAU_LIMIT * found.tau_steps / (found.steps - found.discarded)
-    for ess in (found.ess_bulk, found.ess_tail):
+    wanted = TAU_LIMIT * convergence.tau_steps / (convergence.steps - convergence.discarded)
+    for ess in (convergence.ess_bulk, convergence.ess_tail):
         wanted = max(wanted, ESS_LIMIT / min(ess.values()))
-    return max(wanted, *(error.rounds_factor for error in found.monte_carlo_error.values()), 0.0)
+    return max(wanted, *(error.rounds_factor for error in convergence.monte_carlo_error.values()), 0.0)
 
 
-def next_look(chain: Chain, found: Convergence) -> int:
+def next_look(chain: Chain, convergence: Convergence) -> int:
     """Steps at which a chain that has not converged is worth another look; depends on the chain alone."""
-    wanted = lengthening(found)
+    wanted = lengthening(convergence)
     # Where length is not what it lacks, a little more will not help either.
     growth = np.clip(MARGIN * wanted if 1 < wanted < np.inf else np.inf, *GROWTH_RANGE)
     return int(np.ceil(len(chain.w) * growth))
@@ -147,12 +147,12 @@ class Run[D: Density]:
         """The sample so far, and whether it is the last word; else the next look is set."""
         chain = self.chain()
         sample = diagnose(self.start, chain)
-        found = sample.convergence
-        assert isinstance(found, Convergence)
-        if not found.missing or hopeless(found):
+        convergence = sample.convergence
+        assert isinstance(convergence, Convergence)
+        if not convergence.missing or hopeless(convergence):
             return sample, True
         if len(chain.w) >= self.goal:
-            self.goal = next_look(chain, found)
+            self.goal = next_look(chain, convergence)
         return sample, False
 
     def too_short(self) -> bool:
@@ -192,10 +192,10 @@ class Run[D: Density]:
             raise
 
 
-def hopeless(found: Convergence) -> bool:
+def hopeless(convergence: Convergence) -> bool:
     """Whether nothing but the agreement with importance sampling is missing of a chain far longer than wanted."""
-    disagrees = found.agreement is not None and not found.agreement.agrees
-    return disagrees and len(found.missing) == 1 and SETTLED * lengthening(found) <= 1
+    disagrees = convergence.agreement is not None and not convergence.agreement.agrees
+    return disagrees and len(convergence.missing) == 1 and SETTLED * lengthening(convergence) <= 1
 
 
 class Judged(Protocol):

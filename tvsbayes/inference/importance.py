@@ -111,12 +111,12 @@ class Pool:
         else:
             proposals, counts = (*proposals, proposal), (*counts, ROUND)
         points = valued if self.points is None else Points.joined([self.points, valued])
-        found = Pool(points, proposals, counts, proposal, self.invalid + density.invalid - before)
+        pool = Pool(points, proposals, counts, proposal, self.invalid + density.invalid - before)
         if not np.isfinite(points.log_target).sum() > 8 * w.shape[1]:
             raise FloatingPointError("the posterior density is not finite around the mode")
         if fitted:
-            found = replace(found, next_proposal=found.refitted)
-        return found
+            pool = replace(pool, next_proposal=pool.refitted)
+        return pool
 
 
 def piloted(density: Density, generator: np.random.RandomState, rounds_max: int | None = None) -> Pool:
@@ -262,9 +262,9 @@ class Weighing:
     @property
     def rounds_wanted(self) -> float:
         """How many rounds of the same proposal an accepted answer takes, as far as the draws say."""
-        found = self.importance
+        importance = self.importance
         factor = max(e.rounds_factor for e in self.monte_carlo_error.values())
-        return found.rounds * max(factor, found.heaviest_share / HEAVIEST_MAX)
+        return importance.rounds * max(factor, importance.heaviest_share / HEAVIEST_MAX)
 
     def sample(self, seconds: float) -> Sample:
         """All of them, on which `seconds` were spent."""

@@ -97,8 +97,8 @@ def regression(x: np.ndarray, log_ratio: np.ndarray) -> Regression:
     for search in range(PAIR_SEARCHES + 1):
         products = x[:, pairs[:, 0]] * x[:, pairs[:, 1]]
         whole = np.concatenate([design, products], axis=1)
-        found = np.linalg.lstsq(whole, log_ratio, rcond=None)[0]
-        rest = log_ratio - whole @ found
+        solution = np.linalg.lstsq(whole, log_ratio, rcond=None)[0]
+        rest = log_ratio - whole @ solution
         t = np.where(open_pairs, np.abs((x * rest[:, None]).T @ x) / (spread * np.std(rest)), 0.0)
         new = np.argwhere(t > PAIR_T)
         room = count // PAIR_DRAWS - len(pairs)
@@ -107,7 +107,7 @@ def regression(x: np.ndarray, log_ratio: np.ndarray) -> Regression:
         new = new[np.argsort(-t[tuple(new.T)])[:room]]
         open_pairs[tuple(new.T)] = False
         pairs = np.concatenate([pairs, new])
-    _, slope, square, product = np.split(found, [1, 1 + dimension, 1 + 2 * dimension])
+    _, slope, square, product = np.split(solution, [1, 1 + dimension, 1 + 2 * dimension])
     cross = np.zeros((dimension, dimension))
     cross[tuple(pairs.T)] = product
     return Regression(slope, square, cross + cross.T)
@@ -188,12 +188,12 @@ class Independence:
     def _each(self, v: np.ndarray) -> np.ndarray:
         """Log densities of the coordinates v one by one, shape (n, d)."""
         distance2 = ((v - self.mean) / self.sd) ** 2
-        found = -0.5 * np.log(2 * np.pi) - 0.5 * distance2 - np.log(self.sd)
+        log_density = -0.5 * np.log(2 * np.pi) - 0.5 * distance2 - np.log(self.sd)
         single = log_t(distance2[:, self.places], 1) - np.log(self.sd[self.places])
         table = self.tables.at(v[:, self.places])
         table[:, self.followers.follower] = self.followers.at(v[:, self.places])
-        found[:, self.places] = np.logaddexp(np.log(1 - OWN_SHARE) + table, np.log(OWN_SHARE) + single)
-        return found
+        log_density[:, self.places] = np.logaddexp(np.log(1 - OWN_SHARE) + table, np.log(OWN_SHARE) + single)
+        return log_density
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
         """Log density, shape (n,)."""
@@ -209,20 +209,20 @@ class Independence:
 
     def draw(self, count: int, generator: np.random.RandomState) -> np.ndarray:
         """Independent draws, shape (count, d)."""
-        own, one = (count, len(self.places)), (count, 1)
+        per_place, one = (count, len(self.places)), (count, 1)
         normal = generator.standard_normal((count, len(self.mean)))
-        single = np.sqrt(generator.chisquare(HEAVY_DOF, own) / HEAVY_DOF)
+        single = np.sqrt(generator.chisquare(HEAVY_DOF, per_place) / HEAVY_DOF)
         partly = np.sqrt(generator.chisquare(COUPLED_DOF, one) / COUPLED_DOF) / COUPLED_WIDTH
         whole = np.sqrt(generator.chisquare(HEAVY_DOF, one) / HEAVY_DOF)
-        share = generator.uniform(size=own)
-        alone = generator.uniform(size=own) < OWN_SHARE
+        share = generator.uniform(size=per_place)
+        alone = generator.uniform(size=per_place) < OWN_SHARE
         chance = generator.uniform(size=one)
         chances = generator.uniform(size=(count, len(self.followers.leader)))
         every = np.ones(normal.shape, dtype=bool)
-        found = self._one_by_one(every, normal, np.where(alone, single, np.nan), share, chances)
+        v = self._one_by_one(every, normal, np.where(alone, single, np.nan), share, chances)
         some = np.isin(np.arange(len(self.mean)), self.coupled)
-        found = np.where((chance < COUPLED_SHARE) & some, self.mean + self.sd * normal / partly, found)
-        return self.to_w(np.where(chance > 1 - HEAVY_SHARE, self.mean + self.sd * normal / whole, found))
+        v = np.where((chance < COUPLED_SHARE) & some, self.mean + self.sd * normal / partly, v)
+        return self.to_w(np.where(chance > 1 - HEAVY_SHARE, self.mean + self.sd * normal / whole, v))
 
     def _one_by_one(
         self,
@@ -243,16 +243,16 @@ class Independence:
             chances: likewise, of the followers, shape (n, f).
             before: the points so far, shape (n, d); None where all are drawn.
         """
-        found = self.mean + self.sd * normal
+        v = self.mean + self.sd * normal
         if before is not None:
-            found = np.where(new, found, before)
+            v = np.where(new, v, before)
         alone, stays = np.isfinite(narrowed), ~new[:, self.places]
         single = self.mean[self.places] + self.sd[self.places] * normal[:, self.places] / narrowed
         led = np.where(alone, single, self.tables.draw(share))
-        led = np.where(stays, found[:, self.places], led)
+        led = np.where(stays, v[:, self.places], led)
         # A follower follows its leader, however that was drawn.
-        found[:, self.places] = self.followers.drawn(led, share, chances, alone | stays)
-        return found
+        v[:, self.places] = self.followers.drawn(led, share, chances, alone | stays)
+        return v
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """The protocol of `emcee.moves.MHMove`."""
@@ -266,12 +266,12 @@ class Independence:
 
     def renewed(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """The same protocol, with new values of some coordinates of every point, each from its own density."""
-        before, own = self.to_v(w), (len(w), len(self.places))
+        before, per_place = self.to_v(w), (len(w), len(self.places))
         new = generator.uniform(size=before.shape) < generator.uniform(*RENEWED_RANGE, size=(len(w), 1))
         normal = generator.standard_normal(before.shape)
-        narrowed = np.sqrt(generator.chisquare(HEAVY_DOF, own) / HEAVY_DOF)
-        narrowed = np.where(generator.uniform(size=own) < OWN_SHARE, narrowed, np.nan)
-        share, chances = generator.uniform(size=own), generator.uniform(size=(len(w), len(self.followers.leader)))
+        narrowed = np.sqrt(generator.chisquare(HEAVY_DOF, per_place) / HEAVY_DOF)
+        narrowed = np.where(generator.uniform(size=per_place) < OWN_SHARE, narrowed, np.nan)
+        share, chances = generator.uniform(size=per_place), generator.uniform(size=(len(w), len(self.followers.leader)))
         after = self._one_by_one(new, normal, narrowed, share, chances, before)
         return self.to_w(after), np.where(new, self._each(before) - self._each(after), 0.0).sum(axis=1)
 
@@ -292,14 +292,14 @@ class Independence:
             return self
         v = self.to_v(w[matters])
         near = np.clip((v - self.mean) / self.sd, -REACH, REACH)
-        found = regression(near, log_target[matters] - self._each(v).sum(axis=1))
-        variance = 1 / np.clip(1 - 2 * found.square, 0.6, 1.6)
-        mean = self.mean + self.sd * np.clip(found.slope * variance, -1.0, 1.0)
+        surface = regression(near, log_target[matters] - self._each(v).sum(axis=1))
+        variance = 1 / np.clip(1 - 2 * surface.square, 0.6, 1.6)
+        mean = self.mean + self.sd * np.clip(surface.slope * variance, -1.0, 1.0)
         sd = INFLATION * np.sqrt(np.clip(self.sd**2 * variance, *VARIANCE_RANGE))
         at = np.clip((NODES - self.mean[self.places, None]) / self.sd[self.places, None], -REACH, REACH)
         tilt, bend = (
             np.clip(x[self.places, None], -limit, limit)
-            for x, limit in zip((found.slope, found.square), TILT_LIMITS, strict=True)
+            for x, limit in zip((surface.slope, surface.square), TILT_LIMITS, strict=True)
         )
         change = tilt * at + bend * at**2
         every = [
@@ -308,7 +308,7 @@ class Independence:
         ]
         followers = replace(self.followers, log_density=np.reshape(every, self.followers.log_density.shape))
         straight = self.moved(mean, sd, Tables.normalised(self.tables.log_density + change), followers)
-        return straight.turned(found.cross * np.sqrt(np.outer(variance, variance)))
+        return straight.turned(surface.cross * np.sqrt(np.outer(variance, variance)))
 
 
 def forest(target: Callable[[np.ndarray], np.ndarray], places: np.ndarray, dimension: int) -> list[tuple[int, int]]:

@@ -49,8 +49,8 @@ class StoredPosterior(Shown):
 
     def shown(self) -> View:
         """Means, sds and 95 % intervals."""
-        found = self.propagate(lambda p: np.stack(list(p.values()), axis=1))
-        columns = (each.tolist() for each in (found.mean, found.sd, *found.interval95))
+        propagated = self.propagate(lambda p: np.stack(list(p.values()), axis=1))
+        columns = (each.tolist() for each in (propagated.mean, propagated.sd, *propagated.interval95))
         rows = list(zip(self.by_name, *columns, strict=True))
         title = f"Posterior of {len(self.weights)} stored draws, {self.answer}"
         return View(title, ("quantity", "mean", "sd", "2.5 %", "97.5 %"), rows)
@@ -135,7 +135,7 @@ def _answer(keys: Keys) -> AnswerKind:
 
 def _draws(path: Path) -> dict[str, np.ndarray]:
     """All named columns."""
-    found: dict[str, np.ndarray] = {}
+    draws: dict[str, np.ndarray] = {}
     try:
         file = read_arrays(path, RESULTS_BYTES_MAX)
         for names, values in COLUMNS:
@@ -143,13 +143,13 @@ def _draws(path: Path) -> dict[str, np.ndarray]:
                 columns = np.asarray(file[values], dtype=float)
                 if columns.ndim != 2 or len(columns) < 2 or not np.all(np.isfinite(columns)):
                     raise ValueError(f"{values} of shape {columns.shape}")
-                found |= dict(zip(map(str, file[names].tolist()), columns.T, strict=True))
-        if not found or len({len(column) for column in found.values()}) > 1:
+                draws |= dict(zip(map(str, file[names].tolist()), columns.T, strict=True))
+        if not draws or len({len(column) for column in draws.values()}) > 1:
             raise ValueError("no draws by name, or columns of other lengths")
     except (KeyError, TypeError, ValueError) as error:
         allowed, reason = "draws by name, finite, as `tvsbayes fit` writes them", escaped(str(error), 120)
         raise refusal("damaged", file="results/draws.npz", found=reason, allowed=allowed, remedy=AGAIN) from error
-    return found
+    return draws
 
 
 def _merged(by_name: dict[str, np.ndarray], answer: AnswerKind) -> StoredPosterior:

@@ -69,15 +69,15 @@ def carried(
 
 def reweighted(values: np.ndarray, weights: np.ndarray) -> Propagated:
     """Summary of independent draws (chain, draw, ...) with weights (chain, draw)."""
-    found = weighted_summary(values.reshape(-1, *values.shape[2:]), weights.ravel())
+    summary = weighted_summary(values.reshape(-1, *values.shape[2:]), weights.ravel())
     return Propagated(
-        mean=found.mean,
-        sd=found.sd,
-        interval95=found.interval95,
-        mcse_mean=found.mcse_mean,
-        mcse_sd=found.mcse_sd,
-        mcse_interval95=found.mcse_interval95,
-        ess=found.ess_mean,
+        mean=summary.mean,
+        sd=summary.sd,
+        interval95=summary.interval95,
+        mcse_mean=summary.mcse_mean,
+        mcse_sd=summary.mcse_sd,
+        mcse_interval95=summary.mcse_interval95,
+        ess=summary.ess_mean,
         draws=values,
         weights=weights,
     )
@@ -113,9 +113,9 @@ def propagated(values: np.ndarray) -> Propagated:
     )
 
 
-def monte_carlo_errors(names: Sequence[str], found: Propagated | WeightedSummary) -> dict[str, MonteCarloError]:
+def monte_carlo_errors(names: Sequence[str], propagated: Propagated | WeightedSummary) -> dict[str, MonteCarloError]:
     """Of quantities, the last axis of a summary, in their posterior sds; a quantity that no draw changes has none."""
-    sd = np.where(found.sd > 0, found.sd, 1.0)
-    parts = found.mcse_mean / sd, *(found.mcse_interval95 / sd)
+    sd = np.where(propagated.sd > 0, propagated.sd, 1.0)
+    parts = propagated.mcse_mean / sd, *(propagated.mcse_interval95 / sd)
     rows = zip(*(np.reshape(part, len(names)).tolist() for part in parts), strict=True)
     return {name: MonteCarloError(mean, (low, high)) for name, (mean, low, high) in zip(names, rows, strict=True)}

@@ -41,11 +41,11 @@ def between_cuts(log_density: np.ndarray) -> np.ndarray:
 
     none = ~np.isfinite(log_density)
     least = np.min(np.where(none, np.inf, log_density), axis=-1, keepdims=True)
-    seen = np.where(none, np.where(np.isfinite(least), least, 0.0), log_density)
-    seen = np.maximum(_filled(seen), seen.max(axis=-1, keepdims=True) + CUT_FLOOR)
+    finite = np.where(none, np.where(np.isfinite(least), least, 0.0), log_density)
+    finite = np.maximum(_filled(finite), finite.max(axis=-1, keepdims=True) + CUT_FLOOR)
     beside = np.zeros((*none.shape[:-1], len(NODES)), dtype=bool)
     beside[..., ::2], beside[..., 1::2] = none, none[..., :-1] | none[..., 1:]
-    return np.where(beside, -np.inf, Akima1DInterpolator(CUT_NODES, seen, axis=-1)(NODES))
+    return np.where(beside, -np.inf, Akima1DInterpolator(CUT_NODES, finite, axis=-1)(NODES))
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class Tables:
     @classmethod
     def normalised(cls, log_density: np.ndarray) -> Tables:
         """From log densities up to a constant each, -inf and NaN where there is none."""
-        seen = np.where(np.isfinite(log_density), log_density, -np.inf)
-        seen = np.maximum(seen - seen.max(axis=1, keepdims=True), FLOOR)
-        return cls(seen - np.log(cls(seen).masses.sum(axis=1, keepdims=True)))
+        finite = np.where(np.isfinite(log_density), log_density, -np.inf)
+        finite = np.maximum(finite - finite.max(axis=1, keepdims=True), FLOOR)
+        return cls(finite - np.log(cls(finite).masses.sum(axis=1, keepdims=True)))
 
     @cached_property
     def masses(self) -> np.ndarray:
@@ -149,13 +149,13 @@ class Followers:
 
     def at(self, w: np.ndarray) -> np.ndarray:
         """Log densities of the followers, shape (n, f), of tabulated coordinates w (n, h)."""
-        found = np.empty((len(w), len(self.leader)))
+        log_density = np.empty((len(w), len(self.leader)))
         for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
             node, above = self.share(w[:, leader])
             low, high = (_line_at(w[:, follower], self.log_density[k][node + step]) for step in (0, 1))
             with np.errstate(divide="ignore"):
-                found[:, k] = np.logaddexp(np.log1p(-above) + low, np.log(above) + high)
-        return found
+                log_density[:, k] = np.logaddexp(np.log1p(-above) + low, np.log(above) + high)
+        return log_density
 
     def drawn(self, w: np.ndarray, share: np.ndarray, chance: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Tabulated coordinates (n, h) with their followers drawn anew but those kept.
@@ -166,11 +166,11 @@ class Followers:
             chance: uniform numbers of the mixtures, shape (n, f).
             kept: shape (n, h), boolean.
         """
-        found = w.copy()
+        result = w.copy()
         for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
-            node, above = self.share(found[:, leader])
+            node, above = self.share(result[:, leader])
             chosen = node + (chance[:, k] < above)
             table = self.tables[k]
             new = _point_below(share[:, follower], table.log_density[chosen], table.reached[chosen])
-            found[:, follower] = np.where(kept[:, follower], w[:, follower], new)
-        return found
+            result[:, follower] = np.where(kept[:, follower], w[:, follower], new)
+        return result

@@ -112,14 +112,14 @@ def cache_state() -> CacheState:
         return CacheState(False, f"not used, every run compiles anew: {place}: {fault}", remedy)
     try:
         first, second = _tried(), _tried()
-        told = json.loads(second.stdout)
+        answer = json.loads(second.stdout)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
         return CacheState(False, f"could not be tried: {type(error).__name__}", "run a fit and see what it says")
-    if REJECTED in first.stderr + second.stderr or not told["hits"]:
-        found = f"rejected, every run compiles anew: what is written to {place} is refused when it is read"
+    if REJECTED in first.stderr + second.stderr or not answer["hits"]:
+        state = f"rejected, every run compiles anew: what is written to {place} is refused when it is read"
         remedy = "free space there; else try another version of jaxlib (github.com/jax-ml/jax/issues/38445)"
-        return CacheState(False, found, remedy)
-    if told["traces"]:
+        return CacheState(False, state, remedy)
+    if answer["traces"]:
         remedy = f"pip install flatbuffers; remove {place / 'traced'} if it is not yours"
         return CacheState(False, f"compiled functions are used, their traces not: {place}", remedy)
     entries = list(place.glob("*-cache"))

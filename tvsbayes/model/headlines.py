@@ -243,5 +243,5 @@ def derived_quantities(
         seen: lines.
     """
     given, values = np.asarray(place_errors_rad), space.values(z)
-    found = _modelled(values, errors_at(given, max(len(seen.places.steps), given.shape[1] // 2)), space, seen)
-    return Derived(values, np.asarray(found.modelled), np.asarray(found.jacobian), given)
+    modelled = _modelled(values, errors_at(given, max(len(seen.places.steps), given.shape[1] // 2)), space, seen)
+    return Derived(values, np.asarray(modelled.modelled), np.asarray(modelled.jacobian), given)

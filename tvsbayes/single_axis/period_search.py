@@ -36,6 +36,8 @@ PER_RESOLUTION = 8
 """Points of the grid in 1 / span of frequency."""
 GRID_MAX = 30_000
 """Points; beyond it the range is refused."""
+APART_MIN = 1e-9
+"""Distance of logs of periods in the grid before it is refined: `REFINEMENTS` halvings stay above rounding."""
 AT_ONCE = 400
 """Periods whose columns are held at once."""
 SCALES = 60
@@ -129,7 +131,7 @@ def _searched(ready: _Prepared, wave: Wave, apart: Sequence[Wave] = ()) -> _Sear
             found[np.abs(np.exp(-log_period) - 1 / other.peak) * span < RESOLVED] -= UNRESOLVED
         return found
 
-    grid = np.array([np.log(wave.low)]) if wave.is_fixed else _grid(wave, span)
+    grid = np.array([np.log(wave.low)]) if wave.is_fixed else period_grid(wave, span)
     evidence = evidence_at(grid)
     for _ in range(0 if wave.is_fixed else REFINEMENTS):
         by_period = np.logaddexp.reduce(evidence + weights, axis=1)
@@ -168,7 +170,7 @@ def _sharp(evidence: np.ndarray, grid: np.ndarray) -> float:
     return float(0.5 / np.sqrt(max(-2 * fitted, 1e-12)))
 
 
-def _grid(wave: Wave, span: float) -> np.ndarray:
+def period_grid(wave: Wave, span: float) -> np.ndarray:
     """Logs of periods, evenly in frequency, ascending; `span` of the readings on the clock of the wave.
 
     Raises:
@@ -185,10 +187,12 @@ def _grid(wave: Wave, span: float) -> np.ndarray:
             allowed=f"periods from {least:.3g} on",
             remedy="raise the lower end of the range, or fit a part of the record",
         )
-    even = np.linspace(1 / wave.high, 1 / wave.low, max(count, 40))
-    # A slow wave, of which few fit in, needs points by its log.
+    even = np.linspace(1 / wave.high, 1 / wave.low, max(count, 40))[1:-1]
+    # A slow wave, of which few fit in, needs points by its log. The ends come from one list alone: apart by rounding
+    # they would have one point half-way.
     by_log = np.linspace(np.log(wave.low), np.log(wave.high), 60)
-    return np.unique(np.concatenate([-np.log(even)[::-1], by_log[1:-1], [np.log(wave.low), np.log(wave.high)]]))
+    grid = np.sort(np.concatenate([-np.log(even), by_log[1:-1]]))
+    return np.concatenate([by_log[:1], grid[np.diff(grid, append=np.inf) > APART_MIN], by_log[-1:]])
 
 
 def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], asked: AskedPeriods) -> tuple[Wave, ...]:

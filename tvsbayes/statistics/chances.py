@@ -35,14 +35,14 @@ def recursive_residuals(values: np.ndarray, variances: np.ndarray, *, backwards:
     if len(values) < 2:
         return ()
     order = np.arange(len(values))[::-1] if backwards else np.arange(len(values))
-    found: list[float | None] = [None] * len(values)
+    residuals: list[float | None] = [None] * len(values)
     total = weight = 0.0
     for i in order:
         if weight:
-            found[i] = float((values[i] - total / weight) / np.sqrt(variances[i] + 1 / weight))
+            residuals[i] = float((values[i] - total / weight) / np.sqrt(variances[i] + 1 / weight))
         total += values[i] / variances[i]
         weight += 1 / variances[i]
-    return tuple(found)
+    return tuple(residuals)
 
 
 FRACTION_TERMS = 400
@@ -68,9 +68,9 @@ def log_chance(chi2: np.ndarray | float, dof: np.ndarray | float) -> np.ndarray:
     for term in range(FRACTION_TERMS, 0, -1):
         rest = term * (term - a) / (x + 2 * term + 1 - a - rest)
     far = -x + np.log(x) * a - np.log(x + 1 - a - rest) - special.gammaln(a)
-    found = plain.copy()
-    found[beyond] = far
-    return found
+    result = plain.copy()
+    result[beyond] = far
+    return result
 
 
 def chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:

@@ -44,7 +44,7 @@ def repeated[Numbers: Any](
         waves: sd and period of each cosine.
         functions: numpy or jax.numpy.
     """
-    found = sd**2 * matern52(distance, length, functions)
+    covariance = sd**2 * matern52(distance, length, functions)
     for amplitude, period in waves:
-        found = found + amplitude**2 * periodic(distance, period, functions)
-    return found
+        covariance = covariance + amplitude**2 * periodic(distance, period, functions)
+    return covariance

@@ -104,10 +104,10 @@ class _Surroundings:
         first, second = np.triu_indices(len(steps), 1)
         values = self.at(np.concatenate([0 * steps[:1], steps, -steps, steps[first] + steps[second]]))
         centre, ahead, behind, both = np.split(values, np.cumsum([1, len(steps), len(steps)]))
-        found = np.diag((ahead + behind - 2 * centre) / PAIR_STEP**2)
+        hessian = np.diag((ahead + behind - 2 * centre) / PAIR_STEP**2)
         shared = (both - ahead[first] - ahead[second] + centre) / PAIR_STEP**2
-        found[first, second] = found[second, first] = shared
-        return found
+        hessian[first, second] = hessian[second, first] = shared
+        return hessian
 
 
 def _nearly_there(begin: _Surroundings) -> _Surroundings:
@@ -121,8 +121,8 @@ def _nearly_there(begin: _Surroundings) -> _Surroundings:
 
     before = value_and_slope(np.zeros(count))[0]
     options = {"gtol": HESSIAN_KEPT, "norm": 2, "maxiter": QUASI_STEPS}
-    found = optimize.minimize(value_and_slope, np.zeros(count), jac=True, method="BFGS", options=options)
-    return replace(begin, z=begin.z + begin.ways @ found.x) if found.fun < before else begin
+    optimum = optimize.minimize(value_and_slope, np.zeros(count), jac=True, method="BFGS", options=options)
+    return replace(begin, z=begin.z + begin.ways @ optimum.x) if optimum.fun < before else begin
 
 
 @dataclass(frozen=True)
@@ -185,14 +185,14 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
             raise np.linalg.LinAlgError("the density is not finite about the mode")
         eigenvalues, vectors = np.linalg.eigh(hessian)
         # Far from the mode the density may be flat or convex along a direction: step by the expected scale.
-        found = _descended(here, (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T)
-        here = found.here
-        if found.settled and np.linalg.norm(np.linalg.solve(here.ways[rows], (here.z - begin)[rows])) < HESSIAN_KEPT:
+        descent = _descended(here, (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T)
+        here = descent.here
+        if descent.settled and np.linalg.norm(np.linalg.solve(here.ways[rows], (here.z - begin)[rows])) < HESSIAN_KEPT:
             break
         here = replace(here, ways=here.ways @ (vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 0.1))) @ vectors.T)
     else:
         problems.append("the Newton steps on the full density did not settle")
-    if found.kinked and found.settled and not 0 < eigenvalues[0] <= eigenvalues[-1] < KINK_CURVATURE:
+    if descent.kinked and descent.settled and not 0 < eigenvalues[0] <= eigenvalues[-1] < KINK_CURVATURE:
         here, eigenvalues, vectors = replace(here, ways=expected), np.ones(len(rows)), np.eye(len(rows))
     if eigenvalues[0] <= 0:
         problems.append("the density has no maximum here: its Hessian is not negative definite")

@@ -69,15 +69,15 @@ def weighted_quantiles(values: np.ndarray, weights: np.ndarray, probabilities: S
     the largest 1; lines in between.
     """
     flat = values.reshape(len(values), -1)
-    found = np.empty((len(probabilities), flat.shape[1]))
+    quantiles = np.empty((len(probabilities), flat.shape[1]))
     for column, each in enumerate(flat.T):
         order = np.argsort(each, kind="stable")
         ordered = weights[order]
         middle = np.cumsum(ordered) - 0.5 * ordered
         # One draw alone has no stretch, and is every quantile.
         reach = middle[-1] - middle[0] or 1.0
-        found[:, column] = np.interp(probabilities, (middle - middle[0]) / reach, each[order])
-    return found.reshape(len(probabilities), *values.shape[1:])
+        quantiles[:, column] = np.interp(probabilities, (middle - middle[0]) / reach, each[order])
+    return quantiles.reshape(len(probabilities), *values.shape[1:])
 
 
 def weighted_summary(values: np.ndarray, weights: np.ndarray) -> WeightedSummary:
@@ -164,8 +164,8 @@ def pareto_tail(exceedances: np.ndarray) -> ParetoTail:
     share = np.exp(log_likelihood - np.max(log_likelihood))
     share = np.where(share >= 10 * np.finfo(float).eps * share.sum(), share, 0.0)
     centre = float(b @ share / share.sum())
-    found = float(np.mean(np.log1p(-centre * exceedances)))
-    return ParetoTail((n * found + PRIOR_DRAWS * PRIOR_K) / (n + PRIOR_DRAWS), -found / centre)
+    mean_log = float(np.mean(np.log1p(-centre * exceedances)))
+    return ParetoTail((n * mean_log + PRIOR_DRAWS * PRIOR_K) / (n + PRIOR_DRAWS), -mean_log / centre)
 
 
 def _tail_count(count: int) -> int:

@@ -129,7 +129,7 @@ def draw_axis(
     per_command: float,
     travel: float,
     rng: np.random.Generator,
-    asked: AskedPeriods | None = None,
+    periods: AskedPeriods | None = None,
     between_s: tuple[float, float] = (0.0, 1.0),
 ) -> AxisTruth:
     """A true axis for a list of commands.
@@ -140,7 +140,7 @@ def draw_axis(
         per_command: true unit per command; `[axis]` says only how well it is known beforehand.
         travel: range of what is read, unit, with which default scales grow.
         rng: source of everything random.
-        asked: periods; half of them are there, with the scale of `transmission_error`.
+        periods: half of them are there, with the scale of `transmission_error`.
         between_s: least and greatest time of the readings, for waves of time.
     """
     at = np.unique(np.asarray(commands, dtype=float))
@@ -161,25 +161,25 @@ def draw_axis(
     error = _curve(distance, length, true["transmission_error"], rng)
     play = _curve(distance, length, true["play_variation"], rng)
     ends = (abs(per_command) * float(at[0]), abs(per_command) * float(at[-1]))
-    if asked is None or not asked:
+    if periods is None or not periods:
         return AxisTruth(true, at, error, play)
     record = {"position": ends, "encoder": tuple(sorted((per_command * at[0], per_command * at[-1])))}
     record["seconds"] = between_s
-    return AxisTruth(true, at, error, play, _drawn_waves(asked, priors, travel, record, gear_rng))
+    return AxisTruth(true, at, error, play, _drawn_waves(periods, priors, travel, record, gear_rng))
 
 
 def _drawn_waves(
-    asked: AskedPeriods,
+    stated: AskedPeriods,
     priors: Mapping[str, AxisPrior],
     travel: float,
     record: Mapping[str, tuple[float, float]],
     rng: np.random.Generator,
 ) -> tuple[TrueWave, ...]:
     """Waves of the periods that are asked for; of an unknown one log-uniform in its range."""
-    clock = "seconds" if asked.in_seconds else "position"
-    periods = [(clock, period) for period in asked.stated]
-    periods += [(clock, float(low * (high / low) ** rng.random())) for low, high in asked.between]
-    periods += [("encoder", asked.encoder)] if asked.encoder is not None else []
+    clock = "seconds" if stated.in_seconds else "position"
+    periods = [(clock, period) for period in stated.stated]
+    periods += [(clock, float(low * (high / low) ** rng.random())) for low, high in stated.between]
+    periods += [("encoder", stated.encoder)] if stated.encoder is not None else []
     unit = priors["transmission_error"].u or priors["transmission_error"].value or 0.002 * travel
     waves = []
     for of, period in periods:
