@@ -108,12 +108,24 @@ def camera(axes: Axes, at: np.ndarray) -> None:
     axes.add_patch(patches.Polygon(at + body, facecolor="#DDDDDD", edgecolor="black", lw=1, zorder=4))
 
 
-def frame_from_above(axes: Axes, origin_s: np.ndarray, ends_s: np.ndarray, names: tuple[str, str], colour: str) -> None:
-    """Two axes that lie in the page and the dot of the one that points at the reader."""
+def frame_from_above(
+    axes: Axes,
+    origin_s: np.ndarray,
+    ends_s: np.ndarray,
+    names: tuple[str, str],
+    colour: str,
+    names_at: tuple[float, float] = (0.0, 0.0),
+) -> None:
+    """Two axes that lie in the page and the dot of the one that points at the reader.
+
+    Names stand at the heads, `names_at` degrees from the direction of their axis, where a line goes on beyond it.
+    """
     origin = seen_from_above(origin_s)
-    for end, name in zip(seen_from_above(ends_s), names, strict=True):
+    for end, name, aside_deg in zip(seen_from_above(ends_s), names, names_at, strict=True):
         arrow(axes, origin, end, colour)
-        label(axes, end, 9 * (end - origin) / np.linalg.norm(end - origin), name, colour, fontweight="bold")
+        c, s = np.cos(np.radians(aside_deg)), np.sin(np.radians(aside_deg))
+        ahead = (end - origin) / np.linalg.norm(end - origin) @ np.array([[c, s], [-s, c]])
+        label(axes, end, 9 * ahead, name, colour, fontweight="bold")
     axes.add_patch(patches.Circle(origin, 4.6, facecolor="white", edgecolor=colour, lw=1.5, zorder=7))
     axes.add_patch(patches.Circle(origin, 1.5, facecolor=colour, zorder=8))
 
@@ -172,7 +184,7 @@ def panel_from_above(axes: Axes) -> None:
     ends = in_stereo([[58, 0, 0], [0, 44, 0]])
     frame_from_above(axes, T_SP_MM, ends, ("x", "y"), POSITIONER)
     label(axes, pan_axis, (10, -31), "pan axis and mirror 1", va="top")
-    label(axes, pan_axis, (-58, -52), "P: positioner frame, z up", POSITIONER, fontweight="bold", va="top", ha="left")
+    label(axes, pan_axis, (-46, -52), "P: positioner frame, z up", POSITIONER, fontweight="bold", va="top", ha="left")
     label(axes, second, (4, -17), "mirror 2", ha="left", va="top")
 
     scanner_from_above(axes, aperture, second, spot)
@@ -184,7 +196,7 @@ def scanner_from_above(axes: Axes, aperture: np.ndarray, second: np.ndarray, spo
     pan_axis = seen_from_above(T_SP_MM)
     middle_s = in_stereo(scanner_in_positioner([[0, 0, 0], [58, 0, 0], [0, 32, 0]]))
     axes.plot(*np.array([pan_axis, aperture]).T, color=SCANNER, lw=1.2, ls=(0, (7, 2, 1.5, 2)), zorder=2)
-    frame_from_above(axes, middle_s[0], middle_s[1:], ("x", "y"), SCANNER)
+    frame_from_above(axes, middle_s[0], middle_s[1:], ("x", "y"), SCANNER, (0.0, 90.0))
     middle = seen_from_above(middle_s[0])
     text = "T: scanner frame, z up,\norigin in mid-baseline"
     label(axes, aperture, (-72, -41), text, SCANNER, fontweight="bold", va="top", ha="left")
