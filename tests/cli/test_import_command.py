@@ -15,6 +15,7 @@ from support.commands import MOUNTED, assert_error
 from tvsbayes.instrument.campaign import moves_bytes, pixels_of, read_campaign, write_campaign
 from tvsbayes.instrument.rig import read_rig
 
+UNIT = Path(__file__).parents[1] / "head" / "unit.urdf"
 TABLE = "Nr;Pan;Tilt;XL;YL;XR;YR;Blatt\n1;0;0;640,5;360,25;500;360;nah\n2;200;0;700,5;360,25;560;360;nah\n"
 
 
@@ -244,8 +245,7 @@ def test_a_title_where_names_should_stand_is_called_one(ask, tmp_path, first, sa
 
 def test_a_urdf_becomes_a_head_with_sightings_or_keeps_its_spots(ask, say, tmp_path):
     """Written only with --yes; the folder is read by `check`, and its rig file has the limits of the joints."""
-    unit = Path(__file__).parents[1] / "head" / "unit.urdf"
-    words = "import", "--urdf", unit, "--steps-per-turn", 400, "--to"
+    words = "import", "--urdf", UNIT, "--steps-per-turn", 400, "--to"
     code, text, _ = say(*words, tmp_path / "head")
     assert code == 0 and "nothing written" in text and "position of tilt's joint falls" in text
     code, document = ask(*words, tmp_path / "head", "--yes")
@@ -263,7 +263,7 @@ def test_a_urdf_becomes_a_head_with_sightings_or_keeps_its_spots(ask, say, tmp_p
     shutil.copy(MOUNTED / "stereo.json", tmp_path / "laser")
     laser = read_campaign(tmp_path / "laser")
     assert laser.rig.priors["elevation_axis_offset_mm"].value == pytest.approx(30.0)
-    code, document = ask("import", unit, "--to", tmp_path / "x", "--pan-joint", "pan_joint")
+    code, document = ask("import", UNIT, "--to", tmp_path / "x", "--pan-joint", "pan_joint")
     assert code == 2 and "--urdf" in document["error"]["remedy"]
 
 
@@ -286,7 +286,17 @@ def test_a_log_of_sightings_becomes_a_head(ask, say, tmp_path):
     assert ask("new", tmp_path / "new", "--mechanism", "pan-tilt", "--sightings")[0] == 0
     header = (tmp_path / "new" / "campaign.toml").read_bytes()
     assert ask("import", tmp_path / "log.csv", "--to", tmp_path / "new", "--yes")[0] == 0
-    assert (tmp_path / "new" / "campaign.toml").read_bytes() == header
+    assert read_campaign(tmp_path / "new").rig.priors["degrees_per_step.tilt"].value == pytest.approx(0.05)
+    assert (tmp_path / "new" / "campaign.toml").read_bytes() != header
+    assert ask("import", "--urdf", UNIT, "--steps-per-turn", 400, "--to", tmp_path / "unit", "--yes")[0] == 0
+    header = (tmp_path / "unit" / "campaign.toml").read_bytes()
+    encoders = text.replace("Motor Az", "Encoder Az [arcsec]")
+    (tmp_path / "encoders.csv").write_text(encoders)
+    code, document = ask("import", tmp_path / "encoders.csv", "--to", tmp_path / "unit", "--yes")
+    assert code == 2 and "table of counters" in assert_error(document, "encoder")["remedy"]
+    assert ask("import", tmp_path / "log.csv", "--to", tmp_path / "unit", "--yes")[0] == 0
+    stated = read_campaign(tmp_path / "unit").rig.priors["degrees_per_step.pan"]
+    assert stated.value == pytest.approx(360 / 400 / 30), "of the URDF"
     code, document = ask(*words, tmp_path / "x", "--column", "azimuth_deg=")
     assert code == 2 and "azimuth_deg" in assert_error(document, "missing-column")["remedy"]
     assert ask(*words, tmp_path / "x", "--sd-px", "0.1")[0] == 2

@@ -43,6 +43,7 @@ def understood(columns, notation=Notation(), correction=Correction(), **wish):  
         ("tilt approach", "tilt_approach"),
         ("sigma (arcsec)", "u_deg"),
         ("Uhrzeit", "time_s"),
+        ("stamp_s", "time_s"),
         ("quality", "status"),
         ("remark", None),
     ],

@@ -6,6 +6,7 @@ Options in, library called, table or JSON out; heavy imports stand inside the co
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,14 +15,16 @@ from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically
-from tvsbayes.files.documents import toml_line
+from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign_header import header_values
 from tvsbayes.instrument.counter_limits import LIMIT_KEYS
 from tvsbayes.pipeline import StoredOrFitted
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
     from tvsbayes.calibration.pointing import Calibration
+    from tvsbayes.head.foreign_sightings import ForeignSightings
     from tvsbayes.head.urdf import HeadJoints
     from tvsbayes.instrument.corrections import Correction
     from tvsbayes.instrument.foreign_looks import Notation
@@ -33,6 +36,8 @@ HEAD_URDF = "head.urdf"
 """In a campaign folder: the model that `import --urdf` read."""
 PARTS = ("campaign.toml", "moves.csv", "spots.csv")
 """Of a campaign that `new` made."""
+HEADS = ("campaign.toml", "rig.toml")
+"""Files with [rig.prior]."""
 RATIO_U = 0.01
 """Relative u of a nominal ratio."""
 
@@ -102,7 +107,10 @@ def import_urdf(
         for name, text in files.items():
             write_atomically(to / name, text)
         log = "moves and sightings" if kind is SIGHTING_HEAD else "moves and spots"
-        said = f"written: {escaped(str(to), 200)}\nnext: log {log} there, then `tvsbayes check {typed(to)}`"
+        following = f"log {log} there, then `tvsbayes check {typed(to)}`"
+        if kind is SIGHTING_HEAD:
+            following = f"`tvsbayes import LOG --sightings --to {typed(to)}` with moves and sightings"
+        said = f"written: {escaped(str(to), 200)}\nnext: {following}"
     document = {"campaign": str(to), "joints": dict(head.names), "signs": dict(head.sign), "assumed": assumed}
     document |= {"nominal": {name: prior.value for name, prior in priors.items()}}
     finish({**document, "written": yes, "files": list(files) if yes else []}, "\n".join([*lines, said]), as_json)
@@ -123,9 +131,7 @@ def import_sightings(
     """A table of moves and sightings into a new campaign of a head, or into one without rows."""
     from tvsbayes.files.foreign_table import read_foreign
     from tvsbayes.head.foreign_sightings import NEEDED, SIGHTING_FIELDS, sighting_field, sightings_of_table
-    from tvsbayes.instrument.campaign import MOVES, head_templates
     from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, understand, unit_of_name
-    from tvsbayes.instrument.sightings import SIGHTINGS
 
     def unit(field: str, name: str) -> str:
         of_name = unit_of_name(name, SECONDS if field == "time_s" else DEGREES)
@@ -139,32 +145,69 @@ def import_sightings(
         wanted = [*missing, *(field for field in known.claimed if field not in missing)]
         raise not_sure(table, known, wanted, SIGHTING_FIELDS, NEEDED)
     found = sightings_of_table(table, known.columns, notation, correction, u_deg)
-    templates, fresh = head_templates(True), not (to / "campaign.toml").is_file()
-    if fresh and to.exists():
+    written = _sighting_files(found, to, table.file)
+    ok = sum(sighting.status == "ok" for sighting in found.sightings)
+    lines = [*table_lines(table, known, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in written.assumed)]
+    lines.append(f"gives: {len(found.moves)} moves, {len(found.sightings)} sightings, {ok} of use")
+    yes = confirmed(lines, to, yes, as_json)
+    said = "nothing written: add --yes, or correct it with --column"
+    if yes:
+        to.mkdir(parents=True, exist_ok=True)
+        for name, data in written.files.items():
+            write_atomically(to / name, data)
+        said = f"written: {', '.join(str(to / name) for name in written.files)}\nnext: `tvsbayes check {typed(to)}`"
+    document = {**table_document(table, known), "assumed": written.assumed, "moves": len(found.moves)}
+    document |= {"sightings": len(found.sightings), "ok": ok, "campaign": str(to)}
+    document |= {"files": [str(to / name) for name in written.files] if yes else []}
+    finish(document, "\n".join([*lines, said]), as_json)
+
+
+@dataclass(frozen=True)
+class _SightingFiles:
+    """Files of a head by name, and what they assume, in words."""
+
+    files: dict[str, bytes]
+    assumed: list[str]
+
+
+def _sighting_files(found: ForeignSightings, to: Path, table: str) -> _SightingFiles:
+    """The tables, and campaign and rig file with ratios where those of the folder state none.
+
+    Raises:
+        InputError: a folder with rows, or with ratios that are none of an encoder.
+    """
+    from tvsbayes.instrument.campaign import MOVES, head_templates
+    from tvsbayes.instrument.sightings import SIGHTINGS
+
+    kept = templates = head_templates(True)
+    known: set[str] = set()
+    if not (fresh := not (to / "campaign.toml").is_file()):
+        kept = {name: read_bytes(to / name, TOML_BYTES_MAX, to) for name in HEADS if (to / name).is_file()}
+        known = _stated_priors(to)
+    elif to.exists():
         make_folder(to, empty=True)
     for name in (MOVES.file, SIGHTINGS.file):
         place = to / name
         if place.is_file() and place.read_bytes() != templates[name]:
             allowed, remedy = "no rows yet", "name another folder with --to; nothing is overwritten"
             raise refusal("occupied", file=escaped(str(place), 200), found="rows", allowed=allowed, remedy=remedy)
-    assumed = list(found.assumed) if fresh else [text for text in found.assumed if "[rig.prior]" not in text]
-    ok = sum(sighting.status == "ok" for sighting in found.sightings)
-    lines = [*table_lines(table, known, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in assumed)]
-    lines.append(f"gives: {len(found.moves)} moves, {len(found.sightings)} sightings, {ok} of use")
-    files = {MOVES.file: MOVES.content(found.moves), SIGHTINGS.file: SIGHTINGS.content(found.sightings)}
-    if fresh:
-        files = {**templates, **files, **with_priors(templates, found.priors)}
-    yes = confirmed(lines, to, yes, as_json)
-    said = "nothing written: add --yes, or correct it with --column"
-    if yes:
-        to.mkdir(parents=True, exist_ok=True)
-        for name, data in files.items():
-            write_atomically(to / name, data)
-        said = f"written: {', '.join(str(to / name) for name in files)}\nnext: `tvsbayes check {typed(to)}`"
-    document = {**table_document(table, known), "assumed": assumed, "moves": len(found.moves)}
-    document |= {"sightings": len(found.sightings), "ok": ok, "campaign": str(to)}
-    document |= {"files": [str(to / name) for name in files] if yes else []}
-    finish(document, "\n".join([*lines, said]), as_json)
+    for axis in sorted(found.encoders):
+        if (name := f"degrees_per_step.{axis}") in known:
+            what, allowed = f"angles of an encoder, and {name} in campaign.toml", "counters of the stated ratio"
+            remedy = "give a table of counters, or name a new folder with --to"
+            raise refusal("encoder", file=table, found=what, allowed=allowed, remedy=remedy)
+    priors = {name: prior for name, prior in found.priors.items() if name not in known}
+    files = dict(templates) if fresh else {}
+    files |= with_priors(kept, priors) if priors else {}
+    files |= {MOVES.file: MOVES.content(found.moves), SIGHTINGS.file: SIGHTINGS.content(found.sightings)}
+    return _SightingFiles(files, [text for text in found.assumed if text.partition(":")[0] not in known])
+
+
+def _stated_priors(folder: Path) -> set[str]:
+    """Names in [rig.prior] of a campaign folder."""
+    rig = header_values(folder).get("rig")
+    priors = rig.get("prior") if isinstance(rig, dict) else None
+    return set(priors) if isinstance(priors, dict) else set()
 
 
 def with_priors(
@@ -175,8 +218,10 @@ def with_priors(
         toml_line(name, {"value": float(f"{p.value:.9g}"), "u": float(f"{p.u:.3g}")}) for name, p in priors.items()
     ]
     files = {}
-    for name in ("campaign.toml", "rig.toml"):
+    for name in (name for name in HEADS if name in templates):
         kept = [line for line in templates[name].decode().splitlines() if not _states(line, priors)]
+        if "[rig.prior]" not in kept:
+            kept.append("[rig.prior]")
         at, table = kept.index("[rig.prior]") + 1, (more or {}).get(name, ())
         files[name] = "\n".join([*kept[:at], *entries, *kept[at:], *([""] if table else []), *table, ""]).encode()
     return files

@@ -15,7 +15,7 @@ import numpy as np
 from tvsbayes.errors import refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.foreign_table import ForeignTable
-from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.axes import AXES, Axis
 from tvsbayes.instrument.campaign import MOVES, SPOTS, Move, Spot
 from tvsbayes.instrument.cell_notation import plain_column
 from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SPREAD, field_by_word, unit_of_name, words_of
@@ -61,8 +61,9 @@ def sighting_field(name: str) -> str | None:
     """The field that a column's name tells of."""
     listed = words_of(name)
     words = set(listed)
+    # "s" is of seconds here.
     of_axis = [k for k, spellings in enumerate(_AXIS_WORDS) if words & spellings]
-    if words & SPREAD or words == {"u"} or (words & {"u"} and len(of_axis) != 1):
+    if words & (SPREAD - {"s"}) or words == {"u"} or (words & {"u"} and len(of_axis) != 1):
         return "u_deg"
     if len(of_axis) != 1:
         return field_by_word(listed, _OTHERS)
@@ -79,12 +80,14 @@ class ForeignSightings:
         moves: rows of `moves.csv`.
         sightings: rows of `sightings.csv`.
         priors: of ratios, by their names, as encoders or a line through the table say them.
+        encoders: axes whose counters are angles of an encoder.
         assumed: what it does not say, in words.
     """
 
     moves: tuple[Move, ...]
     sightings: tuple[Sighting, ...]
     priors: dict[str, Prior]
+    encoders: frozenset[Axis]
     assumed: tuple[str, ...]
 
 
@@ -146,9 +149,9 @@ def sightings_of_table(
     assumed += left_out(cells_of, statuses, "sighting")
     changed = corrected(listing.moves, cast(list[Spot], sightings), correction)
     moves, sightings = changed.moves or (), sightings_of(changed.spots or ())
-    told = frozenset(field for field in COUNTERS if field in units)
-    priors = _ratios(moves, sightings, told, assumed)
-    return ForeignSightings(moves, tuple(sightings), priors, (*assumed, *changed.changes))
+    encoders = frozenset(axis for axis, field in zip(AXES, COUNTERS, strict=True) if field in units)
+    priors = _ratios(moves, sightings, encoders, assumed)
+    return ForeignSightings(moves, tuple(sightings), priors, encoders, (*assumed, *changed.changes))
 
 
 @dataclass(frozen=True)
@@ -184,24 +187,24 @@ def _plain_numbers(table: ForeignTable, columns: dict[str, str], notation: Notat
 
 
 def _ratios(
-    moves: Sequence[Move], sightings: Sequence[Sighting], encoders: frozenset[str], assumed: list[str]
+    moves: Sequence[Move], sightings: Sequence[Sighting], encoders: frozenset[Axis], assumed: list[str]
 ) -> dict[str, Prior]:
     """Ratios and contrasts of encoders' steps, and of counters by a line through what was sighted there."""
     priors: dict[str, Prior] = {}
     ok = [s for s in sightings if s.status == "ok"]
     for axis, field, angle in zip(AXES, COUNTERS, ANGLES, strict=True):
+        counters = np.array([getattr(moves[s.move], field) for s in ok], float)
+        slope = line_slope(counters, np.array([getattr(s, angle) for s in ok], float))
+        if slope is not None and slope < 0:
+            remedy = f"add --flip {field}, or exchange two columns by --column"
+            assumed.append(f"{field}: falls where {angle} grows; {remedy}")
         ratio, u = STEP_DEG, ENCODER_U
-        if field not in encoders:
-            counters = np.array([getattr(moves[s.move], field) for s in ok], float)
-            slope = line_slope(counters, np.array([getattr(s, angle) for s in ok], float))
+        if axis not in encoders:
             if slope is None:
                 continue
             ratio, u = abs(slope), LINE_U
             line = f"{ratio:.3g} deg, u {LINE_U:.0%}, by a line through the table"
             assumed.append(f"degrees_per_step.{axis}: {line}; correct it in [rig.prior]")
-            if slope < 0:
-                remedy = f"add --flip {field}, or exchange two columns by --column"
-                assumed.append(f"{field}: falls where {angle} grows; {remedy}")
         priors[f"degrees_per_step.{axis}"] = Prior(ratio, u * ratio)
         priors[f"ratio_contrast_deg_per_step.{axis}"] = Prior(0.0, CONTRAST_U * ratio)
     return priors

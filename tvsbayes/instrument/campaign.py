@@ -108,8 +108,8 @@ class Move:
         Column(
             "seconds, never decreasing",
             *(-1e12, 1e12),
-            names="time t timestamp datetime date millis micros seconds elapsed zeit uhrzeit zeitstempel datum tiempo "
-            "hora fecha temps heure utc",
+            names="time t timestamp stamp datetime date millis micros seconds elapsed zeit uhrzeit zeitstempel datum "
+            "tiempo hora fecha temps heure utc",
         ),
     ]
     pan_steps: Annotated[
