@@ -17,10 +17,9 @@ from selenium.webdriver.support.ui import Select, WebDriverWait
 from support.browsers import CHROMIUM, DRIVER, SECONDS_MAX, Browsed, browser
 
 from tvsbayes.instrument.campaign import read_campaign, with_pixels
-from tvsbayes.view.gathering import look_at
 from tvsbayes.view.page import document, page_html
 from tvsbayes.view.pictures import look_pictures
-from tvsbayes.view.scene import LookColumns, Looked, scene
+from tvsbayes.view.scene import LookColumns, Looked, look_at, scene
 
 pytestmark = [
     pytest.mark.slow,

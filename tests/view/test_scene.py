@@ -14,9 +14,8 @@ from support.viewed_twin import PICTURED, UNDETECTED
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.campaign import ordered_spots, read_campaign, with_pixels
 from tvsbayes.instrument.parameters import names_of
-from tvsbayes.view.gathering import NOT_FITTED, NOT_OF_THESE, look_at, stored_campaign
 from tvsbayes.view.page import KINDS, document
-from tvsbayes.view.scene import Looked, scene
+from tvsbayes.view.scene import NOT_FITTED, NOT_OF_THESE, Looked, look_at, scene, stored_campaign
 
 
 @pytest.fixture(scope="module")

@@ -111,7 +111,7 @@ def report(
         write_atomically(place, content)
         page.files["dcc"] = str(place)
         if dcc_schema:
-            from tvsbayes.metrology.schema_check import check_dcc
+            from tvsbayes.metrology.dcc import check_dcc
 
             checked = check_dcc(content, dcc_schema)
             verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[checked.valid]

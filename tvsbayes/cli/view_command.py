@@ -32,7 +32,7 @@ def view(
         return
     folders = [folder for folder in (campaign, beside) if folder is not None]
     spared(out)
-    from tvsbayes.view.gathering import look_at
+    from tvsbayes.view.scene import look_at
 
     looked = look_at(campaign, beside, report_line)
     from tvsbayes.view.page import document, page_html

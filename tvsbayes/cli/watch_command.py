@@ -62,7 +62,7 @@ def _append(table: Path, found: Watch) -> InputError | None:
     """Add the line of now, UTC; why it could not be added costs nobody the result."""
     import datetime
 
-    from tvsbayes.files.growing_table import append_line
+    from tvsbayes.files.csv_table import append_line
     from tvsbayes.report.watch_text import moved_words
 
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

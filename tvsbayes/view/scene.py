@@ -8,18 +8,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 
 import numpy as np
 
 from tvsbayes.estimators.campaign_arrays import campaign_arrays, pixel_covariance
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.instrument.axes import AXES, direction_of
-from tvsbayes.instrument.campaign import CAMERAS, PIXELS, Campaign, Spot, frame_name, ordered_spots, pixels_of
+from tvsbayes.instrument.campaign import (
+    CAMERAS,
+    PIXELS,
+    Campaign,
+    Spot,
+    frame_name,
+    ordered_spots,
+    pixels_of,
+    read_campaign,
+)
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES, unit_of
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import parameter_space
+from tvsbayes.pipeline import StoredOrFitted, Tell, compile_for, untold
 from tvsbayes.posterior.predictive import repeated_rad
-from tvsbayes.report.evidence import GearBand
+from tvsbayes.report.evidence import GearBand, gear_bands
 from tvsbayes.results.comparison_record import Comparison
 from tvsbayes.results.estimates import StopResidual
 from tvsbayes.results.fit_record import FitRecord
@@ -302,3 +313,59 @@ def _correlation(fitted: Fitted | None) -> tuple[tuple[str, ...], np.ndarray]:
 def numbers_of(looks: LookColumns) -> dict[str, np.ndarray]:
     """The columns of looks that are arrays, by name."""
     return {f.name: value for f in fields(looks) if isinstance(value := getattr(looks, f.name), np.ndarray)}
+
+
+NOT_FITTED = "no results: the rig is drawn as campaign.toml states it; `tvsbayes fit` adds residuals and the fitted rig"
+NOT_OF_THESE = (
+    "results/ are of other data, of a fit that did not converge, or of another version: the rig is drawn as "
+    "campaign.toml states it; run `tvsbayes fit` again"
+)
+
+
+@dataclass(frozen=True)
+class StoredCampaign:
+    """A campaign with what its results say; `fitted` is None, and `note` says why, where there are none to use."""
+
+    campaign: Campaign
+    fitted: Fitted | None
+    note: str | None
+
+
+def stored_campaign(folder: Path) -> StoredCampaign:
+    """A campaign folder and its results.
+
+    Raises:
+        InputError: no campaign, or damaged results.
+    """
+    campaign = read_campaign(folder)
+    results = StoredOrFitted(campaign)
+    record, calibration = results.stored_record, results.stored_calibration
+    fit = None if record is None else results.stored_fit
+    if record is None or calibration is None or fit is None:
+        stored = (Path(folder) / "results" / "fit.json").exists()
+        return StoredCampaign(campaign, None, NOT_OF_THESE if stored else NOT_FITTED)
+    from tvsbayes.assessment.residuals import stop_residuals
+
+    return StoredCampaign(campaign, Fitted(fit, record, stop_residuals(fit), gear_bands(calibration)), None)
+
+
+def look_at(folder: Path, beside: Path | None = None, tell: Tell = untold) -> Looked:
+    """What a page shows of a campaign, beside another where one is named.
+
+    Args:
+        folder: of the campaign.
+        beside: of a later one of the same instrument.
+        tell: shows what takes long.
+
+    Raises:
+        InputError: no campaign, or damaged results.
+    """
+    compile_for(tell)
+    campaigns = [stored_campaign(one) for one in (folder, beside) if one is not None]
+    scenes = tuple(scene(one.campaign, one.fitted, [one.note] if one.note else []) for one in campaigns)
+    fits = [one.fitted.fit for one in campaigns if one.fitted is not None]
+    if len(fits) < 2:
+        return Looked(scenes)
+    from tvsbayes.comparison.changes import compare
+
+    return Looked(scenes, compare(*fits))
