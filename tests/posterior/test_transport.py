@@ -31,7 +31,7 @@ from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.model.compiled import BATCH, in_batches
 from tvsbayes.posterior.plays import Cut
 from tvsbayes.posterior.target import Target
-from tvsbayes.posterior.transport import BLOCK_ROWS, Transport, bends, by_width
+from tvsbayes.posterior.transport import BLOCK_ROWS, Transport, by_width, centred_count, curvatures
 
 STOP_NAMES = (("stop_sd_deg.right", "stop_sd_deg.left"), ("stop_sd_deg.down", "stop_sd_deg.up"))
 """By axis, in the order of `redraw_mix`."""
@@ -143,7 +143,20 @@ def test_a_kink_at_the_mode_turns_no_slope_over():
         return found
 
     # The slope along the narrow coordinate is 0.6 on one side of the kink and 1.4 on the other: never below zero.
-    assert np.abs(bends(replace(path, residuals=kinked))[0, 0, 0] - TURN) * 2 < 1
+    assert np.abs(curvatures(replace(path, residuals=kinked))[0, 1, 1] - TURN) * 2 < 1
+
+
+def test_a_coordinate_that_bends_the_ridge_of_a_narrower_one_stays_wide():
+    """Unless it is moved itself by more than it bends."""
+    moved = np.zeros((3, 3, 3))
+    moved[0, 0, 2] = 1.0
+    assert centred_count(moved) == 1
+    moved[0, 1, 1] = moved[1, 0, 1] = 2.0
+    assert centred_count(moved) == 2
+    moved[1, 1, 2] = 2.0
+    assert centred_count(moved) == 2, "half the square of 2 is less than the square of 2"
+    moved[1, 2, 2] = moved[2, 1, 2] = 2.0
+    assert centred_count(moved) == 1
 
 
 def test_centring_straightens_the_posterior_of_a_campaign():

@@ -13,7 +13,7 @@ from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.instrument.parameters import INDEX, NAMES, PERIODS_MAX
 from tvsbayes.posterior.linear_campaign import LinearCampaign
 from tvsbayes.posterior.stop_states import StopStates
-from tvsbayes.posterior.transport import GEAR_SCALES, Transport, bends
+from tvsbayes.posterior.transport import GEAR_SCALES, Transport, curvatures
 
 RATIO, BACKLASH = INDEX["degrees_per_step.pan"], INDEX["backlash_deg.pan"]
 STRETCH = 0.3
@@ -102,7 +102,7 @@ def ridge() -> Transport:
         gear_noise=np.zeros((len(GEAR_SCALES), 0)),
         creep_noise=np.zeros(0),
     )
-    return replace(straight, bend=bends(straight))
+    return replace(straight, bend=curvatures(straight)[:, 1:, 1:])
 
 
 PLAY, PLAY_SD, FOLLOW, RATIO_SD = -0.04, 0.08, -0.6, 0.3

@@ -56,10 +56,6 @@ FAR_ABOVE = 1e200
 """A last diagonal element that keeps a matrix positive definite whatever stands in its row; nothing reads its root."""
 BLOCK_ROWS = 64
 """Points that are mapped at a time: their matrices stay in the processor's cache."""
-NARROW, NARROW_PLAY = 0.225, 0.15
-"""Conditional posterior sd, in prior sds, below which a coordinate is centred anew at every draw: where the others take
-it, it is known so well that a step of Gauss and Newton is as good as exact. A play that reaches zero is bent there."""
-
 CENTRINGS = 2
 """Gauss-Newton steps of the narrow coordinates at every draw."""
 BEND_STEP = 2.0
@@ -348,16 +344,14 @@ class Transport:
         return np.concatenate([noise, own], axis=1)
 
 
-def bends(path: Transport) -> np.ndarray:
-    """How the slopes of the narrow coordinates change, shape (g, narrow, narrow): second differences of the residuals.
+def curvatures(path: Transport) -> np.ndarray:
+    """Second differences of the residuals along all pairs of coordinates, shape (g, g, g).
 
-    The change of the slope along a narrow coordinate is another residual: what a Gauss-Newton step makes of it says by
-    how much that slope grows along itself and the other narrow ones.
+    The bend of the residuals along two coordinates is another residual: what a Gauss-Newton step makes of it says how
+    far the best values of all coordinates move, by the product of the two.
     """
-    count, narrow = len(path.linear.prior), path.narrow
-    if not narrow:
-        return np.zeros((count, 0, 0))
-    steps, whole = BEND_STEP * np.eye(count), np.zeros((1, path.noise))
+    count, whole = len(path.linear.prior), np.zeros((1, path.noise))
+    steps = BEND_STEP * np.eye(count)
     # Degrees of a play are linear, and below zero there are none.
     steps[list(path.plays)] = 0.0
 
@@ -368,11 +362,33 @@ def bends(path: Transport) -> np.ndarray:
         return (ahead + behind - 2 * centre) / BEND_STEP**2
 
     own, found = curvature(steps), path.conditional(whole)
-    bend = np.empty((count, narrow, narrow))
-    for k, place in enumerate(range(count - narrow, count)):
-        mixed = 0.5 * (curvature(steps + steps[place]) - own - own[place])
-        bend[:, :, k] = found.centring(path.linear, -mixed, narrow)[:, ::-1]
-    return bend
+    moved = np.empty((count, count, count))
+    for one in range(count):
+        mixed = 0.5 * (curvature(steps[one:] + steps[one]) - own[one:] - own[one])
+        moved[one, one:] = found.centring(path.linear, -mixed, count)[:, ::-1]
+        moved[one:, one] = moved[one, one:]
+    return moved
+
+
+def centred_count(moved: np.ndarray) -> int:
+    """How many of the last coordinates are centred anew at every draw: so many that least is left of `curvatures`.
+
+    Centring takes away what the others do to a coordinate, alone or by a product with it. What coordinates that are
+    centred do to each other stays, and so does whatever moves a wide one. A coordinate along which the ridge of the
+    narrower ones is bent is therefore better wide, however well it is known: they follow it then.
+
+    Args:
+        moved: by `curvatures`, shape (g, g, g).
+
+    Returns:
+        The number for which the sum of the variances of what stays, in posterior variances, is least.
+    """
+    count = len(moved)
+    # Variances of products of standard normal numbers: 1, and of half a square 1/2.
+    pairs = np.triu(np.ones((count, count)), 1) + 0.5 * np.eye(count)
+    variance = pairs[..., None] * moved**2
+    left = [variance[..., :wide].sum() + variance[wide:, wide:, wide:].sum() for wide in range(count, -1, -1)]
+    return int(np.argmin(left))
 
 
 @dataclass(frozen=True)
@@ -430,21 +446,42 @@ def creep(fit: JointFit, by_y: np.ndarray, errors: int) -> Creep | None:
 
 def transport(fit: JointFit) -> Transport:
     """The map at the mode of a converged fit."""
+    by_noise = np.isin(NAMES, SCALE_NAMES)
+    others = np.flatnonzero(fit.free & ~by_noise)
+    covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
+    order = by_width(covariance)
+    straight = uncentred(fit, others[order], np.linalg.cholesky(covariance[np.ix_(order, order)]))
+    moved = curvatures(straight)
+    plain = np.setdiff1d(np.arange(len(others)), straight.plays)
+    narrow = centred_count(moved[np.ix_(plain, plain, plain)])
+    # A play is never centred: its degrees are linear as they are.
+    last = plain[len(plain) - narrow :]
+    turned = np.concatenate([np.setdiff1d(np.arange(len(others)), last), last])
+    order = order[turned]
+    path = uncentred(fit, others[order], np.linalg.cholesky(covariance[np.ix_(order, order)]))
+    own, wide = slice(path.noise, None), len(others) - narrow
+    before = np.linalg.solve(straight.root[own, own], path.root[own, own][np.argsort(turned)])
+    after = np.linalg.inv(before)[wide:]
+    bend = np.einsum("abc,ai,bp,kc->ikp", moved, before, before[:, wide:], after, optimize=True)
+    return replace(path, narrow=narrow, bend=bend)
+
+
+def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
+    """The map at the mode of a converged fit, no coordinate centred.
+
+    Args:
+        fit: converged.
+        others: coordinates of z that are sampled, noise scales left out, in the order of y, shape (g,).
+        wide: lower triangular factor of their covariance, shape (g, g).
+    """
     linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
     names = np.array(NAMES)
     free = np.flatnonzero(fit.free)
     scales = np.isin(names[free], SCALE_NAMES)
     # What several scales share comes first: given it, they have little to do with each other.
-    noise, others = free[scales], free[~scales]
+    noise = free[scales]
     noise = noise[np.argsort(~np.isin(names[noise], names_of("look_scatter_deg")), kind="stable")]
-    covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
-    order = by_width(covariance)
-    least = np.where(np.isin(names[others[order]], BLOCKS["backlash_deg"]), NARROW_PLAY, NARROW)
-    broad = np.diag(np.linalg.cholesky(covariance[np.ix_(order, order)])) >= least
-    order, narrow = np.concatenate([order[broad], order[~broad]]), int((~broad).sum())
-    others = others[order]
     of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
-    wide = np.linalg.cholesky(covariance[np.ix_(order, order)])
     stops, drifts = stop_states(fit, linear), walks(fit)
     by_noise, by_scatter = STOP_COLUMNS.reshape(4, 1) == noise, SCATTER_COLUMNS.reshape(2, 1) == noise
     places = fit.arrays.gears.without_padding().places
@@ -458,14 +495,14 @@ def transport(fit: JointFit) -> Transport:
         return in_batches(lambda at: residuals(at, fit.space, fit.arrays), z).reshape(len(z), -1)
 
     precision = np.ones(len(others))
-    for place in np.flatnonzero(np.isin(names[others[: len(others) - narrow]], BLOCKS["backlash_deg"])):
+    for place in np.flatnonzero(np.isin(names[others], BLOCKS["backlash_deg"])):
         precision[place] = HalfNormal(float(fit.z[others[place]])).precision
-    path = Transport(
+    return Transport(
         mode=fit.z,
         free=np.concatenate([noise, others]),
         root=linalg.block_diag(of_noise, wide),
         noise=len(noise),
-        narrow=narrow,
+        narrow=0,
         slope=np.where(half, 1.0, np.asarray(fit.space.u)[noise])[:, None] * of_noise,
         half=half,
         pixels=(noise == INDEX["pixel_scale"]).astype(float),
@@ -481,7 +518,7 @@ def transport(fit: JointFit) -> Transport:
             creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, 2 * len(seen) + len(drifts.walk)),
         ),
         residuals=misfit,
-        bend=np.zeros((len(others), narrow, narrow)),
+        bend=np.zeros((len(others), 0, 0)),
         place_angle_rad=(places.steps * ratio[places.on_tilt.astype(int)])[seen],
         place_on_tilt=np.asarray(places.on_tilt)[seen],
         walk=drifts.walk,
@@ -492,4 +529,3 @@ def transport(fit: JointFit) -> Transport:
         creep_noise=(noise == INDEX["creep_minutes"]).astype(float),
         period_deg=np.asarray(fit.space.harmonic_period_deg),
     )
-    return replace(path, bend=bends(path))
