@@ -81,10 +81,10 @@ class Acquisition:
         journal: from `begin`; closed in the end.
         bench: what it runs on; its positioner is closed in the end.
         stop: the stop key, in force while `run` runs.
-        show: told about progress.
+        show: called with the progress.
         estimate: the running estimate; a run that meets its target ends.
         live: where the run is published, and what is asked of it; by default nobody looks.
-        place_command: a program that places the sheet before the operator is told; by default there is none.
+        place_command: a program that places the sheet before the operator is asked; by default there is none.
     """
 
     def __init__(

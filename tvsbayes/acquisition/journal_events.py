@@ -1,4 +1,4 @@
-"""The events of a run's journal, as their JSON objects stand in `log.jsonl`: structs, told apart by the key `event`.
+"""The events of a run's journal, as their JSON objects stand in `log.jsonl`: structs, distinguished by the key `event`.
 
 `created` opens a journal. Every motion of the plan is an `intent` before, and an order has an event of its own once it
 is done: `homed`, `placed`, `moved`, `looked`. `place_command` is a program that was to place the sheet. `adapted`

@@ -27,7 +27,7 @@ REQUESTS = (PAUSE, RESUME, STOP, LASER_OFF)
 CONTROL_PASSED = "control passed on"
 """No request of a page but news for the journal: another browser controls."""
 KEPT_MAX = 20
-"""Settled requests that are still told of."""
+"""Settled requests that are still listed."""
 REQUESTED, ACKNOWLEDGED, FAILED = "requested", "acknowledged", "failed"
 PAUSE_POLL_S = 0.2
 """How often a paused run looks whether Ctrl-C was pressed."""
@@ -137,7 +137,7 @@ class Control:
         positioner: the device itself.
         stop: the stop key, which a request to stop presses.
         write: appends the event to the journal, with its time.
-        changed: told when a pause begins or ends, and after every exchange with the device.
+        changed: called when a pause begins or ends, and after every exchange with the device.
 
     Attributes:
         paused: whether the run stands still.

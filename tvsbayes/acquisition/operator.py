@@ -181,7 +181,7 @@ class SimulatedOperator:
 
 
 def check_hazard(laser_class: str | None, simulate: bool) -> None:
-    """Refuses a laser class that there is none of, and a real laser of which nobody can be told."""
+    """Refuses a laser class that there is none of, and a real laser where nobody can be asked."""
     if laser_class is not None and laser_class.upper() not in LASER_CLASSES:
         remedy = "read it off the laser's label"
         raise InputError(

@@ -1,6 +1,6 @@
 """The point of one look as a robot gets it: estimate, covariance, and whether its counters were ever looked at; mm.
 
-Also the rule by which a look has no point that can be told.
+Also the rule by which a look has no point of finite uncertainty.
 """
 
 from __future__ import annotations

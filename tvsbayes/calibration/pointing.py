@@ -96,7 +96,7 @@ class Calibration(Shown):
         noise: draws (n, 5) of `NOISE_NAMES`, likewise.
         causes: names of the causes of uncertainty behind `cause_covariance`; empty where unknown.
         cause_covariance: what each contributes to `covariance`, shape (causes, inputs, inputs).
-        gears: counters at which errors of the gears are told; none where gears do not vary.
+        gears: counters at which errors of the gears are tabulated; none where gears do not vary.
         extrinsics: draws (n, 6) of `EXTRINSICS_NAMES`, row by row with `inputs`; none where only the moments were kept.
         names: of the inputs: `INPUT_NAMES`, or what a head has in their places.
     """
@@ -300,7 +300,7 @@ class Calibration(Shown):
         return Located(point, covariance, u95, not self.covers(*steps), self.unseen(*steps))
 
     def refusal(self, pan_steps: float, tilt_steps: float, aperture_deg: float, sides: Sides) -> InputError:
-        """Why beam and line of sight of a look have no point in common, or none that can be told: by name.
+        """Why beam and line of sight of a look have no point in common, or none of finite uncertainty: by name.
 
         "grazing" where the estimated beam passes the aperture's cone without touching it, "behind" where it meets the
         reading behind the baseline, else "diverging".

@@ -2,7 +2,7 @@
 
 Interlaced and two-tap readouts take alternate lines at another moment or with another gain. A constant gain moves no
 centre: the height of each half takes it up. A beam that moved in between, or a gain that changes along the spot, does,
-and the two cannot be told apart on a Gaussian. White noise of pixels puts the halves' centres apart with four times
+and the two are indistinguishable on a Gaussian. White noise of pixels puts the halves' centres apart with four times
 the covariance C of the whole's (each half has 2 C). Where a difference d is beyond that chance, the whole's centre lies
 anywhere between both with equal right: d d'/12 is added to C (JCGM 100:2008, 4.3.7: limits d apart, uniform).
 

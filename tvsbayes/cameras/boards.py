@@ -320,7 +320,7 @@ def find_views(
         board: what to look for.
         finder: see `find_corners`.
         pairing: which picture is of which camera.
-        advance: told the share of the pictures that is done.
+        advance: called with the share of the pictures that is done.
 
     Raises:
         InputError: no folder, an unreadable picture, or two for one camera and view.

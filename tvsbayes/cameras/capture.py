@@ -4,7 +4,7 @@ A picture counts only if its exposure began after it was asked for. Drivers keep
 frame says when it was exposed. So every `grab` first empties the buffers: a buffered frame comes as fast as it can be
 decoded, a live one at the camera's own rate, which is measured at opening; only behind the first live frames, which
 may still have been in the pipe, one is taken. A camera that never makes us wait is refused: its frames could be of any
-age. Where decoding takes as long as the camera's period the two cannot be told apart; then the proof by light holds
+age. Where decoding takes as long as the camera's period the two are indistinguishable; then the proof by light holds
 that the driver of the laser adds. Streams of the network are read all the time (`network_stream`).
 
 Pictures are (height, width, 3), blue, green, red, uint8 or uint16 as the camera gives them; raw pixels, nothing

@@ -263,7 +263,7 @@ def detect(
             left.png and right.png.
         workers: threads; default one per core.
         overlay: folder for one picture per look: outline of the bright area and centre.
-        progress: told how far it is.
+        progress: called with the progress.
 
     Raises:
         InputError: a frame that cannot be read safely, has another size, or a campaign without folder.

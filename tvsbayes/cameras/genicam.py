@@ -21,7 +21,7 @@ import numpy as np
 
 from tvsbayes.cameras.capture import PIPELINE_FRAMES, CameraSettings, StereoImage
 from tvsbayes.errors import DeviceFault, InputError, entry_refusal, escaped, fault
-from tvsbayes.instrument.rig import Rig, Setting
+from tvsbayes.instrument.rig import Rig, Setting, driver_options
 
 FETCH_S = 5.0
 """Longest wait for a picture after its trigger."""
@@ -66,10 +66,7 @@ class GenicamWishes:
         Raises:
             InputError: an entry that is missing or does not belong to GenICam cameras.
         """
-        options = {key.partition(".")[2]: value for key, value in table.items() if key.startswith("options.")}
-        for key in options:
-            if key not in OPTIONS:
-                raise _refused(f"options.{key}", escaped(str(options[key])), ", ".join(OPTIONS), "remove it")
+        options = driver_options(table, "cameras", OPTIONS)
         if "producer" not in options:
             remedy = "name the maker's GenTL producer, a .cti file, in [cameras.options]"
             raise _refused("options.producer", "nothing", "the path of a .cti file", remedy)

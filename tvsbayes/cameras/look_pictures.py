@@ -239,7 +239,7 @@ def copy_frames(pictures: dict[int, View], campaign: Path, advance: Advance = un
     Args:
         pictures: both pictures of each look, by its `spot`.
         campaign: the folder that is to hold `frames/`; a picture that is there already and the same stays.
-        advance: told the share that is done.
+        advance: called with the share that is done.
 
     Returns:
         How many pictures lie there now.

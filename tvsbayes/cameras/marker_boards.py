@@ -39,7 +39,7 @@ class Markers:
     Attributes:
         squares: columns and rows of squares.
         dictionary: name in OpenCV without DICT_.
-        share: side of a marker over that of a square; None before pictures told it.
+        share: side of a marker over that of a square; None before it is estimated from pictures.
         legacy: the first square is white, on boards of an even number of rows (OpenCV before 4.6, calib.io).
     """
 

@@ -326,7 +326,7 @@ def calibrate_folder(
     robust: bool = False,
     progress: Show | None = None,
 ) -> StereoCalibration:
-    """`find_views`, then `calibrate_stereo`; their arguments and errors. `progress` is told how far it is."""
+    """`find_views`, then `calibrate_stereo`; their arguments and errors. `progress` is called with the progress."""
     began = time.perf_counter()
     with Job(STAGES, progress) as job:
         job.begin(FINDING)

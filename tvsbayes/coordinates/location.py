@@ -146,18 +146,6 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Carried:
-    """Draws of points, shape (draws, points, 3), not a number where beam and reading do not meet."""
-
-    xyz_mm: np.ndarray
-
-    @property
-    def meets(self) -> np.ndarray:
-        """Whether each exists, shape (draws, points)."""
-        return np.isfinite(self.xyz_mm).all(axis=-1)
-
-
-@dataclass(frozen=True)
 class Linear:
     """The law of propagation of uncertainty: y = f(x), J = df/dx, U_y = J U_x J^T (GUM 5.2.2, JCGM 102 6.2).
 
@@ -188,8 +176,8 @@ def settings_of(
     return Settings(np.stack([pan, tilt], axis=1), side, np.array(reading))
 
 
-def carry(calibration: Calibration, rigs: Drawn, settings: Settings) -> Carried:
-    """Every draw through the geometry for every point."""
+def carry(calibration: Calibration, rigs: Drawn, settings: Settings) -> np.ndarray:
+    """Every draw through the geometry for every point: (draws, points, 3), not a number where nothing meets."""
     noise = rigs.noise.T[:, :, None]
     xyz = np.empty((len(rigs.inputs), len(settings.steps), 3))
     for rows in settings.of_one_approach():
@@ -197,7 +185,7 @@ def carry(calibration: Calibration, rigs: Drawn, settings: Settings) -> Carried:
         values = rigs.values_at(calibration, (steps[0], steps[1]))
         points = calibration.points(values, noise, (steps[0], steps[1]), (*side,), settings.aperture_deg[rows])
         xyz[:, rows] = points.transpose(1, 2, 0)
-    return Carried(xyz)
+    return xyz
 
 
 def locate_linear(calibration: Calibration, settings: Settings) -> Linear:
@@ -244,7 +232,7 @@ def locate(
         draws: number of draws, at least 500; 1000 give a 95 % half width to about 3 %.
         seed: of stop errors and aperture noise; they are the same for every point, so that a point does not depend
             on its neighbours in the list.
-        progress: told how far it is.
+        progress: called with the progress.
 
     Returns:
         Points with covariance and intervals; look at `refused`.
@@ -293,9 +281,9 @@ def _together[T: (Locations, Validation)](parts: Sequence[T]) -> T:
     return replace(parts[0], **{name: joined([getattr(part, name) for part in parts]) for name in names})
 
 
-def _statistics(settings: Settings, carried: Carried, law: Linear, given: Drawn, calibration: Calibration) -> Locations:
+def _statistics(settings: Settings, xyz: np.ndarray, law: Linear, given: Drawn, calibration: Calibration) -> Locations:
     """Moments, intervals and validation of one block of points; none of them is refused by name yet."""
-    meets, xyz = carried.meets, carried.xyz_mm.copy()
+    meets = np.isfinite(xyz).all(axis=-1)
     lost = (~meets).mean(axis=0)
     count = len(meets)
     # The few draws without a point take the point's median place: at most one in a thousand, or the point is refused.

@@ -122,7 +122,7 @@ def look_blocks(path: Path, advance: Advance = unshown) -> Iterator[LookRows]:
 
     Args:
         path: the file.
-        advance: told which share of it is read.
+        advance: called with the share of it that is read.
 
     Raises:
         InputError: as `read_looks`, in the block where it stands.

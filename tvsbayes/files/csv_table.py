@@ -172,7 +172,7 @@ def table_blocks(path: Path, columns: Sequence[str], rows: int, advance: Advance
         path: the file.
         columns: found by name in any order.
         rows: at most `CSV_ROWS_MAX`.
-        advance: told which share of the file is read.
+        advance: called with the share of the file that is read.
 
     Raises:
         InputError: as `parse_table`, in the block where it stands.

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
 from typing import Literal
 
-from tvsbayes.errors import InputError, closest, escaped
+from tvsbayes.errors import InputError, closest, entry_refusal, escaped
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
@@ -378,6 +378,19 @@ def _parse_options(table: Keys) -> dict[str, Setting]:
                 options.integer(key, -(2**53), 2**53) if whole else options.number(key, -1e300, 1e300)
             )
     return values
+
+
+def driver_options(table: Mapping[str, Setting], section: str, known: Iterable[str]) -> dict[str, Setting]:
+    """The options of a driver by name, of `[positioner]` or `[cameras]`.
+
+    Raises:
+        InputError: one that is not `known`.
+    """
+    options = {key.removeprefix("options."): value for key, value in table.items() if key.startswith("options.")}
+    for name, value in options.items():
+        if name not in known:
+            raise entry_refusal(section, section, f"options.{name}", escaped(str(value)), ", ".join(known), "remove it")
+    return options
 
 
 def _parse_positioner(table: Keys) -> dict[str, Setting]:

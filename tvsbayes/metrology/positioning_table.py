@@ -49,7 +49,7 @@ NOT_COVERED = (
 
 @dataclass(frozen=True)
 class StopReadings:
-    """Mirror angles at the stops of one axis, as the spots told them and the fitted geometry reads them.
+    """Mirror angles at the stops of one axis, inferred from the spots by the fitted geometry.
 
     Attributes:
         axis: pan or tilt.

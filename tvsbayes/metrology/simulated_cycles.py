@@ -103,7 +103,7 @@ def simulated_runs(
     other = AXES[1 - AXES.index(axis)]
     middle = float(calibration.range_steps[AXES.index(other)].mean())
     at = (steps[:, 0], np.full(len(steps), middle)) if axis == AXES[0] else (np.full(len(steps), middle), steps[:, 0])
-    # What repeats by position is told at the counter: what the contrast has gained by then moves it by far less.
+    # What repeats by position is taken at the counter: what the contrast has gained by then moves it by far less.
     gear_errors = calibration.gears.at(calibration.inputs[rows, len(INPUT_NAMES) :], at)
     values |= {name: errors[..., None] for name, errors in gear_errors.items()}
     other_deg = output_deg(values, other, middle, 0.0, calibration.period_deg.get(other))

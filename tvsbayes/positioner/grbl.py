@@ -20,6 +20,7 @@ from functools import partial
 from tvsbayes.errors import DeviceFault, entry_refusal, escaped
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.counter_limits import CounterLimits
+from tvsbayes.instrument.rig import driver_options
 from tvsbayes.positioner.grbl_messages import (
     ALARMS,
     ASK,
@@ -88,10 +89,7 @@ class Wishes:
             if key in table:
                 remedy = "remove it: ramps and home position are settings of the board, a watchdog it does not have"
                 raise _refused(key, str(table[key]), "no entry with a GRBL board", remedy)
-        options = {key.partition(".")[2]: value for key, value in table.items() if key.startswith("options.")}
-        for key, value in options.items():
-            if key not in OPTIONS:
-                raise _refused(f"options.{key}", escaped(str(value)), ", ".join(OPTIONS), "remove it")
+        options = driver_options(table, "positioner", OPTIONS)
         laser = str(options.get("laser", "M3"))
         if laser not in LASER_ORDERS:
             remedy = "name what switches the laser: M3 the spindle, M7 mist, M8 flood coolant"

@@ -21,7 +21,7 @@ RESET = b"\x18"
 HOLD = b"!"
 ASK = b"?"
 STEPS_PER_MM_MAX = 500.0
-"""Positions are told to 0.0005 mm: beyond this a quarter of a step and more."""
+"""Positions are reported to 0.0005 mm: beyond this a quarter of a step and more."""
 LASER_ORDERS = {"M3": "M5", "M4": "M5", "M7": "M9", "M8": "M9"}
 """What switches a laser on and off again: spindle or coolant."""
 _STATUS = re.compile(r"<([A-Za-z]+)(?::\d+)?\|(.*)>")

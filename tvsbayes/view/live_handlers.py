@@ -47,7 +47,7 @@ class Guarded(web.RequestHandler):
         access: who may ask.
         files: of the page.
         live: the run.
-        read: told the number of every snapshot that is sent.
+        read: called with the number of every snapshot that is sent.
         open_to_all: whether the page's own browser is answered without the key.
     """
 

@@ -75,7 +75,7 @@ async def serving(live: Watched, port: int, started: Callable[[str], None], read
         live: the run.
         port: to listen on; 0 takes a free one.
         started: given the link once the server listens.
-        read: told the number of every snapshot that is sent.
+        read: called with the number of every snapshot that is sent.
 
     Raises:
         InputError: the port is taken or forbidden, or the extra is missing.
@@ -157,7 +157,7 @@ class LivePage:
             self._loop.call_soon_threadsafe(self._task.cancel)
 
     def _serve(self) -> None:
-        """Until it is ended or fails; what fails before it listens is told to who waits for the link."""
+        """Until it is ended or fails; what fails before it listens is raised to who waits for the link."""
         try:
             self._loop.run_until_complete(self._task)
         except asyncio.CancelledError:

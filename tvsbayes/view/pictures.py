@@ -55,7 +55,7 @@ def look_pictures(
         folder: of the campaign; a link that leads out of it is not followed.
         looks: which have pictures, and where their spots are.
         bytes_max: of all data URIs.
-        advance: told the share that is done.
+        advance: called with the share that is done.
     """
     pictures: dict[int, dict[str, PagePicture]] = {}
     kept = np.flatnonzero(looks.pictures.any(axis=1))

@@ -39,7 +39,7 @@ class Pyramid:
 
 
 def pyramids(stereo: Stereo, depth_mm: float) -> tuple[Pyramid, Pyramid]:
-    """Both cameras, as deep as told."""
+    """Both cameras, as deep as stated."""
     width, height = stereo.image_width - 0.5, stereo.image_height - 0.5
     corners_px = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)])
     rays = []
