@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from xml.parsers import expat
@@ -32,48 +32,57 @@ PARALLEL_DEG = 45.0
 SAME = 1e-12
 """Change of a number below which it is kept as it stands."""
 CORRECTS = "head_corrects"
-LISTED = 20
-
-
-@dataclass(frozen=True)
-class _Tag:
-    """A start tag: its attributes, and where it stands in the file."""
-
-    attributes: Mapping[str, str]
-    begin: int
-    end: int
+PROPERTY = "xacro:property"
+DEPTH_MAX, LISTED = 100, 20
+_LEAN = "azimuth_axis_tilt_deg"
 
 
 @dataclass
-class _Element:
-    """A joint or transmission: its own tag, those of its children by name, and texts with their places."""
+class _Tag:
+    """An element: its start tag and text with their places in the file, and what stands in it."""
 
-    tag: _Tag
-    parts: dict[str, _Tag] = field(default_factory=dict)
-    texts: dict[str, tuple[str, int]] = field(default_factory=dict)
+    name: str
+    attributes: Mapping[str, str]
+    begin: int
+    end: int
+    children: list[_Tag] = field(default_factory=list)
+    text: str = ""
+    text_begin: int = 0
+
+    def first(self, name: str) -> _Tag | None:
+        """The first element of this name in it, at any depth."""
+        found = (child if child.name == name else child.first(name) for child in self.children)
+        return next((tag for tag in found if tag is not None), None)
+
+    def named(self, part: str, attribute: str) -> str:
+        """A text attribute of an element in it, "" without it."""
+        tag = self.first(part)
+        return "" if tag is None else tag.attributes.get(attribute, "")
 
     def numbers(self, part: str, attribute: str, default: tuple[float, ...]) -> np.ndarray:
-        """Numbers of an attribute."""
-        text = self.parts[part].attributes.get(attribute) if part in self.parts else None
+        """Numbers of an attribute of an element in it."""
+        tag = self.first(part)
+        text = None if tag is None else tag.attributes.get(attribute)
         values = default if text is None else tuple(map(float, text.split()))
         if len(values) != len(default) or not all(map(math.isfinite, values)):
             raise ValueError(f"{part} {attribute}={text!r}: {len(default)} numbers are expected")
         return np.array(values)
 
-    def named(self, part: str, attribute: str) -> str:
-        """A text attribute, "" without it."""
-        return self.parts[part].attributes.get(attribute, "") if part in self.parts else ""
+    @property
+    def type(self) -> str:
+        """Of a joint."""
+        return self.attributes.get("type", "no type")
 
     @property
     def rotation(self) -> Rotation:
-        """Of its origin."""
+        """Of a joint's origin."""
         from scipy.spatial.transform import Rotation
 
         return Rotation.from_euler("xyz", self.numbers("origin", "rpy", (0.0, 0.0, 0.0)))
 
     @property
     def shift_m(self) -> np.ndarray:
-        """Of its origin, shape (3,)."""
+        """Of a joint's origin, shape (3,)."""
         return self.numbers("origin", "xyz", (0.0, 0.0, 0.0))
 
     @property
@@ -87,35 +96,30 @@ class _Element:
 
 @dataclass(frozen=True)
 class Urdf:
-    """A URDF that was read.
-
-    Attributes:
-        data: its bytes.
-        root: of its element `robot`.
-        joints: by name.
-        transmissions: by the name of their joint.
-        properties: of `xacro:property`, by name.
-    """
+    """A URDF that was read: its bytes, and its element `robot`."""
 
     data: bytes
     root: _Tag
-    joints: Mapping[str, _Element]
-    transmissions: Mapping[str, _Element]
-    properties: Mapping[str, _Tag]
+
+    def listed(self, kind: str) -> dict[str, _Tag]:
+        """Elements of a kind right below `robot`, by name."""
+        return {tag.attributes.get("name", ""): tag for tag in self.root.children if tag.name == kind}
+
+    def reduction(self, joint: str) -> _Tag | None:
+        """`mechanicalReduction` of the transmission of a joint, None where none is stated."""
+        found = (tag for tag in self.listed("transmission").values() if tag.named("joint", "name") == joint)
+        return next((tag.first("mechanicalReduction") for tag in found), None)
 
 
 def read_urdf(data: bytes, file: str) -> Urdf:
-    """The joints of a URDF.
+    """The elements of a URDF.
 
     Raises:
         InputError: no XML, a document type, no robot, or a xacro that was not expanded.
     """
     parser = expat.ParserCreate()
-    path: list[tuple[str, _Element]] = []
-    joints: dict[str, _Element] = {}
-    transmissions: dict[str, _Element] = {}
-    properties: dict[str, _Tag] = {}
-    roots: list[_Tag] = []
+    path = [_Tag("", {}, 0, 0)]
+    top = path[0]
 
     def refuse(found: str, allowed: str, remedy: str) -> InputError:
         return refusal("urdf", file=file, line=parser.CurrentLineNumber, found=found, allowed=allowed, remedy=remedy)
@@ -124,43 +128,31 @@ def read_urdf(data: bytes, file: str) -> Urdf:
         at = parser.CurrentByteIndex
         # A ">" inside quotes is none of the tag's.
         close = re.compile(rb"""(?:[^>"']|"[^"]*"|'[^']*')*>""").match(data, at)
-        tag = _Tag(attributes, at, close.end() if close else at)
-        own_property = name == "xacro:property"
-        if (name.startswith("xacro:") and not own_property) or any("${" in v or "$(" in v for v in attributes.values()):
+        foreign = name.startswith("xacro:") and name != PROPERTY
+        if foreign or any("${" in v or "$(" in v for v in attributes.values()):
             raise refuse("xacro that is not expanded", "a plain URDF", "run `xacro FILE > head.urdf`, and give that")
-        if not path and name != "robot":
+        if path[-1] is top and name != "robot":
             raise refuse(f"<{escaped(name)}>", "<robot>", "give a URDF; an SDF or MJCF converts to one")
-        if not path:
-            roots.append(tag)
-        element = _Element(tag)
-        if len(path) == 1 and name == "joint":
-            joints[attributes.get("name", "")] = element
-        elif len(path) > 1:
-            owner = path[1][1]
-            owner.parts.setdefault(name, tag)
-            if path[1][0] == "transmission" and name == "joint":
-                transmissions[attributes.get("name", "")] = owner
-        elif own_property:
-            properties[attributes.get("name", "")] = tag
-        path.append((name, element))
-
-    def end(_: str) -> None:
-        path.pop()
+        if len(path) > DEPTH_MAX:
+            raise refuse(f"more than {DEPTH_MAX} elements in each other", "a plain URDF", "give a URDF file")
+        tag = _Tag(name, attributes, at, close.end() if close else at)
+        path[-1].children.append(tag)
+        path.append(tag)
 
     def text(words: str) -> None:
-        if len(path) > 2 and words.strip():
-            path[1][1].texts.setdefault(path[-1][0], (words, parser.CurrentByteIndex))
+        if words.strip() and not path[-1].text:
+            path[-1].text, path[-1].text_begin = words, parser.CurrentByteIndex
 
     def doctype(*_: object) -> None:
         raise refuse("a document type", "a URDF without one", "remove the lines of <!DOCTYPE>")
 
-    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.StartElementHandler, parser.EndElementHandler = begin, lambda _: path.pop() and None
     parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = text, doctype
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
         raise refuse(escaped(str(error)), "XML", "give a URDF file") from error
-    return Urdf(data, roots[0], joints, transmissions, properties)
+    return Urdf(data, top.children[0])
 
 
 @dataclass(frozen=True)
@@ -177,14 +169,11 @@ class _Frames:
         from scipy.spatial.transform import Rotation
 
         rad = {name: math.radians(value) for name, value in terms.items()}
-        north, east = (rad[f"azimuth_axis_tilt_deg.{side}"] for side in ("north", "east"))
-        stage = Rotation.from_rotvec([-east, north, 0.0])
-        stage *= Rotation.from_rotvec([0.0, 0.0, rad["azimuth_zero_deg"]])
-        skew = rad["axes_not_square_deg"]
-        axis = np.array([0.0, math.cos(skew), math.sin(skew)])
-        up = np.array([0.0, -math.sin(skew), math.cos(skew)])
-        raised = Rotation.from_rotvec(-rad["elevation_zero_deg"] * axis)
-        return cls(stage, stage * raised * Rotation.from_rotvec(-rad["beam_not_square_deg"] * up), stage.apply(axis))
+        lean = Rotation.from_rotvec([-rad[f"{_LEAN}.east"], rad[f"{_LEAN}.north"], 0.0])
+        stage, skew = lean * Rotation.from_euler("Z", rad["azimuth_zero_deg"]), rad["axes_not_square_deg"]
+        square = stage * Rotation.from_euler("X", skew)
+        raised = Rotation.from_euler("YZX", [-rad["elevation_zero_deg"], -rad["beam_not_square_deg"], -skew])
+        return cls(stage, square * raised, square.apply([0.0, 1.0, 0.0]))
 
 
 @dataclass(frozen=True)
@@ -207,23 +196,19 @@ class HeadJoints:
     height_m: float
     between: tuple[Rotation, np.ndarray]
 
-    def joint(self, axis: str) -> _Element:
+    def joint(self, axis: str) -> _Tag:
         """Of an axis."""
-        return self.urdf.joints[self.names[axis]]
+        return self.urdf.listed("joint")[self.names[axis]]
 
     def reduction(self, axis: str) -> float | None:
         """`mechanicalReduction` of its transmission, None where none is stated."""
-        found = self.urdf.transmissions.get(self.names[axis])
-        return (
-            None
-            if found is None or "mechanicalReduction" not in found.texts
-            else float(found.texts["mechanicalReduction"][0])
-        )
+        found = self.urdf.reduction(self.names[axis])
+        return None if found is None else float(found.text)
 
     def limits_deg(self, axis: str) -> tuple[float, float] | None:
         """Lowest and highest angle from the joint's zero, where azimuth or elevation grows; None without limits."""
         joint = self.joint(axis)
-        if joint.tag.attributes.get("type") == "continuous" or "limit" not in joint.parts:
+        if joint.type == "continuous" or joint.first("limit") is None:
             return None
         ends = [float(joint.numbers("limit", end, (0.0,))[0]) for end in ("lower", "upper")]
         low, high = sorted(math.degrees(self.sign[axis] * end) for end in ends)
@@ -253,12 +238,9 @@ def head_joints(data: bytes, file: str, names: Mapping[str, str | None]) -> Head
 def _head_joints(urdf: Urdf, file: str, names: Mapping[str, str | None]) -> HeadJoints:
     from scipy.spatial.transform import Rotation
 
-    def refuse(found: str, allowed: str, remedy: str) -> InputError:
-        return refusal("urdf-joint", file=file, found=found, allowed=allowed, remedy=remedy)
-
-    chosen = _named(urdf, names, refuse)
-    pan, tilt = (urdf.joints[chosen[axis]] for axis in AXES)
-    between = _between(urdf, pan, tilt, refuse)
+    chosen, joints = _named(urdf, names, file), urdf.listed("joint")
+    pan, tilt = (joints[chosen[axis]] for axis in AXES)
+    between = _between(joints, pan, tilt, file)
     first = pan.rotation
     joint_frame = first * between[0] * tilt.rotation
     pan_axis, tilt_axis = first.apply(pan.axis), joint_frame.apply(tilt.axis)
@@ -270,29 +252,29 @@ def _head_joints(urdf: Urdf, file: str, names: Mapping[str, str | None]) -> Head
         angle = math.degrees(math.asin(min(1.0, float(np.linalg.norm(np.cross(one, other))))))
         if angle < PARALLEL_DEG:
             remedy = "name other joints by --pan-joint and --tilt-joint, or turn the link's frame so that x looks ahead"
-            raise refuse(f"{what} stand at {angle:.0f} deg", "axes that cross", remedy)
+            raise _refused(file, f"{what} stand at {angle:.0f} deg", "axes that cross", remedy)
     upwards = 1 if pan_axis[2] >= 0 else -1
     up = upwards * pan_axis
     lean = math.atan2(math.hypot(up[0], up[1]), up[2])
     if math.degrees(lean) > LEAN_MAX_DEG:
         remedy = "pan is the joint that turns about the vertical: name it by --pan-joint; z of its parent link is up"
-        raise refuse(f"the pan axis leans by {math.degrees(lean):.0f} deg", f"at most {LEAN_MAX_DEG:g} deg", remedy)
+        raise _refused(
+            file, f"the pan axis leans by {math.degrees(lean):.0f} deg", f"at most {LEAN_MAX_DEG:g} deg", remedy
+        )
     level = math.hypot(up[0], up[1])
     north, east = (lean * up[k] / level if level > 0 else 0.0 for k in (0, 1))
     upright = Rotation.from_rotvec([-east, north, 0.0]).inv()
     across, sight = upright.apply(tilt_axis), upright.apply(beam)
     # Of both ways to count, the one in which the beam looks ahead at zero.
     sense = 1 if sight[0] * across[1] - sight[1] * across[0] >= 0 else -1
-    across = sense * across
-    azimuth, skew = math.atan2(-across[0], across[1]), math.asin(max(-1.0, min(1.0, across[2])))
-    sight = Rotation.from_rotvec([0.0, 0.0, -azimuth]).apply(sight)
-    over = -math.sin(skew) * sight[1] + math.cos(skew) * sight[2]
-    aside = math.cos(skew) * sight[1] + math.sin(skew) * sight[2]
+    x, y, z = sense * across
+    azimuth, skew = math.atan2(-x, y), math.asin(max(-1.0, min(1.0, z)))
+    ahead, aside, over = Rotation.from_euler("ZX", [azimuth, skew]).inv().apply(sight)
     angles = {
         "azimuth_zero_deg": azimuth,
-        "elevation_zero_deg": math.atan2(over, sight[0]),
-        "azimuth_axis_tilt_deg.north": north,
-        "azimuth_axis_tilt_deg.east": east,
+        "elevation_zero_deg": math.atan2(over, ahead),
+        f"{_LEAN}.north": north,
+        f"{_LEAN}.east": east,
         "axes_not_square_deg": skew,
         "beam_not_square_deg": -math.asin(max(-1.0, min(1.0, aside))),
     }
@@ -304,49 +286,53 @@ def _head_joints(urdf: Urdf, file: str, names: Mapping[str, str | None]) -> Head
     return HeadJoints(urdf, chosen, terms, {"pan": upwards, "tilt": -sense}, height_m, between)
 
 
-type _Refuse = Callable[[str, str, str], InputError]
+def _refused(file: str, found: str, allowed: str, remedy: str) -> InputError:
+    """The error of joints that are no head's."""
+    return refusal("urdf-joint", file=file, found=found, allowed=allowed, remedy=remedy)
 
 
-def _named(urdf: Urdf, names: Mapping[str, str | None], refuse: _Refuse) -> dict[str, str]:
+def _named(urdf: Urdf, names: Mapping[str, str | None], file: str) -> dict[str, str]:
     """The joints by axis: as they were named, else by parts of their names, else the only two that turn."""
-    turning = [name for name, joint in urdf.joints.items() if joint.tag.attributes.get("type") in MOVING]
+    joints = urdf.listed("joint")
+    turning = [name for name, joint in joints.items() if joint.type in MOVING]
     shown = "joints that turn: " + (escaped(listed(turning, LISTED), 400) or "none")
     found: dict[str, str] = {}
     for k, axis in enumerate(AXES):
         name = names[axis]
-        if name is not None and name not in urdf.joints:
-            raise refuse(f"no joint {escaped(name)}", shown, closest(name, urdf.joints, "name one of them"))
-        if name is not None and name not in turning:
-            kind = escaped(urdf.joints[name].tag.attributes.get("type", "no type"))
-            raise refuse(f"joint {escaped(name)} is {kind}", shown, "name a joint that is revolute or continuous")
         if name is None:
             like = [one for one in turning if any(word in one.lower() for word in WORDS[axis])]
             like = like if len(like) == 1 else turning[k : k + 1] if len(turning) == len(AXES) else []
             if not like:
-                raise refuse(f"no {axis} joint by its name", shown, f"name it by --{axis}-joint")
+                raise _refused(file, f"no {axis} joint by its name", shown, f"name it by --{axis}-joint")
             name = like[0]
+        elif name not in joints:
+            raise _refused(file, f"no joint {escaped(name)}", shown, closest(name, joints, "name one of them"))
+        elif name not in turning:
+            what = f"joint {escaped(name)} is {escaped(joints[name].type)}"
+            raise _refused(file, what, shown, "name a joint that is revolute or continuous")
         found[axis] = name
     if found["pan"] == found["tilt"]:
-        raise refuse(f"{escaped(found['pan'])} twice", shown, "name two joints by --pan-joint and --tilt-joint")
+        what, remedy = f"{escaped(found['pan'])} twice", "name two joints by --pan-joint and --tilt-joint"
+        raise _refused(file, what, shown, remedy)
     return found
 
 
-def _between(urdf: Urdf, pan: _Element, tilt: _Element, refuse: _Refuse) -> tuple[Rotation, np.ndarray]:
+def _between(joints: Mapping[str, _Tag], pan: _Tag, tilt: _Tag, file: str) -> tuple[Rotation, np.ndarray]:
     """From the child link of the pan joint to the parent link of the tilt joint, over joints that are fixed."""
     from scipy.spatial.transform import Rotation
 
-    above = {joint.named("child", "link"): joint for joint in urdf.joints.values()}
+    above = {joint.named("child", "link"): joint for joint in joints.values()}
     turn, shift, link = Rotation.identity(), np.zeros(3), tilt.named("parent", "link")
-    for _ in urdf.joints:
+    for _ in joints:
         if link == pan.named("child", "link"):
             return turn, shift
         joint = above.get(link)
-        if joint is None or joint.tag.attributes.get("type") != "fixed":
+        if joint is None or joint.type != "fixed":
             break
         turn, shift = joint.rotation * turn, joint.shift_m + joint.rotation.apply(shift)
         link = joint.named("parent", "link")
     found, remedy = "a tilt joint that is not mounted on the pan joint", "exchange the names, or name other joints"
-    raise refuse(found, "a tilt joint on the child link of the pan joint, fixed joints between them", remedy)
+    raise _refused(file, found, "a tilt joint on the child link of the pan joint, fixed joints between them", remedy)
 
 
 def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[str, float], block: str) -> bytes:
@@ -373,15 +359,14 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
     # The sense in which the joint counts stays.
     axis = link.inv().apply(new.axis * -head.sign["tilt"])
     if np.max(np.abs(axis - tilt.axis)) > SAME:
-        tag = tilt.parts["axis"]
-        edits.append((tag.begin, tag.end, _attribute(head.urdf.data[tag.begin : tag.end], "xyz", axis)))
+        edits += _element(head.urdf, tilt, "axis", {"xyz": axis})
     for name, value in reductions.items():
-        text, at = head.urdf.transmissions[head.names[name]].texts["mechanicalReduction"]
-        edits.append((at, at + len(text.encode()), f"{value:.12g}".encode()))
+        if (tag := head.urdf.reduction(head.names[name])) is not None:
+            edits.append((tag.text_begin, tag.text_begin + len(tag.text.encode()), f"{value:.12g}".encode()))
     data = head.urdf.data
     edits += [
         (tag.begin, re.compile(rb"\s*").match(data, tag.end).end(), b"")  # type: ignore[union-attr]
-        for name, tag in head.urdf.properties.items()
+        for name, tag in head.urdf.listed(PROPERTY).items()
         if name.startswith("head_")
     ]
     root = data[head.urdf.root.begin : head.urdf.root.end]
@@ -404,18 +389,24 @@ def _attribute(text: bytes, name: str, values: np.ndarray) -> bytes:
     return text[:end].rstrip() + b" " + name.encode() + b'="' + words + b'"' + text[end:]
 
 
-def _origin(urdf: Urdf, joint: _Element, turn: Rotation, shift_m: np.ndarray) -> list[tuple[int, int, bytes]]:
+def _element(urdf: Urdf, joint: _Tag, name: str, values: Mapping[str, np.ndarray]) -> list[tuple[int, int, bytes]]:
+    """An element of a joint with other numbers; put in where the joint has none."""
+    tag = joint.first(name)
+    begin, end = (joint.end, joint.end) if tag is None else (tag.begin, tag.end)
+    text = f"\n    <{name}/>".encode() if tag is None else urdf.data[begin:end]
+    for attribute, numbers in values.items():
+        text = _attribute(text, attribute, numbers)
+    return [(begin, end, text)] if values else []
+
+
+def _origin(urdf: Urdf, joint: _Tag, turn: Rotation, shift_m: np.ndarray) -> list[tuple[int, int, bytes]]:
     """What changes of a joint's origin."""
-    turned = float((turn * joint.rotation.inv()).magnitude()) > SAME
-    moved = bool(np.max(np.abs(shift_m - joint.shift_m)) > SAME)
-    if not (turned or moved):
-        return []
-    tag = joint.parts.get("origin")
-    begin, end = (joint.tag.end, joint.tag.end) if tag is None else (tag.begin, tag.end)
-    text = b"\n    <origin/>" if tag is None else urdf.data[begin:end]
-    for name, values, changed in (("xyz", shift_m, moved), ("rpy", turn.as_euler("xyz"), turned)):
-        text = _attribute(text, name, values) if changed else text
-    return [(begin, end, text)]
+    values: dict[str, np.ndarray] = {}
+    if np.max(np.abs(shift_m - joint.shift_m)) > SAME:
+        values["xyz"] = shift_m
+    if float((turn * joint.rotation.inv()).magnitude()) > SAME:
+        values["rpy"] = turn.as_euler("xyz")
+    return _element(urdf, joint, "origin", values)
 
 
 def ratios_of(head: HeadJoints, steps_per_turn: float) -> dict[str, float]:
@@ -451,14 +442,21 @@ class HeadModel:
     data_sha256: str
     steps_per_turn: float | None = None
 
-    def properties(self, sign: Mapping[str, int]) -> dict[str, str]:
+    @property
+    def by_name(self) -> dict[str, float]:
+        """Estimates."""
+        return dict(zip(self.names, self.values.tolist(), strict=True))
+
+    def steps_per_rad(self, head: HeadJoints | None) -> dict[str, float]:
+        """Counters per radian of each joint, by axis."""
+        sign = dict.fromkeys(AXES, 1) if head is None else head.sign
+        return {axis: sign[axis] * math.degrees(1.0) / self.by_name[f"degrees_per_step.{axis}"] for axis in AXES}
+
+    def properties(self, head: HeadJoints | None) -> dict[str, str]:
         """By name: estimates with their u, and counters per radian of each joint."""
-        by_name = dict(zip(self.names, self.values.tolist(), strict=True))
         found = {CORRECTS: self.data_sha256}
-        for axis in AXES:
-            per_rad = sign[axis] * math.degrees(1.0) / by_name[f"degrees_per_step.{axis}"]
-            found[f"head_{axis}_steps_per_rad"] = f"{per_rad:.12g}"
-        for name, value, u in zip(self.names, self.values.tolist(), np.sqrt(np.diag(self.covariance)), strict=True):
+        found |= {f"head_{axis}_steps_per_rad": f"{n:.12g}" for axis, n in self.steps_per_rad(head).items()}
+        for (name, value), u in zip(self.by_name.items(), np.sqrt(np.diag(self.covariance)), strict=True):
             word = name.replace(".", "_")
             found |= {f"head_{word}": f"{value:.12g}", f"head_u_{word}": f"{u:.4g}"}
         return found
@@ -469,36 +467,27 @@ class HeadModel:
         Raises:
             InputError: the URDF has these data's correction already.
         """
-        sign: Mapping[str, int] = {"pan": 1, "tilt": 1} if head is None else head.sign
-        said = "\n".join(f"       {line.replace('--', '- -')}" for line in (self.origin, *UNSAID))
-        block = f"  <!--\n{said}\n  -->\n" if head is None else ""
-        properties = self.properties(sign)
-        block += "".join(f'  <xacro:property name="{name}" value="{text}"/>\n' for name, text in properties.items())
+        lines = [f'  <{PROPERTY} name="{name}" value="{text}"/>\n' for name, text in self.properties(head).items()]
         if head is None:
+            said = "\n".join(f"       {line.replace('--', '- -')}" for line in (self.origin, *UNSAID))
             start = '<?xml version="1.0"?>\n<robot xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
-            return f"{start}{block}</robot>\n".encode()
-        before = head.urdf.properties.get(CORRECTS)
+            return f"{start}  <!--\n{said}\n  -->\n{''.join(lines)}</robot>\n".encode()
+        before = head.urdf.listed(PROPERTY).get(CORRECTS)
         if before is not None and before.attributes.get("value") == self.data_sha256:
             message = "head.urdf has the correction by these data already: it is not applied twice"
             raise InputError("applied", message, remedy="use it, then `tvsbayes verify` it with fresh looks")
-        ratios = {} if self.steps_per_turn is None else dict(zip(self.names, self.values.tolist(), strict=True))
         reductions: dict[str, float] = {}
-        for axis in AXES:
-            stated = head.reduction(axis)
-            if ratios and stated is not None:
-                turns = FULL_TURN_DEG / (float(self.steps_per_turn or 1.0) * ratios[f"degrees_per_step.{axis}"])
+        for axis in AXES if self.steps_per_turn is not None else ():
+            if (stated := head.reduction(axis)) is not None:
+                turns = FULL_TURN_DEG / (float(self.steps_per_turn or 1.0) * self.by_name[f"degrees_per_step.{axis}"])
                 reductions[axis] = math.copysign(turns, stated)
-        return corrected(head, dict(zip(self.names, self.values.tolist(), strict=True)), reductions, block)
+        return corrected(head, self.by_name, reductions, "".join(lines))
 
     def document(self, head: HeadJoints | None) -> dict[str, Any]:
         """The same for programs, with the covariance; units of the names."""
-        sign: Mapping[str, int] = {"pan": 1, "tilt": 1} if head is None else head.sign
         joints = {
-            axis: {
-                "name": axis if head is None else head.names[axis],
-                "steps_per_rad": float(self.properties(sign)[f"head_{axis}_steps_per_rad"]),
-            }
-            for axis in AXES
+            axis: {"name": axis if head is None else head.names[axis], "steps_per_rad": float(f"{n:.12g}")}
+            for axis, n in self.steps_per_rad(head).items()
         }
         return {
             CORRECTS: self.data_sha256,
