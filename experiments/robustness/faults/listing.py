@@ -156,7 +156,7 @@ FAULTS = (
           "test_figures_of_the_published_readings"),
     Fault("a certificate states the whole width as expanded uncertainty", "dcc_real", Local("expanded", "2 * value"),
           "test_ratios_stand_with_expanded_uncertainty_and_backlash_with_its_own"),
-    Fault("uncertainties are printed twice as large", "tables.concise", Argument("sd", "2 * value"),
+    Fault("uncertainties are printed twice as large", "display.concise", Argument("sd", "2 * value"),
           "test_concise_shows_two_digits_of_the_uncertainty"),
     Fault("what must not be used ends with exit code 0", "app.finish", Call("Ended", "function(0)"),
           "test_a_fit_that_did_not_converge_is_exit_4"),
