@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,10 +80,6 @@ class Bench:
     warnings: tuple[str, ...] = ()
 
 
-def _utc_now() -> datetime.datetime:
-    return datetime.datetime.now(datetime.UTC)
-
-
 @contextmanager
 def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench]:
     """Positioner and cameras of a rig file; closed in the end.
@@ -103,7 +100,8 @@ def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench
         details = {"device": dict(positioner.identity), "cameras": plain(settings)}
         observer = CameraObserver(camera, detector)
         warnings = (*getattr(positioner, "warnings", ()), *settings.warnings)
-        yield Bench(positioner, observer, operator, time, _utc_now, details, warnings=warnings)
+        utc = partial(datetime.datetime.now, datetime.UTC)
+        yield Bench(positioner, observer, operator, time, utc, details, warnings=warnings)
     finally:
         positioner.close()
         camera.close()

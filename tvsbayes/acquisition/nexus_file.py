@@ -188,13 +188,9 @@ def _column(group: Any, column: Column, rows: Sequence[Move] | Sequence[Spot]) -
     name = name.replace("ruv_", "correlation_uv_")
     values = [getattr(row, column.name) for row in rows]
     if column.kind is float:
-        _put(group, name, _numbers(values), unit)
+        _put(group, name, np.array([np.nan if value is None else value for value in values], dtype=float), unit)
     else:
         _put(group, name, [NOTHING if value is None else value for value in values], unit)
-
-
-def _numbers(values: Sequence[float | None]) -> np.ndarray:
-    return np.array([np.nan if value is None else value for value in values], dtype=float)
 
 
 def _look_times(records: Sequence[Record]) -> Mapping[int, float]:

@@ -219,10 +219,14 @@ def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> 
 
 
 def _find_classic(grey: np.ndarray, board: Board) -> np.ndarray | None:
-    found, corners = cv2.findChessboardCorners(grey, (board.columns, board.rows))
-    if not found or corners is None or np.size(corners) != 2 * board.corners:
-        return None
-    return _refined(grey, np.asarray(corners, np.float32).reshape(-1, 2), board)
+    corners = _whole(board, *cv2.findChessboardCorners(grey, (board.columns, board.rows)))
+    return None if corners is None else _refined(grey, corners.astype(np.float32), board)
+
+
+def _whole(board: Board, detected: bool, corners: np.ndarray | None) -> np.ndarray | None:
+    """Corners (corners, 2) of a detection, if it is all of them."""
+    whole = detected and corners is not None and np.size(corners) == 2 * board.corners
+    return np.asarray(corners, float).reshape(-1, 2) if whole else None
 
 
 def _refined(grey: np.ndarray, corners: np.ndarray, board: Board) -> np.ndarray:
@@ -244,11 +248,8 @@ def _refined(grey: np.ndarray, corners: np.ndarray, board: Board) -> np.ndarray:
 def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     small = shrunk(grey)
-    found, corners = cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags)
-    if not found or corners is None or np.size(corners) != 2 * board.corners:
-        return None
-    corners = np.asarray(corners, float).reshape(-1, 2)
-    if small is grey:
+    corners = _whole(board, *cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags))
+    if corners is None or small is grey:
         return corners
     scale = np.array(grey.shape[::-1]) / small.shape[::-1]
     return _refined(grey, ((corners + 0.5) * scale - 0.5).astype(np.float32), board)
@@ -294,12 +295,9 @@ def _agreeing(left: _Detection, right: _Detection, board: Board) -> tuple[np.nda
     kept = [k for k, colour in enumerate(right.colours) if colour == left.colours[0]] or list(range(len(grids)))
     grid = left.corners.reshape(board.rows, board.columns, 2)
     along = (grid[:, -1] - grid[:, 0]).mean(0)
-    best = max(kept, key=lambda k: float(along @ _unit((grids[k][:, -1] - grids[k][:, 0]).mean(0))))
+    ways = [(each[:, -1] - each[:, 0]).mean(0) for each in grids]
+    best = max(kept, key=lambda k: float(along @ ways[k]) / max(float(np.linalg.norm(ways[k])), 1e-12))
     return grids[best].reshape(-1, 2), best != 0
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
 def find_views(

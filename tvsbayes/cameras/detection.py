@@ -435,14 +435,9 @@ def _relearned(
     return result
 
 
-def _spread(present: Sequence[int]) -> list[int]:
-    """Rows of some looks, spread evenly over the campaign."""
-    return [present[k] for k in np.unique(np.linspace(0, len(present) - 1, PILOTS_MAX).astype(int))]
-
-
 def _pilots(spots: Sequence[Spot], present: Sequence[int], frames: _Frames, workers: int) -> dict[int, _Patches]:
     """Left and right patch, or why there is none, of looks spread evenly over the campaign, by row of spots.csv."""
-    rows = _spread(present)
+    rows = [present[k] for k in np.unique(np.linspace(0, len(present) - 1, PILOTS_MAX).astype(int))]
 
     def patches(row: int) -> _Patches:
         return patch_around(frames.read(spots[row], "left")), patch_around(frames.read(spots[row], "right"))

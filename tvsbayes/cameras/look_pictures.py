@@ -119,7 +119,11 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
         by_view.setdefault(picture.view, {}).update(dict.fromkeys(picture.sides, picture))
     whole = {name: both for name, both in by_view.items() if len(both) == 2}
     if not whole:
-        raise _no_pairs(folder, pictures.count)
+        found = f"no pair among {pictures.count} PNG and JPEG pictures"
+        remedy = "rename them so that one word tells the camera and the rest of both names is the same"
+        allowed = f"{NAMING} (PNG or JPEG); or pictures of both cameras side by side"
+        place = escaped(str(folder), 200)
+        raise refusal("no-pictures", file=place, found=found, allowed=allowed, remedy=remedy)
     return ViewedFolder(
         views=tuple(View(n, (whole[n]["left"], whole[n]["right"])) for n in sorted(whole, key=natural_order)),
         image_sizes=dict(pictures.usual),
@@ -128,14 +132,6 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
         other_size=tuple(path.name for path in pictures.other_size),
         unread=tuple(unread),
     )
-
-
-def _no_pairs(folder: Path, pictures: int) -> InputError:
-    place = escaped(str(folder), 200)
-    found = f"no pair among {pictures} PNG and JPEG pictures"
-    remedy = "rename them so that one word tells the camera and the rest of both names is the same"
-    allowed = f"{NAMING} (PNG or JPEG); or pictures of both cameras side by side"
-    return refusal("no-pictures", file=place, found=found, allowed=allowed, remedy=remedy)
 
 
 def _numbered(views: Sequence[View], ids: Sequence[int] | None) -> int | None:

@@ -276,7 +276,10 @@ def _adjusted(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3
             start = start_of(views, board, size, fix_k3)
             views = list(start.views)
         done = _lowest_adjustment(start, board, size, free)
-        _check_pairs(done, start.alone_rms_px)
+        together = _rms(done.residuals_px)
+        if together > max(CONTRADICTION_TIMES * start.alone_rms_px, CONTRADICTION_PX):
+            alone = f"each camera by itself by {start.alone_rms_px:.2f}"
+            raise pairs_disagree(f"together they miss by {together:.2f} px, {alone}")
         outliers = _outliers(done)
         if not (robust and outliers.any()):
             return _Adjusted(done, views, outliers, tuple(excluded), turned, start.alone_rms_px)
@@ -306,14 +309,6 @@ def _reordered(pictures: Views | None, turned: tuple[str, ...]) -> tuple[str, ..
     """Views that by direction or by agreement, not by both, were put into another order: two half turns are none."""
     before = () if pictures is None else pictures.reordered
     return (*(name for name in before if name not in turned), *(name for name in turned if name not in before))
-
-
-def _check_pairs(done: Adjustment, alone_rms_px: float) -> None:
-    """Refuses pairs that two cameras by themselves fit far better than one pair of cameras does."""
-    together = _rms(done.residuals_px)
-    if together > max(CONTRADICTION_TIMES * alone_rms_px, CONTRADICTION_PX):
-        reason = f"together they miss by {together:.2f} px, each camera by itself by {alone_rms_px:.2f}"
-        raise pairs_disagree(reason)
 
 
 def calibrate_folder(
