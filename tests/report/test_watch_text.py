@@ -24,6 +24,6 @@ def test_what_follows_the_best_explanation_is_not_called_a_motion_of_its_own():
     parts = tuple(MovedPart(f"{what}: shift along y", 3.0, 0.1, "mm") for what in ("cameras", "positioner"))
     text = watch_text(Watch(MOVED, 0.0, 0.01, parts, 16, 0.5, (), True), 0.8)
     assert "what to do: calibrate the cameras anew" in text and "fasten it" not in text
-    assert "what is told of positioner takes what the first leaves" in text
+    assert "positioner takes up what the first leaves" in text
     alone = watch_text(Watch(MOVED, 0.0, 0.01, parts[1:], 16, 0.5, (), True), 0.8)
     assert "fasten it" in alone and "takes what" not in alone

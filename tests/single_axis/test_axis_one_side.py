@@ -29,7 +29,7 @@ def test_a_play_that_cannot_be_told_is_its_prior(summary):
     assert (play.value, play.sd, play.contraction) == (0.1, 2.0, 0.0)
     assert play.interval95 == pytest.approx((0.1 - 3.92, 0.1 + 3.92), abs=0.01)
     assert summary.classic.backlash is None
-    assert any("backlash cannot be told" in text for text in summary.weak_directions)
+    assert any("backlash is not determined" in text for text in summary.weak_directions)
 
 
 def test_shares_told_lie_between_nought_and_one_hundred(summary):

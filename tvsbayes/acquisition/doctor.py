@@ -300,7 +300,7 @@ def _laser(positioner: Positioner | None, camera: StereoCamera | None, wanted: b
     if positioner is None or camera is None:
         return Check("laser", "skipped", "needs positioner and cameras", "cure the faults above first")
     if not wanted:
-        return Check("laser", "skipped", "not asked for", "run doctor with --laser, goggles on")
+        return Check("laser", "skipped", "not requested", "run doctor with --laser, goggles on")
     stop = StopKey()
     # There is no look worth finishing: the first Ctrl-C interrupts.
     stop.requested = True

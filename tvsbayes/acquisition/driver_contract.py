@@ -44,7 +44,7 @@ def positioner_violations(
         for target in [*targets, targets[-1]]:
             reached, state_now = positioner.move_to(*target), positioner.state()
             for state, order in ((reached, "move_to"), (state_now, "state behind it")):
-                expect(_at(state) == target, f"{order} tells the counters ordered, {target}, and told {_at(state)}")
+                expect(_at(state) == target, f"{order} reports the counters ordered, {target}, not {_at(state)}")
             expect(state_now.status == "idle" and not state_now.laser_on, "behind a motion it is idle and dark")
         for on in (True, False):
             expect(positioner.laser(on).laser_on is on, f"laser({on}) returns once the device has said so")

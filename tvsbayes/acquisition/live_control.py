@@ -78,7 +78,7 @@ class Requests:
             if what not in (RESUME, CONTROL_PASSED):
                 for request in self._waiting():
                     if request.what == RESUME:
-                        self.settle(request, FAILED, f"withdrawn: {what} was asked for after it")
+                        self.settle(request, FAILED, f"withdrawn: {what} was requested after it")
             waiting = self._waiting()
             for request in waiting:
                 if request.what == what:

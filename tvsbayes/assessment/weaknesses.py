@@ -133,7 +133,7 @@ def _shift_directions(fit: JointFit, axis: Axis) -> list[WeakDirection]:
             if np.ptp(values) > 1e-12 * np.max(np.abs(values)):
                 correlation = float(np.corrcoef(values, draws)[0, 1])
                 if inseparable(correlation):
-                    text = f"{what} and {words} are hardly told apart (correlation {correlation:+.2f}): {cure}"
+                    text = f"{what} and {words} are hardly separated (correlation {correlation:+.2f}): {cure}"
                     directions.append(WeakDirection(text, {name: 1.0, shift: correlation}))
     return directions
 

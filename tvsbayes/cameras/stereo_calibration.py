@@ -409,8 +409,8 @@ def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> lis
     spread = math.degrees(math.acos(min(1.0, float(np.abs(normals @ normals.T).min()))))
     if spread < TILT_ADVISED_DEG:
         warnings.append(
-            f"all boards are nearly parallel (within {spread:.0f} deg): focal length and distance cannot be told "
-            "apart; tilt the board by 30 to 45 deg about both axes"
+            f"all boards are nearly parallel (within {spread:.0f} deg): focal length and distance are not "
+            "separated; tilt the board by 30 to 45 deg about both axes"
         )
     elif max(view.tilt_deg for view in result.views) < TILT_ADVISED_DEG:
         warnings.append("no tilt: no board leans more than 15 deg; tilt it by 30 to 45 deg about both axes")

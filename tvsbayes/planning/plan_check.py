@@ -134,7 +134,7 @@ class Judged:
     def together(self, axis: Axis) -> str:
         """That ratio and backlash of the axis move together."""
         share = 100 * self.exchange(axis) ** 2
-        return f"{axis} ratio and {axis} backlash cannot be told apart well ({share:.0f} % of the variance is common)"
+        return f"{axis} ratio and {axis} backlash are not well separated ({share:.0f} % of the variance is common)"
 
     def fault(self, axis: Axis) -> str | None:
         """What the plan leaves open of the axis in words: its ratio or backlash is the prior's, or they exchange."""

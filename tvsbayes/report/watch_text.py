@@ -28,7 +28,7 @@ LINEAR = {"deg": 1.0, "mm": 10.0}
 """Sizes up to which a change is seen in its true size."""
 MISSED = {
     "cameras": "calibrate the cameras anew, then the rig",
-    "positioner": "fasten it and calibrate anew; coordinates are off by what is told above until then",
+    "positioner": "fasten it and calibrate anew; until then coordinates are off by the amount above",
     "zero": "look for a homing switch or a coupling that slipped, then calibrate anew",
     "base": "fasten it and calibrate anew",
     "beam": "fasten camera or telescope on the head, then calibrate anew",
@@ -69,9 +69,7 @@ def watch_text(found: Watch, power_min: float) -> str:
         lines.append(f"what to do: {MISSED[causes[0]]}")
         if len(causes) > 1:
             left = ", ".join(causes[1:])
-            lines.append(
-                f"then watch again: what is told of {left} takes what the first leaves, and may be no motion of its own"
-            )
+            lines.append(f"then watch again: {left} takes up what the first leaves, and may not have moved itself")
     unseen = found.unseen(power_min)
     if found.verdict == CANNOT_TELL:
         lines += [f"cannot see {c.size:g} {c.unit} of {c.what}: {HELPS[c.what]}" for c in unseen]

@@ -317,7 +317,7 @@ def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
             "side; list the moves in between if the axis went on and came back"
         )
     if len({m.time_s for m in campaign.moves}) == 1:
-        found.append("all moves have the same time: drift cannot be told")
+        found.append("all moves have the same time: drift is not determined")
     if not np.any(rows.variance > 0):
         found.append("no reading has a stated u: the scatter of stops includes that of the readings")
     unread = len(campaign.readings) - int(rows.count.sum())
@@ -354,7 +354,7 @@ def _weak(fit: AxisFit) -> list[str]:
         return [*found, "a drive at constant rate cannot tell error by position from drift: both are in the drift"]
     sides = set(rows.side.tolist()) - {0}
     if not rows.both_sides:
-        found.append("backlash cannot be told: every stop was reached from one side; add stops from the other")
+        found.append("backlash is not determined: every stop was reached from one side; add stops from the other")
     if len(rows.positions) < POSITIONS_FEW:
         found.append(
             f"{len(rows.positions)} positions cannot tell the error by position from the ratio; read at least "
@@ -383,7 +383,7 @@ def _weak_in_time(fit: AxisFit) -> list[str]:
             a, b = fit.draws[shift], fit.draws[name]
             if a.std() and b.std() and abs(np.corrcoef(a, b)[0, 1]) > CREEP_SHARE:
                 words = "a creep of the zero" if shift == "creep" else "a shift with the temperature"
-                found.append(f"{what} and {words} are hardly told apart: {cure}")
+                found.append(f"{what} and {words} are hardly separated: {cure}")
     return found
 
 
