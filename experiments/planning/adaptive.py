@@ -30,12 +30,12 @@ from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.acquisition import session
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.replanning import (
-    AdaptWish,
+    AdaptOptions,
     Replanning,
     adapted_plan,
     looks_next,
 )
-from tvsbayes.acquisition.running_estimate import FIRST_LOOKS, GROWTH, EstimateWish
+from tvsbayes.acquisition.running_estimate import FIRST_LOOKS, GROWTH, EstimateOptions
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cli.acquire_command import ahead_of, fitted, proposed
 from tvsbayes.errors import NotConverged
@@ -118,7 +118,7 @@ def adapted(seed: int, folder: Path) -> dict[str, object]:
     rig, plan, last = mounted_rig(), shipped_plan("grid"), Last()
     truth = Instrument(rig, seed).truth
     session.Replanning = partial(Beside, last=last)
-    wish, minutes = EstimateWish(fitted, TARGET), AdaptWish(partial(proposed, Path()), MINUTES)
+    wish, minutes = EstimateOptions(fitted, TARGET), AdaptOptions(partial(proposed, Path()), MINUTES)
     outcome = session.acquire(rig, plan, folder, simulate=True, seed=seed, estimate=wish, adapt=minutes)
     campaign, journal = read_campaign(folder), read_journal(folder)
     steps = adapted_plan(plan, journal.records)

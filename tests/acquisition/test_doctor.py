@@ -19,7 +19,7 @@ from tvsbayes.errors import DeviceFault
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.grbl import GrblPositioner, Wishes
+from tvsbayes.positioner.grbl import GrblPositioner, GrblSettings
 from tvsbayes.positioner.mechanics import Mechanics
 
 RIG = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
@@ -93,7 +93,7 @@ def test_a_grbl_board_is_examined_by_its_own_rules(tmp_path):
     checks = examine(
         RIG,
         tmp_path,
-        open_positioner=lambda: GrblPositioner(lambda: BoardLink(board), Wishes(), board.clock),
+        open_positioner=lambda: GrblPositioner(lambda: BoardLink(board), GrblSettings(), board.clock),
         open_camera=lambda: camera,
         clock=device.clock,
     )

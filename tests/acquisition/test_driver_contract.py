@@ -15,7 +15,7 @@ from tvsbayes.cameras.capture import CameraSettings, StereoImage
 from tvsbayes.errors import DeviceFault
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.grbl import GrblPositioner, Wishes
+from tvsbayes.positioner.grbl import GrblPositioner, GrblSettings
 from tvsbayes.positioner.mechanics import Mechanics
 
 TARGETS, FORBIDDEN = ((100, 20), (-37, -8), (0, 5)), (9_999, 0)
@@ -29,7 +29,7 @@ def serial() -> SerialPositioner:
 def grbl() -> GrblPositioner:
     board = GrblBoard()
     limits = CounterLimits({"pan": (-500, 500), "tilt": (-500, 500)})
-    return GrblPositioner(lambda: BoardLink(board), Wishes(unwatched=True, limits=limits), board.clock)
+    return GrblPositioner(lambda: BoardLink(board), GrblSettings(unwatched=True, limits=limits), board.clock)
 
 
 @pytest.mark.parametrize("make", [serial, grbl])

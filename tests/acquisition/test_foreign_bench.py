@@ -21,7 +21,7 @@ from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.plan import PlanStep
 from tvsbayes.instrument.stereo_pair import Stereo
-from tvsbayes.positioner.grbl import GrblPositioner, Wishes
+from tvsbayes.positioner.grbl import GrblPositioner, GrblSettings
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_works")
 LIMITS = CounterLimits({"pan": (-100, 300), "tilt": (-100, 100)})
@@ -62,7 +62,7 @@ class Eye:
 
 def engine(rig, folder, board, resume=False, plan=None, **happening):
     positioner = GrblPositioner(
-        lambda: BoardLink(board), Wishes(laser="M8", unwatched=True, limits=LIMITS), board.clock
+        lambda: BoardLink(board), GrblSettings(laser="M8", unwatched=True, limits=LIMITS), board.clock
     )
     hand = Hand()
     eye = Eye(rig.stereo, hand, rig.sheets_mm, board, **happening)

@@ -13,8 +13,8 @@ from support.fits_beside import given_rig, proposing, two_directions
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import recorded
-from tvsbayes.acquisition.replanning import AdaptWish, Replanning, adapted_plan
-from tvsbayes.acquisition.running_estimate import EstimateWish
+from tvsbayes.acquisition.replanning import AdaptOptions, Replanning, adapted_plan
+from tvsbayes.acquisition.running_estimate import EstimateOptions
 from tvsbayes.acquisition.session import acquire
 from tvsbayes.cli.main import run
 from tvsbayes.errors import InputError
@@ -138,7 +138,7 @@ def test_a_resumed_run_has_the_plan_of_the_interrupted_one(mounted_rig, tmp_path
             if progress.looks == stop_at and progress.doing == "looking":
                 raise KeyboardInterrupt
 
-        wish, adapt = EstimateWish(two_directions, 5.5e-4), AdaptWish(ahead(), 60.0)
+        wish, adapt = EstimateOptions(two_directions, 5.5e-4), AdaptOptions(ahead(), 60.0)
         terminal = Terminal(show=show)
         return acquire(
             mounted_rig, small_plan(20), folder, simulate=True, seed=4, estimate=wish, adapt=adapt, terminal=terminal,

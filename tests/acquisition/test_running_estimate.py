@@ -17,7 +17,7 @@ from tvsbayes.acquisition import running_estimate
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.recorder import recorded
-from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
+from tvsbayes.acquisition.running_estimate import EstimateOptions, RunningEstimate
 from tvsbayes.acquisition.session import acquire
 from tvsbayes.cli import acquire_command
 from tvsbayes.errors import NotConverged
@@ -45,7 +45,7 @@ def test_run_ends_when_the_running_estimate_meets_its_target(mounted_rig, tmp_pa
 @pytest.mark.parametrize(("asked", "shown"), [(None, False), (True, True), (False, False)])
 def test_estimate_is_shown_without_a_target(mounted_rig, tmp_path, asked, shown):
     """What is known so far belongs into the live line whether or not it ends the run; simulations must ask for it."""
-    wish = EstimateWish(two_directions, enabled=asked)
+    wish = EstimateOptions(two_directions, enabled=asked)
     texts = []
 
     def show(progress):

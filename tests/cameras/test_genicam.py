@@ -15,12 +15,12 @@ from support.bench_runs import RIG_FILE
 from tvsbayes.acquisition.driver_contract import camera_violations
 from tvsbayes.acquisition.drivers import cameras_of, connect_trigger
 from tvsbayes.acquisition.simulated_instrument import Instrument
-from tvsbayes.cameras.genicam import GenicamCamera, GenicamWishes
+from tvsbayes.cameras.genicam import GenicamCamera, GenicamSettings
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.rig import read_rig
 
 WIDTH, HEIGHT = 12, 10
-WISHES = GenicamWishes("maker.cti", ("A1", "right eye"))
+STATED = GenicamSettings("maker.cti", ("A1", "right eye"))
 
 
 @pytest.fixture
@@ -139,8 +139,8 @@ class Maker:
         self.reset_done = True
 
 
-def opened(maker: Maker, **wishes) -> GenicamCamera:
-    return GenicamCamera(maker, replace(WISHES, **wishes), WIDTH, HEIGHT)
+def opened(maker: Maker, **changes) -> GenicamCamera:
+    return GenicamCamera(maker, replace(STATED, **changes), WIDTH, HEIGHT)
 
 
 def test_pictures_are_triggered_after_they_were_asked_for():
@@ -194,7 +194,7 @@ def test_a_line_is_pulsed_by_the_positioner(mounted_rig):
 
 
 @pytest.mark.parametrize(
-    ("wishes", "height", "code", "word"),
+    ("changes", "height", "code", "word"),
     [
         ({"cameras": ("A1", "A3")}, HEIGHT, "camera", "right: 0 cameras are A3; there are: A1, A2"),
         ({"pixel_format": "Mono16"}, HEIGHT, "camera-setting", "PixelFormat = Mono16"),
@@ -202,10 +202,10 @@ def test_a_line_is_pulsed_by_the_positioner(mounted_rig):
         ({}, HEIGHT + 1, "image-size", "12 x 11 px"),
     ],
 )
-def test_cameras_that_do_not_obey_are_named(wishes, height, code, word):
+def test_cameras_that_do_not_obey_are_named(changes, height, code, word):
     maker = Maker(height)
     with pytest.raises(DeviceFault, match=word) as caught:
-        opened(maker, **wishes).grab()
+        opened(maker, **changes).grab()
     assert caught.value.code == code and caught.value.remedy
 
 
@@ -234,7 +234,7 @@ def test_a_gain_that_the_camera_does_not_take_is_named(kept, taken):
 def test_entries_that_do_not_fit_are_refused(change, column):
     table = {"left": "A1", "right": "A2", "options.producer": "maker.cti", **change}
     with pytest.raises(InputError) as caught:
-        GenicamWishes.of({key: value for key, value in table.items() if value is not None})
+        GenicamSettings.of({key: value for key, value in table.items() if value is not None})
     assert caught.value.column == column
 
 

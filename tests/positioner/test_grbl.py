@@ -12,7 +12,7 @@ from support.pseudo_terminal import needs_pseudo_terminals
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.counter_limits import CounterLimits
-from tvsbayes.positioner.grbl import GrblPositioner, Wishes
+from tvsbayes.positioner.grbl import GrblPositioner, GrblSettings
 from tvsbayes.positioner.grbl_messages import parse_greeting, parse_modes, parse_setting, parse_status
 from tvsbayes.positioner.interface import PositionLost
 from tvsbayes.positioner.mechanics import Mechanics
@@ -21,8 +21,8 @@ from tvsbayes.positioner.serial_port import serial_opener
 LIMITS = CounterLimits({"pan": (-500, 1000), "tilt": (-500, 500)})
 
 
-def connected(board: GrblBoard, **wishes) -> GrblPositioner:
-    made = Wishes(**{"unwatched": True, "limits": LIMITS, **wishes})
+def connected(board: GrblBoard, **changes) -> GrblPositioner:
+    made = GrblSettings(**{"unwatched": True, "limits": LIMITS, **changes})
     return GrblPositioner(lambda: BoardLink(board), made, board.clock)
 
 
@@ -241,7 +241,7 @@ def test_light_without_a_watchdog_has_to_be_accepted():
 )
 def test_entries_that_a_board_does_not_have_are_refused(entries, column):
     with pytest.raises(InputError) as caught:
-        Wishes.of(entries)
+        GrblSettings.of(entries)
     assert caught.value.column == column and caught.value.allowed and caught.value.remedy
 
 
@@ -258,14 +258,14 @@ def test_more_power_than_the_board_has_is_refused():
 
 def test_the_options_of_a_board():
     """A switch of a rig file comes as 0 or 1."""
-    assert [Wishes.of({"options.unwatched_laser": said}).unwatched for said in (0, 1)] == [False, True]
-    assert not Wishes.of({}).unwatched and Wishes.of({"options.laser_power": 300}).laser_power == 300.0
+    assert [GrblSettings.of({"options.unwatched_laser": said}).unwatched for said in (0, 1)] == [False, True]
+    assert not GrblSettings.of({}).unwatched and GrblSettings.of({"options.laser_power": 300}).laser_power == 300.0
 
 
 def test_our_own_firmware_under_this_driver_is_named():
     device = SimulatedDevice(VirtualClock(), Mechanics())
     with pytest.raises(DeviceFault, match='driver = "serial"'):
-        GrblPositioner(lambda: ModelLink(device), Wishes(), device.clock)
+        GrblPositioner(lambda: ModelLink(device), GrblSettings(), device.clock)
 
 
 def test_an_unplugged_board_is_named():
@@ -312,7 +312,9 @@ def test_a_board_on_a_pseudo_terminal():
 
     threading.Thread(target=serve, daemon=True).start()
     try:
-        positioner = GrblPositioner(serial_opener(os.ttyname(slave), 115_200), Wishes(unwatched=True, limits=LIMITS))
+        positioner = GrblPositioner(
+            serial_opener(os.ttyname(slave), 115_200), GrblSettings(unwatched=True, limits=LIMITS)
+        )
         positioner.home()
         assert positioner.move_to(300, -20).pan_steps == 300
         assert positioner.laser(True).laser_on

@@ -101,7 +101,7 @@ class Ahead:
 
 
 @dataclass(frozen=True)
-class AdaptWish:
+class AdaptOptions:
     """That the looks of a run are to be chosen while it runs.
 
     Attributes:
@@ -119,7 +119,7 @@ class Replanning(RunningEstimate):
 
     Args:
         folder: the campaign folder.
-        ahead: as of `AdaptWish`.
+        ahead: as of `AdaptOptions`.
         target_u_deg_per_step: wanted of the effective ratios of all directions.
         minutes: that the run may take.
         wait: whether to wait for every proposal.

@@ -55,7 +55,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class EstimateWish:
+class EstimateOptions:
     """Whether a run is fitted beside itself, and to what end.
 
     Attributes:

@@ -17,9 +17,9 @@ from tvsbayes.acquisition.live_run import LiveRun
 from tvsbayes.acquisition.operator import StopKey, Terminal, TerminalOperator, check_hazard
 from tvsbayes.acquisition.place_command import PlaceCommand
 from tvsbayes.acquisition.recorder import Recorded, recorded
-from tvsbayes.acquisition.replanning import AdaptWish, Replanning, adapted_plan, check_plan
+from tvsbayes.acquisition.replanning import AdaptOptions, Replanning, adapted_plan, check_plan
 from tvsbayes.acquisition.run_identity import check_same, identity, setup_changes
-from tvsbayes.acquisition.running_estimate import EstimateWish, RunningEstimate
+from tvsbayes.acquisition.running_estimate import EstimateOptions, RunningEstimate
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.instrument.campaign import NAME_ACQUIRED
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, run_plan
@@ -38,8 +38,8 @@ def acquire(
     resume: bool = False,
     laser_class: str | None = None,
     seed: int = 0,
-    estimate: EstimateWish | None = None,
-    adapt: AdaptWish | None = None,
+    estimate: EstimateOptions | None = None,
+    adapt: AdaptOptions | None = None,
     vision: Vision | None = None,
     terminal: Terminal | None = None,
     live: LiveRun | None = None,
@@ -111,8 +111,8 @@ def _running(
     rig: Rig,
     plan: Sequence[PlanStep],
     folder: Path,
-    estimate: EstimateWish | None,
-    adapt: AdaptWish | None,
+    estimate: EstimateOptions | None,
+    adapt: AdaptOptions | None,
     simulate: bool,
 ) -> RunningEstimate | None:
     """The fits beside a run, if it is to have any."""

@@ -40,7 +40,7 @@ _refused = partial(entry_refusal, "cameras", "cameras")
 
 
 @dataclass(frozen=True)
-class GenicamWishes:
+class GenicamSettings:
     """What the rig file states.
 
     Attributes:
@@ -60,7 +60,7 @@ class GenicamWishes:
     trigger: str = SOFTWARE
 
     @classmethod
-    def of(cls, table: Mapping[str, Setting]) -> GenicamWishes:
+    def of(cls, table: Mapping[str, Setting]) -> GenicamSettings:
         """Those of `[cameras]`.
 
         Raises:
@@ -94,17 +94,17 @@ def genicam_cameras(rig: Rig) -> GenicamCamera:
         InputError: `harvesters` is not installed, or `[cameras]` does not fit.
         DeviceFault: a camera that is not there or does not obey.
     """
-    wishes = GenicamWishes.of(rig.cameras)
+    stated = GenicamSettings.of(rig.cameras)
     try:
         from harvesters.core import Harvester
     except ImportError as error:
         remedy = "pip install 'tvsbayes[genicam]'"
         raise InputError("genicam", f"GenICam cameras need harvesters; {remedy}", remedy=remedy) from error
-    if not Path(wishes.producer).is_file():
+    if not Path(stated.producer).is_file():
         # Harvesters would go on without it, and find no cameras.
         allowed, remedy = "the GenTL producer of the cameras' maker", "install it, or correct the path of its .cti file"
-        raise _refused("options.producer", f"no file {escaped(wishes.producer, 200)}", allowed, remedy)
-    return GenicamCamera(Harvester(), wishes, rig.stereo.image_width, rig.stereo.image_height)
+        raise _refused("options.producer", f"no file {escaped(stated.producer, 200)}", allowed, remedy)
+    return GenicamCamera(Harvester(), stated, rig.stereo.image_width, rig.stereo.image_height)
 
 
 class GenicamCamera:
@@ -112,7 +112,7 @@ class GenicamCamera:
 
     Args:
         harvester: a `harvesters.core.Harvester` without files; belongs to this object from now on.
-        wishes: what the rig file states.
+        stated: what the rig file states.
         width: of one picture, px.
         height: px.
 
@@ -120,8 +120,8 @@ class GenicamCamera:
         DeviceFault: the producer cannot be used, a camera is not there, or does not obey.
     """
 
-    def __init__(self, harvester: Any, wishes: GenicamWishes, width: int, height: int):
-        self._harvester, self._wishes = harvester, wishes
+    def __init__(self, harvester: Any, stated: GenicamSettings, width: int, height: int):
+        self._harvester, self._stated = harvester, stated
         self._size = width, height
         self._acquirers: list[Any] = []
         self._warnings: list[str] = []
@@ -137,9 +137,9 @@ class GenicamCamera:
             ) from error
 
     def _open(self) -> None:
-        self._harvester.add_file(self._wishes.producer)
+        self._harvester.add_file(self._stated.producer)
         self._harvester.update()
-        for name, wanted in zip(_NAMES, self._wishes.cameras, strict=True):
+        for name, wanted in zip(_NAMES, self._stated.cameras, strict=True):
             known = self._harvester.device_info_list
             fits = [
                 n for n, d in enumerate(known) if wanted in (_text(d, "serial_number"), _text(d, "user_defined_name"))
@@ -155,18 +155,18 @@ class GenicamCamera:
 
     def _fix(self, name: str, nodes: Any) -> None:
         """Size, format, software trigger, exposure; automatics off."""
-        wishes = self._wishes
-        must: dict[str, object] = {"PixelFormat": wishes.pixel_format, "Width": self._size[0], "Height": self._size[1]}
+        stated = self._stated
+        must: dict[str, object] = {"PixelFormat": stated.pixel_format, "Width": self._size[0], "Height": self._size[1]}
         if hasattr(nodes, "TriggerMode"):
-            must |= {"TriggerSelector": "FrameStart", "TriggerMode": "On", "TriggerSource": wishes.trigger}
-        elif wishes.trigger == SOFTWARE:
+            must |= {"TriggerSelector": "FrameStart", "TriggerMode": "On", "TriggerSource": stated.trigger}
+        elif stated.trigger == SOFTWARE:
             self._warnings.append(f"{name}: runs freely, without a trigger; buffers are emptied before every look")
         else:
             raise fault("camera-setting", f"{name}: no trigger", "leave out [cameras.options] trigger")
-        if wishes.exposure_us is not None:
-            must["ExposureTime"] = wishes.exposure_us
-        if wishes.gain is not None:
-            must["Gain"] = wishes.gain
+        if stated.exposure_us is not None:
+            must["ExposureTime"] = stated.exposure_us
+        if stated.gain is not None:
+            must["Gain"] = stated.gain
         for automatic in ("ExposureAuto", "GainAuto", "BalanceWhiteAuto"):
             if not _set(nodes, automatic, "Off") and hasattr(nodes, automatic):
                 self._warnings.append(f"{name}: {automatic} cannot be switched off; fix it with the maker's program")
@@ -178,7 +178,7 @@ class GenicamCamera:
     @property
     def wants_pulse(self) -> bool:
         """Whether exposures wait for a line that somebody has to pulse."""
-        return self._wishes.trigger != SOFTWARE
+        return self._stated.trigger != SOFTWARE
 
     def use_trigger(self, pulse: Callable[[], object]) -> None:
         """How the line is pulsed on which the cameras wait."""
@@ -192,7 +192,7 @@ class GenicamCamera:
             for key, node in {"exposure_us": "ExposureTime", "gain": "Gain"}.items():
                 if hasattr(nodes, node):
                     values[f"{name}.{key}"] = float(getattr(nodes, node).value)
-            values[f"{name}.bits"] = float(PIXEL_BITS[self._wishes.pixel_format])
+            values[f"{name}.bits"] = float(PIXEL_BITS[self._stated.pixel_format])
         return CameraSettings(values, tuple(self._warnings))
 
     def grab(self) -> StereoImage:
@@ -203,7 +203,7 @@ class GenicamCamera:
         """
         if self.wants_pulse and self._pulse is None:
             remedy = "use a positioner that offers one (driver serial), or leave out [cameras.options] trigger"
-            raise fault("trigger", f"the cameras wait for {self._wishes.trigger} and nobody pulses it", remedy)
+            raise fault("trigger", f"the cameras wait for {self._stated.trigger} and nobody pulses it", remedy)
         try:
             for acquirer in self._acquirers:
                 _drain(acquirer)
@@ -217,7 +217,7 @@ class GenicamCamera:
             raise
         except Exception as error:
             raise fault("no-frame", f"a camera delivers no frame: {_said(error)}", "check its cable") from error
-        return StereoImage(left, right, 2 ** PIXEL_BITS[self._wishes.pixel_format] - 1)
+        return StereoImage(left, right, 2 ** PIXEL_BITS[self._stated.pixel_format] - 1)
 
     def _expose(self, free: Sequence[bool]) -> None:
         """Trigger those that do not run by themselves."""
@@ -240,7 +240,7 @@ class GenicamCamera:
                 raise fault("image-size", found, f"{self._size[0]} x {self._size[1]} px were calibrated")
             # The memory belongs to the producer again once the buffer is given back.
             data = np.array(part.data)
-        return _as_bgr(data, self._size, self._wishes.pixel_format)
+        return _as_bgr(data, self._size, self._stated.pixel_format)
 
     def close(self) -> None:
         """See `StereoCamera.close`."""

@@ -120,8 +120,8 @@ def acquire(
     from tvsbayes.acquisition.observation import live_detector, twin_renderer
     from tvsbayes.acquisition.operator import LiveLine, Terminal
     from tvsbayes.acquisition.place_command import PlaceCommand
-    from tvsbayes.acquisition.replanning import AdaptWish
-    from tvsbayes.acquisition.running_estimate import EstimateWish
+    from tvsbayes.acquisition.replanning import AdaptOptions
+    from tvsbayes.acquisition.running_estimate import EstimateOptions
     from tvsbayes.acquisition.session import acquire as run_plan
 
     placing = None if place_command is None else PlaceCommand.parsed(place_command, place_seconds)
@@ -138,8 +138,8 @@ def acquire(
             resume=resume,
             laser_class=laser_class,
             seed=seed or 0,
-            estimate=EstimateWish(fitted, target_u, estimate),
-            adapt=AdaptWish(partial(proposed, rig), minutes) if adapt else None,
+            estimate=EstimateOptions(fitted, target_u, estimate),
+            adapt=AdaptOptions(partial(proposed, rig), minutes) if adapt else None,
             vision=vision,
             terminal=Terminal(report_line, line.show, line.ask),
             live=watched,

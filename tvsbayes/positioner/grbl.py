@@ -61,7 +61,7 @@ _refused = partial(entry_refusal, "positioner", "positioner")
 
 
 @dataclass(frozen=True)
-class Wishes:
+class GrblSettings:
     """What the rig file states.
 
     Attributes:
@@ -79,7 +79,7 @@ class Wishes:
     speed_steps_per_s: float | None = None
 
     @classmethod
-    def of(cls, table: Mapping[str, str | int | float]) -> Wishes:
+    def of(cls, table: Mapping[str, str | int | float]) -> GrblSettings:
         """Those of `[positioner]`.
 
         Raises:
@@ -113,7 +113,7 @@ class GrblPositioner:
 
     Args:
         open_link: opens the line; raises OSError while there is none.
-        wishes: what the rig file states.
+        stated: what the rig file states.
         clock: where time comes from.
 
     Raises:
@@ -121,8 +121,8 @@ class GrblPositioner:
         InputError: a setting of the board that does not fit, or more laser power than it has.
     """
 
-    def __init__(self, open_link: Callable[[], Link], wishes: Wishes | None = None, clock: Clock = time):
-        self._wishes, self._clock = wishes or Wishes(), clock
+    def __init__(self, open_link: Callable[[], Link], stated: GrblSettings | None = None, clock: Clock = time):
+        self._stated, self._clock = stated or GrblSettings(), clock
         self._buffer, self._heard = bytearray(), bytearray()
         self._pending, self._homed, self._greeted, self._done = 0, False, False, 0
         self._lit = False
@@ -137,10 +137,10 @@ class GrblPositioner:
             self.identity: dict[str, str] = {"fw": self._greeting(), "driver": "grbl"}
             values: dict[int, float] = {}
             self._order("$$", REPLY_S, lambda line: values.update([one]) if (one := parse_setting(line)) else None)
-            self._board = BoardSettings.of(values, self._wishes.laser)
-            if (self._wishes.laser_power or 0.0) > self._board.power_max:
+            self._board = BoardSettings.of(values, self._stated.laser)
+            if (self._stated.laser_power or 0.0) > self._board.power_max:
                 # The board would take it for full power.
-                found, allowed = f"{self._wishes.laser_power:g}", f"at most {self._board.power_max:g}, the board's $30"
+                found, allowed = f"{self._stated.laser_power:g}", f"at most {self._board.power_max:g}, the board's $30"
                 raise _refused("options.laser_power", found, allowed, "lower it, or leave it out for full power")
             self.identity |= {f"${number}": f"{values[number]:g}" for number in (100, 101, 110, 111)}
         except BaseException:
@@ -166,8 +166,8 @@ class GrblPositioner:
         wanted = (int(pan_steps), int(tilt_steps))
         self._require_homed("a motion")
         for axis, counter in zip(AXES, wanted, strict=True):
-            if not self._wishes.limits.allow(axis, counter) or abs(counter) > COUNTERS_MAX:
-                found = f"{axis} {counter}, allowed is {self._wishes.limits.words(axis)}"
+            if not self._stated.limits.allow(axis, counter) or abs(counter) > COUNTERS_MAX:
+                found = f"{axis} {counter}, allowed is {self._stated.limits.words(axis)}"
                 raise fault("refused-limit", found, "correct the plan or the limits in [positioner]")
         if self._lit:
             self.laser(False)
@@ -191,7 +191,7 @@ class GrblPositioner:
         """See `Positioner.laser`."""
         if on:
             self._require_homed("light")
-            if not self._wishes.unwatched:
+            if not self._stated.unwatched:
                 raise fault(
                     "laser",
                     "a GRBL board leaves the laser on when this computer dies",
@@ -258,20 +258,20 @@ class GrblPositioner:
 
     def _laser_order(self, on: bool) -> str:
         """What is written for light or darkness."""
-        wishes = self._wishes
+        stated = self._stated
         if not on:
-            return LASER_ORDERS[wishes.laser]
-        if wishes.laser not in ("M3", "M4"):
-            return wishes.laser
-        power = self._board.power_max if wishes.laser_power is None else wishes.laser_power
-        return f"{wishes.laser} S{power:g}"
+            return LASER_ORDERS[stated.laser]
+        if stated.laser not in ("M3", "M4"):
+            return stated.laser
+        power = self._board.power_max if stated.laser_power is None else stated.laser_power
+        return f"{stated.laser} S{power:g}"
 
     def _way(self, start: tuple[int, int], end: tuple[int, int]) -> tuple[str, float]:
         """The order of a motion in machine coordinates, and the longest that it may take without ramps, s."""
         x, y = self._board.position_mm(end)
         steps = [abs(b - a) for a, b in zip(start, end, strict=True)]
         rates = [r * k / 60 for r, k in zip(self._board.rate_mm_per_min, self._board.steps_per_mm, strict=True)]
-        speed = self._wishes.speed_steps_per_s
+        speed = self._stated.speed_steps_per_s
         slowest = [rate if speed is None else min(rate, speed) for rate in rates]
         seconds = max(n / rate for n, rate in zip(steps, slowest, strict=True))
         if speed is None or not seconds:
@@ -307,7 +307,7 @@ class GrblPositioner:
         if not modes:
             raise fault("no-answer", "$G was answered without modes", "check the board's firmware: GRBL 1.1 is known")
         # Both coolants may be on at once; M5 and M9 stand for darkness.
-        return self._wishes.laser in modes[-1]
+        return self._stated.laser in modes[-1]
 
     def _asked(self) -> Status:
         """A status report."""

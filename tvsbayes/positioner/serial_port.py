@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.driver import SerialPositioner
-from tvsbayes.positioner.grbl import GrblPositioner, Wishes
+from tvsbayes.positioner.grbl import GrblPositioner, GrblSettings
 from tvsbayes.positioner.interface import Link
 from tvsbayes.positioner.protocol import device_settings
 
@@ -85,8 +85,8 @@ def grbl_positioner(rig: Rig) -> GrblPositioner:
             board that do not fit.
         DeviceFault: the port cannot be opened, or no GRBL board answers.
     """
-    wishes = Wishes.of(rig.positioner)
-    return GrblPositioner(_opener_of(rig), wishes)
+    stated = GrblSettings.of(rig.positioner)
+    return GrblPositioner(_opener_of(rig), stated)
 
 
 def _opener_of(rig: Rig) -> Callable[[], Link]:
