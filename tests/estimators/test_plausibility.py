@@ -16,6 +16,7 @@ from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import PIXEL_SDS, PIXELS, Campaign, read_campaign, write_campaign
 from tvsbayes.instrument.corrections import Correction, corrected
 from tvsbayes.instrument.protocols import PROTOCOLS
+from tvsbayes.instrument.stereo_pair import project_pair, rotation_matrix
 from tvsbayes.twin.simulated_campaign import simulate
 
 
@@ -169,6 +170,17 @@ def test_mismatched_pictures_are_not_called_swapped(paper_twin):
         for s, k in zip(paper_twin.spots, order, strict=True)
     )
     assert not any(f.certain for f in implausible(replace(paper_twin, spots=mixed)))
+
+
+def test_a_transposed_rotation_is_named(paper_twin):
+    """Of cameras that stand half a degree apart; the spots are those that the pair with R itself sees."""
+    turned = replace(paper_twin.stereo, R=rotation_matrix(np.array([0.01, 0.004, 0.0])))
+    pixels = project_pair(turned, paper_twin.usable_points_mm).tolist()
+    ok = [spot for spot in paper_twin.spots if spot.status == "ok"]
+    spots = tuple(replace(s, **dict(zip(PIXELS, row, strict=True))) for s, row in zip(ok, pixels, strict=True))
+    assert "pictures" not in {f.code for f in implausible(replace(paper_twin, spots=spots, stereo=turned))}
+    wrong = replace(paper_twin, spots=spots, stereo=replace(turned, R=turned.R.T))
+    assert any("R of stereo.json looks transposed" in f.sentence for f in implausible(wrong))
 
 
 def test_swapped_pictures_that_contradict_each_other_are_a_doubt(paper_twin):

@@ -8,6 +8,7 @@ import pytest
 from tvsbayes.errors import InputError
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.head.pointing_table import campaign_of, read_stars
+from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.twin.head_physics import head_beam
 
@@ -58,6 +59,8 @@ def test_terms_of_a_table_over_its_wraps(tmp_path):
     path = tmp_path / "night.dat"
     path.write_text("".join(table(40, turns=1.4)))
     campaign = campaign_of(read_stars(path).stars, "night")
+    write_campaign(campaign, tmp_path / "night")
+    assert read_campaign(tmp_path / "night").moves == campaign.moves
     assert np.all(np.diff([move.time_s for move in campaign.moves]) > 0)
     model = pointing_model(campaign)
     # Seven decimals of a degree, over the cosine of 89 deg.

@@ -461,7 +461,9 @@ class _Reader:
         stated_deg, transposed_deg = (_toe_in_deg(r, pose.translation) for r in (pose.rotation, pose.rotation.T))
         said = f"{pose.turn.place} is taken from left to right, x_right = R x_left + T, and nothing else in the file "
         said += f"says so: the optical axes {_toe_in(stated_deg)}; "
-        said += f"transposed they {_toe_in(transposed_deg)}: --key R={path}.T"
+        said += (
+            f"transposed they {_toe_in(transposed_deg)}: --key R={path}.T; `check` of a campaign with spots says which"
+        )
         if stated_deg < -TURN_SAID_DEG < TURN_SAID_DEG < transposed_deg:
             self.warnings.append(f"is R transposed? {said}")
         else:

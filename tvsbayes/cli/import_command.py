@@ -186,7 +186,8 @@ def import_(
 
 def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
     """A pointing table of a telescope becomes a campaign of sightings."""
-    from tvsbayes.head.pointing_table import STEP_DEG, U_ARCSEC, campaign_of, read_stars
+    from tvsbayes.head.foreign_sightings import STEP_DEG
+    from tvsbayes.head.pointing_table import U_ARCSEC, campaign_of, read_stars
     from tvsbayes.instrument.campaign import write_campaign
 
     table = read_stars(file)

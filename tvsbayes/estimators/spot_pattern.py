@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +25,7 @@ SPOTS_LISTED = 10
 MISMATCH_PX = 3.0
 """Distance of a spot's pixels from those of its point that no calibration in use leaves on most spots."""
 CURED = 0.25
-"""Share of the mismatch that may be left where another size of the pictures explains it."""
+"""Share of the mismatch that may be left where another size of the pictures, or the transpose of R, explains it."""
 STRAY_MISMATCH = 10.0
 """Times the median mismatch, and above `MISMATCH_PX`, that makes a single spot stray."""
 KNOCK_PX, KNOCK_SPREADS = 1.0, 6.0
@@ -119,6 +119,12 @@ def _picture_doubts(pattern: SpotPattern) -> tuple[str, ...]:
                 f"the pixels look like those of pictures of {word} the size of stereo.json ({size}): left and right "
                 f"contradict each other by {off_px:.1f} px, and agree once all pixels are multiplied by {factor:g}",
             )
+    turned = replace(stereo, R=stereo.R.T)
+    if np.median(mismatch_px(turned, pattern.pixels, triangulate(turned, pattern.pixels))) < CURED * off_px:
+        return (
+            f"R of stereo.json looks transposed: left and right contradict each other by {off_px:.1f} px, and agree "
+            "with its transpose: import the calibration again with --key R=NAME.T, or without it",
+        )
     return (
         f"left and right contradict each other by {off_px:.1f} px (median): pictures of another size or calibration, "
         "rows of one camera shifted, or x and y exchanged?",

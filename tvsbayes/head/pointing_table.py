@@ -17,14 +17,13 @@ import numpy as np
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import read_bytes
-from tvsbayes.instrument.campaign import Campaign, Move, sighted_campaign
+from tvsbayes.head.foreign_sightings import STEP_DEG
+from tvsbayes.instrument.campaign import Campaign, Move, next_move, sighted_campaign
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.parameters import Prior, names_of
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.sightings import Sighting
 
-STEP_DEG = 1e-5
-"""Of a counter: encoders are read in degrees, and 0.04 arcsec is far below what a telescope is pointed to."""
 ARCSEC = 1 / 3600
 U_ARCSEC = 0.5
 """Stated for a star's place where nobody names one: what is left is estimated as the scatter of stops."""
@@ -131,18 +130,10 @@ def campaign_of(stars: tuple[Star, ...], name: str, u_arcsec: float = U_ARCSEC) 
     sidereal = np.unwrap([star.sidereal_s for star in stars], period=DAY_S)
     time_s = (sidereal - sidereal[0]) * SIDEREAL_S
     pan, tilt = (np.rint(angle / STEP_DEG).astype(int).tolist() for angle in (azimuth, elevation))
-    moves = tuple(
-        Move(
-            move=k,
-            segment=0,
-            time_s=float(time_s[k]),
-            pan_steps=pan[k],
-            tilt_steps=tilt[k],
-            pan_approach="" if k else "unknown",
-            tilt_approach="" if k else "unknown",
-        )
-        for k in range(len(stars))
-    )
+    moves: list[Move] = []
+    for time, *counters in zip(time_s.tolist(), pan, tilt, strict=True):
+        sides = ("", "") if moves else ("unknown", "unknown")
+        moves.append(next_move(moves, 0, time, (counters[0], counters[1]), sides))  # type: ignore[arg-type]
     sightings = tuple(
         Sighting(
             sighting=k,
