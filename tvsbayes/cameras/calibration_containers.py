@@ -33,6 +33,7 @@ MATRIX_TAG = "!!opencv-matrix"
 CONTAINER_BYTES_MAX = 4 * 1024 * 1024
 ENTRIES_MAX = 200_000
 DEPTH_MAX = 12
+TOO_MANY, ALONE = f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
 _ALLOWED = (
     "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, .mat of MATLAB up to version 7, a ZED's SN*.conf,"
     " what rs-enumerate-devices -c prints"
@@ -92,16 +93,14 @@ def _plain(value: Any, file: str) -> Any:
         nonlocal count
         count += 1
         if count > ENTRIES_MAX or depth > DEPTH_MAX:
-            raise bad(
-                file, None, f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
-            )
+            raise bad(file, None, TOO_MANY, ALONE)
         if isinstance(value, dict):
             return {str(key): plain(each, depth + 1) for key, each in value.items()}
         if isinstance(value, list | tuple):
             return [plain(each, depth + 1) for each in value]
         if isinstance(value, np.ndarray | np.generic):
             if value.size > ENTRIES_MAX:
-                raise bad(file, None, f"an array of {value.size} numbers", "keep the calibration alone")
+                raise bad(file, None, f"an array of {value.size} numbers", ALONE)
             return plain(value.tolist(), depth)
         if isinstance(value, float) and not math.isfinite(value):
             return None
@@ -269,6 +268,4 @@ def _counted(events: Iterable[Any], file: str) -> None:
         count += 1
         depth += name.endswith("StartEvent") - name.endswith("EndEvent")
         if depth > DEPTH_MAX or count > ENTRIES_MAX:
-            raise bad(
-                file, line, f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
-            )
+            raise bad(file, line, TOO_MANY, ALONE)

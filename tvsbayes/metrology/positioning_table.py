@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import structs
 
 from tvsbayes.calibration.optics import beam_angle_deg, beam_deg_per_step, output_deg
 from tvsbayes.calibration.pointing import Calibration
@@ -24,7 +25,7 @@ from tvsbayes.metrology.simulated_cycles import (
     target_steps,
     targets_wanted,
 )
-from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, Positioning, Predicted
+from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, Predicted
 
 INDIRECT = (
     "ISO 230-2-style and indirect: angles of the beam are inferred from spots in two cameras through the fitted model; "
@@ -72,20 +73,8 @@ class StopReadings:
     values: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class _PlugIn:
-    """Figures of the campaign's own stops, their targets and runs from either side, or why there are none."""
-
-    figures: Positioning | None = None
-    steps: tuple[int, ...] = ()
-    runs: tuple[tuple[int, int], ...] = ()
-    missing: str | None = None
-    reading_u_deg: float | None = None
-    notes: tuple[str, ...] = ()
-
-
-def _plug_in(readings: StopReadings, deg_per_step: float, wanted: int) -> _PlugIn:
-    """What the campaign's own stops say, where targets are `deg_per_step` times the counter and ISO wants so many."""
+def _with_own_stops(table: AxisPositioning, readings: StopReadings, wanted: int) -> AxisPositioning:
+    """A table with the figures of the campaign's stops, or why there are none, where ISO wants so many targets."""
     u = float(np.sqrt(np.mean(readings.u_deg**2))) if len(readings.u_deg) else None
     left_out, few = readings.play_left_out, []
     unplayed = [f"plug-in: {left_out} stops left out whose play was not taken up for certain"] if left_out else []
@@ -100,15 +89,15 @@ def _plug_in(readings: StopReadings, deg_per_step: float, wanted: int) -> _PlugI
             f"{counters} of the {readings.axis} axis with at least {RUNS_MIN} stops from either side; {TARGETS_MIN} "
             f"are needed, ISO 230-2 asks for {wanted} with {RUNS} runs"
         )
-        return _PlugIn(missing=reason, reading_u_deg=u, notes=tuple(unplayed))
+        return structs.replace(table, missing=reason, reading_u_deg=u, notes=tuple(unplayed))
     other = readings.reference_pose_deg[1 - AXES.index(readings.axis)]
     angle = beam_angle_deg(readings.values, readings.axis, readings.mirror_deg, other)
-    deviation = angle - deg_per_step * readings.steps
+    deviation = angle - table.deg_per_step * readings.steps
     longest = max(len(rows) for pair in usable.values() for rows in pair)
-    table = np.full((2, len(usable), longest), np.nan)
+    by_side = np.full((2, len(usable), longest), np.nan)
     for k, pair in enumerate(usable.values()):
         for side, rows in enumerate(pair):
-            table[side, k, : len(rows)] = deviation[rows]
+            by_side[side, k, : len(rows)] = deviation[rows]
     counts = tuple((len(a), len(b)) for a, b in usable.values())
     fewest = min(map(min, counts))
     if len(usable) < wanted or fewest < RUNS:
@@ -116,11 +105,13 @@ def _plug_in(readings: StopReadings, deg_per_step: float, wanted: int) -> _PlugI
             f"plug-in: {len(usable)} targets, at least {fewest} runs per side; ISO 230-2 asks for {wanted} targets and "
             f"{RUNS} runs"
         )
-    return _PlugIn(
-        figures=figures_of(table[0], table[1]),
-        steps=tuple(usable),
-        runs=counts,
+    return structs.replace(
+        table,
+        plug_in=figures_of(*by_side),
+        plug_in_steps=tuple(usable),
+        plug_in_runs=counts,
         reading_u_deg=u,
+        missing=None,
         notes=(OWN_STOPS, *few, *unplayed),
     )
 
@@ -191,18 +182,21 @@ def positioning(
         cycles = simulated_runs(calibration, axis, chosen, ratio, contrast_deg_per_step=contrast, **options)
         predicted, made = _predicted(cycles), SIMULATED.format(tests, runs, calibration.estimator)
     wanted = targets_wanted((high - low) * ratio)
-    plug_in = _PlugIn(missing="no stops were given") if readings is None else _plug_in(readings, ratio, wanted)
-    return AxisPositioning(
+    table = AxisPositioning(
         axis=axis,
         deg_per_step=ratio,
         predicted=predicted,
         target_steps=chosen,
         runs=runs,
         estimator=calibration.estimator,
-        plug_in=plug_in.figures,
-        plug_in_steps=plug_in.steps,
-        plug_in_runs=plug_in.runs,
-        reading_u_deg=plug_in.reading_u_deg,
-        missing=plug_in.missing,
-        notes=(INDIRECT, *plug_in.notes, made, DEFINITIONS, *(f"not covered: {text}" for text in NOT_COVERED)),
+        plug_in=None,
+        plug_in_steps=(),
+        plug_in_runs=(),
+        reading_u_deg=None,
+        missing="no stops were given",
+        notes=(),
     )
+    if readings is not None:
+        table = _with_own_stops(table, readings, wanted)
+    notes = (INDIRECT, *table.notes, made, DEFINITIONS, *(f"not covered: {text}" for text in NOT_COVERED))
+    return structs.replace(table, notes=notes)
