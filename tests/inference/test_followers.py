@@ -119,6 +119,18 @@ def test_a_pair_that_explains_the_same_scatter_is_proposed_as_the_target_has_it(
     assert followed > 0.2 > 20 * effective_share(target, 2)
 
 
+def test_two_followers_that_mend_one_misfit_are_counted_once():
+    """Three variances of which only the sum is known: where the leader's is small, either of the others is enough."""
+
+    def target(w: np.ndarray) -> np.ndarray:
+        variance = np.exp(w) @ [0.5, 0.1, 0.1]
+        return -0.5 * np.sum(w**2, axis=1) - 20 * (np.log(variance) + 0.7 / variance)
+
+    assert {leader for leader, _ in forest(target, np.arange(3), 3)} == {0}
+    # Counted twice, the leader would be drawn where nothing is: a share of 1e-4.
+    assert effective_share(target, 3) > 0.2
+
+
 def test_coordinates_follow_those_that_they_depend_on_most(monkeypatch):
     """A chain of three, the middle one known by both others, and a fourth that depends on none."""
 

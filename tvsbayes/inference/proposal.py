@@ -363,6 +363,38 @@ def forest(target: Callable[[np.ndarray], np.ndarray], places: np.ndarray, dimen
     return pairs
 
 
+def _at_each(target: Callable[[np.ndarray], np.ndarray], points: np.ndarray) -> np.ndarray:
+    """Log densities of points (..., d), shape (...,)."""
+    return (target(points.reshape(-1, points.shape[-1])) if points.size else np.zeros(0)).reshape(points.shape[:-1])
+
+
+def _planes(target: Callable[[np.ndarray], np.ndarray], pairs: np.ndarray, dimension: int) -> np.ndarray:
+    """Log densities on the planes of leaders and followers, shape (pairs, leader nodes, nodes).
+
+    Of several that follow one leader the later ones see the earlier where these are most probable: two that mend the
+    same misfit are not counted twice.
+
+    Args:
+        target: log density of points (n, d).
+        pairs: coordinates of leader and follower, shape (pairs, 2).
+        dimension: d.
+    """
+    turn = np.array([np.sum(pairs[:k, 0] == leader) for k, leader in enumerate(pairs[:, 0])], dtype=int)
+    points = np.zeros((len(pairs), len(LEADER_NODES), len(CUT_NODES), dimension))
+    found = np.zeros((len(pairs), len(LEADER_NODES), len(NODES)))
+    for now in range(turn.max(initial=-1) + 1):
+        own = np.flatnonzero(turn == now)
+        for k in own:
+            leader, follower = pairs[k]
+            points[k, :, :, leader], points[k, :, :, follower] = LEADER_NODES[:, None], CUT_NODES
+        found[own] = between_cuts(_at_each(target, points[own]))
+        for k in own:
+            best = NODES[np.argmax(np.nan_to_num(found[k], nan=-np.inf), axis=1)]
+            later = (pairs[:, 0] == pairs[k, 0]) & (turn > now)
+            points[later, :, :, pairs[k, 1]] = best[:, None]
+    return found
+
+
 def first_proposal(
     target: Callable[[np.ndarray], np.ndarray], dimension: int, heavy: np.ndarray, coupled: np.ndarray
 ) -> Independence:
@@ -382,23 +414,16 @@ def first_proposal(
     pairs = forest(target, places, dimension)
     along = np.zeros((len(places), len(CUT_NODES), dimension))
     along[np.arange(len(places)), :, places] = CUT_NODES
-    planes = np.zeros((len(pairs), len(LEADER_NODES), len(CUT_NODES), dimension))
-    for k, (leader, follower) in enumerate(pairs):
-        planes[k, :, :, places[leader]] = LEADER_NODES[:, None]
-        planes[k, :, :, places[follower]] = CUT_NODES
-    points = np.concatenate([along.reshape(-1, dimension), planes.reshape(-1, dimension)])
-    cuts = target(points) if len(points) else np.zeros(0)
-    lines, rows = np.split(cuts, [along.shape[0] * along.shape[1]])
-    lines, rows = between_cuts(lines.reshape(along.shape[:2])), between_cuts(rows.reshape(planes.shape[:3]))
-    alone = lines.copy()
-    gains = np.zeros_like(lines)
+    lines = between_cuts(_at_each(target, along))
+    planes = _planes(target, places[np.reshape(np.array(pairs, dtype=int), (-1, 2))], dimension)
+    rows, alone, gains = planes.copy(), lines.copy(), np.zeros_like(lines)
     for k in reversed(range(len(pairs))):
         leader, follower = pairs[k]
         # What both say together, as the leader's own density and the follower's whatever the leader is; what the
         # follower leads in turn belongs to it.
         rows[k] = np.where(np.isfinite(rows[k]), rows[k], -np.inf) + gains[follower]
         with np.errstate(invalid="ignore"):
-            gain = special.logsumexp(rows[k], axis=1) - np.interp(LEADER_NODES, NODES, alone[leader])
+            gain = special.logsumexp(rows[k], axis=1) - planes[k][:, NODES == 0.0][:, 0]
         gains[leader] += np.interp(NODES, LEADER_NODES, np.where(np.isfinite(gain), gain, 0.0))
         lines[follower] = special.logsumexp(rows[k], axis=0)
     leaders = np.setdiff1d(np.arange(len(places)), [follower for _, follower in pairs])
