@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import threading
-
 import pytest
 from support.grbl_board import BoardLink, GrblBoard
-from support.pseudo_terminal import needs_pseudo_terminals
+from support.pseudo_terminal import answered, needs_pseudo_terminals
 
 from tvsbayes.acquisition.simulated_instrument import ModelLink, SimulatedDevice, VirtualClock
 from tvsbayes.errors import DeviceFault, InputError
@@ -297,29 +294,17 @@ def test_whoever_loses_a_lit_board_is_told_to_cut_its_light_first(lost, code, li
 def test_a_board_on_a_pseudo_terminal():
     """Pyserial and a real file descriptor; the board's time runs with the requests."""
     board = GrblBoard()
-    master, slave = os.openpty()
 
-    def serve():
-        while True:
-            try:
-                data = os.read(master, 4096)
-            except OSError:
-                return
-            board.clock.sleep(1.0)
-            board.receive(data)
-            data, board.out = bytes(board.out), bytearray()
-            os.write(master, data)
+    def answer(data: bytes) -> bytes:
+        board.clock.sleep(1.0)
+        board.receive(data)
+        sent, board.out = bytes(board.out), bytearray()
+        return sent
 
-    threading.Thread(target=serve, daemon=True).start()
-    try:
-        positioner = GrblPositioner(
-            serial_opener(os.ttyname(slave), 115_200), GrblSettings(unwatched=True, limits=LIMITS)
-        )
+    with answered(answer) as port:
+        positioner = GrblPositioner(serial_opener(port, 115_200), GrblSettings(unwatched=True, limits=LIMITS))
         positioner.home()
         assert positioner.move_to(300, -20).pan_steps == 300
         assert positioner.laser(True).laser_on
         positioner.close()
         assert board.steps == [300, -20] and not board.lit_in_motion
-    finally:
-        os.close(slave)
-        os.close(master)

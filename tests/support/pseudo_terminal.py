@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -15,14 +15,9 @@ needs_pseudo_terminals = pytest.mark.skipif(not hasattr(os, "openpty"), reason="
 
 
 @contextmanager
-def served(device: SimulatedDevice, pause_us: int) -> Iterator[str]:
-    """The name of a port that the device answers on.
-
-    Every request finds it `pause_us` later: motions end without anybody waiting.
-    """
+def answered(answer: Callable[[bytes], bytes]) -> Iterator[str]:
+    """The name of a port on which every request gets an answer."""
     master, slave = os.openpty()
-    lines: list[bytes] = []
-    device.listener = lines.append
 
     def serve():
         while True:
@@ -30,11 +25,7 @@ def served(device: SimulatedDevice, pause_us: int) -> Iterator[str]:
                 data = os.read(master, 4096)
             except OSError:
                 return
-            device.clock.now_us += pause_us
-            device.model.advance(device.clock.now_us)
-            device.model.receive(data, device.clock.now_us)
-            while lines:
-                os.write(master, lines.pop(0))
+            os.write(master, answer(data))
 
     threading.Thread(target=serve, daemon=True).start()
     try:
@@ -42,3 +33,24 @@ def served(device: SimulatedDevice, pause_us: int) -> Iterator[str]:
     finally:
         os.close(slave)
         os.close(master)
+
+
+@contextmanager
+def served(device: SimulatedDevice, pause_us: int) -> Iterator[str]:
+    """The name of a port that the device answers on.
+
+    Every request finds it `pause_us` later: motions end without anybody waiting.
+    """
+    lines: list[bytes] = []
+    device.listener = lines.append
+
+    def answer(data: bytes) -> bytes:
+        device.clock.now_us += pause_us
+        device.model.advance(device.clock.now_us)
+        device.model.receive(data, device.clock.now_us)
+        sent = b"".join(lines)
+        lines.clear()
+        return sent
+
+    with answered(answer) as port:
+        yield port
