@@ -170,7 +170,9 @@ def figure(_: argparse.Namespace) -> None:
         ):
             place = [names.index(row["axis"]) + shift for row in rows]
             axes.plot(place, [row[key] for row in rows], "o", markersize=3, color=colour, alpha=0.7, label=label)
-        axes.set_xticks(range(len(names)), names)
+        counts = [sum(row["axis"] == name for row in rows) for name in names]
+        ticks = [f"{name.replace('_', ' ')}\nn = {n}" for name, n in zip(names, counts, strict=True)]
+        axes.set_xticks(range(len(names)), ticks)
         axes.set_ylabel("(mean - predicted) / u")
         axes.legend()
 

@@ -121,6 +121,7 @@ def draw(splits: Sequence[Halves], named: Halves) -> None:
         left.hist(z, np.arange(-4.25, 4.5, 0.5), density=True, color=BLUE, alpha=0.6, label="halves")
         left.plot(x, stats.norm.pdf(x), color=BLACK, linewidth=1, label="stated")
         left.set_xlabel("difference of two halves / stated sd, 24 parameters")
+        left.set_ylabel("probability density")
         left.legend()
         parameters = len(splits[0].z)
         chi2 = np.sort([one.chi2 for one in splits])
@@ -129,7 +130,7 @@ def draw(splits: Sequence[Halves], named: Halves) -> None:
         right.axhline(named.chi2, color=RED, linewidth=0.8, label="odd against even")
         right.plot([0.3, 2.2], [0.3, 2.2], color=BLACK, linewidth=0.8)
         right.set_xlabel("chi-square per parameter, expected")
-        right.set_ylabel("found")
+        right.set_ylabel("chi-square per parameter, observed")
         right.legend()
 
 
