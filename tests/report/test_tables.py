@@ -76,7 +76,7 @@ def test_concise_says_the_uncertainty_to_five_percent(mantissa):
         (18.3, 24.3, 1.54, "[18.3, 24.3]"),
         (-0.25, 0.25, 0.0996, "[-0.25, 0.25]"),
         (-100.0, 300.0, 123.0, "[-100, 300]"),
-        (0.2, 0.2, 0.0, "[0.200000, 0.200000]"),
+        (0.2, 0.2, 0.0, ""),
     ],
 )
 def test_interval_ends_have_the_digits_of_the_uncertainty(low, high, sd, expected):

@@ -32,7 +32,12 @@ def signed(value: float, sd: float) -> str:
 
 
 def interval_text(low: float, high: float, sd: float) -> str:
-    """Interval ends to the digits of the standard uncertainty, as `concise` has them (GUM 7.2.6)."""
+    """Interval ends to the digits of the standard uncertainty, as `concise` has them (GUM 7.2.6).
+
+    Empty where both ends are the same: what is held has no interval.
+    """
+    if low == high:
+        return ""
     decimals = max(0, 1 - int(f"{sd:.1e}".split("e")[1])) if 0 < sd < math.inf else 6
     return f"[{low:.{decimals}f}, {high:.{decimals}f}]"
 
