@@ -52,7 +52,7 @@ def head_of(kind: str) -> Rig:
             table, NO_STEREO, dict(table.priors), {}, {}, {"sighting_sd_deg": 0.005}, {"move_s": 20.0, "look_s": 5.0}
         )
     mounted = mounted_rig()
-    stated = {n: p for n, p in mounted.table.priors.items() if n in HEAD.told}
+    stated = {n: p for n, p in mounted.table.priors.items() if n in HEAD.documented}
     table = RigTable(stated, mechanism=HEAD)
     small = {"elevation_zero_deg": Prior(0.0, 2.0)}
     table = replace(table, priors={**table.priors, **small})

@@ -130,7 +130,7 @@ def test_without_a_model_there_are_properties():
     assert np.shape(document["covariance"]) == (len(document["names"]),) * 2
     # A joint that falls where elevation grows counts down.
     assert document["joints"]["tilt"]["steps_per_rad"] < 0 < document["joints"]["pan"]["steps_per_rad"]
-    assert set(document["names"]) <= SIGHTING_HEAD.told | set(TERMS)
+    assert set(document["names"]) <= SIGHTING_HEAD.documented | set(TERMS)
 
 
 @pytest.mark.parametrize(

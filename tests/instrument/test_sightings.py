@@ -49,7 +49,7 @@ def test_folder_there_and_back(simulated, tmp_path):
     assert found.spots == simulated.campaign.spots
     assert found.rig == simulated.campaign.rig
     text = (tmp_path / "campaign.toml").read_text() + (tmp_path / "truth.json").read_text()
-    scanners = set(NAMES) - SIGHTING_HEAD.told
+    scanners = set(NAMES) - SIGHTING_HEAD.documented
     assert not [name for name in scanners if f'"{name}"' in text]
     truth = read_truth(tmp_path / "truth.json", found.stereo)
     assert truth.parameters["azimuth_zero_deg"] == simulated.truth.parameters["azimuth_zero_deg"]

@@ -68,7 +68,7 @@ def report_line(text: str) -> None:
     try:
         typer.echo(shown("".join(c if c.isprintable() else "?" for c in text), sys.stderr), err=True)
     except OSError:
-        # Ctrl-C ends the `tee` behind us too: nobody is left to be told, and the work goes on. What is still in the
+        # Ctrl-C ends the `tee` behind us too: nobody is left to be informed, and the work goes on. What is still in the
         # stream's buffer must not fail again while Python ends.
         sys.stderr = open(os.devnull, "w", encoding="utf-8")
 

@@ -157,10 +157,10 @@ def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed:
     tell_part(classic_text(line, data.unit), as_json)
     kept = _fitted(data, output_place(folder, "results"), Sampled(quick, no_sample, MAX_MINUTES, seed))
     documents["fit"] = kept.as_json(seed)
-    told = axis_fit_text(kept.summary, written=list(kept.files.values()))
+    text = axis_fit_text(kept.summary, written=list(kept.files.values()))
     if kept.error is not None:
-        finish({**documents, "report": None}, told, as_json, kept.error)
-    tell_part(told, as_json)
+        finish({**documents, "report": None}, text, as_json, kept.error)
+    tell_part(text, as_json)
     page = documents["report"] = _page(data, folder, issue, pdf)
     finish(documents, f"next: open {', '.join(page['files'].values())} in a browser", as_json)
 

@@ -94,8 +94,8 @@ def import_readings(
 def _finish_import(understood: _Understood, to: Path, *, yes: bool, as_json: bool) -> None:
     """Show what was understood, write it if that is wanted, and say what is next."""
     found, named = understood.found, understood.unit
-    told = _unit_told(to, named)
-    assumed = [*found.assumed, told, *_drive_told(found)]
+    unit_line = _unit_line(to, named)
+    assumed = [*found.assumed, unit_line, *_drive_lines(found)]
     lines = [*understood.lines, *found.notes, *(f"assumed: {text}" for text in assumed)]
     ok = sum(reading.status == "ok" for reading in found.readings)
     lines.append(f"gives: {len(found.moves)} moves, {len(found.readings)} readings{_minutes(found)}")
@@ -208,7 +208,7 @@ def _table_understood(table: ForeignTable, stated: Mapping[str, str], wish: Axis
     return _Understood(table_lines(table, known, AXIS_FIELDS, unit_shown), table_document(table, known), found, unit)
 
 
-def _drive_told(found: ForeignReadings) -> list[str]:
+def _drive_lines(found: ForeignReadings) -> list[str]:
     """What campaign.toml gets of a drive at constant rate."""
     drive = found.drive
     if drive is None:
@@ -223,7 +223,7 @@ def _drive_told(found: ForeignReadings) -> list[str]:
     return said
 
 
-def _unit_told(to: Path, named: str | None) -> str:
+def _unit_line(to: Path, named: str | None) -> str:
     """Which unit results will have: a reading in mm must not be reported in degrees."""
     kept = (to / "campaign.toml").is_file()
     if named and not kept:

@@ -144,8 +144,8 @@ def fit(
     document = {**summary.as_json(), "seed": seed, "files": files}
     text = fit_text(summary, details, list(files.values()), results.causes)
     budgets = () if results.record.evidence is None else results.record.evidence.budgets
-    if budgets and (told := assumed_stereo(data.stereo, budgets)) is not None:
-        text = f"{told}\n{text}"
+    if budgets and (note := assumed_stereo(data.stereo, budgets)) is not None:
+        text = f"{note}\n{text}"
     if results.error is None and out is None:
         text += f"\nnext: {command_line('report', campaign)}"
     finish(document, text, as_json, results.error)

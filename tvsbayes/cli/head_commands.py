@@ -83,7 +83,7 @@ def import_urdf(
     kind = HEAD if spots == untouched else SIGHTING_HEAD
     ratios = {} if steps_per_turn is None else ratios_of(head, steps_per_turn)
     priors = {name: Prior(value, RATIO_U * value) for name, value in ratios.items()}
-    terms = {name: value for name, value in head.terms.items() if value and name in kind.told}
+    terms = {name: value for name, value in head.terms.items() if value and name in kind.documented}
     priors |= {name: Prior(value, kind.priors[name].u) for name, value in terms.items()}
     assumed = [
         f"pan is joint {escaped(head.names['pan'])}, tilt joint {escaped(head.names['tilt'])}; zero counters are zero "
@@ -265,7 +265,7 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
     calibration, origin = accepted_calibration(data), Origin.of(data)
     kind = data.rig.mechanism
     terms = {f"backlash_deg.{axis}" for axis in AXES} | {f"degrees_per_step.{axis}" for axis in AXES}
-    terms |= {term.name for term in kind.terms.values() if term.name in kind.told}
+    terms |= {term.name for term in kind.terms.values() if term.name in kind.documented}
     kept = [k for k, name in enumerate(calibration.names) if name in terms and calibration.covariance[k, k] > 0]
     stated = data.header.get("urdf")
     known: dict[str, Any] = stated if isinstance(stated, dict) else {}

@@ -1,6 +1,6 @@
 """The bar that shows a wait: on stderr, where that is a terminal, for a wait that has lasted two seconds.
 
-What an interrupted wait leaves behind is told too.
+What an interrupted wait leaves behind is said too.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ def chain_kept(further: str) -> Iterator[Show]:
     """`waiting` for a fit; Ctrl-C says that its chain is kept, and how to go on with it."""
     from tvsbayes.posterior.sampling import WALKING
 
-    told = 0
+    announced = 0
     try:
         with waiting() as shown:
 
             def show(state: Progress) -> None:
-                nonlocal told
-                told += state.doing == f"{SAMPLING}: {WALKING}"
+                nonlocal announced
+                announced += state.doing == f"{SAMPLING}: {WALKING}"
                 if shown is not None:
                     shown(state)
 
             yield show
     except KeyboardInterrupt:
-        # It is told of once when it begins: before the first block of steps there is no chain to keep.
-        if told > 1:
+        # It is announced once when it begins: before the first block of steps there is no chain to keep.
+        if announced > 1:
             report_line(f"the chain so far is kept in chain.npz; {further}")
         raise
 

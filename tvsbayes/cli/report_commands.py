@@ -225,8 +225,8 @@ class WrittenPage:
         ]
         validation = self.record.summary.validation
         failed = validation is not None and not validation.passed
-        told = validation_lines(validation)[:1] if validation is not None and failed else []
-        return [*told, *lines, f"report {self.number}"]
+        tests = validation_lines(validation)[:1] if validation is not None and failed else []
+        return [*tests, *lines, f"report {self.number}"]
 
     def as_json(self) -> dict[str, Any]:
         """The document of `report --json`."""
@@ -286,8 +286,8 @@ def calibrate(
     tell_part(held_text(documents["check"]), as_json)
     if not anyway:
         stop_at(implausible(data), GO_ON)
-    documents["classic"], told = _classic(data)
-    tell_part(told, as_json)
+    documents["classic"], printed = _classic(data)
+    tell_part(printed, as_json)
     compile_for(report_line)
     with chain_kept(f"go on with `{command_line('fit', campaign)} --resume`") as progress:
         results = calibrate_campaign(
@@ -301,10 +301,10 @@ def calibrate(
         )
     summary = results.record.summary
     documents["fit"] = {**summary.as_json(), "seed": seed, "files": results.files}
-    told = fit_text(summary, written=list(results.files.values()), causes=results.causes)
+    printed = fit_text(summary, written=list(results.files.values()), causes=results.causes)
     if results.error is not None:
-        finish({**documents, "report": None}, told, as_json, results.error)
-    tell_part(told, as_json)
+        finish({**documents, "report": None}, printed, as_json, results.error)
+    tell_part(printed, as_json)
     page = PageWish(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf).write(data)
     tell_removed(page.removed, page.files)
     documents["report"] = page.as_json()

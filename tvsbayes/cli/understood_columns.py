@@ -69,12 +69,12 @@ def not_sure(
     """The refusal of a table whose columns do not say enough, with what they say; `needed` ones must be there."""
     claims = [f"{field} ({' or '.join(escaped(name) for name in own)})" for field, own in known.claimed.items()]
     found = f"no column that is surely {', '.join([*(f for f in missing if f not in known.claimed), *claims])}"
-    told = ", ".join(f"{field} = {escaped(known.columns[field])}" for field in fields if field in known.columns)
-    found += f"; understood so far: {told or 'nothing'}"
+    understood = ", ".join(f"{field} = {escaped(known.columns[field])}" for field in fields if field in known.columns)
+    found += f"; understood so far: {understood or 'nothing'}"
     remedy = f"say which: {' '.join(f'--column {field}=NAME' for field in missing)}"
     spare = [field for field in missing if field not in needed]
     remedy += (f"; --column {spare[0]}= where there is none" if spare else "") + besides
-    if not told and not claims:
+    if not understood and not claims:
         remedy += "; if that line is a title, delete it, so that the first holds the names of the columns"
     names = ", ".join(escaped(name) for name in table.columns)
     line, allowed = table.first_line, f"any of {names}"

@@ -343,8 +343,8 @@ def _next_looks(
     lines = [found.why, *outline(rig, found.steps)]
     if found.confirmed is not None:
         state = "" if found.confirmed.accepted else ", whose weights must not be used"
-        told = ", ".join(f"{d} {u:.2e}" for d, u in found.confirmed.u_deg_per_step.items())
-        lines.append(f"u by importance sampling{state}, deg/step: {told}")
+        values = ", ".join(f"{d} {u:.2e}" for d, u in found.confirmed.u_deg_per_step.items())
+        lines.append(f"u by importance sampling{state}, deg/step: {values}")
     finish(found.as_json(), "\n".join(lines), as_json)
 
 

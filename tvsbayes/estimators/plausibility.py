@@ -226,7 +226,7 @@ def _reading_findings(ok: Sequence[Spot]) -> list[Finding]:
 
 def _metres(campaign: Campaign) -> list[str]:
     """Lengths that are stated in metres where the name says mm."""
-    lengths = [name for name in campaign.rig.mechanism.told if name == "mirror_offset_mm"]
+    lengths = [name for name in campaign.rig.mechanism.documented if name == "mirror_offset_mm"]
     stated = {name: campaign.rig.priors[name].value for name in lengths}
     origin = [campaign.rig.priors[name].value for name in names_of("extrinsics.translation_mm")]
     stated["extrinsics.translation_mm"] = max(origin, key=abs)

@@ -76,7 +76,7 @@ class Mechanism:
         return self.names[: len(RIG_NAMES)]
 
     @cached_property
-    def told(self) -> frozenset[str]:
+    def documented(self) -> frozenset[str]:
         """Names that files and documents may have."""
         return frozenset(self.names) - frozenset(self.held)
 

@@ -129,7 +129,7 @@ _GROUPS = {
 
 def _names_at(place: Place, mechanism: Mechanism) -> tuple[str, ...]:
     """What may stand in a table of a mechanism's file."""
-    return tuple(p.name for p in mechanism.parameters.values() if p.place == place and p.name in mechanism.told)
+    return tuple(p.name for p in mechanism.parameters.values() if p.place == place and p.name in mechanism.documented)
 
 
 def _period_number(name: str) -> int:
@@ -469,7 +469,7 @@ def read_rig(path: Path) -> Rig:
             raise sheets.refuse(name, "text", "a printable name of 1 to 100 characters", "rename the sheet")
     costs = keys.table("costs")
     costs.only(COSTS_S)
-    names = tuple(name for name in table.mechanism.rig_names if name in table.mechanism.told)
+    names = tuple(name for name in table.mechanism.rig_names if name in table.mechanism.documented)
     truth = {**table.priors, **_parse_priors(_named_entries(keys.table("truth"), names))}
     _check_periods(keys.table("truth"), truth, table.harmonic_period_deg)
     return Rig(

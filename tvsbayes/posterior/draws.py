@@ -44,8 +44,8 @@ class Draws(Mapping[str, np.ndarray]):
 
     def __init__(self, draws: Derived, mechanism: Mechanism = TWO_MIRROR):
         self.derived = draws
-        told = (name for name in mechanism.names if name in mechanism.told)
-        self.names = (*told, *derived_names(mechanism))
+        documented = (name for name in mechanism.names if name in mechanism.documented)
+        self.names = (*documented, *derived_names(mechanism))
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Draws of one quantity."""

@@ -43,7 +43,7 @@ USUAL_SCALE = (0.5, 2.0)
 def remedy(validation: Validation) -> str:
     """What helps against the defect that explains the residuals best."""
     cause = validation.tests[0].name if validation.tests else ""
-    return next((told for begin, told in REMEDIES.items() if cause.startswith(begin)), ANY_REMEDY)
+    return next((cure for begin, cure in REMEDIES.items() if cause.startswith(begin)), ANY_REMEDY)
 
 
 def factor_told(validation: Validation) -> str:
@@ -77,18 +77,18 @@ def verdict_line(summary: FitSummary) -> str:
     unseen = [d for d in DIRECTIONS if (e := summary.effective[d]) is not None and not e.informed]
     validation = summary.validation
     if not summary.converged:
-        told = UNSAMPLED
+        verdict = UNSAMPLED
     elif summary.answer == "rough":
-        told = ROUGH
+        verdict = ROUGH
     elif validation is None or not validation.tests:
-        told = "usable; too few spots to look for model errors"
+        verdict = "usable; too few spots to look for model errors"
     else:
-        told = (
+        verdict = (
             f"usable; no sign of a model error in {len(validation.tests)} tests (least p {validation.tests[0].p:.2g})"
         )
     if unseen:
-        told += f"; the data say nothing of {', '.join(unseen)}"
-    return f"verdict: {told}"
+        verdict += f"; the data say nothing of {', '.join(unseen)}"
+    return f"verdict: {verdict}"
 
 
 def noise_line(summary: FitSummary) -> str | None:
@@ -152,8 +152,8 @@ def steps_ahead(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()
         found.append(f"Add stops reached by moving {named}: so few hardly tell their own scatter.")
     if summary.estimator == "laplace":
         found.append(f"Sample the posterior, which takes minutes: `tvsbayes fit {folder}`, then make the report again.")
-    told = [weak.text for weak in summary.weak_directions if asks_for_looks(weak)]
-    return found + [f"{text[0].upper()}{text[1:]}." for text in map(sentence_in_words, told)]
+    texts = [weak.text for weak in summary.weak_directions if asks_for_looks(weak)]
+    return found + [f"{text[0].upper()}{text[1:]}." for text in map(sentence_in_words, texts)]
 
 
 def asks_for_looks(weak: WeakDirection) -> bool:

@@ -263,9 +263,9 @@ def hold_out_table(found: AxisHoldOut, unit: str) -> TableView:
 
 def axis_hold_out_text(found: AxisHoldOut, unit: str) -> str:
     """A hold-out in words."""
-    told = f"RMS z {found.rms_z:.2f}, classic {found.classic_rms_z:.2f}; "
-    told += f"{100 * found.inside_share:.0f} % of the left-out readings in their 95 % intervals"
-    return terminal(hold_out_table(found, unit), told, *_lines("warning", found.warnings))
+    errors = f"RMS z {found.rms_z:.2f}, classic {found.classic_rms_z:.2f}; "
+    errors += f"{100 * found.inside_share:.0f} % of the left-out readings in their 95 % intervals"
+    return terminal(hold_out_table(found, unit), errors, *_lines("warning", found.warnings))
 
 
 def next_table(plan: AxisPlan, unit: str) -> TableView:

@@ -137,8 +137,8 @@ def plan_text(result: PlanResult) -> str:
     lines.append("chance of success (assurance): that the fit of such a campaign reports the target as met")
     most = LOOKS_PER_EXPERIMENT * result.curve[-1].experiments
     for level, n in zip(ASSURED, (result.n80, result.n95), strict=True):
-        told = f"not reached with up to {most} looks" if n is None else f"{LOOKS_PER_EXPERIMENT * n} looks"
-        lines.append(f"for a chance of {100 * level:.0f} %: {told}")
+        count = f"not reached with up to {most} looks" if n is None else f"{LOOKS_PER_EXPERIMENT * n} looks"
+        lines.append(f"for a chance of {100 * level:.0f} %: {count}")
     if result.assurance is None or result.assurance_se is None:
         lines.append("the target is met already: nothing is left to do")
     else:
@@ -282,10 +282,10 @@ def locations_text(found: Locations) -> str:
     # Every point of a file may be far off for a reason of its own.
     seen = zip(found.unseen, found.refused, strict=True)
     beyond = dict.fromkeys(words for words, error in seen if words and not error)
-    told = [extrapolated_text(words) for words in list(beyond)[:UNSEEN_SHOWN]]
+    notes = [extrapolated_text(words) for words in list(beyond)[:UNSEEN_SHOWN]]
     if len(beyond) > UNSEEN_SHOWN:
-        told.append(f"and {len(beyond) - UNSEEN_SHOWN} more counters that no look reached")
-    return terminal(table, *textwrap.wrap(LAW, COLUMNS), *told)
+        notes.append(f"and {len(beyond) - UNSEEN_SHOWN} more counters that no look reached")
+    return terminal(table, *textwrap.wrap(LAW, COLUMNS), *notes)
 
 
 LAW_SHARE = 0.95
@@ -300,12 +300,14 @@ def cloud_text(found: CloudFile, law: LawChecked, calibration: Calibration) -> s
     """What was written, what was not, and how far its uncertainties hold."""
     lines = [f"written: {escaped(str(found.path), 200)}, {_points(found.points)}, frame T, mm"]
     lines.append(f"properties: {', '.join(found.columns)}")
-    told = f"sds by the law of propagation (GUM): of {_points(law.points)} carried by draws too it holds to a digit or "
-    told += f"more at {law.held}"
+    agreement = (
+        f"sds by the law of propagation (GUM): of {_points(law.points)} carried by draws too it holds to a digit or "
+    )
+    agreement += f"more at {law.held}"
     if law.off_mm is not None and law.most_off_mm is not None:
-        told += f"; ends of 95 % intervals differ by {two_digits(law.off_mm)} mm at half of them, at most by "
-        told += f"{two_digits(law.most_off_mm)} mm"
-    lines.append(told)
+        agreement += f"; ends of 95 % intervals differ by {two_digits(law.off_mm)} mm at half of them, at most by "
+        agreement += f"{two_digits(law.most_off_mm)} mm"
+    lines.append(agreement)
     if law.held < LAW_SHARE * law.points:
         lines.append("do not rely on the sds of this cloud: `tvsbayes locate` --points without --cloud gives draws")
     elif law.points:
@@ -378,8 +380,8 @@ def positions_text(found: PositionHoldOut) -> str:
         rows.append([p.axis, str(p.position), p.direction, str(p.n), f"{p.mean:.4f}", concise(p.predicted, p.u), z])
     caption = "counters left out and predicted, mirror angles in deg; z in stated uncertainties"
     table = TableView(caption, ["axis", "counter", "direction", "n", "mean", "predicted(u)", "z"], rows)
-    told = [] if found.rms_z is None else [f"RMS z {found.rms_z:.2f}"]
-    return terminal(table, *told, *(f"warning: {text}" for text in found.warnings))
+    summary = [] if found.rms_z is None else [f"RMS z {found.rms_z:.2f}"]
+    return terminal(table, *summary, *(f"warning: {text}" for text in found.warnings))
 
 
 def changes_text(comparison: Comparison) -> str:

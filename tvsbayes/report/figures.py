@@ -251,13 +251,13 @@ def intervals(
         takes = "takes what a fit says: tvsbayes.calibrate(campaign, sampled=False).record.summary"
         raise TypeError(f"intervals {takes}, or read_fit(path).summary; not a {type(joint).__name__}")
     classic = {} if classic is None else classic if isinstance(classic, Mapping) else classic.directions
-    told = {d: (x.value, x.interval95) for d, x in ratios.items() if x is not None}
+    fitted = {d: (x.value, x.interval95) for d, x in ratios.items() if x is not None}
     seen = {d: (x.mean_deg_per_step, x.interval95_gum or (x.mean_deg_per_step,) * 2) for d, x in classic.items() if x}
     with drawing(3.2) as figure:
-        apart = 0.12 if seen and told else 0.0
+        apart = 0.12 if seen and fitted else 0.0
         # Gears of pan and tilt differ by more than any interval is long: each has its scale.
         for axes, pair in zip(figure.subplots(len(SENSES), 1), SENSES.values(), strict=True):
-            for offset, name, results in ((-apart, "classic", seen), (apart, "joint", told)):
+            for offset, name, results in ((-apart, "classic", seen), (apart, "joint", fitted)):
                 colour, marker = OF_ESTIMATOR[name]
                 for row, direction in enumerate(pair):
                     if direction not in results:

@@ -142,8 +142,8 @@ def _scatters(e: Evidence) -> list[FigureView]:
     """The experiments of all directions that have some, in one figure."""
     if e.classic is None:
         return []
-    told = {d: r for d, r in e.classic.directions.items() if r is not None}
-    means = ", ".join(f"{d} {r.mean_deg_per_step:.6f} deg/step of {r.n}" for d, r in told.items())
+    estimated = {d: r for d, r in e.classic.directions.items() if r is not None}
+    means = ", ".join(f"{d} {r.mean_deg_per_step:.6f} deg/step of {r.n}" for d, r in estimated.items())
     figure = figures.direction_scatters(e.classic, e.fit.summary)
     return [
         FigureView(
@@ -303,8 +303,8 @@ def validation_section(e: Evidence) -> Section:
     if sampling is None:
         text.append("The posterior was not sampled: intervals are those of the Laplace approximation.")
     else:
-        told = sampling_line(sampling), agreement_line(sampling)
-        text += [f"{line}." for line in told if line is not None]
+        checks = sampling_line(sampling), agreement_line(sampling)
+        text += [f"{line}." for line in checks if line is not None]
         items += [f"not reached: {sentence}" for sentence in sampling.missing]
     tables.append(_foretold(e))
     if e.held_out is None:
@@ -322,14 +322,14 @@ def validation_section(e: Evidence) -> Section:
 def _foretold(e: Evidence) -> TableView | None:
     """What the model says of the classic estimator beside what that says."""
     rows = []
-    for direction, told in e.fit.summary.classic_predicted.items():
+    for direction, predicted in e.fit.summary.classic_predicted.items():
         seen = None if e.classic is None else e.classic.directions[direction]
-        if told is None or seen is None:
+        if predicted is None or seen is None:
             continue
         u = seen.u_type_a_deg_per_step or 0.0
-        spread = np.hypot(told.sd, u)
-        z = (seen.mean_deg_per_step - told.value) / spread if spread > 0 else 0.0
-        cells = [concise(told.value, told.sd), concise(seen.mean_deg_per_step, u), f"{z:+.1f}"]
+        spread = np.hypot(predicted.sd, u)
+        z = (seen.mean_deg_per_step - predicted.value) / spread if spread > 0 else 0.0
+        cells = [concise(predicted.value, predicted.sd), concise(seen.mean_deg_per_step, u), f"{z:+.1f}"]
         rows.append([direction, *cells])
     caption = "What the joint model says the classic estimator should report, and what it reports, deg/step"
     columns = ["direction", "predicted", "reported, type A", "difference / u"]

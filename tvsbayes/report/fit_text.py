@@ -52,8 +52,8 @@ def fit_text(
     validation = failed(summary)
     if validation is not None:
         # Above and below the table: who reads either end of the text must meet it.
-        told = validation_lines(validation)
-        lines = [told[0], *lines, *told[1:], f"what helps: {remedy(validation)}"]
+        tests = validation_lines(validation)
+        lines = [tests[0], *lines, *tests[1:], f"what helps: {remedy(validation)}"]
     lines += answer_lines(summary)
     if summary.few_stops:
         lines.append(few_stops_line(summary.few_stops, summary.estimator))
@@ -154,11 +154,11 @@ def suspect_line(spots: Sequence[int]) -> str:
 def few_stops_line(few: Mapping[str, int], estimator: str) -> str:
     """What few stops of a direction do to its intervals."""
     named = ", ".join(f"{direction} {count}" for direction, count in few.items())
-    told = f"few stops ({named}): they hardly tell their own scatter"
+    sentence = f"few stops ({named}): they hardly tell their own scatter"
     if estimator == "posterior":
-        return f"{told}; the intervals hold it, more stops would shorten them"
-    told += ", and the Laplace intervals of ratio and backlash are too short"
-    return f"{told}; sample the posterior (`tvsbayes fit`), or add stops"
+        return f"{sentence}; the intervals hold it, more stops would shorten them"
+    sentence += ", and the Laplace intervals of ratio and backlash are too short"
+    return f"{sentence}; sample the posterior (`tvsbayes fit`), or add stops"
 
 
 def validation_lines(validation: Validation) -> list[str]:
@@ -207,8 +207,8 @@ def answer_lines(summary: FitSummary) -> list[str]:
     if summary.converged and summary.monte_carlo_error:
         worst = max(summary.monte_carlo_error.items(), key=lambda each: each[1].rounds_factor)
         ends = " and ".join(f"{each:.2f}" for each in worst[1].interval95)
-        told = f"{worst[1].mean:.2f} sd of the mean, {ends} sd of the interval's ends ({worst[0]})"
-        lines.append(f"Monte Carlo error, largest: {told}")
+        largest = f"{worst[1].mean:.2f} sd of the mean, {ends} sd of the interval's ends ({worst[0]})"
+        lines.append(f"Monte Carlo error, largest: {largest}")
     return [*lines, f"what helps: {'fit without --quick' if quick else 'fit with --resume and more --max-minutes'}"]
 
 
@@ -245,11 +245,11 @@ def lost_motion_lines(lost: Mapping[str, Sequence[LostMotion]]) -> list[str]:
     """Lost motion after a reversal, for the step counts that were used."""
     lines = []
     for direction, entries in lost.items():
-        told = []
+        parts = []
         for text, group in groupby(entries, lambda e: concise(e.value_deg, e.sd_deg)):
             steps = [e.steps for e in group]
-            told.append(f"{steps[0]} {f'to {steps[-1]} ' * (len(steps) > 1)}steps {text}")
-        lines.append(f"lost motion {direction}, deg: {', '.join(told)}")
+            parts.append(f"{steps[0]} {f'to {steps[-1]} ' * (len(steps) > 1)}steps {text}")
+        lines.append(f"lost motion {direction}, deg: {', '.join(parts)}")
     return lines
 
 

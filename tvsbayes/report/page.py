@@ -135,8 +135,10 @@ def prose(text: str) -> Markup:
     parts = str(text).split("`")
     if len(parts) % 2 == 0:
         return escape(typeset(text))
-    told = (Markup("<code>{}</code>").format(part) if k % 2 else escape(typeset(part)) for k, part in enumerate(parts))
-    return Markup("").join(told)
+    pieces = (
+        Markup("<code>{}</code>").format(part) if k % 2 else escape(typeset(part)) for k, part in enumerate(parts)
+    )
+    return Markup("").join(pieces)
 
 
 def page_html(document: Document) -> bytes:

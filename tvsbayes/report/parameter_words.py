@@ -27,8 +27,8 @@ def source_in_words(source: str) -> str:
     for begin, article in (("prior of ln ", ""), ("prior of ", "the ")):
         if source.startswith(begin):
             name = source.removeprefix(begin)
-            told = name_in_words(name)
-            return begin + article * (told != name) + told
+            words = name_in_words(name)
+            return begin + article * (words != name) + words
     return name_in_words(source)
 
 

@@ -76,9 +76,11 @@ def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
 def headline_table(summary: FitSummary) -> TableView:
     """Ratios, contrasts and key parameters of the joint estimator: what ends a fit."""
     pose = summary.reference_pose_deg
-    told = {f"effective_deg_per_step.{part}": e for part, e in summary.effective.items()}
-    told |= {f"effective_contrast_deg_per_step.{part}": e for part, e in summary.contrasts.items() if e is not None}
-    rows = [estimate_row(label, told[name], unit) for name, label, unit in _rows(*told)]
+    estimates = {f"effective_deg_per_step.{part}": e for part, e in summary.effective.items()}
+    estimates |= {
+        f"effective_contrast_deg_per_step.{part}": e for part, e in summary.contrasts.items() if e is not None
+    }
+    rows = [estimate_row(label, estimates[name], unit) for name, label, unit in _rows(*estimates)]
     there = (row for row in (*KEY_PARAMETERS, *HEAD_PARAMETERS) if row[0] in summary.parameters)
     rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in there]
     kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]

@@ -82,7 +82,7 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Seque
     if not criteria:
         usable = verdict_line(summary).removeprefix("verdict: ") + "; mind what check warns of" * bool(doubts)
         return Verdict(f"{sentence(usable)} No limit was stated", "cannot-tell")
-    told = []
+    judgements = []
     for verdict in (NOT_MET, CANNOT_TELL, MET):
         mine = [c for c in criteria if c.verdict == verdict]
         limits = dict.fromkeys((c.limit, c.unit) for c in mine)
@@ -92,12 +92,12 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Seque
             bound = "" if len(part) == 1 else "at most " if verdict == NOT_MET else "at least "
             worst = chance_text(max(chances) if verdict == NOT_MET else min(chances), bound)
             names = ", ".join(c.quantity for c in part)
-            told.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {worst})"))
-    text = "; ".join(sentence for _, sentence in told)
+            judgements.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {worst})"))
+    text = "; ".join(sentence for _, sentence in judgements)
     judged = ""
     if failed and validation is not None:
         judged = "With that factor: " if validation.widens else "As fitted: "
-    return Verdict(failed + judged + text[0].upper() + text[1:], told[0][0].replace(" ", "-"))
+    return Verdict(failed + judged + text[0].upper() + text[1:], judgements[0][0].replace(" ", "-"))
 
 
 def criteria_table(criteria: Sequence[Criterion]) -> TableView | None:
@@ -136,10 +136,10 @@ def answer_table(e: Evidence) -> TableView:
                 rows.append([f"{' and '.join(pair)}, deg/step", *cells])
             continue
         classic = None if e.classic is None else e.classic.directions[direction]
-        told = "no experiment"
+        measured = "no experiment"
         if classic is not None:
-            told = f"{concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0)}, n = {classic.n}"
-        rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), *[told] * applicable])
+            measured = f"{concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0)}, n = {classic.n}"
+        rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), *[measured] * applicable])
     for axis, pair in SENSES.items():
         if (contrast := summary.contrasts[axis]) is not None:
             rows.append([f"{' - '.join(pair)}, \u00b5deg/step", *_cells(scaled(contrast, 1e6)), *[""] * applicable])
@@ -176,8 +176,8 @@ def both_estimators(e: Evidence) -> FigureView:
     """Ratios of both estimators with their intervals; of the joint one alone where the other has no experiments."""
     picture = figures.intervals(e.fit.summary, e.classic)
     if e.classic is None:
-        told = "Effective ratios. The classic method needs four-point experiments: the campaign has none."
-        return FigureView(picture, "Ratios with 95 % intervals; values in the table beside it", told)
+        caption = "Effective ratios. The classic method needs four-point experiments: the campaign has none."
+        return FigureView(picture, "Ratios with 95 % intervals; values in the table beside it", caption)
     return FigureView(
         picture,
         "Ratios of both estimators with 95 % intervals; values in the table beside it",
@@ -196,15 +196,15 @@ def why_far(e: Evidence) -> list[str]:
     """What the error of the joint calibration consists of, and why the last of the simple ones is farther off."""
     order = np.argsort(-e.budget.share)[:CAUSES_TOLD]
     causes = ", ".join(f"{cause_in_words(e.budget.causes[k])} {100 * e.budget.share[k]:.0f} %" for k in order)
-    told = [f"What the joint one leaves comes from, as shares of the variance: {causes}."]
+    sentences = [f"What the joint one leaves comes from, as shares of the variance: {causes}."]
     for name, off in list(e.simple_errors.items())[-1:]:
-        told.append(
+        sentences.append(
             f"Why {name} is off there: its beam points {off.azimuth_deg:+.2f} deg in azimuth and "
             f"{off.elevation_deg:+.2f} deg in elevation from the joint one (ratios, lost motion, mirrors), which alone "
             f"makes {_mm(off.by_direction_mm)}; where it takes beam and aperture to stand, and the aperture's zero, "
             f"alone make {_mm(off.by_place_mm)}."
         )
-    return told
+    return sentences
 
 
 def _mm(value: float) -> str:
@@ -221,8 +221,8 @@ def warnings_of(e: Evidence) -> list[str]:
         found.append(LAPLACE_SHORT)
     if e.campaign.header.get("synthetic"):
         found.append("The campaign is synthetic: made by the digital twin, not measured.")
-    if (told := assumed_stereo(e.campaign.stereo, e.shown.budgets)) is not None:
-        found.append(sentence(told))
+    if (note := assumed_stereo(e.campaign.stereo, e.shown.budgets)) is not None:
+        found.append(sentence(note))
     found += [f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts]
     found += [f"`check` warns: {sentence_in_words(text)}" for text in e.doubts]
     return found

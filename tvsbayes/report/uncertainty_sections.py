@@ -156,12 +156,12 @@ def _gum_table(tables: Sequence[BudgetTable], caption: str) -> TableView:
     for name in (*names, tables[0].rows[-1].quantity):
         first, stated = own[name][0], [row for row in own[name] if row.u is not None]
         # One number for all where all have it.
-        told = ["; ".join(dict.fromkeys(two_digits(row.u) for row in stated if row.u is not None))]
-        told.append("; ".join(dict.fromkeys(_freedom(row.dof) for row in stated)))
+        cells = ["; ".join(dict.fromkeys(two_digits(row.u) for row in stated if row.u is not None))]
+        cells.append("; ".join(dict.fromkeys(_freedom(row.dof) for row in stated)))
         if alone:
-            told = [first.distribution, *told, "" if first.sensitivity is None else _digits(first.sensitivity)]
+            cells = [first.distribution, *cells, "" if first.sensitivity is None else _digits(first.sensitivity)]
         parts = [cell for found in of_name for cell in _contributed(found.get(name))]
-        rows.append([_named(first), first.kind, *told, *parts])
+        rows.append([_named(first), first.kind, *cells, *parts])
     columns = ["source", "type", *(["distribution", "u", "dof", "sensitivity"] if alone else ["u", "dof"])]
     rows.insert(-1, [OTHERS, *[""] * (len(columns) - 1), *(c for table in tables for c in _others(table, names))])
     if alone and any(row.share > 1 for each in own.values() for row in each):
@@ -198,13 +198,13 @@ def _apart(table: BudgetTable, result: Estimate | None) -> str:
     ends = table.estimate - table.expanded, table.estimate + table.expanded
     parameter = parameter_of(table.quantity)
     never_below = parameter is not None and parameter.prior.distribution == "half-normal"
-    told = ", which reaches below 0, where no value can be" * (never_below and ends[0] < 0 <= low)
+    note = ", which reaches below 0, where no value can be" * (never_below and ends[0] < 0 <= low)
     rounding = 10.0 ** (math.floor(math.log10(half)) - 1) if half > 0 else 0.0
     shift = max(abs(ends[0] - low), abs(ends[1] - high))
-    if told or abs(table.expanded - half) > rounding or shift > END_SHIFT * half:
-        told += f" (the first page, which counts: {interval_text(low, high, result.sd)}, U = {two_digits(half)} "
-        told += f"{table.unit})"
-    return told
+    if note or abs(table.expanded - half) > rounding or shift > END_SHIFT * half:
+        note += f" (the first page, which counts: {interval_text(low, high, result.sd)}, U = {two_digits(half)} "
+        note += f"{table.unit})"
+    return note
 
 
 def _digits(value: float) -> str:
