@@ -2,8 +2,9 @@
 
 A bench is a folder with `looks.csv` (counters, sheet, centroids; empty where a camera does not see the spot),
 `rig_stereo.yml` (OpenCV's FileStorage, no covariance) and `truth.json`. Nothing here is the package's: see
-`strange_optics`. True values are drawn evenly from ranges inside the package's default priors. World and units of
-`strange_optics`.
+`strange_optics`. True values are drawn evenly from ranges inside the package's default priors, but for the offset of
+the mirrors: looks leave half of its prior's variance, and intervals hold what is spread as the prior says. World and
+units of `strange_optics`.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import NormalDist
 
 import cv2
 import numpy as np
@@ -34,6 +36,8 @@ RMS_MOST_PX = 1.0
 ALL_SEEN_AGAIN = 0.9
 """Share of the benches that see every look which are drawn again: most tables have looks that a camera missed."""
 TRIES = 20_000
+OFFSET_MM, OFFSET_SD_MM = 30.0, 5.0
+"""Of the mirrors, as the package's default prior."""
 AIM_SD_DEG = 6.0
 """How far the middle of a pattern lies from the middle of the view, by eye."""
 TO_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -208,7 +212,7 @@ def _rig(rng: np.random.Generator, traits: Traits) -> Rig:
     left = _camera(rng, size, focal_px, np.eye(3), np.zeros(3), k3[0])
     right = _camera(rng, size, focal_px, rotation, -rotation @ place, k3[1])
     head = Head(
-        offset_mm=rng.uniform(20, 40),
+        offset_mm=NormalDist(OFFSET_MM, OFFSET_SD_MM).inv_cdf(rng.random()),
         mirror_error_deg=tuple(rng.uniform(-0.5, 0.5, 2)),
         laser_tilt_deg=tuple(rng.uniform(-0.5, 0.5, 2)),
         laser_shift_mm=tuple(rng.uniform(-0.7, 0.7, 2)),

@@ -75,7 +75,7 @@ def test_no_module_of_the_benches_is_the_package():
 
 
 def _standard() -> set[str]:
-    return {"collections", "csv", "dataclasses", "json", "pathlib"}
+    return {"collections", "csv", "dataclasses", "json", "pathlib", "statistics"}
 
 
 def test_cameras_project_as_opencv_does(drawn):

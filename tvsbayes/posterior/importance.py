@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import jax
 import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.inference.importance import K_MAX, ROUND, ImportanceRun, Weighing, uncertain, weighted_run
+from tvsbayes.inference.importance import K_MAX, ROUND, ImportanceRun, Pool, Weighing, uncertain, weighted_run
 from tvsbayes.inference.summaries import monte_carlo_errors
 from tvsbayes.instrument.homing import prior_chance
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.target import Target
-from tvsbayes.posterior.transport import Mapped, transport
+from tvsbayes.posterior.transport import Mapped, transport, transport_beside
 from tvsbayes.progress import Advance, unshown
 from tvsbayes.results.convergence import Reweighted
 from tvsbayes.statistics.streams import Stream, random_stream
@@ -28,7 +28,7 @@ SHARED_DRAWS_LEAST = 2 * ROUND
 SHARED_MARGIN = 2.0
 """A way of homing takes so many times the draws that its share of the posterior asks for."""
 BESIDE_ROUNDS_MAX = 12
-"""Of a way of homing that is sampled by itself."""
+"""Of a way of homing that has draws of its own."""
 
 
 def importance_run(
@@ -52,7 +52,8 @@ def importance_run(
 def run_beside(fit: JointFit, run: ImportanceRun[Target], seed: int) -> Posterior:
     """The posterior under another way of homing, from the draws of the most probable one weighted anew.
 
-    Both posteriors mostly lie over each other. Where they do not, the other one is sampled by itself.
+    Both posteriors mostly lie over each other. Where they do not, the other one has draws of its own, by its own map
+    from the proposal that the most probable one has learnt: so many that the whole is known.
 
     Args:
         fit: under the other way.
@@ -62,14 +63,32 @@ def run_beside(fit: JointFit, run: ImportanceRun[Target], seed: int) -> Posterio
     began, ways, every = time.monotonic(), run.density.fit.mixture, len(run.pool.drawn)
     share = next(way.probability for way in ways if way.sides == fit.sides) / ways[0].probability
     count = int(max(SHARED_MARGIN * share * every, SHARED_DRAWS_LEAST))
-    for some in dict.fromkeys((min(count, every), every)):
-        weighed = _weighed_anew(fit, run, some, seed)
+
+    def known(weighed: Weighing) -> bool:
         error = max(e.rounds_factor for e in weighed.monte_carlo_error.values())
         # An error of a part is as large in the whole as the part.
-        if weighed.importance.pareto_k < K_MAX and error * share**2 <= 1:
-            return Target(fit, run.density.path).posterior(weighed.sample(time.monotonic() - began), seed)
-    alone = importance_run(fit, seed, rounds_max=BESIDE_ROUNDS_MAX)
-    return alone.density.posterior(alone.sample, seed)
+        return weighed.importance.pareto_k < K_MAX and error * share**2 <= 1
+
+    weighed = _weighed_anew(fit, run, min(count, every), seed)
+    if not known(weighed):
+        weighed = _weighing_alone(fit, run, known, seed)
+    density = weighed.density
+    assert isinstance(density, Target)
+    return density.posterior(weighed.sample(time.monotonic() - began), seed)
+
+
+def _weighing_alone(
+    fit: JointFit, run: ImportanceRun[Target], known: Callable[[Weighing], bool], seed: int
+) -> Weighing:
+    """Draws of another way of homing, until they are known well enough or the budget is spent."""
+    target = Target(fit, transport_beside(fit, run.density.path))
+    pool, generator = Pool.empty(run.pool.proposals[-1]), np.random.RandomState(seed)
+    for count in range(1, BESIDE_ROUNDS_MAX + 1):
+        pool = pool.extended(target, generator, fitted=False)
+        weighed = Weighing(target, pool)
+        if count * ROUND >= SHARED_DRAWS_LEAST and known(weighed):
+            break
+    return weighed
 
 
 def _weighed_anew(fit: JointFit, run: ImportanceRun[Target], count: int, seed: int) -> Weighing:

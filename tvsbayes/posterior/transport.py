@@ -466,6 +466,16 @@ def transport(fit: JointFit) -> Transport:
     return replace(path, narrow=narrow, bend=bend)
 
 
+def transport_beside(fit: JointFit, path: Transport) -> Transport:
+    """The map of another way of homing: coordinates in the order of a known map, centred and bent as there.
+
+    What a proposal has learnt there of w holds here, and no second differences are asked for.
+    """
+    others = path.free[path.noise :]
+    covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
+    return replace(uncentred(fit, others, np.linalg.cholesky(covariance)), narrow=path.narrow, bend=path.bend)
+
+
 def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
     """The map at the mode of a converged fit, no coordinate centred.
 
