@@ -196,7 +196,7 @@ class LivePage {
       const u = last.u_deg_per_step[name];
       const moved = temperature?.moved[name] ?? null;
       const met = !aim.directions.includes(name) ? "" : u <= target ? "met" : `u is ${(u / target).toFixed(1)} times the target`;
-      return [name, withU(value, u), ...(target === null ? [] : [met]), [moved === null ? "" : moved.toFixed(1), Math.abs(moved) > 3 ? "hot" : ""]];
+      return [name, withU(value, u), ...(target === null ? [] : [met]), [moved === null ? "" : moved.toFixed(1).replace("-0.0", "0.0"), Math.abs(moved) > 3 ? "hot" : ""]];
     }));
     this.drawHistory(told);
   }
