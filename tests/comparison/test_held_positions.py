@@ -20,6 +20,7 @@ from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import Prior, names_of
 from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.stops import rests_of
+from tvsbayes.results.comparison_record import hold_out_document
 from tvsbayes.twin.simulated_campaign import simulate
 
 PAN, TILT = (0, 80, 160, 240), (-60, 60)
@@ -67,7 +68,7 @@ def test_counters_are_predicted_within_their_u_where_the_model_knows_that_gears_
     assert found.warnings == ("tilt is seen at 2 counters: with one left out no line is left",)
     limit = np.sqrt(stats.chi2.ppf(0.999, len(PAN)) / len(PAN))
     assert found.rms_z < limit
-    document = json.loads(json.dumps(found.as_json(), allow_nan=False))
+    document = json.loads(json.dumps(hold_out_document(found, "deg"), allow_nan=False))
     assert document["hold_out"]["by"] == "positions" and document["unit"] == "deg"
     assert set(document["hold_out"]["positions"][0]) == {
         *("axis", "position", "direction", "n", "mean", "predicted", "u"),

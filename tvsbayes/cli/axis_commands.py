@@ -171,6 +171,7 @@ def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_j
         message = "B is a later campaign of a scanner; axes are compared one by one"
         raise InputError("usage", message, remedy="leave out B")
     from tvsbayes.report.axis_document import axis_hold_out_text
+    from tvsbayes.results.comparison_record import hold_out_document
     from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
     from tvsbayes.single_axis.held_out_positions import hold_out_positions
 
@@ -180,8 +181,7 @@ def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_j
     data = read_axis(folder)
     with waiting() as progress:
         found = hold_out_positions(data, seed, progress)
-    document: dict[str, Any] = {"kind": "positions left out", "unit": data.unit, "hold_out": found.as_json()}
-    document |= {"inputs": axis_hashes(data), "seed": seed}
+    document = hold_out_document(found, data.unit) | {"inputs": axis_hashes(data), "seed": seed}
     files, text = {}, axis_hold_out_text(found, data.unit)
     if keep(document, path := output_place(folder, "results") / "compare.json"):
         files, text = {"compare": str(path)}, f"{text}\nwritten: {path}"

@@ -222,12 +222,13 @@ def _compare_positions(campaign: Path, as_json: bool) -> None:
     from tvsbayes.comparison.held_positions import hold_out_positions
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.command_text import positions_text
+    from tvsbayes.results.comparison_record import hold_out_document
 
     data = read_campaign(campaign)
     with waiting() as progress, Job({FITTING: 1.0, HOLDING_OUT: 6.0}, progress) as job:
         fitted = StoredOrFitted(data, report_line, job.part(FITTING)).fit
         found = hold_out_positions(fitted, progress=job.part(HOLDING_OUT))
-    finish({**found.as_json(), "files": {}}, positions_text(found), as_json)
+    finish({**hold_out_document(found, "deg"), "files": {}}, positions_text(found), as_json)
 
 
 def _compare_pointing(data: Campaign, as_json: bool) -> None:

@@ -20,7 +20,8 @@ from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.progress import Job, Show
-from tvsbayes.results.comparison_record import HeldOutPosition, PositionHoldOut
+from tvsbayes.results.comparison_record import HeldOutCounter, PositionHoldOut
+from tvsbayes.statistics.intervals import rms
 
 POSITIONS_MIN = 3
 """Counters of an axis: with one left out, two make a line."""
@@ -56,7 +57,7 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
             file="moves.csv",
             remedy="look from at least three counters of an axis",
         )
-    positions: list[HeldOutPosition] = []
+    positions: list[HeldOutCounter] = []
     with Job(dict.fromkeys(folds, 1.0), progress) as job:
         for name, (number, out, sign) in folds.items():
             try:
@@ -68,9 +69,8 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
                 warnings.append(f"without {name} the fit does not converge: {'; '.join(taught.problems)}")
                 continue
             positions += predicted_positions(fit_of_all, taught, number, int(name.split()[1]), out, sign)
-    z = [(position.mean - position.predicted) / position.u for position in positions]
-    rms = float(np.sqrt(np.mean(np.square(z)))) if z else None
-    return PositionHoldOut("positions", tuple(positions), rms, tuple(warnings))
+    rms_z = rms([position.z for position in positions]) if positions else None
+    return PositionHoldOut(positions=tuple(positions), rms_z=rms_z, warnings=tuple(warnings))
 
 
 def _of_all_looks(fit_of_all: JointFit, taught: JointFit) -> Linearised:
@@ -82,7 +82,7 @@ def _of_all_looks(fit_of_all: JointFit, taught: JointFit) -> Linearised:
 
 def predicted_positions(
     fit_of_all: JointFit, taught: JointFit, axis: int, counter: int, out: np.ndarray, sign: np.ndarray
-) -> list[HeldOutPosition]:
+) -> list[HeldOutCounter]:
     """A counter from each side from which its looks came.
 
     Args:
@@ -117,6 +117,15 @@ def predicted_positions(
         if not weight.any():
             continue
         mean, off, u = np.degrees([weight @ angles, weight @ deviation, np.sqrt(weight @ covariance @ weight)]).tolist()
-        n = int(np.sum(weight > 0))
-        entries.append(HeldOutPosition(AXES[axis], counter, direction, n, mean, mean - off, u))
+        entries.append(
+            HeldOutCounter(
+                axis=AXES[axis],
+                position=counter,
+                direction=direction,
+                n=int(np.sum(weight > 0)),
+                mean=mean,
+                predicted=mean - off,
+                u=u,
+            )
+        )
     return entries

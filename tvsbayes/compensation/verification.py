@@ -7,6 +7,7 @@ shift, ratio, play and scatter of a size that nobody knows. Commands as the camp
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -18,7 +19,6 @@ import numpy as np
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.promise import Since, bound_of, reading_u, refuse_answer
 from tvsbayes.errors import InputError, NothingToEstimate, refusal
-from tvsbayes.files.csv_table import csv_bytes
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import (
     APPLIED,
@@ -37,11 +37,11 @@ from tvsbayes.results.compensation_record import (
     Verification,
 )
 from tvsbayes.results.records import read_record, stored_document
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis, stops_csv
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import results_for
-from tvsbayes.single_axis.axis_rows import rows_of
-from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
+from tvsbayes.single_axis.axis_rows import DIRECTIONS, rows_of
+from tvsbayes.single_axis.predicted_stops import PredictedStops, log_mean, predicted_stops
 from tvsbayes.statistics.streams import Stream, random_stream
 
 SURE, UNLIKELY, P_MIN = 0.95, 0.01, 0.003
@@ -156,11 +156,11 @@ def _log_densities(trial: Trial) -> dict[str, float]:
     log_densities = {}
     for world, factors in SCENARIOS.items():
         possible = [f for f in factors if f[0] == f[1] or play_matters]
-        log_densities[world] = _mean_density([trial.at(*f).log_density(trial.value, trial.shift) for f in possible])
+        log_densities[world] = log_mean([trial.at(*f).log_density(trial.value, trial.shift) for f in possible])
     least = OTHER_LEAST * float(np.sqrt(np.median(np.diag(covariance))))
     sizes = np.geomspace(least, max(0.5 * trial.travel, 2 * least), OTHERS)
     others = [promised.log_density(trial.value, trial.shift + size**2 * trial.other) for size in sizes]
-    return log_densities | {OTHER_MACHINE: _mean_density(others)}
+    return log_densities | {OTHER_MACHINE: log_mean(others)}
 
 
 def judged(trial: Trial, seed: int) -> Judged:
@@ -174,11 +174,6 @@ def judged(trial: Trial, seed: int) -> Judged:
     if verdict == CANNOT_TELL:
         needed = needed_readings(promised, promised.pooled()[0] - without.pooled()[0], trial.noise)
     return Judged(verdict, p, worlds, needed, promised, without)
-
-
-def _mean_density(logs: Sequence[float]) -> float:
-    """Logarithm of the mean of densities."""
-    return float(np.logaddexp.reduce(logs) - np.log(len(logs)))
 
 
 def _p_value(promised: PredictedStops, value: np.ndarray, shift: np.ndarray, seed: int) -> float:
@@ -379,15 +374,11 @@ class VerifyPlan:
 
     def plan_bytes(self) -> bytes:
         """`plan.csv`: step, command, direction, read (1 or 0)."""
-        words = {1: "forward", -1: "backward"}
-        rows: list[tuple[int, float, str, int]] = []
-        at: float | None = None
-        for command, side in self.stops:
-            if at is None or side * (command - at) < self.overrun:
-                rows.append((len(rows), command - side * self.overrun, words[-side], 0))
-            rows.append((len(rows), command, words[side], 1))
-            at = command
-        return csv_bytes(("step", "command", "direction", "read"), rows)
+        before = [side * math.inf for _, side in self.stops[:1]] + [command for command, _ in self.stops]
+        return stops_csv(
+            (command - side * self.overrun if side * (command - at) < self.overrun else None, command, DIRECTIONS[side])
+            for at, (command, side) in zip(before, self.stops, strict=False)
+        )
 
 
 def _parting(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarray, visits: np.ndarray) -> float:

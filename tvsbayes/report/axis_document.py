@@ -32,6 +32,7 @@ from tvsbayes.report.page import digest_number, numbered
 from tvsbayes.report.position_figures import CURVE_POINTS, axis_errors, wave
 from tvsbayes.report.result_tables import WAVE_COLUMNS, WAVES, percent, wave_row
 from tvsbayes.report.tables import TableView, interval_text, two_digits
+from tvsbayes.results.comparison_record import AxisHoldOut
 from tvsbayes.results.compensation_record import stored_verification
 from tvsbayes.results.estimates import Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import provenance
@@ -47,7 +48,6 @@ from tvsbayes.single_axis.axis_record import (
     drawn_deviations,
 )
 from tvsbayes.single_axis.classic_line import ClassicAxis
-from tvsbayes.single_axis.held_out_positions import AxisHoldOut
 from tvsbayes.single_axis.next_stops import AxisPlan, unit_of
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
@@ -254,9 +254,8 @@ def hold_out_table(found: AxisHoldOut, unit: str) -> TableView:
     """Positions left out, beside what was predicted of them."""
     rows = []
     for p in found.positions:
-        z, classic_z = (p.mean - p.predicted) / p.u, (p.mean - p.classic_predicted) / max(p.classic_u, 1e-300)
-        row = [f"{p.position:.10g}", p.direction, str(p.n), f"{p.mean:.6g}", concise(p.predicted, p.u), f"{z:+.1f}"]
-        rows.append([*row, f"{classic_z:+.1f}"])
+        row = [f"{p.position:.10g}", p.direction, str(p.n), f"{p.mean:.6g}", concise(p.predicted, p.u), f"{p.z:+.1f}"]
+        rows.append([*row, f"{p.classic_z:+.1f}"])
     caption = f"positions left out and predicted, {escaped(unit)}; z in stated uncertainties"
     return TableView(caption, ["position", "direction", "n", "mean", "predicted(u)", "z", "z classic"], rows)
 

@@ -376,8 +376,8 @@ def positions_text(found: PositionHoldOut) -> str:
     """Counters left out, beside what was predicted of them."""
     rows = []
     for p in found.positions:
-        z = f"{(p.mean - p.predicted) / p.u:+.1f}"
-        rows.append([p.axis, str(p.position), p.direction, str(p.n), f"{p.mean:.4f}", concise(p.predicted, p.u), z])
+        predicted = concise(p.predicted, p.u), f"{p.z:+.1f}"
+        rows.append([p.axis, str(p.position), p.direction, str(p.n), f"{p.mean:.4f}", *predicted])
     caption = "counters left out and predicted, mirror angles in deg; z in stated uncertainties"
     table = TableView(caption, ["axis", "counter", "direction", "n", "mean", "predicted(u)", "z"], rows)
     summary = [] if found.rms_z is None else [f"RMS z {found.rms_z:.2f}"]

@@ -18,7 +18,6 @@ from tvsbayes.results.records import (
     NotNegative,
     Probability,
     Record,
-    plain,
     read_record,
     stored_document,
 )
@@ -127,29 +126,59 @@ class HoldOut(Shown, Record, frozen=True):
         return View(f"HoldOut by {self.by}: {self.verdict}: {self.reason}", columns, rows)
 
 
-class HeldOutPosition(Record, frozen=True):
-    """One counter of an axis from one side, predicted by the looks at all others; mirror angles, deg.
+class HeldOutPosition(Record, frozen=True, kw_only=True):
+    """One position from one side, predicted by all others: of two axes mirror angles in deg, of one in its unit.
 
     Attributes:
-        axis: "pan" or "tilt".
-        position: counter, steps.
-        direction: "left", "right", "up", "down" or "unknown": that of the move to it.
-        n: looks in the mean.
-        mean: of the angles seen.
-        predicted, u: of that mean; stop errors and noise of its looks in u.
+        position: command, steps of two axes.
+        direction: of the move to it, such as "left", "forward" or "unknown".
+        n: looks or readings in the mean.
+        mean: of what was seen or read.
+        predicted, u: of that mean; stop errors and noise of its looks or readings in u.
     """
 
-    axis: str
-    position: int
+    position: float
     direction: str
     n: int
     mean: float
     predicted: float
     u: float
 
+    @property
+    def z(self) -> float:
+        """How far off the prediction is, in u."""
+        return (self.mean - self.predicted) / self.u
 
-class PositionHoldOut(Record, frozen=True):
-    """All counters predicted.
+
+class HeldOutCounter(HeldOutPosition, frozen=True, kw_only=True):
+    """A counter of one of two axes, "pan" or "tilt"."""
+
+    axis: str
+
+
+class HeldOutReadings(HeldOutPosition, frozen=True, kw_only=True):
+    """A position of one axis.
+
+    Attributes:
+        rows, inside: moves in it, and how many of their readings lie within 95 % of what was predicted of each.
+        classic_predicted, classic_u: by the least-squares line with one reversal and independent stops.
+        end: whether nothing was read beyond it on one side.
+    """
+
+    rows: int
+    inside: int
+    classic_predicted: float
+    classic_u: float
+    end: bool
+
+    @property
+    def classic_z(self) -> float:
+        """How far off the classic's prediction is, in its u."""
+        return (self.mean - self.classic_predicted) / max(self.classic_u, 1e-300)
+
+
+class PositionHoldOut(Record, frozen=True, kw_only=True):
+    """All positions predicted.
 
     Attributes:
         by: "positions".
@@ -158,14 +187,38 @@ class PositionHoldOut(Record, frozen=True):
         warnings: sentences on what could not.
     """
 
-    by: str
-    positions: tuple[HeldOutPosition, ...]
+    by: str = "positions"
+    positions: tuple[HeldOutCounter, ...]
     rms_z: float | None
     warnings: tuple[str, ...]
 
-    def as_json(self) -> dict[str, object]:
-        """The document of `compare --by positions --json`, without what the caller adds (`files`)."""
-        return {"kind": "positions left out", "unit": "deg", "hold_out": plain(self)}
+
+class AxisHoldOut(Shown, Record, frozen=True, kw_only=True):
+    """All positions of one axis predicted; as of two axes, and the classic beside it.
+
+    Attributes:
+        classic_rms_z: of the classic line; 0 where nothing could be predicted, as `rms_z`.
+        inside_share: of the readings left out, in their 95 % intervals.
+    """
+
+    by: str = "positions"
+    positions: tuple[HeldOutReadings, ...]
+    rms_z: float
+    classic_rms_z: float
+    inside_share: float
+    warnings: tuple[str, ...]
+
+    def shown(self) -> View:
+        """Every position beside what was predicted of it."""
+        names = ("position", "direction", "n", "mean", "predicted", "u", "classic_predicted", "classic_u")
+        rows = [tuple(getattr(position, name) for name in names) for position in self.positions]
+        title = f"AxisHoldOut: RMS z {self.rms_z:.2f}, classic {self.classic_rms_z:.2f}"
+        return View(title, tuple(name.replace("_", " ") for name in names), rows)
+
+
+def hold_out_document(held: PositionHoldOut | AxisHoldOut, unit: str) -> dict[str, object]:
+    """The document of `compare --by positions --json`, without what the caller adds (`files`)."""
+    return {"kind": "positions left out", "unit": unit, "hold_out": held.as_json()}
 
 
 class Change(Record, frozen=True):

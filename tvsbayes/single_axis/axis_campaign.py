@@ -25,7 +25,7 @@ from tvsbayes.files.csv_kind import (
     templates,
     unique,
 )
-from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table
+from tvsbayes.files.csv_table import CSV_BYTES_MAX, Table, csv_bytes
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.campaign import MOVES, SPOTS
@@ -406,3 +406,17 @@ def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:
         "axis": axis.encode(),
     }
     return {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
+
+
+def stops_csv(stops: Iterable[tuple[float | None, float, str]]) -> bytes:
+    """`plan.csv` of an axis: step, command, direction, read (1 or 0).
+
+    Args:
+        stops: the command visited before, None where there is none; the command; the direction it is reached by.
+    """
+    rows: list[tuple[int, float, str, int]] = []
+    for via, command, direction in stops:
+        if via is not None:
+            rows.append((len(rows), via, "backward" if direction == "forward" else "forward", 0))
+        rows.append((len(rows), command, direction, 1))
+    return csv_bytes(("step", "command", "direction", "read"), rows)

@@ -41,7 +41,7 @@ from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_SHARE
 from tvsbayes.single_axis.axis_periods import period_estimate, wave_samples, waves_at_an_end, weak_waves
 from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
-from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.statistics.intervals import NORMAL_95, interval95
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
 AXIS_FIT_FORMAT = "tvsbayes-axis-fit/1"
@@ -51,7 +51,6 @@ POSITIONS_FEW = 5
 """Below it a process of position is mostly its prior."""
 REVERSED = 0.975
 """Probability of a negative backlash from which it is said."""
-TAILS_PERCENT = (2.5, 97.5)
 POSITIONS_LISTED = 400
 
 
@@ -155,10 +154,9 @@ def axis_fit_schema() -> dict[str, Any]:
 def _estimate(
     draws: np.ndarray, prior: float | None, diagnosis: tuple[float | None, float | None, float | None]
 ) -> Estimate:
-    low, high = np.percentile(draws, TAILS_PERCENT)
     sd = float(draws.std())
     contraction = None if not prior else float(max(1 - (sd / prior) ** 2, -1.0))
-    return Estimate(float(draws.mean()), sd, (float(low), float(high)), prior, contraction, *diagnosis)
+    return Estimate(float(draws.mean()), sd, interval95(draws), prior, contraction, *diagnosis)
 
 
 def _diagnoses(fit: AxisFit) -> dict[str, tuple[float | None, float | None, float | None]]:
@@ -277,10 +275,9 @@ def _deviations(fit: AxisFit) -> tuple[PositionDeviation, ...]:
     if len(positions) > POSITIONS_LISTED:
         positions = positions[np.linspace(0, len(positions) - 1, POSITIONS_LISTED).astype(int)]
     drawn = drawn_deviations(fit, positions, random_stream(fit.seed, AxisStream.DEVIATIONS))
-    low, high = np.percentile(drawn, TAILS_PERCENT, axis=0)
     return tuple(
-        PositionDeviation(float(p), float(v.mean()), float(v.std()), (float(a), float(b)))
-        for p, v, a, b in zip(positions, drawn.T, low, high, strict=True)
+        PositionDeviation(float(p), float(v.mean()), float(v.std()), interval95(v))
+        for p, v in zip(positions, drawn.T, strict=True)
     )
 
 

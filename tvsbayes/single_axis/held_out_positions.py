@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tvsbayes.display import Shown, View
 from tvsbayes.errors import NothingToEstimate
 from tvsbayes.inference.importance import K_MAX, weighted_run
 from tvsbayes.progress import Job, Show
-from tvsbayes.results.records import plain
+from tvsbayes.results.comparison_record import AxisHoldOut, HeldOutReadings
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_density import AxisDensity
 from tvsbayes.single_axis.axis_fit import model_of
@@ -18,8 +17,8 @@ from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.classic_line import fit_line
-from tvsbayes.single_axis.predicted_stops import carried_scales
-from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.single_axis.predicted_stops import PredictedStops, carried_scales
+from tvsbayes.statistics.intervals import NORMAL_95, rms
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
@@ -29,68 +28,6 @@ POSITIONS_MIN, POSITIONS_MAX = 3, 200
 REFITTED_MAX, WEIGHED, WEIGHED_MIN = 30, 400, 80
 """Positions up to which each has a fit of its own; beyond, draws of one fit are weighted, as long as so many of them
 count. `POSITIONS_MAX` are predicted at most."""
-
-
-@dataclass(frozen=True)
-class HeldOutPosition:
-    """One position from one side, predicted by all others.
-
-    Attributes:
-        position: command.
-        direction: "forward", "backward" or "unknown".
-        n: readings in the mean.
-        mean: of the readings, unit.
-        predicted, u: of that mean; stop errors and noise of its readings in u.
-        rows, inside: moves in it, and how many of their readings lie within 95 % of what was predicted of each.
-        classic_predicted, classic_u: by the least-squares line with one reversal and independent stops.
-        end: whether nothing was read beyond it on one side.
-    """
-
-    position: float
-    direction: str
-    n: int
-    mean: float
-    predicted: float
-    u: float
-    rows: int
-    inside: int
-    classic_predicted: float
-    classic_u: float
-    end: bool
-
-
-@dataclass(frozen=True, repr=False)
-class AxisHoldOut(Shown):
-    """All positions predicted.
-
-    Attributes:
-        by: "positions".
-        positions: each from each side.
-        rms_z: root mean square of (mean - predicted) / u; `classic_rms_z` of the classic's.
-        inside_share: of the readings left out, in their 95 % intervals.
-        warnings: sentences.
-    """
-
-    by: str
-    positions: tuple[HeldOutPosition, ...]
-    rms_z: float
-    classic_rms_z: float
-    inside_share: float
-    warnings: tuple[str, ...]
-
-    def shown(self) -> View:
-        """Every position beside what was predicted of it."""
-        rows = [
-            (p.position, p.direction, p.n, p.mean, p.predicted, p.u, p.classic_predicted, p.classic_u)
-            for p in self.positions
-        ]
-        columns = ("position", "direction", "n", "mean", "predicted", "u", "classic predicted", "classic u")
-        title = f"AxisHoldOut: RMS z {self.rms_z:.2f}, classic {self.classic_rms_z:.2f}"
-        return View(title, columns, rows)
-
-    def as_json(self) -> dict[str, object]:
-        """Plain types."""
-        return plain(self)
 
 
 def _means_of(rows: AxisRows, members: np.ndarray) -> tuple[np.ndarray, int]:
@@ -114,15 +51,7 @@ class _Foretold:
 
     mean: np.ndarray
     covariance: np.ndarray
-    fault: str
-
-
-def _mixture(means: np.ndarray, covariances: np.ndarray, weights: np.ndarray, fault: str = "") -> _Foretold:
-    """Of normal distributions (n, rows), (n, rows, rows) by weights (n,)."""
-    mean = weights @ means
-    off = means - mean
-    within = np.einsum("n,nij->ij", weights, covariances)
-    return _Foretold(mean, within + np.einsum("n,ni,nj->ij", weights, off, off), fault)
+    fault: str = ""
 
 
 def _reweighted(model: AxisModel, w: np.ndarray, left: np.ndarray) -> _Foretold | None:
@@ -131,20 +60,20 @@ def _reweighted(model: AxisModel, w: np.ndarray, left: np.ndarray) -> _Foretold 
     None where the weights cannot be trusted. Leave-one-out by importance (Vehtari, Gelman and Gabry, Stat. Comput. 27
     (2017) 1413), whole positions left out.
     """
-    means, covariances = model.left_out(w, left)
-    off = model.rows.value[left] - means
-    _, log_det = np.linalg.slogdet(covariances)
-    square = np.einsum("ni,ni->n", off, np.linalg.solve(covariances, off[..., None])[..., 0])
-    smooth = smoothed_weights(0.5 * (log_det + square))
+    stops = PredictedStops(*model.left_out(w, left), {})
+    smooth = smoothed_weights(-stops.log_densities(model.rows.value[left]))
     if not smooth.pareto_k < K_MAX or effective_draws(smooth.weights) < WEIGHED_MIN:
         return None
-    return _mixture(means, covariances, smooth.weights)
+    return _Foretold(*stops.pooled(smooth.weights))
 
 
 def _refitted(model: AxisModel, out: np.ndarray, seed: int) -> _Foretold:
     """By a fit of the rows that are not left out."""
-    w, fault = _fitted_without(model, out, seed)
-    return _mixture(*model.left_out(w, np.flatnonzero(out)), np.full(len(w), 1 / len(w)), fault)
+    without = AxisModel.of(model.rows.without(out), model.priors, None, model.coordinates.waves)
+    rng = random_stream(seed, AxisStream.HELD_OUT)
+    drawn = _drawn(without, DRAWS, seed, rng)
+    w = carried_scales(without, drawn.w, model, rng)
+    return _Foretold(*PredictedStops(*model.left_out(w, np.flatnonzero(out)), {}).pooled(), drawn.fault)
 
 
 def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | None = None) -> AxisHoldOut:
@@ -169,7 +98,7 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
             file="moves.csv",
             remedy="read at least three positions",
         )
-    found: list[HeldOutPosition] = []
+    predictions: list[HeldOutReadings] = []
     warnings = []
     if len(positions) > POSITIONS_MAX:
         warnings.append(f"of {len(positions)} positions {POSITIONS_MAX} are left out in turn, evenly chosen")
@@ -189,14 +118,13 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
             predicted = predicted or _refitted(model, out, seed + number)
             if predicted.fault:
                 warnings.append(f"position {position:.10g}: {predicted.fault}")
-            found += _scored(rows, position, left, predicted.mean, predicted.covariance)
+            predictions += _scored(rows, position, left, predicted.mean, predicted.covariance)
     return AxisHoldOut(
-        "positions",
-        tuple(found),
-        _rms([(p.mean - p.predicted) / p.u for p in found]),
-        _rms([(p.mean - p.classic_predicted) / p.classic_u for p in found if p.classic_u > 0]),
-        sum(p.inside for p in found) / max(sum(p.rows for p in found), 1),
-        tuple(warnings),
+        positions=tuple(predictions),
+        rms_z=rms([p.z for p in predictions]),
+        classic_rms_z=rms([p.classic_z for p in predictions if p.classic_u > 0]),
+        inside_share=sum(p.inside for p in predictions) / max(sum(p.rows for p in predictions), 1),
+        warnings=tuple(warnings),
     )
 
 
@@ -223,23 +151,11 @@ def _drawn(model: AxisModel, count: int, seed: int, rng: np.random.Generator) ->
     return _Drawn(sample.equal(count, rng), "; ".join(sample.convergence.missing))
 
 
-def _rms(z: list[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(z)))) if z else 0.0
-
-
-def _fitted_without(model: AxisModel, out: np.ndarray, seed: int) -> tuple[np.ndarray, str]:
-    """Coordinates of the scales, for the whole model, from the rows not left out; what is wrong with them, or ""."""
-    without = AxisModel.of(model.rows.without(out), model.priors, None, model.coordinates.waves)
-    rng = random_stream(seed, AxisStream.HELD_OUT)
-    found = _drawn(without, DRAWS, seed, rng)
-    return carried_scales(without, found.w, model, rng), found.fault
-
-
 def _scored(
     rows: AxisRows, position: float, left: np.ndarray, mean: np.ndarray, covariance: np.ndarray
-) -> list[HeldOutPosition]:
+) -> list[HeldOutReadings]:
     """The position from each side it was reached from."""
-    found = []
+    predictions = []
     out = rows.command == position
     for side in (1, -1, 0):
         mine = np.flatnonzero(rows.side[left] == side)
@@ -251,8 +167,8 @@ def _scored(
         u = float(np.sqrt(weights @ covariance[np.ix_(mine, mine)] @ weights))
         z = (rows.value[members] - mean[mine]) / np.sqrt(np.diag(covariance)[mine])
         classic, classic_u = classic_prediction(rows, out, members)
-        found.append(
-            HeldOutPosition(
+        predictions.append(
+            HeldOutReadings(
                 position=float(position),
                 direction=DIRECTIONS[side],
                 n=n,
@@ -266,4 +182,4 @@ def _scored(
                 end=position in (rows.positions[0], rows.positions[-1]),
             )
         )
-    return found
+    return predictions

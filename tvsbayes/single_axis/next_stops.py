@@ -13,10 +13,9 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate
-from tvsbayes.files.csv_table import csv_bytes
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.records import plain
-from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, stops_csv
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, headline_functionals
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import AxisModel
@@ -93,12 +92,7 @@ class AxisPlan(Shown):
 
     def plan_bytes(self) -> bytes:
         """`plan.csv`: step, command, direction, read (1 or 0)."""
-        rows: list[tuple[int, float, str, int]] = []
-        for stop in self.next:
-            if stop.via is not None:
-                rows.append((len(rows), stop.via, "backward" if stop.direction == "forward" else "forward", 0))
-            rows.append((len(rows), stop.command, stop.direction, 1))
-        return csv_bytes(("step", "command", "direction", "read"), rows)
+        return stops_csv((stop.via, stop.command, stop.direction) for stop in self.next)
 
 
 def _move_seconds(campaign: AxisCampaign) -> float:

@@ -37,10 +37,12 @@ class PredictedStops:
     covariance: np.ndarray
     scales: dict[str, np.ndarray]
 
-    def pooled(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (r,) and covariance (r, r) of the mixture."""
-        off = self.mean - self.mean.mean(axis=0)
-        return self.mean.mean(axis=0), self.covariance.mean(axis=0) + off.T @ off / len(off)
+    def pooled(self, weights: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (r,) and covariance (r, r) of the mixture by weights (n,) of sum 1; None: of equal draws."""
+        weights = np.full(len(self.mean), 1 / len(self.mean)) if weights is None else weights
+        mean = weights @ self.mean
+        off = self.mean - mean
+        return mean, np.tensordot(weights, self.covariance, 1) + (weights[:, None] * off).T @ off
 
     def drawn(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Readings (count, r) of the mixture, as many of each draw as of any other."""
@@ -49,14 +51,22 @@ class PredictedStops:
         normal = rng.standard_normal((count, self.mean.shape[1])) * np.sqrt(np.maximum(values, 0.0))[which]
         return self.mean[which] + np.einsum("nij,nj->ni", vectors[which], normal)
 
-    def log_density(self, value: np.ndarray, more: np.ndarray | None = None) -> float:
-        """Of readings (r,); `more` is a covariance (r, r) beside those of the prediction."""
+    def log_densities(self, value: np.ndarray, more: np.ndarray | None = None) -> np.ndarray:
+        """Of readings (r,) by each draw, shape (n,); `more` is a covariance (r, r) beside those of the prediction."""
         covariance = self.covariance if more is None else self.covariance + more
         _, log_det = np.linalg.slogdet(covariance)
         off = value - self.mean
         square = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0])
-        each = -0.5 * (log_det + square + len(value) * np.log(2 * np.pi))
-        return float(np.logaddexp.reduce(each) - np.log(len(each)))
+        return -0.5 * (log_det + square + len(value) * np.log(2 * np.pi))
+
+    def log_density(self, value: np.ndarray, more: np.ndarray | None = None) -> float:
+        """Of readings (r,) by the mixture of equal draws; `more` as in `log_densities`."""
+        return log_mean(self.log_densities(value, more))
+
+
+def log_mean(logs: Sequence[float] | np.ndarray) -> float:
+    """Logarithm of the mean of densities whose logarithms are given."""
+    return float(np.logaddexp.reduce(logs) - np.log(len(logs)))
 
 
 def carried_scales(of: AxisModel, drawn: np.ndarray, into: AxisModel, rng: np.random.Generator) -> np.ndarray:

@@ -55,6 +55,11 @@ def interval95(draws: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def rms(values: Sequence[float]) -> float:
+    """Root mean square; 0 of no values."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
+
+
 def phases_deg(cosine: np.ndarray, sine: np.ndarray) -> np.ndarray:
     """Phases of waves with these parts (n,), each within half a turn of their circular mean, deg."""
     phase = np.arctan2(sine, cosine)
