@@ -300,3 +300,6 @@ def test_a_log_of_sightings_becomes_a_head(ask, say, tmp_path):
     code, document = ask(*words, tmp_path / "x", "--column", "azimuth_deg=")
     assert code == 2 and "azimuth_deg" in assert_error(document, "missing-column")["remedy"]
     assert ask(*words, tmp_path / "x", "--sd-px", "0.1")[0] == 2
+    assert ask("new", tmp_path / "scanner")[0] == 0
+    assert_error(ask(*words, tmp_path / "scanner", "--yes")[1], "instrument")
+    assert not (tmp_path / "scanner" / "sightings.csv").exists()

@@ -17,7 +17,7 @@ from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign_header import header_values
+from tvsbayes.instrument.campaign_header import header_values, mechanism_of
 from tvsbayes.instrument.counter_limits import LIMIT_KEYS
 from tvsbayes.pipeline import StoredOrFitted
 from tvsbayes.progress import Job
@@ -174,14 +174,19 @@ def _sighting_files(found: ForeignSightings, to: Path, table: str) -> _SightingF
     """The tables, and campaign and rig file with ratios where those of the folder state none.
 
     Raises:
-        InputError: a folder with rows, or with ratios that are none of an encoder.
+        InputError: a folder of another instrument, with rows, or with ratios that are none of an encoder.
     """
     from tvsbayes.instrument.campaign import MOVES, head_templates
+    from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
     from tvsbayes.instrument.sightings import SIGHTINGS
 
     kept = templates = head_templates(True)
     known: set[str] = set()
     if not (fresh := not (to / "campaign.toml").is_file()):
+        if mechanism_of(to) != SIGHTING_HEAD.key:
+            what, allowed = "a campaign without sightings.csv", "one that `new --mechanism pan-tilt --sightings` made"
+            remedy = "name a new folder with --to"
+            raise refusal("instrument", file=escaped(str(to), 200), found=what, allowed=allowed, remedy=remedy)
         kept = {name: read_bytes(to / name, TOML_BYTES_MAX, to) for name in HEADS if (to / name).is_file()}
         known = _stated_priors(to)
     elif to.exists():
