@@ -10,8 +10,7 @@ import pytest
 from scipy import stats
 from support.waits import check_forward, doings
 
-from tvsbayes.comparison.held_out import folds_of, hold_out, predict_classic
-from tvsbayes.comparison.scores import judge
+from tvsbayes.comparison.held_out import folds_of, hold_out, judge, predict_classic
 from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.four_point import Selection, classic, select_experiments
 from tvsbayes.estimators.joint_fit import fit

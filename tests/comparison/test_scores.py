@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tvsbayes.comparison.scores import judge, ratio_interval
+from tvsbayes.comparison.held_out import judge, ratio_interval
 from tvsbayes.results.comparison_record import BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL, Prediction
 
 

@@ -18,8 +18,7 @@ from tvsbayes.instrument.plan import plan_seconds, read_plan
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.instrument.rig import read_rig
 from tvsbayes.planning import watch_plan as plans
-from tvsbayes.planning.watch_design import Pattern, WatchDesigns
-from tvsbayes.planning.watch_plan import watch_plan
+from tvsbayes.planning.watch_plan import Pattern, WatchDesigns, watch_plan
 from tvsbayes.twin.simulated_campaign import simulate
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,17 +1,287 @@
-"""`plan --watch`: the fewest looks that notice every stated change, within a budget, and what is out of reach."""
+"""`plan --watch`: the fewest looks that notice every stated change, within a budget, and what is out of reach.
+
+Candidates are the looks of the campaign itself: within the limits, in both images, at counters whose gear errors are
+known. A pattern of them on every sheet is repeated after further homings, since a homing hides the same part of a
+turned positioner from all looks that follow it. Patterns are searched with independent stops, so that information
+adds up; what is said of the plan is computed from its own moves. Counters in steps, minutes by `[costs]`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
-from tvsbayes.comparison.watched_looks import FALSE_ALARM_RATE, LOOKS_MIN, POWER_MIN
+from tvsbayes.comparison.watched_looks import (
+    FALSE_ALARM_RATE,
+    LOOKS_MIN,
+    POWER_MIN,
+    Departure,
+    WatchedLooks,
+    columns_of,
+    null_distribution,
+    powers,
+    rows_of,
+)
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.instrument.rig import Rig
-from tvsbayes.planning.watch_design import Pattern, WatchDesigns
+from tvsbayes.estimators.linear_spots import LinearSpots, stop_information
+from tvsbayes.estimators.noise_scales import noise_draws
+from tvsbayes.instrument.axes import AXES
+from tvsbayes.instrument.campaign import Campaign, Spot, ordered_spots, pixels_of
+from tvsbayes.instrument.homing import homed
+from tvsbayes.instrument.parameters import INDEX, NAMES
+from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_seconds, run_plan
+from tvsbayes.instrument.rig import COSTS_S, Rig
+from tvsbayes.instrument.stereo_pair import triangulate
+from tvsbayes.instrument.stops import rests_of
+from tvsbayes.model.parameter_space import physical_at
+from tvsbayes.planning.candidates import BACKLASH_COLUMNS, run_up_steps
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2
 from tvsbayes.results.watch_record import LOOKS_MAX, PlannedChange, WatchPlan
+from tvsbayes.statistics.streams import Stream, random_stream
+
+PATTERN_MAX = 12
+"""Looks after one homing at most."""
+CANDIDATES_MAX = 32
+DIRECTIONS = 24
+"""Of a change, over which patterns are judged."""
+ENOUGH = 20.0
+"""Noncentrality at which a test of three components at 1 % shared by eight has a power of 80 %."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A look of the campaign that may be taken again: counters, the sides that they are reached from, its spot."""
+
+    steps: tuple[int, int]
+    side: tuple[int, int]
+    target: str
+    spot: Spot
+
+
+def _candidates(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> list[Candidate]:
+    """One look of every kind; at most `CANDIDATES_MAX` on a sheet, outermost counters first."""
+    rests = [rests_of(campaign.moves, axis) for axis in AXES]
+    found: dict[tuple, Candidate] = {}
+    for row, spot in enumerate(spots):
+        at = [rests[axis][spot.move] for axis in range(2)]
+        side = at[0].sign, at[1].sign
+        if used[row] and all(side):
+            steps = at[0].steps, at[1].steps
+            found.setdefault((steps, side, spot.target), Candidate(steps, side, spot.target, spot))
+    if not found:
+        return []
+    every = np.array([one.steps for one in found.values()], dtype=float)
+    middle, width = every.mean(axis=0), np.maximum(np.ptp(every, axis=0), 1.0)
+    outer = sorted(found.values(), key=lambda one: -float(np.max(np.abs((one.steps - middle) / width))))
+    sheets: dict[str, list[Candidate]] = {}
+    for one in outer:
+        own = sheets.setdefault(one.target, [])
+        if len(own) < CANDIDATES_MAX:
+            own.append(one)
+    return [one for own in sheets.values() for one in own]
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Numbers of the candidates that are looked at after a homing, by sheet."""
+
+    looks: dict[str, tuple[int, ...]]
+
+    @property
+    def size(self) -> int:
+        """Looks of one homing on every sheet."""
+        return sum(map(len, self.looks.values()))
+
+
+def _rig_of(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> Rig:
+    """What a campaign says of its rig: sheets where its spots lie, the usual costs."""
+    sheets: dict[str, float] = {}
+    for name in () if campaign.rig.mechanism.sightings else dict.fromkeys(spot.target for spot in spots):
+        own = [spot for spot, use in zip(spots, used, strict=True) if use and spot.target == name]
+        if own:
+            sheets[name] = float(np.median(triangulate(campaign.stereo, pixels_of(own))[:, 0]))
+    return Rig(campaign.rig, campaign.stereo, campaign.rig.priors, sheets, {}, {}, dict(COSTS_S))
+
+
+class WatchDesigns:
+    """Plans for watching a calibration, and what they notice.
+
+    Args:
+        fit: converged.
+        rig: limits, costs and sheets; None takes the campaign's own counters and the usual costs.
+        seed: of the noise scales and of the directions of a change.
+    """
+
+    def __init__(self, fit: JointFit, rig: Rig | None, seed: int):
+        self.fit, self.seed = fit, seed
+        self.campaign = homed(fit.campaign, fit.sides)
+        self.z = noise_draws(fit, 2, seed).centre
+        spots = ordered_spots(self.campaign)
+        used = np.asarray(fit.arrays.spots.valid)[: len(spots)] > 0
+        self.rig = _rig_of(self.campaign, spots, used) if rig is None else rig
+        every = _candidates(self.campaign, spots, used)
+        self.candidates = [one for one in every if self._reachable(one)]
+        if not self.candidates:
+            raise InputError(
+                "no-look",
+                "no look of the campaign can be taken again: sides unknown, sheets that the rig does not have, or "
+                "run-ups beyond the limits",
+                remedy="name the campaign's sheets in [sheets], widen the limits in [positioner], or plan looks with "
+                "`plan RIG`",
+            )
+        # The campaign as its own second day: what its looks show, with the columns of the changes.
+        again = WatchedLooks(fit, replace(fit.campaign, spots=tuple(one.spot for one in self.candidates)))
+        later = again.problem.spots[again.first :]
+        shift = max(spot.spot for spot in spots) + 1
+        rows = {spot.spot - shift: again.first + place for place, spot in enumerate(later)}
+        self.changes = again.changes
+        self._learn(again.linear(self.z), again.first, [rows[one.spot.spot] for one in self.candidates])
+
+    @cached_property
+    def _overshoot(self) -> np.ndarray:
+        """Run-up (pan, tilt) that takes up the play as the fit found it, steps."""
+        physical = physical_at(self.z, self.fit.space).value
+        return run_up_steps(physical, physical[BACKLASH_COLUMNS])
+
+    @cached_property
+    def _limits(self) -> np.ndarray:
+        """Lowest and highest counter of (pan, tilt): the rig's, else those that the campaign reached; (2, 2)."""
+        reached = {axis: [getattr(move, f"{axis}_steps") for move in self.campaign.moves] for axis in AXES}
+        known = self.rig.limits.within({axis: (min(own), max(own)) for axis, own in reached.items()})
+        return np.array([known[axis] for axis in AXES])
+
+    def _reachable(self, one: Candidate) -> bool:
+        if one.target not in self.rig.depths_mm:
+            return False
+        start = np.array(one.steps) - np.array(one.side) * self._overshoot
+        both = np.stack([np.array(one.steps), start])
+        return bool(np.all((both >= self._limits[:, 0]) & (both <= self._limits[:, 1])))
+
+    def _learn(self, linear: LinearSpots, first: int, places: list[int]) -> None:
+        """What the first day knows, and what every candidate (its row) would show, stop errors integrated out."""
+        errors = linear.places.shape[2]
+        self.own = len(NAMES)
+        spelled = linear.spelled_out(linear.places)
+        shifts = columns_of(self.changes)[-1].stop
+        fisher = stop_information(rows_of(spelled, slice(first))).fisher
+        keep = np.r_[: self.own, self.own + shifts : self.own + shifts + errors]
+        self.known = fisher[np.ix_(keep, keep)] + np.eye(len(keep))
+        shown = []
+        for one, row in zip(self.candidates, places, strict=True):
+            slope = linear.load[row, :, :2]
+            variance = self._stop_variance(one)
+            columns = spelled.jacobian[row]
+            own = columns[:, keep].copy()
+            # The path since homing is short in these plans: the contrast is left to the first day.
+            own[:, [INDEX[f"ratio_contrast_deg_per_step.{axis}"] for axis in AXES]] = 0.0
+            whole = np.concatenate([own, columns[:, self.own : self.own + shifts], slope], axis=1)
+            root = np.linalg.cholesky(np.eye(4) + slope @ np.diag(variance) @ slope.T)
+            shown.append(np.linalg.solve(root, whole))
+        rows = np.array(shown)
+        self.each = np.einsum("mia,mib->mab", rows, rows)
+        self.shifts = shifts
+        generator = random_stream(self.seed, Stream.WATCHED_CHANGES)
+        self._ways = []
+        for change in self.changes:
+            ways = generator.standard_normal((DIRECTIONS, len(change.names)))
+            self._ways.append(change.size * ways / np.linalg.norm(ways, axis=1, keepdims=True))
+
+    def _stop_variance(self, one: Candidate) -> np.ndarray:
+        physical = physical_at(self.z, self.fit.space).value
+        names = ("left" if one.side[0] > 0 else "right", "up" if one.side[1] > 0 else "down")
+        return np.radians([physical[INDEX[f"stop_sd_deg.{name}"]] for name in names]) ** 2
+
+    def information(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:
+        """Of the changes, after a pattern with so many homings on every sheet, shape (q, q).
+
+        With `also_before` the campaign had as many of them added.
+        """
+        total = np.zeros((self.each.shape[1] - 2,) * 2)
+        for looks in pattern.looks.values():
+            block = self.each[list(looks)].sum(axis=0)
+            cross, offsets = block[:-2, -2:], block[-2:, -2:] + np.eye(2) / HOME_VARIANCE_RAD2
+            total += homings * (block[:-2, :-2] - cross @ np.linalg.solve(offsets, cross.T))
+        count = len(self.known)
+        coupling, own = total[:count, count:], total[:count, :count]
+        known = self.known + own * (2 if also_before else 1)
+        return total[count:, count:] - coupling.T @ np.linalg.solve(known, coupling)
+
+    def powers(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:
+        """Of every change, at a limit by Bonferroni's bound."""
+        information = self.information(pattern, homings, also_before)
+        departure = Departure(0.0, 0, np.zeros(len(information)), information, self.changes)
+        return np.array(powers(departure, np.log(FALSE_ALARM_RATE / len(self.changes)), self.seed))
+
+    def _worth(self, pattern: Pattern, homings: float) -> float:
+        """What patterns are chosen by: logs of the noncentralities that are too small, over directions and changes."""
+        information, total = self.information(pattern, homings), 0.0
+        for rows, ways in zip(columns_of(self.changes), self._ways, strict=True):
+            seen = np.einsum("ni,ij,nj->n", ways, information[rows, rows], ways) / ENOUGH
+            total += float(np.mean(np.minimum(np.log(np.maximum(seen, 1e-12)), 0.0)))
+        return total
+
+    def grown(self, sheets: Sequence[str], homings: float) -> list[Pattern]:
+        """Patterns of one look on every sheet, two and so on, each the best beside those before it."""
+        pattern, found = Pattern(dict.fromkeys(sheets, ())), []
+        for _ in range(PATTERN_MAX):
+            for sheet in sheets:
+                numbers = [k for k, one in enumerate(self.candidates) if one.target == sheet]
+                tried = [Pattern({**pattern.looks, sheet: (*pattern.looks[sheet], number)}) for number in numbers]
+                pattern = max(tried, key=lambda one: self._worth(one, homings))
+            found.append(pattern)
+        return found
+
+    def patterns(self) -> list[Pattern]:
+        """For every choice of sheets, grown for few homings and for many."""
+        names = list(dict.fromkeys(one.target for one in self.candidates))
+        choices = [(name,) for name in names] + list(combinations(names, 2))
+        grown = [pattern for sheets in choices for homings in (1.0, 8.0) for pattern in self.grown(sheets, homings)]
+        return list({tuple(pattern.looks.items()): pattern for pattern in grown}.values())
+
+    def steps(self, pattern: Pattern, homings: int) -> tuple[PlanStep, ...]:
+        """The plan: each sheet placed once, on it a homing, the pattern, the next homing."""
+        return tuple(step for step, _ in self._ordered(pattern, homings))
+
+    def _ordered(self, pattern: Pattern, homings: int) -> list[tuple[PlanStep, Spot | None]]:
+        """Steps with the spot that each look saw in the campaign."""
+        plan, seen = PlanBuilder(), {}
+        for sheet, looks in pattern.looks.items():
+            for homing in range(homings):
+                plan.home()
+                if not homing:
+                    plan.place(sheet)
+                for one in (self.candidates[k] for k in looks):
+                    start = [
+                        goal - side * over if (goal - at) * side < over else at
+                        for goal, side, over, at in zip(one.steps, one.side, self._overshoot, plan.at, strict=True)
+                    ]
+                    plan.move(*map(int, start))
+                    plan.move(*one.steps)
+                    seen[len(plan.steps)] = one.spot
+                    plan.look()
+        return [(step, seen.get(step.step)) for step in plan.steps]
+
+    def minutes(self, pattern: Pattern, homings: int) -> float:
+        """Duration by `[costs]`."""
+        return plan_seconds(self.rig, self.steps(pattern, homings)) / 60
+
+    def judged(self, pattern: Pattern, homings: int) -> list[float]:
+        """Powers of the plan by its own moves, at the limit of all tests together."""
+        ordered = self._ordered(pattern, homings)
+        log = run_plan([step for step, _ in ordered], self.rig)
+        seen = [spot for _, spot in ordered if spot is not None]
+        spots = tuple(
+            spot.renumbered(number, look.move) for number, (spot, look) in enumerate(zip(seen, log.looks, strict=True))
+        )
+        planned = replace(self.fit.campaign, moves=tuple(log.moves), spots=spots)
+        departure = WatchedLooks(self.fit, planned).departure(self.z)
+        return powers(departure, null_distribution(departure, self.seed).limit, self.seed)
+
 
 MINUTES = 10.0
 """Of a plan that nobody limits."""
@@ -110,11 +380,11 @@ def _most(every: list[_Tried], minutes: float) -> np.ndarray:
     """The largest set of changes that a plan within the budget notices, as a mask."""
     best, best_key = np.zeros(every[0].powers.shape[1], dtype=bool), (-1, -1.0)
     for tried in every:
-        for powers in tried.powers[tried.allowed(minutes)]:
-            seen = powers >= POWER_MIN
-            key = int(seen.sum()), float(np.sum(powers))
+        for of_changes in tried.powers[tried.allowed(minutes)]:
+            noticed = of_changes >= POWER_MIN
+            key = int(noticed.sum()), float(np.sum(of_changes))
             if key > best_key:
-                best, best_key = seen, key
+                best, best_key = noticed, key
     return best
 
 

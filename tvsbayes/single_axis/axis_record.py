@@ -33,10 +33,9 @@ from tvsbayes.results.records import (
     stored_document,
 )
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
-from tvsbayes.single_axis.axis_conflicts import conflict_text
 from tvsbayes.single_axis.axis_density import FUNCTIONALS, blocks_of, line_weights
 from tvsbayes.single_axis.axis_doubts import data_doubts
-from tvsbayes.single_axis.axis_fit import AxisFit, fit_axis, model_of
+from tvsbayes.single_axis.axis_fit import AxisFit, conflict_text, fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_SHARE, kind_of, prior_sd
 from tvsbayes.single_axis.axis_periods import period_estimate, wave_samples, waves_at_an_end, weak_waves
 from tvsbayes.single_axis.axis_rows import AxisRows

@@ -127,7 +127,7 @@ FAULTS = (
           "test_no_reader_of_the_text_can_miss_a_failure"),
     Fault("cameras that two campaigns share count twice", "changes.compare", Local("shared", "False"),
           "test_a_calibration_has_not_changed_from_itself"),
-    Fault("the classic and the joint estimate change places in the hold-out", "scores.judge",
+    Fault("the classic and the joint estimate change places in the hold-out", "held_out.judge",
           Local("ratio", "1 / value"), "test_scores_of_predictions_by_hand"),
     Fault("watching ignores that it tests many things", "null_distribution", Call("min", "logs[1]"),
           "test_false_alarms_and_power_are_those_of_the_linear_model"),
