@@ -11,6 +11,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.estimators.findings import Finding, mending_command, stop_at
 from tvsbayes.files.disk import shipped_data
 from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.results.records import plain
 
 DOUBT = Finding("units", "is it in metres?")
 SIGN = Finding("counter-sign", "spots move right", "flip it", True, "moves.csv", 7)
@@ -33,7 +34,7 @@ def test_what_is_certain_stops_with_where_and_what_to_do():
 
 def test_a_sentence_has_its_remedy():
     assert SIGN.sentence == "spots move right; flip it" and DOUBT.sentence == "is it in metres?"
-    assert SIGN.as_json()["certain"] is True and SIGN.as_json()["line"] == 7
+    assert plain(SIGN)["certain"] is True and plain(SIGN)["line"] == 7
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ which are printed and stop nothing. No units, no frames.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from tvsbayes.errors import InputError, typed
@@ -38,10 +38,6 @@ class Finding:
     def sentence(self) -> str:
         """Message and remedy in one sentence."""
         return f"{self.message}; {self.remedy}" if self.remedy else self.message
-
-    def as_json(self) -> dict[str, object]:
-        """An entry of `findings` in the document of `check --json`."""
-        return asdict(self)
 
 
 def doubts(code: str, sentences: Iterable[str], file: str | None = None) -> list[Finding]:

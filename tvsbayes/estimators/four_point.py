@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -22,6 +22,7 @@ from tvsbayes.errors import NothingToEstimate
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
 from tvsbayes.instrument.stereo_pair import Stereo, triangulate
+from tvsbayes.results.records import plain
 from tvsbayes.statistics.intervals import coverage_factor, effective_dof
 
 PROBE_PX = 0.01
@@ -106,12 +107,8 @@ class DirectionResult:
 
     def as_json(self) -> dict[str, object]:
         """The direction's object of `classic --json`; infinite dof becomes null."""
-        document = asdict(self)
-        for name in ("interval95_type_a", "interval95_gum"):
-            document[name] = None if document[name] is None else list(document[name])
-        if self.effective_dof is not None and not np.isfinite(self.effective_dof):
-            document["effective_dof"] = None
-        return document
+        finite = self.effective_dof is not None and np.isfinite(self.effective_dof)
+        return {**plain(self), "effective_dof": self.effective_dof if finite else None}
 
 
 @dataclass(frozen=True, repr=False)
@@ -136,12 +133,8 @@ class ClassicResult(Shown):
 
     def as_json(self) -> dict[str, object]:
         """The document of `tvsbayes classic --json`."""
-        results = self.directions.items()
-        return {
-            "directions": {name: None if result is None else result.as_json() for name, result in results},
-            "experiments": [asdict(experiment) for experiment in self.experiments],
-            "skipped": [asdict(skipped) for skipped in self.skipped],
-        }
+        directions = {name: None if of is None else of.as_json() for name, of in self.directions.items()}
+        return {**plain(self), "directions": directions}
 
 
 def ratio_deg_per_step(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -37,6 +37,7 @@ from tvsbayes.instrument.parameters import names_of
 from tvsbayes.instrument.sightings import SIGHTINGS, sighted_deg, sightings_of
 from tvsbayes.instrument.stereo_pair import SHORTEST_BASELINE_MM, baseline_doubt, pair_doubts, triangulate
 from tvsbayes.instrument.stops import observed_stops, separation
+from tvsbayes.results.records import plain
 
 RATIOS_TRIED, RATIO_SDS = 61, 3.0
 FAR_DEG, NEARER = 5.0, 4.0
@@ -119,8 +120,7 @@ class CampaignCheck:
 
     def as_json(self) -> dict[str, object]:
         """The document of `check --json`."""
-        findings = [finding.as_json() for finding in self.findings]
-        return {"kind": "campaign", **asdict(self), "findings": findings, "warnings": list(self.warnings)}
+        return {"kind": "campaign", **plain(self)}
 
 
 def _can_stand(depths_mm: np.ndarray) -> np.ndarray:

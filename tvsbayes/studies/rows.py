@@ -11,12 +11,15 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import msgspec
+
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.disk import read_bytes
+from tvsbayes.results.records import plain
 
 STUDY_FORMAT = "tvsbayes-study/1"
 ROWS_BYTES_MAX = 128 * 1024 * 1024
@@ -43,13 +46,6 @@ class HeadlineRow:
     interval95: tuple[float, float]
     pit: float
     predicted_sd: float
-
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any]) -> HeadlineRow:
-        """The entry of a line."""
-        low, high = map(float, document["interval95"])
-        single = {key: float(document[key]) for key in ("truth", "value", "sd", "pit", "predicted_sd")}
-        return cls(interval95=(low, high), **single)
 
 
 @dataclass(frozen=True)
@@ -82,31 +78,17 @@ class StudyRow:
 
     def as_json(self) -> dict[str, object]:
         """Its line in a file of rows, less the format."""
-        document = {**asdict(self), "problems": list(self.problems)}
-        names = ("headlines", "target") if self.headlines else ()
-        order = ("design", "index", "seed", "estimator", "converged", "unseen", "problems", *names, "seconds")
-        return {name: document[name] for name in order}
+        absent = () if self.headlines else ("headlines", "target")
+        return {name: value for name, value in plain(self).items() if name not in absent}
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> StudyRow:
         """The row of a line.
 
         Raises:
-            KeyError, TypeError, ValueError, AttributeError: a document of another shape.
+            msgspec.ValidationError: a document of another shape.
         """
-        target = document.get("target")
-        return cls(
-            design=str(document["design"]),
-            index=int(document["index"]),
-            seed=int(document["seed"]),
-            converged=bool(document["converged"]),
-            unseen=int(document["unseen"]),
-            problems=tuple(map(str, document["problems"])),
-            seconds=float(document["seconds"]),
-            headlines={str(k): HeadlineRow.from_json(h) for k, h in document.get("headlines", {}).items()},
-            target=None if target is None else float(target),
-            estimator=str(document.get("estimator", "laplace")),
-        )
+        return msgspec.convert(document, cls)
 
 
 class StudyRows:
@@ -155,7 +137,7 @@ class StudyRows:
             document = json.loads(line)
             if document["format"] == STUDY_FORMAT:
                 return StudyRow.from_json(document)
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        except (ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError):
             pass
         raise self._no_row(number)
 
