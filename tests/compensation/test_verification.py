@@ -23,8 +23,6 @@ from tvsbayes.results.compensation_record import (
     WRONG_SIGN,
 )
 
-FIT = results().fit
-
 
 @pytest.mark.parametrize(
     ("factors", "world"),
@@ -40,7 +38,7 @@ FIT = results().fit
 )
 def test_every_world_is_named(factors, world):
     """Also where it befell the play alone, as a lost reversal or a backlash setting beside the table do."""
-    found = verify_readings(FIT, table(), fresh(3, factors))
+    found = verify_readings(results().fit, table(), fresh(3, factors))
     assert found.world == world and found.worlds[world] > 0.95
     assert found.verdict == (KEPT if world == APPLIED else BROKEN)
     assert (found.p > 0.01) == (world == APPLIED)
@@ -49,7 +47,7 @@ def test_every_world_is_named(factors, world):
 
 def test_sizes_are_those_of_the_readings():
     new = fresh(3)
-    found = verify_readings(FIT, table(), new)
+    found = verify_readings(results().fit, table(), new)
     aim = table().offset + np.array([new.moves[r.move].command for r in new.readings])
     errors = np.array([r.value for r in new.readings]) - aim
     assert found.after.rms == pytest.approx(np.sqrt(np.mean(errors**2)))
@@ -60,7 +58,7 @@ def test_sizes_are_those_of_the_readings():
 def test_another_axis_is_none_of_the_worlds():
     asked, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
     other = driven(true_axis(8, 1.004), asked, read, 9, by=Correction.of(table()))
-    found = verify_readings(FIT, table(), other)
+    found = verify_readings(results().fit, table(), other)
     assert (found.verdict, found.world) == (BROKEN, OTHER_MACHINE)
 
 
@@ -68,22 +66,22 @@ def test_a_table_too_small_to_be_seen_cannot_be_told():
     """Three readings of 0.5 mm uncertainty: every world explains them."""
     new = fresh(3)
     blurred = replace(new, readings=tuple(replace(r, u=0.5) for r in new.readings[:3]))
-    found = verify_readings(FIT, table(), blurred)
+    found = verify_readings(results().fit, table(), blurred)
     assert found.verdict == CANNOT_TELL and found.needed != 0
 
 
 def test_what_lies_outside_or_takes_longer_is_said():
     asked, read = to_and_fro(np.array([-15.0, 1.0, 23.0]))
     slow = tuple(replace(m, time_s=100 * m.time_s) for m in asked)
-    found = verify_readings(FIT, table(), driven(true_axis(), slow, read, 4, by=Correction.of(table())))
+    found = verify_readings(results().fit, table(), driven(true_axis(), slow, read, 4, by=Correction.of(table())))
     assert "outside" in found.remarks[0] and "what is expected is wider" in found.remarks[1]
 
 
 def test_other_units_and_missing_tables_are_refused(tmp_path):
     with pytest.raises(InputError, match="'deg'"):
-        verify_readings(FIT, table(), replace(fresh(3), unit="deg"))
+        verify_readings(results().fit, table(), replace(fresh(3), unit="deg"))
     with pytest.raises(InputError, match="no compensation"):
-        stored_compensation(replace(FIT.campaign, path=tmp_path))
+        stored_compensation(replace(results().fit.campaign, path=tmp_path))
 
 
 def test_grblhal_may_begin_in_either_half_of_the_play():
@@ -92,16 +90,16 @@ def test_grblhal_may_begin_in_either_half_of_the_play():
     asked, read = to_and_fro(np.array([-15.0, -7.0, 1.0, 6.0, 12.0, 18.0]))
     new = driven(true_axis(), asked, read, 5, by=Correction.of(made))
     shifted = replace(new, readings=tuple(replace(r, value=float(r.value or 0) + 0.15) for r in new.readings))
-    assert verify_readings(FIT, made, shifted).verdict == KEPT
-    assert verify_readings(FIT, structs.replace(made, zero_free=False), shifted).verdict == BROKEN
+    assert verify_readings(results().fit, made, shifted).verdict == KEPT
+    assert verify_readings(results().fit, structs.replace(made, zero_free=False), shifted).verdict == BROKEN
 
 
 def test_python_verifies_in_one_call():
-    assert verify_axis(FIT.campaign, fresh(3), made=table()).verdict == KEPT
+    assert verify_axis(results().fit.campaign, fresh(3), made=table()).verdict == KEPT
 
 
 def test_plan_spreads_its_stops_and_knows_whether_they_tell():
-    found = plan_verification(FIT, table())
+    found = plan_verification(results().fit, table())
     assert found.enough and len(found.stops) >= 6 and {side for _, side in found.stops} == {-1, 1}
     assert np.ptp([command for command, _ in found.stops]) > 30
     rows = [line.split(",") for line in found.plan_bytes().decode().splitlines()[1:]]
@@ -110,4 +108,4 @@ def test_plan_spreads_its_stops_and_knows_whether_they_tell():
         if row[3] == "1":
             assert (at[k] > at[k - 1]) == (row[2] == "forward") and abs(at[k] - at[k - 1]) >= found.overrun - 1e-9
     tiny = [structs.replace(r, add_forward=1e-5, add_backward=-1e-5) for r in table().table]
-    assert not plan_verification(FIT, structs.replace(table(), table=tuple(tiny))).enough
+    assert not plan_verification(results().fit, structs.replace(table(), table=tuple(tiny))).enough

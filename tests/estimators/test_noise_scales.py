@@ -64,7 +64,7 @@ def test_what_geometry_took_is_given_back(mixed_fit):
 
 def test_the_mean_is_that_of_many_more_draws(mixed_fit):
     """A proposal narrower or askew is made good by the weights: within four standard errors of the few."""
-    few, many = noise_draws(mixed_fit, 32, seed=1), noise_draws(mixed_fit, 128, seed=2)
+    few, many = noise_draws(mixed_fit, 32, seed=1), noise_draws(mixed_fit, 64, seed=2)
     means = [draws.weights @ draws.z[:, PIXEL] for draws in (few, many)]
     sd = np.sqrt(many.weights @ (many.z[:, PIXEL] - means[1]) ** 2)
     assert abs(means[0] - means[1]) < 4 * sd * np.sqrt(sum(1 / effective_draws(draws.weights) for draws in (few, many)))

@@ -283,7 +283,9 @@ def child(folder: Path) -> dict:
     return json.loads(result.stdout)
 
 
+@pytest.mark.slow
 def test_a_second_process_neither_traces_nor_compiles(tmp_path):
+    """Of a function of the model; of a small one `test_compilation_cache` sees the same in every run."""
     first, second = child(tmp_path / "cache"), child(tmp_path / "cache")
     assert (first["empty"], first["traces"], first["misses"]) == (True, 1, 1)
     assert (second["empty"], second["traces"], second["misses"], second["hits"]) == (False, 0, 0, 1)
