@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from tvsbayes.errors import NotConverged, require_kind
 from tvsbayes.estimators.joint_fit import JointFit
@@ -20,8 +21,9 @@ from tvsbayes.progress import Job, Show
 from tvsbayes.results.convergence import Convergence
 
 TIERS = ("importance", "emcee")
-MIXTURE_ROUNDS = 4 * ROUNDS_LEAST
-"""Of the most probable way of homing, where fewer leave the mixture of all rough."""
+MIXTURE_ROUNDS, MIXTURE_MARGIN = 4 * ROUNDS_LEAST, 1.2
+"""Rounds of the most probable way of homing, at most, where fewer leave the mixture of all rough; and how many times as
+many it has as the errors of the mixture ask for."""
 DRAWING, WALKING = "drawing weighted samples", "sampling with emcee"
 DRAWN_SECONDS, WALKED_SECONDS = 3.0, 8.0
 """What progress predicts with."""
@@ -89,7 +91,7 @@ def sample(
         early = _mixture(start, seed)
         if early.convergence.answer == "rough" and start.sample.convergence.answer == "accepted" and chain is None:
             # The share of a less probable way of homing asks for more draws than the most probable one needs.
-            start = importance_run(fit, seed, job.at, rounds_least=MIXTURE_ROUNDS)
+            start = importance_run(fit, seed, job.at, rounds_least=_rounds_of_mixture(start, early))
             early = _mixture(start, seed)
         if tier == "importance":
             return early
@@ -105,6 +107,13 @@ def sample(
         agrees = found.agreement is None or found.agreement.agrees
         # A chain knows one way of homing; where others count, the weighted draws of all have the last word.
         return early if len(early.fit.mixture) > 1 and walked.converged and agrees else better(early, walked)
+
+
+def _rounds_of_mixture(start: ImportanceRun[Target], mixture: Posterior) -> int:
+    """How many rounds the most probable way of homing has for the errors of the mixture."""
+    factor = max(error.rounds_factor for error in mixture.convergence.monte_carlo_error.values())
+    rounds = start.sample.convergence.importance.rounds
+    return int(np.clip(np.ceil(MIXTURE_MARGIN * factor * rounds), rounds + 1, MIXTURE_ROUNDS))
 
 
 def _mixture(start: ImportanceRun[Target], seed: int) -> Posterior:
