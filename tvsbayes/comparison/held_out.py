@@ -21,6 +21,7 @@ from tvsbayes.progress import Job, Show
 from tvsbayes.results.comparison_record import BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL, HoldOut, Prediction, Score
 from tvsbayes.statistics.chances import student_log_density
 from tvsbayes.statistics.intervals import coverage_factor
+from tvsbayes.statistics.streams import Stream, random_stream
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
@@ -167,7 +168,7 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress
                 return undecided(f"{without} there is no fit: {error.message}")
             if not taught.converged:
                 return undecided(f"{without} the fit does not converge: {'; '.join(taught.problems)}")
-            by_model = predict_joint(taught, selection, out, np.random.default_rng([seed, index]))
+            by_model = predict_joint(taught, selection, out, random_stream(seed, Stream.HELD_OUT, index))
             for e, joint in by_model.items():
                 if e in predicted:
                     about = (int(selection.experiments[e]), name, str(selection.direction[e]), int(selection.steps[e]))

@@ -35,6 +35,8 @@ class Stream(IntEnum):
     """Directions of the changes that looks of `plan --watch` shall show."""
     OTHER_HOMING = 16
     """Errors of the gears at places, of draws weighted under another way of homing."""
+    HELD_OUT = 17
+    """Looks predicted for experiments that were left out, fold by fold."""
     PROMISE = 22
     WORLDS = 23
     """Replicates behind the p of `verify`."""
@@ -61,6 +63,6 @@ class AxisStream(IntEnum):
     PREDICTED_STOPS = 21
 
 
-def random_stream(seed: int, stream: Stream | AxisStream) -> np.random.Generator:
-    """The random numbers of one purpose."""
-    return np.random.default_rng([seed, stream.value])
+def random_stream(seed: int, stream: Stream | AxisStream, *part: int) -> np.random.Generator:
+    """The random numbers of one purpose, or of a numbered part of it."""
+    return np.random.default_rng([seed, stream.value, *part])
