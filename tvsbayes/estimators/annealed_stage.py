@@ -52,10 +52,10 @@ def innovations(lin: LinearLooks, arrays: CampaignArrays, before: Belief) -> See
     turned = ToStates.of(by_pan, by_tilt)
     both = jnp.concatenate([lin.residual[..., None], lin.residual_jacobian, -lin.place_columns], axis=2)
     columns = turned.of_many(tuple(both.transpose(1, 2, 0)))
-    seen, free = (jnp.stack(part).transpose(2, 0, 1) for part in (columns[:2], columns[2:]))
-    rows = filter_rows(seen, turned.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, arrays.spots)
-    found = filtered(rows, before)
-    return eqx.tree_at(lambda f: f.standardised, found, jnp.concatenate([found.standardised, free], axis=1))
+    observed, free = (jnp.stack(part).transpose(2, 0, 1) for part in (columns[:2], columns[2:]))
+    rows = filter_rows(observed, turned.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, arrays.spots)
+    result = filtered(rows, before)
+    return eqx.tree_at(lambda f: f.standardised, result, jnp.concatenate([result.standardised, free], axis=1))
 
 
 class Part(LinearLooks):
@@ -76,12 +76,12 @@ def linear_part(
     before: Belief,
 ) -> Part:
     """`PART` spots from the first on; `inflation` is a factor on their noise."""
-    own = arrays.of_spots(first, min(PART, len(arrays.spots.valid)))
-    lin = linearise(at, space, own, inflation)
-    seen = innovations(lin, own, before)
-    columns = seen.standardised.reshape(-1, seen.standardised.shape[2])
+    part = arrays.of_spots(first, min(PART, len(arrays.spots.valid)))
+    lin = linearise(at, space, part, inflation)
+    result = innovations(lin, part, before)
+    columns = result.standardised.reshape(-1, result.standardised.shape[2])
     given = {field.name: getattr(lin, field.name) for field in fields(lin)}
-    mean, covariance = jnp.asarray(seen.belief.mean), jnp.asarray(seen.belief.covariance)
+    mean, covariance = jnp.asarray(result.belief.mean), jnp.asarray(result.belief.covariance)
     return Part(**given, gram=columns.T @ columns, mean=mean, covariance=covariance)
 
 
@@ -103,10 +103,10 @@ def linear_campaign(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
     gram = np.sum([np.asarray(part.gram) for part in parts], axis=0)
     lin = Linearised.joined(parts, point, space, arrays)
     mixed = linalg.block_diag(lin.place_root, np.diag(np.where(fixed.held, 0.0, 1.0)))
-    own = np.concatenate([1 + z.size + filled, np.arange(1, 1 + z.size)])
+    coordinates = np.concatenate([1 + z.size + filled, np.arange(1, 1 + z.size)])
     prior = np.concatenate([np.zeros(len(lin.place_root)), np.where(fixed.held, z - fixed.value, z)])
-    root = np.linalg.cholesky(mixed.T @ gram[np.ix_(own, own)] @ mixed + np.eye(prior.size))
-    slope = mixed.T @ gram[own, 0] + prior
+    root = np.linalg.cholesky(mixed.T @ gram[np.ix_(coordinates, coordinates)] @ mixed + np.eye(prior.size))
+    slope = mixed.T @ gram[coordinates, 0] + prior
     explained = linalg.solve_triangular(root, slope, lower=True, check_finite=False)
     left = gram[0, 0] + prior @ prior - explained @ explained
     free = len(lin.place_root)

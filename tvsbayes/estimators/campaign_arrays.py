@@ -170,11 +170,11 @@ def move_arrays(moves: Sequence[Move], size: int | None = None, powered_on_s: fl
     )
 
 
-def place_arrays(seen: SeenPlaces) -> Places:
+def place_arrays(places: SeenPlaces) -> Places:
     """Pad places to the largest number of them."""
-    count, size = len(seen.steps), 2 * PLACES_MAX
+    count, size = len(places.steps), 2 * PLACES_MAX
     return Places(
-        padded(seen.steps, size), padded(seen.on_tilt, size, False, bool), padded(np.ones(count), size, False, bool)
+        padded(places.steps, size), padded(places.on_tilt, size, False, bool), padded(np.ones(count), size, False, bool)
     )
 
 
@@ -184,16 +184,16 @@ def no_gears(size: int) -> GearArrays:
     return GearArrays(Places(placed(np.zeros(0)), *2 * [placed(np.zeros(0, dtype=bool))]), none, none)
 
 
-def gear_arrays(seen: SeenPlaces, size: int) -> GearArrays:
+def gear_arrays(given: SeenPlaces, size: int) -> GearArrays:
     """Pad the places of looks.
 
     Args:
-        seen: from `seen_places`.
+        given: from `seen_places`.
         size: padded number of spots.
     """
-    places = place_arrays(seen)
-    wider = (0, 0), (0, len(places.steps) - len(seen.steps))
-    return GearArrays(places, *(padded(np.pad(share, wider), size) for share in (seen.error_share, seen.play_share)))
+    places = place_arrays(given)
+    wider = (0, 0), (0, len(places.steps) - len(given.steps))
+    return GearArrays(places, *(padded(np.pad(share, wider), size) for share in (given.error_share, given.play_share)))
 
 
 def pixel_covariance(spot: Spot | Sighting) -> np.ndarray:
@@ -232,8 +232,8 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
     gears = gear_arrays(places if gears_vary(priors) else places.none, size)
     aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
     points_mm = triangulate(campaign.stereo, pixels) if frames is None else frames[:, 2]
-    seen = np.isfinite(points_mm).all(axis=1)
-    points_mm[~seen] = NOWHERE_MM
+    finite = np.isfinite(points_mm).all(axis=1)
+    points_mm[~finite] = NOWHERE_MM
     spot_arrays = SpotArrays(
         move_index=padded([s.move for s in spots], size, spots[-1].move, np.int32),
         pixels=padded(pixels, size),
@@ -241,7 +241,7 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
         aperture_rad=padded(np.nan_to_num(np.radians(aperture)), size),
         has_aperture=padded(np.isfinite(aperture), size),
         triangulated_mm=padded(points_mm, size, NOWHERE_MM),
-        valid=padded(seen, size),
+        valid=padded(finite, size),
         weight=placed(np.ones(size)),
         redraw=padded(new.redraw, size, False, bool),
         redraw_mix=padded(new.redraw_mix, size),
@@ -269,11 +269,14 @@ def in_sight(campaign: Campaign) -> np.ndarray:
 
 def spot_constants(campaign: Campaign) -> np.ndarray:
     """Terms of each ordered spot's log likelihood that no parameter changes: 2 pi and its stated covariance."""
-    own = components(campaign.rig)
+    constants = components(campaign.rig)
     return np.array(
         [
             -0.5
-            * ((own + (s.aperture_deg is not None)) * np.log(2 * np.pi) + np.linalg.slogdet(pixel_covariance(s))[1])
+            * (
+                (constants + (s.aperture_deg is not None)) * np.log(2 * np.pi)
+                + np.linalg.slogdet(pixel_covariance(s))[1]
+            )
             for s in ordered_spots(campaign)
         ]
     )

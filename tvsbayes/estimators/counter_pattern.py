@@ -100,30 +100,30 @@ class _Followed:
 def _rest(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Coefficients, what they leave, and the rank of a design."""
     scale = np.maximum(np.abs(design).max(axis=0), 1e-12)
-    found, _, rank, _ = np.linalg.lstsq(design / scale, values, rcond=1e-9)
-    return (found.T / scale).T, values - (design / scale) @ found, int(rank)
+    solution, _, rank, _ = np.linalg.lstsq(design / scale, values, rcond=1e-9)
+    return (solution.T / scale).T, values - (design / scale) @ solution, int(rank)
 
 
 def _columns(nearness: np.ndarray, *counters: np.ndarray) -> np.ndarray:
     """A line in counters whose height and slopes change with the distance: beams do not begin where cameras stand."""
-    own = [part for steps in (np.ones_like(nearness), *counters) for part in (steps, steps * nearness)]
-    return np.column_stack(own)
+    products = [part for steps in (np.ones_like(nearness), *counters) for part in (steps, steps * nearness)]
+    return np.column_stack(products)
 
 
-def _followed(seen: _Seen, axis: Axis, steps: np.ndarray, other: np.ndarray) -> _Followed:
+def _followed(pattern: _Seen, axis: Axis, steps: np.ndarray, other: np.ndarray) -> _Followed:
     """A line in the counter beside another counter's."""
-    base = _columns(seen.nearness, other)
-    full = np.column_stack((base, steps, steps * seen.nearness))
-    _, before, _ = _rest(base, seen.angles_deg[axis])
-    found, after, rank = _rest(full, seen.angles_deg[axis])
-    _, own, _ = _rest(base, steps)
+    base = _columns(pattern.nearness, other)
+    full = np.column_stack((base, steps, steps * pattern.nearness))
+    _, before, _ = _rest(base, pattern.angles_deg[axis])
+    solution, after, rank = _rest(full, pattern.angles_deg[axis])
+    _, rest, _ = _rest(base, steps)
     motion = float(before @ before)
     return _Followed(
         share=1 - float(after @ after) / motion if motion > 0 else 0.0,
-        slope=float(found[-2] + found[-1] * seen.nearness.mean()),
+        slope=float(solution[-2] + solution[-1] * pattern.nearness.mean()),
         left_deg=float(np.sqrt(np.mean(after**2))),
-        spread_steps=float(np.sqrt(np.mean(own**2))),
-        stops_free=len(np.unique(seen.at)) - rank,
+        spread_steps=float(np.sqrt(np.mean(rest**2))),
+        stops_free=len(np.unique(pattern.at)) - rank,
     )
 
 
@@ -150,7 +150,7 @@ def _seen(pattern: SpotPattern) -> _Seen:
     group = sheet_groups(pattern.points_mm[:, 0])
     # The sheet's, not the spot's own: a sheet that stands askew is deeper on one side, as if depth were a counter.
     sheet_mm = np.array([depth_mm[group == g].mean() for g in range(group.max() + 1)])[group]
-    angles_deg = {axis: np.degrees(np.arctan2(own, depth_mm)) for axis, own in zip(AXES, across_mm, strict=True)}
+    angles_deg = {axis: np.degrees(np.arctan2(across, depth_mm)) for axis, across in zip(AXES, across_mm, strict=True)}
     return _Seen(
         pattern,
         np.array([spot.move for spot in pattern.spots]),

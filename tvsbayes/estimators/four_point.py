@@ -247,17 +247,17 @@ def experiment_rows(campaign: Campaign, selection: Selection) -> np.ndarray:
 
 def _by_point(spots: Sequence[Spot], rows: list[int]) -> tuple[list[int], str | None]:
     """Rows of points 1 to 4 in order, or the reason why there are not exactly four."""
-    found: dict[int | None, list[int]] = {}
+    by_point: dict[int | None, list[int]] = {}
     for row in rows:
-        found.setdefault(spots[row].point, []).append(row)
+        by_point.setdefault(spots[row].point, []).append(row)
     ordered = []
     for point in (1, 2, 3, 4):
-        here = found.get(point, [])
-        if not here:
+        members = by_point.get(point, [])
+        if not members:
             return [], f"point {point} is missing"
-        ok = [row for row in here if spots[row].status == "ok"]
+        ok = [row for row in members if spots[row].status == "ok"]
         if not ok:
-            return [], f"point {point} is not usable: status {spots[here[0]].status}"
+            return [], f"point {point} is not usable: status {spots[members[0]].status}"
         if len(ok) > 1:
             return [], f"point {point} is present {len(ok)} times"
         ordered.append(ok[0])
@@ -364,11 +364,11 @@ def stereo_variance(function: Callable[[Stereo, float], float], stereo: Stereo, 
 
     def slope(of: Callable[[float], float], step: float) -> float:
         for _ in range(STEP_HALVINGS):
-            found = (of(step) - of(-step)) / (2 * step)
-            if np.isfinite(found):
+            difference = (of(step) - of(-step)) / (2 * step)
+            if np.isfinite(difference):
                 break
             step /= 2
-        return found
+        return difference
 
     def moved(index: int, step: float) -> float:
         vector = stereo.vector.copy()

@@ -194,12 +194,12 @@ class JointFit(Shown):
     @property
     def homing_side(self) -> dict[str, dict[str, float]]:
         """Probability of each way of homing, by axis whose sides nobody recorded."""
-        found: dict[str, dict[str, float]] = {}
+        sides: dict[str, dict[str, float]] = {}
         for way in self.alternatives:
             for axis, side in way.sides.items():
-                own = found.setdefault(axis, {})
-                own[side] = own.get(side, 0.0) + way.probability
-        return found
+                of_axis = sides.setdefault(axis, {})
+                of_axis[side] = of_axis.get(side, 0.0) + way.probability
+        return sides
 
 
 def fit(
@@ -270,24 +270,24 @@ def fit(
             raise diverged from error
 
 
-def _by_homing(found: JointFit, problem: Problem, axes: tuple[str, ...], seed: int, advance: Advance) -> JointFit:
+def _by_homing(first: JointFit, problem: Problem, axes: tuple[str, ...], seed: int, advance: Advance) -> JointFit:
     """The fit under the most probable way of homing, with all that count.
 
     Args:
-        found: under "anywhere" for every axis.
+        first: under "anywhere" for every axis.
         problem: that it came from.
         axes: whose sides nobody recorded.
         seed: of the Laplace draws.
         advance: told how far it is.
     """
-    start = Mode(found.z, found.covariance, -found.log_density, ())
+    start = Mode(first.z, first.covariance, -first.log_density, ())
     modes: dict[tuple[tuple[str, str], ...], tuple[Problem, Mode]] = {}
 
     def mode_under(sides: Sides) -> tuple[Problem, Mode]:
         key = tuple(sorted(sides.items()))
         if key not in modes:
-            own = _problem_under(found, problem, sides)
-            modes[key] = own, own.mode_beside(start)
+            under = _problem_under(first, problem, sides)
+            modes[key] = under, under.mode_beside(start)
             advance(len(modes) / most_fits(axes))
         return modes[key]
 
@@ -296,7 +296,7 @@ def _by_homing(found: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
         return laplace_evidence(mode, problem.free) + float(np.log(prior_chance(sides)))
 
     def fit_under(sides: Sides) -> JointFit:
-        return replace(fit_at(found.campaign, *mode_under(sides), seed), sides=dict(sides))
+        return replace(fit_at(first.campaign, *mode_under(sides), seed), sides=dict(sides))
 
     weighed_ways = weighed(axes, evidence)
     alternatives = tuple(
@@ -311,9 +311,9 @@ def _by_homing(found: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
 def _problem_under(found: JointFit, problem: Problem, sides: Sides) -> Problem:
     """The problem of a fit if the axes came home in these ways."""
     used = np.asarray(found.arrays.spots.valid)[: len(problem.spots)] > 0
-    own = Problem(homed(found.campaign, sides), problem.table, used)
-    own.arrays = eqx.tree_at(lambda a: a.spots.weight, own.arrays, problem.arrays.spots.weight)
-    return own
+    under = Problem(homed(found.campaign, sides), problem.table, used)
+    under.arrays = eqx.tree_at(lambda a: a.spots.weight, under.arrays, problem.arrays.spots.weight)
+    return under
 
 
 def laplace_evidence(mode: Mode, free: Bool[np.ndarray, " parameters"]) -> float:

@@ -344,17 +344,17 @@ def innovations(
         Standardised innovations and log likelihood; cost linear in the number of spots.
     """
     every = len(arrays.spots.valid) // block_size(arrays.spots)
-    seen = passed(model, arrays, every if blocks is None else blocks)
-    standardised, log_density, none = seen.standardised, jnp.asarray(seen.sums.log_density), jnp.zeros(0)
+    result = passed(model, arrays, every if blocks is None else blocks)
+    standardised, log_density, none = result.standardised, jnp.asarray(result.sums.log_density), jnp.zeros(0)
     if not arrays.gears.groups:
-        return Innovations(jnp.concatenate([standardised, seen.free], axis=1), none, none, log_density)
-    found = RepeatedErrors.of(seen.sums, root_at_places(model, arrays.gears))
-    mean = jnp.asarray(found.drawn(jnp.zeros_like(normal)))
-    by_group = (found.root @ mean).reshape(2, arrays.gears.groups, -1).swapaxes(0, 1).reshape(arrays.gears.groups, -1)
-    standardised = standardised - jnp.einsum("gsce,ge->sc", seen.columns, by_group)
-    drawn = jnp.asarray(found.root @ found.drawn(normal))
-    whole = jnp.concatenate([standardised, seen.free], axis=1)
-    return Innovations(whole, mean, drawn, jnp.asarray(log_density + found.log_density()))
+        return Innovations(jnp.concatenate([standardised, result.free], axis=1), none, none, log_density)
+    errors = RepeatedErrors.of(result.sums, root_at_places(model, arrays.gears))
+    mean = jnp.asarray(errors.drawn(jnp.zeros_like(normal)))
+    by_group = (errors.root @ mean).reshape(2, arrays.gears.groups, -1).swapaxes(0, 1).reshape(arrays.gears.groups, -1)
+    standardised = standardised - jnp.einsum("gsce,ge->sc", result.columns, by_group)
+    drawn = jnp.asarray(errors.root @ errors.drawn(normal))
+    whole = jnp.concatenate([standardised, result.free], axis=1)
+    return Innovations(whole, mean, drawn, jnp.asarray(log_density + errors.log_density()))
 
 
 def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> np.ndarray:
@@ -428,29 +428,29 @@ def evaluate(
     pairs = pairs_of(gears.groups)
 
     def sums(values: np.ndarray) -> Sums:
-        found = _sums(values, space, arrays)
-        along, gram = np.asarray(found.along), np.asarray(found.gram)
-        return Sums(np.asarray(found.log_density), along[:, : gears.groups], gram[:, :pairs])
+        result = _sums(values, space, arrays)
+        along, gram = np.asarray(result.along), np.asarray(result.gram)
+        return Sums(np.asarray(result.log_density), along[:, : gears.groups], gram[:, :pairs])
 
     def added(values: np.ndarray, sums: Sums, normal: np.ndarray) -> Evaluation:
         try:
-            found = RepeatedErrors.of(sums, roots_at(values, space, gears), np)
+            errors = RepeatedErrors.of(sums, roots_at(values, space, gears), np)
         except np.linalg.LinAlgError:
             if len(values) == 1:
                 return Evaluation(np.full(1, np.nan), np.zeros(normal.shape))
             rows = [slice(k, k + 1) for k in range(len(values))]
             return _joined([added(values[k], jax.tree.map(lambda x, k=k: x[k], sums), normal[k]) for k in rows])
-        errors_rad = (found.root @ found.drawn(normal, np)[..., None])[..., 0]
-        return Evaluation(sums.log_density + found.log_density(np), errors_rad)
+        errors_rad = (errors.root @ errors.drawn(normal, np)[..., None])[..., 0]
+        return Evaluation(sums.log_density + errors.log_density(np), errors_rad)
 
     def block(z: np.ndarray, normal: np.ndarray) -> Evaluation:
         values = space.values(z)
-        found = in_batches(sums, values)
-        finite = np.isfinite(found.log_density) & np.isfinite(values).all(axis=1)
-        log_density, errors_rad = np.where(finite, found.log_density, np.nan), np.zeros(normal.shape)
+        parts = in_batches(sums, values)
+        finite = np.isfinite(parts.log_density) & np.isfinite(values).all(axis=1)
+        log_density, errors_rad = np.where(finite, parts.log_density, np.nan), np.zeros(normal.shape)
         if gears.groups and finite.any():
-            own = added(values[finite], jax.tree.map(lambda x: x[finite], found), normal[finite])
-            log_density[finite], errors_rad[finite] = own.log_density, own.place_errors_rad
+            whole = added(values[finite], jax.tree.map(lambda x: x[finite], parts), normal[finite])
+            log_density[finite], errors_rad[finite] = whole.log_density, whole.place_errors_rad
         return Evaluation(log_density - 0.5 * np.sum(z**2, axis=1), errors_rad)
 
     given = [np.asarray(z), np.asarray(normal)]

@@ -110,21 +110,21 @@ def linearise(
         inflation: factor on pixel and aperture noise.
     """
     model = space.model_at(jnp.asarray(at.values))
-    found = standing(model, arrays, inflation)
-    looks, terms = found.looks, found.terms
+    standard = standing(model, arrays, inflation)
+    looks, terms = standard.looks, standard.terms
     by_coordinates = look_jacobian(at, space, looks, arrays)
-    unit_noise = found.to_states.in_place
-    residuals = unit_noise(terms.range_out.of_many(found.noise.whitened(by_coordinates, arrays.spots))[1:])
+    unit_noise = standard.to_states.in_place
+    residuals = unit_noise(terms.range_out.of_many(standard.noise.whitened(by_coordinates, arrays.spots))[1:])
     slope = jnp.stack([jnp.stack(unit_noise(own), axis=1) for own in (terms.by_pan, terms.by_tilt)], axis=2)
     return LinearLooks(
         residual=jnp.stack(unit_noise(terms.residual), axis=1),
         slope=slope,
-        play_sd_rad=found.play_sd_rad,
+        play_sd_rad=standard.play_sd_rad,
         mirror_angles_rad=jnp.stack([looks.pan_rad, looks.tilt_rad], axis=1),
         predicted=jnp.stack(looks.predicted, axis=1),
-        stop_variance=found.stop_variance,
-        drift_variance=found.drift_variance,
-        scatter_variance=found.scatter_variance,
+        stop_variance=standard.stop_variance,
+        drift_variance=standard.drift_variance,
+        scatter_variance=standard.scatter_variance,
         place_columns=place_columns(slope, arrays.gears),
         residual_jacobian=-jnp.stack(residuals).transpose(2, 0, 1),
         predicted_jacobian=jnp.stack(by_coordinates).transpose(2, 0, 1),
@@ -270,11 +270,11 @@ def _without_places(groups: list[StopGroup], whole: np.ndarray, parameters: int)
         whole: products of the columns residual, coordinates and errors by the inverse covariance without the latter.
         parameters: number of coordinates.
     """
-    own = slice(1 + parameters, None)
+    places = slice(1 + parameters, None)
     count = len(whole) - 1 - parameters
-    covariance = np.linalg.inv(np.eye(count) + whole[own, own])
-    explained = covariance @ whole[own, : 1 + parameters]
-    fisher = whole[1 : 1 + parameters, 1 : 1 + parameters] - whole[1 : 1 + parameters, own] @ explained[:, 1:]
+    covariance = np.linalg.inv(np.eye(count) + whole[places, places])
+    explained = covariance @ whole[places, : 1 + parameters]
+    fisher = whole[1 : 1 + parameters, 1 : 1 + parameters] - whole[1 : 1 + parameters, places] @ explained[:, 1:]
     if count:
         groups = [
             StopGroup(

@@ -216,11 +216,11 @@ def observe_with_stop_errors(
     Returns:
         u_left, v_left, u_right, v_right (px), aperture reading (rad), shape (n, spots, 5), without padding.
     """
-    count, window, found = int(arrays.count), min(WINDOW, len(arrays.spots.valid)), []
+    count, window, parts = int(arrays.count), min(WINDOW, len(arrays.spots.valid)), []
     values = space.values(z)
     for first in range(0, count, window):
-        own = stop_error_rad[:, first : min(first + window, count)]
+        window_errors = stop_error_rad[:, first : min(first + window, count)]
         filled = np.zeros((len(z), window, 2))
-        filled[:, : own.shape[1]] = own
-        found.append(np.asarray(_observed(values, filled, space, arrays, np.int32(first)))[:, : own.shape[1]])
-    return np.concatenate(found, axis=1)
+        filled[:, : window_errors.shape[1]] = window_errors
+        parts.append(np.asarray(_observed(values, filled, space, arrays, np.int32(first)))[:, : window_errors.shape[1]])
+    return np.concatenate(parts, axis=1)

@@ -85,7 +85,7 @@ class Room:
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """At points (n, p), which tell the scales, shape (n,)."""
-        own, rest = slice(len(NAMES)), slice(len(NAMES), None)
+        free, rest = slice(len(NAMES)), slice(len(NAMES), None)
         if not self.products[rest].size:
             return np.zeros(len(z))
         values = np.stack([physical_at(one, self.space).value for one in z])
@@ -98,9 +98,9 @@ class Room:
         )
         back = np.swapaxes(root, 1, 2)
         inner = np.eye(root.shape[1]) + back @ self.products[rest, rest] @ root
-        load = self.products[own, rest] @ root
-        told = self.products[own, own] - load @ np.linalg.solve(inner, np.swapaxes(load, 1, 2))
-        return -0.5 * np.linalg.slogdet(np.eye(len(NAMES)) + told)[1]
+        load = self.products[free, rest] @ root
+        information = self.products[free, free] - load @ np.linalg.solve(inner, np.swapaxes(load, 1, 2))
+        return -0.5 * np.linalg.slogdet(np.eye(len(NAMES)) + information)[1]
 
 
 def held_by(free: Bool[np.ndarray, " parameters"]) -> Bool[np.ndarray, " parameters"]:
@@ -150,8 +150,8 @@ class Problem:
     def negative_log_density(self, z: np.ndarray) -> np.ndarray:
         """Of many points (n, p); infinite where the model has no value."""
         still = no_draw(len(z), self.arrays)
-        found = evaluate(z, still, self.space, self.arrays).log_density
-        return np.where(np.isfinite(found), -found, np.inf)
+        log_density = evaluate(z, still, self.space, self.arrays).log_density
+        return np.where(np.isfinite(log_density), -log_density, np.inf)
 
     def noise_scales(self, z: np.ndarray) -> np.ndarray:
         """Best noise scales for given geometry, under their priors.
@@ -184,11 +184,11 @@ class Problem:
         # Eight prior standard deviations: a factor 3000 on a stop sd, 55 on the pixel scale.
         bounds = list(zip(-8.0 / unit, 8.0 / unit, strict=True))
         settled = {"ftol": 1e-8, "gtol": 1e-2}
-        found = optimize.minimize(
+        optimum = optimize.minimize(
             value_and_slope, z[self.noise] / unit, jac=True, method="L-BFGS-B", bounds=bounds, options=settled
         )
         result = z.copy()
-        result[self.noise] = found.x * unit
+        result[self.noise] = optimum.x * unit
         return result
 
     def room(self, z: np.ndarray) -> Room:
@@ -199,9 +199,9 @@ class Problem:
         lin = self.linearised(z)
         jacobian = np.where(self.held, 0.0, -np.asarray(lin.residual_jacobian))
         linear = linear_spots(lin, self.arrays, jacobian)
-        found = stop_information(linear.spelled_out(np.asarray(lin.place_columns)))
+        information = stop_information(linear.spelled_out(np.asarray(lin.place_columns)))
         ratio = np.radians(physical_at(z, self.space).value[RATIO_COLUMNS])
-        return Room(self.space, found.fisher, places.steps * ratio[places.on_tilt.astype(int)], places)
+        return Room(self.space, information.fisher, places.steps * ratio[places.on_tilt.astype(int)], places)
 
     def alternate(self, z: np.ndarray) -> np.ndarray:
         """Geometry and noise scales in turn until the noise settles (formulation 4.2)."""
@@ -245,23 +245,23 @@ class Problem:
 
         Their variance is that of the density with geometry and cameras integrated out, at most the prior's.
         """
-        found = newton_mode(self.negative_log_density, z, self.free & ~self.repeated, self.curvature(z))
-        own = np.flatnonzero(self.repeated)
-        if not own.size:
-            return found
-        room, steps = self.room(found.z), SCALE_STEP * np.eye(len(NAMES))[own]
-        points = np.concatenate([found.z[None], found.z + steps, found.z - steps])
+        optimum = newton_mode(self.negative_log_density, z, self.free & ~self.repeated, self.curvature(z))
+        repeated = np.flatnonzero(self.repeated)
+        if not repeated.size:
+            return optimum
+        room, steps = self.room(optimum.z), SCALE_STEP * np.eye(len(NAMES))[repeated]
+        points = np.concatenate([optimum.z[None], optimum.z + steps, optimum.z - steps])
         centre, *nudged = self.negative_log_density(points) - room(points)
         both = np.sum(np.reshape(nudged, (2, -1)), axis=0)
-        covariance = found.covariance.copy()
-        covariance[own, own] = 1 / np.clip((both - 2 * centre) / SCALE_STEP**2, 1.0, None)
-        return replace(found, covariance=covariance)
+        covariance = optimum.covariance.copy()
+        covariance[repeated, repeated] = 1 / np.clip((both - 2 * centre) / SCALE_STEP**2, 1.0, None)
+        return replace(optimum, covariance=covariance)
 
     def mode_beside(self, known: Mode) -> Mode:
         """The mode from that of another way of homing, which is seldom far away; scales of repeating errors held."""
-        found = neighbouring_mode(self.negative_log_density, known, self.free & ~self.repeated)
-        if found is not None:
-            return found
+        optimum = neighbouring_mode(self.negative_log_density, known, self.free & ~self.repeated)
+        if optimum is not None:
+            return optimum
         z = self.alternate(known.z.copy())
         value = float(self.negative_log_density(z[None])[0])
         # So far below, the last Newton steps change nothing: the way is as good as impossible.

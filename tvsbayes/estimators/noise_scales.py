@@ -57,8 +57,8 @@ class ScalesAlone:
         """At points (n, p) that differ in their noise scales, shape (n,)."""
         arrays, still = self.fit.arrays, no_draw(len(z), self.fit.arrays)
         joint = evaluate(z, still, self._space, arrays).log_density
-        found = joint + np.array([self._room(point) for point in z])
-        return np.where(np.isfinite(found), found, -np.inf)
+        log_density = joint + np.array([self._room(point) for point in z])
+        return np.where(np.isfinite(log_density), log_density, -np.inf)
 
     def _room(self, z: np.ndarray) -> float:
         """What integrating geometry and cameras out adds to the density at z."""
@@ -66,10 +66,10 @@ class ScalesAlone:
         lin = stage(z, self._space, arrays, Fixed(self.fit.held, z, np.array(1.0)), NO_STEP)
         jacobian = np.where(self.fit.held, 0.0, -np.asarray(lin.residual_jacobian))
         spots = linear_spots(lin, arrays, jacobian)
-        found = stop_information(spots)
-        errors = np.concatenate([group.residual for group in found.groups])
+        information = stop_information(spots)
+        errors = np.concatenate([group.residual for group in information.groups])
         slope = jacobian.reshape(len(errors), -1).T @ errors - np.where(self.fit.held, 0.0, z)
-        precision = found.fisher + np.eye(len(z))
+        precision = information.fisher + np.eye(len(z))
         return float(0.5 * slope @ np.linalg.solve(precision, slope) - 0.5 * np.linalg.slogdet(precision)[1])
 
 

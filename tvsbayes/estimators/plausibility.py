@@ -142,34 +142,34 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     points_mm = campaign.usable_points_mm if points_mm is None else points_mm
     few = partial(listed, most=SPOTS_LISTED)
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
-    found = []
+    findings = []
     misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
     if misspelt:
         said = f"spots {few(misspelt)} are left out: their status is not spelt ok, in small letters"
-        found.append(Finding("status", said, file="spots.csv"))
+        findings.append(Finding("status", said, file="spots.csv"))
     stray = [s.spot for s in campaign.spots if s.status == UNDETECTED and s.u_left_px is not None]
     if stray:
         said = f"spots {few(stray)} are undetected and have pixels, which nothing uses: ok, or refused?"
-        found.append(Finding("status", said, file="spots.csv"))
+        findings.append(Finding("status", said, file="spots.csv"))
     if not ok:
-        return tuple(found)
-    found += _stereo_findings(campaign)
-    found += doubts("units", _metres(campaign), "campaign.toml")
+        return tuple(findings)
+    findings += _stereo_findings(campaign)
+    findings += doubts("units", _metres(campaign), "campaign.toml")
     if (unit := _pixel_unit(campaign, ok)) is not None:
-        return (*found, unit)
-    found += _from_one(campaign, ok)
+        return (*findings, unit)
+    findings += _from_one(campaign, ok)
     stands = _can_stand(points_mm[:, 0])
     odd = [spot for spot, can in zip(ok, stands, strict=True) if not can]
     if odd:
-        found.append(_impossible_depths(campaign, ok, odd))
+        findings.append(_impossible_depths(campaign, ok, odd))
     if len(odd) < ODD_SHARE * len(ok):
         there = [spot for spot, can in zip(ok, stands, strict=True) if can]
         if len(there) >= SPOTS_MIN:
             pattern = pattern_of(campaign, there, points_mm[stands])
             # Counters and planes say nothing where the pictures themselves contradict each other.
             pictures = picture_findings(pattern)
-            found += pictures or [*counter_findings(pattern), *table_findings(pattern)]
-    return (*found, *_reading_findings(ok))
+            findings += pictures or [*counter_findings(pattern), *table_findings(pattern)]
+    return (*findings, *_reading_findings(ok))
 
 
 def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple[Finding, ...]:
@@ -183,25 +183,25 @@ def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple
         What `implausible` finds, and noise that is not as stated: a poor calibration leaves the same, so that `check`
         itself does not say it. Empty where nothing of it explains the failure.
     """
-    found = [*implausible(campaign)]
+    findings = [*implausible(campaign)]
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
     points_mm = campaign.usable_points_mm
     stands = _can_stand(points_mm[:, 0])
     if stands.sum() < 2 * SPOTS_MIN or stands.mean() <= 1 - ODD_SHARE:
-        return tuple(found)
+        return tuple(findings)
     there = [spot for spot, can in zip(ok, stands, strict=True) if can]
     seen_px = mismatch_spread_px(pattern_of(campaign, there, points_mm[stands]))
     stated_px = float(np.median([[getattr(spot, name) for name in PIXEL_SDS] for spot in there]))
     said = f"left and right of a spot agree to {seen_px:.2g} px (sd), su and sv of spots.csv say {stated_px:.2g} px"
     if not 1 / NOISE_OFF < seen_px / stated_px < NOISE_OFF:
         remedy = f"state {seen_px:.2g} px in su and sv, by `tvsbayes import --sd-px {seen_px:.2g}` of a table without"
-        found.append(Finding("pixel-noise", said, remedy, file="spots.csv"))
+        findings.append(Finding("pixel-noise", said, remedy, file="spots.csv"))
     elif pixel_scale is not None and pixel_scale > NOISE_OFF:
         said += f", but beams miss them by {pixel_scale:.2g} times that: the beam scatters, not the pixels"
         remedy = "look for a loose laser or mirror, vibration, steps that were lost, or a sheet that moved"
-        found.append(Finding("beam-scatter", said, remedy))
+        findings.append(Finding("beam-scatter", said, remedy))
     # What is certain explains most.
-    return tuple(sorted(found, key=lambda finding: not finding.certain))
+    return tuple(sorted(findings, key=lambda finding: not finding.certain))
 
 
 def _stereo_findings(campaign: Campaign) -> list[Finding]:
@@ -299,9 +299,9 @@ def _incomplete(skipped: Sequence[SkippedExperiment]) -> list[str]:
     for one in skipped:
         by_reason.setdefault(one.reason, []).append(one.experiment)
     return [
-        f"{'experiments' if len(own) > 1 else 'experiment'} {listed(own, SPOTS_LISTED)} "
-        f"{'are' if len(own) > 1 else 'is'} not complete: {reason}"
-        for reason, own in by_reason.items()
+        f"{'experiments' if len(experiments) > 1 else 'experiment'} {listed(experiments, SPOTS_LISTED)} "
+        f"{'are' if len(experiments) > 1 else 'is'} not complete: {reason}"
+        for reason, experiments in by_reason.items()
     ]
 
 

@@ -226,7 +226,7 @@ def _stray_doubts(pattern: SpotPattern) -> tuple[str, ...]:
     """Single spots away from the pattern of all others: a mistyped cell, or a reflection."""
     off = pattern.mismatch_px
     apart = off > max(MISMATCH_PX, STRAY_MISMATCH * float(np.median(off)))
-    found = {int(k): f"left and right contradict each other by {off[k]:.1f} px" for k in np.flatnonzero(apart)}
+    reasons = {int(k): f"left and right contradict each other by {off[k]:.1f} px" for k in np.flatnonzero(apart)}
     for name in sorted({spot.target for spot in pattern.spots}):
         rows = np.array([k for k, s in enumerate(pattern.spots) if s.target == name and not apart[k]], int)
         if len(rows) < PLANE_MIN:
@@ -240,12 +240,12 @@ def _stray_doubts(pattern: SpotPattern) -> tuple[str, ...]:
         slope_mm = SHEET_SLOPE * _from_neighbours(pattern.points_mm[rows, 1:], placement, np.zeros(len(rows)))
         limit = np.maximum.reduce([least, MISMATCH_PX * _mm_per_pixel(pattern, rows), slope_mm])
         for k in np.flatnonzero((np.abs(away) > limit) & (apart_mm > STRAY_NEIGHBOUR * usual)):
-            found[int(rows[k])] = f"{abs(away[k]):.1f} mm off the plane of its sheet, others {spread:.1g} mm"
-    if not found:
+            reasons[int(rows[k])] = f"{abs(away[k]):.1f} mm off the plane of its sheet, others {spread:.1g} mm"
+    if not reasons:
         return ()
-    first = min(found)
-    spots = listed([pattern.spots[k].spot for k in sorted(found)], SPOTS_LISTED)
-    one = f"spot {pattern.spots[first].spot}: {found[first]}"
+    first = min(reasons)
+    spots = listed([pattern.spots[k].spot for k in sorted(reasons)], SPOTS_LISTED)
+    one = f"spot {pattern.spots[first].spot}: {reasons[first]}"
     return (f"spots {spots} lie apart from all others ({one}): a mistyped pixel, a reflection, or a wrong status?",)
 
 

@@ -101,7 +101,7 @@ def spot_residuals(looks: Looks, noise: NoiseScales, model: Model, spots: SpotAr
     off = spots.aperture_rad - reading
     # Angles are compared on the circle.
     off = off - jnp.round(off / (2 * jnp.pi)) * (2 * jnp.pi)
-    misfit = (*(seen - pixel for seen, pixel in zip(spots.pixels.T, pixels, strict=True)), off)
+    misfit = (*(measured - pixel for measured, pixel in zip(spots.pixels.T, pixels, strict=True)), off)
     misfit, by_pan, by_tilt, by_range = materialise(
         tuple(noise.whitened(numbers, spots) for numbers in (misfit, looks.by_pan, looks.by_tilt, looks.by_range))
     )
@@ -159,16 +159,16 @@ class ToStates(eqx.Module):
         # By Schur's complement, in sums of what is positive: a large scatter costs no digits.
         last2 = 1 + by_tilt_2 * tilt_rest**2
         last, across = jnp.sqrt(last2), tilt_load * by_tilt_2 * tilt_rest
-        own = jnp.sqrt(1 + by_pan_2 * pan_load**2 + by_tilt_2 * tilt_load**2 / last2)
+        scale = jnp.sqrt(1 + by_pan_2 * pan_load**2 + by_tilt_2 * tilt_load**2 / last2)
         across = across / last
-        loads = pan_load / own, (tilt_load - across * (tilt_rest / last)) / own, tilt_rest / last
-        return cls(first, second, *loads, (own, across, last))
+        loads = pan_load / scale, (tilt_load - across * (tilt_rest / last)) / scale, tilt_rest / last
+        return cls(first, second, *loads, (scale, across, last))
 
     @property
     def log_scale(self) -> Float[Array, " spots"]:
         """What the scatter of looks adds to the log density besides the two components: -ln det U."""
-        own, _, last = self.spread
-        return -jnp.log(own) - jnp.log(last)
+        scale, _, last = self.spread
+        return -jnp.log(scale) - jnp.log(last)
 
     @property
     def slope(self) -> Float[Array, "spots 2 2"]:
@@ -190,6 +190,6 @@ class ToStates(eqx.Module):
         return tuple(n + p * by_one + q * by_two for p, q, n in zip(self.first, self.second, numbers, strict=True))
 
     def _unit_noise(self, one: Array, two: Array) -> tuple[Array, Array]:
-        own, across, last = self.spread
+        scale, across, last = self.spread
         two = two / last
-        return (one - across * two) / own, two
+        return (one - across * two) / scale, two

@@ -131,7 +131,7 @@ def steps_ahead(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()
 
     `causes` explain a fit that failed.
     """
-    found = []
+    steps = []
     if not summary.explained and causes:
         return [f"Use none of the numbers: {finding.sentence}." for finding in causes]
     if not summary.explained:
@@ -141,19 +141,19 @@ def steps_ahead(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()
         ]
     if (validation := failed(summary)) is not None:
         help_ = remedy(validation)
-        found.append(f"{validation.cause}: {help_}.")
+        steps.append(f"{validation.cause}: {help_}.")
     if summary.suspect_spots and (validation is None or "single spots" not in validation.cause):
         ids = listed(summary.suspect_spots, SPOTS_LISTED)
-        found.append(
+        steps.append(
             f"Look at spots {ids}, which disagree with all others, or fit with --robust, which leaves them out."
         )
     if summary.few_stops:
         named = ", ".join(f"{direction} ({count})" for direction, count in summary.few_stops.items())
-        found.append(f"Add stops reached by moving {named}: so few hardly tell their own scatter.")
+        steps.append(f"Add stops reached by moving {named}: so few hardly tell their own scatter.")
     if summary.estimator == "laplace":
-        found.append(f"Sample the posterior, which takes minutes: `tvsbayes fit {folder}`, then make the report again.")
+        steps.append(f"Sample the posterior, which takes minutes: `tvsbayes fit {folder}`, then make the report again.")
     texts = [weak.text for weak in summary.weak_directions if asks_for_looks(weak)]
-    return found + [f"{text[0].upper()}{text[1:]}." for text in map(sentence_in_words, texts)]
+    return steps + [f"{text[0].upper()}{text[1:]}." for text in map(sentence_in_words, texts)]
 
 
 def asks_for_looks(weak: WeakDirection) -> bool:

@@ -136,11 +136,11 @@ def offered(summary: AxisSummary) -> list[str]:
     return [for_firmware(summary), *([worst_place(summary)] if summary.deviations else []), *waves]
 
 
-def _waves(found: Sequence[PeriodEstimate], summary: AxisSummary, periods_in: str) -> list[str]:
+def _waves(estimates: Sequence[PeriodEstimate], summary: AxisSummary, periods_in: str) -> list[str]:
     """Waves that are likely, in words."""
     unit = escaped(summary.unit)
     said = []
-    for one in found:
+    for one in estimates:
         if one.probability >= LIKELY:
             period = f"{one.period.value:.10g}" if one.source == "stated" else concise(one.period.value, one.period.sd)
             amplitude = concise(one.amplitude.value, one.amplitude.sd)
@@ -250,21 +250,21 @@ def axis_verdict(summary: AxisSummary) -> str:
     return f"{ROUGH if summary.answer == 'rough' else 'usable'}{reserved(summary)}"
 
 
-def hold_out_table(found: AxisHoldOut, unit: str) -> TableView:
+def hold_out_table(hold_out: AxisHoldOut, unit: str) -> TableView:
     """Positions left out, beside what was predicted of them."""
     rows = []
-    for p in found.positions:
+    for p in hold_out.positions:
         row = [f"{p.position:.10g}", p.direction, str(p.n), f"{p.mean:.6g}", concise(p.predicted, p.u), f"{p.z:+.1f}"]
         rows.append([*row, f"{p.classic_z:+.1f}"])
     caption = f"positions left out and predicted, {escaped(unit)}; z in stated uncertainties"
     return TableView(caption, ["position", "direction", "n", "mean", "predicted(u)", "z", "z classic"], rows)
 
 
-def axis_hold_out_text(found: AxisHoldOut, unit: str) -> str:
+def axis_hold_out_text(hold_out: AxisHoldOut, unit: str) -> str:
     """A hold-out in words."""
-    errors = f"RMS z {found.rms_z:.2f}, classic {found.classic_rms_z:.2f}; "
-    errors += f"{100 * found.inside_share:.0f} % of the left-out readings in their 95 % intervals"
-    return terminal(hold_out_table(found, unit), errors, *_lines("warning", found.warnings))
+    errors = f"RMS z {hold_out.rms_z:.2f}, classic {hold_out.classic_rms_z:.2f}; "
+    errors += f"{100 * hold_out.inside_share:.0f} % of the left-out readings in their 95 % intervals"
+    return terminal(hold_out_table(hold_out, unit), errors, *_lines("warning", hold_out.warnings))
 
 
 def next_table(plan: AxisPlan, unit: str) -> TableView:

@@ -217,13 +217,13 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
         "boards cover "
         + ", ".join(f"{100 * share:.0f} % of the {side} image" for side, share in result.coverage.items()),
     ]
-    if (found := result.pictures) is not None:
+    if (pictures := result.pictures) is not None:
         lists = {
-            "without their counterpart": found.unpaired,
-            "names tell no camera, not used": found.unnamed,
-            "no board found": found.without_board,
-            "another size, not used": found.other_size,
-            "found by the other finder": found.by_fallback,
+            "without their counterpart": pictures.unpaired,
+            "names tell no camera, not used": pictures.unnamed,
+            "no board found": pictures.without_board,
+            "another size, not used": pictures.other_size,
+            "found by the other finder": pictures.by_fallback,
         }
         lines += [f"{what}: {escaped(', '.join(names), 400)}" for what, names in lists.items() if names]
     if result.reordered:
@@ -234,54 +234,55 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
     return terminal(*lines)
 
 
-def detection_text(found: Detection) -> str:
+def detection_text(detection: Detection) -> str:
     """What `detect` found, as a table of statuses."""
     from tvsbayes.cameras.detection import REASONS
 
-    rows = [[status, str(count), REASONS.get(status.split(" ")[0], "")] for status, count in found.statuses.items()]
-    rows += [["undetected", str(found.missing), "no frames"]] if found.missing else []
-    rows += [["as it was", str(found.kept), "refused by somebody else"]] if found.kept else []
+    rows = [[status, str(count), REASONS.get(status.split(" ")[0], "")] for status, count in detection.statuses.items()]
+    rows += [["undetected", str(detection.missing), "no frames"]] if detection.missing else []
+    rows += [["as it was", str(detection.kept), "refused by somebody else"]] if detection.kept else []
     noise = ", ".join(
-        f"{side} contrast {one.speckle_contrast:.2f}, gain {one.gain_dn:.3f} DN" for side, one in found.noise.items()
+        f"{side} contrast {one.speckle_contrast:.2f}, gain {one.gain_dn:.3f} DN"
+        for side, one in detection.noise.items()
     )
     sd = (
         ""
-        if found.median_sd_px is None
-        else f"median standard uncertainty of a coordinate {found.median_sd_px:.3f} px; "
+        if detection.median_sd_px is None
+        else f"median standard uncertainty of a coordinate {detection.median_sd_px:.3f} px; "
     )
-    title = f"{found.processed} looks"
+    title = f"{detection.processed} looks"
     table = TableView(title, ["status", "looks", "meaning"], rows)
     lines = [
         f"{side} camera: odd and even {one.lines} of {one.spots} spot{'s' * (one.spots != 1)} show the beam "
         f"{one.apart_px:.2g} px apart, more than their noise: an interlaced readout, or a beam that moved or flickered "
         "while it was read. Their uncertainty is widened by the difference / sqrt(12); read whole frames at once "
         "(progressive, global shutter), or let the beam come to rest"
-        for side, found_there in found.lines.items()
+        for side, found_there in detection.lines.items()
         for one in found_there
     ]
-    return terminal(table, f"method {found.method}; {sd}noise: {noise}", *lines)
+    return terminal(table, f"method {detection.method}; {sd}noise: {noise}", *lines)
 
 
-def locations_text(found: Locations) -> str:
+def locations_text(locations: Locations) -> str:
     """Points with their uncertainty."""
     rows: list[list[str]] = []
-    for index, error in enumerate(found.refused):
+    for index, error in enumerate(locations.refused):
         if error is not None:
             rows.append([str(index), f"refused: {error.code}", "", "", "", ""])
             continue
-        sd = np.sqrt(np.diag(found.covariance_mm2[index]))
-        cells = [concise(float(x), float(u)) for x, u in zip(found.xyz_mm[index], sd, strict=True)]
-        half = " ".join(map(two_digits, found.u95_mm[index]))
-        held = int(found.digits_held[index].min())
-        off = two_digits(float(found.law_off_mm[index]))
+        sd = np.sqrt(np.diag(locations.covariance_mm2[index]))
+        cells = [concise(float(x), float(u)) for x, u in zip(locations.xyz_mm[index], sd, strict=True)]
+        half = " ".join(map(two_digits, locations.u95_mm[index]))
+        held = int(locations.digits_held[index].min())
+        off = two_digits(float(locations.law_off_mm[index]))
         verdict = f"same to {held} digit{'s' * (held > 1)}" if held else f"off by {off} mm"
         # What is only known to be far off needs no second opinion on its u.
-        rows.append([str(index), *cells, half, "EXTRAPOLATED" if found.extrapolated[index] else verdict])
+        rows.append([str(index), *cells, half, "EXTRAPOLATED" if locations.extrapolated[index] else verdict])
     columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "law"]
-    table = TableView(f"frame T, {found.draws} draws ({found.estimator})", columns, rows)
+    table = TableView(f"frame T, {locations.draws} draws ({locations.estimator})", columns, rows)
     # Every point of a file may be far off for a reason of its own.
-    seen = zip(found.unseen, found.refused, strict=True)
-    beyond = dict.fromkeys(words for words, error in seen if words and not error)
+    missing = zip(locations.unseen, locations.refused, strict=True)
+    beyond = dict.fromkeys(words for words, error in missing if words and not error)
     notes = [extrapolated_text(words) for words in list(beyond)[:UNSEEN_SHOWN]]
     if len(beyond) > UNSEEN_SHOWN:
         notes.append(f"and {len(beyond) - UNSEEN_SHOWN} more counters that no look reached")
@@ -296,10 +297,10 @@ def _points(count: int) -> str:
     return f"{count} point{'s' * (count != 1)}"
 
 
-def cloud_text(found: CloudFile, law: LawChecked, calibration: Calibration) -> str:
+def cloud_text(cloud: CloudFile, law: LawChecked, calibration: Calibration) -> str:
     """What was written, what was not, and how far its uncertainties hold."""
-    lines = [f"written: {escaped(str(found.path), 200)}, {_points(found.points)}, frame T, mm"]
-    lines.append(f"properties: {', '.join(found.columns)}")
+    lines = [f"written: {escaped(str(cloud.path), 200)}, {_points(cloud.points)}, frame T, mm"]
+    lines.append(f"properties: {', '.join(cloud.columns)}")
     agreement = (
         f"sds by the law of propagation (GUM): of {_points(law.points)} carried by draws too it holds to a digit or "
     )
@@ -312,15 +313,15 @@ def cloud_text(found: CloudFile, law: LawChecked, calibration: Calibration) -> s
         lines.append("do not rely on the sds of this cloud: `tvsbayes locate` --points without --cloud gives draws")
     elif law.points:
         lines.append("the sds may be relied on")
-    if found.extrapolated:
-        seen = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in calibration.seen_steps.items())
+    if cloud.extrapolated:
+        ranges = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in calibration.seen_steps.items())
         lines.append(
-            f"{_points(found.extrapolated)} EXTRAPOLATED: outside {seen}, where looks were; errors of the gears are "
+            f"{_points(cloud.extrapolated)} EXTRAPOLATED: outside {ranges}, where looks were; errors of the gears are "
             "predicted there by their size alone"
         )
-    if found.refused_path is not None:
-        name = escaped(str(found.refused_path), 200)
-        looks = f"{found.refused} look{' has' if found.refused == 1 else 's have'}"
+    if cloud.refused_path is not None:
+        name = escaped(str(cloud.refused_path), 200)
+        looks = f"{cloud.refused} look{' has' if cloud.refused == 1 else 's have'}"
         lines.append(f"{looks} no point: lines and reasons in {name}")
     return "\n".join(lines)
 
@@ -372,16 +373,16 @@ def hold_out_text(held: HoldOut) -> str:
     )
 
 
-def positions_text(found: PositionHoldOut) -> str:
+def positions_text(hold_out: PositionHoldOut) -> str:
     """Counters left out, beside what was predicted of them."""
     rows = []
-    for p in found.positions:
+    for p in hold_out.positions:
         predicted = concise(p.predicted, p.u), f"{p.z:+.1f}"
         rows.append([p.axis, str(p.position), p.direction, str(p.n), f"{p.mean:.4f}", *predicted])
     caption = "counters left out and predicted, mirror angles in deg; z in stated uncertainties"
     table = TableView(caption, ["axis", "counter", "direction", "n", "mean", "predicted(u)", "z"], rows)
-    summary = [] if found.rms_z is None else [f"RMS z {found.rms_z:.2f}"]
-    return terminal(table, *summary, *(f"warning: {text}" for text in found.warnings))
+    summary = [] if hold_out.rms_z is None else [f"RMS z {hold_out.rms_z:.2f}"]
+    return terminal(table, *summary, *(f"warning: {text}" for text in hold_out.warnings))
 
 
 def changes_text(comparison: Comparison) -> str:

@@ -65,25 +65,31 @@ def promise_table(made: Compensation) -> TableView:
     return TableView(caption, ["arriving", "without", "after applying", *CAUSES], rows)
 
 
-def sizes_table(found: Verification) -> TableView:
+def sizes_table(verification: Verification) -> TableView:
     """Errors without the table and with it."""
     rows = [
-        ["before (expected without the table)", two_digits(found.before.rms), two_digits(found.before.worst)],
-        ["after (read)", two_digits(found.after.rms), two_digits(found.after.worst)],
+        [
+            "before (expected without the table)",
+            two_digits(verification.before.rms),
+            two_digits(verification.before.worst),
+        ],
+        ["after (read)", two_digits(verification.after.rms), two_digits(verification.after.worst)],
     ]
     columns = ["", "RMS", "worst"]
-    if (at := found.millimetres) is not None:
+    if (at := verification.millimetres) is not None:
         columns += [f"RMS at {at.distance_mm:.10g} mm, mm", "worst, mm"]
         for row, size in zip(rows, (at.before, at.after), strict=True):
             row += [two_digits(size.rms), two_digits(size.worst)]
-    of = " of both axes" * found.looks + ", and of points" * (at is not None)
-    return TableView(f"errors, {escaped(found.unit)}{of}", columns, rows)
+    of = " of both axes" * verification.looks + ", and of points" * (at is not None)
+    return TableView(f"errors, {escaped(verification.unit)}{of}", columns, rows)
 
 
-def _promised(found: Verification) -> str:
-    at = found.millimetres
+def _promised(verification: Verification) -> str:
+    at = verification.millimetres
     points = "" if at is None else f", of points at {at.distance_mm:.10g} mm {two_digits(at.promised95)} mm"
-    return f"promised: 95 % of errors at most {two_digits(found.promised95)} {escaped(found.unit)}{points}"
+    return (
+        f"promised: 95 % of errors at most {two_digits(verification.promised95)} {escaped(verification.unit)}{points}"
+    )
 
 
 def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
@@ -111,33 +117,35 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
     return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
 
 
-def verification_text(found: Verification) -> str:
+def verification_text(verification: Verification) -> str:
     """A verification for people."""
-    p = "< 0.0003" if found.p < 3e-4 else f"= {found.p:.2g}"
-    rows = [[name, f"{100 * chance:.1f} %"] for name, chance in found.worlds.items()]
-    axis = not found.looks
+    p = "< 0.0003" if verification.p < 3e-4 else f"= {verification.p:.2g}"
+    rows = [[name, f"{100 * chance:.1f} %"] for name, chance in verification.worlds.items()]
+    axis = not verification.looks
     what = (
-        f"{found.readings} readings under the table" if axis else f"{found.readings} looks that the calibration aimed"
+        f"{verification.readings} readings under the table"
+        if axis
+        else f"{verification.readings} looks that the calibration aimed"
     )
     lines: list[Part] = [
-        f"{found.verdict}: {found.world} (p {p})",
+        f"{verification.verdict}: {verification.world} (p {p})",
         "",
         TableView(what, [f"the {'table' if axis else 'calibration'} was", "probability"], rows),
         "",
-        sizes_table(found),
-        _promised(found),
-        *found.remarks,
+        sizes_table(verification),
+        _promised(verification),
+        *verification.remarks,
     ]
-    if found.verdict == BROKEN:
+    if verification.verdict == BROKEN:
         remedies = REMEDIES if axis else REMEDIES | SCANNER_REMEDIES
-        lines.append(f"what to do: {remedies[found.world]}")
-    elif found.verdict == CANNOT_TELL and found.needed is None:
+        lines.append(f"what to do: {remedies[verification.world]}")
+    elif verification.verdict == CANNOT_TELL and verification.needed is None:
         lines.append(
             "no number of such readings tells: what the table corrects is lost in what homing and fit leave open"
         )
-    elif found.verdict == CANNOT_TELL:
+    elif verification.verdict == CANNOT_TELL:
         kind = "readings" if axis else "looks"
-        more = f"about {found.needed} {kind} of this kind" if found.needed else f"some more {kind}"
+        more = f"about {verification.needed} {kind} of this kind" if verification.needed else f"some more {kind}"
         lines.append(f"what to do: {more} would tell; `tvsbayes plan --verify FOLDER` names those that tell soonest")
     return terminal(*lines)
 
@@ -145,56 +153,55 @@ def verification_text(found: Verification) -> str:
 APPLIED_TITLE = "Applied, and what is left"
 
 
-def compensation_section(made: Compensation, found: Verification | None) -> Section:
+def compensation_section(made: Compensation, verification: Verification | None) -> Section:
     """Report: what was made to be applied, what is left by the promise, and what fresh readings say of it."""
     low, high = made.range_command
     text = [
         f"Made for {made.target}, to be applied by the {made.applied_by}; the promise holds for commands from "
         f"{low:.10g} to {high:.10g}, within {two_digits(made.hours)} h and {made.travel_command:.4g} commands of "
         "travel since homing.",
-        "No fresh readings have verified it." if found is None else _verdict(found),
+        "No fresh readings have verified it." if verification is None else _verdict(verification),
     ]
-    tables = [promise_table(made), *([] if found is None else [sizes_table(found)])]
+    tables = [promise_table(made), *([] if verification is None else [sizes_table(verification)])]
     return Section(APPLIED_TITLE, text, made.unsaid, tables)
 
 
-def verified_section(found: Verification) -> Section:
+def verified_section(verification: Verification) -> Section:
     """Report of a scanner: what fresh looks say that its calibration aimed, with points in mm."""
-    text = "Counters by `tvsbayes steps-for` or the header, held against fresh looks. " + _verdict(found)
-    return Section(APPLIED_TITLE, [text], tables=[sizes_table(found)])
+    text = "Counters by `tvsbayes steps-for` or the header, held against fresh looks. " + _verdict(verification)
+    return Section(APPLIED_TITLE, [text], tables=[sizes_table(verification)])
 
 
-def _verdict(found: Verification) -> str:
-    kind = "readings" if found.millimetres is None else "looks"
-    said = f"{found.verdict}: {found.readings} fresh {kind}, most probable: {found.world}, p = {found.p:.2g}."
-    promised = _promised(found)
+def _verdict(verification: Verification) -> str:
+    kind = "readings" if verification.millimetres is None else "looks"
+    said = f"{verification.verdict}: {verification.readings} fresh {kind}, "
+    said += f"most probable: {verification.world}, p = {verification.p:.2g}."
+    promised = _promised(verification)
     return f"{said} {promised[0].upper()}{promised[1:]}."
 
 
-def verify_plan_text(found: VerifyPlan) -> str:
+def verify_plan_text(plan: VerifyPlan) -> str:
     """Readings that tell soonest what became of a table."""
     words = {1: "forward", -1: "backward"}
-    rows = [[f"{command:.10g}", words[side]] for command, side in found.stops]
+    rows = [[f"{command:.10g}", words[side]] for command, side in plan.stops]
     table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
-    return terminal(
-        table, f"to arrive on a side, come from at least {found.overrun:.4g} commands away", _how_far(found)
-    )
+    return terminal(table, f"to arrive on a side, come from at least {plan.overrun:.4g} commands away", _how_far(plan))
 
 
-def aim_plan_text(found: AimPlan) -> str:
+def aim_plan_text(plan: AimPlan) -> str:
     """Looks that tell soonest what became of a calibration."""
-    rows = [[str(p), str(t), SIDES["pan"][ps > 0], SIDES["tilt"][ts > 0]] for p, t, ps, ts in found.stops]
+    rows = [[str(p), str(t), SIDES["pan"][ps > 0], SIDES["tilt"][ts > 0]] for p, t, ps, ts in plan.stops]
     columns = ["pan", "tilt", "arriving", ""]
     table = TableView(
         f"{len(rows)} looks with the calibration in force, in this order, from a homing on", columns, rows
     )
-    pan, tilt = found.run_up
+    pan, tilt = plan.run_up
     come = f"to arrive on a side, come from at least {pan} steps of pan and {tilt} of tilt away"
-    return terminal(table, come, _how_far(found))
+    return terminal(table, come, _how_far(plan))
 
 
-def _how_far(found: VerifyPlan | AimPlan) -> str:
+def _how_far(plan: VerifyPlan | AimPlan) -> str:
     """Whether a plan tells."""
-    if found.enough:
-        return f"they tell the worlds apart in 95 of 100: {found.distance:.1f} standard deviations"
-    return f"they hardly tell: the nearest two worlds are {found.distance:.1f} standard deviations apart"
+    if plan.enough:
+        return f"they tell the worlds apart in 95 of 100: {plan.distance:.1f} standard deviations"
+    return f"they hardly tell: the nearest two worlds are {plan.distance:.1f} standard deviations apart"

@@ -86,7 +86,7 @@ class GearBand:
 
 def gear_bands(calibration: Calibration) -> tuple[GearBand, ...]:
     """Of both axes; none where gears do not vary."""
-    found, columns = [], calibration.inputs[:, len(INPUT_NAMES) :]
+    curves, columns = [], calibration.inputs[:, len(INPUT_NAMES) :]
     for index, axis in enumerate(AXES if calibration.gears.size else ()):
         nodes = calibration.gears.steps[index]
         steps = np.linspace(nodes[0], nodes[-1], BAND_POINTS)
@@ -97,8 +97,8 @@ def gear_bands(calibration: Calibration) -> tuple[GearBand, ...]:
             low, high = np.quantile(values, (0.025, 0.975), axis=0)
             bands.append(np.stack([low, values.mean(axis=0), high]))
         low_seen, high_seen = calibration.range_steps[index].tolist()
-        found.append(GearBand(axis, steps, bands[0], bands[1], (low_seen, high_seen)))
-    return tuple(found)
+        curves.append(GearBand(axis, steps, bands[0], bands[1], (low_seen, high_seen)))
+    return tuple(curves)
 
 
 @dataclass(frozen=True)
@@ -172,18 +172,18 @@ def gather(
     maps = _maps(campaign, classic_result, calibration, range_mm)
     # The middle cell of an odd number is the middle of the counters.
     cell = MAP_CELLS // 2, MAP_CELLS // 2, maps.range_mm.tolist().index(range_mm)
-    found = {name: distance[:, *cell] for name, distance in maps.distance_mm.items()}
+    distances = {name: distance[:, *cell] for name, distance in maps.distance_mm.items()}
     criteria = []
     if limit_deg_per_step is not None:
         criteria += _ratio_criteria(campaign, fit, limit_deg_per_step)
     if limit_mm is not None:
-        errors = _inflation(fit) * found["joint"]
+        errors = _inflation(fit) * distances["joint"]
         criteria.append(criterion(f"3D point at {range_mm:g} mm", errors, limit_mm, "mm"))
     pan, tilt = (float(value) for value in calibration.range_steps.mean(axis=1))
     ray = calibration.ray(pan, tilt, HOME_APPROACH)
     point = np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction)
-    own = budget(calibration, pan, tilt, calibration.reading(point))
-    least = "xyz"[int(np.argmax(np.diag(own.covariance_mm2)))]
+    table = budget(calibration, pan, tilt, calibration.reading(point))
+    least = "xyz"[int(np.argmax(np.diag(table.covariance_mm2)))]
     return Evidence(
         campaign=campaign,
         fit=fit,
@@ -191,15 +191,15 @@ def gather(
         held_out=stored_hold_out(campaign, fit.provenance.inputs),
         planned=stored_plan(campaign, fit.provenance.inputs),
         criteria=criteria,
-        distances_mm=found,
+        distances_mm=distances,
         range_mm=range_mm,
         simple_errors={
             name: simple_error(calibration, one, (pan, tilt), range_mm)
             for name, one in simple_calibrations(campaign.rig.priors, classic_result).items()
         },
         maps=maps,
-        budget=own,
-        point=coordinate_budget(own, calibration, point.tolist(), least),
+        budget=table,
+        point=coordinate_budget(table, calibration, point.tolist(), least),
         gears=gear_bands(calibration),
         crops=spot_crops(campaign, fit.summary.suspect_spots),
         doubts=tuple(doubts),
@@ -224,10 +224,10 @@ def _inflation(fit: FitRecord) -> float:
 
 def _ratio_criteria(campaign: Campaign, fit: FitRecord, limit: float) -> list[Criterion]:
     """Every effective ratio against its limit, deg/step."""
-    draws, found = stored_ratios(campaign), []
+    draws, criteria = stored_ratios(campaign), []
     for k, direction in enumerate(DIRECTIONS):
         estimate = fit.summary.effective[direction]
         if estimate is not None:
             errors = _inflation(fit) * (draws[:, k] - estimate.value)
-            found.append(criterion(f"ratio {direction}", errors, limit, "deg/step"))
-    return found
+            criteria.append(criterion(f"ratio {direction}", errors, limit, "deg/step"))
+    return criteria

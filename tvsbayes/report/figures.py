@@ -252,12 +252,14 @@ def intervals(
         raise TypeError(f"intervals {takes}, or read_fit(path).summary; not a {type(joint).__name__}")
     classic = {} if classic is None else classic if isinstance(classic, Mapping) else classic.directions
     fitted = {d: (x.value, x.interval95) for d, x in ratios.items() if x is not None}
-    seen = {d: (x.mean_deg_per_step, x.interval95_gum or (x.mean_deg_per_step,) * 2) for d, x in classic.items() if x}
+    four_point = {
+        d: (x.mean_deg_per_step, x.interval95_gum or (x.mean_deg_per_step,) * 2) for d, x in classic.items() if x
+    }
     with drawing(3.2) as figure:
-        apart = 0.12 if seen and fitted else 0.0
+        apart = 0.12 if four_point and fitted else 0.0
         # Gears of pan and tilt differ by more than any interval is long: each has its scale.
         for axes, pair in zip(figure.subplots(len(SENSES), 1), SENSES.values(), strict=True):
-            for offset, name, results in ((-apart, "classic", seen), (apart, "joint", fitted)):
+            for offset, name, results in ((-apart, "classic", four_point), (apart, "joint", fitted)):
                 colour, marker = OF_ESTIMATOR[name]
                 for row, direction in enumerate(pair):
                     if direction not in results:
@@ -279,13 +281,13 @@ def gap_terms(gaps: ComparisonRecord | Mapping[str, Gap | None]) -> Figure:
         ValueError: no direction has a gap.
     """
     gaps = gaps if isinstance(gaps, Mapping) else gaps.directions
-    found = {direction: each for direction, each in gaps.items() if each is not None}
-    if not found:
+    stated = {direction: each for direction, each in gaps.items() if each is not None}
+    if not stated:
         raise ValueError("no direction has a gap: the campaign has no complete experiment")
-    names = [term.name for term in next(iter(found.values())).terms]
+    names = [term.name for term in next(iter(stated.values())).terms]
     with drawing(3.6) as figure:
         axes = figure.add_subplot()
-        for shift, (direction, each) in zip(np.linspace(-0.24, 0.24, len(found)), found.items(), strict=True):
+        for shift, (direction, each) in zip(np.linspace(-0.24, 0.24, len(stated)), stated.items(), strict=True):
             values = np.array([term.value for term in each.terms])
             ends = np.array([term.interval95 for term in each.terms])
             marker, colour = OF_DIRECTION[direction]
@@ -345,9 +347,9 @@ def residuals(stops: Sequence[StopResidual], axis: Axis) -> Figure:
     return figure
 
 
-def causes(found: Sequence[Cause], axis: str) -> Figure:
+def causes(shares: Sequence[Cause], axis: str) -> Figure:
     """Mean deviation by group of each cause, with two standard errors."""
-    mine = [cause for cause in found if cause.axis == axis and len(cause.groups) > 1]
+    mine = [cause for cause in shares if cause.axis == axis and len(cause.groups) > 1]
     rows = sum(len(cause.groups) for cause in mine)
     with drawing(1.2 + 0.22 * max(rows, 2)) as figure:
         axes = figure.add_subplot()
@@ -366,24 +368,24 @@ def causes(found: Sequence[Cause], axis: str) -> Figure:
     return figure
 
 
-def error_maps(found: ErrorMap, range_index: int) -> Figure:
+def error_maps(maps: ErrorMap, range_index: int) -> Figure:
     """Root mean square 3D error of each estimator over pan and tilt at one range, mm."""
-    names = [name for name in OF_ESTIMATOR if name in found.rms_mm]
+    names = [name for name in OF_ESTIMATOR if name in maps.rms_mm]
     with drawing(0.5 + 1.75 * len(names)) as figure:
         panels = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
         # One scale for all: equal colours are equal errors.
-        every = np.concatenate([found.rms_mm[name][:, :, range_index].ravel() for name in names])
-        seen = every[np.isfinite(every)]
-        low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0)
+        every = np.concatenate([maps.rms_mm[name][:, :, range_index].ravel() for name in names])
+        finite = every[np.isfinite(every)]
+        low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
         for axes, name in zip(panels, names, strict=True):
-            values = found.rms_mm[name][:, :, range_index].T
+            values = maps.rms_mm[name][:, :, range_index].T
             colours = colour_map(SEQUENTIAL)
             mesh = axes.pcolormesh(
-                found.pan_steps, found.tilt_steps, values, cmap=colours, vmin=low, vmax=high, rasterized=True
+                maps.pan_steps, maps.tilt_steps, values, cmap=colours, vmin=low, vmax=high, rasterized=True
             )
             figure.colorbar(mesh, ax=axes, label="mm")
-            _cells(axes, found.pan_steps, found.tilt_steps, values, low + 0.55 * (high - low))
-            axes.set(ylabel="tilt, steps", title=f"{name}, range {found.range_mm[range_index]:.4g} mm")
+            _cells(axes, maps.pan_steps, maps.tilt_steps, values, low + 0.55 * (high - low))
+            axes.set(ylabel="tilt, steps", title=f"{name}, range {maps.range_mm[range_index]:.4g} mm")
             axes.grid(False)
         panels[-1].set_xlabel("pan, steps")
     return figure

@@ -323,13 +323,13 @@ def _foretold(e: Evidence) -> TableView | None:
     """What the model says of the classic estimator beside what that says."""
     rows = []
     for direction, predicted in e.fit.summary.classic_predicted.items():
-        seen = None if e.classic is None else e.classic.directions[direction]
-        if predicted is None or seen is None:
+        result = None if e.classic is None else e.classic.directions[direction]
+        if predicted is None or result is None:
             continue
-        u = seen.u_type_a_deg_per_step or 0.0
+        u = result.u_type_a_deg_per_step or 0.0
         spread = np.hypot(predicted.sd, u)
-        z = (seen.mean_deg_per_step - predicted.value) / spread if spread > 0 else 0.0
-        cells = [concise(predicted.value, predicted.sd), concise(seen.mean_deg_per_step, u), f"{z:+.1f}"]
+        z = (result.mean_deg_per_step - predicted.value) / spread if spread > 0 else 0.0
+        cells = [concise(predicted.value, predicted.sd), concise(result.mean_deg_per_step, u), f"{z:+.1f}"]
         rows.append([direction, *cells])
     caption = "What the joint model says the classic estimator should report, and what it reports, deg/step"
     columns = ["direction", "predicted", "reported, type A", "difference / u"]

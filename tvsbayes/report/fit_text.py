@@ -121,19 +121,19 @@ def detail_lines(summary: FitSummary) -> list[Part]:
 
 def homing_lines(summary: FitSummary) -> list[str]:
     """How the axes came home whose sides nobody recorded."""
-    found = []
+    lines = []
     for axis, chances in summary.homing_side.items():
         ordered = sorted(chances.items(), key=lambda each: -each[1])
         ways = ", ".join(f"{side} {100 * chance:.1f} %" for side, chance in ordered)
-        found.append(f"{axis} homing side, not recorded: {ways}")
-    return found
+        lines.append(f"{axis} homing side, not recorded: {ways}")
+    return lines
 
 
 def gear_lines(summary: FitSummary) -> list[str]:
     """Where effective ratios hold that have errors of the gears in them, and what they are without."""
-    found = [f"effective ratios are slopes of lines through the looks, {range_text(summary)}; elsewhere errors differ"]
+    lines = [f"effective ratios are slopes of lines through the looks, {range_text(summary)}; elsewhere errors differ"]
     local = [f"{d} {concise(e.value, e.sd)}" for d, e in summary.local.items() if e is not None]
-    return found + [f"local ratios, without errors of the gears, deg/step: {', '.join(local)}"] * bool(local)
+    return lines + [f"local ratios, without errors of the gears, deg/step: {', '.join(local)}"] * bool(local)
 
 
 def astray_text(summary: FitSummary, causes: Sequence[Finding] = ()) -> str:
@@ -212,11 +212,12 @@ def answer_lines(summary: FitSummary) -> list[str]:
     return [*lines, f"what helps: {'fit without --quick' if quick else 'fit with --resume and more --max-minutes'}"]
 
 
-def importance_line(found: Importance) -> str:
+def importance_line(importance: Importance) -> str:
     """What importance sampling is worth, in one line."""
-    text = f"importance sampling: {found.draws} draws, {100 * found.effective_share:.0f} % effective, at least "
-    text += f"{found.least_ess.value:.0f} for a result ({found.least_ess.quantity}); Pareto k {found.pareto_k:.2f}, "
-    return f"{text}of results at most {found.worst_pareto_k.value:.2f}"
+    least, worst = importance.least_ess, importance.worst_pareto_k
+    text = f"importance sampling: {importance.draws} draws, {100 * importance.effective_share:.0f} % effective, "
+    text += f"at least {least.value:.0f} for a result ({least.quantity}); "
+    return f"{text}Pareto k {importance.pareto_k:.2f}, of results at most {worst.value:.2f}"
 
 
 def agreement_line(sampling: Sampling) -> str | None:

@@ -51,8 +51,8 @@ def sentence_in_words(text: str) -> str:
     """A sentence with parameters by their words; commands between backticks stay."""
     parts = text.split("`")
 
-    def words(found: re.Match[str]) -> str:
-        name = found.group()
+    def words(match: re.Match[str]) -> str:
+        name = match.group()
         quantity = QUANTITIES.get(name)
         if quantity is None or not quantity.words:
             return IN_WORDS.get(name, name)

@@ -57,9 +57,9 @@ def gear_errors(band: GearBand, stops: Sequence[StopResidual]) -> Figure:
             mine = [stop for stop in stops if stop.direction == direction]
             marker, colour = OF_DIRECTION[direction]
             at = np.array([stop.steps for stop in mine], dtype=float)
-            found = np.interp(at, band.steps, band.error_deg[1]) + [stop.deviation_deg for stop in mine]
+            errors = np.interp(at, band.steps, band.error_deg[1]) + [stop.deviation_deg for stop in mine]
             label = f"stops, moving {direction}"
-            panels[0].plot(at, found, marker, color=colour, markersize=3.5, rasterized=True, label=label)
+            panels[0].plot(at, errors, marker, color=colour, markersize=3.5, rasterized=True, label=label)
         panels[-1].set_xlabel(f"{band.axis} counter, steps")
         legend(figure, 2, panels[0])
     return figure

@@ -147,19 +147,19 @@ def waves_table(summary: FitSummary) -> TableView | None:
 
 def gap_table(gaps: Mapping[str, Gap | None]) -> TableView:
     """The gap between both estimators by its terms, of the directions that have one."""
-    found = {direction: gap for direction, gap in gaps.items() if gap is not None}
+    stated = {direction: gap for direction, gap in gaps.items() if gap is not None}
 
     def cell(term: GapTerm) -> str:
         return signed(term.value, term.sd)
 
     rows = [
-        ["classic mean", *(f"{gap.classic:.6f}" for gap in found.values())],
-        ["effective ratio (joint)", *(concise(gap.joint.value, gap.joint.sd) for gap in found.values())],
-        ["classic - joint", *(cell(gap.total) for gap in found.values())],
+        ["classic mean", *(f"{gap.classic:.6f}" for gap in stated.values())],
+        ["effective ratio (joint)", *(concise(gap.joint.value, gap.joint.sd) for gap in stated.values())],
+        ["classic - joint", *(cell(gap.total) for gap in stated.values())],
     ]
-    for number, term in enumerate(next(iter(found.values())).terms):
-        rows.append([f"  {term.name}", *(cell(gap.terms[number]) for gap in found.values())])
-    return TableView("why the classic differs from the joint, deg/step, value(u)", ["", *found], rows)
+    for number, term in enumerate(next(iter(stated.values())).terms):
+        rows.append([f"  {term.name}", *(cell(gap.terms[number]) for gap in stated.values())])
+    return TableView("why the classic differs from the joint, deg/step, value(u)", ["", *stated], rows)
 
 
 def hold_out_table(held: HoldOut) -> TableView | None:

@@ -216,16 +216,16 @@ def _mm(value: float) -> str:
 def warnings_of(e: Evidence) -> list[str]:
     """What must be known before the numbers are used; the verdict and what to do next say the rest."""
     summary = e.fit.summary
-    found = list(summary.problems)
+    warnings = list(summary.problems)
     if summary.estimator == "laplace":
-        found.append(LAPLACE_SHORT)
+        warnings.append(LAPLACE_SHORT)
     if e.campaign.header.get("synthetic"):
-        found.append("The campaign is synthetic: made by the digital twin, not measured.")
+        warnings.append("The campaign is synthetic: made by the digital twin, not measured.")
     if (note := assumed_stereo(e.campaign.stereo, e.shown.budgets)) is not None:
-        found.append(sentence(note))
-    found += [f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts]
-    found += [f"`check` warns: {sentence_in_words(text)}" for text in e.doubts]
-    return found
+        warnings.append(sentence(note))
+    warnings += [f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts]
+    warnings += [f"`check` warns: {sentence_in_words(text)}" for text in e.doubts]
+    return warnings
 
 
 def _steps(e: Evidence) -> list[str]:
@@ -234,19 +234,19 @@ def _steps(e: Evidence) -> list[str]:
     summary = e.fit.summary
     failed = not summary.explained
     causes = misfit_causes(e.campaign, summary.parameters["pixel_scale"].value) if failed else ()
-    found = steps_ahead(summary, folder, causes)
+    steps = steps_ahead(summary, folder, causes)
     if e.planned is not None and not e.planned.stop.now and e.planned.next:
         best = e.planned.next[0]
-        found.append(f"Look at {best.text} ({best.minutes:.1f} min): the best next four looks of the plan.")
+        steps.append(f"Look at {best.text} ({best.minutes:.1f} min): the best next four looks of the plan.")
     unmet = next((c for c in e.criteria if c.verdict != MET), None)
     if unmet is not None and e.planned is None and summary.explained:
         limit = f"{unmet.limit:g} {unmet.unit}"
         aim = f"u(worst) <= {limit}" if unmet.unit != "mm" else f"U95(x) at {e.range_mm:g},0,0 mm <= {limit}"
         given = f"`tvsbayes plan {folder}/rig.toml --given {folder} --target '{aim}'`"
-        found.append(f"Add looks until the limit is met; the fewest: {given}.")
-    if not found:
-        found.append("Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped.")
+        steps.append(f"Add looks until the limit is met; the fewest: {given}.")
+    if not steps:
+        steps.append("Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped.")
     if not e.criteria and e.fit.summary.converged:
         limit = f"`tvsbayes report {folder} --limit-mm 5`, or `--limit-deg-per-step 0.0005`"
-        found.append(f"State the largest error that you can bear, and the page says whether it is kept: {limit}.")
-    return found
+        steps.append(f"State the largest error that you can bear, and the page says whether it is kept: {limit}.")
+    return steps

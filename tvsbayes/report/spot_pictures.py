@@ -48,9 +48,9 @@ def spot_crops(campaign: Campaign, suspects: Sequence[int]) -> tuple[SpotCrop, .
     """Cut-outs of suspect spots first, then of others evenly chosen; none without frames, or where they are damaged."""
     if campaign.path is None or not (campaign.path / "frames").is_dir():
         return ()
-    seen = [spot for spot in campaign.spots if spot.status == "ok"]
-    doubted = [spot for spot in seen if spot.spot in set(suspects)][:LOOKS_SHOWN]
-    others = [spot for spot in seen if spot not in doubted]
+    usable = [spot for spot in campaign.spots if spot.status == "ok"]
+    doubted = [spot for spot in usable if spot.spot in set(suspects)][:LOOKS_SHOWN]
+    others = [spot for spot in usable if spot not in doubted]
     wanted = min(LOOKS_SHOWN - len(doubted), len(others))
     places = np.linspace(0, len(others) - 1, wanted).round().astype(int).tolist()
     return tuple(crop for spot in [*doubted, *(others[k] for k in places)] for crop in _crops(campaign.path, spot))

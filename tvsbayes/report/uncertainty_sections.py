@@ -111,9 +111,9 @@ def budgets_section(e: Evidence) -> Section:
 
 def _notes(e: Evidence) -> list[str]:
     """What the reader of a budget must know, each once."""
-    found = list(dict.fromkeys(note for table in e.shown.budgets for note in table.notes))
-    found += [f"a point {e.range_mm:g} mm away: {note}" for note in e.point.notes if note not in found]
-    return [sentence(note) for note in found]
+    notes = list(dict.fromkeys(note for table in e.shown.budgets for note in table.notes))
+    notes += [f"a point {e.range_mm:g} mm away: {note}" for note in e.point.notes if note not in notes]
+    return [sentence(note) for note in notes]
 
 
 def _pairs(tables: Sequence[BudgetTable]) -> list[list[BudgetTable]]:
@@ -149,22 +149,22 @@ def _gum_table(tables: Sequence[BudgetTable], caption: str) -> TableView:
     """Budgets beside each other, every input that matters to any of them; one alone in all columns of GUM 7.2.7."""
     alone = len(tables) == 1
     of_name = [{row.quantity: row for row in table.rows} for table in tables]
-    own = {name: [rows[name] for rows in of_name if name in rows] for rows in of_name for name in rows}
+    by_name = {name: [rows[name] for rows in of_name if name in rows] for rows in of_name for name in rows}
     names = list(dict.fromkeys(row.quantity for table in tables for row in _mattering(table)))
-    names.sort(key=lambda name: -max(row.share for row in own[name]))
+    names.sort(key=lambda name: -max(row.share for row in by_name[name]))
     rows = []
     for name in (*names, tables[0].rows[-1].quantity):
-        first, stated = own[name][0], [row for row in own[name] if row.u is not None]
+        first, stated = by_name[name][0], [row for row in by_name[name] if row.u is not None]
         # One number for all where all have it.
         cells = ["; ".join(dict.fromkeys(two_digits(row.u) for row in stated if row.u is not None))]
         cells.append("; ".join(dict.fromkeys(_freedom(row.dof) for row in stated)))
         if alone:
             cells = [first.distribution, *cells, "" if first.sensitivity is None else _digits(first.sensitivity)]
-        parts = [cell for found in of_name for cell in _contributed(found.get(name))]
+        parts = [cell for of_source in of_name for cell in _contributed(of_source.get(name))]
         rows.append([_named(first), first.kind, *cells, *parts])
     columns = ["source", "type", *(["distribution", "u", "dof", "sensitivity"] if alone else ["u", "dof"])]
     rows.insert(-1, [OTHERS, *[""] * (len(columns) - 1), *(c for table in tables for c in _others(table, names))])
-    if alone and any(row.share > 1 for each in own.values() for row in each):
+    if alone and any(row.share > 1 for each in by_name.values() for row in each):
         # GUM 5.2.2: with correlated inputs the cross terms are as real as the squares.
         caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations takes them back"
     parts_of = [""] if alone else [f", {table.quantity.rpartition('.')[2]}" for table in tables]
@@ -227,9 +227,9 @@ def axes_section(e: Evidence) -> Section:
         items += [note for note in axis.notes if note not in items and "plug-in" not in note]
     rows = []
     for name, (symbol, term) in FIGURES.items():
-        found = [(axis.predicted or {}).get(name) for axis in axes]
-        if any(figure is not None for figure in found):
-            cells = [cell for figure in found for cell in _figure_cells(figure)]
+        predictions = [(axis.predicted or {}).get(name) for axis in axes]
+        if any(figure is not None for figure in predictions):
+            cells = [cell for figure in predictions for cell in _figure_cells(figure)]
             rows.append([f"{_growing(term)} {_arrow(symbol)}", *cells])
     columns = ["figure", *(cell for axis in axes for cell in (f"{axis.axis}, median", f"{axis.axis}, 95 % interval"))]
     first = axes[0]

@@ -43,38 +43,38 @@ def moved_words(part: MovedPart) -> str:
     return f"{part.what} {concise(part.value, part.u)} {part.unit}"
 
 
-def watch_text(found: Watch, power_min: float) -> str:
+def watch_text(watch: Watch, power_min: float) -> str:
     """A watched calibration for people.
 
     Args:
-        found: the result.
+        watch: the result.
         power_min: below which a change counts as unseen.
     """
     rows = [
         [c.what, f"{c.size:g} {c.unit}", f"{100 * c.power:.0f} %", "< 1e-9" if c.p < 1e-9 else f"{c.p:.2g}"]
-        for c in found.changes
+        for c in watch.changes
     ]
     table = TableView(
-        f"{found.looks} new looks against the calibration", ["change", "of", "would be noticed by", "p"], rows
+        f"{watch.looks} new looks against the calibration", ["change", "of", "would be noticed by", "p"], rows
     )
-    p = "< 1e-9" if found.p < 1e-9 else f"= {found.p:.2g}"
-    lines = [f"{found.verdict} (p {p}; false alarms {100 * found.false_alarm_rate:g} %)"]
-    lines += [f"moved: {moved_words(part)}" for part in found.moved]
-    if any(abs(part.value) > LINEAR.get(part.unit, math.inf) for part in found.moved):
+    p = "< 1e-9" if watch.p < 1e-9 else f"= {watch.p:.2g}"
+    lines = [f"{watch.verdict} (p {p}; false alarms {100 * watch.false_alarm_rate:g} %)"]
+    lines += [f"moved: {moved_words(part)}" for part in watch.moved]
+    if any(abs(part.value) > LINEAR.get(part.unit, math.inf) for part in watch.moved):
         lines.append(
             "sizes are linear about the calibration: such large ones are rough, beyond the u that stands there"
         )
-    if found.verdict == MOVED:
-        causes = list(dict.fromkeys(part.what.split(":")[0] for part in found.moved))
+    if watch.verdict == MOVED:
+        causes = list(dict.fromkeys(part.what.split(":")[0] for part in watch.moved))
         lines.append(f"what to do: {MISSED[causes[0]]}")
         if len(causes) > 1:
             left = ", ".join(causes[1:])
             lines.append(f"then watch again: {left} takes up what the first leaves, and may not have moved itself")
-    unseen = found.unseen(power_min)
-    if found.verdict == CANNOT_TELL:
+    unseen = watch.unseen(power_min)
+    if watch.verdict == CANNOT_TELL:
         lines += [f"cannot see {c.size:g} {c.unit} of {c.what}: {HELPS[c.what]}" for c in unseen]
-    if found.verdict != MOVED and found.p_all < found.false_alarm_rate:
-        lines.append(f"warning: the looks scatter more than the calibration says (p = {found.p_all:.2g})")
+    if watch.verdict != MOVED and watch.p_all < watch.false_alarm_rate:
+        lines.append(f"warning: the looks scatter more than the calibration says (p = {watch.p_all:.2g})")
     return terminal(*lines, "", table)
 
 
