@@ -17,7 +17,6 @@ from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign_header import header_values, mechanism_of
 from tvsbayes.instrument.counter_limits import LIMIT_KEYS
 from tvsbayes.pipeline import StoredOrFitted
 from tvsbayes.progress import Job
@@ -177,6 +176,7 @@ def _sighting_files(found: ForeignSightings, to: Path, table: str) -> _SightingF
         InputError: a folder of another instrument, with rows, or with ratios that are none of an encoder.
     """
     from tvsbayes.instrument.campaign import MOVES, head_templates
+    from tvsbayes.instrument.campaign_header import mechanism_of
     from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
     from tvsbayes.instrument.sightings import SIGHTINGS
 
@@ -210,6 +210,8 @@ def _sighting_files(found: ForeignSightings, to: Path, table: str) -> _SightingF
 
 def _stated_priors(folder: Path) -> set[str]:
     """Names in [rig.prior] of a campaign folder."""
+    from tvsbayes.instrument.campaign_header import header_values
+
     rig = header_values(folder).get("rig")
     priors = rig.get("prior") if isinstance(rig, dict) else None
     return set(priors) if isinstance(priors, dict) else set()
