@@ -10,7 +10,7 @@ import pytest
 from support.waits import check_forward
 
 from tvsbayes import progress
-from tvsbayes.progress import FORESEEN_SECONDS, FORESEEN_SHARE, DelayedDisplay, Job, OpenEnded, Progress
+from tvsbayes.progress import EXPECTED_SECONDS, EXPECTED_SHARE, DelayedDisplay, Job, OpenEnded, Progress
 
 ROUNDING = 2.0**-50
 """Of a sum of a few shares near 1, four units of float64's last place."""
@@ -65,7 +65,7 @@ def test_time_left_of_an_even_job_is_right_from_the_beginning():
     """A hundred steps of half a second: 50 s less what has passed, once there is something to predict by."""
     told = followed({"all": 1.0}, [(0.5, (k + 1) / 100) for k in range(100)])
     known = [state for state in told if state.seconds_left is not None]
-    assert known[0].share >= FORESEEN_SHARE and known[0].seconds >= FORESEEN_SECONDS and len(known) >= 99
+    assert known[0].share >= EXPECTED_SHARE and known[0].seconds >= EXPECTED_SECONDS and len(known) >= 99
     for state in known:
         assert state.seconds_left == pytest.approx(50 - state.seconds, abs=1e-9), "50 s, shares rounded to 1e-16"
     check_forward(told)
@@ -80,7 +80,7 @@ def test_time_left_of_an_uneven_job_rises_with_the_clock_at_most():
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_what_was_not_needed_foretells_nothing(asked):
+def test_what_was_not_needed_predicts_nothing(asked):
     """Ten steps of a second each, after a stage of nine tenths whose result was there already."""
     clock, told = Clock(), []
     with Job({"fit": 9.0, "work": 1.0, "more": 0.0}, told.append, clock) as job:

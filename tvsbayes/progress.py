@@ -37,10 +37,10 @@ Show = Callable[[Progress], None]
 """Takes the news of a wait."""
 Advance = Callable[[float], None]
 """Takes the share of a stage that is done, from 0 to 1."""
-FORESEEN_SHARE, FORESEEN_SECONDS = 0.02, 0.5
+EXPECTED_SHARE, EXPECTED_SECONDS = 0.02, 0.5
 """Share done and time passed from which the rest is predicted."""
 MEMORY = 0.2
-"""Part of the time passed over which the speed is averaged: stages are not equally well foreseen."""
+"""Part of the time passed over which the speed is averaged: stages are not equally well predicted."""
 EXPECTED_LAST = 0.8
 """Of what is left of a stage of unknown length, the share that ends at the length expected now: it may not suffice."""
 
@@ -219,9 +219,9 @@ class Job:
             return 0.0
         before, passed = self._told.seconds_left, seconds - self._told.seconds
         worked = share - self._skipped
-        if before is None and (worked < FORESEEN_SHARE or seconds < FORESEEN_SECONDS):
+        if before is None and (worked < EXPECTED_SHARE or seconds < EXPECTED_SECONDS):
             return None
-        now = seconds * (1 - share) / max(worked, FORESEEN_SHARE)
+        now = seconds * (1 - share) / max(worked, EXPECTED_SHARE)
         if before is None:
             return now
         expected = max(before - passed, 0.0)

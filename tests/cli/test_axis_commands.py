@@ -98,7 +98,7 @@ def test_options_of_scanners_are_refused(ask, folder, tmp_path, line):
         assert "is an axis folder" in document["error"]["message"] and "report" in document["error"]["remedy"]
 
 
-def test_two_positions_leave_nothing_to_foretell(ask, tmp_path):
+def test_two_positions_leave_nothing_to_predict(ask, tmp_path):
     moves = runs(2, (0.0, 1000.0), 0.0)
     write_axis(campaign(moves, [0.01 * m.command for m in moves]), tmp_path / "two")
     code, document = ask("compare", tmp_path / "two")

@@ -44,7 +44,7 @@ def test_regions_of_one_counter_ask_for_another_counter(paper_fit, monkeypatch):
     assert "start at one counter" in reason and "second starting counter" in reason and "|N|" not in reason
 
 
-def test_joint_foretells_a_step_count_it_never_saw(mixed_fit):
+def test_joint_predicts_a_step_count_it_never_saw(mixed_fit):
     told = []
     held = hold_out(mixed_fit, progress=told.append)
     check_forward(told)
@@ -111,7 +111,7 @@ def test_a_fold_without_a_fit_decides_nothing(mixed_fit, monkeypatch):
     assert held.verdict == CANNOT_TELL and "the fit ran away" in held.reason and not held.predictions
 
 
-def test_few_experiments_foretell_with_the_width_of_their_own_scatter():
+def test_few_experiments_predict_with_the_width_of_their_own_scatter():
     """Two others of known ratio and normal scatter: Student's t with 1 dof covers 95 %, the normal would 71 %."""
     sets = 4000
     generator = np.random.default_rng(21)

@@ -187,7 +187,7 @@ def test_a_stage_has_the_normal_equations_of_the_dense_marginal_problem(varying,
     np.testing.assert_allclose(root.T @ root, curvature, atol=ALGEBRA * np.abs(curvature).max())
 
 
-def test_scales_of_nought_are_perfect_gears(varying, dozen, evaluate):
+def test_scales_of_zero_are_perfect_gears(varying, dozen, evaluate):
     """With all scales zero the density is that of a campaign that has no places at all."""
     table = perfect_gears(dozen.campaign.rig)
     assert not campaign_arrays(dozen.campaign, table).gears.filled

@@ -159,7 +159,7 @@ def test_plan_of_a_watch_needs_no_sheet(ask, known_head, tmp_path):
     assert {step.action for step in steps} == {"home", "move", "look"}
 
 
-def test_a_plan_foretells_what_the_fit_reports(known_head):
+def test_a_plan_predicts_what_the_fit_reports(known_head):
     """The covariance expected of the plan that was run, beside that of its fit: within a third, with 32 looks."""
     folder, _ = known_head
     knowledge = prior_knowledge(head_rig())

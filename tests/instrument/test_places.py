@@ -134,7 +134,7 @@ def test_through_one_counter_there_is_no_line():
     assert not line_share(seen, np.array([True, False])).any()
 
 
-def test_gears_vary_where_a_scale_may_be_above_nought():
+def test_gears_vary_where_a_scale_may_be_above_zero():
     still = perfect_gears(RigTable())
     assert not gears_vary(still) and gears_vary(varying_gears(RigTable(), periods=False))
     for name in ("transmission_error_deg.tilt", "play_variation_deg.pan", "harmonic_amplitude_deg.tilt.1"):

@@ -51,7 +51,7 @@ def test_concise_shows_two_digits_of_the_uncertainty(value, sd, expected):
         (math.inf, "inf"),
     ],
 )
-def test_uncertainties_have_two_digits_a_nought_among_them(u, expected):
+def test_uncertainties_have_two_digits_a_zero_among_them(u, expected):
     assert two_digits(u) == expected
 
 

@@ -32,7 +32,7 @@ def test_a_play_that_cannot_be_told_is_its_prior(summary):
     assert any("backlash is not determined" in text for text in summary.weak_directions)
 
 
-def test_shares_told_lie_between_nought_and_one_hundred(summary):
+def test_shares_told_lie_between_zero_and_one_hundred(summary):
     wider = structs.replace(summary.parameters["ratio_contrast"], contraction=-1.0)
     hardly = structs.replace(wider, contraction=-0.001)
     shown = parameter_table(

@@ -32,7 +32,7 @@ def test_the_line_is_that_of_least_squares():
     np.testing.assert_allclose(stated, [solved[1], u[1], solved[2], u[2], scatter], rtol=1e-9)
 
 
-def test_what_rows_of_one_side_cannot_tell_is_nought():
+def test_what_rows_of_one_side_cannot_tell_is_zero():
     rows = rows_with(2)
     forward = fit_line(rows, rows.side > 0)
     slope, offset = np.polyfit((rows.command - rows.command.mean())[rows.side > 0], rows.value[rows.side > 0], 1)

@@ -119,7 +119,7 @@ def test_an_axis_without_a_ratio_is_refused():
     assert "per_command" in caught.value.remedy
 
 
-def test_a_reading_of_nought_says_how_far_a_command_goes():
+def test_a_reading_of_zero_says_how_far_a_command_goes():
     moves = runs(1, (0.0, 100.0), 0.0)
     made = simulate_axis(campaign(moves, [0.02 * m.command for m in moves]))
     # A line through points that lie on it.

@@ -48,7 +48,7 @@ CLASSIC_DRAWS = 256
 SEEN_SHARE = 0.5
 """Of the draws that must show an experiment, for it to count: one draw that went astray drops none."""
 LENGTH_NAMES = names_of("transmission_error_length_deg")
-ABSENT_AT_NOUGHT = tuple(
+ABSENT_AT_ZERO = tuple(
     name
     for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
     if name not in (*LENGTH_NAMES, *names_of("creep_minutes"))
@@ -126,7 +126,7 @@ class _Source:
 def _absent(fit: JointFit) -> set[str]:
     """What the model does not have of errors of the gears, scatter of looks and shifts of the zeros, or means not."""
     value = dict(zip(fit.names, np.asarray(fit.mode.physical).tolist(), strict=True))
-    none = {name for name in ABSENT_AT_NOUGHT if not fit.free[INDEX[name]] and value[name] == 0}
+    none = {name for name in ABSENT_AT_ZERO if not fit.free[INDEX[name]] and value[name] == 0}
     for axis in AXES:
         if {f"transmission_error_deg.{axis}", f"play_variation_deg.{axis}"} <= none:
             none.add(f"transmission_error_length_deg.{axis}")

@@ -38,10 +38,10 @@ def weighed(axes: Sequence[str], evidence: Callable[[Sides], float]) -> tuple[We
     """
     open_sides = dict.fromkeys(axes, ANYWHERE)
     alone = {axis: {side: evidence({**open_sides, axis: side}) for side in ways(axis)} for axis in axes}
-    foreseen = [(sides, sum(alone[axis][side] for axis, side in sides.items())) for sides in every_way(axes)]
-    highest = max(value for _, value in foreseen)
-    told = [(sides, evidence(sides)) for sides, value in foreseen if value > highest + np.log(WORTH_A_FIT)]
-    values = np.array([value for _, value in told])
+    expected = [(sides, sum(alone[axis][side] for axis, side in sides.items())) for sides in every_way(axes)]
+    highest = max(value for _, value in expected)
+    likely = [(sides, evidence(sides)) for sides, value in expected if value > highest + np.log(WORTH_A_FIT)]
+    values = np.array([value for _, value in likely])
     chance = np.exp(values - values.max())
     chance /= chance.sum()
-    return tuple(WeighedWay(told[k][0], float(chance[k])) for k in np.argsort(-chance))
+    return tuple(WeighedWay(likely[k][0], float(chance[k])) for k in np.argsort(-chance))

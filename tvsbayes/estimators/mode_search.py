@@ -54,7 +54,7 @@ HUBER_CORE = 0.8214
 """Share of clean spots with full weight: P(|z| < 1.345), the constant of 95 % efficiency (Huber 1964)."""
 ROUNDS_MAX, WEIGHTS_SETTLED = 20, 0.02
 """Rounds of the robust option, and the largest change of a weight at which they end."""
-ALTERNATIONS_MAX, ROUNDS_FORESEEN = 6, 6
+ALTERNATIONS_MAX, ROUNDS_EXPECTED = 6, 6
 """Of geometry and noise in turn at most, and rounds of the robust option as progress predicts them."""
 COMPILING, SEARCHING = "compiling the model", "searching the mode"
 COMPILED_SECONDS, SEARCHED_SECONDS = 40.0, 1.0
@@ -217,7 +217,7 @@ class Problem:
 
         `job` has the stages of `search_stages`.
         """
-        z, passes = np.zeros(len(NAMES)), len(ANNEALING) + 1 + (ROUNDS_FORESEEN if robust else 0)
+        z, passes = np.zeros(len(NAMES)), len(ANNEALING) + 1 + (ROUNDS_EXPECTED if robust else 0)
         job.begin(COMPILING)
         for number, inflation in enumerate(ANNEALING, 1):
             z = self.least_squares(z, inflation)

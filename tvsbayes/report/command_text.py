@@ -81,7 +81,7 @@ def held_text(document: Mapping[str, Any], sightings: bool = False) -> str:
     ]
     parts: list[Part] = [TableView(document["kind"], [], rows)]
     if "expected" in document:
-        parts.append(_foreseen_table(document["expected"], document["contraction"]))
+        parts.append(_expected_table(document["expected"], document["contraction"]))
     if (journal := document.get("journal")) is not None:
         rows = [[key, _held_value(value)] for key, value in journal.items() if key != "kind"]
         parts.append(TableView("journal of the run", [], rows))
@@ -102,7 +102,7 @@ def _held_value(value: Any) -> str:
     return "not known" if value is None else escaped(str(value), 400)
 
 
-def _foreseen_table(expected: Mapping[str, float], contraction: Mapping[str, float | None]) -> TableView:
+def _expected_table(expected: Mapping[str, float], contraction: Mapping[str, float | None]) -> TableView:
     """What a plan will tell: u of every result, and how much of the prior variance it takes away."""
     rows = []
     for name, u in expected.items():

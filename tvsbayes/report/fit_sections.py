@@ -306,7 +306,7 @@ def validation_section(e: Evidence) -> Section:
         checks = sampling_line(sampling), agreement_line(sampling)
         text += [f"{line}." for line in checks if line is not None]
         items += [f"not reached: {sentence}" for sentence in sampling.missing]
-    tables.append(_foretold(e))
+    tables.append(_predicted(e))
     if e.held_out is None:
         text.append(
             "Held-out experiments: not computed; run the command compare on the campaign and make the report again."
@@ -319,7 +319,7 @@ def validation_section(e: Evidence) -> Section:
     return Section("Validation", text, items, tables)
 
 
-def _foretold(e: Evidence) -> TableView | None:
+def _predicted(e: Evidence) -> TableView | None:
     """What the model says of the classic estimator beside what that says."""
     rows = []
     for direction, predicted in e.fit.summary.classic_predicted.items():

@@ -119,7 +119,7 @@ def digest_number(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:NUMBER_DIGITS].upper()
 
 
-MINUS, NOUGHT = re.compile(r"(?<![\w.)/-])-(?=\d)"), re.compile(r"(?<![\w.])[-\u2212](0(?:\.0+)?)(?![\d.(])")
+MINUS, MINUS_ZERO = re.compile(r"(?<![\w.)/-])-(?=\d)"), re.compile(r"(?<![\w.])[-\u2212](0(?:\.0+)?)(?![\d.(])")
 SIGNS = (("+-", "\u00b1"), ("<=", "\u2264"), (">=", "\u2265"))
 
 
@@ -127,7 +127,7 @@ def typeset(text: str) -> str:
     """Text with true signs: minus before numbers, plus-minus, not more than, and no minus before zero."""
     for plain, sign in SIGNS:
         text = text.replace(plain, sign)
-    return MINUS.sub("\u2212", NOUGHT.sub(r"\1", text))
+    return MINUS.sub("\u2212", MINUS_ZERO.sub(r"\1", text))
 
 
 def prose(text: str) -> Markup:

@@ -43,7 +43,7 @@ COMMAND_MAX = 1e12
 """Of a command or a reading, either sign."""
 TURNS = {**{unit: 360.0 / in_deg for unit, in_deg in DEGREES.items()}, "turn": 1.0}
 """One turn in the units of angles."""
-_NEVER_NOUGHT = ("transmission_error_length", "reading_scale", "creep_minutes", "seeing_s")
+_NEVER_ZERO = ("transmission_error_length", "reading_scale", "creep_minutes", "seeing_s")
 """Log-normals that the model divides by: held at 0, every density is without a value."""
 PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
 """Keys of `[axis]` that ask for waves."""
@@ -272,7 +272,7 @@ def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
         entry = keys.table(name)
         if kind == "half-normal" and value and u:
             raise entry.refuse("value", "half-normal", "0 where u is not 0", "give the scale as u, or fix it by u = 0")
-        if kind == "log-normal" and not value and (u or name in _NEVER_NOUGHT):
+        if kind == "log-normal" and not value and (u or name in _NEVER_ZERO):
             raise entry.refuse("value", "log-normal", "a positive median", "u is the sd of the logarithm")
         if name == "per_command" and not value:
             raise entry.refuse("value", "zero", "a number other than 0", "state what one command does, or leave it out")

@@ -46,7 +46,7 @@ def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray
 
 
 @dataclass(frozen=True)
-class _Foretold:
+class _Prediction:
     """Of the rows left out: mean (rows,), covariance (rows, rows), and what is wrong with them, or ""."""
 
     mean: np.ndarray
@@ -54,7 +54,7 @@ class _Foretold:
     fault: str = ""
 
 
-def _reweighted(model: AxisModel, w: np.ndarray, left: np.ndarray) -> _Foretold | None:
+def _reweighted(model: AxisModel, w: np.ndarray, left: np.ndarray) -> _Prediction | None:
     """By draws (n, d) of the posterior of all rows, weighted by what each makes of those left out.
 
     None where the weights cannot be trusted. Leave-one-out by importance (Vehtari, Gelman and Gabry, Stat. Comput. 27
@@ -64,16 +64,16 @@ def _reweighted(model: AxisModel, w: np.ndarray, left: np.ndarray) -> _Foretold 
     smooth = smoothed_weights(-stops.log_densities(model.rows.value[left]))
     if not smooth.pareto_k < K_MAX or effective_draws(smooth.weights) < WEIGHED_MIN:
         return None
-    return _Foretold(*stops.pooled(smooth.weights))
+    return _Prediction(*stops.pooled(smooth.weights))
 
 
-def _refitted(model: AxisModel, out: np.ndarray, seed: int) -> _Foretold:
+def _refitted(model: AxisModel, out: np.ndarray, seed: int) -> _Prediction:
     """By a fit of the rows that are not left out."""
     without = AxisModel.of(model.rows.without(out), model.priors, None, model.coordinates.waves)
     rng = random_stream(seed, AxisStream.HELD_OUT)
     drawn = _drawn(without, DRAWS, seed, rng)
     w = carried_scales(without, drawn.w, model, rng)
-    return _Foretold(*PredictedStops(*model.left_out(w, np.flatnonzero(out)), {}).pooled(), drawn.fault)
+    return _Prediction(*PredictedStops(*model.left_out(w, np.flatnonzero(out)), {}).pooled(), drawn.fault)
 
 
 def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | None = None) -> AxisHoldOut:
