@@ -6,8 +6,9 @@ AXES holds tables of ISO 230-2 runs as `experiments.real.axis_files` takes them;
 of a geared axis with an encoder (`place_deg`, `side`, `repeat`, `time_s`, `encoder_counts`); a visit is a repeat. Of
 every reading left out the error is counted: as it is, from the nominal line through the others (offset alone); after
 taking off one constant play; the mean of the others at its command and side; what the table of `compensate` expects
-there, which is for a machine that was homed anew; and what the same fit expects there at its own time, the walk of the
-zero followed. Nothing was homed in between, so that `home_sd` is 0; a zero that warms up is no matter of a table.
+there, which is for a machine that was homed anew; the same with the zero of the others, as the constant play has it,
+since nothing was homed here; and what the fit expects at its own time, the walk of the zero followed. `home_sd` is 0; a
+zero that warms up is no matter of a table.
 """
 
 from __future__ import annotations
@@ -67,6 +68,7 @@ class LeftOut:
     constant: np.ndarray
     means: np.ndarray
     table: np.ndarray
+    zeroed: np.ndarray
     followed: np.ndarray
     promised: np.ndarray
 
@@ -94,6 +96,7 @@ def left_out(campaign: AxisCampaign, visits: Sequence[int], visit: int) -> LeftO
         constant=(error - line @ solved)[out],
         means=error[out] - means,
         table=(value - expected)[out],
+        zeroed=(value - expected)[out] - (value - expected)[~out].mean(),
         followed=value[out] - _followed(results.fit, campaign, at[out]),
         promised=promised[out],
     )
@@ -112,7 +115,7 @@ def _followed(fit: AxisFit, campaign: AxisCampaign, moves: np.ndarray) -> np.nda
 def row_of(name: str, unit: str, campaign: AxisCampaign, visits: Sequence[int]) -> str:
     """A line of the table: all visits left out in turn."""
     each = [left_out(campaign, visits, visit) for visit in sorted(set(visits))]
-    names = ("before", "constant", "means", "table", "followed", "promised")
+    names = ("before", "constant", "means", "table", "zeroed", "followed", "promised")
     *errors, promised = (np.concatenate([getattr(one, part) for one in each]) for part in names)
     table = errors[3]
     inside = float(np.mean(np.abs(table) <= promised))
@@ -131,8 +134,9 @@ def main() -> None:
     print(
         "By `experiments.compensation.real_visits`. RMS of the errors of readings left out; promised: 95 %, median.\n"
     )
-    print("| axis | unit | before | one constant play | means of others | table | at its time | promised | inside |")
-    print("|" + "---|" * 9)
+    names = ("axis", "unit", "before", "one constant play", "means of others", "table", "its zero that of the others")
+    print("| " + " | ".join([*names, "at its time", "promised", "inside"]) + " |")
+    print("|" + "---|" * 10)
     for table in tables_of(arguments.axes):
         print(row_of(table.stem, "um", *linear_axis(table)), flush=True)
     print(row_of("rotary", "mdeg", *rotary_axis(arguments.rotary)), flush=True)
