@@ -82,6 +82,16 @@ class ForeignTable:
     def __len__(self) -> int:
         return len(self.lines)
 
+    def require_rows(self) -> None:
+        """Refuse a table of names alone.
+
+        Raises:
+            InputError: there is no row.
+        """
+        if not self.lines:
+            found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
+            raise refusal("empty", file=self.file, found=found, allowed="at least one row", remedy=remedy)
+
     def refuse(self, row: int, column: str, allowed: str, remedy: str) -> InputError:
         """The error of one cell."""
         cell = self.columns[column][row]

@@ -12,7 +12,6 @@ from typing import cast
 
 import numpy as np
 
-from tvsbayes.errors import refusal
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.foreign_table import ForeignTable
 from tvsbayes.instrument.axes import AXES, Axis
@@ -110,9 +109,7 @@ def sightings_of_table(
     Raises:
         InputError: a cell that is no value of its field, or no row.
     """
-    if not len(table):
-        found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
-        raise refusal("empty", file=table.file, found=found, allowed="at least one row", remedy=remedy)
+    table.require_rows()
     assumed: list[str] = []
     plain = _plain_numbers(table, columns, notation, assumed)
     table, units = plain.table, plain.units

@@ -155,9 +155,7 @@ def looks_of(
         InputError: a cell that is no value of its field; looks whose moves nobody knows.
     """
     cells = FieldCells(table, columns)
-    if not len(table):
-        found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
-        raise refusal("empty", file=table.file, found=found, allowed="at least one row", remedy=remedy)
+    table.require_rows()
     assumed: list[str] = []
     moves: tuple[Move, ...] | None = None
     if all(field in cells for field in COUNTERS):

@@ -169,9 +169,7 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: boo
     Raises:
         InputError: a cell that is no value of its field, or no row.
     """
-    if not len(table):
-        found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
-        raise refusal("empty", file=table.file, found=found, allowed="at least one row", remedy=remedy)
+    table.require_rows()
     assumed: list[str] = []
     table, unit = _plain(table, columns, assumed)
     cells = FieldCells(table, columns)
