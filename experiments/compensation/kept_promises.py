@@ -25,7 +25,8 @@ from experiments.common.command_line import act, study_parser
 from experiments.common.rows import git, output, read_rows, run_rows
 from experiments.compensation.drawn_axes import fresh_moves, read, stands, up_and_down
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.compensation.promise import Wish, compensation_of
+from tvsbayes.compensation.formats import Wish
+from tvsbayes.compensation.promise import compensation_of
 from tvsbayes.compensation.verification import SCENARIOS, verify_readings
 from tvsbayes.errors import TvsError
 from tvsbayes.results.compensation_record import APPLIED, BROKEN, KEPT, OTHER_MACHINE, WORLDS

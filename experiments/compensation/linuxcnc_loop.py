@@ -27,7 +27,8 @@ from msgspec import structs
 from experiments.common.command_line import print_only
 from experiments.compensation.drawn_axes import fresh_moves, read, stands, up_and_down
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.compensation.promise import Wish, compensation_of, file_text
+from tvsbayes.compensation.formats import Wish
+from tvsbayes.compensation.promise import compensation_of, file_text
 from tvsbayes.compensation.verification import verify_readings
 from tvsbayes.results.compensation_record import TableRow
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove

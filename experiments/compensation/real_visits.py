@@ -22,7 +22,8 @@ import numpy as np
 
 from experiments.common.command_line import parser
 from experiments.common.printed_runs import axis_of, tables_of
-from tvsbayes.compensation.promise import Wish, compensation_of
+from tvsbayes.compensation.formats import Wish
+from tvsbayes.compensation.promise import compensation_of
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import AxisModel

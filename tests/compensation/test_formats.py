@@ -13,8 +13,8 @@ from msgspec import structs
 from support.compensated import results, table
 
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.compensation.formats import CSV_COLUMNS, FORMATS, Origin
-from tvsbayes.compensation.promise import Wish, compensation_of
+from tvsbayes.compensation.formats import CSV_COLUMNS, FORMATS, Origin, Wish
+from tvsbayes.compensation.promise import compensation_of
 
 ORIGIN = Origin("tvsbayes of a test", "0123456789abcdef" * 4)
 WISHES = {

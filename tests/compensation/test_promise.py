@@ -10,7 +10,8 @@ from msgspec import structs
 from support.compensated import driven, results, table, to_and_fro, true_axis
 
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.compensation.promise import Since, Wish, compensate, compensation_of
+from tvsbayes.compensation.formats import Wish
+from tvsbayes.compensation.promise import Since, compensate, compensation_of
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.single_axis.axis_campaign import AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
@@ -81,7 +82,7 @@ def test_time_and_travel_since_homing_are_the_longest_segment():
         (Wish("csv", in_force=3.0), "--in-force"),
         (Wish("csv", per_command=-1.0), "--per-command"),
         (Wish("csv", resolution=float("nan")), "--resolution"),
-        (Wish("pec"), "--period"),
+        (Wish("pec"), "needs a period"),
         (Wish("pec", period=4.0), "eight positions"),
     ],
 )

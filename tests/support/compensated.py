@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.compensation.promise import Wish, compensation_of
+from tvsbayes.compensation.formats import Wish
+from tvsbayes.compensation.promise import compensation_of
 from tvsbayes.results.compensation_record import Compensation
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_parameters import AxisPrior

@@ -62,7 +62,9 @@ def compensate(
         float | None, typer.Option("--in-force", help="Value of $100 or rotation_distance that is set now.")
     ] = None,
     letter: Annotated[str, typer.Option("--letter", help="Axis in settings of grbl: X, Y, Z, A, B or C.")] = "X",
-    period: Annotated[float | None, typer.Option("--period", help="Of a pec table, in commands.")] = None,
+    period: Annotated[
+        float | None, typer.Option("--period", help="Of a pec table, in commands (strongest wave).")
+    ] = None,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -72,7 +74,8 @@ def compensate(
     header` gives its calibration for a microcontroller; its promise is that of `locate`. Of a pan-tilt head `--to urdf`
     gives its model: zeros, axes and reductions of the joints, and beside it YAML with their covariance.
     """
-    from tvsbayes.compensation.promise import Wish, checked, compensation_of, file_beside, file_text
+    from tvsbayes.compensation.formats import Wish, checked
+    from tvsbayes.compensation.promise import compensation_of, file_beside, file_text
     from tvsbayes.report.compensation_text import compensation_text
     from tvsbayes.results.compensation_record import COMPENSATION_FORMAT
     from tvsbayes.results.fit_record import provenance
@@ -119,7 +122,8 @@ def compensate(
     if out is None:
         text += f"\nnothing written: give -o FILE; it would hold:\n\n{file_text(made, data)}".rstrip("\n")
     else:
-        text += f"\nnext: apply it, then {command_line('verify', campaign, 'FRESH')}"
+        following = made.shown_by if made.in_motion else command_line("verify", campaign, "FRESH")
+        text += f"\nnext: apply it, then {following}"
     finish({**document, "files": files}, text, as_json)
 
 

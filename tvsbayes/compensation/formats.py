@@ -14,7 +14,8 @@ from typing import Literal
 import numpy as np
 
 from tvsbayes.compensation.correction import Correction
-from tvsbayes.results.compensation_record import Compensation
+from tvsbayes.errors import InputError
+from tvsbayes.results.compensation_record import AppliedBy, Compensation
 
 Holds = Literal["table", "ratio and play", "ratio", "period"]
 LINUXCNC_DECIMALS = 7
@@ -50,7 +51,7 @@ def stated(made: Compensation, origin: Origin) -> list[str]:
         f"compensation by {plainly(origin.text)}, data {origin.data_sha256[:16]}",
         f"machine: {plainly(made.machine) or 'not named'}; unit {unit}",
         f"for commands from {number(low)} to {number(high)}",
-        "state when this was written: applied to nothing; apply it once, in one place; then run tvsbayes verify",
+        f"state when this was written: applied to nothing; apply it once, in one place; then {made.shown_by}",
         f"to be applied by the {made.applied_by}",
         f"aim: reading = {number(made.offset)} + {number(made.per_command)} x command",
         "sense: what is added to a command is (aim - reading expected) / (reading per command)",
@@ -58,10 +59,13 @@ def stated(made: Compensation, origin: Origin) -> list[str]:
     for side, left in made.promise.items():
         before = f"{left.without95:.3g} without"
         lines.append(f"promise, arriving {side}: 95 % of errors at most {left.error95:.3g} {unit} ({before})")
-    lines += [
-        f"within {made.hours:.3g} h and {number(made.travel_command, 4)} commands of travel since homing",
-        f"arrive with at least {number(made.reversal_command, 4)} commands of travel on a side",
-    ]
+    if made.in_motion:
+        lines.append("within one period, off the drive's own line, but for one shift")
+    else:
+        lines += [
+            f"within {made.hours:.3g} h and {number(made.travel_command, 4)} commands of travel since homing",
+            f"arrive with at least {number(made.reversal_command, 4)} commands of travel on a side",
+        ]
     return lines + [plainly(text) for text in made.unsaid]
 
 
@@ -204,7 +208,7 @@ PHASES = 64
 
 
 def _pec(made: Compensation, origin: Origin) -> str:
-    period, low = made.settings["period_command"], made.range_command[0]
+    period, low = made.settings["period_command"], made.table[0].command
     phase = np.arange(PHASES) / PHASES
     at = low + (phase * period - low) % period
     added = Correction.of(made).sent(at, np.zeros(PHASES)) - at
@@ -262,5 +266,55 @@ FORMATS: Mapping[str, Format] = {
         unsaid=("a URDF knows zero and ratio: play and error by position stay",),
         beside=_urdf_yaml,
     ),
-    "pec": Format("period", _pec, unsaid=("a period's table knows no play, and only what repeats with the period",)),
+    "pec": Format("period", _pec, unsaid=("a table of one period knows no play, and only what repeats with it",)),
 }
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a compensation is to be; fields as the options of `compensate`.
+
+    Attributes:
+        target: format, a name in `FORMATS`.
+        applied_by: who adds the corrections.
+        per_command: reading per command that is aimed at; None for that of `[axis]`, 1 or -1 where commands count in
+            the unit of readings, else the fit's.
+        resolution: least command that is carried out; 0 where it is fine.
+        in_force: setting in force, of formats that change one.
+        letter: of the axis, in the settings of grbl: X, Y, Z, A, B or C.
+        period: of a period's table, in commands; None for that of the strongest wave.
+    """
+
+    target: str = "csv"
+    applied_by: AppliedBy = "controller"
+    per_command: float | None = None
+    resolution: float = 0.0
+    in_force: float | None = None
+    letter: str = "X"
+    period: float | None = None
+
+
+def checked(wish: Wish) -> Format:
+    """The format that is wanted.
+
+    Raises:
+        InputError: it is unknown, or a number that it needs is missing or impossible.
+    """
+    form = FORMATS.get(wish.target)
+    if form is None:
+        allowed = ", ".join(FORMATS)
+        remedy = f"name one of {allowed}"
+        raise InputError("format", f"--to {wish.target[:60]!r}: unknown", allowed=allowed, remedy=remedy)
+    if not (np.isfinite(wish.resolution) and wish.resolution >= 0):
+        raise InputError("usage", f"--resolution {wish.resolution:g}", allowed="0 or more", remedy="give commands")
+    if form.in_force and wish.in_force is None:
+        message = f"--to {wish.target} changes a setting, and nothing says which value {form.in_force} has now"
+        raise InputError("usage", message, remedy=f"add --in-force with the value of {form.in_force} in force")
+    if wish.in_force is not None and not 0 < wish.in_force < np.inf:
+        remedy = "give the value without a sign: which way the axis runs is another setting"
+        raise InputError("usage", f"--in-force {wish.in_force:g}", allowed="more than 0", remedy=remedy)
+    if wish.in_force is not None and not form.in_force:
+        raise InputError("usage", f"--in-force is not for --to {wish.target}", remedy="leave it out")
+    if wish.period is not None and form.holds != "period":
+        raise InputError("usage", f"--to {wish.target} takes no --period", remedy="leave it out")
+    return form

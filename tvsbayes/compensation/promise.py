@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,17 +17,18 @@ import numpy as np
 from msgspec import structs
 
 from tvsbayes.compensation.correction import Correction, Cycles, cycles
-from tvsbayes.compensation.formats import FORMATS, LINUXCNC_DECIMALS, Format, Origin, number
+from tvsbayes.compensation.formats import FORMATS, LINUXCNC_DECIMALS, Format, Origin, Wish, checked, number
+from tvsbayes.compensation.periodic_error import drive_compensation, period_of
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.progress import Job, Show
-from tvsbayes.results.compensation_record import AppliedBy, Compensation, SidePromise, TableRow
+from tvsbayes.results.compensation_record import Compensation, SidePromise, TableRow
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hashes, read_axis
 from tvsbayes.single_axis.axis_density import line_weights
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_of
 from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
-from tvsbayes.statistics.intervals import NORMAL_95
+from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
 from tvsbayes.statistics.streams import Stream, random_stream
 
 NODES_FEW, NODES_MANY = 13, 41
@@ -42,30 +43,6 @@ ONE_SIDED = "every stop was read from one side: the play is not known, and what 
 RUNS_MAX = 20
 """Up and down, in a prediction: a longer travel is not followed."""
 SIDES = (("forward", 1), ("backward", -1))
-
-
-@dataclass(frozen=True)
-class Wish:
-    """What a compensation is to be; fields as the options of `compensate`.
-
-    Attributes:
-        target: format, a name in `FORMATS`.
-        applied_by: who adds the corrections.
-        per_command: reading per command that is aimed at; None for that of `[axis]`, 1 or -1 where commands count in
-            the unit of readings, else the fit's.
-        resolution: least command that is carried out; 0 where it is fine.
-        in_force: setting in force, of formats that change one.
-        letter: of the axis, in the settings of grbl: X, Y, Z, A, B or C.
-        period: of a period's table, in commands.
-    """
-
-    target: str = "csv"
-    applied_by: AppliedBy = "controller"
-    per_command: float | None = None
-    resolution: float = 0.0
-    in_force: float | None = None
-    letter: str = "X"
-    period: float | None = None
 
 
 @dataclass(frozen=True)
@@ -142,35 +119,6 @@ def _nominal(campaign: AxisCampaign, fitted: float, wish: Wish) -> float:
     return fitted
 
 
-def checked(wish: Wish) -> Format:
-    """The format that is wanted.
-
-    Raises:
-        InputError: it is unknown, or a number that it needs is missing or impossible.
-    """
-    form = FORMATS.get(wish.target)
-    if form is None:
-        allowed = ", ".join(FORMATS)
-        remedy = f"name one of {allowed}"
-        raise InputError("format", f"--to {wish.target[:60]!r}: unknown", allowed=allowed, remedy=remedy)
-    if not (np.isfinite(wish.resolution) and wish.resolution >= 0):
-        raise InputError("usage", f"--resolution {wish.resolution:g}", allowed="0 or more", remedy="give commands")
-    if form.in_force and wish.in_force is None:
-        message = f"--to {wish.target} changes a setting, and nothing says which value {form.in_force} has now"
-        raise InputError("usage", message, remedy=f"add --in-force with the value of {form.in_force} in force")
-    if wish.in_force is not None and not 0 < wish.in_force < np.inf:
-        remedy = "give the value without a sign: which way the axis runs is another setting"
-        raise InputError("usage", f"--in-force {wish.in_force:g}", allowed="more than 0", remedy=remedy)
-    if wish.in_force is not None and not form.in_force:
-        raise InputError("usage", f"--in-force is not for --to {wish.target}", remedy="leave it out")
-    if (wish.period is not None) != (form.holds == "period"):
-        missing, remedy = ("needs --period, in commands", "add it")
-        if wish.period is not None:
-            missing, remedy = "takes no --period", "leave it out"
-        raise InputError("usage", f"--to {wish.target} {missing}", remedy=remedy)
-    return form
-
-
 def table_commands(rows: AxisRows) -> np.ndarray:
     """Commands of a table: those read, thinned where they are many, halved where they are few."""
     commands = rows.positions
@@ -198,7 +146,7 @@ def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wi
         return _Shaped(Correction(command, forward, backward, wish.resolution))
     middle = at.mean.mean(axis=0)
     if form.holds == "period":
-        return _folded(at, nominal, fitted, wish)
+        return _folded(at, fitted, float(wish.period or 0.0), wish.resolution)
     # The line that the format knows, through command 0: what is left over is one shift.
     slope = float(np.polyfit(command, middle, 1)[0])
     play = float(np.mean(at.mean[1] - at.mean[0])) * float(np.sign(slope))
@@ -254,13 +202,12 @@ def _offset(at: _Expected, nominal: float) -> float:
     return float(at.mean[:, nearest].mean() - nominal * at.command[nearest])
 
 
-def _folded(at: _Expected, nominal: float, fitted: float, wish: Wish) -> _Shaped:
+def _folded(at: _Expected, fitted: float, period: float, resolution: float) -> _Shaped:
     """Both sides' middle error, off its line, averaged over periods.
 
     Raises:
         InputError: the range is shorter than a period, or the table is coarse against it.
     """
-    period = float(wish.period or 0.0)
     low, high = float(at.command[0]), float(at.command[-1])
     spacing = float(np.max(np.diff(at.command)))
     if not 8 * spacing <= period <= high - low:
@@ -277,21 +224,7 @@ def _folded(at: _Expected, nominal: float, fitted: float, wish: Wish) -> _Shaped
     command = np.linspace(low, high, PERIOD_NODES)
     again = 2 * np.pi * command / period
     added = -np.column_stack([f(k * again) for k in range(1, 5) for f in (np.cos, np.sin)]) @ amplitudes / fitted
-    return _Shaped(Correction(command, added, added, wish.resolution), {"period_command": period})
-
-
-def _bound(mean: np.ndarray, sd: np.ndarray) -> float:
-    """What 95 % of errors do not exceed, either sign, of normal distributions of equal weight."""
-    from scipy.optimize import brentq
-    from scipy.special import ndtr
-
-    sd = np.maximum(sd, 1e-300)
-
-    def beyond(limit: float) -> float:
-        return float(np.mean(ndtr((-limit - mean) / sd) + ndtr((mean - limit) / sd))) - 0.05
-
-    top = float(np.max(np.abs(mean) + 6 * sd))
-    return 0.0 if top < 1e-200 else float(brentq(beyond, 0.0, top, xtol=1e-6 * top))
+    return _Shaped(Correction(command, added, added, resolution), {"period_command": period})
 
 
 def bound_of(stops: PredictedStops, aim: np.ndarray, members: np.ndarray, shift: bool = False) -> float:
@@ -308,7 +241,7 @@ def bound_of(stops: PredictedStops, aim: np.ndarray, members: np.ndarray, shift:
         centre = np.eye(mean.shape[1]) - 1.0 / mean.shape[1]
         mean, covariance = mean @ centre, centre @ covariance @ centre
     variance = np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)
-    return _bound(mean[:, members].ravel(), np.sqrt(variance[:, members]).ravel())
+    return absolute_bound95(mean[:, members].ravel(), np.sqrt(variance[:, members]).ravel())
 
 
 def _promise(
@@ -330,10 +263,10 @@ def _promise(
         rest = np.sqrt(np.maximum(variance - stops**2 - home**2 - drift**2 - reading**2, 0.0))
         zero = np.zeros_like(rest)
         causes = {
-            "table": _bound((after.mean - pooled)[:, mine].ravel(), rest.ravel()),
+            "table": absolute_bound95((after.mean - pooled)[:, mine].ravel(), rest.ravel()),
             "format": float(NORMAL_95 * np.sqrt(np.mean((pooled - aim)[mine] ** 2))),
             **{
-                cause: _bound(zero.ravel(), sd.ravel())
+                cause: absolute_bound95(zero.ravel(), sd.ravel())
                 for cause, sd in (("stops", stops), ("homing", home), ("drift", drift), ("readings", reading))
             },
         }
@@ -366,10 +299,15 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
     """
     refuse_answer(results.summary.answer)
     fit, campaign = results.fit, results.fit.campaign
+    if fit.rows.in_motion:
+        checked(wish)
+        return drive_compensation(fit, wish)
     rows, since = fit.rows, Since.of(campaign.moves)
     draws = fit.draws["effective_per_command"]
     fitted = float(draws.mean())
     form = checked(wish)
+    if form.holds == "period":
+        wish = replace(wish, period=period_of(fit, wish.period))
     if wish.per_command is not None and not (np.isfinite(wish.per_command) and wish.per_command * fitted > 0):
         message = f"--per-command {wish.per_command:g}: the readings go by {fitted:.6g} per command"
         raise InputError("usage", message, remedy="give the nominal ratio with the sign of the readings")

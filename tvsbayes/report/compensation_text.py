@@ -49,7 +49,7 @@ HELPS = {
     "stops": "the scatter of single stops; no table takes that out",
     "table": "the table itself; read more, at more positions",
     "format": "what the format cannot hold; csv, linuxcnc and header hold both sides by position",
-    "drift": "the walk of the zero; home more often",
+    "drift": "the walk of the zero; home more often, or guide",
     "readings": "the readings themselves; a better reference",
 }
 """What the largest cause of what is left is, and what takes it down."""
@@ -103,18 +103,28 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
         "",
         promise_table(made),
         "",
-        f"the promise holds between these commands, within {two_digits(made.hours)} h and {made.travel_command:.4g} "
-        "commands of travel since homing",
-        f"arrive with at least {made.reversal_command:.4g} commands of travel on a side",
+        *_where(made),
         f"most of what is left: {HELPS[largest]}",
         *(f"the format: {text}" for text in made.unsaid),
     ]
-    if made.homings == 1:
+    if made.homings == 1 and not made.in_motion:
         lines.append("one homing alone was read: how far the next one is off is known by its prior; home_sd in [axis]")
-    lines.append(
-        "nothing is applied yet; apply it once, in one place, then take fresh readings and run tvsbayes verify"
-    )
+    lines.append(f"nothing is applied yet; apply it once, in one place, then {made.shown_by}")
     return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
+
+
+def _where(made: Compensation) -> list[str]:
+    """For which errors the promise is."""
+    if made.in_motion:
+        period = made.travel_command
+        return [
+            f"the promise holds within one period of {period:.6g} commands, off the drive's own line, but for a shift"
+        ]
+    return [
+        f"the promise holds between these commands, within {two_digits(made.hours)} h and {made.travel_command:.4g} "
+        "commands of travel since homing",
+        f"arrive with at least {made.reversal_command:.4g} commands of travel on a side",
+    ]
 
 
 def verification_text(verification: Verification) -> str:
@@ -157,9 +167,8 @@ def compensation_section(made: Compensation, verification: Verification | None) 
     """Report: what was made to be applied, what is left by the promise, and what fresh readings say of it."""
     low, high = made.range_command
     text = [
-        f"Made for {made.target}, to be applied by the {made.applied_by}; the promise holds for commands from "
-        f"{low:.10g} to {high:.10g}, within {two_digits(made.hours)} h and {made.travel_command:.4g} commands of "
-        "travel since homing.",
+        f"Made for {made.target}, to be applied by the {made.applied_by}, for commands from {low:.10g} to {high:.10g}; "
+        f"{_where(made)[0]}.",
         "No fresh readings have verified it." if verification is None else _verdict(verification),
     ]
     tables = [promise_table(made), *([] if verification is None else [sizes_table(verification)])]

@@ -126,6 +126,18 @@ class Compensation(Shown, Record, frozen=True, kw_only=True):
         """Of table and promise, so that a verification knows of which it is."""
         return hashlib.sha256(json.dumps(self.as_json(), sort_keys=True).encode()).hexdigest()
 
+    @property
+    def in_motion(self) -> bool:
+        """Whether it is of a drive at constant rate, which never turns back: a table of one period."""
+        return self.reversal_command == 0 and "period_command" in self.settings
+
+    @property
+    def shown_by(self) -> str:
+        """What shows whether the promise is kept."""
+        if self.in_motion:
+            return "log again and run tvsbayes fit: its wave of this period is what is left"
+        return "take fresh readings and run tvsbayes verify"
+
     def shown(self) -> View:
         """The table."""
         rows = [(r.command, r.forward, r.backward, r.u_forward, r.u_backward) for r in self.table]

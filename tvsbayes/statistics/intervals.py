@@ -55,6 +55,20 @@ def interval95(draws: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def absolute_bound95(mean: np.ndarray, sd: np.ndarray) -> float:
+    """What 95 % of errors do not exceed, either sign, of normal distributions (n,) of equal weight."""
+    from scipy.optimize import brentq
+    from scipy.special import ndtr
+
+    sd = np.maximum(sd, 1e-300)
+
+    def beyond(limit: float) -> float:
+        return float(np.mean(ndtr((-limit - mean) / sd) + ndtr((mean - limit) / sd))) - 0.05
+
+    top = float(np.max(np.abs(mean) + 6 * sd))
+    return 0.0 if top < 1e-200 else float(brentq(beyond, 0.0, top, xtol=1e-6 * top))
+
+
 def rms(values: Sequence[float]) -> float:
     """Root mean square; 0 of no values."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0

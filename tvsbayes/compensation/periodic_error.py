@@ -1,0 +1,166 @@
+"""The table of a drive at constant rate: what repeats with one period of its command, and what is left of that.
+
+A drive that tracks never stops and never turns back: a controller can take out what repeats with a turn of its worm.
+The table is the expected wave over one period in the middle of the record, where its phase is known best. The promise
+is of errors off the drive's own line within one period, but for one shift. Commands as the campaign counts them, the
+rest in its unit. No JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tvsbayes.compensation.correction import Correction
+from tvsbayes.compensation.formats import FORMATS, Wish
+from tvsbayes.errors import InputError, NothingToEstimate
+from tvsbayes.results.compensation_record import CAUSES, Compensation, SidePromise, TableRow
+from tvsbayes.single_axis.axis_fit import AxisFit
+from tvsbayes.single_axis.axis_periods import WaveSample, wave_samples
+from tvsbayes.single_axis.axis_rows import HOUR_S
+from tvsbayes.single_axis.waves import wave_columns
+from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
+
+NODES = 129
+"""Of the table, both ends of the period included."""
+DRAWS, TRIED = 200, 400
+"""Draws of the waves, and commands of the record, over which the promise is taken."""
+HARMONICS = 8
+"""Parts of a period that a table holds: waves of P, P/2 ... P/8."""
+SLIP_TURNS = 0.25
+"""Of a wave against the table, over the record, below which it repeats with the period."""
+LIKELY = 0.95
+"""Probability above which a wave counts."""
+
+
+def known_waves(fit: AxisFit) -> list[WaveSample]:
+    """Waves of the gear that are there, the strongest first."""
+    likely = (each for each in wave_samples(fit) if each.probability >= LIKELY and each.wave.clock != "encoder")
+    return sorted(likely, key=lambda each: -float(each.amplitude.mean()))
+
+
+def commands_of(fit: AxisFit, sample: WaveSample) -> float:
+    """Period of a wave in commands, mean."""
+    per_command = fit.rows.rate if sample.wave.clock == "seconds" else fit.rows.line[1]
+    period = float(np.mean(sample.period[sample.likeliest]))
+    return period * abs(per_command or 0.0) if sample.wave.clock == "seconds" else period / abs(per_command or 1.0)
+
+
+def period_of(fit: AxisFit, wanted: float | None) -> float:
+    """Period of a table, in commands: what is wanted, else that of the strongest wave.
+
+    Raises:
+        InputError: nothing is wanted, and no wave is known that repeats with the command.
+    """
+    if wanted is not None:
+        return wanted
+    for sample in known_waves(fit):
+        if fit.rows.in_motion or sample.wave.clock == "position":
+            return commands_of(fit, sample)
+    message = "--to pec needs a period, and the fit knows no wave of the gear"
+    remedy = "add --period, in commands; or ask for one by `periods` or `period_between` in [axis], and fit again"
+    raise InputError("usage", message, remedy=remedy)
+
+
+def _waves(fit: AxisFit, samples: Sequence[WaveSample], command: np.ndarray) -> np.ndarray:
+    """Sum of waves at commands (m,), by draws: shape (`DRAWS`, m)."""
+    rows = fit.rows
+    order = np.argsort(rows.command)
+    time_s = np.interp(command, rows.command[order], rows.time_s[order])
+    total = np.zeros((DRAWS, len(command)))
+    for sample in samples:
+        drawn = np.linspace(0, len(sample.period) - 1, DRAWS).astype(int)
+        at = fit.model.clock(sample.wave, command, time_s, command)
+        columns = wave_columns(at, sample.period[drawn], sample.record)
+        total += np.einsum("ntc,nc->nt", columns, sample.coefficients[drawn])
+    return total
+
+
+def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
+    """The table of one period and its promise.
+
+    Raises:
+        InputError: the format holds no period, no wave is known, or the period is longer than the record.
+        NothingToEstimate: no known wave repeats with the period.
+    """
+    form = FORMATS[wish.target]
+    if form.holds != "period":
+        message = f"--to {wish.target}: the readings are of a drive at constant rate, which never stops nor turns back"
+        raise InputError("usage", message, allowed="--to pec", remedy="read stops from both sides for other formats")
+    rows, campaign = fit.rows, fit.campaign
+    period = period_of(fit, wish.period)
+    low, high = float(rows.command.min()), float(rows.command.max())
+    if not 0 < period <= high - low:
+        message = f"--period {period:g}: the record is {high - low:g} commands long"
+        raise InputError("usage", message, allowed="a whole period in the record", remedy="log a longer run")
+    every = known_waves(fit)
+    turns = (high - low) / period
+    kept = []
+    for sample in every:
+        ratio = period / commands_of(fit, sample)
+        if 1 <= round(ratio) <= HARMONICS and abs(ratio - round(ratio)) * turns <= SLIP_TURNS:
+            kept.append(sample)
+    if not kept:
+        raise NothingToEstimate(
+            "no-wave",
+            f"no wave that the fit knows repeats with a period of {period:.6g} commands",
+            file="campaign.toml",
+            remedy="give another --period, or none; `periods` in [axis] asks for one by name, then fit again",
+        )
+    begins = 0.5 * (low + high - period)
+    command = begins + period * np.linspace(0.0, 1.0, NODES)
+    offset, slope = rows.line
+    wave = _waves(fit, kept, command)
+    added = -wave.mean(axis=0) / slope
+    correction = Correction(command, added, added, wish.resolution)
+    tried = np.linspace(low, high, TRIED)
+    before = _waves(fit, every, tried)
+    phase = begins + (tried - begins) % period
+    after = before + slope * (correction.sent(phase, np.zeros(TRIED)) - phase)
+    values = fit.model.coordinates.values(fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)])
+    hours = period / abs(rows.rate or 1.0) / HOUR_S
+    # A random walk of variance s^2 t scatters by s^2 T / 6 about its own mean within T.
+    drift = values["drift_per_root_hour"] * np.sqrt(hours / 6.0)
+    reading = values["reading_scale"] * rows.reading_u
+    promise = _promise(before, after, drift, reading)
+    expected = offset + slope * command + wave.mean(axis=0)
+    u = np.sqrt(wave.var(axis=0) + np.mean(drift**2 + reading**2))
+    columns = (command, expected, expected, u, u, added, added)
+    return Compensation(
+        target=wish.target,
+        machine=str(campaign.header.get("serial") or campaign.header.get("name") or ""),
+        unit=campaign.unit,
+        applied_by=wish.applied_by,
+        per_command=slope,
+        offset=offset,
+        zero_free=True,
+        range_command=(low, high),
+        resolution=wish.resolution,
+        reversal_command=0.0,
+        hours=hours,
+        travel_command=period,
+        homings=len(np.unique(rows.segment)),
+        table=tuple(TableRow(*map(float, row)) for row in zip(*columns, strict=True)),
+        settings={"period_command": period},
+        promise={"forward": promise, "backward": promise},
+        unsaid=form.unsaid,
+    )
+
+
+def _promise(before: np.ndarray, after: np.ndarray, drift: np.ndarray, reading: np.ndarray) -> SidePromise:
+    """What is left by draws of the waves (n, m), of drift (n,) and reading (n,): of either side, as there is one."""
+    noise = np.sqrt(drift**2 + reading**2)[:, None] * np.ones(after.shape[1])
+    mean, zero = after.mean(axis=0), np.zeros_like(after)
+    alone = {
+        "table": absolute_bound95((after - mean).ravel(), zero.ravel()),
+        "format": float(NORMAL_95 * np.sqrt(np.mean(mean**2))),
+        "drift": absolute_bound95(np.zeros_like(drift), drift),
+        "readings": absolute_bound95(np.zeros_like(reading), reading),
+    }
+    return SidePromise(
+        error95=absolute_bound95(after.ravel(), noise.ravel()),
+        rms=float(np.sqrt(np.mean(after**2 + noise**2))),
+        without95=absolute_bound95(before.ravel(), noise.ravel()),
+        causes={cause: alone.get(cause, 0.0) for cause in CAUSES},
+    )
