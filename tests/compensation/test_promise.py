@@ -36,6 +36,15 @@ def test_errors_after_applying_lie_within_the_promise():
     assert bound.max() < 0.2 * before
 
 
+def test_within_one_homing_errors_lie_within_the_promise_but_for_a_shift():
+    made = table()
+    bound = np.repeat([made.promise[side].shift_free95 for side in ("forward", "backward")], 14)
+    errors = [errors_after(made, seed) for seed in range(12)]
+    # 95 % of 336 errors that share one table.
+    assert 0.88 <= np.mean([np.abs(each - each.mean()) <= bound for each in errors]) <= 1.0
+    assert all(left.shift_free95 < left.error95 for left in made.promise.values())
+
+
 def test_a_format_that_holds_less_leaves_more():
     left = {name: max(p.error95 for p in table(name, **w).promise.values()) for name, w in CASES.items()}
     assert left["csv"] < left["grblhal"] < left["grbl"]

@@ -158,9 +158,11 @@ def _promise(before: np.ndarray, after: np.ndarray, drift: np.ndarray, reading: 
         "drift": absolute_bound95(np.zeros_like(drift), drift),
         "readings": absolute_bound95(np.zeros_like(reading), reading),
     }
+    error95 = absolute_bound95(after.ravel(), noise.ravel())
     return SidePromise(
-        error95=absolute_bound95(after.ravel(), noise.ravel()),
+        error95=error95,
         rms=float(np.sqrt(np.mean(after**2 + noise**2))),
         without95=absolute_bound95(before.ravel(), noise.ravel()),
         causes={cause: alone.get(cause, 0.0) for cause in CAUSES},
+        shift_free95=error95,
     )

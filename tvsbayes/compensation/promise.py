@@ -275,6 +275,7 @@ def _promise(
             rms=float(np.sqrt(np.mean((pooled - aim)[mine] ** 2 + np.diag(covariance)[mine]))),
             without95=bound_of(before, aim, mine, shift),
             causes=causes,
+            shift_free95=bound_of(after, aim, mine, shift=True),
         )
     return sides
 

@@ -109,6 +109,11 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
     ]
     if made.homings == 1 and not made.in_motion:
         lines.append("one homing alone was read: how far the next one is off is known by its prior; home_sd in [axis]")
+        left = [
+            f"{side} {two_digits(p.shift_free95)}" for side, p in made.promise.items() if p.shift_free95 is not None
+        ]
+        if left and not made.zero_free:
+            lines.append(f"but for one shift common to all, as within one homing, at most: {', '.join(left)} {unit}")
     lines.append(f"nothing is applied yet; apply it once, in one place, then {made.shown_by}")
     return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
 

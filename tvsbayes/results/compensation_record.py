@@ -68,12 +68,15 @@ class SidePromise(Record, frozen=True):
         rms: root mean square of the errors expected.
         without95: `error95` if nothing is applied.
         causes: what each cause alone would leave, 95 %.
+        shift_free95: `error95` of errors but for one shift common to all, as within one homing; None in older
+            files.
     """
 
     error95: NotNegative
     rms: NotNegative
     without95: NotNegative
     causes: dict[str, NotNegative]
+    shift_free95: NotNegative | None = None
 
 
 type Sides = Annotated[dict[str, SidePromise], Meta(extra_json_schema={"required": ("forward", "backward")})]
