@@ -12,7 +12,13 @@ const LETTER_PX = 6.5, LINE_PX = 13;
 /** Where the eye is, as azimuth from X (depth) towards Y (left) and elevation, degrees. */
 const VIEWS = { "from-above": [180, 90], "from-side": [-90, 10], "from-behind": [190, 17] };
 
-const wayOf = (looks, row) => [looks.row("first_mm", row), looks.row("second_mm", row), looks.row("end_mm", row), null];
+/** The vectors of a look's row that holds several. */
+const vectorsOf = (looks, name, row) => {
+  const numbers = [...looks.row(name, row)];
+  return Array.from({ length: numbers.length / 3 }, (_, k) => numbers.slice(3 * k, 3 * k + 3));
+};
+
+const wayOf = (looks, row) => [...vectorsOf(looks, "mirrors_mm", row), looks.row("end_mm", row), null];
 
 function ellipsoidOf(looks, row, scale) {
   const [centre, axes] = [looks.row("point_mm", row), looks.row("ellipsoid_mm", row)];
@@ -27,8 +33,9 @@ function ellipsoidOf(looks, row, scale) {
 }
 
 function mirrorsOf(looks, row) {
-  return ["first", "second"].flatMap((which) => {
-    const [centre, normal] = [looks.row(`${which}_mm`, row), [...looks.row(`${which}_normal`, row)]];
+  const centres = vectorsOf(looks, "mirrors_mm", row);
+  return vectorsOf(looks, "normals", row).flatMap((normal, mirror) => {
+    const centre = centres[mirror];
     if (!normal.every(Number.isFinite)) return [];
     // Any two directions in the plane of the mirror.
     const sizes = normal.map(Math.abs);
@@ -168,7 +175,7 @@ class Rig extends Plot {
     const points = rows.map((row) => looks.row("point_mm", row));
     const places = rows.map((row) => looks.first + row);
     const texts = rows.map((row, k) => `look ${looks.at("spot", row)}: ${[...points[k]].map((v) => v.toFixed(2)).join(", ")} mm`);
-    const [first] = looks.some("second_normal", 1);
+    const [first] = looks.some("normals", 1);
     const mirrors = first === undefined ? [] : mirrorsOf(looks, first);
     const origin = rig.origin_mm === null ? [] : [rig.origin_mm];
     const [space] = this.panels;

@@ -48,13 +48,14 @@ def test_beams_leave_by_the_law_of_reflection(shown):
     def unit(way):
         return way / np.linalg.norm(way, axis=1, keepdims=True)
 
-    between, leaving = unit(looks.second_mm - looks.first_mm), unit(looks.end_mm - looks.second_mm)
-    normal = looks.second_normal
+    first, second = looks.mirrors_mm[:, 0], looks.mirrors_mm[:, 1]
+    between, leaving = unit(second - first), unit(looks.end_mm - second)
+    normal = looks.normals[:, 1]
     reflected = between - 2 * np.sum(between * normal, axis=1, keepdims=True) * normal
     np.testing.assert_allclose(reflected[used], leaving[used], atol=1e-9)
     # Stops of 0.1 deg, seen at 0.3 m: the spot lies within millimetres of the beam's end.
     assert np.linalg.norm(looks.end_mm - looks.point_mm, axis=1)[used].max() < 5
-    assert np.linalg.norm(looks.first_mm[used] - shown.origin_mm, axis=1).max() < 20
+    assert np.linalg.norm(first[used] - shown.origin_mm, axis=1).max() < 20
 
 
 def test_look_without_a_spot_is_there_without_numbers(shown):
@@ -106,8 +107,8 @@ def test_folder_without_results_shows_the_stated_rig(viewed):
     # The stated rig is not turned and its laser not tilted: straight down onto the first mirror, then to the second.
     looks, down = shown.looks, np.array([0.0, 0.0, -1.0])
     used = np.isfinite(looks.end_mm).all(axis=1)
-    between = (looks.second_mm - looks.first_mm)[used]
-    reflected = down - 2 * (looks.first_normal[used] @ down)[:, None] * looks.first_normal[used]
+    between = (looks.mirrors_mm[:, 1] - looks.mirrors_mm[:, 0])[used]
+    reflected = down - 2 * (looks.normals[used, 0] @ down)[:, None] * looks.normals[used, 0]
     np.testing.assert_allclose(reflected, between / np.linalg.norm(between, axis=1, keepdims=True), atol=1e-9)
     assert np.isfinite(shown.looks.end_mm).all(axis=1).sum() == len(shown.looks.spot) - 1
 

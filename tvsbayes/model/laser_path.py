@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.head.chain import HeadOptics
-from tvsbayes.instrument.mirrors import Optics, Ray, Vectors, laser_way
+from tvsbayes.instrument.mirrors import Optics, Ray
 from tvsbayes.instrument.parameters import HARMONIC_ORDERS
 from tvsbayes.model.geometry import Scalar, materialise
 
@@ -244,16 +244,6 @@ def angles_at(
     return jax.lax.while_loop(lambda state: state.stretch.next <= index[-1], further, begin)
 
 
-class Reflections(eqx.Module):
-    """Where the laser meets both mirrors, mm, the mirrors' unit normals, and the direction in which it leaves."""
-
-    first_mm: Vectors
-    first_normal: Vectors
-    second_mm: Vectors
-    second_normal: Vectors
-    outgoing: Vectors
-
-
 def trace(optics: Optics | HeadOptics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Ray:
     """Trace the beam to where it leaves (formulation 3.2; the signs are part of the contract).
 
@@ -266,14 +256,6 @@ def trace(optics: Optics | HeadOptics, pan_rad: Float[Array, "*batch"], tilt_rad
         The rays in frame P.
     """
     return optics.leaving(pan_rad, tilt_rad, jnp, materialise)
-
-
-def reflections(optics: Optics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Reflections:
-    """What `trace` meets on its way, in frame P; arguments as there."""
-    way = laser_way(optics, pan_rad, tilt_rad, jnp, materialise)
-    (first, second), (first_mm, second_mm) = way.mirrors, (ray.origin_mm for ray in way.rays)
-    parts = (first_mm, first.normal, second_mm, second.normal, way.rays[-1].direction)
-    return Reflections(*map(way.pan.forward, parts))
 
 
 class BeamAngles(eqx.Module):

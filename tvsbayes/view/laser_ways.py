@@ -1,4 +1,4 @@
-"""Where the laser goes in a rig, look by look: over both mirrors and as far as the spot, in frame S, and its pixels.
+"""Where the laser goes in a rig, look by look: over all mirrors and as far as the spot, in frame S, and its pixels.
 
 By the model itself (formulation 3), at the mode of a fit or at the centre of the priors. mm, rad, px.
 """
@@ -16,29 +16,25 @@ from jaxtyping import Array, Float, Int
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.looks import WINDOW, in_frame_s, nearest_range, spot_angles
-from tvsbayes.instrument.mirrors import Optics, Ray, Vectors
+from tvsbayes.instrument.mirrors import Optics, Ray, Vectors, laser_way
 from tvsbayes.model.compiled import compiled
-from tvsbayes.model.geometry import image, rotation_matrix, transform
-from tvsbayes.model.laser_path import reflections
+from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
 from tvsbayes.model.parameter_space import ParameterSpace
 
 
 class Ways(eqx.Module):
-    """Ways of the laser in frame S; the first axis of every array is x, y, z or the pixel, the second the look.
+    """Ways of the laser in frame S; the last axis of every array is the look, the one before x, y, z or the pixel.
 
     Attributes:
         origin_mm: of frame P, on the pan axis, shape (3, 1).
-        first_mm, first_normal: where it meets mirror 1, and that mirror's unit normal.
-        second_mm, second_normal: the same of mirror 2.
+        mirrors_mm, normals: where it meets the mirrors in their order, and their unit normals.
         end_mm: of the beam, where it passes closest to the triangulated spot.
         predicted_px: u_left, v_left, u_right, v_right of that end, shape (4, looks).
     """
 
     origin_mm: Float[Array, "3 1"]
-    first_mm: Float[Array, "3 looks"]
-    first_normal: Float[Array, "3 looks"]
-    second_mm: Float[Array, "3 looks"]
-    second_normal: Float[Array, "3 looks"]
+    mirrors_mm: Float[Array, "mirrors 3 looks"]
+    normals: Float[Array, "mirrors 3 looks"]
     end_mm: Float[Array, "3 looks"]
     predicted_px: Float[Array, "4 looks"]
 
@@ -56,17 +52,16 @@ def _window(
     if not isinstance(model.optics, Optics):
         remedy = "`tvsbayes fit --details` has the terms of a head"
         raise InputError("usage", "view draws the mirrors of a scanner, and this is a pan-tilt head", remedy=remedy)
-    met = reflections(model.optics, pan, tilt)
-    ray = Ray(met.second_mm, met.outgoing)
+    way = laser_way(model.optics, pan, tilt, jnp, materialise)
+    rays = [Ray(*map(way.pan.forward, ray)) for ray in way.rays]
+    ray = rays[-1]
     reach = nearest_range(model.extrinsics, ray, Vectors.of(arrays.spots.triangulated_mm.T))
     end = in_frame_s(model.extrinsics, ray.at(reach))
     turn, none = rotation_matrix(model.extrinsics.rotation_rad), jnp.zeros(1)
     return Ways(
         origin_mm=in_frame_s(model.extrinsics, Vectors(none, none, none)).stacked(),
-        first_mm=in_frame_s(model.extrinsics, met.first_mm).stacked(),
-        first_normal=transform(turn, met.first_normal).stacked(),
-        second_mm=in_frame_s(model.extrinsics, met.second_mm).stacked(),
-        second_normal=transform(turn, met.second_normal).stacked(),
+        mirrors_mm=jnp.stack([in_frame_s(model.extrinsics, ray.origin_mm).stacked() for ray in rays]),
+        normals=jnp.stack([transform(turn, way.pan.forward(mirror.normal)).stacked() for mirror in way.mirrors]),
         end_mm=end.stacked(),
         predicted_px=jnp.stack(image(model.cameras, end)),
     )
@@ -85,5 +80,5 @@ def laser_ways(z: np.ndarray, turned_rad: np.ndarray, space: ParameterSpace, arr
     filled = np.zeros((-(-count // size) * size, 2))
     filled[:count] = turned_rad
     parts = [_window(z, filled[k : k + size], space, arrays, np.int32(k)) for k in range(0, count, size)]
-    joined = jax.tree.map(lambda *arrays_of: np.concatenate(arrays_of, axis=1)[:, :count], *parts)
+    joined = jax.tree.map(lambda *arrays_of: np.concatenate(arrays_of, axis=-1)[..., :count], *parts)
     return replace(joined, origin_mm=np.asarray(parts[0].origin_mm))

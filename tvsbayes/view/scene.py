@@ -61,8 +61,8 @@ class LookColumns:
         predicted_px: where the fitted rig puts them, at the range seen, shape (n, 4).
         point_mm: triangulated spot, shape (n, 3).
         ellipsoid_mm: half axes of its 95 % ellipsoid by pixel noise, shape (n, 3, 3).
-        first_mm, second_mm, end_mm: the laser's way over both mirrors to where it passes the spot, shape (n, 3).
-        first_normal, second_normal: unit normals of the mirrors, shape (n, 3).
+        mirrors_mm, normals: where the laser meets the mirrors, and their unit normals, shape (n, mirrors, 3).
+        end_mm: where it passes the spot, shape (n, 3).
         deviation_deg, u_deg: of the stops of (pan, tilt): seen less fitted mirror angle, and its sd, shape (n, 2).
         suspect: whether the fit finds it unlikely, or left it out, shape (n,).
     """
@@ -79,10 +79,8 @@ class LookColumns:
     predicted_px: np.ndarray
     point_mm: np.ndarray
     ellipsoid_mm: np.ndarray
-    first_mm: np.ndarray
-    first_normal: np.ndarray
-    second_mm: np.ndarray
-    second_normal: np.ndarray
+    mirrors_mm: np.ndarray
+    normals: np.ndarray
     end_mm: np.ndarray
     deviation_deg: np.ndarray
     u_deg: np.ndarray
@@ -204,7 +202,8 @@ def _ways(campaign: Campaign, fitted: Fitted | None) -> Ways | None:
     return laser_ways(fit.z, turned, fit.space, fit.arrays)
 
 
-_WAY_FIELDS = ("first_mm", "first_normal", "second_mm", "second_normal", "end_mm", "predicted_px")
+_WAY_SHAPES = {"mirrors_mm": (0, 3), "normals": (0, 3), "end_mm": (3,), "predicted_px": (4,)}
+"""Of a look without any usable spot beside it."""
 
 
 def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> LookColumns:
@@ -213,10 +212,12 @@ def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> Look
     row_of = {spot.spot: row for row, spot in enumerate(spots)}
     used = ordered_spots(campaign)
     rows = np.array([row_of[spot.spot] for spot in used], dtype=int)
-    laid = {name: np.full((count, 4 if name == "predicted_px" else 3), np.nan) for name in _WAY_FIELDS}
+    laid = {name: np.full((count, *shape), np.nan) for name, shape in _WAY_SHAPES.items()}
     if ways is not None:
-        for name, column in laid.items():
-            column[rows] = np.asarray(getattr(ways, name)).T[: len(rows)]
+        for name in laid:
+            of_looks = np.moveaxis(np.asarray(getattr(ways, name)), -1, 0)
+            laid[name] = np.full((count, *of_looks.shape[1:]), np.nan)
+            laid[name][rows] = of_looks[: len(rows)]
     point, covariance = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
     pixels = np.full((count, 4), np.nan)
     pixels[rows] = pixels_of(used)
