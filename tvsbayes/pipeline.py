@@ -19,6 +19,7 @@ from tvsbayes.files.disk import make_folder, output_place, require_writable
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.progress import Job, Show
+from tvsbayes.results.records import CHAIN, IMPORTANCE, Tier
 
 if TYPE_CHECKING:
     import numpy as np
@@ -126,7 +127,7 @@ def calibrate(
     *,
     model: ModelChoice = AS_STATED,
     sampled: bool = True,
-    tier: str = "emcee",
+    tier: Tier = CHAIN,
     max_minutes: float = MAX_MINUTES,
     resume: bool = False,
     seed: int = 0,
@@ -174,7 +175,7 @@ def calibrate(
             if place is not None:
                 make_folder(place)
             shown = job.part(SAMPLING)
-            if tier == "importance":
+            if tier == IMPORTANCE:
                 posterior = sample(joint, tier, seed=seed, progress=shown)
             else:
                 posterior = sample(
@@ -193,12 +194,12 @@ def calibrate(
         return _results(joint, posterior, seed, place, files, tell)
 
 
-def _later_stages(sampled: bool, tier: str, folder: Path | None) -> dict[str, float]:
+def _later_stages(sampled: bool, tier: Tier, folder: Path | None) -> dict[str, float]:
     """What `calibrate` does after its fit, with seconds; what is not done has none."""
     from tvsbayes.posterior.sampling import sampling_stages
 
     sampling = sum(sampling_stages(tier).values()) if sampled else 0.0
-    filing = FILED_SECONDS if sampled and tier == "emcee" and folder is not None else 0.0
+    filing = FILED_SECONDS if sampled and tier == CHAIN and folder is not None else 0.0
     return {SAMPLING: sampling, FILING: filing, SUMMARISING: SUMMARISED_SECONDS}
 
 

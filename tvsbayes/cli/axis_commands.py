@@ -15,6 +15,7 @@ from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, write_atomically
 from tvsbayes.pipeline import MAX_MINUTES
 from tvsbayes.progress import Job
+from tvsbayes.results.records import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     from tvsbayes.report.document import Issue
@@ -130,7 +131,7 @@ def _fitted(data: AxisCampaign, place: Path, wish: Sampled) -> Kept:
     with waiting() as progress:
         found = fit_axis(
             data,
-            tier="importance" if wish.quick else "emcee",
+            tier=IMPORTANCE if wish.quick else CHAIN,
             sampled=not wish.no_sample,
             max_minutes=wish.max_minutes,
             seed=wish.seed,

@@ -28,6 +28,7 @@ from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
 from tvsbayes.pipeline import FITTING, MAX_MINUTES, StoredOrFitted, calibrate, compile_for
 from tvsbayes.progress import Job, Show
+from tvsbayes.results.records import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
@@ -132,7 +133,7 @@ def fit(
             out or output_place(campaign, "results"),
             model=ModelChoice(**model),
             sampled=not no_sample,
-            tier="importance" if quick else "emcee",
+            tier=IMPORTANCE if quick else CHAIN,
             max_minutes=minutes,
             resume=resume,
             seed=seed,

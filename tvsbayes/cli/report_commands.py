@@ -36,6 +36,7 @@ from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.pipeline import calibrate as calibrate_campaign
 from tvsbayes.progress import Job
+from tvsbayes.results.records import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Campaign
@@ -294,7 +295,7 @@ def calibrate(
             data,
             output_place(campaign, "results"),
             sampled=not no_sample,
-            tier="importance" if quick else "emcee",
+            tier=IMPORTANCE if quick else CHAIN,
             seed=seed,
             tell=report_line,
             progress=progress,

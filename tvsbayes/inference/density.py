@@ -116,7 +116,7 @@ class Proposal(Protocol):
 
 
 class Step(Protocol):
-    """The protocol of `emcee.moves.MHMove`."""
+    """A Metropolis-Hastings step of a chain."""
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """New points for w (n, d), and ln q(old | new) - ln q(new | old)."""

@@ -17,6 +17,7 @@ from tvsbayes.inference.density import Density, columns_of
 from tvsbayes.inference.importance import ImportanceRun, Sample, uncertain
 from tvsbayes.inference.summaries import monte_carlo_errors, propagated
 from tvsbayes.results.convergence import Agreement, Convergence, MonteCarloError, extreme
+from tvsbayes.results.records import CHAIN
 from tvsbayes.statistics.streams import Stream, random_stream
 
 GROUPS = 4
@@ -208,7 +209,7 @@ def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
         errors = errors if same.agrees else errors | beside.gaps
     if same is not None and not same.agrees:
         gap = f"by {same.worst.value:.1f} Monte Carlo errors, wanted below {AGREEMENT_LIMIT:g}"
-        missing.append(f"emcee and importance sampling differ on {same.worst.quantity} {gap}")
+        missing.append(f"{CHAIN} and importance sampling differ on {same.worst.quantity} {gap}")
     convergence = Convergence(
         steps=len(chain.w),
         discarded=discarded,

@@ -29,6 +29,7 @@ from tvsbayes.results.convergence import (
     Reweighted,
     extreme,
 )
+from tvsbayes.results.records import IMPORTANCE, Tier
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import (
     SmoothedWeights,
@@ -159,13 +160,13 @@ class Sample:
     seconds: float
 
     @property
-    def tier(self) -> str:
-        """What made the draws: "importance" (independent, weighted) or "emcee" (a chain, equal)."""
-        return "importance" if isinstance(self.convergence, Reweighted) else "emcee"
+    def tier(self) -> Tier:
+        """What made the draws: weighted independent draws, or the equal ones of a chain."""
+        return self.convergence.tier
 
     def summarised(self, values: np.ndarray) -> Propagated:
         """Mean, sd, interval and errors of values (chain, draw, ...), one for every draw."""
-        return reweighted(values, self.weights) if self.tier == "importance" else propagated(values)
+        return reweighted(values, self.weights) if self.tier == IMPORTANCE else propagated(values)
 
     def equal(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Coordinates (count, d) of draws that weigh the same, in random order."""

@@ -118,7 +118,7 @@ class Independence:
     """Independent draws of coordinates that are normal or tabulated, a share of them with a heavier part.
 
     The mixture: every coordinate on its own; the coupled ones together from a multivariate t; all of them from another.
-    Called by `emcee.moves.MHMove` with (points, generator); returns new points and ln q(old) - ln q(new).
+    It is a step of a chain too (`density.Step`).
 
     Attributes:
         mean, sd: of every coordinate, shape (d,).
@@ -255,7 +255,7 @@ class Independence:
         return v
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """The protocol of `emcee.moves.MHMove`."""
+        """See `density.Step`."""
         proposed = self.draw(len(w), generator)
         return proposed, self.log_density(w) - self.log_density(proposed)
 

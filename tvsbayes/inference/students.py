@@ -67,7 +67,7 @@ class StudentMixture:
         return np.logaddexp.reduce(parts, axis=0)
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """The protocol of `emcee.moves.MHMove`."""
+        """See `density.Step`."""
         proposed = self.draw(len(w), generator)
         return proposed, self.log_density(w) - self.log_density(proposed)
 

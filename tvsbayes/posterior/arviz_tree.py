@@ -33,6 +33,7 @@ from tvsbayes.posterior.chain import fingerprint
 from tvsbayes.posterior.draws import Draws, Posterior, derived_names
 from tvsbayes.posterior.predictive import PIXEL_LABELS, move_log_likelihood, predictive_pixels
 from tvsbayes.results.convergence import Convergence
+from tvsbayes.results.records import CHAIN, IMPORTANCE
 
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
 RESAMPLED = 4, 1024
@@ -128,7 +129,7 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         A tree for `az.summary`, `az.loo`, `az.compare` and ArviZ's plots. The unit of the log likelihood is a move.
         Weighted draws are resampled: ArviZ knows no weights.
     """
-    if posterior.tier == "importance":
+    if posterior.tier == IMPORTANCE:
         posterior = posterior.resampled(*RESAMPLED)
     fit = posterior.fit
     shape = posterior.z.shape[:2]
@@ -168,7 +169,7 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         "seed": posterior.seed,
         "converged": int(posterior.converged),
         **lengths,
-        "versions": json.dumps({name: version(name) for name in ("tvsbayes", "emcee", "arviz", "jax", "numpy")}),
+        "versions": json.dumps({name: version(name) for name in ("tvsbayes", CHAIN, "arviz", "jax", "numpy")}),
         "inputs": json.dumps(input_hashes(fit.campaign)),
         "fingerprint": fingerprint(fit),
         "reference_pose_deg": np.degrees(fit.reference_pose_rad),

@@ -1,4 +1,4 @@
-"""The file that keeps a chain of emcee and what it began with: all that continues it bit for bit.
+"""The file that keeps a chain and what it began with: all that continues it bit for bit.
 
 Coordinates w of `posterior.transport`; arrays of a chain are ordered (step, walker, ...).
 """
@@ -25,6 +25,7 @@ from tvsbayes.inference.tables import Followers, Tables
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.posterior.target import Target
 from tvsbayes.posterior.transport import transport
+from tvsbayes.results.records import CHAIN
 
 CHAIN_KIND = "tvsbayes-chain/"
 CHAIN_FORMAT = f"{CHAIN_KIND}7"
@@ -38,7 +39,7 @@ def fingerprint(fit: JointFit) -> str:
     for array in (*jax.tree.leaves(fit.space), *jax.tree.leaves(fit.arrays), fit.free):
         array = np.asarray(array)
         digest.update(f"{array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes())
-    for package in ("tvsbayes", "emcee", "jax", "numpy"):
+    for package in ("tvsbayes", CHAIN, "jax", "numpy"):
         digest.update(f"{package} {version(package)}".encode())
     return digest.hexdigest()
 

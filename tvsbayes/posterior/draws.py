@@ -24,6 +24,7 @@ from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import DERIVED, Derived, derived_quantities
 from tvsbayes.results.convergence import Convergence, Reweighted
+from tvsbayes.results.records import IMPORTANCE, Tier
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic, weighted_mean
 
@@ -64,10 +65,9 @@ class Draws(Mapping[str, np.ndarray]):
 
 def headline_names(fit: JointFit) -> tuple[str, ...]:
     """Names in `Draws` of what a fit is for, as far as the campaign moved and priors leave it open."""
-    moved = set(legs_of(fit.campaign.moves))
-    others = {"effective_mirror_offset_mm"} if fit.space.mechanism.terms else set()
-    names = [quantity.name for quantity in HEADLINES if quantity.applies(moved) and quantity.name not in others]
-    return tuple(name for name in names if name not in INDEX or fit.free[INDEX[name]])
+    moved, derived = set(legs_of(fit.campaign.moves)), derived_names(fit.space.mechanism)
+    names = [quantity.name for quantity in HEADLINES if quantity.applies(moved)]
+    return tuple(name for name in names if (fit.free[INDEX[name]] if name in INDEX else name in derived))
 
 
 @dataclass(frozen=True, repr=False)
@@ -120,9 +120,9 @@ class Posterior(Shown):
         return self.convergence.converged
 
     @property
-    def tier(self) -> str:
-        """What made the draws: "importance" (independent, weighted) or "emcee" (a chain, equal)."""
-        return "importance" if isinstance(self.convergence, Reweighted) else "emcee"
+    def tier(self) -> Tier:
+        """What made the draws: weighted independent draws, or the equal ones of a chain."""
+        return self.convergence.tier
 
     @property
     def by_name(self) -> Draws:
@@ -169,7 +169,7 @@ class Posterior(Shown):
 
     def summarised(self, values: np.ndarray) -> Propagated:
         """Mean, sd, interval and errors of values (chain, draw, ...), one for every draw."""
-        return reweighted(values, self.weights) if self.tier == "importance" else propagated(values)
+        return reweighted(values, self.weights) if self.tier == IMPORTANCE else propagated(values)
 
     def propagate(self, function: Callable[[Mapping[str, np.ndarray]], np.ndarray]) -> Propagated:
         """Carry the posterior into a quantity of your own.

@@ -19,24 +19,24 @@ from tvsbayes.posterior.importance import importance_run, mixed, run_beside
 from tvsbayes.posterior.target import Target
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.convergence import Convergence
+from tvsbayes.results.records import CHAIN, IMPORTANCE, TIERS, Tier
 
-TIERS = ("importance", "emcee")
 MIXTURE_ROUNDS, MIXTURE_MARGIN = 4 * ROUNDS_LEAST, 1.2
 """Rounds of the most probable way of homing, at most, where fewer leave the mixture of all rough; and how many times as
 many it has as the errors of the mixture ask for."""
-DRAWING, WALKING = "drawing weighted samples", "sampling with emcee"
+DRAWING, WALKING = "drawing weighted samples", f"sampling with {CHAIN}"
 DRAWN_SECONDS, WALKED_SECONDS = 3.0, 8.0
 """What progress predicts with."""
 
 
-def sampling_stages(tier: str) -> dict[str, float]:
+def sampling_stages(tier: Tier) -> dict[str, float]:
     """Stages of sampling, with seconds."""
-    return {DRAWING: DRAWN_SECONDS, WALKING: WALKED_SECONDS if tier == "emcee" else 0.0}
+    return {DRAWING: DRAWN_SECONDS, WALKING: WALKED_SECONDS if tier == CHAIN else 0.0}
 
 
 def sample(
     fit: JointFit,
-    tier: str = "emcee",
+    tier: Tier = CHAIN,
     *,
     max_minutes: float = 10.0,
     seed: int = 0,
@@ -79,7 +79,7 @@ def sample(
         raise ValueError(f"max_minutes is {max_minutes}; it must be positive")
     if resume and checkpoint is None:
         raise ValueError("resume needs the checkpoint to continue")
-    if tier == "importance" and checkpoint is not None:
+    if tier == IMPORTANCE and checkpoint is not None:
         raise ValueError("importance sampling has no chain to keep or to resume")
     began = time.monotonic()
     with jax.enable_x64(True), Job(sampling_stages(tier), progress) as job:
@@ -93,7 +93,7 @@ def sample(
             # The share of a less probable way of homing asks for more draws than the most probable one needs.
             start = importance_run(fit, seed, job.at, rounds_least=_rounds_of_mixture(start, early))
             early = _mixture(start, seed)
-        if tier == "importance":
+        if tier == IMPORTANCE:
             return early
         if first is not None:
             first(early)

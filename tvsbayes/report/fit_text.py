@@ -25,6 +25,7 @@ from tvsbayes.report.result_tables import (
 from tvsbayes.report.tables import TableView
 from tvsbayes.results.convergence import Importance, Sampling
 from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
+from tvsbayes.results.records import CHAIN
 
 PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 
@@ -228,7 +229,7 @@ def agreement_line(sampling: Sampling) -> str | None:
         return "importance sampling was not accepted: the chain stands alone"
     said = "agree on every result" if sampling.agreement.agrees else "DISAGREE"
     worst = sampling.agreement.worst
-    text = f"emcee and importance sampling {said}: the largest difference is {worst.value:.1f} Monte Carlo errors"
+    text = f"{CHAIN} and importance sampling {said}: the largest difference is {worst.value:.1f} Monte Carlo errors"
     return f"{text} ({worst.quantity})"
 
 
@@ -238,8 +239,8 @@ def first_text(summary: FitSummary) -> str:
     if sampling is None or sampling.importance is None:
         return ""
     if not sampling.converged:
-        return f"importance sampling has no answer: {'; '.join(sampling.missing)}; emcee goes on ..."
-    return terminal(headline_table(summary), f"{importance_line(sampling.importance)}; emcee goes on ...")
+        return f"importance sampling has no answer: {'; '.join(sampling.missing)}; {CHAIN} goes on ..."
+    return terminal(headline_table(summary), f"{importance_line(sampling.importance)}; {CHAIN} goes on ...")
 
 
 def lost_motion_lines(lost: Mapping[str, Sequence[LostMotion]]) -> list[str]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 
 from tvsbayes.instrument.parameters import QUANTITIES
+from tvsbayes.results.records import CHAIN, IMPORTANCE
 
 MADE_BY = {
     "laplace": "Laplace approximation at the mode",
-    "importance": "posterior by importance sampling",
-    **dict.fromkeys(("emcee", "posterior"), "posterior sampled by emcee"),
+    IMPORTANCE: "posterior by importance sampling",
+    **dict.fromkeys((CHAIN, "posterior"), f"posterior sampled by {CHAIN}"),
 }
 """By tier, or by estimator where results name no tier."""
 IN_WORDS = {**QUANTITIES.words, "extrinsics": "the positioner's pose"}

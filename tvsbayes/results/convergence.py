@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from tvsbayes.results.records import AnswerKind, Count, FromOne, NotNegative
+from tvsbayes.results.records import CHAIN, IMPORTANCE, AnswerKind, Count, FromOne, NotNegative, Tier
 
 MEAN_ERROR_MAX, END_ERROR_MAX = 0.1, 0.2
 """Monte Carlo standard error of a headline's mean and of the ends of its 95 % interval, in its sd, with which an answer
@@ -151,6 +152,7 @@ class Reweighted:
         monte_carlo_error: of every headline.
     """
 
+    tier: ClassVar[Tier] = IMPORTANCE
     importance: Importance
     ess_bulk: dict[str, float]
     ess_tail: dict[str, float]
@@ -218,6 +220,7 @@ class Convergence:
         rough: what is missing leaves a rough answer.
     """
 
+    tier: ClassVar[Tier] = CHAIN
     steps: int
     discarded: int
     thin: int

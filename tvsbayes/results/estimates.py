@@ -296,7 +296,7 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
 
     Attributes:
         estimator: "posterior" if a converged sample stands behind the numbers, else "laplace".
-        tier: what made a posterior's draws, "importance" or "emcee"; None of a Laplace approximation.
+        tier: what made a posterior's draws, weighted draws or a chain; None of a Laplace approximation.
         converged: the mode was reached and explains the data, and what was sampled has an answer.
         answer: "accepted" or "rough" of a posterior, "laplace" of the approximation at the mode; None in results of
             0.2.0 and before.

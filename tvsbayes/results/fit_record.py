@@ -29,6 +29,7 @@ from tvsbayes.results.comparison_record import Gap
 from tvsbayes.results.estimates import Cause, FitSummary, StopResidual
 from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, BudgetTable
 from tvsbayes.results.records import (
+    CHAIN,
     ByDirection,
     ClosedRecord,
     Matrix,
@@ -43,7 +44,7 @@ FIT_FORMAT = "tvsbayes-fit/1"
 FIT_FORMATS = (FIT_FORMAT,)
 """Versions of `results/fit.json` that can be read; the schema of each is in `data/schemas`."""
 type Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
-PACKAGES = (*("tvsbayes", "jax", "optimistix", "equinox", "emcee", "arviz", "numpy", "scipy"), "opencv-python-headless")
+PACKAGES = (*("tvsbayes", "jax", "optimistix", "equinox", CHAIN, "arviz", "numpy", "scipy"), "opencv-python-headless")
 """Whose versions a result states."""
 AGAIN = "run `tvsbayes fit` again"
 

@@ -43,7 +43,9 @@ type ByDirection[T] = dict[Direction, T]
 type BothAxes[T] = Annotated[dict[AxisName, T], Meta(extra_json_schema={"required": AXES})]
 type AllDirections[T] = Annotated[dict[Direction, T], Meta(extra_json_schema={"required": DIRECTIONS})]
 type EstimatorName = Annotated[str, Meta(extra_json_schema={"enum": ("laplace", "posterior")})]
-type Tier = Annotated[str, Meta(extra_json_schema={"enum": ("importance", "emcee")})]
+IMPORTANCE, CHAIN = TIERS = ("importance", "emcee")
+"""What made the draws of a posterior: weighted independent draws, or a chain, named by the library that runs it."""
+type Tier = Annotated[str, Meta(extra_json_schema={"enum": TIERS})]
 type AnswerKind = Annotated[str, Meta(extra_json_schema={"enum": ("accepted", "rough", "laplace")})]
 
 TEXT_CHARS_MAX = 20_000

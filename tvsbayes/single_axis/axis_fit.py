@@ -18,7 +18,7 @@ from tvsbayes.errors import NotConverged, TvsError
 from tvsbayes.inference.importance import Sample, weighted_run
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.estimates import CONFLICT_LIMIT, conflict_sentence
-from tvsbayes.results.records import AnswerKind, EstimatorName, Tier
+from tvsbayes.results.records import CHAIN, AnswerKind, EstimatorName, Tier
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, AxisDensity, headline_functionals
 from tvsbayes.single_axis.axis_mode import AxisMode, find_mode
@@ -248,7 +248,7 @@ def default_priors(rows: AxisRows) -> dict[str, AxisPrior]:
 def fit_axis(
     campaign: AxisCampaign,
     *,
-    tier: str = "emcee",
+    tier: Tier = CHAIN,
     sampled: bool = True,
     max_minutes: float = 10.0,
     seed: int = 0,
@@ -271,7 +271,7 @@ def fit_axis(
         InputError: too many moves, or angles that wrap.
     """
     model = model_of(campaign, more)
-    stages = {MODE: 1.0, WEIGHING: 2.0 * sampled, WALKING: 8.0 * (sampled and tier == "emcee"), TELLING: 0.5}
+    stages = {MODE: 1.0, WEIGHING: 2.0 * sampled, WALKING: 8.0 * (sampled and tier == CHAIN), TELLING: 0.5}
     with Job(stages, progress) as job:
         job.begin(MODE)
         mode, sample = find_mode(model), None
@@ -280,7 +280,7 @@ def fit_axis(
             run = weighted_run(AxisDensity(model, mode), seed, job.at, ROUNDS_MAX, pilots_max=PILOTS_MAX)
             began = time.monotonic()
             sample = run.sample
-            if tier == "emcee":
+            if tier == CHAIN:
                 from tvsbayes.inference.ensemble import Run, better
 
                 job.begin(WALKING)

@@ -73,7 +73,7 @@ class AxisSummary(Shown, Record, frozen=True):
     Attributes:
         unit: of everything but commands, hours and shares.
         estimator: "laplace" or "posterior".
-        tier: what made a posterior's draws, "importance" or "emcee"; None of a Laplace approximation.
+        tier: what made a posterior's draws, weighted draws or a chain; None of a Laplace approximation.
         converged: there is a mode, and an answer of the sampler, accepted or rough, where one was asked for.
         problems: what an accepted answer lacks.
         per_command: ratio by direction, "forward" and "backward"; it holds beyond the range read.
