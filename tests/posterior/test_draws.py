@@ -13,6 +13,7 @@ from tvsbayes.inference.summaries import propagated
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.posterior.draws import Posterior
+from tvsbayes.results.records import CHAIN
 
 SIGMAS = 5.0
 
@@ -49,7 +50,7 @@ def test_lost_motion_takes_ratio_and_backlash_of_its_own_axis():
     shape = physical.shape[:2]
     draws = drawn_quantities(*shape, physical=physical)
     fit = SimpleNamespace(space=SimpleNamespace(mechanism=TWO_MIRROR))
-    known = Posterior(fit, physical, np.zeros(shape), draws, np.full(shape, 1 / 6), None, 0, 0.0)
+    known = Posterior(fit, physical, np.zeros(shape), draws, np.full(shape, 1 / 6), SimpleNamespace(tier=CHAIN), 0, 0.0)
     expected = {"left": (0.122, 0.3), "right": (0.118, 0.3), "up": (0.144, 0.5), "down": (0.136, 0.5)}
     for direction, lost in expected.items():
         found = known.lost_motion_deg(direction, np.array([2, 200]))

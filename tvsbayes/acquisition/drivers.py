@@ -2,7 +2,7 @@
 
 A driver is an entry point of the group `tvsbayes.positioners` or `tvsbayes.cameras`: a function that takes the `Rig`
 and returns a connected `Positioner` or an open `StereoCamera` (data/docs/instrument.md, "Your own hardware"). Our own
-are registered in the same way; they are known here too, so that a source tree without an installation has them.
+are known without one, so that a source tree without an installation has them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ OWN: Mapping[str, Mapping[str, str]] = {
         "simulated": "tvsbayes.acquisition.simulated_drivers:simulated_cameras",
     },
 }
-"""As in pyproject.toml."""
+"""Our own drivers by the group of entry points: "module:function" by name."""
 _TABLES = {POSITIONERS: "positioner", CAMERAS: "cameras"}
 
 

@@ -66,7 +66,8 @@ def locate(
         ),
     ] = None,
     cloud: Annotated[
-        Path | None, typer.Option("--cloud", help="Write the points of --points here: OUT.ply or OUT.csv; any number.")
+        Path | None,
+        typer.Option("--cloud", help="Write the points of --points here, in the format of the ending: OUT.ply."),
     ] = None,
     draws: Annotated[int, typer.Option("--draws", min=500, max=100_000, help="Draws per point.")] = 1000,
     budget: Annotated[

@@ -135,7 +135,7 @@ def cloud_place(path: Path, looks: Path | None = None) -> Path:
     if path.suffix.lower() not in FORMATS:
         found, allowed = escaped(path.suffix or path.name), " or ".join(FORMATS)
         message = f"--cloud {shown}: the ending {found} names no format"
-        raise InputError("usage", message, found=found, allowed=allowed, remedy="name a file .ply or .csv")
+        raise InputError("usage", message, found=found, allowed=allowed, remedy=f"name a file {allowed}")
     if looks is not None and any(one.exists() and looks.exists() and one.samefile(looks) for one in _written(path)):
         message = f"--cloud {shown} would replace {escaped(str(looks), 200)}, which the looks are read from"
         raise InputError("usage", message, found=shown, allowed="another file", remedy="name another cloud")

@@ -33,7 +33,7 @@ from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.results.records import IMPORTANCE
+from tvsbayes.results.records import CHAIN, IMPORTANCE
 from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
 from tvsbayes.studies.rows import STUDY_FORMAT, HeadlineRow, StudyRow
 from tvsbayes.twin.simulated_campaign import simulate
@@ -123,7 +123,7 @@ def study_row(job: StudyJob, index: int) -> StudyRow:
 def posterior_of(result: JointFit, seed: int) -> Posterior:
     """By importance sampling; where its weights are not sound by a chain, with which `tvsbayes fit` ends as well."""
     posterior = sample(result, IMPORTANCE, seed=seed)
-    return posterior if posterior.converged else sample(result, seed=seed)
+    return posterior if posterior.converged else sample(result, CHAIN, seed=seed)
 
 
 @dataclass(frozen=True)
