@@ -36,7 +36,7 @@ from tvsbayes.results.comparison_record import AxisHoldOut
 from tvsbayes.results.compensation_record import stored_verification
 from tvsbayes.results.estimates import Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import provenance
-from tvsbayes.results.records import CHAIN, IMPORTANCE, plain
+from tvsbayes.results.records import IMPORTANCE, plain
 from tvsbayes.single_axis.axis_campaign import axis_hashes
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
@@ -215,7 +215,8 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
         details: also the error by position, ISO 230-2 and what the readings leave to the priors.
         written: files that hold all of it.
     """
-    how = {None: "Laplace approximation", IMPORTANCE: "weighted draws", CHAIN: f"chain of {CHAIN}"}[summary.tier]
+    words = {None: "Laplace approximation", IMPORTANCE: "weighted draws"}
+    how = words.get(summary.tier, f"chain of {summary.tier}")
     more: list[Part] = []
     if details:
         deviations = deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN)

@@ -13,7 +13,7 @@ from tvsbayes.display import concise
 from tvsbayes.errors import escaped
 from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.report.document import Part, terminal
-from tvsbayes.report.parameter_words import MADE_BY, name_in_words
+from tvsbayes.report.parameter_words import made_by, name_in_words
 from tvsbayes.report.result_tables import gap_table, hold_out_table, point_budget_table
 from tvsbayes.report.tables import COLUMNS, TableView, two_digits
 from tvsbayes.results.comparison_record import Comparison, Gap, HoldOut, PositionHoldOut
@@ -419,7 +419,7 @@ def study_text(result: StudyResult) -> str:
         numbers = [f"{h.sd:.3g}", f"{h.rms_z:.2f}", f"{h.rms_predicted:.2f}", *shares, f"{h.power:.2f}"]
         rows.append([name, *numbers, "within" if h.within else "OUTSIDE"])
     columns = ["quantity", "median sd", "RMS z", "predicted", *(f"{100 * x:g} %" for x in LEVELS), "power", ""]
-    title = f"{result.campaigns} simulated campaigns, {n} fits converged ({MADE_BY[result.estimator]}); "
+    title = f"{result.campaigns} simulated campaigns, {n} fits converged ({made_by(result.estimator)}); "
     lines: list[Part] = [TableView(f"{title}{result.seconds:.1f} s each", columns, rows)]
     a, b = result.assurance_interval95
     share = f"{100 * result.assurance:.1f} % of fits ({100 * a:.1f} to {100 * b:.1f} %)"

@@ -7,14 +7,18 @@ import re
 from tvsbayes.instrument.parameters import QUANTITIES
 from tvsbayes.results.records import CHAIN, IMPORTANCE
 
-MADE_BY = {
+_MADE_BY = {
     "laplace": "Laplace approximation at the mode",
     IMPORTANCE: "posterior by importance sampling",
-    **dict.fromkeys((CHAIN, "posterior"), f"posterior sampled by {CHAIN}"),
+    "posterior": f"posterior sampled by {CHAIN}",
 }
-"""By tier, or by estimator where results name no tier."""
 IN_WORDS = {**QUANTITIES.words, "extrinsics": "the positioner's pose"}
 """By block of quantities; those of the positioner's pose also as one."""
+
+
+def made_by(tier: str) -> str:
+    """What made the numbers, by tier, or by estimator where results name no tier."""
+    return _MADE_BY.get(tier, f"posterior sampled by {tier}")
 
 
 def name_in_words(name: str) -> str:

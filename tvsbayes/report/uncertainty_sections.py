@@ -18,7 +18,7 @@ from tvsbayes.metrology.traceability import header_table, stated_text
 from tvsbayes.report import figures
 from tvsbayes.report.document import FigureView, Section, sentence
 from tvsbayes.report.drawing import SMALLEST_SHARE
-from tvsbayes.report.parameter_words import MADE_BY, name_in_words, share_in_words, source_in_words
+from tvsbayes.report.parameter_words import made_by, name_in_words, share_in_words, source_in_words
 from tvsbayes.report.result_tables import point_budget_table
 from tvsbayes.report.tables import TableView, interval_text, two_digits
 from tvsbayes.results.metrology_tables import FIGURES, BudgetRow, BudgetTable, Predicted
@@ -286,7 +286,7 @@ def method_section(e: Evidence) -> Section:
         "by a calibrated stereo pair; all spots at once; stop errors integrated out; stereo calibration and focal "
         "scale uncertain within their stated covariance. Classic: the four-point method of "
         "doi 10.3390/metrology5040058.",
-        f"Estimator: {MADE_BY[e.fit.summary.tier or e.fit.summary.estimator]}. Intervals are equal-tailed "
+        f"Estimator: {made_by(e.fit.summary.tier or e.fit.summary.estimator)}. Intervals are equal-tailed "
         "(JCGM 101:2008, 5.3.3), coverage probability 95 %.",
         f"Command: {made.command}. Seed {made.seed}.",
     ]

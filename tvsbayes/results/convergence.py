@@ -218,9 +218,9 @@ class Convergence:
         agreement: with them; None where they were not accepted.
         monte_carlo_error: of every headline.
         rough: what is missing leaves a rough answer.
+        tier: what ran the chain.
     """
 
-    tier: ClassVar[Tier] = CHAIN
     steps: int
     discarded: int
     thin: int
@@ -236,6 +236,7 @@ class Convergence:
     agreement: Agreement | None
     monte_carlo_error: dict[str, MonteCarloError]
     rough: bool
+    tier: Tier = CHAIN
 
     @property
     def answer(self) -> AnswerKind:
