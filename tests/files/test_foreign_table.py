@@ -85,6 +85,13 @@ def test_lines_above_the_names_of_a_sheet(tmp_path):
     assert read_foreign(tmp_path / "t.xlsx").columns == {"Pan": ("200", "400"), "XL": ("640.25", "641.5")}
 
 
+def test_remarks_in_few_rows_hide_no_names_below_other_lines(tmp_path):
+    """The row of names is then wider than most."""
+    rows = "1;2;\n" * 9 + "3;;not seen\n"
+    table = written(tmp_path / "t.csv", ("bench 3\n\nn;v;remark\n" + rows).encode())
+    assert list(table.columns) == ["n", "v", "remark"] and table.first_line == 3 and len(table) == 10
+
+
 @pytest.mark.parametrize(
     ("text", "columns"),
     [

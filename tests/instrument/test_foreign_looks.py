@@ -160,6 +160,14 @@ def test_numbers_that_cannot_be_kept_are_told():
     assert not [text for text in whole.assumed if text.startswith(("spot", "experiment"))]
 
 
+def test_points_without_experiments_count_looks():
+    """No four-point experiment: numbers above 4 are nobody's mistake."""
+    rows = [f"{10 * k} 0 1 1 1 1 {k}" for k in range(1, 9)]
+    found = looks(*rows, header="Pan Tilt XL YL XR YR Point")
+    assert {(s.experiment, s.point) for s in found.spots} == {(None, None)} and len(found.spots) == 8
+    assert any("column Point is left out" in text for text in found.assumed)
+
+
 def test_looks_alone_go_to_moves_that_are_listed():
     moves = looks(*(row.rsplit(" ", 5)[0] for row in LOOKS), header="Pan Tilt").moves
     assert len(moves) == 3
@@ -202,7 +210,7 @@ def test_a_log_of_moves_that_counts_otherwise_than_we_do_is_told(numbers, said):
         (("1 2 3 4",), "XL YL XR YR", "column move=NAME"),
         (("1 2 3 4 7",), "XL YL XR YR move", "line 2, move: "),
         (("0 0 1 2 3 4 1 0",), "Pan Tilt XL YL XR YR exp pt", "line 2, pt: .* from 1 to 4"),
-        (("0 0 1 2 3 4 -1",), "Pan Tilt XL YL XR YR exp", "line 2, exp: .* from 0 to"),
+        (("0 0 1 2 3 4 -1 1",), "Pan Tilt XL YL XR YR exp pt", "line 2, exp: .* from 0 to"),
         (("0 0 1 2 3 4 -1",), "Pan Tilt XL YL XR YR spot", "line 2, spot: .* from 0 to"),
         (("0 0 1 2 3 4 500",), "Pan Tilt XL YL XR YR B", "line 2, B: .* from -360 to 360"),
         (("0 0 1 2 3 4 0",), "Pan Tilt XL YL XR YR std_XL", "line 2, std_XL: .* from 0.0001 to 100"),

@@ -219,7 +219,8 @@ def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | N
 def _without_heading(rows: list[tuple[int, list[str]]]) -> tuple[list[tuple[int, list[str]]], list[str]]:
     """The rows from the names of the columns on, and the lines above them in words.
 
-    The names stand in the first row with as many cells as most rows have, and are no numbers; rows above have fewer.
+    The names stand in the first row that is as wide as most rows or wider, and are no numbers: a last column of remarks
+    is empty in most rows.
     """
 
     def width(cells: Sequence[str]) -> int:
@@ -230,11 +231,10 @@ def _without_heading(rows: list[tuple[int, list[str]]]) -> tuple[list[tuple[int,
     if not often or often[0][0] < 2 or 2 * often[0][1] <= len(filled):
         return rows, []
     cells_usual = often[0][0]
-    first = next(k for count, k in filled if count == cells_usual)
-    above = [k for count, k in filled if k < first]
+    first = next(k for count, k in filled if count >= cells_usual)
+    above = [k for _, k in filled if k < first]
     names = [cell for cell in rows[first][1] if cell]
-    wider = any(count > cells_usual for count, k in filled if k < first)
-    if not above or wider or len(above) > ABOVE_MAX or any(map(_is_number, names)):
+    if not above or len(above) > ABOVE_MAX or any(map(_is_number, names)):
         return rows, []
     text = " ".join(cell for cell in rows[above[0]][1] if cell)
     several = f"{len(above)} lines" if len(above) > 1 else "a line"

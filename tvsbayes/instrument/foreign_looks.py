@@ -46,6 +46,8 @@ BAD = {
     *("non", "mauvais", "mauvaise", "invalide"),
 }
 """Words of a status, in small letters without accents."""
+FOUR_POINT = ("experiment", "point")
+"""Fields of the four-point method: both or neither."""
 WORDS_TOLD = 5
 """Of those that leave rows out."""
 NO_NUMBER = {"nan", "n/a", "#n/a", "null"}
@@ -350,7 +352,6 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
     if any(column is None for column in stated):
         text = f"standard uncertainty of a centroid: {notation.sd_px:g} px; --sd-px states another"
         assumed.append(f"{text}, the fit finds the scale" if all(c is None for c in stated) else text)
-    experiments, points = cells.read(SPOTS["experiment"]), cells.read(SPOTS["point"])
     numbers = cells.read(SPOTS["spot"], empty=True)
     others = {name: cells.read(SPOTS[name]) for name in SPOTS.optional}
     statuses, targets = cells.text("status"), cells.text("target")
@@ -363,6 +364,14 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
     unique = None not in looked_numbers and len(set(looked_numbers)) == len(looked_numbers)
     if "spot" in cells and not unique:
         assumed.append("spot: numbers are missing or stand twice, so looks are numbered by their rows")
+    four_point = [field for field in FOUR_POINT if field in cells]
+    if len(four_point) == 1:
+        # "Point 1 ... 200" counts looks.
+        column = escaped(cells.columns[four_point[0]])
+        assumed.append(f"column {column} is left out: no column gives the other of {' and '.join(FOUR_POINT)}")
+    experiments, points = (
+        cells.read(SPOTS[field]) if len(four_point) == 2 else [None] * len(of_row) for field in FOUR_POINT
+    )
     half = sum((a is None) != (b is None) for a, b in zip(experiments, points, strict=True))
     if half:
         assumed.append(f"experiment, point: {half} row{'s' * (half != 1)} with one of both alone, which is left out")
