@@ -47,8 +47,17 @@ TOGETHER = {
 """Packages whose files share fits and compiled functions: one process takes them all. Roughly the longest first."""
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector):
+    """Each second process collects from the end: it finds compiled what the first compiled, and the other way round."""
+    report = yield
+    if isinstance(collector, pytest.Directory) and int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % 2:
+        report.result.reverse()
+    return report
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Order the packages for two processes.
+    """Order the packages for two processes, whichever end each began to collect at.
 
     One compiles the model for the commands while the other is at what needs little of it, and then reads it from the
     cache; the long packages follow, and then single files, so that neither is left alone with a package at the end.
@@ -60,7 +69,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         name = TOGETHER.get(package, package)
         return turns.index(name) if name in turns else len(turns)
 
-    items.sort(key=turn)
+    items.sort(key=lambda item: (turn(item), item.path))
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling:
