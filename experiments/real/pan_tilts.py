@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.common.command_line import parser
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.instrument.campaign import Campaign, Move, sighted_campaign
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
@@ -122,9 +123,16 @@ tilt's curve, a linkage, is an error by position several times what the prior ex
 """
 
 
-if __name__ == "__main__":
-    folder = Path(sys.argv[1])
+def main() -> None:
+    """See the module."""
+    made = parser(__doc__)
+    made.add_argument("folder", type=Path)
+    folder = made.parse_args().folder
     print(TEXT)
     camera(columns(folder / "camera.csv"))
     for axis in ("pan", "tilt"):
         servo(folder / f"servo_{axis}.csv")
+
+
+if __name__ == "__main__":
+    main()

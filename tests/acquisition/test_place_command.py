@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from pathlib import Path
 
 import pytest
 from support.bench_runs import Run, small_plan
+from support.firmware_sessions import NO_EMULATOR
 
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.journal_check import verify
@@ -14,6 +17,7 @@ from tvsbayes.acquisition.place_command import WORDS_MAX, PlaceCommand
 from tvsbayes.cli.main import run
 from tvsbayes.errors import DeviceFault, InputError
 from tvsbayes.instrument.campaign import read_campaign
+from tvsbayes.positioner.emulated_board import EmulatedBoard
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_works")
 SAYS = "import sys; print('moved to', *sys.argv[1:])"
@@ -46,6 +50,33 @@ def test_every_placement_is_made_by_the_program_in_the_dark(mounted_rig, tmp_pat
         assert one["words"].strip() == f"moved to {one['target']} {x_mm:.3f} {number}"
         assert (one["exit_code"], one["placement"], one["x_mm"], one["limit_s"]) == (0, number, x_mm, 60.0)
     assert verify(tmp_path / "c").stopped == "done" and len(read_campaign(tmp_path / "c").spots) == 8
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(NO_EMULATOR), reason=NO_EMULATOR)
+def test_the_stage_of_the_page_stands_at_every_target(mounted_rig, tmp_path, monkeypatch):
+    """The program of instrument.md, on an emulated board of its own: 10 steps a mm from 225 mm."""
+    page = Path(__file__).parents[2] / "data" / "docs" / "instrument.md"
+    (code,) = re.findall(r"```python\n(# stage\.py.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "stage.py").write_text(code)
+    at, stood = [0, 0], []
+
+    def on_step(axis: int, sense: int) -> None:
+        at[axis] += sense
+
+    ordinary = PlaceCommand.run
+    with EmulatedBoard(on_step) as board:
+
+        def seen(self, *given):
+            done = ordinary(self, *given)
+            board.drain()
+            stood.append((given[1], at[0]))
+            return done
+
+        monkeypatch.setattr(PlaceCommand, "run", seen)
+        command = PlaceCommand((sys.executable, str(tmp_path / "stage.py"), board.port))
+        assert Run(mounted_rig, tmp_path / "c", place_command=command).engine.run().reason == "done"
+    assert len(stood) > 1 and stood == [(x_mm, round(10 * (x_mm - 225))) for x_mm, _ in stood]
 
 
 def test_a_program_that_fails_ends_the_run_and_resume_goes_on(mounted_rig, tmp_path):

@@ -133,7 +133,10 @@ def test_no_point_lies_behind_the_scanner(ask, folder, tmp_path, capsys):
     run([*map(str, ("locate", folder, "--points", points, "--cloud", out))])
     text = capsys.readouterr().out
     assert (
-        "1 point," in text and "of 1 point carried" in text and "1 look has no point" in text and "1 points" not in text
+        "1 point," in text
+        and "of 1 point carried" in text
+        and "1 look has no point (behind 1)" in text
+        and "1 points" not in text
     )
 
 

@@ -87,7 +87,7 @@ def test_both_formats_hold_the_same_and_a_foreign_reader_opens_them(tmp_path):
     ply, table = (
         write_cloud(cloud(one, blocks, SIMPLE), tmp_path / f"c.{kind}", ["nominal"]) for kind in ("ply", "csv")
     )
-    assert (ply.points, ply.refused) == (61, 9) == (table.points, table.refused)
+    assert (ply.points, ply.refused) == (61, {"diverging": 9}) == (table.points, table.refused)
     vertices = PlyData.read(str(ply.path))["vertex"].data
     assert vertices.dtype.names == columns_of(["nominal"]) == ply.columns
     with open(table.path, newline="") as stream:
@@ -111,7 +111,7 @@ def test_a_cloud_without_refused_looks_has_no_table_of_them(tmp_path):
 
 def test_the_table_of_an_earlier_cloud_goes_and_a_foreign_file_of_its_name_stays(tmp_path):
     place, table = tmp_path / "c.ply", tmp_path / "c.refused.csv"
-    assert write_cloud(cloud(calibration(), [looks(20)], {}), place, []).refused == 2 and table.exists()
+    assert write_cloud(cloud(calibration(), [looks(20)], {}), place, []).refused.total() == 2 and table.exists()
     assert write_cloud(cloud(calibration(), [looks(6)], {}), place, []).refused_path is None
     assert not table.exists(), "it would tell of looks that are not refused"
     table.write_text("my own notes\n")

@@ -10,6 +10,7 @@ import csv
 import io
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +38,7 @@ class CloudFile:
         columns: its properties, in order.
         points: in it.
         extrapolated: of them, beyond the counters that the campaign saw.
-        refused: looks without a point.
+        refused: looks without a point, by the code of the reason.
         refused_path: the table of these; None where there is none.
     """
 
@@ -45,7 +46,7 @@ class CloudFile:
     columns: tuple[str, ...]
     points: int
     extrapolated: int
-    refused: int
+    refused: Counter[str]
     refused_path: Path | None
 
     def as_json(self) -> dict[str, object]:
@@ -55,7 +56,7 @@ class CloudFile:
             "columns": list(self.columns),
             "written": self.points,
             "extrapolated": self.extrapolated,
-            "refused": self.refused,
+            "refused": self.refused.total(),
             "refused_file": None if self.refused_path is None else str(self.refused_path),
         }
 
@@ -188,4 +189,5 @@ def write_cloud(blocks: Iterable[CloudBlock], path: Path, names: Sequence[str]) 
             stream.write(csv_bytes(REFUSED_COLUMNS, refused))
     else:
         _removed_if_ours(table)
-    return CloudFile(path, columns_of(names), points, extrapolated, len(refused), table if refused else None)
+    reasons = Counter(code for _, code, _ in refused)
+    return CloudFile(path, columns_of(names), points, extrapolated, reasons, table if refused else None)

@@ -181,8 +181,8 @@ def _in_view(knowledge: Knowledge, box: np.ndarray, turns: Sequence[int], half_t
         good = near & (positions.visible(knowledge, knowledge.z[None]) > 0)
         notes.append(
             "where the positioner stands is stated so loosely that looks may miss the images (as few as "
-            f"{100 * share[good].min(initial=1.0):.0f} % of drawn instruments see one): state the extrinsics, or "
-            "measure little and plan with --given"
+            f"{100 * share[good].min(initial=1.0):.0f} % of drawn instruments see one): state all six extrinsics in "
+            "[rig.prior], to some 0.03 rad and 5 mm, or measure little and plan with --given"
         )
     return _InView(positions[good], tuple(notes))
 

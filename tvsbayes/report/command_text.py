@@ -321,8 +321,10 @@ def cloud_text(cloud: CloudFile, law: LawChecked, calibration: Calibration) -> s
         )
     if cloud.refused_path is not None:
         name = escaped(str(cloud.refused_path), 200)
-        looks = f"{cloud.refused} look{' has' if cloud.refused == 1 else 's have'}"
-        lines.append(f"{looks} no point: lines and reasons in {name}")
+        count = cloud.refused.total()
+        reasons = ", ".join(f"{code} {number}" for code, number in sorted(cloud.refused.items()))
+        have = "look has" if count == 1 else "looks have"
+        lines.append(f"{count} {have} no point ({reasons}): lines and reasons in {name}")
     return "\n".join(lines)
 
 
