@@ -21,7 +21,7 @@ from tvsbayes.instrument.model_choice import ModelChoice
 from tvsbayes.model.compiled import Traces
 from tvsbayes.pipeline import FITTING, SUMMARISING, StoredOrFitted, calibrate, compile_for
 
-pytestmark = pytest.mark.usefixtures("own_compilation_cache")
+pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once")
 
 
 def test_what_a_fit_left_is_taken_up_again(grid_folder, monkeypatch):

@@ -91,7 +91,7 @@ def test_a_far_start_is_annealed_to_the_same_mode(simulated, fitted):
 
 
 def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, mounted_rig, monkeypatch):
-    """Fewer spots, or more of them at more counters: every argument of a compiled function keeps its shape."""
+    """Other numbers of spots and of counters: every argument of a compiled function keeps its shape."""
     made, first = [], Compiled._made
 
     def counted(self, *arguments):
@@ -99,13 +99,10 @@ def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, m
         return first(self, *arguments)
 
     monkeypatch.setattr(Compiled, "_made", counted)
-    campaign = simulated.campaign
     plan = grid_protocol(pan_steps=(0, 60, 120, 180), tilt_steps=(-90, -30, 30, 90))
     grid = simulate(mounted_rig, plan, seed=22).campaign
-    for other in (replace(campaign, spots=campaign.spots[:-7]), grid):
-        again = fit(other)
-        assert again.converged and again.arrays.gears.filled >= fitted.arrays.gears.filled
-    assert again.arrays.gears.filled > fitted.arrays.gears.filled and made == []
+    again = fit(replace(grid, spots=grid.spots[: len(simulated.campaign.spots) - 7]))
+    assert again.converged and again.arrays.gears.filled > fitted.arrays.gears.filled and made == []
 
 
 def test_the_order_of_rows_does_not_matter(simulated, fitted):
@@ -115,7 +112,7 @@ def test_the_order_of_rows_does_not_matter(simulated, fitted):
     np.testing.assert_array_equal(again.z, fitted.z)
 
 
-def test_an_outlier_is_blamed_on_the_right_spot_of_its_stop(simulated):
+def test_an_outlier_is_blamed_on_the_right_spot_of_its_stop(simulated, fitted):
     spots = ordered_spots(simulated.campaign)
     # The first of two spots taken at one stop, away from the ends of the campaign.
     first = next(a for a, b in pairwise(spots[20:]) if a.move == b.move)
@@ -125,10 +122,10 @@ def test_an_outlier_is_blamed_on_the_right_spot_of_its_stop(simulated):
     robust = fit(replace(campaign, spots=spoiled), model=ModelChoice(robust=True))
     assert robust.converged, robust.problems
     assert robust.excluded_spots == (first.spot,)
-    without = fit(replace(campaign, spots=tuple(s for s in campaign.spots if s.spot != first.spot)))
-    sd = without.draws.effective_deg_per_step.std(axis=0)
-    difference = robust.mode.effective_deg_per_step - without.mode.effective_deg_per_step
-    # Huber weights of the clean spots move an estimate by a fraction of its sd (95 % efficiency).
+    sd = fitted.draws.effective_deg_per_step.std(axis=0)
+    difference = robust.mode.effective_deg_per_step - fitted.mode.effective_deg_per_step
+    # One spot less of 96 moves an estimate by a tenth of its sd, Huber weights of the clean ones by a fraction (95 %
+    # efficiency).
     assert np.all(np.abs(difference) < 0.5 * SD * sd)
 
 
@@ -150,15 +147,6 @@ def test_robust_on_clean_data_excludes_nothing(simulated, fitted):
     assert np.all(np.abs(difference) < 0.5 * SD * sd)
 
 
-def test_the_per_axis_model_has_one_ratio(simulated):
-    result = fit(simulated.campaign, model=ModelChoice(per_axis=True))
-    left, right, up, down = result.draws.effective_deg_per_step.T
-    np.testing.assert_array_equal(left, right)
-    np.testing.assert_array_equal(up, down)
-    for axis in ("pan", "tilt"):
-        assert not result.free[INDEX[f"ratio_contrast_deg_per_step.{axis}"]]
-
-
 PAN_ERROR_DEG = {"harmonic_deg.pan.1.cos": 0.06, "harmonic_deg.pan.1.sin": 0.08}
 """An amplitude of 0.1 deg, twice the rig's median stop error."""
 
@@ -178,7 +166,7 @@ def wobbling(mounted_rig) -> SimulatedCampaign:
     return simulate(rig, plan, seed=5)
 
 
-def test_a_pinions_error_is_found_and_without_it_the_stops_scatter(simulated, fitted, wobbling):
+def test_a_pinions_error_is_found_and_without_it_the_stops_scatter(wobbling):
     plain = fit(wobbling.campaign, model=ModelChoice(perfect_gears=True))
     freed = fit(wobbling.campaign, model=ModelChoice(perfect_gears=True, harmonics=True))
     assert plain.converged and freed.converged, (plain.problems, freed.problems)
