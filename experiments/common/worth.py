@@ -18,7 +18,7 @@ from tvsbayes.planning.candidates import Candidates, candidates
 from tvsbayes.planning.expectation import Knowledge, information_of
 from tvsbayes.planning.limits import MANY, split_of
 from tvsbayes.planning.looks import LookArrays, covariance_of
-from tvsbayes.planning.search import Question, Scope, design_family
+from tvsbayes.planning.search import DesignProblem, Scope, design_family
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 
 CAUSES = ("looks", "cameras", "priors")
@@ -95,4 +95,4 @@ def searched_family(knowledge: Knowledge, found: Candidates | None = None, scope
     target = replace(parse_target(DEFAULT_TARGET), limit=UNREACHED)
     pose = seen.mirror_angles_rad.mean(axis=0)
     centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
-    return design_family(Question(knowledge, found, seen, target, centre), scope)
+    return design_family(DesignProblem(knowledge, found, seen, target, centre), scope)

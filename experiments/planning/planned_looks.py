@@ -30,7 +30,7 @@ from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, PlanInformation, information_of, prior_knowledge
 from tvsbayes.planning.limits import MANY, limit_of, split_of
 from tvsbayes.planning.looks import LookArrays, covariance_of
-from tvsbayes.planning.search import LADDER, Question, Scope, design_family
+from tvsbayes.planning.search import LADDER, DesignProblem, Scope, design_family
 from tvsbayes.planning.target import DEFAULT_TARGET, Sensitivity, parse_target, sensitivity
 from tvsbayes.report.drawing import BLUE, GREEN, GREY, ORANGE, RED
 
@@ -130,7 +130,7 @@ def second_session(first: Session) -> None:
     print("|---|---|---|---|---|---|---|---|")
     for label, allowed in (("more of the same range", ~away), ("with the beams a full turn away", np.ones_like(away))):
         part = replace(shown, rows=np.where(allowed[:, None, None], shown.rows, 0.0))
-        asked = Question(sharp, wide, part, replace(TARGET, limit=UNREACHED), first.at)
+        asked = DesignProblem(sharp, wide, part, replace(TARGET, limit=UNREACHED), first.at)
         more = design_family(asked, Scope(largest=16))
         for n in (2, 4, 8, 16):
             after = information_of(more.arranged(n).steps, sharp)

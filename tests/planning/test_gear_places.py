@@ -28,7 +28,7 @@ from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces, TaughtErrors, r
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookArrays, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.plan_check import check_plan
 from tvsbayes.planning.planner import judged
-from tvsbayes.planning.search import Question
+from tvsbayes.planning.search import DesignProblem
 from tvsbayes.planning.target import AT_POINT, GEARS_AT_POINT, parse_target, sensitivity
 from tvsbayes.statistics.gaussian_process import matern52
 
@@ -265,7 +265,7 @@ def test_a_plan_for_real_gears_looks_from_more_counters(mounted_rig, monkeypatch
         pose = seen.mirror_angles_rad.mean(axis=0)
         target = parse_target(f"u({ratio}) <= 2e-4 deg/step")
         at = sensitivity(target, known.z, known.space, known.rig.table, pose, known.gears)
-        steps = offered.looks.steps[Question(known, offered, seen, target, at).search().greedy(24), axis]
+        steps = offered.looks.steps[DesignProblem(known, offered, seen, target, at).search().greedy(24), axis]
         counts.append((len(np.unique(steps)), int(np.sum((steps > steps.min()) & (steps < steps.max())))))
     assert counts[1][0] > counts[0][0] and counts[1][1] > counts[0][1], counts
 

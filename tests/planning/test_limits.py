@@ -18,7 +18,7 @@ from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.limits import Batch, Limit, limit_of, next_experiments, split_of, stop_now
 from tvsbayes.planning.looks import LookArrays, arrange, information_of_looks
-from tvsbayes.planning.search import Question
+from tvsbayes.planning.search import DesignProblem
 from tvsbayes.planning.target import AT_POINT, GEARS_AT_POINT, Sensitivity, Target, parse_target, sensitivity
 
 pytestmark = pytest.mark.usefixtures("small_searches")
@@ -40,7 +40,7 @@ def test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away(wide):
     pose = seen.mirror_angles_rad.mean(axis=0)
     at = sensitivity(target, known.z, known.space, wide.table, pose)
     now = at.value(known.covariance)
-    batches = next_experiments(Question(known, found, seen, target, at))
+    batches = next_experiments(DesignProblem(known, found, seen, target, at))
     turned = [batch for batch in batches if batch.text.startswith("a full turn of pan away, ")]
     assert turned and len(turned) < len(batches)
     for batch in batches:

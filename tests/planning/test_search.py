@@ -19,7 +19,7 @@ from tvsbayes.planning.search import (
     CRITERIA,
     KNOWN,
     MEAN_WEIGHT,
-    Question,
+    DesignProblem,
     Scope,
     Search,
     scores,
@@ -117,7 +117,7 @@ def refine(knowledge, found, seen):
         at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose)
         assurance = Assurance(family, target, draw_instruments(knowledge, 10, 3), 3)
         plain = assurance.values([2])[2]
-        asked = Question(knowledge, found, seen, target, at)
+        asked = DesignProblem(knowledge, found, seen, target, at)
         return plain, search.refine(family, asked, 2, Scope(minutes=minutes), assurance)
 
     return run

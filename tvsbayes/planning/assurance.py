@@ -112,17 +112,17 @@ class Family:
     """Designs that grow by one look at a time: the first 4 n of `picks` are n experiments."""
 
     knowledge: Knowledge
-    found: Candidates
+    candidates: Candidates
     picks: np.ndarray
     aperture: bool
 
     def looks(self, experiments: int) -> Looks:
         """Looks of n experiments."""
-        return self.found.looks[self.picks[: LOOKS_PER_EXPERIMENT * experiments]]
+        return self.candidates.looks[self.picks[: LOOKS_PER_EXPERIMENT * experiments]]
 
     def arranged(self, experiments: int) -> Arranged:
         """Their plan."""
-        return arrange(self.looks(experiments), self.knowledge.sheets, self.found.overshoot)
+        return arrange(self.looks(experiments), self.knowledge.sheets, self.candidates.overshoot)
 
     @property
     def largest(self) -> int:
@@ -162,7 +162,7 @@ class Assurance:
         self._of_lines = before and target.point_mm is None and family.knowledge.gears.size > 0
         self.noise = random_stream(seed, Stream.INSTRUMENT_SCALES).standard_normal((len(instruments), len(SCALES)))
         self.distinct, self.index = np.unique(family.picks, return_inverse=True)
-        self.looks = family.found.looks[self.distinct]
+        self.looks = family.candidates.looks[self.distinct]
         self.arrays = LookArrays(self.looks, family.knowledge, family.aperture)
         self._scene = lru_cache(maxsize=self.KEPT)(self._evaluated)
         self._values: dict[int, np.ndarray] = {}
@@ -175,13 +175,13 @@ class Assurance:
         """Reported uncertainty of the target at each truth, shape (draws,), by number of experiments."""
         draws, together = len(self.instruments), max(1, self.PAIRS // len(self.looks))
         wanted = {n: self.family.arranged(n) for n in sizes if n not in self._values}
-        found = {n: np.full(draws, np.inf) for n in wanted}
+        values_by_size = {n: np.full(draws, np.inf) for n in wanted}
         for first in range(0, draws, together) if wanted else ():
             scene = self._scene(first, min(first + together, draws))
             for n, design in wanted.items():
-                found[n][scene.rows] = self._reported(scene, n, design)
+                values_by_size[n][scene.rows] = self._reported(scene, n, design)
             advance((first + together) / draws)
-        self._values |= found
+        self._values |= values_by_size
         return {n: self._values[n] for n in sizes}
 
     def met_share(self, experiments: int) -> float:
@@ -191,11 +191,11 @@ class Assurance:
     def _evaluated(self, first: int, end: int) -> _Scene:
         every, knowledge = self.instruments[np.arange(first, end)], self.family.knowledge
         gears = [own_gears(knowledge, physical) for physical in every.physical]
-        turning = np.array([own.turning(self.looks.steps, self.looks.side) for own in gears])
-        seen = self.arrays.at_all(every.z, every.value, turning)
-        poses = seen.mirror_angles_rad[:, self.index].mean(axis=1)
+        turning = np.array([places.turning(self.looks.steps, self.looks.side) for places in gears])
+        shown = self.arrays.at_all(every.z, every.value, turning)
+        poses = shown.mirror_angles_rad[:, self.index].mean(axis=1)
         rows, aimed = [], []
-        for row in np.flatnonzero(seen.seen.any(axis=1)).tolist():
+        for row in np.flatnonzero(shown.seen.any(axis=1)).tolist():
             try:
                 aimed.append(self._aimed(every.z[row], every.space_of(row), poses[row], gears[row]))
             except InputError:
@@ -205,7 +205,7 @@ class Assurance:
         parts = (knowledge.gears.size // 2 + 1,) if self._of_lines else ()
         gradient = np.array([one.gradient for one in aimed]).reshape(len(rows), *parts, wanted, knowledge.size)
         own_variance = np.array([one.own_variance for one in aimed]).reshape(len(rows), *parts, wanted)
-        return _Scene(first + chosen, every[chosen], seen[chosen], gradient, own_variance)
+        return _Scene(first + chosen, every[chosen], shown[chosen], gradient, own_variance)
 
     def _aimed(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray, gears: GearPlaces) -> Sensitivity:
         """How the target depends on the coordinates of an instrument; of lines, by place (leading axis c + 1).

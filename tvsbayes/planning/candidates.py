@@ -108,14 +108,14 @@ class Positions:
 
 def sided(positions: Positions, limits: np.ndarray, overshoot: np.ndarray) -> Looks:
     """Positions from all four sides whose run-up stays inside the limits (2, 2)."""
-    found = []
+    parts = []
     for side in itertools.product((1, -1), repeat=2):
         start = positions.steps - np.array(side) * overshoot
         both = np.stack([positions.steps, start])
         good = np.all((both >= limits[:, 0]) & (both <= limits[:, 1]), axis=(0, 2))
         sides = np.tile(np.array(side), (int(good.sum()), 1))
-        found.append(Looks(positions.steps[good], sides, positions.sheet[good]))
-    return Looks(*(np.concatenate([getattr(some, part.name) for some in found]) for part in fields(Looks)))
+        parts.append(Looks(positions.steps[good], sides, positions.sheet[good]))
+    return Looks(*(np.concatenate([getattr(some, part.name) for some in parts]) for part in fields(Looks)))
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,8 @@ def _box_in_view(knowledge: Knowledge, limits: np.ndarray, ratio: np.ndarray) ->
     reach = REACH_DEG / np.abs(ratio)
     window = np.stack([np.maximum(limits[:, 0], -reach), np.minimum(limits[:, 1], reach)], axis=1)
     coarse = Positions.grid(window, (COARSE_PAN, COARSE_TILT), len(knowledge.sheets))
-    seen = coarse.steps[coarse.visible(knowledge, knowledge.z[None]) > 0]
-    if not len(seen):
+    steps = coarse.steps[coarse.visible(knowledge, knowledge.z[None]) > 0]
+    if not len(steps):
         raise InputError(
             "out-of-view",
             "no counters within the limits put the spot into both images on any sheet",
@@ -154,7 +154,7 @@ def _box_in_view(knowledge: Knowledge, limits: np.ndarray, ratio: np.ndarray) ->
             column="rig.prior",
             remedy="check the extrinsics in [rig.prior], the sheets' X and the limits in [positioner]",
         )
-    return np.stack([seen.min(axis=0), seen.max(axis=0)], axis=1)
+    return np.stack([steps.min(axis=0), steps.max(axis=0)], axis=1)
 
 
 @dataclass(frozen=True)

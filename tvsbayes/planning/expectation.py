@@ -255,8 +255,8 @@ def expect(
     given = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, spots)
 
     def step(belief, row):
-        found = kalman_update(belief.renewed(row), row)
-        return found.belief, found.standardised
+        updated = kalman_update(belief.renewed(row), row)
+        return updated.belief, updated.standardised
 
     _, rows = jax.lax.scan(step, no_belief(columns.shape[2]), given)
     rows = jnp.where(seen[:, None, None], rows, 0.0)
@@ -322,8 +322,8 @@ def expected_information(
     count = len(depth_mm)
     depths = padded(depth_mm, len(arrays.spots.valid), depth_mm[-1])
     turns = padded(turning, len(arrays.spots.valid))
-    found = expect(z, space, arrays, depths, largest_px(rig), turns)
-    return jax.tree.map(lambda x: np.asarray(x)[:count], found)
+    expectation = expect(z, space, arrays, depths, largest_px(rig), turns)
+    return jax.tree.map(lambda x: np.asarray(x)[:count], expectation)
 
 
 @dataclass(frozen=True)
@@ -391,8 +391,10 @@ def information_of(
     depth = np.array([rig.depths_mm[log.targets[look.placement]] for look in log.looks])
     arrays = design_arrays(log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture)
     turning = knowledge.gears.turning_after(log.moves, look_moves)
-    found = expected_information(arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space, turning)
-    rows = np.asarray(found.rows)[..., : knowledge.size].reshape(-1, knowledge.size)
-    seen = np.asarray(found.seen) if found.seen.any() else np.ones(len(depth), dtype=bool)
-    pose = np.asarray(found.mirror_angles_rad)[seen].mean(axis=0)
-    return PlanInformation(rows.T @ rows, found, tuple(log.moves), look_moves, plan_minutes(steps, rig), pose)
+    expectation = expected_information(
+        arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space, turning
+    )
+    rows = np.asarray(expectation.rows)[..., : knowledge.size].reshape(-1, knowledge.size)
+    seen = np.asarray(expectation.seen) if expectation.seen.any() else np.ones(len(depth), dtype=bool)
+    pose = np.asarray(expectation.mirror_angles_rad)[seen].mean(axis=0)
+    return PlanInformation(rows.T @ rows, expectation, tuple(log.moves), look_moves, plan_minutes(steps, rig), pose)

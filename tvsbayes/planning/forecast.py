@@ -79,9 +79,9 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         first = run.campaign if first is None else first
     if first is None:
         return None
-    found = ratio_slopes(np.concatenate(pixels), np.concatenate(steps), np.concatenate(axes), rig.stereo)
-    ratio = found.ratio.reshape(-1, len(DIRECTIONS))
-    by_pixel = np.sum(found.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
+    slopes = ratio_slopes(np.concatenate(pixels), np.concatenate(steps), np.concatenate(axes), rig.stereo)
+    ratio = slopes.ratio.reshape(-1, len(DIRECTIONS))
+    by_pixel = np.sum(slopes.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
     pair = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]] + 2 * beam * np.array(looks)
     variance = by_pixel * np.array(spot_sds) ** 2 + pair * (ratio / np.array(local) / np.array(steps)) ** 2
     # Every direction has its experiments, else the draw was left out.
@@ -164,10 +164,12 @@ def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: C
 def _measured(campaign: Campaign) -> dict[str, tuple[float, int]] | None:
     """S and n of each direction of a campaign with complete experiments."""
     try:
-        found = classic(campaign).directions
+        by_direction = classic(campaign).directions
     except TvsError:
         return None
-    return {d: (r.sd_deg_per_step, r.n) for d, r in found.items() if r is not None and r.sd_deg_per_step is not None}
+    return {
+        d: (r.sd_deg_per_step, r.n) for d, r in by_direction.items() if r is not None and r.sd_deg_per_step is not None
+    }
 
 
 def value_of_classic(forecast: ClassicForecast | None, target: Target, experiments: int) -> float | None:

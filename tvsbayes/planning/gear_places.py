@@ -52,12 +52,12 @@ class GearPlaces(KnownPlaces):
             steps: counters, shape (m, 2).
             side: +1 reached left or up, -1 right or down, 0 unknown, shape (m, 2).
         """
-        found = np.zeros((len(steps), 2, self.size))
+        turns = np.zeros((len(steps), 2, self.size))
         if self.size:
             for axis in range(2):
                 at = self.between(steps[:, axis], axis)
-                found[:, axis] = np.concatenate([at.error, -0.5 * side[:, axis, None] * at.play], axis=1)
-        return found
+                turns[:, axis] = np.concatenate([at.error, -0.5 * side[:, axis, None] * at.play], axis=1)
+        return turns
 
     def line_through(self, steps: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Share of each place in the slope of the line of its axis through looks, as a fit of these looks has it.
@@ -69,27 +69,27 @@ class GearPlaces(KnownPlaces):
         Returns:
             Shape (..., c); zero for an axis that is seen at one counter alone.
         """
-        found = np.zeros((*weight.shape[:-1], len(self.steps)))
+        shares = np.zeros((*weight.shape[:-1], len(self.steps)))
         for axis in range(2):
             counters = steps[:, axis].astype(float)
             total = np.maximum(weight.sum(axis=-1, keepdims=True), 1)
             off = counters - (weight @ counters)[..., None] / total
             square = np.sum(weight * off**2, axis=-1, keepdims=True)
             slope = np.divide(weight * off, square, out=np.zeros_like(off), where=square > 0)
-            found += slope @ self._interpolation(counters, axis)
-        return found
+            shares += slope @ self._interpolation(counters, axis)
+        return shares
 
     def _interpolation(self, counters: np.ndarray, axis: int) -> np.ndarray:
         """Share of the places in the counters (m,) of an axis, each from those of its window, shape (m, c)."""
-        found = np.zeros((len(counters), len(self.steps)))
-        own = self.on_tilt == (axis == 1)
-        windows = windows_of(self.steps[own], abs(float(np.degrees(self.ratio_rad_per_step[axis]))))
+        weights = np.zeros((len(counters), len(self.steps)))
+        of_axis = self.on_tilt == (axis == 1)
+        windows = windows_of(self.steps[of_axis], abs(float(np.degrees(self.ratio_rad_per_step[axis]))))
         nearest = np.argmin([np.abs(counters - nodes[:, None]).min(axis=0) for nodes in windows], axis=0)
         for number, nodes in enumerate(windows):
-            here, places = np.flatnonzero(nearest == number), np.flatnonzero(own & np.isin(self.steps, nodes))
+            rows, places = np.flatnonzero(nearest == number), np.flatnonzero(of_axis & np.isin(self.steps, nodes))
             places = places[np.argsort(self.steps[places])]
-            found[np.ix_(here, places)] = interpolation(counters[here], nodes)
-        return found
+            weights[np.ix_(rows, places)] = interpolation(counters[rows], nodes)
+        return weights
 
     def turning_after(self, moves: Sequence[Move], looks: Sequence[int]) -> np.ndarray:
         """`turning` of the looks after some of the moves."""
@@ -150,12 +150,12 @@ def place_headlines(
     """
 
     def along(share):
-        seen = SeenLine(pose_rad, places, share)
+        line = SeenLine(pose_rad, places, share)
 
         def values(point):
             model = space.model(point[: len(NAMES)])
             mirrors = beam_angles(model.optics, pose_rad[0], pose_rad[1])
-            slopes = line_deg_per_step(model, seen, root @ point[len(NAMES) :], mirrors)
+            slopes = line_deg_per_step(model, line, root @ point[len(NAMES) :], mirrors)
             return target_values(AtPose(model, mirrors, slopes))
 
         point = jnp.concatenate([z, jnp.zeros(len(root))])
@@ -171,8 +171,8 @@ def believed_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> G
     """
     physical = np.array(physical_at(z, space).value)
     if not after_data:
-        own = np.asarray(space.kind) == KINDS.index("half-normal")
-        physical[: len(own)] = np.where(own, np.asarray(space.u), physical[: len(own)])
+        half_normal = np.asarray(space.kind) == KINDS.index("half-normal")
+        physical[: len(half_normal)] = np.where(half_normal, np.asarray(space.u), physical[: len(half_normal)])
     return scales_at(physical, np.asarray(space.harmonic_period_deg))
 
 
@@ -194,9 +194,11 @@ def regular_places(reached: np.ndarray, ratio_deg_per_step: np.ndarray, scales: 
     steps, on_tilt, share = [], [], []
     for axis in range(2):
         deg_per_step = abs(float(ratio_deg_per_step[axis]))
-        for number, own in enumerate(windows_of(reached[:, axis], deg_per_step)):
-            wanted = math.ceil(np.ptp(own) * deg_per_step / SPACING_DEG) + 1
-            nodes = np.linspace(own[0], own[-1], min(max(wanted, 2), PLACES_MAX)) if len(own) > 1 else own
+        for number, windows in enumerate(windows_of(reached[:, axis], deg_per_step)):
+            wanted = math.ceil(np.ptp(windows) * deg_per_step / SPACING_DEG) + 1
+            nodes = (
+                np.linspace(windows[0], windows[-1], min(max(wanted, 2), PLACES_MAX)) if len(windows) > 1 else windows
+            )
             off = nodes - nodes.mean()
             lined = number == 0 and len(nodes) > 1
             steps.append(nodes)
@@ -220,19 +222,19 @@ class TaughtErrors:
 
     def carried(self, places: GearPlaces) -> np.ndarray:
         """The same covariance of the coordinates and of the errors at other places."""
-        own, count = len(self.places.steps), len(NAMES)
+        size, count = len(self.places.steps), len(NAMES)
         scales = self.places.scales
         assert scales is not None, "a fit with places has scales"
         # In their units errors hang together whatever their size; no play would leave nothing to divide by.
         sized = replace(scales, play_rad=np.where(scales.play_rad > 0, scales.play_rad, 1.0))
-        taught, asked = replace(self.places, scales=sized), replace(places, scales=sized)
-        here = np.split(asked.root, 2)
-        factors = taught.factors_with(asked.steps, asked.on_tilt)
+        taught, wanted = replace(self.places, scales=sized), replace(places, scales=sized)
+        roots = np.split(wanted.root, 2)
+        factors = taught.factors_with(wanted.steps, wanted.on_tilt)
         follows, rest = [], []
-        for part, factor in zip((here[0][:, : len(here[0])], here[1][:, len(here[0]) :]), factors, strict=True):
-            turned = linalg.solve_triangular(part, factor[own:], lower=True)
-            follows.append(turned[:, :own])
-            rest.append(turned[:, own:])
+        for part, factor in zip((roots[0][:, : len(roots[0])], roots[1][:, len(roots[0]) :]), factors, strict=True):
+            turned = linalg.solve_triangular(part, factor[size:], lower=True)
+            follows.append(turned[:, :size])
+            rest.append(turned[:, size:])
         move = linalg.block_diag(np.eye(count), *follows)
         left = linalg.block_diag(np.zeros((count, count)), *(part @ part.T for part in rest))
         return move @ self.covariance @ move.T + left

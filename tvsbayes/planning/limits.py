@@ -14,7 +14,7 @@ from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, described
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.looks import covariance_of
-from tvsbayes.planning.search import Question
+from tvsbayes.planning.search import DesignProblem
 from tvsbayes.planning.target import GEARS_AT_POINT, Sensitivity, Target
 from tvsbayes.results.plan_record import Advice, Batch
 
@@ -46,18 +46,22 @@ STOP_SHARE_PER_MINUTE = 1e-3
 """Measuring is no longer worth while when the best next looks lower the target by less than this share a minute."""
 
 
-def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, found: Sensitivity) -> dict[str, float]:
+def split_of(
+    knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, at_target: Sensitivity
+) -> dict[str, float]:
     """Share of each cause in the worst quantity's variance; see `causes.causes_of`.
 
     Args:
         knowledge: before the looks.
         data: information of the looks, shape (p + e, p + e).
         noise: its part that pixel noise alone stands for, or None to leave the looks whole.
-        found: the target.
+        at_target: the target.
     """
     covariance = covariance_of(knowledge.precision + data)
-    worst = int(np.argmax(np.einsum("qi,ij,qj->q", found.gradient, covariance, found.gradient) + found.own_variance))
-    pull = covariance @ found.gradient[worst]
+    worst = int(
+        np.argmax(np.einsum("qi,ij,qj->q", at_target.gradient, covariance, at_target.gradient) + at_target.own_variance)
+    )
+    pull = covariance @ at_target.gradient[worst]
     parts = {}
     if noise is None:
         parts["looks"] = float(pull @ data @ pull)
@@ -72,9 +76,10 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, f
             parts[name] = float(np.sum(pull[columns] ** 2))
         errors = np.split(pull[len(NAMES) :], 2)
         parts |= {
-            name: float(own @ own) for name, own in zip((TRANSMISSION_ERROR, PLAY_VARIATION), errors, strict=True)
+            name: float(variances @ variances)
+            for name, variances in zip((TRANSMISSION_ERROR, PLAY_VARIATION), errors, strict=True)
         }
-    parts |= {name: float(value[worst]) for name, value in found.own.items()}
+    parts |= {name: float(value[worst]) for name, value in at_target.own.items()}
     total = sum(parts.values())
     kept = {name: value / total for name, value in parts.items() if value > 1e-12 * total}
     return dict(sorted(kept.items(), key=lambda item: -item[1]))
@@ -95,11 +100,16 @@ def _state(table: RigTable, columns: Sequence[int], share: float) -> str:
     return " and ".join(f"u({name}) = {_at_most(share * u)} instead of {u:.2g}" for name, u in stated.items())
 
 
-def _needed_at_point(found: Sensitivity, target: Target) -> str | None:
+def _needed_at_point(at_target: Sensitivity, target: Target) -> str | None:
     """What would have to be better at the target's point itself, in words; None where no calibration is in its way."""
-    own, gears = found.own_variance, found.own.get(GEARS_AT_POINT, np.zeros_like(found.own_variance))
+    own_variance, gears = (
+        at_target.own_variance,
+        at_target.own.get(GEARS_AT_POINT, np.zeros_like(at_target.own_variance)),
+    )
     # The worst of the quantities, each with its own parts.
-    stop, geared, whole = (target.factor * math.sqrt(max(variance)) for variance in (own - gears, gears, own))
+    stop, geared, whole = (
+        target.factor * math.sqrt(max(variance)) for variance in (own_variance - gears, gears, own_variance)
+    )
     unit = target.unit
     if stop > target.limit:
         short = f"{stop:.3g} {unit} come from the stop and the reading at the point itself"
@@ -111,23 +121,23 @@ def _needed_at_point(found: Sensitivity, target: Target) -> str | None:
     return None
 
 
-def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target: Target) -> Limit:
+def limit_of(knowledge: Knowledge, data: np.ndarray, at_target: Sensitivity, target: Target) -> Limit:
     """What no number of looks of this kind removes, and what would.
 
     Args:
         knowledge: before the looks.
         data: information of the largest design, shape (p + e, p + e).
-        found: the target's sensitivities.
+        at_target: the target's sensitivities.
         target: the target.
     """
     many = MANY * data
-    floor = found.value(covariance_of(knowledge.precision + many), target.factor)
-    shares = split_of(knowledge, many, None, found)
+    floor = at_target.value(covariance_of(knowledge.precision + many), target.factor)
+    shares = split_of(knowledge, many, None, at_target)
     cause = next(iter(shares))
     if floor <= target.limit:
         return Limit(floor, cause, shares, True, None)
     groups = knowledge.rig.table.mechanism.prior_groups
-    if (at_point := _needed_at_point(found, target)) is not None:
+    if (at_point := _needed_at_point(at_target, target)) is not None:
         return Limit(floor, cause, shares, False, at_point)
 
     def with_inputs(scaled: Mapping[str, float]) -> float:
@@ -136,7 +146,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target:
             columns = groups[name]
             # The prior's own precision is 1 in its coordinates, whatever the campaign added.
             precision[columns, columns] += share**-2 - 1
-        return found.value(covariance_of(precision + many), target.factor)
+        return at_target.value(covariance_of(precision + many), target.factor)
 
     scaled: dict[str, float] = {}
     names = [name for name in shares if name in groups]
@@ -161,16 +171,16 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, found: Sensitivity, target:
     return Limit(floor, cause, shares, False, "no single input stands in the way: widen the limits or add sheets")
 
 
-def next_experiments(asked: Question) -> tuple[Batch, ...]:
+def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:
     """Four looks at every sheet, chosen from all candidates and from those a full turn away, by gain per minute."""
-    search, found, rig, now = asked.search(), asked.found, asked.knowledge.rig, asked.now
+    search, candidates, rig, now = problem.search(), problem.candidates, problem.knowledge.rig, problem.now
     batches = []
-    for number in range(len(asked.knowledge.sheets)):
+    for number in range(len(problem.knowledge.sheets)):
         for turned in (False, True):
-            here = (found.looks.sheet == number) & (found.turned | (not turned))
-            if not here.any():
+            allowed = (candidates.looks.sheet == number) & (candidates.turned | (not turned))
+            if not allowed.any():
                 continue
-            best = asked.chosen(search, here, LOOKS_PER_EXPERIMENT)
+            best = problem.chosen(search, allowed, LOOKS_PER_EXPERIMENT)
             steps, minutes, gain = best.design.steps, best.design.minutes(rig), max(now - best.value, 0.0)
             text = f"{'a full turn of pan away, ' if turned else ''}{described(rig, steps)}"
             batches.append(Batch(steps, minutes, gain, gain / max(minutes, 1e-9), text))

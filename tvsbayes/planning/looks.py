@@ -229,8 +229,8 @@ def _shown(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> _Shown:
         arrays = CampaignArrays(pair.moves(eyes.warm_minutes), spot, gears, eyes.azimuth_convention, alone)
         # Errors of the gears turn the mirrors as an offset does: their columns follow from its, outside.
         still = jnp.zeros((1, 2, 0))
-        found = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], eyes.image_px, still)
-        return _Shown(*(getattr(found, part.name)[0] for part in fields(_Shown)))
+        expectation = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], eyes.image_px, still)
+        return _Shown(*(getattr(expectation, part.name)[0] for part in fields(_Shown)))
 
     return jax.vmap(one)(pairs)
 
@@ -291,17 +291,17 @@ class LookArrays:
             turning: how errors of their own gears turn the looks, shape (n, m, 2, e); by default as of the knowledge's.
         """
         turning = self.turning if turning is None else turning
-        found = [
+        blocks = [
             [np.asarray(part) for part in jax.tree.leaves(_shown(block, self.space, self.eyes))]
             for block in self._blocks(z, value, self.SHOWN)
         ]
         shape = len(z), len(self.looks)
-        whole = (np.concatenate(parts)[: shape[0] * shape[1]] for parts in zip(*found, strict=True))
-        seen = Seen(*(part.reshape(*shape, *part.shape[1:]) for part in whole))
+        whole = (np.concatenate(parts)[: shape[0] * shape[1]] for parts in zip(*blocks, strict=True))
+        shown = Seen(*(part.reshape(*shape, *part.shape[1:]) for part in whole))
         if not turning.shape[-1]:
-            return seen
-        own, offset = seen.rows[..., :-2], seen.rows[..., -2:]
-        return replace(seen, rows=np.concatenate([own, offset @ turning, offset], axis=-1))
+            return shown
+        own, offset = shown.rows[..., :-2], shown.rows[..., -2:]
+        return replace(shown, rows=np.concatenate([own, offset @ turning, offset], axis=-1))
 
     def at(self, z: np.ndarray, space: ParameterSpace) -> Seen:
         """At one instrument: coordinates (p,) in a space that differs from the knowledge's by `value` at most."""
@@ -310,10 +310,10 @@ class LookArrays:
     def in_images(self, z: np.ndarray) -> np.ndarray:
         """Whether instruments at points (n, p) see the looks in both images, shape (n, m)."""
         value = np.broadcast_to(np.asarray(self.space.value), (len(z), len(self.space.value)))
-        found = [
+        blocks = [
             np.asarray(_in_images(block, self.space, self.eyes)) for block in self._blocks(z, value, self.IN_IMAGES)
         ]
-        return np.concatenate(found)[: len(z) * len(self.looks)].reshape(len(z), -1)
+        return np.concatenate(blocks)[: len(z) * len(self.looks)].reshape(len(z), -1)
 
 
 CONTRAST_COLUMNS = [INDEX["ratio_contrast_deg_per_step.pan"], INDEX["ratio_contrast_deg_per_step.tilt"]]

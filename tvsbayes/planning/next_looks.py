@@ -19,8 +19,8 @@ from tvsbayes.instrument.conditions import powered_on_s, warm_minutes
 from tvsbayes.instrument.plan import PlanStep, plan_seconds, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.expectation import knowledge_of
-from tvsbayes.planning.planner import question
-from tvsbayes.planning.search import Chosen, Question
+from tvsbayes.planning.planner import design_problem
+from tvsbayes.planning.search import Chosen, DesignProblem
 from tvsbayes.planning.target import Target
 from tvsbayes.posterior.sampling import sample
 
@@ -94,8 +94,12 @@ class NextLooks:
 def confirmation(fit: JointFit, seed: int = 0) -> Confirmation:
     """The effective ratios of a converged fit by importance sampling: with rough scales Laplace's sds are short."""
     drawn = sample(fit, "importance", seed=seed)
-    told = drawn.propagate(lambda p: np.stack([p[f"effective_deg_per_step.{d}"] for d in DIRECTIONS], axis=1))
-    means, sds, ends = told.mean.tolist(), told.sd.tolist(), [(low, high) for low, high in told.interval95.T.tolist()]
+    summary = drawn.propagate(lambda p: np.stack([p[f"effective_deg_per_step.{d}"] for d in DIRECTIONS], axis=1))
+    means, sds, ends = (
+        summary.mean.tolist(),
+        summary.sd.tolist(),
+        [(low, high) for low, high in summary.interval95.T.tolist()],
+    )
     by_direction = (dict(zip(DIRECTIONS, each, strict=True)) for each in (means, sds, ends))
     return Confirmation(drawn.converged, *by_direction)
 
@@ -118,17 +122,17 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
         raise NotConverged.of(fit.problems, "see `tvsbayes fit`")
     on_s = powered_on_s(fit.campaign.header)
     warm = replace(knowledge_of(fit, rig), warm_minutes=float(warm_minutes(fit.campaign.moves, on_s)[-1]))
-    asked = question(warm, target, fit.reference_pose_rad, False)
+    problem = design_problem(warm, target, fit.reference_pose_rad, False)
     # The segment goes on: no home offset is drawn anew, and the creep so far is in what the looks show.
-    asked = replace(asked, knowledge=replace(asked.knowledge, after_data=False), warming=False)
+    problem = replace(problem, knowledge=replace(problem.knowledge, after_data=False), warming=False)
     last, sheet = fit.campaign.moves[-1], ordered_spots(fit.campaign)[-1].target
 
     def minutes(choice: Chosen) -> float:
         steps = choice.design.steps_onwards
         return plan_seconds(rig, steps[1:] if choice.design.sheet[0] == sheet else steps) / 60
 
-    choices = _choices(asked, count, (last.pan_steps, last.tilt_steps))
-    best = max(choices, key=lambda choice: (asked.now - choice.value) / max(minutes(choice), 1e-9))
+    choices = _choices(problem, count, (last.pan_steps, last.tilt_steps))
+    best = max(choices, key=lambda choice: (problem.now - choice.value) / max(minutes(choice), 1e-9))
     sds = np.asarray(fit.draws.effective_deg_per_step).std(axis=0)
     confirmed = confirmation(fit) if confirm_below is not None and sds.max() <= confirm_below else None
     places, wanted = ", ".join(dict.fromkeys(best.design.sheet)), target.text.split("<=")[0].strip()
@@ -136,27 +140,27 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
         target=target,
         steps=best.design.steps_onwards,
         minutes=minutes(best),
-        now=asked.now,
+        now=problem.now,
         expected=best.value,
-        after_each=_after_each(asked, best),
+        after_each=_after_each(problem, best),
         deg_per_step=dict(zip(DIRECTIONS, map(float, np.asarray(fit.mode.effective_deg_per_step)), strict=True)),
         u_deg_per_step=dict(zip(DIRECTIONS, map(float, sds), strict=True)),
         why=(
-            f"{count} looks at {places} lower {wanted} most per minute: from {asked.now:.3g} to {best.value:.3g} "
+            f"{count} looks at {places} lower {wanted} most per minute: from {problem.now:.3g} to {best.value:.3g} "
             f"{target.unit} in {minutes(best):.1f} minutes"
         ),
         confirmed=confirmed,
     )
 
 
-def _choices(asked: Question, count: int, at: tuple[int, int]) -> list[Chosen]:
+def _choices(problem: DesignProblem, count: int, at: tuple[int, int]) -> list[Chosen]:
     """The best looks on every sheet and on every pair of sheets."""
-    search, of_look = asked.search(), asked.found.looks.sheet
-    subsets = [s for size in (1, 2) for s in combinations(range(len(asked.knowledge.sheets)), size)]
+    search, of_look = problem.search(), problem.candidates.looks.sheet
+    subsets = [s for size in (1, 2) for s in combinations(range(len(problem.knowledge.sheets)), size)]
     candidates = (np.isin(of_look, subset) for subset in subsets)
-    return [asked.chosen(search, here, count, at) for here in candidates if here.any()]
+    return [problem.chosen(search, allowed, count, at) for allowed in candidates if allowed.any()]
 
 
-def _after_each(asked: Question, best: Chosen) -> tuple[float, ...]:
+def _after_each(problem: DesignProblem, best: Chosen) -> tuple[float, ...]:
     order = best.design.order
-    return tuple(asked.value(best.picks, best.design, order[:done]) for done in range(1, len(order) + 1))
+    return tuple(problem.value(best.picks, best.design, order[:done]) for done in range(1, len(order) + 1))

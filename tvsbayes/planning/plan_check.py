@@ -159,11 +159,11 @@ def judge(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = F
     Raises:
         InputError: a plan that looks at nothing or places an unknown sheet.
     """
-    found = information_of(steps, knowledge, aperture=aperture)
-    gradient = np.asarray(knowledge.gears.headlines(knowledge.z, knowledge.space, found.pose_rad).gradient)
-    covariance = gradient @ covariance_of(knowledge.precision + found.fisher) @ gradient.T
+    information = information_of(steps, knowledge, aperture=aperture)
+    gradient = np.asarray(knowledge.gears.headlines(knowledge.z, knowledge.space, information.pose_rad).gradient)
+    covariance = gradient @ covariance_of(knowledge.precision + information.fisher) @ gradient.T
     prior = np.einsum("qi,ij,qj->q", gradient, knowledge.covariance, gradient)
-    return Judged(found, covariance, gradient, prior)
+    return Judged(information, covariance, gradient, prior)
 
 
 def extended(
@@ -186,19 +186,19 @@ class _Cure:
 
 
 def _cure(
-    steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates, axis: Axis, before: Judged
+    steps: Sequence[PlanStep], knowledge: Knowledge, possible: Candidates, axis: Axis, before: Judged
 ) -> _Cure | None:
     """Fewest looks after which the axis has no fault, on the sheet that stands; None if there are none."""
-    seen = LookArrays(found.looks, knowledge, False).at(knowledge.z, knowledge.space)
+    shown = LookArrays(possible.looks, knowledge, False).at(knowledge.z, knowledge.space)
     rows = before.rows(axis)
-    own = np.zeros(len(rows))
+    slopes = np.zeros(len(rows))
     precision = knowledge.precision + before.information.fisher
-    search = Search(seen.rows[..., :-2], precision, before.gradient[rows], own, "A")
+    search = Search(shown.rows[..., :-2], precision, before.gradient[rows], slopes, "A")
     placed = run_plan(steps, knowledge.rig).sheet
-    here = found.looks.sheet == (knowledge.sheets.index(placed) if placed in knowledge.sheets else 0)
-    picks = np.array(search.among(here).greedy(CURE_LOOKS), dtype=int)
+    allowed = possible.looks.sheet == (knowledge.sheets.index(placed) if placed in knowledge.sheets else 0)
+    picks = np.array(search.among(allowed).greedy(CURE_LOOKS), dtype=int)
     for count in range(1, len(picks) + 1):
-        addition = extended(steps, found.looks[picks[:count]], knowledge, found.overshoot)
+        addition = extended(steps, possible.looks[picks[:count]], knowledge, possible.overshoot)
         after = judge((*steps, *addition), knowledge)
         if after.fault(axis) is None:
             return _Cure(addition, after)
@@ -207,23 +207,23 @@ def _cure(
 
 def beyond_limits(limits: CounterLimits, moves: Sequence[Move]) -> list[str]:
     """Axes that leave the limits which `[positioner]` states, as sentences."""
-    found = []
+    faults = []
     for axis in AXES:
         counters = [getattr(move, f"{axis}_steps") for move in moves]
         least, most = min(counters), max(counters)
         if not (limits.allow(axis, least) and limits.allow(axis, most)):
-            found.append(f"{axis} moves from {least} to {most} steps; [positioner] allows {limits.words(axis)}")
-    return found
+            faults.append(f"{axis} moves from {least} to {most} steps; [positioner] allows {limits.words(axis)}")
+    return faults
 
 
 def _fault(
-    steps: Sequence[PlanStep], knowledge: Knowledge, found: Candidates | None, plan: Judged, axis: Axis, text: str
+    steps: Sequence[PlanStep], knowledge: Knowledge, possible: Candidates | None, plan: Judged, axis: Axis, text: str
 ) -> PlanFault:
     """A fault with its smallest cure, if candidates were found among which to seek one."""
     before = plan.u(axis)
-    if found is None:
+    if possible is None:
         return PlanFault(axis, text, (), before, None)
-    cure = _cure(steps, knowledge, found, axis, plan)
+    cure = _cure(steps, knowledge, possible, axis, plan)
     if cure is None:
         return PlanFault(axis, f"{text}; no {CURE_LOOKS} looks cure it on this rig", (), before, None)
     looks, after = sum(s.action == "look" for s in cure.addition), cure.after.u(axis)
@@ -251,28 +251,28 @@ def _few_stops(knowledge: Knowledge, plan: Judged) -> list[str]:
 
 def _sees_few_counters(knowledge: Knowledge, plan: Judged) -> list[str]:
     """Axes whose looks cannot tell gear error from ratio, as sentences."""
-    gears, found = knowledge.gears, list[str]()
+    gears, notes = knowledge.gears, list[str]()
     if not gears.size:
-        return found
-    seen = [move for move in plan.information.moves if move.move in plan.information.seen_moves]
+        return notes
+    moves = [move for move in plan.information.moves if move.move in plan.information.seen_moves]
     uncertain = np.linalg.norm(gears.root, axis=1)[: len(gears.steps)] > LEAST_ERROR_RAD
     for number, axis in enumerate(AXES):
-        counters = sorted({getattr(move, f"{axis}_steps") for move in seen})
-        own = (gears.on_tilt == (number == 1)) & (gears.share != 0)
-        if 2 <= len(counters) <= FEW_COUNTERS and uncertain[own].any():
-            places = gears.steps[own].round().astype(int).tolist()
+        counters = sorted({getattr(move, f"{axis}_steps") for move in moves})
+        of_axis = (gears.on_tilt == (number == 1)) & (gears.share != 0)
+        if 2 <= len(counters) <= FEW_COUNTERS and uncertain[of_axis].any():
+            places = gears.steps[of_axis].round().astype(int).tolist()
             room = np.diff(places).min() / 2
             telling = [n for n in places if np.abs(np.subtract(counters, n)).min() > room]
-            found.append(too_few_counters(axis, counters, telling))
-    return found
+            notes.append(too_few_counters(axis, counters, telling))
+    return notes
 
 
-def _with_gears(knowledge: Knowledge, steps: Sequence[PlanStep], found: Candidates | None) -> Knowledge:
+def _with_gears(knowledge: Knowledge, steps: Sequence[PlanStep], possible: Candidates | None) -> Knowledge:
     """What is known, with errors of gears over the counters of the plan and all that the rig could look from."""
     log = run_plan(steps, knowledge.rig)
     looks = [log.moves[look.move] for look in log.looks]
     reached = np.array([(move.pan_steps, move.tilt_steps) for move in looks]).reshape(-1, 2)
-    reached = reached if found is None else np.concatenate([reached, found.looks.steps])
+    reached = reached if possible is None else np.concatenate([reached, possible.looks.steps])
     return knowledge.with_gears(reached) if len(reached) else knowledge
 
 
@@ -290,21 +290,21 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = N
     knowledge = prior_knowledge(rig)
     with Job({JUDGING: judging_seconds(), CURING: CURED_SECONDS}, progress) as job:
         job.begin(JUDGING)
-        found, warnings = None, list[str]()
+        possible, warnings = None, list[str]()
         if knowledge.gears_vary:
-            found = _candidates(knowledge, warnings)
-            knowledge = _with_gears(knowledge, steps, found)
+            possible = _candidates(knowledge, warnings)
+            knowledge = _with_gears(knowledge, steps, possible)
         plan = judge(steps, knowledge)
         job.begin(CURING)
         information = plan.information
-        looks, seen = len(information.look_moves), int(information.expectation.seen.sum())
-        if seen < looks:
-            warnings.append(f"{looks - seen} of {looks} looks miss an image at the most probable instrument")
+        looks, in_view = len(information.look_moves), int(information.expectation.seen.sum())
+        if in_view < looks:
+            warnings.append(f"{looks - in_view} of {looks} looks miss an image at the most probable instrument")
         warnings += beyond_limits(rig.limits, information.moves)
         texts = {axis: text for axis in AXES if (text := plan.fault(axis)) is not None}
         if texts and not knowledge.gears_vary:
-            found = _candidates(knowledge, warnings)
-        faults = tuple(_fault(steps, knowledge, found, plan, axis, text) for axis, text in texts.items())
+            possible = _candidates(knowledge, warnings)
+        faults = tuple(_fault(steps, knowledge, possible, plan, axis, text) for axis, text in texts.items())
     warnings += [fault.text for fault in faults]
     warnings += _sees_few_counters(knowledge, plan)
     warnings += _few_stops(knowledge, plan)
@@ -317,7 +317,7 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = N
     u, shares = np.sqrt(np.diag(plan.covariance)), plan.contraction()
     return PlanCheck(
         looks=looks,
-        seen=seen,
+        seen=in_view,
         minutes=information.minutes,
         expected=dict(zip(TARGET_ROWS, map(float, u), strict=True)),
         contraction={

@@ -42,7 +42,7 @@ from tvsbayes.planning.forecast import (
 from tvsbayes.planning.limits import Limit, limit_of, next_experiments, split_of, stop_now
 from tvsbayes.planning.looks import LookArrays, Looks, covariance_of, looks_wait
 from tvsbayes.planning.plan_check import JUDGING, judge, judging_seconds
-from tvsbayes.planning.search import LADDER, Question, Scope, design_family, refine, smallest_design
+from tvsbayes.planning.search import LADDER, DesignProblem, Scope, design_family, refine, smallest_design
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.progress import Advance, Job, Show
 from tvsbayes.results.plan_record import Advice, Batch
@@ -128,10 +128,10 @@ class PlanResult(Shown):
 
     def shown(self) -> View:
         """The curve: what so many looks bring."""
-        said = "met already" if self.assurance is None else f"{self.looks} looks in {self.minutes:.1f} minutes"
+        size = "met already" if self.assurance is None else f"{self.looks} looks in {self.minutes:.1f} minutes"
         columns = ("looks", "minutes", "classic", "joint", "chance of success")
         rows = [(LOOKS_PER_EXPERIMENT * p.experiments, p.minutes, p.classic, p.joint, p.assurance) for p in self.curve]
-        return View(f"PlanResult for {self.target.text}: {said}", columns, rows)
+        return View(f"PlanResult for {self.target.text}: {size}", columns, rows)
 
     def as_json(self) -> dict[str, object]:
         """The document of `plan --json`."""
@@ -173,14 +173,14 @@ def _baselines(knowledge: Knowledge, target: Target, aperture: bool, pose_rad: n
 
 
 def judged(
-    name: str, found: PlanInformation, knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None = None
+    name: str, information: PlanInformation, knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None = None
 ) -> Baseline:
     """One plan at the most probable instrument; ratios hold at `pose_rad`, by default the plan's own, as in a fit."""
-    pose = found.pose_rad if pose_rad is None else pose_rad
+    pose = information.pose_rad if pose_rad is None else pose_rad
     at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
-    value = at.value(covariance_of(knowledge.precision + found.fisher), target.factor)
-    seen = int(found.expectation.seen.sum())
-    return Baseline(name, len(found.look_moves), seen, found.minutes, value)
+    value = at.value(covariance_of(knowledge.precision + information.fisher), target.factor)
+    in_view = int(information.expectation.seen.sum())
+    return Baseline(name, len(information.look_moves), in_view, information.minutes, value)
 
 
 def plan(
@@ -260,19 +260,19 @@ def few_looks(looks: Looks, target: Target) -> list[str]:
     return notes
 
 
-def question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, aperture: bool) -> Question:
+def design_problem(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, aperture: bool) -> DesignProblem:
     """The candidates of an instrument as it is known, and a target there.
 
     Raises:
         InputError: nothing to look at or in view; a target that is held fixed.
     """
-    found = candidates(knowledge)
-    knowledge = knowledge.with_gears(found.looks.steps)
-    seen = LookArrays(found.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
-    pose = seen.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
+    possible = candidates(knowledge)
+    knowledge = knowledge.with_gears(possible.looks.steps)
+    shown = LookArrays(possible.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
+    pose = shown.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
     at_centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
-    asked = Question(knowledge, found, seen, target, at_centre)
-    if asked.now == 0:
+    problem = DesignProblem(knowledge, possible, shown, target, at_centre)
+    if problem.now == 0:
         raise InputError(
             "target",
             f"{target.quantity} is held fixed by the rig (u = 0): its uncertainty is 0 whatever is measured",
@@ -281,7 +281,7 @@ def question(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, 
             allowed="a quantity that is to be estimated",
             remedy="state u > 0 for it in [rig.prior], or another target",
         )
-    return asked
+    return problem
 
 
 def _durations(family: Family, scope: Scope) -> dict[int, float]:
@@ -366,27 +366,27 @@ def _planned(
     job: Job,
 ) -> PlanResult:
     job.begin(LOOKING)
-    asked = question(knowledge, target, pose_rad, scope.aperture)
-    knowledge = asked.knowledge
+    problem = design_problem(knowledge, target, pose_rad, scope.aperture)
+    knowledge = problem.knowledge
     job.begin(CHOOSING)
-    family = design_family(asked, scope, job.at)
+    family = design_family(problem, scope, job.at)
     durations = _durations(family, scope)
     job.begin(COUNTING)
     assurance = Assurance(family, target, draw_instruments(knowledge, draws, seed), seed)
     forecast = classic_forecast(knowledge, assurance.instruments)
     size = _size(assurance, forecast, durations, job.at)
     job.begin(EXCHANGING)
-    refined = refine(family, asked, size.experiments, scope, assurance, job.at)
+    refined = refine(family, problem, size.experiments, scope, assurance, job.at)
     job.begin(JUDGING)
     steps = refined.family.arranged(size.experiments).steps
     exact = judge(steps, knowledge, aperture=scope.aperture)
     chosen = judged("planned", exact.information, knowledge, target, pose_rad)
     share = float(np.mean(refined.reported <= target.limit))
-    most = asked.information(family.picks, family.arranged(family.largest))
-    limit = limit_of(knowledge, most, asked.at_centre, target)
+    most = problem.information(family.picks, family.arranged(family.largest))
+    limit = limit_of(knowledge, most, problem.at_centre, target)
     pixels = _pixel_part(exact.information.expectation)
-    batches = next_experiments(asked)
-    done = knowledge.after_data and asked.now <= target.limit
+    batches = next_experiments(problem)
+    done = knowledge.after_data and problem.now <= target.limit
     notes = few_looks(refined.family.looks(size.experiments), target)
     notes += [exact.together(axis) for axis in AXES if inseparable(exact.exchange(axis))]
     return PlanResult(
@@ -395,36 +395,36 @@ def _planned(
         experiments=0 if done else size.experiments,
         looks=0 if done else len(refined.family.picks),
         minutes=0.0 if done else exact.information.minutes,
-        now=asked.now,
-        expected=asked.now if done else chosen.joint,
+        now=problem.now,
+        expected=problem.now if done else chosen.joint,
         assurance=None if done else share,
         assurance_se=None if done else share_error(share, draws),
         curve=size.curve,
         n80=size.n80,
         n95=size.n95,
         limit=limit,
-        shares=split_of(knowledge, exact.information.fisher, pixels, asked.at_centre),
+        shares=split_of(knowledge, exact.information.fisher, pixels, problem.at_centre),
         baselines=(chosen, *_baselines(knowledge, target, scope.aperture, pose_rad)),
         next=batches,
-        stop=stop_now(asked.now, target, limit, batches, knowledge.after_data),
+        stop=stop_now(problem.now, target, limit, batches, knowledge.after_data),
         classic=classic_answer(target, forecast, campaign),
         met=done or share >= ASSURED[0],
-        notes=(*asked.found.notes, *([] if done else notes)),
+        notes=(*problem.candidates.notes, *([] if done else notes)),
         draws=draws,
         seed=seed,
         criterion=scope.criterion,
     )
 
 
-def _pixel_part(found: Expectation) -> np.ndarray:
+def _pixel_part(expectation: Expectation) -> np.ndarray:
     """What pixel noise alone contributes to the information, (C^-1 J)^T (C^-1 J), shape (p + e, p + e)."""
     spots = LinearSpots(
-        residual=np.zeros(found.jacobian.shape[:2]),
-        load=np.asarray(found.load),
-        renewed=np.asarray(found.keep) == 0,
-        variance=np.asarray(found.variance),
-        jacobian=np.asarray(found.jacobian),
-        places=np.zeros((*found.jacobian.shape[:2], 0)),
+        residual=np.zeros(expectation.jacobian.shape[:2]),
+        load=np.asarray(expectation.load),
+        renewed=np.asarray(expectation.keep) == 0,
+        variance=np.asarray(expectation.variance),
+        jacobian=np.asarray(expectation.jacobian),
+        places=np.zeros((*expectation.jacobian.shape[:2], 0)),
     )
     gain = np.concatenate([group.jacobian for group in stop_information(spots).groups])
     return gain.T @ gain

@@ -131,10 +131,12 @@ class Search:
         row, (components, _, count) = self.rows[place], prospects.inner.shape
         root = np.linalg.cholesky(np.eye(components) + row @ prospects.covariance @ row.T)
         along = np.linalg.solve(root, row @ prospects.covariance)
-        seen = (along @ self.columns).reshape(components, components, count)
-        inner = prospects.inner - sum(part[:, None] * part for part in seen)
-        told = along @ self.gradient.T
-        moved = prospects.moved - sum(part[:, None] * one[:, None] for part, one in zip(seen, told, strict=True))
+        in_columns = (along @ self.columns).reshape(components, components, count)
+        inner = prospects.inner - sum(part[:, None] * part for part in in_columns)
+        in_gradient = along @ self.gradient.T
+        moved = prospects.moved - sum(
+            part[:, None] * one[:, None] for part, one in zip(in_columns, in_gradient, strict=True)
+        )
         covariance = prospects.covariance - along.T @ along
         return _Prospects(0.5 * (covariance + covariance.T), inner, moved)
 
@@ -154,9 +156,9 @@ class Search:
     def _places(self, picks: Sequence[int]) -> list[int]:
         return np.searchsorted(np.asarray(self.numbers), list(picks)).tolist()
 
-    def among(self, here: np.ndarray) -> Search:
+    def among(self, allowed: np.ndarray) -> Search:
         """The same search with only some candidates to choose from, shape (m,)."""
-        return replace(self, rows=self.rows[here], numbers=np.asarray(self.numbers)[here])
+        return replace(self, rows=self.rows[allowed], numbers=np.asarray(self.numbers)[allowed])
 
     def _after(self, places: Sequence[int]) -> np.ndarray:
         """Covariance of the columns after a design."""
@@ -173,9 +175,9 @@ class Search:
         for _ in range(passes):
             changed = False
             for number, look in enumerate(places):
-                found = self.after_one_more(self._after(places[:number] + places[number + 1 :]))
-                best = int(np.argmin(found))
-                if found[look] - found[best] > worth * abs(found[look]):
+                scores_with = self.after_one_more(self._after(places[:number] + places[number + 1 :]))
+                best = int(np.argmin(scores_with))
+                if scores_with[look] - scores_with[best] > worth * abs(scores_with[look]):
                     places[number], changed = best, True
             if not changed:
                 break
@@ -223,8 +225,8 @@ SUBSETS_MAX = 40
 
 def _sheet_subsets(count: int) -> list[tuple[int, ...]]:
     """Which sheets to place: all choices of one to three, the farthest apart first."""
-    found = [s for size in (1, 2, 3) for s in combinations(range(count), size)]
-    return sorted(found, key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
+    subsets = [s for size in (1, 2, 3) for s in combinations(range(count), size)]
+    return sorted(subsets, key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
 
 
 @dataclass(frozen=True)
@@ -243,12 +245,12 @@ class Chosen:
 
 
 @dataclass(frozen=True)
-class Question:
-    """What is asked of a search: the candidates, what they show at the most probable instrument, and the target there.
+class DesignProblem:
+    """The candidates, what they show at the most probable instrument, and the target there.
 
     Attributes:
         knowledge: with the errors of the gears at places over all candidates.
-        found: candidates.
+        candidates: looks to choose from.
         seen: what they show.
         target: what is wanted.
         at_centre: how the target depends on the coordinates.
@@ -256,7 +258,7 @@ class Question:
     """
 
     knowledge: Knowledge
-    found: Candidates
+    candidates: Candidates
     seen: Seen
     target: Target
     at_centre: Sensitivity
@@ -287,22 +289,22 @@ class Question:
         precision = self.knowledge.precision + self.information(picks, design, taken)
         return self.at_centre.value(covariance_of(precision), self.target.factor)
 
-    def chosen(self, search: Search, here: np.ndarray, count: int, at: tuple[int, int] | None = None) -> Chosen:
+    def chosen(self, search: Search, allowed: np.ndarray, count: int, at: tuple[int, int] | None = None) -> Chosen:
         """The best looks among some candidates.
 
         Args:
             search: for the target.
-            here: candidates to choose from, shape (m,); one at least.
+            allowed: candidates to choose from, shape (m,); one at least.
             count: looks.
             at: where the axes stand; None for a plan that begins with a homing.
         """
-        picks = np.array(search.among(here).greedy(count))
-        looks = self.found.looks[picks]
-        design = arrange(looks, self.knowledge.sheets, self.found.overshoot, at or (0, 0))
+        picks = np.array(search.among(allowed).greedy(count))
+        looks = self.candidates.looks[picks]
+        design = arrange(looks, self.knowledge.sheets, self.candidates.overshoot, at or (0, 0))
         if at is not None:
             # A run-up of its own for the first look: nobody knows where the axes stand when the looks begin.
             via = design.via.copy()
-            via[0] = design.goal[0] - looks.side[design.order[0]] * self.found.overshoot
+            via[0] = design.goal[0] - looks.side[design.order[0]] * self.candidates.overshoot
             design = replace(design, via=via)
         return Chosen(picks, design, self.value(picks, design))
 
@@ -322,35 +324,35 @@ class _Reached:
     value: float = math.inf
 
 
-def _reached(family: Family, asked: Question, scope: Scope) -> _Reached:
+def _reached(family: Family, problem: DesignProblem, scope: Scope) -> _Reached:
     best = _Reached()
     for n in (n for n in LADDER if n <= scope.largest):
         design = family.arranged(n)
-        duration = design.minutes(asked.knowledge.rig)
+        duration = design.minutes(problem.knowledge.rig)
         if scope.minutes is not None and duration > scope.minutes:
             break
-        value = asked.value(family.picks[: LOOKS_PER_EXPERIMENT * n], design)
-        best = min(best, _Reached(duration if value <= asked.target.limit else math.inf, value))
+        value = problem.value(family.picks[: LOOKS_PER_EXPERIMENT * n], design)
+        best = min(best, _Reached(duration if value <= problem.target.limit else math.inf, value))
     return best
 
 
-def design_family(asked: Question, scope: Scope | None = None, advance: Advance = unshown) -> Family:
+def design_family(problem: DesignProblem, scope: Scope | None = None, advance: Advance = unshown) -> Family:
     """The choice of sheets and the order of looks that reach the target soonest.
 
     For every choice of sheets looks are added greedily; the choice that first meets the target, counted in minutes,
     is kept, or the best after the largest number of experiments (or minutes) if none does.
     """
-    scope, knowledge, found = scope or Scope(), asked.knowledge, asked.found
-    search = asked.search(None if scope.criterion == "c" else _of_all_gears(knowledge, asked.seen), scope.criterion)
+    scope, knowledge, candidates = scope or Scope(), problem.knowledge, problem.candidates
+    search = problem.search(None if scope.criterion == "c" else _of_all_gears(knowledge, problem.seen), scope.criterion)
     families = []
     subsets = list(_sheet_subsets(len(knowledge.sheets)))
     for number, subset in enumerate(subsets):
         advance(number / len(subsets))
-        here = np.isin(found.looks.sheet, subset)
-        if here.any():
-            picks = search.among(here).greedy(LOOKS_PER_EXPERIMENT * scope.largest)
-            families.append(Family(knowledge, found, np.array(picks), scope.aperture))
-    return min(families, key=lambda family: _reached(family, asked, scope))
+        allowed = np.isin(candidates.looks.sheet, subset)
+        if allowed.any():
+            picks = search.among(allowed).greedy(LOOKS_PER_EXPERIMENT * scope.largest)
+            families.append(Family(knowledge, candidates, np.array(picks), scope.aperture))
+    return min(families, key=lambda family: _reached(family, problem, scope))
 
 
 def smallest_design(meets: Callable[[int], bool], sizes: Sequence[int]) -> int | None:
@@ -375,7 +377,7 @@ class Refined:
 
 def refine(
     family: Family,
-    asked: Question,
+    problem: DesignProblem,
     experiments: int,
     scope: Scope,
     assurance: Assurance,
@@ -385,13 +387,13 @@ def refine(
 
     Exchanges suit the most probable instrument; they are kept only where they do not cost assurance or time.
     """
-    knowledge, found = family.knowledge, family.found
+    knowledge, candidates = family.knowledge, family.candidates
     picks = family.picks[: LOOKS_PER_EXPERIMENT * experiments]
     plain = Refined(replace(family, picks=picks), assurance.values([experiments])[experiments])
     if scope.criterion != "c":
         return plain
-    here = np.isin(found.looks.sheet, found.looks.sheet[picks])
-    exchanged = replace(family, picks=np.array(asked.search().among(here).exchange(picks.tolist())))
+    allowed = np.isin(candidates.looks.sheet, candidates.looks.sheet[picks])
+    exchanged = replace(family, picks=np.array(problem.search().among(allowed).exchange(picks.tolist())))
     duration = exchanged.arranged(experiments).minutes(knowledge.rig)
     if scope.minutes is not None and duration > scope.minutes:
         return plain
@@ -399,6 +401,6 @@ def refine(
     other = Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])
 
     def merit(of: Refined) -> tuple[float, float]:
-        return float(np.mean(of.reported <= asked.target.limit)), -float(np.median(of.reported))
+        return float(np.mean(of.reported <= problem.target.limit)), -float(np.median(of.reported))
 
     return other if merit(other) > merit(plain) else plain

@@ -204,11 +204,11 @@ def sensitivity(
     assert goal.aperture_deg is not None, "a point has a reading"
     count = len(inputs)
     jacobian = machine.derivatives(goal.pan_steps, goal.tilt_steps, goal.aperture_deg, goal.approach)[rows]
-    own = jacobian[:, count:] ** 2
-    here = {AT_POINT[0]: own[:, :2].sum(axis=1), AT_POINT[1]: own[:, 4]}
+    variances = jacobian[:, count:] ** 2
+    by_source = {AT_POINT[0]: variances[:, :2].sum(axis=1), AT_POINT[1]: variances[:, 4]}
     gradient = jacobian[:, :count] @ slope[inputs]
     if not gears.size:
-        return Sensitivity(gradient, here)
+        return Sensitivity(gradient, by_source)
     # Per rad of both mirrors: what a stop error of sd 1 does.
     reached = [CALIBRATION_NOISE.index(f"stop_sd_deg.{name}") for name in goal.approach]
     by_angle = jacobian[:, count : count + 2] / np.radians(stop_sd[reached])
@@ -216,5 +216,5 @@ def sensitivity(
     side = [APPROACH_SIGN[name] for name in goal.approach]
     turning = np.stack([np.append(one.error[0], -0.5 * s * one.play[0]) for one, s in zip(between, side, strict=True)])
     rest = np.array([one.error_rest[0] ** 2 + 0.25 * one.play_rest[0] ** 2 for one in between])
-    here[GEARS_AT_POINT] = by_angle**2 @ rest
-    return Sensitivity(np.concatenate([gradient, by_angle @ turning], axis=1), here)
+    by_source[GEARS_AT_POINT] = by_angle**2 @ rest
+    return Sensitivity(np.concatenate([gradient, by_angle @ turning], axis=1), by_source)

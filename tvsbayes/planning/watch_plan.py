@@ -66,24 +66,24 @@ class Candidate:
 def _candidates(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> list[Candidate]:
     """One look of every kind; at most `CANDIDATES_MAX` on a sheet, outermost counters first."""
     rests = [rests_of(campaign.moves, axis) for axis in AXES]
-    found: dict[tuple, Candidate] = {}
+    by_place: dict[tuple, Candidate] = {}
     for row, spot in enumerate(spots):
         at = [rests[axis][spot.move] for axis in range(2)]
         side = at[0].sign, at[1].sign
         if used[row] and all(side):
             steps = at[0].steps, at[1].steps
-            found.setdefault((steps, side, spot.target), Candidate(steps, side, spot.target, spot))
-    if not found:
+            by_place.setdefault((steps, side, spot.target), Candidate(steps, side, spot.target, spot))
+    if not by_place:
         return []
-    every = np.array([one.steps for one in found.values()], dtype=float)
+    every = np.array([one.steps for one in by_place.values()], dtype=float)
     middle, width = every.mean(axis=0), np.maximum(np.ptp(every, axis=0), 1.0)
-    outer = sorted(found.values(), key=lambda one: -float(np.max(np.abs((one.steps - middle) / width))))
+    outer = sorted(by_place.values(), key=lambda one: -float(np.max(np.abs((one.steps - middle) / width))))
     sheets: dict[str, list[Candidate]] = {}
     for one in outer:
-        own = sheets.setdefault(one.target, [])
-        if len(own) < CANDIDATES_MAX:
-            own.append(one)
-    return [one for own in sheets.values() for one in own]
+        of_sheet = sheets.setdefault(one.target, [])
+        if len(of_sheet) < CANDIDATES_MAX:
+            of_sheet.append(one)
+    return [one for of_sheet in sheets.values() for one in of_sheet]
 
 
 @dataclass(frozen=True)
@@ -102,9 +102,9 @@ def _rig_of(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> Rig:
     """What a campaign says of its rig: sheets where its spots lie, the usual costs."""
     sheets: dict[str, float] = {}
     for name in () if campaign.rig.mechanism.sightings else dict.fromkeys(spot.target for spot in spots):
-        own = [spot for spot, use in zip(spots, used, strict=True) if use and spot.target == name]
-        if own:
-            sheets[name] = float(np.median(triangulate(campaign.stereo, pixels_of(own))[:, 0]))
+        of_sheet = [spot for spot, use in zip(spots, used, strict=True) if use and spot.target == name]
+        if of_sheet:
+            sheets[name] = float(np.median(triangulate(campaign.stereo, pixels_of(of_sheet))[:, 0]))
     return Rig(campaign.rig, campaign.stereo, campaign.rig.priors, sheets, {}, {}, dict(COSTS_S))
 
 
@@ -152,7 +152,7 @@ class WatchDesigns:
     def _limits(self) -> np.ndarray:
         """Lowest and highest counter of (pan, tilt): the rig's, else those that the campaign reached; (2, 2)."""
         reached = {axis: [getattr(move, f"{axis}_steps") for move in self.campaign.moves] for axis in AXES}
-        known = self.rig.limits.within({axis: (min(own), max(own)) for axis, own in reached.items()})
+        known = self.rig.limits.within({axis: (min(reach), max(reach)) for axis, reach in reached.items()})
         return np.array([known[axis] for axis in AXES])
 
     def _reachable(self, one: Candidate) -> bool:
@@ -176,10 +176,10 @@ class WatchDesigns:
             slope = linear.load[row, :, :2]
             variance = self._stop_variance(one)
             columns = spelled.jacobian[row]
-            own = columns[:, keep].copy()
+            kept = columns[:, keep].copy()
             # The path since homing is short in these plans: the contrast is left to the first day.
-            own[:, [INDEX[f"ratio_contrast_deg_per_step.{axis}"] for axis in AXES]] = 0.0
-            whole = np.concatenate([own, columns[:, self.own : self.own + shifts], slope], axis=1)
+            kept[:, [INDEX[f"ratio_contrast_deg_per_step.{axis}"] for axis in AXES]] = 0.0
+            whole = np.concatenate([kept, columns[:, self.own : self.own + shifts], slope], axis=1)
             root = np.linalg.cholesky(np.eye(4) + slope @ np.diag(variance) @ slope.T)
             shown.append(np.linalg.solve(root, whole))
         rows = np.array(shown)
@@ -207,8 +207,8 @@ class WatchDesigns:
             cross, offsets = block[:-2, -2:], block[-2:, -2:] + np.eye(2) / HOME_VARIANCE_RAD2
             total += homings * (block[:-2, :-2] - cross @ np.linalg.solve(offsets, cross.T))
         count = len(self.known)
-        coupling, own = total[:count, count:], total[:count, :count]
-        known = self.known + own * (2 if also_before else 1)
+        coupling, of_parameters = total[:count, count:], total[:count, :count]
+        known = self.known + of_parameters * (2 if also_before else 1)
         return total[count:, count:] - coupling.T @ np.linalg.solve(known, coupling)
 
     def powers(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:
@@ -221,20 +221,20 @@ class WatchDesigns:
         """What patterns are chosen by: logs of the noncentralities that are too small, over directions and changes."""
         information, total = self.information(pattern, homings), 0.0
         for rows, ways in zip(columns_of(self.changes), self._ways, strict=True):
-            seen = np.einsum("ni,ij,nj->n", ways, information[rows, rows], ways) / ENOUGH
-            total += float(np.mean(np.minimum(np.log(np.maximum(seen, 1e-12)), 0.0)))
+            shares = np.einsum("ni,ij,nj->n", ways, information[rows, rows], ways) / ENOUGH
+            total += float(np.mean(np.minimum(np.log(np.maximum(shares, 1e-12)), 0.0)))
         return total
 
     def grown(self, sheets: Sequence[str], homings: float) -> list[Pattern]:
         """Patterns of one look on every sheet, two and so on, each the best beside those before it."""
-        pattern, found = Pattern(dict.fromkeys(sheets, ())), []
+        pattern, patterns = Pattern(dict.fromkeys(sheets, ())), []
         for _ in range(PATTERN_MAX):
             for sheet in sheets:
                 numbers = [k for k, one in enumerate(self.candidates) if one.target == sheet]
                 tried = [Pattern({**pattern.looks, sheet: (*pattern.looks[sheet], number)}) for number in numbers]
                 pattern = max(tried, key=lambda one: self._worth(one, homings))
-            found.append(pattern)
-        return found
+            patterns.append(pattern)
+        return patterns
 
     def patterns(self) -> list[Pattern]:
         """For every choice of sheets, grown for few homings and for many."""
@@ -249,7 +249,7 @@ class WatchDesigns:
 
     def _ordered(self, pattern: Pattern, homings: int) -> list[tuple[PlanStep, Spot | None]]:
         """Steps with the spot that each look saw in the campaign."""
-        plan, seen = PlanBuilder(), {}
+        plan, counts = PlanBuilder(), {}
         for sheet, looks in pattern.looks.items():
             for homing in range(homings):
                 plan.home()
@@ -262,9 +262,9 @@ class WatchDesigns:
                     ]
                     plan.move(*map(int, start))
                     plan.move(*one.steps)
-                    seen[len(plan.steps)] = one.spot
+                    counts[len(plan.steps)] = one.spot
                     plan.look()
-        return [(step, seen.get(step.step)) for step in plan.steps]
+        return [(step, counts.get(step.step)) for step in plan.steps]
 
     def minutes(self, pattern: Pattern, homings: int) -> float:
         """Duration by `[costs]`."""
@@ -274,9 +274,10 @@ class WatchDesigns:
         """Powers of the plan by its own moves, at the limit of all tests together."""
         ordered = self._ordered(pattern, homings)
         log = run_plan([step for step, _ in ordered], self.rig)
-        seen = [spot for _, spot in ordered if spot is not None]
+        looked = [spot for _, spot in ordered if spot is not None]
         spots = tuple(
-            spot.renumbered(number, look.move) for number, (spot, look) in enumerate(zip(seen, log.looks, strict=True))
+            spot.renumbered(number, look.move)
+            for number, (spot, look) in enumerate(zip(looked, log.looks, strict=True))
         )
         planned = replace(self.fit.campaign, moves=tuple(log.moves), spots=spots)
         departure = WatchedLooks(self.fit, planned).departure(self.z)
@@ -318,12 +319,12 @@ class _Tried:
 
 
 def _tried(designs: WatchDesigns) -> list[_Tried]:
-    found = []
+    trials = []
     for pattern in designs.patterns():
         powers = np.array([designs.powers(pattern, float(homings)) for homings in RUNGS])
         once, twice = (designs.minutes(pattern, homings) for homings in (1, 2))
-        found.append(_Tried(pattern, powers, once, twice - once))
-    return found
+        trials.append(_Tried(pattern, powers, once, twice - once))
+    return trials
 
 
 def _smallest(designs: WatchDesigns, tried: _Tried, wanted: np.ndarray) -> int | None:
@@ -390,12 +391,12 @@ def _most(every: list[_Tried], minutes: float) -> np.ndarray:
 
 def _fullest(every: list[_Tried], minutes: float) -> _Need:
     """Where nothing can be noticed often enough: what notices most."""
-    found = [
+    by_power = [
         (float(tried.powers[rung].sum()), number, int(RUNGS[rung]))
         for number, tried in enumerate(every)
         for rung in np.flatnonzero(tried.allowed(minutes))
     ]
-    _, number, homings = max(found)
+    _, number, homings = max(by_power)
     return _Need(every[number], homings)
 
 
@@ -447,15 +448,15 @@ def _changes(designs: WatchDesigns, every: list[_Tried], judged: list[float]) ->
     """What the plan notices of every change, and what each by itself would take."""
     alone = [_fewest(designs, every, mask) for mask in np.eye(len(designs.changes), dtype=bool)]
     added = _to_add(designs, every) if None in alone else [None] * len(alone)
-    found = []
+    changes = []
     for change, power, need, more in zip(designs.changes, judged, alone, added, strict=True):
-        told = change.what, change.size, change.unit, power
+        description = change.what, change.size, change.unit, power
         if need is None:
-            found.append(PlannedChange(*told, None, None, None, more))
+            changes.append(PlannedChange(*description, None, None, None, more))
         else:
             homings = need.homings * len(need.tried.pattern.looks)
-            found.append(PlannedChange(*told, need.looks, homings, need.minutes, None))
-    return tuple(found)
+            changes.append(PlannedChange(*description, need.looks, homings, need.minutes, None))
+    return tuple(changes)
 
 
 def _to_add(designs: WatchDesigns, every: list[_Tried]) -> list[int | None]:
@@ -463,11 +464,11 @@ def _to_add(designs: WatchDesigns, every: list[_Tried]) -> list[int | None]:
     fewest: list[int | None] = [None] * len(designs.changes)
     for tried in every:
         for homings in RUNGS:
-            looks, seen = tried.looks(int(homings)), designs.powers(tried.pattern, float(homings), True) >= POWER_MIN
+            looks, enough = tried.looks(int(homings)), designs.powers(tried.pattern, float(homings), True) >= POWER_MIN
             fewest = [
-                min(looks, best or looks) if good else best for best, good in zip(fewest, seen.tolist(), strict=True)
+                min(looks, best or looks) if good else best for best, good in zip(fewest, enough.tolist(), strict=True)
             ]
-            if seen.all():
+            if enough.all():
                 break
     return fewest
 

@@ -295,7 +295,7 @@ def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
     allowed = f"[low, high] with 0 < low < high, or a list of up to {RANGES_MAX} such pairs"
     value = keys.values["period_between"]
     entries: list[object] = value if isinstance(value, list) else [value]
-    found = []
+    ranges = []
     for pair in entries if entries and all(isinstance(entry, list) for entry in entries) else [entries]:
         ends = pair if isinstance(pair, list) else []
         numbers = [float(end) for end in ends if isinstance(end, int | float) and not isinstance(end, bool)]
@@ -304,14 +304,14 @@ def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
         low, high = numbers
         if not 0 < low < high <= COMMAND_MAX:
             raise keys.refuse("period_between", "range", allowed, "order the ends; a known period goes into `periods`")
-        found.append((low, high))
-    for k, (low, high) in enumerate(found):
-        if any((low, high) != other and low < other[1] and other[0] < high for other in found[:k]):
+        ranges.append((low, high))
+    for k, (low, high) in enumerate(ranges):
+        if any((low, high) != other and low < other[1] and other[0] < high for other in ranges[:k]):
             same = "ranges that are the same or do not overlap"
             raise keys.refuse("period_between", "range", same, "write one range twice where both periods may be there")
-    if len(found) > RANGES_MAX:
+    if len(ranges) > RANGES_MAX:
         raise keys.refuse("period_between", "range", allowed, "ask for fewer unknown periods at once")
-    return tuple(found)
+    return tuple(ranges)
 
 
 def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
@@ -363,12 +363,12 @@ def readings_bytes(readings: Iterable[Reading]) -> bytes:
 
 def _axis_table_lines(campaign: AxisCampaign) -> list[str]:
     priors = [toml_line(name, {"value": p.value, "u": p.u}) for name, p in sorted(campaign.stated.items())]
-    asked = campaign.periods
+    periods = campaign.periods
     given = {
-        "periods": list(asked.stated),
-        "periods_in": "seconds" if asked.in_seconds else None,
-        "period_between": [list(pair) for pair in asked.between],
-        "encoder_period": asked.encoder,
+        "periods": list(periods.stated),
+        "periods_in": "seconds" if periods.in_seconds else None,
+        "period_between": [list(pair) for pair in periods.between],
+        "encoder_period": periods.encoder,
     }
     return [*priors, *(toml_line(name, value) for name, value in given.items() if value)]
 

@@ -47,11 +47,11 @@ def blocks_of(w: np.ndarray) -> list[np.ndarray]:
 def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
     """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns), or (n, ...) as those of `line_weights`."""
     lines, weights = line_functionals(model), line_weights(model, w)
-    found = np.concatenate([lines, model.head(slope=1.0)[None]])
+    functionals = np.concatenate([lines, model.head(slope=1.0)[None]])
     if weights.ndim == 2:
-        found = np.repeat(found[None], len(weights), axis=0)
-    found[..., -1, :] += weights
-    return found
+        functionals = np.repeat(functionals[None], len(weights), axis=0)
+    functionals[..., -1, :] += weights
+    return functionals
 
 
 def line_functionals(model: AxisModel) -> np.ndarray:
@@ -86,9 +86,9 @@ class AxisDensity:
 
     def valued(self, w: np.ndarray, generator: np.random.Generator) -> Points:
         """The same, with draws of the line."""
-        seen = self.model.posterior(w, self.functionals)
-        linear = seen.linear.drawn(np.eye(len(self.functionals)), generator)
-        return Points(w, seen.log_density - self.mode.log_density, {"linear": linear})
+        likelihood = self.model.posterior(w, self.functionals)
+        linear = likelihood.linear.drawn(np.eye(len(self.functionals)), generator)
+        return Points(w, likelihood.log_density - self.mode.log_density, {"linear": linear})
 
     def log_density(self, points: Points) -> np.ndarray:
         """Of the sampled coordinates."""

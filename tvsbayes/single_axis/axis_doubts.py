@@ -44,7 +44,7 @@ def _odd_segments(rows: AxisRows) -> list[str]:
         # Offset, slope and play take three rows; a fourth tells their scatter.
         if mine.sum() > 3 and np.ptp(rows.command[mine]) > 0:
             lines[int(segment)] = fit_line(rows, mine)
-    found = []
+    sentences = []
     for segment, line in lines.items():
         # Of two that differ the data cannot say which is wrong: both are named.
         others = [other for number, other in lines.items() if number != segment or len(lines) > 2]
@@ -56,12 +56,12 @@ def _odd_segments(rows: AxisRows) -> list[str]:
         off, reach = abs(slope - reference), float(np.ptp(rows.command[rows.segment == segment]))
         loose = max(abs(float(one.solved[2])) + one.scatter for one in (line, typical))
         if off > max(SLOPE_SHARE * min(abs(slope), abs(reference)), SLOPE_ERRORS * u) and off * reach > PLAYS * loose:
-            found.append(
+            sentences.append(
                 f"segment {segment} reads {slope:.5g} {rows.unit} per command, {slope / reference:.3g} times what "
                 f"others read ({reference:.5g}): its commands were counted in other steps (full steps among "
                 "microsteps?) or its readings have another unit; write moves.csv and readings.csv in the same ones"
             )
-    return found
+    return sentences
 
 
 def _odd_ratio(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
@@ -142,10 +142,10 @@ def _line_through_most(rows: AxisRows) -> _MostLine:
     """
     slopes = []
     for side in np.unique(rows.side):
-        own = np.flatnonzero(rows.side == side)
-        own = own[np.argsort(rows.command[own], kind="stable")]
-        half = len(own) // 2
-        near, far = own[: len(own) - half], own[half:]
+        of_side = np.flatnonzero(rows.side == side)
+        of_side = of_side[np.argsort(rows.command[of_side], kind="stable")]
+        half = len(of_side) // 2
+        near, far = of_side[: len(of_side) - half], of_side[half:]
         apart = rows.command[far] - rows.command[near]
         slopes += ((rows.value[far] - rows.value[near])[apart > 0] / apart[apart > 0]).tolist()
     off = rows.value - float(np.median(slopes or [rows.line[1]])) * rows.command

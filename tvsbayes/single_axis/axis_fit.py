@@ -70,7 +70,7 @@ def prior_conflicts(
         stated: entries of `[axis]`.
         defaults: complete priors, as if nothing were stated.
     """
-    found = [_of_stretched(model, name, defaults[name]) for name in STRETCHED if name in stated]
+    conflicts = [_of_stretched(model, name, defaults[name]) for name in STRETCHED if name in stated]
     values = model.coordinates.values(w)
     for k, name in enumerate(model.coordinates.names):
         key = name.split(".")[0]
@@ -80,21 +80,21 @@ def prior_conflicts(
         # That an axis is far better than the default is no fault of what was stated.
         if key not in STRETCHED and (off if key not in stated else abs(off)) > CONFLICT_LIMIT:
             drawn = values[name]
-            found.append(
+            conflicts.append(
                 PriorConflict(name, float(drawn.mean()), float(drawn.std()), model.priors[key], key in stated, abs(off))
             )
-    return tuple(conflict for conflict in found if conflict is not None)
+    return tuple(conflict for conflict in conflicts if conflict is not None)
 
 
 def conflict_text(conflict: PriorConflict) -> str:
     """In words: what the readings say, what the prior does, what to do."""
     prior, key = conflict.prior, conflict.name.split(".")[0]
     whose = "of [axis]" if conflict.stated else "by default"
-    said = f"`{key} = {{ value = {prior.value:.10g}, u = {prior.u:.6g} }}` {whose}"
+    entry = f"`{key} = {{ value = {prior.value:.10g}, u = {prior.u:.6g} }}` {whose}"
     # To the second digit of its u.
     digits = int(np.clip(2 + np.ceil(np.log10(max(abs(conflict.value), 1e-300) / conflict.sd)), 2, 12))
     quantity = f"{conflict.name} = {conflict.value:.{digits}g} (u = {conflict.sd:.2g})"
-    return conflict_sentence(quantity, conflict.distance, said, REMEDY)
+    return conflict_sentence(quantity, conflict.distance, entry, REMEDY)
 
 
 def _of_stretched(model: AxisModel, name: str, wide: AxisPrior) -> PriorConflict | None:
@@ -209,9 +209,9 @@ class AxisFit(Shown):
     def draws(self) -> dict[str, np.ndarray]:
         """Equal draws (draws,) of every sampled parameter, of the linear ones, and of the line through the stops."""
         rng = random_stream(self.seed, AxisStream.LINEAR_TERMS)
-        found = {name: v for name, v in self.model.coordinates.values(self.w).items() if name in self.free}
+        by_name = {name: v for name, v in self.model.coordinates.values(self.w).items() if name in self.free}
         linear = self.linear.drawn(headline_functionals(self.model, self.w), rng)
-        return found | dict(zip(HEADLINE_DRAWS, linear.T, strict=True)) | self._shift_draws(rng)
+        return by_name | dict(zip(HEADLINE_DRAWS, linear.T, strict=True)) | self._shift_draws(rng)
 
     def _shift_draws(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Of the zero's shifts in time."""
@@ -293,6 +293,6 @@ def fit_axis(
             w = rng.multivariate_normal(mode.w, mode.covariance, EQUAL_DRAWS, method="cholesky")
         else:
             w = np.zeros((EQUAL_DRAWS, 0))
-        found = AxisFit(campaign, model.rows, model, mode, sample, w, seed)
-        assert found.draws
-    return found
+        fit = AxisFit(campaign, model.rows, model, mode, sample, w, seed)
+        assert fit.draws
+    return fit

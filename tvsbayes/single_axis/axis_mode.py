@@ -78,8 +78,8 @@ def _gradients(model: AxisModel, w: np.ndarray, width: np.ndarray, step: float) 
     value = model.log_density((w[:, None] + shift).reshape(-1, d)).reshape(len(w), 2, d)
     # Where a density has no value neither has its slope.
     with np.errstate(invalid="ignore"):
-        found = (value[:, 0] - value[:, 1]) / (2 * step)
-    return np.where(np.isfinite(found), found, 0.0)
+        slopes = (value[:, 0] - value[:, 1]) / (2 * step)
+    return np.where(np.isfinite(slopes), slopes, 0.0)
 
 
 def _missing(log_density: float, off: float = 0.0) -> tuple[str, ...]:
@@ -103,14 +103,14 @@ def find_mode(model: AxisModel, near: Mapping[str, float] | None = None) -> Axis
     """
     start, width = _start(model, _repeat_sd(model))
     start = np.array([(near or {}).get(name, at) for name, at in zip(model.coordinates.names, start, strict=True)])
-    found = _searched(model, start, width)
-    if found.missing and len(found.w):
+    nearest = _searched(model, start, width)
+    if nearest.missing and len(nearest.w):
         bounded = _searched(model, *_start(model, _repeat_sd(model)), bounded=True)
         if not bounded.missing:
             return bounded
         again = _searched(model, *_start(model, max(fit_line(model.rows).scatter, 1e-4 * model.rows.travel)))
-        found = max(found, again, key=lambda mode: (not mode.missing, mode.log_density))
-    return found
+        nearest = max(nearest, again, key=lambda mode: (not mode.missing, mode.log_density))
+    return nearest
 
 
 def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray, bounded: bool = False) -> AxisMode:
@@ -125,8 +125,8 @@ def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray, bounded: b
         return AxisMode(start, np.zeros((0, 0)), alone, _missing(alone))
 
     def value(v: np.ndarray) -> float:
-        found = float(model.log_density((start + width * v)[None])[0])
-        return -found if np.isfinite(found) else 1e30
+        density = float(model.log_density((start + width * v)[None])[0])
+        return -density if np.isfinite(density) else 1e30
 
     def slope(v: np.ndarray) -> np.ndarray:
         return -_gradients(model, (start + width * v)[None], width, STEP)[0]

@@ -191,7 +191,7 @@ class AxisModel:
     def shifts(self) -> tuple[str, ...]:
         """Which shifts of the zero in time have a column: `creep`, `thermal_per_K`."""
         there = {"creep": _creeps(self.rows), "thermal_per_K": self.rows.kelvin is not None}
-        named = [name for name, found in there.items() if found]
+        named = [name for name, recorded in there.items() if recorded]
         return tuple(name for name in named if not self.priors[name].u == 0 == self.priors[name].value)
 
     @property
@@ -221,8 +221,8 @@ class AxisModel:
 
     def clock(self, wave: Wave, command: np.ndarray, time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
         """What a wave's period is of, at rows with these commands, times and readings, each (t,)."""
-        found = {"position": abs(self.rows.line[1]) * command, "seconds": time_s, "encoder": value}
-        return found[wave.clock]
+        clocks = {"position": abs(self.rows.line[1]) * command, "seconds": time_s, "encoder": value}
+        return clocks[wave.clock]
 
     def record(self, wave: Wave) -> WaveRecord:
         """Where the rows lie on the clock of a wave."""
@@ -240,14 +240,14 @@ class AxisModel:
 
     def _shift_columns(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Columns (n or 1, rows) of the shifts of the zero in time."""
-        found = {}
+        columns = {}
         if "creep" in self.shifts:
             minutes = values["creep_minutes"]
             minutes = minutes if "creep_minutes" in self.coordinates.names else minutes[:1]
-            found["creep"] = -np.expm1(-self.rows.warm_s[None] / (60.0 * minutes[:, None]))
+            columns["creep"] = -np.expm1(-self.rows.warm_s[None] / (60.0 * minutes[:, None]))
         if "thermal_per_K" in self.shifts and self.rows.kelvin is not None:
-            found["thermal_per_K"] = self.rows.kelvin[None]
-        return found
+            columns["thermal_per_K"] = self.rows.kelvin[None]
+        return columns
 
     def _columns(self, w: np.ndarray, values: Mapping[str, np.ndarray], extra: np.ndarray | None) -> np.ndarray:
         """Readings less what the priors' means say, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
@@ -256,40 +256,40 @@ class AxisModel:
         play = play_places(rows, backlash if self.play_is_sampled else np.zeros(1))
         spread = play.spread if self.play_is_sampled else self._unknown_spread
         # Draws that differ in nothing share their columns.
-        own = self.play_is_sampled or any(len(each) > 1 for each in (*shifts.values(), *waves))
-        blocks = len(backlash) if own else 1
+        by_draw = self.play_is_sampled or any(len(each) > 1 for each in (*shifts.values(), *waves))
+        blocks = len(backlash) if by_draw else 1
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
-        found = np.zeros((blocks, len(rows.move), width))
+        filled = np.zeros((blocks, len(rows.move), width))
         level = rows.line[0] + rows.line[1] * self.middle
         anchor = play.anchor - self.middle
-        found[:, :, 0] = rows.value - level - self.priors["per_command"].value * anchor
-        found[:, :, 0] -= 0.5 * play.side * backlash[:blocks, None]
-        found[:, :, 1 + OFFSET], found[:, :, 1 + SLOPE], found[:, :, 1 + CONTRAST] = 1.0, anchor, 0.5 * play.path
-        found[:, :, 1 + BACKLASH] = 0.5 * play.side
+        filled[:, :, 0] = rows.value - level - self.priors["per_command"].value * anchor
+        filled[:, :, 0] -= 0.5 * play.side * backlash[:blocks, None]
+        filled[:, :, 1 + OFFSET], filled[:, :, 1 + SLOPE], filled[:, :, 1 + CONTRAST] = 1.0, anchor, 0.5 * play.path
+        filled[:, :, 1 + BACKLASH] = 0.5 * play.side
         for k, segment in enumerate(self.homed):
-            found[:, :, 1 + HEAD + k] = rows.segment == segment
+            filled[:, :, 1 + HEAD + k] = rows.segment == segment
         for k, segment in enumerate(self.unknown_segments):
-            found[:, :, 1 + HEAD + len(self.homed) + k] = spread * (rows.segment == segment)
+            filled[:, :, 1 + HEAD + len(self.homed) + k] = spread * (rows.segment == segment)
         at = 1 + HEAD + len(self.homed) + len(self.unknown_segments)
         for k, (name, column) in enumerate(shifts.items(), start=at):
-            found[:, :, 0] -= self.priors[name].value * column
-            found[:, :, k] = column
+            filled[:, :, 0] -= self.priors[name].value * column
+            filled[:, :, k] = column
         for k, columns in enumerate(waves):
             begins = 1 + self.waves_begin + COLUMNS * k
-            found[:, :, begins : begins + COLUMNS] = columns
+            filled[:, :, begins : begins + COLUMNS] = columns
         start, count = 1 + self.processes, len(self.places.command)
-        found[:, :, start : start + count] = self._weights
-        found[:, :, start + count : start + 2 * count] = 0.5 * play.share[:, :, None] * self._weights
+        filled[:, :, start : start + count] = self._weights
+        filled[:, :, start + count : start + 2 * count] = 0.5 * play.share[:, :, None] * self._weights
         if extra is not None:
-            found[:, :, 1 + self.columns :] = extra
-        return found
+            filled[:, :, 1 + self.columns :] = extra
+        return filled
 
     def _scatter(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Variances of stop errors (in motion of the seeing) and of readings, each (n, rows)."""
         rows = self.rows
         if rows.in_motion:
-            seen = (values["seeing_scale"] * rows.reading_u) ** 2
-            stop = seen[:, None] * averaged_variance(rows.width_s[None] / values["seeing_s"][:, None])
+            seeing = (values["seeing_scale"] * rows.reading_u) ** 2
+            stop = seeing[:, None] * averaged_variance(rows.width_s[None] / values["seeing_s"][:, None])
             return stop, np.outer(values["reading_scale"] ** 2, rows.variance) + (FLOOR * rows.travel) ** 2
         forward = 0.5 * (1.0 + rows.side)
         stop = np.outer(values["stop_sd.forward"] ** 2, forward)
@@ -308,8 +308,8 @@ class AxisModel:
         gap = np.maximum(HOUR_S * rows.hours - rows.width_s, 0.0)[None] / lasts
         over = rows.width_s[None] / lasts
         whole = np.where(over > 1e-3, -np.expm1(-over) / np.maximum(over, 1e-3), 1.0 - 0.5 * over)
-        found = np.exp(-gap) * whole**2 / averaged_variance(over)
-        return np.where(rows.redrawn, 0.0, np.minimum(found, 1.0))
+        carry = np.exp(-gap) * whole**2 / averaged_variance(over)
+        return np.where(rows.redrawn, 0.0, np.minimum(carry, 1.0))
 
     def _between_nodes(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Variance (n,) that both processes have midway between nodes and lines of third order do not carry."""
@@ -325,8 +325,8 @@ class AxisModel:
     @cached_property
     def informed(self) -> np.ndarray:
         """Columns that any row depends on; the others are places where the processes are predicted."""
-        seen = np.any(self._weights != 0, axis=0)
-        return np.flatnonzero(np.concatenate((np.ones(self.processes, bool), seen, seen)))
+        weighted = np.any(self._weights != 0, axis=0)
+        return np.flatnonzero(np.concatenate((np.ones(self.processes, bool), weighted, weighted)))
 
     def _factor(self, values: Mapping[str, np.ndarray], scales: Sequence[np.ndarray], told_first: bool) -> np.ndarray:
         """Factor of the prior covariance of the columns, shape (n, columns, columns); `scales` (n,) are of the waves.
@@ -349,8 +349,8 @@ class AxisModel:
         for k, name in enumerate(self.shifts, start=HEAD + len(self.homed) + len(self.unknown_segments)):
             factor[:, k, k] = self.priors[name].u
         for k, scale in enumerate(scales):
-            own = self.waves_begin + COLUMNS * k + np.arange(COLUMNS)
-            factor[:, own, own] = np.outer(scale, SHARES)
+            of_wave = self.waves_begin + COLUMNS * k + np.arange(COLUMNS)
+            factor[:, of_wave, of_wave] = np.outer(scale, SHARES)
         distance = slope * (self.places.command[:, None] - self.places.command)
         length = values["transmission_error_length"][:, None, None]
         covariance = matern52(distance[None], length) + JITTER * np.eye(count)
@@ -411,24 +411,24 @@ class AxisModel:
             root, scaled, scale = _equilibrated(information)
             sides = np.concatenate([towards[:, None], functionals @ block.factor], axis=1) / scale[:, None]
             solved = np.linalg.solve(scaled, np.swapaxes(sides, 1, 2))
-            found = sides @ solved
+            products = sides @ solved
             log_det = 2 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)) + np.log(scale), axis=1)
-            left = block.products[:, 0, 0] - found[:, 0, 0]
+            left = block.products[:, 0, 0] - products[:, 0, 0]
             log_density[part] = -0.5 * (block.log_scatter + log_det + left + rows * np.log(2 * np.pi))
-            mean[part], covariance[part] = found[:, 0, 1:], found[:, 1:, 1:]
+            mean[part], covariance[part] = products[:, 0, 1:], products[:, 1:, 1:]
         if wanted:
             mean += self._prior_means(w) @ functionals.T
         return Likelihood(log_density, LinearPosterior(mean, covariance))
 
     def _prior_means(self, w: np.ndarray) -> np.ndarray:
         """Of the columns, (n, columns): what their deviations are from."""
-        found = np.zeros((len(w), self.columns))
-        found[:, OFFSET] = self.rows.line[0] + self.rows.line[1] * self.middle
-        found[:, SLOPE] = self.priors["per_command"].value
-        found[:, BACKLASH] = self.coordinates.values(w)["backlash"]
+        means = np.zeros((len(w), self.columns))
+        means[:, OFFSET] = self.rows.line[0] + self.rows.line[1] * self.middle
+        means[:, SLOPE] = self.priors["per_command"].value
+        means[:, BACKLASH] = self.coordinates.values(w)["backlash"]
         for k, name in enumerate(self.shifts, start=HEAD + len(self.homed) + len(self.unknown_segments)):
-            found[:, k] = self.priors[name].value
-        return found
+            means[:, k] = self.priors[name].value
+        return means
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
         """Log posterior density at coordinates (n, d) up to a constant, shape (n,); -inf where it has no value."""
@@ -437,17 +437,20 @@ class AxisModel:
     def posterior(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
         """The same with the prior of the coordinates; zero where it has no value."""
         wanted = len(functionals)
-        found = Likelihood.nowhere(len(w), wanted)
+        likelihood = Likelihood.nowhere(len(w), wanted)
         usable = np.flatnonzero(np.all(np.abs(w) < FARTHEST, axis=1))
         if len(usable):
             prior = self.coordinates.log_prior(w[usable])
             usable, prior = usable[np.isfinite(prior)], prior[np.isfinite(prior)]
         if len(usable):
-            seen = self._possible(w[usable], functionals)
-            value = seen.log_density + prior
-            found.log_density[usable] = np.where(np.isfinite(value), value, -np.inf)
-            found.linear.mean[usable], found.linear.covariance[usable] = seen.linear.mean, seen.linear.covariance
-        return found
+            possible = self._possible(w[usable], functionals)
+            value = possible.log_density + prior
+            likelihood.log_density[usable] = np.where(np.isfinite(value), value, -np.inf)
+            likelihood.linear.mean[usable], likelihood.linear.covariance[usable] = (
+                possible.linear.mean,
+                possible.linear.covariance,
+            )
+        return likelihood
 
     def _possible(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
         """`likelihood`, -inf where rounding leaves a matrix no factor."""
@@ -472,10 +475,10 @@ class AxisModel:
             reach = block.factor[:, :, informed] if len(others) else block.factor
             means[part] = np.einsum("nij,njk,nk->ni", reach, inverse, towards, optimize=True)
             covariances[part] = reach @ inverse @ np.swapaxes(reach, 1, 2)
-            for own in (others[: len(others) // 2], others[len(others) // 2 :]):
+            for halves in (others[: len(others) // 2], others[len(others) // 2 :]):
                 # Of the error by position, then of the play: independent beforehand.
-                free = block.factor[:, own[:, None], own]
-                covariances[part, own[:, None], own] += free @ np.swapaxes(free, 1, 2)
+                free = block.factor[:, halves[:, None], halves]
+                covariances[part, halves[:, None], halves] += free @ np.swapaxes(free, 1, 2)
         return LinearPosterior(means + self._prior_means(w), covariances)
 
     def left_out(self, w: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -498,23 +501,23 @@ class AxisModel:
             information, towards = _information(block, len(rows))
             _, scaled, scale = _equilibrated(information)
             inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
-            found = np.einsum("nij,nj->ni", inverse, towards)
-            means[part] = self.rows.value[rows] - found[:, self.columns :]
+            expected = np.einsum("nij,nj->ni", inverse, towards)
+            means[part] = self.rows.value[rows] - expected[:, self.columns :]
             covariances[part] = inverse[:, self.columns :, self.columns :]
         return means, covariances
 
     def head(self, **of: float) -> np.ndarray:
         """A functional (columns,) of `offset`, `slope`, `contrast`, `backlash` by their factors."""
-        found = np.zeros(self.columns)
+        functional = np.zeros(self.columns)
         for name, factor in of.items():
-            found[_HEAD_COLUMNS[name]] = factor
-        return found
+            functional[_HEAD_COLUMNS[name]] = factor
+        return functional
 
     def shift(self, name: str) -> np.ndarray:
         """A functional (columns,) of one of `shifts`."""
-        found = np.zeros(self.columns)
-        found[HEAD + len(self.homed) + len(self.unknown_segments) + self.shifts.index(name)] = 1.0
-        return found
+        functional = np.zeros(self.columns)
+        functional[HEAD + len(self.homed) + len(self.unknown_segments) + self.shifts.index(name)] = 1.0
+        return functional
 
     @property
     def repeats_by_draw(self) -> bool:
@@ -529,19 +532,19 @@ class AxisModel:
         Raises:
             ValueError: a period is not known, and no draws are given.
         """
-        found = np.zeros((len(command), self.columns))
-        found[:, self.processes : self.processes + len(self.places.command)] = self.places.weights(command)
-        own = self.repeats_by_draw
-        if own and w is None:
+        functionals = np.zeros((len(command), self.columns))
+        functionals[:, self.processes : self.processes + len(self.places.command)] = self.places.weights(command)
+        by_draw = self.repeats_by_draw
+        if by_draw and w is None:
             raise ValueError("draws are needed where a period is not known")
         draws = self.coordinates.wave_draws(np.zeros((1, len(self.coordinates.names))) if w is None else w)
-        found = np.repeat(found[None], 1 if w is None or not own else len(w), axis=0)
+        functionals = np.repeat(functionals[None], 1 if w is None or not by_draw else len(w), axis=0)
         for k, (wave, each) in enumerate(zip(self.coordinates.waves, draws, strict=True)):
             if wave.clock == "position":
                 begins = self.waves_begin + COLUMNS * k
                 at = self.clock(wave, command, command, command)
-                found[:, :, begins : begins + COLUMNS] = wave_columns(at, each.period, self.record(wave))
-        return found if own else found[0]
+                functionals[:, :, begins : begins + COLUMNS] = wave_columns(at, each.period, self.record(wave))
+        return functionals if by_draw else functionals[0]
 
 
 def _creeps(rows: AxisRows) -> bool:

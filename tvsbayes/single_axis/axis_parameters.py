@@ -151,38 +151,38 @@ class AxisCoordinates:
 
     def wave_draws(self, w: np.ndarray) -> list[WaveDraws]:
         """Every wave at coordinates (n, d)."""
-        found = []
+        draws = []
         for k, wave in enumerate(self.waves, start=1):
             place = None if wave.is_fixed else w[:, self.names.index(f"wave_period.{k}")]
-            found.append(wave_draws(wave, w[:, self.names.index(f"wave_scale.{k}")], place))
-        return found
+            draws.append(wave_draws(wave, w[:, self.names.index(f"wave_scale.{k}")], place))
+        return draws
 
     def log_prior(self, w: np.ndarray) -> np.ndarray:
         """Log prior density at coordinates (n, d) up to a constant, shape (n,)."""
-        found: np.ndarray = -0.5 * np.sum(w**2, axis=1)
+        density: np.ndarray = -0.5 * np.sum(w**2, axis=1)
         if self.waves:
             draws = self.wave_draws(w)
-            found = found + log_order(self.waves, draws) + sum(each.log_prior for each in draws)
-        return found
+            density = density + log_order(self.waves, draws) + sum(each.log_prior for each in draws)
+        return density
 
     def values(self, w: np.ndarray) -> dict[str, np.ndarray]:
         """Every name of `SAMPLED` at coordinates (n, d): arrays (n,)."""
         from scipy.special import log_ndtr, ndtri_exp
 
-        found = {}
+        by_name = {}
         for name, prior in self.priors.items():
             if name not in self.names:
-                found[name] = np.full(len(w), prior.value)
+                by_name[name] = np.full(len(w), prior.value)
                 continue
             z, kind = w[:, self.names.index(name)], kind_of(name)
             if kind == "half-normal":
                 # u Phi^-1((1 + Phi(z)) / 2) = -u Phi^-1(Phi(-z) / 2), exact in the far tail too.
-                found[name] = -prior.u * ndtri_exp(log_ndtr(-z) - np.log(2.0))
+                by_name[name] = -prior.u * ndtri_exp(log_ndtr(-z) - np.log(2.0))
             elif kind == "log-normal":
-                found[name] = prior.value * np.exp(prior.u * z)
+                by_name[name] = prior.value * np.exp(prior.u * z)
             else:
-                found[name] = prior.value + prior.u * z
-        return found
+                by_name[name] = prior.value + prior.u * z
+        return by_name
 
     def coordinate(self, name: str, value: float) -> float:
         """Of a free parameter with a normal or log-normal prior."""

@@ -79,22 +79,22 @@ def _with_wave(fit: AxisFit, k: int, rng: np.random.Generator) -> tuple[np.ndarr
 
     # The wave is added to draws without it: all else follows what the readings say without it.
     names = model.coordinates.names
-    found = w[rng.choice(len(w), WITH_WAVE, replace=len(w) < WITH_WAVE)].copy()
-    before = found.copy()
+    chosen = w[rng.choice(len(w), WITH_WAVE, replace=len(w) < WITH_WAVE)].copy()
+    before = chosen.copy()
     wave = model.coordinates.waves[k]
     column = names.index(f"wave_scale.{k + 1}")
     before[:, column] = absent_at(wave)
-    found[:, column] = ndtri(wave.absent + (1 - wave.absent) * rng.uniform(1e-9, 1 - 1e-9, len(found)))
+    chosen[:, column] = ndtri(wave.absent + (1 - wave.absent) * rng.uniform(1e-9, 1 - 1e-9, len(chosen)))
     if not wave.is_fixed:
         place = names.index(f"wave_period.{k + 1}")
-        found[:, place] = before[:, place] = rng.standard_normal(len(found))
-    gain = model.log_density(found) - model.log_density(before)
-    gain += 0.5 * (found[:, column] ** 2 - before[:, column] ** 2)
+        chosen[:, place] = before[:, place] = rng.standard_normal(len(chosen))
+    gain = model.log_density(chosen) - model.log_density(before)
+    gain += 0.5 * (chosen[:, column] ** 2 - before[:, column] ** 2)
     gain = np.where(np.isfinite(gain), gain, -np.inf)
     if np.any(np.isfinite(gain)):
         weights = np.exp(gain - gain.max())
-        found = found[systematic(weights / weights.sum(), WITH_WAVE, rng.random())]
-    return found, model.linear(found)
+        chosen = chosen[systematic(weights / weights.sum(), WITH_WAVE, rng.random())]
+    return chosen, model.linear(chosen)
 
 
 def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
@@ -103,7 +103,7 @@ def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
     In order: stated ones, the strongest of every range that was asked for, further ones by strength, the encoder's.
     """
     model, rng = fit.model, random_stream(fit.seed, AxisStream.PERIODS)
-    found = []
+    samples = []
     for k, wave in enumerate(model.coordinates.waves):
         probability = float(np.mean(model.coordinates.wave_draws(fit.w)[k].scale > 0))
         w, linear = _with_wave(fit, k, rng)
@@ -115,9 +115,9 @@ def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
         period = np.broadcast_to(model.coordinates.wave_draws(w)[k].period, len(w)).copy()
         # Positions of the model are by the line; the true ratio makes them longer or shorter.
         true_period = period * ratio if wave.clock == "position" else period
-        found.append(WaveSample(wave, period, true_period, coefficients, probability, model.record(wave)))
-    given = [each for each in found if each.wave.known is not None]
-    inferred = [each for each in found if each.wave.known is None]
+        samples.append(WaveSample(wave, period, true_period, coefficients, probability, model.record(wave)))
+    given = [each for each in samples if each.wave.known is not None]
+    inferred = [each for each in samples if each.wave.known is None]
     further = sorted(inferred, key=lambda each: (each.probability > 0.5, each.amplitude.mean()), reverse=True)
     first = []
     for ends in fit.campaign.periods.between:
@@ -158,43 +158,43 @@ def separate_periods(period: np.ndarray) -> list[PeriodGroup]:
     ordered = np.sort(period)
     cut = np.flatnonzero(np.diff(ordered) > ALIKE * ordered[1:]) + 1
     groups = [group for group in np.split(ordered, cut) if len(group) >= ALIKE * len(period)]
-    found = [PeriodGroup(float(g.mean()), (float(g[0]), float(g[-1])), len(g) / len(period)) for g in groups]
-    return sorted(found, key=lambda group: -group.share)
+    separate = [PeriodGroup(float(g.mean()), (float(g[0]), float(g[-1])), len(g) / len(period)) for g in groups]
+    return sorted(separate, key=lambda group: -group.share)
 
 
 def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
     """What the readings leave open about waves, in words, with what would tell."""
-    found = []
+    sentences = []
     for sample in samples:
         unit = sample.period_unit(fit.campaign.unit)
         groups = separate_periods(sample.period)
         if sample.probability > 0.5 and len(groups) > 1 and sample.wave.known is None:
-            said = ", ".join(f"{group.mean:.4g} {unit} ({100 * group.share:.0f} %)" for group in groups[:4])
-            found.append(
-                f"the readings cannot tell which period the wave has: {said}; read a longer run, at places that are "
+            shares = ", ".join(f"{group.mean:.4g} {unit} ({100 * group.share:.0f} %)" for group in groups[:4])
+            sentences.append(
+                f"the readings cannot tell which period the wave has: {shares}; read a longer run, at places that are "
                 "not evenly spaced"
             )
-    return found + strong_harmonics(samples, fit.campaign.unit) + _one_wave_twice(fit)
+    return sentences + strong_harmonics(samples, fit.campaign.unit) + _one_wave_twice(fit)
 
 
 def strong_harmonics(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
     """Waves whose second harmonic is stronger than the first: half of the period is the wave that leads."""
-    found = []
+    sentences = []
     for sample in samples:
         mine = sample.likeliest
         second = float(np.hypot(*sample.coefficients[mine, 2:4].T).mean())
         if sample.probability > 0.5 and second > float(sample.amplitude[mine].mean()):
             period, of = float(sample.true_period[mine].mean()), sample.period_unit(unit)
-            found.append(
+            sentences.append(
                 f"the wave of {period:.4g} {of} is strongest by its second harmonic: {second:.2g} {unit} every "
                 f"{0.5 * period:.4g} {of}; ask for that period in a range of its own to part two wheels"
             )
-    return found
+    return sentences
 
 
 def waves_at_an_end(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
     """Warnings of periods that lie where the range ends that was asked for: the true one may lie beyond it."""
-    found = []
+    sentences = []
     for sample in samples:
         wave = sample.wave
         if wave.known is not None or not sample.probability > 0.5:
@@ -202,16 +202,16 @@ def waves_at_an_end(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
         low, high = interval95(sample.period)
         if low < wave.low * (1 + ALIKE) or high > wave.high * (1 - ALIKE):
             of = sample.period_unit(unit)
-            found.append(
+            sentences.append(
                 f"the period {np.mean(sample.period):.4g} {of} lies at the end of the range that was asked for "
                 f"({wave.low:.4g} to {wave.high:.4g} {of}): the true one may lie beyond; widen period_between"
             )
-    return found
+    return sentences
 
 
 def _one_wave_twice(fit: AxisFit) -> list[str]:
     """Gear and encoder with one period, which their readings hardly part."""
-    found = []
+    sentences = []
     model, rows = fit.model, fit.rows
     gears = [wave for wave in model.coordinates.waves if wave.clock == "position"]
     for wave in gears:
@@ -220,9 +220,9 @@ def _one_wave_twice(fit: AxisFit) -> list[str]:
                 continue
             span = float(np.ptp(rows.value))
             if abs(1 / wave.peak - 1 / other.peak) * span < 1.0:
-                found.append(
+                sentences.append(
                     f"gear and encoder both have a wave of about {other.peak:.4g} {fit.campaign.unit}: how it is split "
                     "between them is weak, their sum is not; turn the encoder's shaft against the gear, or read with a "
                     "second instrument"
                 )
-    return found
+    return sentences

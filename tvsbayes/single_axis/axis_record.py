@@ -162,19 +162,26 @@ def _diagnoses(fit: AxisFit) -> dict[str, tuple[float | None, float | None, floa
     """R-hat, bulk and tail effective draws by quantity; every other has those of the least known."""
     if fit.sample is None or fit.answer == "laplace":
         return {"": (None, None, None)}
-    found = fit.sample.convergence
-    each = {name: (found.rhat.get(name), found.ess_bulk[name], found.ess_tail[name]) for name in found.ess_bulk}
-    worst = max(found.rhat.values(), default=None), min(found.ess_bulk.values()), min(found.ess_tail.values())
+    convergence = fit.sample.convergence
+    each = {
+        name: (convergence.rhat.get(name), convergence.ess_bulk[name], convergence.ess_tail[name])
+        for name in convergence.ess_bulk
+    }
+    worst = (
+        max(convergence.rhat.values(), default=None),
+        min(convergence.ess_bulk.values()),
+        min(convergence.ess_tail.values()),
+    )
     return {**each, "": worst}
 
 
 def _prior_sds(fit: AxisFit) -> dict[str, float]:
     priors = fit.model.priors
     sampled = [name for name in fit.free if not name.startswith("wave_")]
-    found = {name: prior_sd(kind_of(name), priors[name.split(".")[0]]) for name in (*sampled, *fit.model.shifts)}
+    sds = {name: prior_sd(kind_of(name), priors[name.split(".")[0]]) for name in (*sampled, *fit.model.shifts)}
     contrast = CONTRAST_SHARE * abs(fit.rows.line[1])
     side = float(np.hypot(priors["per_command"].u, 0.5 * contrast))
-    return found | {
+    return sds | {
         "per_command": priors["per_command"].u,
         "backlash": priors["backlash"].u,
         "ratio_contrast": contrast,
@@ -285,52 +292,52 @@ def _sampling(fit: AxisFit) -> dict[str, float | int | None]:
         return {}
     judged = fit.sample.convergence
     first = judged.importance
-    found: dict[str, float | int | None] = {
+    numbers: dict[str, float | int | None] = {
         "draws": first.draws,
         "rounds": first.rounds,
         "effective": first.effective_share * first.draws,
         "pareto_k": first.pareto_k,
     }
     if isinstance(judged, Convergence):
-        found |= {"steps": judged.steps, "acceptance": float(judged.acceptance.mean())}
-        found["autocorrelation_times"] = (judged.steps - judged.discarded) / judged.tau_steps
+        numbers |= {"steps": judged.steps, "acceptance": float(judged.acceptance.mean())}
+        numbers["autocorrelation_times"] = (judged.steps - judged.discarded) / judged.tau_steps
         if judged.agreement is not None:
-            found["agreement"] = judged.agreement.worst.value
-    return found
+            numbers["agreement"] = judged.agreement.worst.value
+    return numbers
 
 
 def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     """What is odd about the data, in sentences."""
-    found = []
+    sentences = []
     if rows.in_motion:
         return _warnings_in_motion(campaign, rows)
     legs = rows.legs
     idle = (legs.step == 0) & ~legs.first
     again = [int(m) for m in rows.move if idle[m]]
     if again:
-        found.append(
+        sentences.append(
             f"same command as the move before: moves {listed(again, 5)}; nothing moved, so they are of one stop and "
             "side; list the moves in between if the axis went on and came back"
         )
     if len({m.time_s for m in campaign.moves}) == 1:
-        found.append("all moves have the same time: drift is not determined")
+        sentences.append("all moves have the same time: drift is not determined")
     if not np.any(rows.variance > 0):
-        found.append("no reading has a stated u: the scatter of stops includes that of the readings")
+        sentences.append("no reading has a stated u: the scatter of stops includes that of the readings")
     unread = len(campaign.readings) - int(rows.count.sum())
     if unread:
-        found.append(f"{unread} readings are not used: their status is not ok")
-    return found + data_doubts(campaign, rows)
+        sentences.append(f"{unread} readings are not used: their status is not ok")
+    return sentences + data_doubts(campaign, rows)
 
 
 def _warnings_in_motion(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
     """What is odd about a record of a drive that never stops."""
-    found = []
+    sentences = []
     if not any(r.u > 0 for r in campaign.readings):
-        found.append(f"no reading has a stated u: {rows.reading_u:.2g} {rows.unit} by differences of neighbours")
+        sentences.append(f"no reading has a stated u: {rows.reading_u:.2g} {rows.unit} by differences of neighbours")
     unread = len(campaign.readings) - int(rows.count.sum())
     if unread:
-        found.append(f"{unread} of {len(campaign.readings)} readings are not used: their status is not ok")
-    return found
+        sentences.append(f"{unread} of {len(campaign.readings)} readings are not used: their status is not ok")
+    return sentences
 
 
 def _reversed(fit: AxisFit) -> list[str]:
@@ -345,21 +352,21 @@ def _reversed(fit: AxisFit) -> list[str]:
 
 def _weak(fit: AxisFit) -> list[str]:
     """What the data leave to the priors, and what would tell."""
-    rows, found = fit.rows, _weak_in_time(fit)
+    rows, sentences = fit.rows, _weak_in_time(fit)
     if rows.in_motion:
-        return [*found, "a drive at constant rate cannot tell error by position from drift: both are in the drift"]
+        return [*sentences, "a drive at constant rate cannot tell error by position from drift: both are in the drift"]
     sides = set(rows.side.tolist()) - {0}
     if not rows.both_sides:
-        found.append("backlash is not determined: every stop was reached from one side; add stops from the other")
+        sentences.append("backlash is not determined: every stop was reached from one side; add stops from the other")
     if len(rows.positions) < POSITIONS_FEW:
-        found.append(
+        sentences.append(
             f"{len(rows.positions)} positions cannot tell the error by position from the ratio; read at least "
             f"{POSITIONS_FEW}, spread over the travel"
         )
     repeats = [np.sum((rows.command == p) & (rows.side == s)) for p in rows.positions for s in sides]
     if max(repeats, default=0) < 2:
-        found.append("no position was reached twice from one side: scatter and error by position hardly come apart")
-    return found
+        sentences.append("no position was reached twice from one side: scatter and error by position hardly come apart")
+    return sentences
 
 
 CREEP_SHARE = 0.5
@@ -368,7 +375,7 @@ CREEP_SHARE = 0.5
 
 def _weak_in_time(fit: AxisFit) -> list[str]:
     """What a shift of the zero in time cannot be told from."""
-    found = []
+    sentences = []
     for shift, cure in {
         "creep": "alternate the directions, come back to the first stop, wait until it is warm",
         "thermal_per_K": "come back to the first stop at another temperature",
@@ -379,8 +386,8 @@ def _weak_in_time(fit: AxisFit) -> list[str]:
             a, b = fit.draws[shift], fit.draws[name]
             if a.std() and b.std() and abs(np.corrcoef(a, b)[0, 1]) > CREEP_SHARE:
                 words = "a creep of the zero" if shift == "creep" else "a shift with the temperature"
-                found.append(f"{what} and {words} are hardly separated: {cure}")
-    return found
+                sentences.append(f"{what} and {words} are hardly separated: {cure}")
+    return sentences
 
 
 def uninformed(summary: AxisSummary) -> TvsError | None:

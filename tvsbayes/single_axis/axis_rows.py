@@ -490,7 +490,7 @@ def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
         backlash = backlash[:1]
     half = 0.5 * np.maximum(backlash, 0.0)
     n, count, turned = len(half), len(rows.move), float(np.sign(slope))
-    found = [np.empty((n, count)) for _ in range(5)]
+    arrays = [np.empty((n, count)) for _ in range(5)]
     path = _path(legs)
     ends: list[_End] = []
     row = 0
@@ -507,13 +507,13 @@ def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
             places = low.place(slope, half), high.place(slope, half)
             off = 0.5 * (places[0] + places[1]) - slope * command
             middle_side = 0.5 * (low.side + high.side)
-            found[0][:, row] = 0.5 * (low.anchor + high.anchor)
-            found[1][:, row] = 0.5 * (low.path + high.path)
-            found[2][:, row] = middle_side
-            found[3][:, row] = np.where(half > 0, off / np.where(half > 0, half, 1.0), middle_side)
-            found[4][:, row] = 0.5 * (places[1] - places[0])
+            arrays[0][:, row] = 0.5 * (low.anchor + high.anchor)
+            arrays[1][:, row] = 0.5 * (low.path + high.path)
+            arrays[2][:, row] = middle_side
+            arrays[3][:, row] = np.where(half > 0, off / np.where(half > 0, half, 1.0), middle_side)
+            arrays[4][:, row] = 0.5 * (places[1] - places[0])
             row += 1
-    return PlayPlaces(*found)
+    return PlayPlaces(*arrays)
 
 
 def line_design(rows: AxisRows) -> np.ndarray:

@@ -60,13 +60,13 @@ class LineFit:
 def fit_line(rows: AxisRows, kept: np.ndarray | None = None) -> LineFit:
     """Least squares over the rows that are `kept` (None: all)."""
     used = np.ones(len(rows.value), dtype=bool) if kept is None else kept
-    told = np.array([True, np.ptp(rows.command[used]) > 0, np.ptp(rows.side[used]) > 0])
-    design = line_design(rows)[used][:, told]
+    determined = np.array([True, np.ptp(rows.command[used]) > 0, np.ptp(rows.side[used]) > 0])
+    design = line_design(rows)[used][:, determined]
     solved, covariance = np.zeros(3), np.zeros((3, 3))
-    solved[told] = np.linalg.lstsq(design, rows.value[used], rcond=None)[0]
-    freedom = max(int(used.sum()) - int(told.sum()), 1)
-    scatter = float(np.sqrt(np.sum((rows.value[used] - design @ solved[told]) ** 2) / freedom))
-    covariance[np.ix_(told, told)] = scatter**2 * np.linalg.pinv(design.T @ design)
+    solved[determined] = np.linalg.lstsq(design, rows.value[used], rcond=None)[0]
+    freedom = max(int(used.sum()) - int(determined.sum()), 1)
+    scatter = float(np.sqrt(np.sum((rows.value[used] - design @ solved[determined]) ** 2) / freedom))
+    covariance[np.ix_(determined, determined)] = scatter**2 * np.linalg.pinv(design.T @ design)
     return LineFit(solved, covariance, scatter)
 
 
@@ -122,8 +122,8 @@ def positioning_of(rows: AxisRows) -> Positioning | None:
 
 def iso230_figures(rows: AxisRows) -> dict[str, float] | None:
     """Those of the whole axis, by name, in the folder's unit."""
-    found = positioning_of(rows)
-    if found is None:
+    positioning = positioning_of(rows)
+    if positioning is None:
         return None
     of_axis = {name.replace("_up", "_forward").replace("_down", "_backward"): name for name in FIGURES}
-    return {name.removesuffix("_deg"): float(getattr(found, kept_as)) for name, kept_as in of_axis.items()}
+    return {name.removesuffix("_deg"): float(getattr(positioning, kept_as)) for name, kept_as in of_axis.items()}

@@ -40,7 +40,7 @@ def whitened(
     renewed = np.all(carry == 0, axis=0).tolist()
     # Numbers of one draw are plain floats: rows of a long record cost arithmetic, not calls.
     by_row = [_by_row(each, n) for each in (np.outer(drift, rows.hours), stop, reading, carry)]
-    found = []
+    blocks = []
     p_zero = p_held = p_both = 0.0 * by_row[0][0]
     for k, (walked, scatter, noise, kept) in enumerate(zip(*by_row, strict=True)):
         if begins[k]:
@@ -53,7 +53,7 @@ def whitened(
             p_held = kept**2 * p_held + (1 - kept**2) * scatter
         variance = p_zero + 2 * p_both + p_held + noise
         gain_zero, gain_held = (p_zero + p_both) / variance, (p_held + p_both) / variance
-        found.append((variance, gain_zero, gain_held))
+        blocks.append((variance, gain_zero, gain_held))
         # Joseph's form: differences of large variances keep the rest positive.
         left_zero, left_held = 1 - gain_zero, 1 - gain_held
         after_zero = left_zero**2 * p_zero - 2 * left_zero * gain_zero * p_both + gain_zero**2 * (p_held + noise)
@@ -66,7 +66,7 @@ def whitened(
         )
         p_zero, p_held = after_zero, after_held
     # Shape (3, rows, n, 1).
-    variance, gain_zero, gain_held = np.array(found).reshape(count, 3, n).swapaxes(0, 1)[..., None]
+    variance, gain_zero, gain_held = np.array(blocks).reshape(count, 3, n).swapaxes(0, 1)[..., None]
     white = np.empty((count, n, width))
     zero, held = np.zeros((n, width)), np.zeros((n, width))
     of_row = np.swapaxes(columns, 0, 1)

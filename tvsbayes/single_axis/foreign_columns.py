@@ -32,16 +32,16 @@ _ARROWS = str.maketrans({"\u2191": " forward ", "\u2193": " backward ", "\u2192"
 
 def run_columns(columns: Mapping[str, Sequence[str]]) -> dict[str, tuple[int, int]]:
     """Columns that hold a run each, by name: its number and its direction; empty where the table has none."""
-    found: dict[str, tuple[int, int]] = {}
+    runs: dict[str, tuple[int, int]] = {}
     for name, cells in columns.items():
         words = words_of(name.translate(_ARROWS))
         sides = [side for side, spellings in DIRECTIONS.items() if spellings.intersection(words)]
         numbers = [int(word) for word in words if word.isdigit()]
         first = next((cell for cell in cells if cell), "")
         if len(sides) == 1 and len(numbers) < 2 and NUMBER.fullmatch(first):
-            found[name] = (numbers[0] if numbers else 1, sides[0])
-    both = {side for _, side in found.values()} == {-1, 1}
-    return found if (both or len(found) > 1) and len(set(found.values())) == len(found) else {}
+            runs[name] = (numbers[0] if numbers else 1, sides[0])
+    both = {side for _, side in runs.values()} == {-1, 1}
+    return runs if (both or len(runs) > 1) and len(set(runs.values())) == len(runs) else {}
 
 
 @dataclass(frozen=True)
@@ -110,23 +110,23 @@ def deviation_columns(table: ForeignTable, columns: Mapping[str, str]) -> dict[s
     """
     command, value = (_numbers(table.columns[columns[field]]) for field in ("command", "value"))
     names = (columns["value"], columns["command"])
-    found = {}
+    ways = {}
     for name, cells in table.columns.items():
         words = set(words_of(name))
         if name in names or not words & (SPREAD | DEVIATION | {"fehler"}):
             continue
         scale = _scale(name, columns["value"])
-        own = _numbers(cells)
-        rows = [k for k, cell in enumerate(own) if cell is not None and None not in (command[k], value[k])]
+        numbers = _numbers(cells)
+        rows = [k for k, cell in enumerate(numbers) if cell is not None and None not in (command[k], value[k])]
         for sign, text in ((1.0, f"{names[0]} - {names[1]}"), (-1.0, f"{names[1]} - {names[0]}"), (0.0, "")):
             off = [
-                abs(_signed(value[k] - command[k], sign) * scale - own[k]) <= _half_digit(cells[k])  # type: ignore
+                abs(_signed(value[k] - command[k], sign) * scale - numbers[k]) <= _half_digit(cells[k])  # type: ignore
                 for k in rows
             ]
-            if len(rows) > 2 and all(off) and any(own[k] for k in rows):
-                found[name] = escaped(text or f"|{names[0]} - {names[1]}|", 120)
+            if len(rows) > 2 and all(off) and any(numbers[k] for k in rows):
+                ways[name] = escaped(text or f"|{names[0]} - {names[1]}|", 120)
                 break
-    return found
+    return ways
 
 
 def _signed(deviation: float, sign: float) -> float:
@@ -145,10 +145,10 @@ def _half_digit(cell: str) -> float:
 
 def _scale(name: str, beside: str) -> float:
     """Units of one column in one of another, by their names; 1 where they do not say."""
-    own, other = unit_of_name(name, READING_UNITS), unit_of_name(beside, READING_UNITS)
+    unit, other = unit_of_name(name, READING_UNITS), unit_of_name(beside, READING_UNITS)
     for units in (LENGTHS_MM, DEGREES):
-        if own in units and other in units:
-            return units[other] / units[own]
+        if unit in units and other in units:
+            return units[other] / units[unit]
     return 1.0
 
 

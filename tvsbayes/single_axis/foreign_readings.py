@@ -96,27 +96,29 @@ def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = N
     Raises:
         InputError: a field or column that does not exist.
     """
-    names, said = list(columns), dict(stated or {})
-    known = understand(names, said, AXIS_FIELDS, axis_field_of)
-    if "value" in known.columns or "value" in known.claimed or "value" in said:
+    names, stated_columns = list(columns), dict(stated or {})
+    known = understand(names, stated_columns, AXIS_FIELDS, axis_field_of)
+    if "value" in known.columns or "value" in known.claimed or "value" in stated_columns:
         return known
     claims = known.claimed.get("command", ())
-    found = [name for name in claims if _FOUND_BY_ENCODERS.intersection(words_of(name))]
-    sure = [name for name in claims if name not in found]
+    readings = [name for name in claims if _FOUND_BY_ENCODERS.intersection(words_of(name))]
+    sure = [name for name in claims if name not in readings]
     units = [
         name
         for name in known.unused
         if (words := words_of(name)) and all(unit_of_name(word, READING_UNITS) for word in words)
     ]
-    if len(sure) == len(found) == 1 and not units and (unit_of_name(found[0], READING_UNITS) or not known.unused):
-        return understand(names, {**said, "command": sure[0], "value": found[0]}, AXIS_FIELDS, axis_field_of)
+    if len(sure) == len(readings) == 1 and not units and (unit_of_name(readings[0], READING_UNITS) or not known.unused):
+        return understand(
+            names, {**stated_columns, "command": sure[0], "value": readings[0]}, AXIS_FIELDS, axis_field_of
+        )
     units = units or [
         name
         for name in known.unused
         if unit_of_name(name, READING_UNITS) and not _TEMPERATURE.intersection(words_of(name))
     ]
     if len(units) == 1 and not claims:
-        return understand(names, {**said, "value": units[0]}, AXIS_FIELDS, axis_field_of)
+        return understand(names, {**stated_columns, "value": units[0]}, AXIS_FIELDS, axis_field_of)
     return known
 
 
@@ -212,9 +214,9 @@ def _plain(table: ForeignTable, columns: Mapping[str, str], assumed: list[str]) 
     plain = dict(table.columns)
     for field in ("command", "value", "u"):
         if field in columns:
-            found = plain_column(columns[field], table.columns[columns[field]])
-            plain[columns[field]], units[field] = found.cells, found.unit
-            assumed += [found.remark] * bool(found.remark)
+            column = plain_column(columns[field], table.columns[columns[field]])
+            plain[columns[field]], units[field] = column.cells, column.unit
+            assumed += [column.remark] * bool(column.remark)
     return replace(table, columns=plain), units.get("value")
 
 
@@ -254,7 +256,7 @@ class _Stops:
         for command, side, value in zip(self._commands, self._sides, self._values, strict=True):
             if side and value is not None:
                 read[command][side].append(value)
-        gaps = [median(own[-1]) - median(own[1]) for own in read.values() if len(own) == 2]
+        gaps = [median(by_side[-1]) - median(by_side[1]) for by_side in read.values() if len(by_side) == 2]
         gap = median(gaps) if gaps else 0.0
         votes = []
         for row in range(1, len(self._commands)):
@@ -317,18 +319,18 @@ class _Stops:
 
     def remarks(self) -> list[str]:
         """What was assumed of moves."""
-        said = []
+        sentences = []
         if n := self._again:
-            said.append(f"{n} row{'s' * (n > 1)} at the command before: read at that stop again, without a move")
+            sentences.append(f"{n} row{'s' * (n > 1)} at the command before: read at that stop again, without a move")
         if n := self._put_in:
             name = escaped(self._cells.columns["approach"])
-            said.append(
+            sentences.append(
                 f"{n} move{'s' * (n > 1)} put in, {self._reach:.6g} past the stop, where column {name} says another "
                 "side than the row before leads to; --column approach= takes sides from the order alone"
             )
         if "approach" not in self._cells:
-            said.append("approach: unknown at the beginning of each segment")
-        return said
+            sentences.append("approach: unknown at the beginning of each segment")
+        return sentences
 
 
 def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool], assumed: list[str]) -> list[int]:
@@ -345,10 +347,10 @@ def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool]
             step = commands[row] - commands[row - 1]
             if step and words[row] in moved and not homings[row]:
                 moved[words[row]].add(1 if step > 0 else -1)
-        found = [next(iter(moved[word])) if len(moved[word]) == 1 else 0 for word in listed]
-        if found[0] * found[1] < 0:
-            sides |= dict(zip(listed, found, strict=True))
-            forward, backward = (escaped(listed[found.index(side)], 24) for side in (1, -1))
+        signs = [next(iter(moved[word])) if len(moved[word]) == 1 else 0 for word in listed]
+        if signs[0] * signs[1] < 0:
+            sides |= dict(zip(listed, signs, strict=True))
+            forward, backward = (escaped(listed[signs.index(side)], 24) for side in (1, -1))
             assumed.append(f"approach: {forward} is forward and {backward} backward, as the commands rise and fall")
     for row, word in enumerate(words):
         if word not in sides:
@@ -358,11 +360,11 @@ def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool]
     return [sides[word] for word in words]
 
 
-def unwrapped(found: ForeignReadings, unit: str, counts_per_turn: float | None = None) -> ForeignReadings:
+def unwrapped(wrapped: ForeignReadings, unit: str, counts_per_turn: float | None = None) -> ForeignReadings:
     """The same with the whole turns added that an encoder or autocollimator which begins anew leaves out.
 
     Args:
-        found: moves and readings.
+        wrapped: moves and readings.
         unit: of the readings; those of no angle stay as they are unless they count to a power of two.
         counts_per_turn: where readings begin anew, in their unit; 0: nowhere.
 
@@ -370,23 +372,23 @@ def unwrapped(found: ForeignReadings, unit: str, counts_per_turn: float | None =
         InputError: readings jump by one number again and again, and nobody said that they begin anew there.
     """
     if counts_per_turn == 0:
-        return found
-    rows = [k for k, reading in enumerate(found.readings) if reading.status == "ok" and reading.value is not None]
-    command = np.array([found.moves[found.readings[k].move].command for k in rows])
-    value = np.array([found.readings[k].value for k in rows], dtype=float)
+        return wrapped
+    rows = [k for k, reading in enumerate(wrapped.readings) if reading.status == "ok" and reading.value is not None]
+    command = np.array([wrapped.moves[wrapped.readings[k].move].command for k in rows])
+    value = np.array([wrapped.readings[k].value for k in rows], dtype=float)
     turn = counts_per_turn or TURNS.get(unit) or _counts_of(command, value)
     jumps = turn_jumps(command, value, turn) if turn is not None else {}
     # A wild reading jumps too, and back: by no whole turns.
     if turn is None or not jumps or any(abs(far - round(far)) > WHOLE for far in jumps.values()):
-        return found
-    readings, turns = list(found.readings), 0
+        return wrapped
+    readings, turns = list(wrapped.readings), 0
     for row, k in enumerate(rows):
         turns -= round(jumps.get(row, 0.0))
         readings[k] = replace(readings[k], value=float(value[row]) + turn * turns)
     times = "once" if len(jumps) == 1 else f"{len(jumps)} times"
     sentence = f"value: jumps by whole turns {times}, which are added: {turn:g} {unit} each; "
     sentence += "--counts-per-turn says another"
-    return replace(found, readings=tuple(readings), assumed=(*found.assumed, sentence))
+    return replace(wrapped, readings=tuple(readings), assumed=(*wrapped.assumed, sentence))
 
 
 def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:

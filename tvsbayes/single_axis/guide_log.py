@@ -304,7 +304,7 @@ def readings_of_run(run: GuideRun, file: str, stated: Mapping[str, float]) -> Fo
     """
     scale = _scale(run, stated, file)
     moves: list[AxisMove] = []
-    found: list[tuple[float, int, float | None, str]] = []
+    taken: list[tuple[float, int, float | None, str]] = []
     pulsed, waiting = 0.0, True
     for k, (_, time_s, raw, pulse_ms, settling) in enumerate(run.frames):
         waiting = waiting or k in run.breaks
@@ -316,18 +316,18 @@ def readings_of_run(run: GuideRun, file: str, stated: Mapping[str, float]) -> Fo
                 pulsed, waiting = 0.0, False
             motion = raw * scale.pixel_arcsec / scale.cos_declination + pulsed
             value = scale.drive_arcsec_per_s * time_s + motion
-        found.append((time_s, len(moves) - 1, value, status))
+        taken.append((time_s, len(moves) - 1, value, status))
         pulsed += pulse_ms / 1000.0 * scale.pulse_arcsec_per_s
-    used = sum(value is not None for _, _, value, _ in found)
+    used = sum(value is not None for _, _, value, _ in taken)
     if used < 3:
         remedy = "name another run with --run"
         raise refusal("empty", file=file, line=run.line, found=f"{used} frames", allowed="three or more", remedy=remedy)
     # A frame before the first stretch belongs to no move.
-    found += [(time_s, -1, None, "dropped") for _, time_s in run.dropped]
+    taken += [(time_s, -1, None, "dropped") for _, time_s in run.dropped]
     begins = [move.time_s for move in moves]
     rows = [
         (time_s, max(0, sum(at <= time_s for at in begins) - 1) if move < 0 else move, value, status)
-        for time_s, move, value, status in sorted(found, key=lambda row: row[0])
+        for time_s, move, value, status in sorted(taken, key=lambda row: row[0])
         if time_s >= begins[0]
     ]
     readings = tuple(
@@ -350,27 +350,27 @@ def _counted(run: GuideRun, used: int, stretches: int) -> str:
     events += [f"{n} {name}" for name, n in run.counts.items() if name.startswith("rows of") and n]
     text = f"frames: {used} used of {len(run.frames) + len(run.dropped)} ({', '.join(events)} left out)"
     broken = [_several(run.counts["dither"], "dither"), *([_several(n, "pause")] if (n := run.counts["pause"]) else [])]
-    own = "of its own each" if stretches > 1 else "of its own"
-    return f"{text}; {stretches} stretch{'es' * (stretches != 1)} with a zero {own} ({', '.join(broken)})"
+    words = "of its own each" if stretches > 1 else "of its own"
+    return f"{text}; {stretches} stretch{'es' * (stretches != 1)} with a zero {words} ({', '.join(broken)})"
 
 
 def _remarks(run: GuideRun) -> list[str]:
     """What else a reader should know of a run."""
-    said = [f"pier side {run.pier}"]
+    remarks = [f"pier side {run.pier}"]
     if not run.ended:
-        said.append("the log does not say that the run ended: it may be cut off")
+        remarks.append("the log does not say that the run ended: it may be cut off")
     times = [frame[1] for frame in run.frames]
     step = median([b - a for a, b in pairwise(times)] or [0.0])
     pulses = [abs(frame[3]) for frame in run.frames]
     if late := sum(p > 1000.0 * step for p in pulses):
-        said.append(f"{late} pulses last longer than the {step:.2g} s between frames and act in part later")
+        remarks.append(f"{late} pulses last longer than the {step:.2g} s between frames and act in part later")
     if (most := run.header.get("pulse_max_ms")) and (capped := sum(p >= most for p in pulses)):
-        said.append(f"{capped} pulses at their limit of {most:g} ms")
+        remarks.append(f"{capped} pulses at their limit of {most:g} ms")
     if n := run.counts["frame with a saturated star"]:
-        said.append(f"{n} frame{'s' * (n > 1)} with a saturated star, used")
+        remarks.append(f"{n} frame{'s' * (n > 1)} with a saturated star, used")
     if n := run.counts["change of the RA algorithm"]:
-        said.append(f"{n} change{'s' * (n > 1)} of the RA algorithm during the run")
-    return said
+        remarks.append(f"{n} change{'s' * (n > 1)} of the RA algorithm during the run")
+    return remarks
 
 
 def _header_of(run: GuideRun, file: str) -> dict[str, object]:

@@ -85,7 +85,7 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
     Raises:
         InputError: no pair that is surely command and reading, or no time at which both are known.
     """
-    found: dict[str, list[tuple[float, float]]] = {}
+    by_name: dict[str, list[tuple[float, float]]] = {}
     left_out, begin = 0, None
     for line in text.splitlines():
         match = _CAMONITOR.fullmatch(line.strip())
@@ -94,15 +94,15 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
             continue
         rest = (match["rest"] or "").upper()
         if not _NUMBER.fullmatch(match["value"]) or "INVALID" in rest:
-            found.setdefault(match["name"], [])
+            by_name.setdefault(match["name"], [])
             left_out += 1
             continue
         when = datetime.datetime.fromisoformat(match["time"])
         begin = begin or when
-        found.setdefault(match["name"], []).append(((when - begin).total_seconds(), float(match["value"])))
-    series = {name: _series(rows) for name, rows in found.items() if rows}
+        by_name.setdefault(match["name"], []).append(((when - begin).total_seconds(), float(match["value"])))
+    series = {name: _series(rows) for name, rows in by_name.items() if rows}
     command, value = _pair(series, file, stated)
-    kind = f"EPICS camonitor, {len(found)} series, {left_out} lines without a number left out"
+    kind = f"EPICS camonitor, {len(by_name)} series, {left_out} lines without a number left out"
     return _joined(series, command, value, file, kind)
 
 
@@ -129,10 +129,10 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
     free = [name for name in changing if name not in stated.values()]
     known = {field: name for field in ("command", "value") if (name := stated.get(field))}
     for field, words in (("value", _READ), ("command", _COMMANDED)):
-        own = [name for name in free if set(words_of(name)).intersection(words)]
-        if field not in known and len(own) == 1:
-            known[field] = own[0]
-            free.remove(own[0])
+        matching = [name for name in free if set(words_of(name)).intersection(words)]
+        if field not in known and len(matching) == 1:
+            known[field] = matching[0]
+            free.remove(matching[0])
     lacking = [field for field in ("command", "value") if field not in known]
     if len(lacking) == 1 and len(free) == 1:
         known[lacking[0]] = free[0]

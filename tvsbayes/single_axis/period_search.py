@@ -86,7 +86,7 @@ def _log_evidence(ready: _Prepared, wave: Wave, log_period: np.ndarray, scales: 
     model, rows = ready.model, ready.model.rows
     x = model.clock(wave, rows.command, rows.time_s, rows.value)
     width = rows.width_s * (1.0 if wave.clock == "seconds" else abs(rows.line[1] * (rows.rate or 0.0)))
-    found = np.empty((len(log_period), len(scales)))
+    evidence = np.empty((len(log_period), len(scales)))
     for begins in range(0, len(log_period), AT_ONCE):
         part = slice(begins, begins + AT_ONCE)
         columns = wave_columns(x, np.exp(log_period[part]), WaveRecord.of(x), width) * np.array(SHARES)
@@ -95,16 +95,16 @@ def _log_evidence(ready: _Prepared, wave: Wave, log_period: np.ndarray, scales: 
         white = model.whitened_extra(ready.w, flat)
         across = white.T @ ready.base[:, 1:]
         towards = (white.T @ ready.base[:, 0] - across @ ready.inverse @ ready.towards).reshape(count, COLUMNS)
-        own = white.reshape(len(x), count, COLUMNS)
+        of_columns = white.reshape(len(x), count, COLUMNS)
         across = across.reshape(count, COLUMNS, -1)
-        information = np.einsum("rpi,rpj->pij", own, own, optimize=True)
+        information = np.einsum("rpi,rpj->pij", of_columns, of_columns, optimize=True)
         information -= across @ ready.inverse @ np.swapaxes(across, 1, 2)
         values, vectors = np.linalg.eigh(information)
         values = np.maximum(values, 0.0)[:, None, :]
         along = np.einsum("pij,pi->pj", vectors, towards)[:, None, :] ** 2
         variance = scales[None, :, None] ** 2
-        found[part] = 0.5 * np.sum(variance * along / (1 + variance * values) - np.log1p(variance * values), axis=2)
-    return found
+        evidence[part] = 0.5 * np.sum(variance * along / (1 + variance * values) - np.log1p(variance * values), axis=2)
+    return evidence
 
 
 @dataclass(frozen=True)
@@ -126,10 +126,10 @@ def _searched(ready: _Prepared, wave: Wave, apart: Sequence[Wave] = ()) -> _Sear
     scales = np.exp(log_scale)
 
     def evidence_at(log_period: np.ndarray) -> np.ndarray:
-        found = _log_evidence(ready, wave, log_period, scales)
+        evidence = _log_evidence(ready, wave, log_period, scales)
         for other in apart:
-            found[np.abs(np.exp(-log_period) - 1 / other.peak) * span < RESOLVED] -= UNRESOLVED
-        return found
+            evidence[np.abs(np.exp(-log_period) - 1 / other.peak) * span < RESOLVED] -= UNRESOLVED
+        return evidence
 
     grid = np.array([np.log(wave.low)]) if wave.is_fixed else period_grid(wave, span)
     evidence = evidence_at(grid)
@@ -195,25 +195,25 @@ def period_grid(wave: Wave, span: float) -> np.ndarray:
     return np.concatenate([by_log[:1], grid[np.diff(grid, append=np.inf) > APART_MIN], by_log[-1:]])
 
 
-def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], asked: AskedPeriods) -> tuple[Wave, ...]:
+def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], periods: AskedPeriods) -> tuple[Wave, ...]:
     """The waves that a folder asks for, with tables by what its readings say; stated ones first, the encoder's last.
 
     Args:
         rows: what was read.
         priors: complete; the scale of `transmission_error` is that of the waves.
-        asked: periods.
+        periods: periods.
 
     Raises:
         InputError: a range that is too wide for the record.
     """
-    if not asked:
+    if not periods:
         return ()
     error = priors["transmission_error"]
     unit = error.u or error.value or (AXIS_KEYS["transmission_error"].share or 0.0) * rows.travel
-    clock: Clock = "seconds" if asked.in_seconds else "position"
-    stated = [_of_stated(clock, period, unit, rows, priors) for period in asked.stated]
-    unknown = [replace(Wave.fixed(clock, low, unit), high=high) for low, high in asked.between]
-    encoder = [] if asked.encoder is None else [_of_stated("encoder", asked.encoder, unit, rows, priors)]
+    clock: Clock = "seconds" if periods.in_seconds else "position"
+    stated = [_of_stated(clock, period, unit, rows, priors) for period in periods.stated]
+    unknown = [replace(Wave.fixed(clock, low, unit), high=high) for low, high in periods.between]
+    encoder = [] if periods.encoder is None else [_of_stated("encoder", periods.encoder, unit, rows, priors)]
     known = [Wave.fixed(wave.clock, wave.peak, unit) for wave in (*stated, *encoder)]
     near: dict[str, float] = {}
     unknown, peaks = _inferred(rows, priors, known, unknown, near)
@@ -231,7 +231,7 @@ def _inferred(
     rows: AxisRows,
     priors: Mapping[str, AxisPrior],
     known: Sequence[Wave],
-    asked: Sequence[Wave],
+    waves: Sequence[Wave],
     near: dict[str, float],
 ) -> tuple[list[Wave], list[Wave]]:
     """The waves of unknown period, and each at its peak: one after the other, the strongest evidence first.
@@ -240,7 +240,7 @@ def _inferred(
     gear train has more periods than its owner knows of, and the one that is asked for may not be the strongest. `near`
     holds the coordinates of the last mode by name.
     """
-    found: list[Wave] = []
+    inferred: list[Wave] = []
     peaks: list[Wave] = []
 
     def strongest(ranges: Sequence[Wave]) -> _Searched:
@@ -251,16 +251,16 @@ def _inferred(
         return max((_searched(ready, wave, peaks) for wave in ranges), key=lambda each: each.log_evidence)
 
     def take(best: _Searched) -> None:
-        found.append(next(wave for wave in asked if (wave.low, wave.high) == (best.wave.low, best.wave.high)))
+        inferred.append(next(wave for wave in waves if (wave.low, wave.high) == (best.wave.low, best.wave.high)))
         peaks.append(replace(Wave.fixed(best.wave.clock, best.wave.peak, best.wave.unit), absent=best.wave.absent))
 
-    different = list({(wave.low, wave.high): wave for wave in asked}.values())
-    while different and len(found) < WAVES_MAX and (best := strongest(different)).log_evidence > FURTHER:
+    different = list({(wave.low, wave.high): wave for wave in waves}.values())
+    while different and len(inferred) < WAVES_MAX and (best := strongest(different)).log_evidence > FURTHER:
         take(best)
     for wave in different:
-        while found.count(wave) < asked.count(wave):
+        while inferred.count(wave) < waves.count(wave):
             take(strongest([wave]))
-    return found, peaks
+    return inferred, peaks
 
 
 RATIO_SDS = 3.0

@@ -30,23 +30,23 @@ class ProcessPlaces:
         Raises:
             ValueError: a command that is no place, of exact ones.
         """
-        found = np.zeros((len(command), len(self.command)))
+        weights_at = np.zeros((len(command), len(self.command)))
         if not len(self.command):
-            return found
+            return weights_at
         if self.exact:
             at = np.searchsorted(self.command, command)
             if not np.array_equal(self.command[np.minimum(at, len(self.command) - 1)], command):
                 raise ValueError("a command at which no process stands")
-            found[np.arange(len(command)), at] = 1.0
-            return found
+            weights_at[np.arange(len(command)), at] = 1.0
+            return weights_at
         spacing = self.command[1] - self.command[0]
         first = np.clip(((command - self.command[0]) // spacing).astype(int) - 1, 0, len(self.command) - 4)
         t = (command - self.command[first]) / spacing
         # Lagrange's polynomial of third order through four nodes.
         for k in range(4):
             others = [j for j in range(4) if j != k]
-            found[np.arange(len(command)), first + k] = np.prod([(t - j) / (k - j) for j in others], axis=0)
-        return found
+            weights_at[np.arange(len(command)), first + k] = np.prod([(t - j) / (k - j) for j in others], axis=0)
+        return weights_at
 
 
 def process_places(commands: np.ndarray, more: np.ndarray) -> ProcessPlaces:

@@ -77,9 +77,9 @@ class Tabulated:
     @classmethod
     def of(cls, at: np.ndarray, log_density: np.ndarray, floor: float) -> Tabulated:
         """Proportional to exp(log_density), with a uniform part that has the probability `floor`."""
-        found = np.exp(log_density - log_density.max())
-        found = (1 - floor) * found / np.trapezoid(found, at) + floor / np.ptp(at)
-        return cls(at, found / np.trapezoid(found, at))
+        density = np.exp(log_density - log_density.max())
+        density = (1 - floor) * density / np.trapezoid(density, at) + floor / np.ptp(at)
+        return cls(at, density / np.trapezoid(density, at))
 
     @property
     def _below(self) -> np.ndarray:
@@ -176,13 +176,13 @@ def wave_draws(wave: Wave, strength: np.ndarray, place: np.ndarray | None) -> Wa
     there = share > wave.absent
     log_scale = wave.log_scale.quantile(np.clip((share - wave.absent) / (1 - wave.absent), 0.0, 1.0))
     prior = np.where(there, log(WAVE_PRIOR / (1 - wave.absent)), log((1 - WAVE_PRIOR) / max(wave.absent, 1e-300)))
-    own = log_scale_prior(log_scale, wave.unit) - wave.log_scale.log_density(log_scale)
+    correction = log_scale_prior(log_scale, wave.unit) - wave.log_scale.log_density(log_scale)
     period = np.array([wave.low])
     if place is not None and wave.log_period is not None:
         log_period = wave.log_period.quantile(ndtr(place))
         period = np.exp(log_period)
-        own = own - log(log(wave.high / wave.low)) - wave.log_period.log_density(log_period)
-    return WaveDraws(np.where(there, np.exp(log_scale), 0.0), period, prior + np.where(there, own, 0.0))
+        correction = correction - log(log(wave.high / wave.low)) - wave.log_period.log_density(log_period)
+    return WaveDraws(np.where(there, np.exp(log_scale), 0.0), period, prior + np.where(there, correction, 0.0))
 
 
 def absent_at(wave: Wave) -> float:
@@ -194,10 +194,10 @@ def absent_at(wave: Wave) -> float:
 
 def names_of(waves: Sequence[Wave]) -> tuple[str, ...]:
     """Coordinates of the waves, in order."""
-    found = []
+    names = []
     for k, wave in enumerate(waves, start=1):
-        found += [f"wave_scale.{k}", *([] if wave.is_fixed else [f"wave_period.{k}"])]
-    return tuple(found)
+        names += [f"wave_scale.{k}", *([] if wave.is_fixed else [f"wave_period.{k}"])]
+    return tuple(names)
 
 
 def start_of(wave: Wave, name: str) -> float:
@@ -215,7 +215,7 @@ def log_order(waves: Sequence[Wave], draws: Sequence[WaveDraws]) -> np.ndarray:
     With m waves of K there, the first m are, each the one of the rest that is nearest to its own peak; such an order
     stands for K! / (K - m)! others. -inf for all others.
     """
-    found = np.zeros(1)
+    order = np.zeros(1)
     alike: dict[tuple[float, float, Clock], list[int]] = {}
     for k, wave in enumerate(waves):
         if wave.known is None and not wave.is_fixed:
@@ -227,13 +227,13 @@ def log_order(waves: Sequence[Wave], draws: Sequence[WaveDraws]) -> np.ndarray:
         count = there.sum(axis=0)
         allowed = np.all(there[:-1] | ~there[1:], axis=0)
         for row, k in enumerate(group):
-            own = np.abs(np.log(draws[k].period / waves[k].peak))
+            distance = np.abs(np.log(draws[k].period / waves[k].peak))
             for other, j in enumerate(group[row + 1 :], start=row + 1):
-                nearer = own <= np.abs(np.log(draws[j].period / waves[k].peak))
+                nearer = distance <= np.abs(np.log(draws[j].period / waves[k].peak))
                 allowed &= nearer | ~there[other] | ~there[row]
         each = np.array([log(factorial(len(group)) / factorial(len(group) - m)) for m in range(len(group) + 1)])
-        found = found + np.where(allowed, each[count], -np.inf)
-    return found
+        order = order + np.where(allowed, each[count], -np.inf)
+    return order
 
 
 @dataclass(frozen=True)
