@@ -103,7 +103,7 @@ def test_no_ratio_of_angles_that_lie_on_no_line():
 
 @pytest.mark.parametrize(
     ("cells", "said"),
-    [(["95", "1", "1", "1", "1"], "a number from -90 to 90"), (["", "1", "1", "1", "1"], "elevation_deg where")],
+    [(["95", "1", "1", "1", "1"], "a number from -90 to 90"), (["", "1", "1", "1", "1"], "alt: found an empty cell")],
 )
 def test_cells_that_are_no_sightings_are_refused(cells, said):
     counters = {"pan": [str(pan) for pan, _ in STEPS], "tilt": [str(tilt) for _, tilt in STEPS]}

@@ -16,18 +16,10 @@ from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.foreign_table import ForeignTable
 from tvsbayes.instrument.axes import AXES, Axis
 from tvsbayes.instrument.campaign import MOVES, SPOTS, Move, Spot
-from tvsbayes.instrument.cell_notation import plain_column
 from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SPREAD, field_by_word, unit_of_name, words_of
 from tvsbayes.instrument.corrections import Correction, corrected
-from tvsbayes.instrument.foreign_looks import (
-    GOOD,
-    FieldCells,
-    Notation,
-    left_out,
-    moves_of_rows,
-    refused_status,
-    word_of,
-)
+from tvsbayes.instrument.foreign_cells import FieldCells, left_out, plain_column, status_of
+from tvsbayes.instrument.foreign_looks import Notation, moves_of_rows
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, sightings_of
 
@@ -128,19 +120,13 @@ def sightings_of_table(
     for row, (azimuth, elevation, u) in enumerate(zip(*angles[:2], stated_u, strict=True)):
         if azimuth is None and elevation is None and not statuses[row]:
             continue
-        good = not statuses[row] or word_of(statuses[row]) in GOOD
-        if good and None in (azimuth, elevation, u):
-            empty = ANGLES[0] if azimuth is None else ANGLES[1] if elevation is None else "u_deg"
-            raise cells_of.refuse(row, empty, f"a number for {empty} where the sighting is ok", "complete the cell")
-        status = "ok" if good else refused_status(statuses[row])
+        values = {"azimuth_deg": azimuth, "elevation_deg": elevation, "u_deg": u}
         sightings.append(
             Sighting(
                 sighting=row,
                 move=listing.of_row[row],
-                azimuth_deg=azimuth,
-                elevation_deg=elevation,
-                u_deg=u,
-                status=status,
+                **values,
+                status=status_of(cells_of, row, values, "sighting"),
             )
         )
     assumed += left_out(cells_of, statuses, "sighting")

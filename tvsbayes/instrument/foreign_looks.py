@@ -6,20 +6,13 @@ a table does not say is assumed and listed in words. Px with the integer at the 
 
 from __future__ import annotations
 
-import datetime
-import math
-import re
-import unicodedata
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Any
 
-from tvsbayes.errors import InputError, escaped, refusal
-from tvsbayes.files.csv_kind import ID_MAX, Column
+from tvsbayes.errors import escaped, refusal
+from tvsbayes.files.csv_kind import ID_MAX
 from tvsbayes.files.csv_table import NUMBER
-from tvsbayes.files.foreign_table import DAY_S, ForeignTable
+from tvsbayes.files.foreign_table import ForeignTable
 from tvsbayes.instrument.axes import AXES, SENSES, Axis
 from tvsbayes.instrument.campaign import (
     APERTURE_MAX_DEG,
@@ -33,32 +26,22 @@ from tvsbayes.instrument.campaign import (
     Spot,
     next_move,
 )
-from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, unit_of_name, words_of
+from tvsbayes.instrument.column_names import COUNTERS, DEGREES, unit_of_name
+from tvsbayes.instrument.foreign_cells import (
+    FieldCells,
+    homings_of,
+    left_out,
+    readable,
+    seconds_of,
+    status_of,
+    temperatures_of,
+    word_of,
+)
 
 SD_PX = 0.1
 """Standard uncertainty of a centroid where a table states none; the fit scales it by what the spots show."""
-GOOD = {
-    *("ok", "1", "true", "yes", "good", "valid", "ja", "gut", "gultig", "si", "bien", "bueno", "buena", "valido"),
-    *("oui", "bon", "bonne", "valide"),
-}
-BAD = {
-    *("0", "false", "no", "bad", "invalid", "nein", "schlecht", "ungultig", "mal", "malo", "mala", "invalido"),
-    *("non", "mauvais", "mauvaise", "invalide"),
-}
-"""Words of a status, in small letters without accents."""
 FOUR_POINT = ("experiment", "point")
 """Fields of the four-point method: both or neither."""
-WORDS_TOLD = 5
-"""Of those that leave rows out."""
-NO_NUMBER = {"nan", "n/a", "#n/a", "null"}
-"""What programs write into a cell that has no number, in small letters."""
-EPOCH_SCALES = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3}
-"""Seconds of a unit by the least number that counts it since 1970; smaller ones are seconds."""
-_FLAGS = {"": False, "0": False, "false": False, "1": True, "true": True}
-"""Cells of a column that marks homings, in small letters."""
-_CLOCK = re.compile(r"[0-9]{1,2}:[0-9]{2}:[0-9]{2}(?:\.[0-9]{1,6})?")
-_DOTTED_DATE = re.compile(r"([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})[ ,T]+")
-"""Day, month and year: with dots in no other order."""
 
 
 @dataclass(frozen=True)
@@ -95,53 +78,6 @@ class ForeignLooks:
     assumed: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class FieldCells:
-    """Cells of a table by field."""
-
-    table: ForeignTable
-    columns: Mapping[str, str]
-
-    def __contains__(self, field: str) -> bool:
-        return field in self.columns
-
-    def text(self, field: str) -> list[str]:
-        """Cells of a field; empty ones where no column gives it."""
-        return list(self.table.columns[self.columns[field]]) if field in self else [""] * len(self.table)
-
-    def read(self, column: Column, low: float | None = None, high: float | None = None, empty: bool = False) -> list:
-        """Values of a column of our files, its default in empty cells, None where it has none and `empty` allows it.
-
-        Args:
-            column: its limits hold where no others are given; "200.0" is a whole number.
-            low: another limit.
-            high: another limit.
-            empty: whether a cell may be empty although the column has no default.
-        """
-        field, empty = column.name, empty or column.may_be_empty
-        default = column.default if column.may_be_empty else None
-        least, greatest = column.low if low is None else low, column.high if high is None else high
-        values: list[Any] = []
-        for row, text in enumerate(self.text(field)):
-            cell = "" if text.lower() in NO_NUMBER else text
-            value = float(cell) if NUMBER.fullmatch(cell) else math.nan
-            if not cell and empty:
-                values.append(default)
-            elif not least <= value <= greatest:
-                remedy = "correct the cell, or name another column"
-                raise self.refuse(row, field, f"a number from {least:g} to {greatest:g} for {field}", remedy)
-            elif column.kind is int and not value.is_integer():
-                remedy = "give the counters of the motors; angles are what the fit finds" if field in COUNTERS else ""
-                raise self.refuse(row, field, f"a whole number for {field}", remedy or "correct the cell")
-            else:
-                values.append(column.kind(value))
-        return values
-
-    def refuse(self, row: int, field: str, allowed: str, remedy: str) -> InputError:
-        """The error of one cell."""
-        return self.table.refuse(row, self.columns[field], allowed, remedy)
-
-
 def looks_of(
     table: ForeignTable, columns: Mapping[str, str], notation: Notation, listed: Sequence[Move] | None = None
 ) -> ForeignLooks:
@@ -168,20 +104,6 @@ def looks_of(
         of_row = tuple(_listed_moves(cells, listed or ()))
     spots = _spots(cells, of_row, notation, assumed) if any(field in cells for field in PIXELS) else None
     return ForeignLooks(moves, spots, tuple(assumed))
-
-
-def temperatures_of(cells: FieldCells, assumed: list[str]) -> list[float | None]:
-    """Temperature of every row, deg C, from degrees Fahrenheit or kelvins where the column's name says so."""
-    if "temperature_degC" not in cells:
-        return [None] * len(cells.table)
-    words = set(words_of(cells.columns["temperature_degC"]))
-    unit = "Fahrenheit" if words & {"f", "fahrenheit"} else "kelvin" if words & {"k", "kelvin"} else ""
-    temperatures = cells.read(MOVES["temperature_degC"])
-    if unit:
-        factor, zero = (1 / 1.8, 32.0) if unit == "Fahrenheit" else (1.0, 273.15)
-        temperatures = [None if value is None else factor * (value - zero) for value in temperatures]
-        assumed.append(f"temperature: degrees of {unit}, as the column's name says, turned into deg C")
-    return temperatures
 
 
 def _listed_moves(cells: FieldCells, listed: Sequence[Move]) -> list[int]:
@@ -283,68 +205,6 @@ def _approaches(cells: FieldCells, axis: Axis, default: str) -> list[str]:
     return words
 
 
-def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
-    """Whether the axes homed before each row but the first, which begins a segment anyway.
-
-    Numbers of segments change at a homing. Where all cells are 0 or 1 and a 0 follows a 1, they are no numbers of
-    segments but marks: each 1 is a homing, and the 0 after it is none.
-    """
-    if "segment" not in cells:
-        return [False] * len(cells.table)
-    words = [word.lower() for word in cells.text("segment")]
-    flags = [_FLAGS.get(word) for word in words]
-    marked = None not in flags and any(before and not after for before, after in pairwise(flags))
-    later = map(bool, flags[1:]) if marked else (before != after for before, after in pairwise(words))
-    homings = [False, *later]
-    count, name = sum(homings), escaped(cells.columns["segment"])
-    how = "at each 1" if marked else "where it changes"
-    assumed.append(f"segment: {count} homing{'s' * (count != 1)} after the first row, by column {name} {how}")
-    return homings
-
-
-def _iso_date(dotted: re.Match[str]) -> str:
-    day, month, year = dotted.groups()
-    return f"{year}-{month:0>2}-{day:0>2}T"
-
-
-def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
-    """Seconds of every row: numbers in the unit of the column's name, or dates with times."""
-    if "time_s" not in cells:
-        return None
-    texts = cells.text("time_s")
-    if all(NUMBER.fullmatch(cell) for cell in texts):
-        unit = unit_of_name(cells.columns["time_s"], SECONDS)
-        scale = SECONDS.get(unit or "", 1.0)
-        seconds = [scale * float(cell) for cell in texts]
-        since_1970 = next((each for least, each in EPOCH_SCALES.items() if seconds and seconds[0] >= least), None)
-        if unit is None and since_1970 is not None:
-            seconds = [since_1970 * (value - seconds[0]) for value in seconds]
-            assumed.append(f"time_s: counted in {since_1970:g} s since 1970, so seconds since the first row")
-    else:
-        seconds = []
-        for row, cell in enumerate(texts):
-            try:
-                if _CLOCK.fullmatch(cell):
-                    clock = datetime.time.fromisoformat(cell.zfill(8))
-                    day = datetime.datetime.combine(datetime.date(1970, 1, 1), clock, datetime.UTC).timestamp()
-                    later = seconds and day < seconds[-1] % DAY_S
-                    seconds.append(day + DAY_S * ((seconds[-1] // DAY_S if seconds else 0) + bool(later)))
-                    continue
-                when = datetime.datetime.fromisoformat(_DOTTED_DATE.sub(_iso_date, cell, count=1))
-                # Without a zone every hour has its length: this machine's summer time is not the logger's.
-                seconds.append((when if when.tzinfo else when.replace(tzinfo=datetime.UTC)).timestamp())
-            except ValueError as error:
-                allowed = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
-                raise cells.refuse(row, "time_s", allowed, "correct the cell, or write --column time_s=") from error
-        seconds = [value - seconds[0] for value in seconds]
-        assumed.append("time_s: seconds since the first row")
-    for row in range(1, len(seconds)):
-        if seconds[row] < seconds[row - 1]:
-            remedy = "sort the rows as they happened: play remembers the order"
-            raise cells.refuse(row, "time_s", "times that do not decrease", remedy)
-    return seconds
-
-
 def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed: list[str]) -> tuple[Spot, ...]:
     """The looks of a table with pixels."""
     pixels = [cells.read(SPOTS[field]) for field in PIXELS]
@@ -383,7 +243,9 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
         if not looked[row]:
             continue
         centre = [column[row] for column in pixels]
-        status = _status(statuses[row], centre, cells, row)
+        unseen = None in centre and not word_of(statuses[row])
+        at = dict(zip(PIXELS, centre, strict=True))
+        status = "no centre in the table" if unseen else status_of(cells, row, at, "look")
         number = numbers[row] if unique else row
         reading = None if (read := readings[row]) is None else scale_deg * read
         of_experiment = (experiments[row], points[row]) if None not in (experiments[row], points[row]) else (None, None)
@@ -416,52 +278,3 @@ def _sd_px(cells: FieldCells, row: int, field: str, column: Sequence[float | Non
         allowed = f"a number from {PIXEL_SD_MIN:g} to {PIXEL_SD_MAX:g} where the look is ok"
         raise cells.refuse(row, field, allowed, f"complete the cell, or write --column {field}= and --sd-px")
     return sd
-
-
-def word_of(status: str) -> str:
-    """A cell of a status as `GOOD` and `BAD` have it."""
-    plain = unicodedata.normalize("NFKD", status.strip().lower())
-    return "".join(letter for letter in plain if not unicodedata.combining(letter))
-
-
-def left_out(cells: FieldCells, statuses: Iterable[str], what: str) -> list[str]:
-    """What a column of statuses leaves out, as a sentence: a word that somebody meant well may be none of `GOOD`."""
-    counts = Counter(escaped(text, 24) for text in statuses if text.strip() and word_of(text) not in GOOD)
-    if not counts:
-        return []
-    common = [f"{text} {count}" for text, count in counts.most_common(WORDS_TOLD)]
-    named = ", ".join(common) + " ..." * (len(counts) > WORDS_TOLD)
-    count = sum(counts.values())
-    return [
-        f"status: {count} {what}{'s' * (count != 1)} left out by column {escaped(cells.columns['status'])}: {named}"
-    ]
-
-
-def _status(text: str, centre: Sequence[float | None], cells: FieldCells, row: int) -> str:
-    """The word "ok", or why a look is of no use."""
-    complete = None not in centre
-    word = word_of(text)
-    if word in GOOD or not word:
-        if complete or not word:
-            return "ok" if complete else "no centre in the table"
-        field = PIXELS[centre.index(None)]
-        raise cells.refuse(row, field, "a number where the look is ok", "complete the cell, or its status")
-    return refused_status(text)
-
-
-def refused_status(text: str) -> str:
-    """A cell that says why a row is of no use, as the reader of our tables takes it."""
-    return readable(f"refused: {text}" if word_of(text) in BAD else text, "refused:", 200) or "refused"
-
-
-def readable(text: str, before: str, chars_max: int) -> str:
-    """A cell's text as the reader of our tables takes it: printable, on one line, nothing that a spreadsheet runs.
-
-    Args:
-        text: of the cell.
-        before: word put before a text that begins with = + - or @: without these signs "-50" and "50" were one.
-        chars_max: longer ones are cut.
-    """
-    kept = "".join(c if c.isprintable() else " " for c in text)
-    kept = " ".join(kept.split())
-    return (f"{before} {kept}" if kept.startswith(("=", "+", "-", "@")) else kept)[:chars_max]

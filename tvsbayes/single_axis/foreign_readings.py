@@ -17,7 +17,6 @@ import numpy as np
 
 from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.foreign_table import ForeignTable
-from tvsbayes.instrument.cell_notation import plain_column
 from tvsbayes.instrument.column_names import (
     READING_UNITS,
     Understood,
@@ -26,13 +25,13 @@ from tvsbayes.instrument.column_names import (
     unit_of_name,
     words_of,
 )
-from tvsbayes.instrument.foreign_looks import (
-    GOOD,
+from tvsbayes.instrument.foreign_cells import (
     FieldCells,
     homings_of,
     left_out,
-    refused_status,
+    plain_column,
     seconds_of,
+    status_of,
     temperatures_of,
     word_of,
 )
@@ -194,7 +193,8 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: boo
         stops.go(row, command, None if times is None else times[row])
         if value is not None or statuses[row]:
             move = stops.moves[-1].move
-            readings.append(Reading(len(readings), move, value, stated_u[row], _status(cells, row, value)))
+            status = status_of(cells, row, {"value": value}, "reading")
+            readings.append(Reading(len(readings), move, value, stated_u[row], status))
     assumed += left_out(cells, statuses, "reading") + stops.remarks()
     if "u" not in cells:
         assumed.append("u: none, so that the scatter of stops covers the readings' own")
@@ -414,14 +414,3 @@ def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
     found, allowed = f"readings that jump by about {typical:.0f} counts, {len(jumps)} times", "a continuous count"
     remedy = "say where the encoder begins anew, --counts-per-turn N; or that these are motions, --counts-per-turn 0"
     raise refusal("wrapped", file="value", found=found, allowed=allowed, remedy=remedy)
-
-
-def _status(cells: FieldCells, row: int, value: float | None) -> str:
-    """The word "ok", or why a reading is of no use."""
-    text = cells.text("status")[row]
-    word = word_of(text)
-    if word and word not in GOOD:
-        return refused_status(text)
-    if value is None:
-        raise cells.refuse(row, "value", "a number where the reading is ok", "complete the cell, or its status")
-    return "ok"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tvsbayes.instrument.cell_notation import plain_column
+from tvsbayes.instrument.foreign_cells import plain_column
 
 
 @pytest.mark.parametrize(
