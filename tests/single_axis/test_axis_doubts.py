@@ -9,9 +9,8 @@ import pytest
 from support.axes import campaign, drawn, random_moves, runs
 
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
-from tvsbayes.single_axis.axis_doubts import data_doubts
+from tvsbayes.single_axis.axis_doubts import axis_warnings, data_doubts
 from tvsbayes.single_axis.axis_parameters import AxisPrior
-from tvsbayes.single_axis.axis_record import axis_warnings
 from tvsbayes.single_axis.axis_rows import rows_of
 
 RATIO, PLAY, U = 0.0125, 0.085, 0.003

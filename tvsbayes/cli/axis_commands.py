@@ -41,7 +41,7 @@ def new(out: Path, as_json: bool) -> None:
 def held(folder: Path) -> dict[str, Any]:
     """What `check` says of an axis folder."""
     from tvsbayes.single_axis.axis_campaign import read_axis
-    from tvsbayes.single_axis.axis_record import axis_warnings
+    from tvsbayes.single_axis.axis_doubts import axis_warnings
     from tvsbayes.single_axis.axis_rows import rows_of
 
     data = read_axis(folder)

@@ -23,7 +23,7 @@ from msgspec import Meta
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import escaped
-from tvsbayes.files.disk import read_bytes
+from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
 from tvsbayes.results.comparison_record import Gap
 from tvsbayes.results.estimates import Cause, FitSummary, StopResidual
@@ -198,3 +198,17 @@ def read_fit(path: Path | str) -> FitRecord:
         if table.predicted is not None and set(table.predicted) != set(FIGURES):
             raise keys.refuse("positioning", "schema", ", ".join(FIGURES), AGAIN, "other figures")
     return record
+
+
+def write_files(folder: Path, draws: bytes, document: Mapping[str, object]) -> dict[str, str]:
+    """Write `draws.npz` and the document `fit.json`, each whole or not at all; their paths by "draws" and "fit".
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    make_folder(folder)
+    contents = {"draws": draws, "fit": json.dumps(document, indent=1, allow_nan=False).encode()}
+    paths = {"draws": folder / "draws.npz", "fit": folder / "fit.json"}
+    for kind, path in paths.items():
+        write_atomically(path, contents[kind])
+    return {kind: str(path) for kind, path in paths.items()}

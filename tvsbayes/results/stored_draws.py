@@ -6,7 +6,6 @@ Draws in the units of the contract names, ratios in deg/step, pose in rad; mode 
 from __future__ import annotations
 
 import io
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,11 +17,11 @@ from tvsbayes.calibration.calibration_file import (
     stored_calibration,
 )
 from tvsbayes.calibration.pointing import Calibration
-from tvsbayes.files.disk import RESULTS_BYTES_MAX, make_folder, read_arrays, write_atomically
+from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays
 from tvsbayes.instrument.axes import AXES, SENSES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.homing import ANYWHERE
-from tvsbayes.results.fit_record import FitRecord
+from tvsbayes.results.fit_record import FitRecord, write_files
 
 
 @dataclass(frozen=True)
@@ -111,12 +110,7 @@ def write_results(
         InputError: the folder cannot be written.
     """
     content = _draws_bytes(draws, record.summary.estimator, calibration, mode)
-    document = json.dumps(record.as_json(), indent=1, allow_nan=False)
-    contents = {"draws": ("draws.npz", content), "fit": ("fit.json", document.encode())}
-    make_folder(folder)
-    for name, data in contents.values():
-        write_atomically(folder / name, data)
-    return {key: str(folder / name) for key, (name, _) in contents.items()}
+    return write_files(folder, content, record.as_json())
 
 
 def stored_mode(campaign: Campaign) -> StoredMode | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tvsbayes.errors import listed
 from tvsbayes.results.estimates import CONFLICT_LIMIT
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, Reading
 from tvsbayes.single_axis.axis_parameters import axis_priors
@@ -30,8 +31,42 @@ LINE_SLOPE = float(np.sqrt(12.0))
 """Largest sd of the slope that errors of sd 1, however they go with position, give a line over a range of 1."""
 
 
+def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
+    """What is odd about the data, in sentences."""
+    sentences = []
+    if rows.in_motion:
+        return _warnings_in_motion(campaign, rows)
+    legs = rows.legs
+    idle = (legs.step == 0) & ~legs.first
+    again = [int(m) for m in rows.move if idle[m]]
+    if again:
+        sentences.append(
+            f"same command as the move before: moves {listed(again, 5)}; nothing moved, so they are of one stop and "
+            "side; list the moves in between if the axis went on and came back"
+        )
+    if len({m.time_s for m in campaign.moves}) == 1:
+        sentences.append("all moves have the same time: drift is not determined")
+    if not np.any(rows.variance > 0):
+        sentences.append("no reading has a stated u: the scatter of stops includes that of the readings")
+    unread = len(campaign.readings) - int(rows.count.sum())
+    if unread:
+        sentences.append(f"{unread} readings are not used: their status is not ok")
+    return sentences + data_doubts(campaign, rows)
+
+
+def _warnings_in_motion(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
+    """What is odd about a record of a drive that never stops."""
+    sentences = []
+    if not any(r.u > 0 for r in campaign.readings):
+        sentences.append(f"no reading has a stated u: {rows.reading_u:.2g} {rows.unit} by differences of neighbours")
+    unread = len(campaign.readings) - int(rows.count.sum())
+    if unread:
+        sentences.append(f"{unread} of {len(campaign.readings)} readings are not used: their status is not ok")
+    return sentences
+
+
 def data_doubts(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """All of it, in sentences."""
+    """Of its numbers alone."""
     wild = _wild_readings(campaign, rows)
     return [*_odd_segments(rows), *_odd_ratio(campaign, rows), *(wild or _wild_stops(campaign, rows))]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -13,12 +13,12 @@ import numpy as np
 from msgspec import Meta, field
 
 from tvsbayes.display import Shown, View
-from tvsbayes.errors import NothingToEstimate, TvsError, escaped, listed, refusal
-from tvsbayes.files.disk import RESULTS_BYTES_MAX, make_folder, read_arrays, write_atomically
+from tvsbayes.errors import NothingToEstimate, TvsError, escaped, refusal
+from tvsbayes.files.disk import RESULTS_BYTES_MAX, read_arrays
 from tvsbayes.progress import Show
 from tvsbayes.results.convergence import Convergence, MonteCarloError
 from tvsbayes.results.estimates import CONTRACTION_LIMIT, Estimate, PeriodEstimate
-from tvsbayes.results.fit_record import Provenance, Sha256, provenance
+from tvsbayes.results.fit_record import Provenance, Sha256, provenance, write_files
 from tvsbayes.results.records import (
     AnswerKind,
     Count,
@@ -34,11 +34,10 @@ from tvsbayes.results.records import (
 )
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_density import FUNCTIONALS, blocks_of, line_weights
-from tvsbayes.single_axis.axis_doubts import data_doubts
+from tvsbayes.single_axis.axis_doubts import axis_warnings
 from tvsbayes.single_axis.axis_fit import AxisFit, conflict_text, fit_axis, model_of
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_SHARE, kind_of, prior_sd
 from tvsbayes.single_axis.axis_periods import period_estimate, wave_samples, waves_at_an_end, weak_waves
-from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
 from tvsbayes.statistics.streams import AxisStream, random_stream
@@ -306,40 +305,6 @@ def _sampling(fit: AxisFit) -> dict[str, float | int | None]:
     return numbers
 
 
-def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """What is odd about the data, in sentences."""
-    sentences = []
-    if rows.in_motion:
-        return _warnings_in_motion(campaign, rows)
-    legs = rows.legs
-    idle = (legs.step == 0) & ~legs.first
-    again = [int(m) for m in rows.move if idle[m]]
-    if again:
-        sentences.append(
-            f"same command as the move before: moves {listed(again, 5)}; nothing moved, so they are of one stop and "
-            "side; list the moves in between if the axis went on and came back"
-        )
-    if len({m.time_s for m in campaign.moves}) == 1:
-        sentences.append("all moves have the same time: drift is not determined")
-    if not np.any(rows.variance > 0):
-        sentences.append("no reading has a stated u: the scatter of stops includes that of the readings")
-    unread = len(campaign.readings) - int(rows.count.sum())
-    if unread:
-        sentences.append(f"{unread} readings are not used: their status is not ok")
-    return sentences + data_doubts(campaign, rows)
-
-
-def _warnings_in_motion(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """What is odd about a record of a drive that never stops."""
-    sentences = []
-    if not any(r.u > 0 for r in campaign.readings):
-        sentences.append(f"no reading has a stated u: {rows.reading_u:.2g} {rows.unit} by differences of neighbours")
-    unread = len(campaign.readings) - int(rows.count.sum())
-    if unread:
-        sentences.append(f"{unread} of {len(campaign.readings)} readings are not used: their status is not ok")
-    return sentences
-
-
 def _reversed(fit: AxisFit) -> list[str]:
     """Where the sign of the reversal is not that of lost motion."""
     if not fit.rows.both_sides or np.mean(fit.draws["backlash"] < 0) < REVERSED:
@@ -409,18 +374,11 @@ def keep_fit(fit: AxisFit, summary: AxisSummary, folder: Path) -> dict[str, str]
     Raises:
         InputError: the folder cannot be written.
     """
-    import io
-
     made = plain(provenance(axis_hashes(fit.campaign), fit.seed))
-    document = {"format": AXIS_FIT_FORMAT, **summary.as_json(), **made}
     buffer = io.BytesIO()
     draws = np.stack(list(fit.draws.values()), axis=-1)
     np.savez(buffer, names=np.array(list(fit.draws)), w=fit.w, draws=draws)
-    make_folder(folder)
-    paths = {"draws": folder / "draws.npz", "fit": folder / "fit.json"}
-    write_atomically(paths["draws"], buffer.getvalue())
-    write_atomically(paths["fit"], json.dumps(document, indent=1, allow_nan=False).encode())
-    return {kind: str(path) for kind, path in paths.items()}
+    return write_files(folder, buffer.getvalue(), {"format": AXIS_FIT_FORMAT, **summary.as_json(), **made})
 
 
 @dataclass(frozen=True, repr=False)
