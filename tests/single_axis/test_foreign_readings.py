@@ -141,7 +141,7 @@ def test_statuses_are_such_as_our_own_reader_takes(tmp_path):
     found = readings_of(*table(tmp_path, "steps;encoder;ok", "0;0,5;1", "100;1,5;-", "200;;+ slipped"))
     assert [reading.status for reading in found.readings] == ["ok", "refused: -", "refused: + slipped"]
     assert "status: 2 readings left out by column ok: - 1, + slipped 1" in found.assumed
-    assert parse_readings(readings_bytes(found.readings), "readings.csv", 3) == found.readings
+    assert parse_readings(readings_bytes(found.readings), 3) == found.readings
 
 
 @pytest.mark.parametrize(

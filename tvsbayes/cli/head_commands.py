@@ -53,8 +53,8 @@ def refuse_sightings(sightings: bool) -> None:
         raise InputError("usage", message, remedy=f"{remedy}; the twin of the head: simulate RIG PLAN FOLDER")
 
 
-def refuse_head(command: str, calibration: Calibration) -> None:
-    """A command that needs the scanner's aperture does not take a head.
+def refuse_head(calibration: Calibration) -> None:
+    """`locate` needs the scanner's aperture: it does not take a head.
 
     Raises:
         InputError: the calibration is one of a head.
@@ -62,7 +62,7 @@ def refuse_head(command: str, calibration: Calibration) -> None:
     from tvsbayes.calibration.pointing import INPUT_NAMES
 
     if calibration.names != INPUT_NAMES:
-        message = f"{command} meets the beam with the scanner's aperture, and a pan-tilt head has none"
+        message = "locate meets the beam with the scanner's aperture, and a pan-tilt head has none"
         raise InputError("usage", message, remedy="steps-for says which counters point along a direction")
 
 

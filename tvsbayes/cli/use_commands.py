@@ -106,7 +106,7 @@ def locate(
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import budget_text, locations_text
 
-    refuse_head("locate", calibration)
+    refuse_head(calibration)
     found = locate_points(calibration, *where, draws=draws, seed=seed)
     if found.refused[0] is not None:
         raise found.refused[0]
@@ -133,7 +133,7 @@ def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool
         from tvsbayes.coordinates.location import locate as locate_points
         from tvsbayes.report.command_text import locations_text
 
-        refuse_head("locate", calibration)
+        refuse_head(calibration)
         found = locate_points(calibration, *where, draws=draws, seed=seed, progress=job.part(LOCATING))
     entries = [found.as_json(k) for k in range(len(found.refused))]
     document = {"estimator": found.estimator, "draws": found.draws, "points": entries}
@@ -155,7 +155,7 @@ def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int,
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
         measured = read_campaign(campaign)
         calibration = StoredOrFitted(measured, report_line, job.part(FITTING)).calibration
-        refuse_head("locate", calibration)
+        refuse_head(calibration)
         simple = simple_calibrations(measured.rig.priors, classic_of(measured))
         job.begin(LOCATING)
         sample = EvenSample()

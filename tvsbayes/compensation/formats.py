@@ -69,8 +69,8 @@ def stated(made: Compensation, origin: Origin) -> list[str]:
     return lines + [plainly(text) for text in made.unsaid]
 
 
-def _commented(made: Compensation, origin: Origin, mark: str) -> list[str]:
-    return [f"{mark} {line}" for line in stated(made, origin)]
+def _commented(made: Compensation, origin: Origin) -> list[str]:
+    return [f"# {line}" for line in stated(made, origin)]
 
 
 CSV_COLUMNS = ("command", "forward", "backward", "u_forward", "u_backward")
@@ -83,7 +83,7 @@ def _csv(made: Compensation, origin: Origin) -> str:
     ]
     says = "# columns: reading expected at a command, arriving forward (rising command) or backward; standard"
     says += " uncertainty of a single arrival"
-    return "\n".join([*_commented(made, origin, "#"), says, ",".join(CSV_COLUMNS), *rows, ""])
+    return "\n".join([*_commented(made, origin), says, ",".join(CSV_COLUMNS), *rows, ""])
 
 
 def _linuxcnc(made: Compensation, origin: Origin) -> str:
@@ -103,7 +103,7 @@ def _linuxcnc(made: Compensation, origin: Origin) -> str:
     says = (
         "# in [JOINT_N]: COMP_FILE = this file, COMP_FILE_TYPE = 0; the play is in it: BACKLASH beside it is not used"
     )
-    return "\n".join([*lines, *_commented(made, origin, "#"), says, ""])
+    return "\n".join([*lines, *_commented(made, origin), says, ""])
 
 
 def _grbl(made: Compensation, origin: Origin) -> str:
@@ -113,7 +113,7 @@ def _grbl(made: Compensation, origin: Origin) -> str:
 
 def _klipper(made: Compensation, origin: Origin) -> str:
     lines = [f"rotation_distance: {made.settings['rotation_distance']:.6f}"]
-    return "\n".join([*_commented(made, origin, "#"), "# in the section of the stepper:", *lines, ""])
+    return "\n".join([*_commented(made, origin), "# in the section of the stepper:", *lines, ""])
 
 
 def _header(made: Compensation, origin: Origin) -> str:
@@ -199,7 +199,7 @@ def _urdf_yaml(made: Compensation, origin: Origin) -> str:
         },
         "left_after_applying_95": {side: promise.error95 for side, promise in made.promise.items()},
     }
-    said = [*_commented(made, origin, "#"), f"# axis_corrects: {APPLIED_ONCE}"]
+    said = [*_commented(made, origin), f"# axis_corrects: {APPLIED_ONCE}"]
     return "\n".join([*said, yaml.safe_dump(document, sort_keys=False)])
 
 
@@ -214,7 +214,7 @@ def _pec(made: Compensation, origin: Origin) -> str:
     added = Correction.of(made).sent(at, np.zeros(PHASES)) - at
     lines = [f"# period: {number(period)} commands; phase 0 at command 0; add is in commands", "phase,add"]
     lines += [f"{number(float(p), 6)},{number(float(a), 7)}" for p, a in zip(phase, added, strict=True)]
-    return "\n".join([*_commented(made, origin, "#"), *lines, ""])
+    return "\n".join([*_commented(made, origin), *lines, ""])
 
 
 @dataclass(frozen=True)

@@ -86,12 +86,11 @@ def _off_deg(values: dict[str, float | complex], steps: np.ndarray, frames: np.n
     return -np.degrees(1.0) * np.stack([across, above], axis=1) / np.maximum(along.real, 0.5)[:, None]
 
 
-def pointing_model(campaign: Campaign, without: Sequence[int] = ()) -> PointingModel:
+def pointing_model(campaign: Campaign) -> PointingModel:
     """Fit ratios and terms by least squares.
 
     Args:
         campaign: of a head, with sightings.
-        without: ids of sightings that are left out.
 
     Raises:
         InputError: a campaign without sightings.
@@ -107,7 +106,7 @@ def pointing_model(campaign: Campaign, without: Sequence[int] = ()) -> PointingM
             allowed="a campaign of a head with sightings",
             remedy=remedy,
         )
-    rows = sightings_of([row for row in ordered_spots(campaign) if row.spot not in without])
+    rows = sightings_of(ordered_spots(campaign))
     terms = [term.name for term in HEAD_TERMS.values()]
     values: dict[str, float | complex] = {name: priors[name].value for name in (*RATIOS, *terms)}
     names = tuple(n for n in values if priors[n].u > (RATIO_KNOWN * abs(priors[n].value) if n in RATIOS else 0.0))

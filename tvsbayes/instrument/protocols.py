@@ -27,7 +27,6 @@ def four_point_protocol(
     targets: tuple[str, str] = ("d1", "d2"),
     pan_range_steps: tuple[int, int] = PAN_RANGE_STEPS,
     tilt_range_steps: tuple[int, int] = TILT_RANGE_STEPS,
-    overshoot_steps: int = OVERSHOOT_STEPS,
 ) -> tuple[PlanStep, ...]:
     """The paper's four-point experiments, in its order: point 1 at d1, 2 at d2, move N, 3 at d2, 4 at d1.
 
@@ -42,7 +41,6 @@ def four_point_protocol(
         targets: names of the near and the far sheet.
         pan_range_steps: lowest and highest pan counter.
         tilt_range_steps: lowest and highest tilt counter.
-        overshoot_steps: run-up where a start must be reached from the other side.
     """
     ranges = {"pan": pan_range_steps, "tilt": tilt_range_steps}
     plan, experiment = PlanBuilder(), 0
@@ -58,7 +56,7 @@ def four_point_protocol(
             if approach == "direct":
                 plan.move(**{axis: start})
             else:
-                plan.reach(axis, start, sign if approach == "cleared" else -sign, overshoot_steps)
+                plan.reach(axis, start, sign if approach == "cleared" else -sign, OVERSHOOT_STEPS)
             plan.look(experiment, 1)
             plan.place(targets[1])
             plan.look(experiment, 2)
@@ -98,7 +96,6 @@ def grid_protocol(
     targets: Sequence[str] = ("d1", "d2", "d3"),
     pan_steps: Sequence[int] = GRID_PAN_STEPS,
     tilt_steps: Sequence[int] = GRID_TILT_STEPS,
-    overshoot_steps: int = OVERSHOOT_STEPS,
 ) -> tuple[PlanStep, ...]:
     """A grid of poses at every sheet, each pose seen once from either side of both axes.
 
@@ -114,9 +111,9 @@ def grid_protocol(
                 rank = row if tilt_sign > 0 else len(tilt_steps) - 1 - row
                 pan_sign = tilt_sign * (1 if rank % 2 == 0 else -1)
                 ordered = sorted(pan_steps, reverse=pan_sign < 0)
-                run_up = ordered[0] - pan_sign * overshoot_steps
+                run_up = ordered[0] - pan_sign * OVERSHOOT_STEPS
                 if (tilt - plan.at[1]) * tilt_sign <= 0:
-                    plan.move(pan=run_up, tilt=tilt - tilt_sign * overshoot_steps)
+                    plan.move(pan=run_up, tilt=tilt - tilt_sign * OVERSHOOT_STEPS)
                 plan.move(pan=run_up, tilt=tilt)
                 for pan in ordered:
                     plan.move(pan=pan)

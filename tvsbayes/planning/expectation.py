@@ -322,8 +322,8 @@ def expected_information(
     count = len(depth_mm)
     depths = padded(depth_mm, len(arrays.spots.valid), depth_mm[-1])
     turns = padded(turning, len(arrays.spots.valid))
-    expectation = expect(z, space, arrays, depths, largest_px(rig), turns)
-    return jax.tree.map(lambda x: np.asarray(x)[:count], expectation)
+    views = expect(z, space, arrays, depths, largest_px(rig), turns)
+    return jax.tree.map(lambda x: np.asarray(x)[:count], views)
 
 
 @dataclass(frozen=True)
@@ -391,10 +391,8 @@ def information_of(
     depth = np.array([rig.depths_mm[log.targets[look.placement]] for look in log.looks])
     arrays = design_arrays(log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture)
     turning = knowledge.gears.turning_after(log.moves, look_moves)
-    expectation = expected_information(
-        arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space, turning
-    )
-    rows = np.asarray(expectation.rows)[..., : knowledge.size].reshape(-1, knowledge.size)
-    seen = np.asarray(expectation.seen) if expectation.seen.any() else np.ones(len(depth), dtype=bool)
-    pose = np.asarray(expectation.mirror_angles_rad)[seen].mean(axis=0)
-    return PlanInformation(rows.T @ rows, expectation, tuple(log.moves), look_moves, plan_minutes(steps, rig), pose)
+    views = expected_information(arrays, depth, rig, knowledge.z if z is None else z, space or knowledge.space, turning)
+    rows = np.asarray(views.rows)[..., : knowledge.size].reshape(-1, knowledge.size)
+    seen = np.asarray(views.seen) if views.seen.any() else np.ones(len(depth), dtype=bool)
+    pose = np.asarray(views.mirror_angles_rad)[seen].mean(axis=0)
+    return PlanInformation(rows.T @ rows, views, tuple(log.moves), look_moves, plan_minutes(steps, rig), pose)

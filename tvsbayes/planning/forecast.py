@@ -164,12 +164,10 @@ def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: C
 def _measured(campaign: Campaign) -> dict[str, tuple[float, int]] | None:
     """S and n of each direction of a campaign with complete experiments."""
     try:
-        by_direction = classic(campaign).directions
+        results = classic(campaign).directions
     except TvsError:
         return None
-    return {
-        d: (r.sd_deg_per_step, r.n) for d, r in by_direction.items() if r is not None and r.sd_deg_per_step is not None
-    }
+    return {d: (r.sd_deg_per_step, r.n) for d, r in results.items() if r is not None and r.sd_deg_per_step is not None}
 
 
 def value_of_classic(forecast: ClassicForecast | None, target: Target, experiments: int) -> float | None:

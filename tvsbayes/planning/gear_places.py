@@ -194,11 +194,9 @@ def regular_places(reached: np.ndarray, ratio_deg_per_step: np.ndarray, scales: 
     steps, on_tilt, share = [], [], []
     for axis in range(2):
         deg_per_step = abs(float(ratio_deg_per_step[axis]))
-        for number, windows in enumerate(windows_of(reached[:, axis], deg_per_step)):
-            wanted = math.ceil(np.ptp(windows) * deg_per_step / SPACING_DEG) + 1
-            nodes = (
-                np.linspace(windows[0], windows[-1], min(max(wanted, 2), PLACES_MAX)) if len(windows) > 1 else windows
-            )
+        for number, chain in enumerate(windows_of(reached[:, axis], deg_per_step)):
+            wanted = math.ceil(np.ptp(chain) * deg_per_step / SPACING_DEG) + 1
+            nodes = np.linspace(chain[0], chain[-1], min(max(wanted, 2), PLACES_MAX)) if len(chain) > 1 else chain
             off = nodes - nodes.mean()
             lined = number == 0 and len(nodes) > 1
             steps.append(nodes)

@@ -46,22 +46,18 @@ STOP_SHARE_PER_MINUTE = 1e-3
 """Measuring is no longer worth while when the best next looks lower the target by less than this share a minute."""
 
 
-def split_of(
-    knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, at_target: Sensitivity
-) -> dict[str, float]:
+def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, aim: Sensitivity) -> dict[str, float]:
     """Share of each cause in the worst quantity's variance; see `causes.causes_of`.
 
     Args:
         knowledge: before the looks.
         data: information of the looks, shape (p + e, p + e).
         noise: its part that pixel noise alone stands for, or None to leave the looks whole.
-        at_target: the target.
+        aim: the target.
     """
     covariance = covariance_of(knowledge.precision + data)
-    worst = int(
-        np.argmax(np.einsum("qi,ij,qj->q", at_target.gradient, covariance, at_target.gradient) + at_target.own_variance)
-    )
-    pull = covariance @ at_target.gradient[worst]
+    worst = int(np.argmax(np.einsum("qi,ij,qj->q", aim.gradient, covariance, aim.gradient) + aim.own_variance))
+    pull = covariance @ aim.gradient[worst]
     parts = {}
     if noise is None:
         parts["looks"] = float(pull @ data @ pull)
@@ -76,10 +72,9 @@ def split_of(
             parts[name] = float(np.sum(pull[columns] ** 2))
         errors = np.split(pull[len(NAMES) :], 2)
         parts |= {
-            name: float(variances @ variances)
-            for name, variances in zip((TRANSMISSION_ERROR, PLAY_VARIATION), errors, strict=True)
+            name: float(error @ error) for name, error in zip((TRANSMISSION_ERROR, PLAY_VARIATION), errors, strict=True)
         }
-    parts |= {name: float(value[worst]) for name, value in at_target.own.items()}
+    parts |= {name: float(value[worst]) for name, value in aim.own.items()}
     total = sum(parts.values())
     kept = {name: value / total for name, value in parts.items() if value > 1e-12 * total}
     return dict(sorted(kept.items(), key=lambda item: -item[1]))
@@ -100,16 +95,12 @@ def _state(table: RigTable, columns: Sequence[int], share: float) -> str:
     return " and ".join(f"u({name}) = {_at_most(share * u)} instead of {u:.2g}" for name, u in stated.items())
 
 
-def _needed_at_point(at_target: Sensitivity, target: Target) -> str | None:
+def _needed_at_point(aim: Sensitivity, target: Target) -> str | None:
     """What would have to be better at the target's point itself, in words; None where no calibration is in its way."""
-    own_variance, gears = (
-        at_target.own_variance,
-        at_target.own.get(GEARS_AT_POINT, np.zeros_like(at_target.own_variance)),
-    )
+    total = aim.own_variance
+    gears = aim.own.get(GEARS_AT_POINT, np.zeros_like(total))
     # The worst of the quantities, each with its own parts.
-    stop, geared, whole = (
-        target.factor * math.sqrt(max(variance)) for variance in (own_variance - gears, gears, own_variance)
-    )
+    stop, geared, whole = (target.factor * math.sqrt(max(variance)) for variance in (total - gears, gears, total))
     unit = target.unit
     if stop > target.limit:
         short = f"{stop:.3g} {unit} come from the stop and the reading at the point itself"
@@ -121,23 +112,23 @@ def _needed_at_point(at_target: Sensitivity, target: Target) -> str | None:
     return None
 
 
-def limit_of(knowledge: Knowledge, data: np.ndarray, at_target: Sensitivity, target: Target) -> Limit:
+def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: Target) -> Limit:
     """What no number of looks of this kind removes, and what would.
 
     Args:
         knowledge: before the looks.
         data: information of the largest design, shape (p + e, p + e).
-        at_target: the target's sensitivities.
+        aim: the target's sensitivities.
         target: the target.
     """
     many = MANY * data
-    floor = at_target.value(covariance_of(knowledge.precision + many), target.factor)
-    shares = split_of(knowledge, many, None, at_target)
+    floor = aim.value(covariance_of(knowledge.precision + many), target.factor)
+    shares = split_of(knowledge, many, None, aim)
     cause = next(iter(shares))
     if floor <= target.limit:
         return Limit(floor, cause, shares, True, None)
     groups = knowledge.rig.table.mechanism.prior_groups
-    if (at_point := _needed_at_point(at_target, target)) is not None:
+    if (at_point := _needed_at_point(aim, target)) is not None:
         return Limit(floor, cause, shares, False, at_point)
 
     def with_inputs(scaled: Mapping[str, float]) -> float:
@@ -146,7 +137,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, at_target: Sensitivity, tar
             columns = groups[name]
             # The prior's own precision is 1 in its coordinates, whatever the campaign added.
             precision[columns, columns] += share**-2 - 1
-        return at_target.value(covariance_of(precision + many), target.factor)
+        return aim.value(covariance_of(precision + many), target.factor)
 
     scaled: dict[str, float] = {}
     names = [name for name in shares if name in groups]

@@ -23,6 +23,7 @@ from tvsbayes.planning.planner import design_problem
 from tvsbayes.planning.search import Chosen, DesignProblem
 from tvsbayes.planning.target import Target
 from tvsbayes.posterior.sampling import sample
+from tvsbayes.results.records import IMPORTANCE
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Confirmation:
             d: {"value": self.deg_per_step[d], "sd": self.u_deg_per_step[d], "interval95": list(self.interval95[d])}
             for d in DIRECTIONS
         }
-        return {"tier": "importance", "accepted": self.accepted, "effective_deg_per_step": ratios}
+        return {"tier": IMPORTANCE, "accepted": self.accepted, "effective_deg_per_step": ratios}
 
 
 @dataclass(frozen=True)
@@ -91,16 +92,12 @@ class NextLooks:
         }
 
 
-def confirmation(fit: JointFit, seed: int = 0) -> Confirmation:
+def confirmation(fit: JointFit) -> Confirmation:
     """The effective ratios of a converged fit by importance sampling: with rough scales Laplace's sds are short."""
-    drawn = sample(fit, "importance", seed=seed)
-    summary = drawn.propagate(lambda p: np.stack([p[f"effective_deg_per_step.{d}"] for d in DIRECTIONS], axis=1))
-    means, sds, ends = (
-        summary.mean.tolist(),
-        summary.sd.tolist(),
-        [(low, high) for low, high in summary.interval95.T.tolist()],
-    )
-    by_direction = (dict(zip(DIRECTIONS, each, strict=True)) for each in (means, sds, ends))
+    drawn = sample(fit, IMPORTANCE)
+    stats = drawn.propagate(lambda p: np.stack([p[f"effective_deg_per_step.{d}"] for d in DIRECTIONS], axis=1))
+    ends = [(low, high) for low, high in stats.interval95.T.tolist()]
+    by_direction = (dict(zip(DIRECTIONS, of, strict=True)) for of in (stats.mean.tolist(), stats.sd.tolist(), ends))
     return Confirmation(drawn.converged, *by_direction)
 
 

@@ -131,12 +131,10 @@ class Search:
         row, (components, _, count) = self.rows[place], prospects.inner.shape
         root = np.linalg.cholesky(np.eye(components) + row @ prospects.covariance @ row.T)
         along = np.linalg.solve(root, row @ prospects.covariance)
-        in_columns = (along @ self.columns).reshape(components, components, count)
-        inner = prospects.inner - sum(part[:, None] * part for part in in_columns)
-        in_gradient = along @ self.gradient.T
-        moved = prospects.moved - sum(
-            part[:, None] * one[:, None] for part, one in zip(in_columns, in_gradient, strict=True)
-        )
+        cross = (along @ self.columns).reshape(components, components, count)
+        inner = prospects.inner - sum(part[:, None] * part for part in cross)
+        slope = along @ self.gradient.T
+        moved = prospects.moved - sum(part[:, None] * one[:, None] for part, one in zip(cross, slope, strict=True))
         covariance = prospects.covariance - along.T @ along
         return _Prospects(0.5 * (covariance + covariance.T), inner, moved)
 

@@ -274,10 +274,9 @@ class WatchDesigns:
         """Powers of the plan by its own moves, at the limit of all tests together."""
         ordered = self._ordered(pattern, homings)
         log = run_plan([step for step, _ in ordered], self.rig)
-        looked = [spot for _, spot in ordered if spot is not None]
+        shown = [spot for _, spot in ordered if spot is not None]
         spots = tuple(
-            spot.renumbered(number, look.move)
-            for number, (spot, look) in enumerate(zip(looked, log.looks, strict=True))
+            spot.renumbered(number, look.move) for number, (spot, look) in enumerate(zip(shown, log.looks, strict=True))
         )
         planned = replace(self.fit.campaign, moves=tuple(log.moves), spots=spots)
         departure = WatchedLooks(self.fit, planned).departure(self.z)

@@ -37,7 +37,6 @@ from tvsbayes.single_axis.waves import AskedPeriods
 
 FORMAT = "tvsbayes-axis/1"
 Approach = Literal["forward", "backward", "unknown"]
-APPROACHES: tuple[Approach, ...] = ("forward", "backward", "unknown")
 """Forward is a rising command, whatever the sign of the unit per command."""
 COMMAND_MAX = 1e12
 """Of a command or a reading, either sign."""
@@ -199,18 +198,17 @@ def parse_axis_moves(data: bytes, file: str = "moves.csv") -> tuple[AxisMove, ..
 
 
 def parse_readings(
-    data: bytes, file: str, moves: int, moved: tuple[AxisMove, ...] = (), in_motion: bool = False
+    data: bytes, moves: int, moved: tuple[AxisMove, ...] = (), in_motion: bool = False
 ) -> tuple[Reading, ...]:
     """The checked rows of `readings.csv`.
 
     Args:
         data: content of the file.
-        file: its name, for errors.
         moves: number of moves, which `move` must name.
         moved: the moves, where readings were taken `in_motion`: then each that is ok has its time.
         in_motion: whether the folder states a `rate`.
     """
-    return READINGS.parse(data, file, follows_a_move(moves, "reading"), _times_in_motion(moved, in_motion))
+    return READINGS.parse(data, READINGS.file, follows_a_move(moves, "reading"), _times_in_motion(moved, in_motion))
 
 
 def _times_in_motion(moves: tuple[AxisMove, ...], in_motion: bool) -> Callable[[Table, Values], None]:
@@ -322,7 +320,7 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> AxisCampaign:
         raise keys.refuse("unit", "text", 'the unit of readings, such as "deg" or "mm"', "name it")
     stated, periods = _parse_axis_table(keys.table("axis")), _parse_periods(keys.table("axis"))
     moves = parse_axis_moves(files["moves.csv"])
-    readings = parse_readings(files["readings.csv"], "readings.csv", len(moves), moves, "rate" in header)
+    readings = parse_readings(files["readings.csv"], len(moves), moves, "rate" in header)
     return AxisCampaign(unit, moves, readings, stated, header, periods, path)
 
 

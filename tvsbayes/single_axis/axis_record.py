@@ -161,15 +161,12 @@ def _diagnoses(fit: AxisFit) -> dict[str, tuple[float | None, float | None, floa
     """R-hat, bulk and tail effective draws by quantity; every other has those of the least known."""
     if fit.sample is None or fit.answer == "laplace":
         return {"": (None, None, None)}
-    convergence = fit.sample.convergence
-    each = {
-        name: (convergence.rhat.get(name), convergence.ess_bulk[name], convergence.ess_tail[name])
-        for name in convergence.ess_bulk
-    }
+    state = fit.sample.convergence
+    each = {name: (state.rhat.get(name), state.ess_bulk[name], state.ess_tail[name]) for name in state.ess_bulk}
     worst = (
-        max(convergence.rhat.values(), default=None),
-        min(convergence.ess_bulk.values()),
-        min(convergence.ess_tail.values()),
+        max(state.rhat.values(), default=None),
+        min(state.ess_bulk.values()),
+        min(state.ess_tail.values()),
     )
     return {**each, "": worst}
 

@@ -95,9 +95,9 @@ def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = N
     Raises:
         InputError: a field or column that does not exist.
     """
-    names, stated_columns = list(columns), dict(stated or {})
-    known = understand(names, stated_columns, AXIS_FIELDS, axis_field_of)
-    if "value" in known.columns or "value" in known.claimed or "value" in stated_columns:
+    names, given = list(columns), dict(stated or {})
+    known = understand(names, given, AXIS_FIELDS, axis_field_of)
+    if "value" in known.columns or "value" in known.claimed or "value" in given:
         return known
     claims = known.claimed.get("command", ())
     readings = [name for name in claims if _FOUND_BY_ENCODERS.intersection(words_of(name))]
@@ -108,16 +108,14 @@ def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = N
         if (words := words_of(name)) and all(unit_of_name(word, READING_UNITS) for word in words)
     ]
     if len(sure) == len(readings) == 1 and not units and (unit_of_name(readings[0], READING_UNITS) or not known.unused):
-        return understand(
-            names, {**stated_columns, "command": sure[0], "value": readings[0]}, AXIS_FIELDS, axis_field_of
-        )
+        return understand(names, {**given, "command": sure[0], "value": readings[0]}, AXIS_FIELDS, axis_field_of)
     units = units or [
         name
         for name in known.unused
         if unit_of_name(name, READING_UNITS) and not _TEMPERATURE.intersection(words_of(name))
     ]
     if len(units) == 1 and not claims:
-        return understand(names, {**stated_columns, "value": units[0]}, AXIS_FIELDS, axis_field_of)
+        return understand(names, {**given, "value": units[0]}, AXIS_FIELDS, axis_field_of)
     return known
 
 

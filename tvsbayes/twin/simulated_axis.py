@@ -272,16 +272,13 @@ def drive_of(
     return positions
 
 
-def simulate_axis(
-    template: AxisCampaign, moves: Sequence[AxisMove] | None = None, seed: int = 0, repeats: int = 1
-) -> SimulatedAxis:
+def simulate_axis(template: AxisCampaign, moves: Sequence[AxisMove] | None = None, seed: int = 0) -> SimulatedAxis:
     """An axis with the priors of a folder, moved as listed and read after every move.
 
     Args:
         template: unit, `[axis]`; its readings, where there are any, say how far a command goes and how well it is read.
         moves: to make; None for those of the template, read where it has readings (everywhere if it has none).
         seed: of the true axis, its stops and the noise.
-        repeats: readings at each.
 
     Raises:
         InputError: neither `[axis]` nor readings say what one command does.
@@ -306,7 +303,7 @@ def simulate_axis(
     stops = stops_of(truth, moves, rng, template.powered_on_s)
     readings: list[Reading] = []
     for move, stand in zip(moves, stops, strict=True):
-        for _ in range(repeats if read is None or move.move in read else 0):
+        if read is None or move.move in read:
             noise = truth.parameters["reading_scale"] * u * float(rng.standard_normal())
             readings.append(Reading(len(readings), move.move, float(_encoder_reads(truth, stand) + noise), u))
     header = {**template.header, "synthetic": True, "seed": seed}

@@ -219,7 +219,7 @@ FAULTS = (
           "test_play_is_the_clip_of_the_definition"),
     Fault("an axis' stop error is drawn anew while it stands", "axis_rows._redrawn", Returns("value | True"),
           "test_repeats_at_one_stop_share_its_error"),
-    Fault("a left-out reading is predicted on its other side", "AxisModel.left_out", Local("found", "-value"),
+    Fault("a left-out reading is predicted on its other side", "AxisModel.left_out", Local("expected", "-value"),
           "test_rows_left_out_are_the_conditional_of_the_dense_gaussian"),
     # Compensation.
     Fault("corrections of both sides change places", "Correction.sent", Argument("side", "-value"),
