@@ -206,8 +206,8 @@ def write_files(folder: Path, draws: bytes, document: Mapping[str, object]) -> d
     Raises:
         InputError: the folder cannot be written.
     """
-    make_folder(folder)
     contents = {"draws": draws, "fit": json.dumps(document, indent=1, allow_nan=False).encode()}
+    make_folder(folder)
     paths = {"draws": folder / "draws.npz", "fit": folder / "fit.json"}
     for kind, path in paths.items():
         write_atomically(path, contents[kind])
