@@ -15,7 +15,7 @@ from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, write_atomically
 from tvsbayes.pipeline import MAX_MINUTES
 from tvsbayes.progress import Job
-from tvsbayes.results.records import CHAIN, IMPORTANCE
+from tvsbayes.results.records import CHAIN, IMPORTANCE, plain
 
 if TYPE_CHECKING:
     from tvsbayes.report.document import Issue
@@ -65,15 +65,20 @@ def held(folder: Path) -> dict[str, Any]:
 
 def classic(folder: Path, as_json: bool) -> None:
     """The least-squares line with one reversal, and ISO 230-2."""
-    from tvsbayes.report.axis_document import classic_text
-    from tvsbayes.results.records import plain
     from tvsbayes.single_axis.axis_campaign import read_axis
+
+    document, text = _classic(read_axis(folder))
+    finish(document, text, as_json)
+
+
+def _classic(data: AxisCampaign) -> tuple[dict[str, Any], str]:
+    """What `classic` says, as a document and as text."""
+    from tvsbayes.report.axis_document import classic_text
     from tvsbayes.single_axis.axis_rows import rows_of
     from tvsbayes.single_axis.classic_line import classic_axis
 
-    data = read_axis(folder)
-    found = classic_axis(rows_of(data))
-    finish({"unit": data.unit, **plain(found)}, classic_text(found, data.unit), as_json)
+    line = classic_axis(rows_of(data))
+    return {"unit": data.unit, **plain(line)}, classic_text(line, data.unit)
 
 
 def fit(
@@ -92,22 +97,11 @@ def fit(
     from tvsbayes.single_axis.axis_campaign import read_axis
 
     place = out or output_place(folder, "results")
-    wish = Sampled(quick, no_sample, max_minutes, seed)
-    kept = _fitted(read_axis(folder), place, wish)
+    kept = _fitted(read_axis(folder), place, quick, no_sample, max_minutes, seed)
     text = axis_fit_text(kept.summary, details, list(kept.files.values()))
     if kept.error is None and out is None:
         text += f"\nnext: {command_line('report', folder)}"
     finish(kept.as_json(seed), text, as_json, kept.error)
-
-
-@dataclass(frozen=True)
-class Sampled:
-    """How an axis is to be fitted; fields as the options of `fit`."""
-
-    quick: bool
-    no_sample: bool
-    max_minutes: float
-    seed: int
 
 
 @dataclass(frozen=True)
@@ -123,18 +117,18 @@ class Kept:
         return {**self.summary.as_json(), "seed": seed, "files": self.files}
 
 
-def _fitted(data: AxisCampaign, place: Path, wish: Sampled) -> Kept:
-    """Fit an axis and keep the results in a folder."""
+def _fitted(data: AxisCampaign, place: Path, quick: bool, no_sample: bool, max_minutes: float, seed: int) -> Kept:
+    """Fit an axis and keep the results in a folder; options as of `fit`."""
     from tvsbayes.single_axis.axis_fit import fit_axis
     from tvsbayes.single_axis.axis_record import keep_fit, summarise_axis, uninformed
 
     with waiting() as progress:
         found = fit_axis(
             data,
-            tier=IMPORTANCE if wish.quick else CHAIN,
-            sampled=not wish.no_sample,
-            max_minutes=wish.max_minutes,
-            seed=wish.seed,
+            tier=IMPORTANCE if quick else CHAIN,
+            sampled=not no_sample,
+            max_minutes=max_minutes,
+            seed=seed,
             progress=progress,
         )
     summary = summarise_axis(found)
@@ -143,20 +137,16 @@ def _fitted(data: AxisCampaign, place: Path, wish: Sampled) -> Kept:
 
 def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool, as_json: bool) -> None:
     """Check, classic, fit and report of an axis in one go."""
-    from tvsbayes.report.axis_document import axis_fit_text, classic_text
+    from tvsbayes.report.axis_document import axis_fit_text
     from tvsbayes.report.command_text import held_text
-    from tvsbayes.results.records import plain
     from tvsbayes.single_axis.axis_campaign import read_axis
-    from tvsbayes.single_axis.axis_rows import rows_of
-    from tvsbayes.single_axis.classic_line import classic_axis
 
     data = read_axis(folder)
     documents: dict[str, Any] = {"check": held(folder)}
     tell_part(held_text(documents["check"]), as_json)
-    line = classic_axis(rows_of(data))
-    documents["classic"] = {"unit": data.unit, **plain(line)}
-    tell_part(classic_text(line, data.unit), as_json)
-    kept = _fitted(data, output_place(folder, "results"), Sampled(quick, no_sample, MAX_MINUTES, seed))
+    documents["classic"], text = _classic(data)
+    tell_part(text, as_json)
+    kept = _fitted(data, output_place(folder, "results"), quick, no_sample, MAX_MINUTES, seed)
     documents["fit"] = kept.as_json(seed)
     text = axis_fit_text(kept.summary, written=list(kept.files.values()))
     if kept.error is not None:
