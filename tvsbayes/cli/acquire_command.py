@@ -184,17 +184,17 @@ def proposed(rig: Path, folder: Path, looks: int, target_u: float, count: int, c
 
     compile_for(untold)
     target = parse_target(f"u(worst) <= {target_u:g} deg/step")
-    found = next_looks(fit(read_campaign(folder)), read_rig(rig), target, count, confirm_below=confirm_below)
-    return ahead_of(found, looks)
+    ahead = next_looks(fit(read_campaign(folder)), read_rig(rig), target, count, confirm_below=confirm_below)
+    return ahead_of(ahead, looks)
 
 
-def ahead_of(found: NextLooks, looks: int) -> Ahead:
+def ahead_of(chosen: NextLooks, looks: int) -> Ahead:
     """What a run takes of the next looks after so many."""
     from tvsbayes.acquisition.replanning import Ahead, Proposal
     from tvsbayes.acquisition.running_estimate import Estimate
 
-    proposal = Proposal(found.steps, found.after_each, found.now, looks, found.why)
-    laplace, checked = Estimate(looks, found.deg_per_step, found.u_deg_per_step), found.confirmed
+    proposal = Proposal(chosen.steps, chosen.after_each, chosen.now, looks, chosen.why)
+    laplace, checked = Estimate(looks, chosen.deg_per_step, chosen.u_deg_per_step), chosen.confirmed
     if checked is None:
         return Ahead(laplace, proposal)
     sampled = Estimate(looks, checked.deg_per_step, checked.u_deg_per_step, "importance")

@@ -123,7 +123,7 @@ def _fitted(data: AxisCampaign, place: Path, quick: bool, no_sample: bool, max_m
     from tvsbayes.single_axis.axis_record import keep_fit, summarise_axis, uninformed
 
     with waiting() as progress:
-        found = fit_axis(
+        result = fit_axis(
             data,
             tier=IMPORTANCE if quick else CHAIN,
             sampled=not no_sample,
@@ -131,8 +131,8 @@ def _fitted(data: AxisCampaign, place: Path, quick: bool, no_sample: bool, max_m
             seed=seed,
             progress=progress,
         )
-    summary = summarise_axis(found)
-    return Kept(summary, keep_fit(found, summary, place), found.error or uninformed(summary))
+    summary = summarise_axis(result)
+    return Kept(summary, keep_fit(result, summary, place), result.error or uninformed(summary))
 
 
 def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool, as_json: bool) -> None:
@@ -171,9 +171,9 @@ def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_j
         raise InputError("usage", message, column="--by", allowed="positions", remedy="write --by positions")
     data = read_axis(folder)
     with waiting() as progress:
-        found = hold_out_positions(data, seed, progress)
-    document = hold_out_document(found, data.unit) | {"inputs": axis_hashes(data), "seed": seed}
-    files, text = {}, axis_hold_out_text(found, data.unit)
+        holdout = hold_out_positions(data, seed, progress)
+    document = hold_out_document(holdout, data.unit) | {"inputs": axis_hashes(data), "seed": seed}
+    files, text = {}, axis_hold_out_text(holdout, data.unit)
     if keep(document, path := output_place(folder, "results") / "compare.json"):
         files, text = {"compare": str(path)}, f"{text}\nwritten: {path}"
     finish({**document, "files": files}, text, as_json)
@@ -233,11 +233,11 @@ def plan(
     data = read_axis(folder)
     with waiting() as progress, Job({FITTING: 1.0, PLANNING: 3.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed, tell=report_line)
-        found = plan_next(results.fit, wanted, minutes=minutes, progress=job.part(PLANNING))
-    document, text = {**found.as_json(), "unit": data.unit, "seed": seed}, axis_plan_text(found, data.unit)
-    document["u_unit"] = unit_of(found.target, data.unit)
-    if out is not None and found.next:
-        write_atomically(out, found.plan_bytes())
+        stops = plan_next(results.fit, wanted, minutes=minutes, progress=job.part(PLANNING))
+    document, text = {**stops.as_json(), "unit": data.unit, "seed": seed}, axis_plan_text(stops, data.unit)
+    document["u_unit"] = unit_of(stops.target, data.unit)
+    if out is not None and stops.next:
+        write_atomically(out, stops.plan_bytes())
         document["plan"] = str(out)
         text += f"\nwritten: {escaped(str(out), 200)}"
     elif out is not None:

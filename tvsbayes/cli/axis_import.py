@@ -93,24 +93,24 @@ def import_readings(
 
 def _finish_import(understood: _Understood, to: Path, *, yes: bool, as_json: bool) -> None:
     """Show what was understood, write it if that is wanted, and say what is next."""
-    found, named = understood.found, understood.unit
+    table, named = understood.found, understood.unit
     unit_line = _unit_line(to, named)
-    assumed = [*found.assumed, unit_line, *_drive_lines(found)]
-    lines = [*understood.lines, *found.notes, *(f"assumed: {text}" for text in assumed)]
-    ok = sum(reading.status == "ok" for reading in found.readings)
-    lines.append(f"gives: {len(found.moves)} moves, {len(found.readings)} readings{_minutes(found)}")
-    written = _write(to, found, named) if confirmed(lines, to, yes, as_json) else []
-    document = {**understood.document, "notes": list(found.notes), "assumed": assumed, "moves": len(found.moves)}
+    assumed = [*table.assumed, unit_line, *_drive_lines(table)]
+    lines = [*understood.lines, *table.notes, *(f"assumed: {text}" for text in assumed)]
+    ok = sum(reading.status == "ok" for reading in table.readings)
+    lines.append(f"gives: {len(table.moves)} moves, {len(table.readings)} readings{_minutes(table)}")
+    written = _write(to, table, named) if confirmed(lines, to, yes, as_json) else []
+    document = {**understood.document, "notes": list(table.notes), "assumed": assumed, "moves": len(table.moves)}
     following = f"tvsbayes calibrate {typed(to)}" if written else None
-    document |= {"readings": len(found.readings), "ok": ok, "campaign": str(to), "files": written, "next": following}
-    said = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
+    document |= {"readings": len(table.readings), "ok": ok, "campaign": str(to), "files": written, "next": following}
+    ending = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
     after = f"\nnext: `{following}`" * bool(written)
-    finish(document, "\n".join([*lines, f"{said}{after}"]), as_json)
+    finish(document, "\n".join([*lines, f"{ending}{after}"]), as_json)
 
 
-def _minutes(found: ForeignReadings) -> str:
+def _minutes(readings: ForeignReadings) -> str:
     """How long a log lasts."""
-    times = [reading.time_s for reading in found.readings if reading.time_s is not None]
+    times = [reading.time_s for reading in readings.readings if reading.time_s is not None]
     return f" over {(times[-1] - times[0]) / 60:.1f} minutes" if times else ""
 
 
@@ -157,12 +157,12 @@ def _run_understood(runs: Sequence[GuideRun], file: Path, wish: AxisNotation) ->
         remedy = "leave --run and --yes out for the list"
         raise InputError("usage", message, allowed=f"1 to {len(runs)}", remedy=remedy)
     run = runs[number - 1]
-    found = readings_of_run(run, escaped(file.name), wish.assume)
+    readings = readings_of_run(run, escaped(file.name), wish.assume)
     (row,) = run_rows([run])
     lines = [f"{escaped(file.name)}: guide log of PHD2, run {number} of {len(runs)}, {escaped(run.mount)}"]
     lines.append(f"begins {escaped(run.begins)}, {run.minutes:.1f} minutes")
     document = {"file": escaped(file.name), "kind": "phd2", "run": row, "rows": len(run.frames) + len(run.dropped)}
-    return _Understood(lines, document, found, found.unit)
+    return _Understood(lines, document, readings, readings.unit)
 
 
 def _table_understood(table: ForeignTable, stated: Mapping[str, str], wish: AxisNotation, to: Path) -> _Understood:
@@ -192,35 +192,35 @@ def _table_understood(table: ForeignTable, stated: Mapping[str, str], wish: Axis
         remarks.append(f"column {escaped(name)} is {text} in every row: a deviation, no uncertainty; set aside")
     kept = {field: name for field, name in known.columns.items() if name not in apart or field in stated}
     known = replace(known, columns=kept, unused=tuple(dict.fromkeys((*known.unused, *apart))))
-    found = readings_of(table, known.columns, wish.deviations)
-    unit = found.unit or unit_of_name(known.columns["value"], READING_UNITS)
+    readings = readings_of(table, known.columns, wish.deviations)
+    unit = readings.unit or unit_of_name(known.columns["value"], READING_UNITS)
     cells = [cell for cell in table.columns[known.columns["value"]] if cell]
     numbers = [float(cell) for cell in cells if NUMBER.fullmatch(cell)]
     if unit is None and numbers and all(n.is_integer() for n in numbers) and max(numbers) - min(numbers) > 360:
         unit = "counts"
         remarks.append("unit: whole numbers over more than 360, so counts; `unit` in campaign.toml says another")
-    found = unwrapped(found, unit_of_folder(to) or unit or UNIT, wish.counts_per_turn)
-    found = replace(found, assumed=(*remarks, *found.assumed))
+    readings = unwrapped(readings, unit_of_folder(to) or unit or UNIT, wish.counts_per_turn)
+    readings = replace(readings, assumed=(*remarks, *readings.assumed))
 
     def unit_shown(field: str, name: str) -> str:
         return unit_of_name(name, SECONDS) or "s" if field == "time_s" else ""
 
-    return _Understood(table_lines(table, known, AXIS_FIELDS, unit_shown), table_document(table, known), found, unit)
+    return _Understood(table_lines(table, known, AXIS_FIELDS, unit_shown), table_document(table, known), readings, unit)
 
 
-def _drive_lines(found: ForeignReadings) -> list[str]:
+def _drive_lines(readings: ForeignReadings) -> list[str]:
     """What campaign.toml gets of a drive at constant rate."""
-    drive = found.drive
+    drive = readings.drive
     if drive is None:
         return []
-    said = [f"campaign.toml: {name} = {{ value = {v:g}, u = {u:g} }}" for name, (v, u) in drive.priors.items()]
+    lines = [f"campaign.toml: {name} = {{ value = {v:g}, u = {u:g} }}" for name, (v, u) in drive.priors.items()]
     if drive.period_between is None:
-        return [*said, "too short a run to look for a period; state `periods` in campaign.toml where one is known"]
+        return [*lines, "too short a run to look for a period; state `periods` in campaign.toml where one is known"]
     low, high = drive.period_between
-    said.append(
+    lines.append(
         f"campaign.toml: period_between = [{low:g}, {high:g}] s, a minute to a third of the run; change it there"
     )
-    return said
+    return lines
 
 
 def _unit_line(to: Path, named: str | None) -> str:
@@ -247,17 +247,17 @@ def _refuse_filled(to: Path) -> None:
             raise refusal("occupied", file=escaped(str(place), 200), found="rows", allowed=allowed, remedy=remedy)
 
 
-def _write(to: Path, found: ForeignReadings, unit: str | None) -> list[str]:
+def _write(to: Path, rows: ForeignReadings, unit: str | None) -> list[str]:
     """The tables, in a folder with the explained campaign.toml, which comes last; `unit` as the column says."""
     from tvsbayes.single_axis.axis_campaign import axis_moves_bytes, axis_templates, readings_bytes
 
-    contents = {"moves.csv": axis_moves_bytes(found.moves), "readings.csv": readings_bytes(found.readings)}
+    contents = {"moves.csv": axis_moves_bytes(rows.moves), "readings.csv": readings_bytes(rows.readings)}
     if not (to / "campaign.toml").is_file():
         make_folder(to, empty=True)
         template = axis_templates()["campaign.toml"]
-        own = unit or UNIT
-        template = template.replace(f'\nunit = "{UNIT}"'.encode(), f'\nunit = "{own}"'.encode())
-        contents["campaign.toml"] = template if found.drive is None else _with_drive(template, found.drive)
+        stated = unit or UNIT
+        template = template.replace(f'\nunit = "{UNIT}"'.encode(), f'\nunit = "{stated}"'.encode())
+        contents["campaign.toml"] = template if rows.drive is None else _with_drive(template, rows.drive)
     for name, data in contents.items():
         write_atomically(to / name, data)
     return [str(to / name) for name in contents]

@@ -112,11 +112,11 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
         raise InputError("usage", f"{found}; allowed: number, order", allowed="number, order", remedy=remedy)
     listed_in = moves_file(out, folder)
     rows = _rows_of(out)
-    seen = views_of(folder, swap=swap)
+    views = views_of(folder, swap=swap)
     moves = _moves_of(listed_in)
     numbers = None if listed_in is None else range(len(moves))
-    paired = pair_looks(seen.views, numbers, rows, pair)  # type: ignore[arg-type]
-    _refuse_other_size(out, seen)
+    paired = pair_looks(views.views, numbers, rows, pair)  # type: ignore[arg-type]
+    _refuse_other_size(out, views)
     if not (out / "campaign.toml").is_file():
         make_folder(out, empty=True)
         write_templates(out)
@@ -129,7 +129,7 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
         copied = copy_frames(paired.pictures, out, job.at)
     # Last: a folder whose looks are listed has all their pictures.
     write_atomically(out / "spots.csv", spots_bytes(paired.spots))
-    lines = _unpaired_lines(seen, paired, "spots" if rows else "moves")
+    lines = _unpaired_lines(views, paired, "spots" if rows else "moves")
     text = _paired_text(out, paired, copied, "pan_steps and tilt_steps" if listed_in is None else None, moves)
     if not rows and paired.matching == "number" and paired.renumbered is None and 0 in paired.without:
         text += (
@@ -145,9 +145,9 @@ def moves_file(out: Path, folder: Path) -> Path | None:
     """Where the moves of the pictures are listed: in the campaign, beside the pictures, or not yet."""
     from tvsbayes.instrument.campaign import campaign_templates
 
-    own, beside = out / "moves.csv", folder / "moves.csv"
-    if own.is_file() and read_bytes(own, CSV_BYTES_MAX) != campaign_templates()["moves.csv"]:
-        return own
+    target, beside = out / "moves.csv", folder / "moves.csv"
+    if target.is_file() and read_bytes(target, CSV_BYTES_MAX) != campaign_templates()["moves.csv"]:
+        return target
     return beside if beside.is_file() else None
 
 
@@ -183,15 +183,15 @@ def rows_listed(out: Path) -> bool:
     return spots.is_file() and len(read_bytes(spots, CSV_BYTES_MAX).splitlines()) > 1
 
 
-def _refuse_other_size(out: Path, seen: ViewedFolder) -> None:
+def _refuse_other_size(out: Path, views: ViewedFolder) -> None:
     """Pictures of another size than those of the calibration beside them give no usable centre."""
     from tvsbayes.instrument.stereo_pair import read_stereo
 
     if not (out / "stereo.json").is_file():
         return
     wanted = read_stereo(out / "stereo.json").image_sizes
-    if seen.image_sizes != wanted:
-        found, allowed = f"pictures of {_sizes_px(seen.image_sizes)}", f"{_sizes_px(wanted)} as in stereo.json"
+    if views.image_sizes != wanted:
+        found, allowed = f"pictures of {_sizes_px(views.image_sizes)}", f"{_sizes_px(wanted)} as in stereo.json"
         place, remedy = escaped(str(out / "stereo.json"), 200), "calibrate and observe at one image size"
         raise refusal("image-size", file=place, found=found, allowed=allowed, remedy=remedy)
 
@@ -202,25 +202,25 @@ def _sizes_px(sizes: Mapping[str, tuple[int, int]]) -> str:
 
 
 def _paired_text(
-    out: Path, found: PairedLooks, copied: int, to_fill_in: str | None, moves: Sequence[Move | None]
+    out: Path, pairs: PairedLooks, copied: int, to_fill_in: str | None, moves: Sequence[Move | None]
 ) -> str:
     """How many pictures went where, by what rule, and what to do next."""
     place = escaped(str(out), 200)
-    first = next(iter(found.pictures.items()), None)
-    how = "the number in the name" if found.matching == "number" else "the order of the names"
-    lines = [f"{place}: {copied} pictures in frames/, {len(found.pictures)} looks in spots.csv, paired by {how}"]
+    first = next(iter(pairs.pictures.items()), None)
+    how = "the number in the name" if pairs.matching == "number" else "the order of the names"
+    lines = [f"{place}: {copied} pictures in frames/, {len(pairs.pictures)} looks in spots.csv, paired by {how}"]
     if first is not None:
         left, right = (escaped(picture.path.name) for picture in first[1].pictures)
-        move = next(spot.move for spot in found.spots if spot.spot == first[0])
+        move = next(spot.move for spot in pairs.spots if spot.spot == first[0])
         both = left if left == right else f"{left} and {right}"
         reached = moves[move] if move < len(moves) else None
         at = "" if reached is None else f" at pan {reached.pan_steps}, tilt {reached.tilt_steps} steps"
         lines.append(f"for example {both}: spot {first[0]}, seen after move {move}{at}")
     if to_fill_in is not None:
-        rows = 1 + max(spot.move for spot in found.spots)
+        rows = 1 + max(spot.move for spot in pairs.spots)
         lines.append(f"fill in moves.csv: {to_fill_in} of all {rows} rows, absolute counters AFTER the move")
-    if found.renumbered is not None:
-        low, high = found.renumbered
+    if pairs.renumbered is not None:
+        low, high = pairs.renumbered
         lines.append(
             f"the numbers in the names, {low} to {high}, are too sparse for moves: these are counted anew, in order; "
             "with a moves.csv of your own begin again: put it beside the pictures, and name another folder"
@@ -233,16 +233,16 @@ def _paired_text(
     return "\n".join(lines)
 
 
-def _unpaired_lines(seen: ViewedFolder, found: PairedLooks, rows: str) -> list[str]:
+def _unpaired_lines(views: ViewedFolder, pairs: PairedLooks, rows: str) -> list[str]:
     """What could not be paired, a line for each kind."""
     files = {
-        "without the picture of the other camera": seen.unpaired,
-        "their names tell no camera": seen.unnamed,
-        f"not of {_sizes_px(seen.image_sizes)} as most": seen.other_size,
-        "of a kind that is not read; save them as PNG of 8 bits": seen.unread,
-        "a second pair for its row": found.left_over,
+        "without the picture of the other camera": views.unpaired,
+        "their names tell no camera": views.unnamed,
+        f"not of {_sizes_px(views.image_sizes)} as most": views.other_size,
+        "of a kind that is not read; save them as PNG of 8 bits": views.unread,
+        "a second pair for its row": pairs.left_over,
     }
     lines = [f"{few(names)}: {why}" for why, names in files.items() if names]
-    if found.without:
-        lines.append(f"{rows} {listed(found.without, NAMES_LISTED)}: no pictures, which they need not have")
+    if pairs.without:
+        lines.append(f"{rows} {listed(pairs.without, NAMES_LISTED)}: no pictures, which they need not have")
     return lines

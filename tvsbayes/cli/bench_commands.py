@@ -239,14 +239,14 @@ def _named_keys(keys: list[str] | None) -> dict[str, str]:
     """Fields with the names that hold them, of --key."""
     from tvsbayes.cameras.calibration_formats import STATED
 
-    found = {}
+    named = {}
     for text in keys or []:
         field, _, name = text.partition("=")
         if field not in STATED or not name:
             remedy = "write --key M1=NAME, with M1, D1, M2, D2, R or T"
             raise InputError("usage", f"--key {escaped(text, 80)}: no such name", remedy=remedy)
-        found[field] = name
-    return found
+        named[field] = name
+    return named
 
 
 def _imported(
@@ -263,19 +263,19 @@ def _imported(
         if not 0 < unit_mm <= UNITS_MM["m"]:
             allowed, remedy = "mm, cm, m or a number of mm", "write --import-unit 25 where T counts squares of 25 mm"
             raise InputError("usage", f"--import-unit {escaped(import_unit)}", allowed=allowed, remedy=remedy)
-    found = read_calibration(paths, _image_size(image_size), unit_mm=unit_mm, stated=known, keys=keys)
-    if found.source == "tvsbayes":
+    made = read_calibration(paths, _image_size(image_size), unit_mm=unit_mm, stated=known, keys=keys)
+    if made.source == "tvsbayes":
         options = {"image_size": image_size, "import_unit": import_unit, "key": keys or None}
         refuse_options("for files of other programs", "leave it out: this file tells it", **options)
-    remarks = [*(f"note: {note}" for note in found.notes), *(f"warning: {warning}" for warning in found.warnings)]
-    pair = found.stereo
+    remarks = [*(f"note: {note}" for note in made.notes), *(f"warning: {warning}" for warning in made.warnings)]
+    pair = made.stereo
     sds = [float(variance) ** 0.5 for variance in pair.parameter_covariance.diagonal()]
     values = zip(STEREO_PARAMETER_NAMES, pair.vector.tolist(), sds, strict=True)
     document: dict[str, object] = {
-        **{"source": found.source, "image_width": pair.image_width, "image_height": pair.image_height},
+        **{"source": made.source, "image_width": pair.image_width, "image_height": pair.image_height},
         "parameters": {name: {"value": value, "sd": sd} for name, value, sd in values},
         **{"rms_px": pair.rms_px, "assumed": pair.assumed, "assumed_from": pair.assumed_from},
-        **{"warnings": [*found.notes, *found.warnings]},
+        **{"warnings": [*made.notes, *made.warnings]},
     }
     return MadePair(pair, "\n".join([stereo_text(pair), *remarks]), document)
 
@@ -292,8 +292,8 @@ def _write_pair(made: MadePair, places: dict[str, Path], export: Format | None, 
         else:
             write_atomically(path, contents[name])
     written = {name: str(path) for name, path in places.items()}
-    said = f"written: {', '.join(written.values())}" if written else "nothing written: give -o stereo.json"
-    finish({**made.document, "files": written}, f"{made.text}\n{said}", as_json)
+    ending = f"written: {', '.join(written.values())}" if written else "nothing written: give -o stereo.json"
+    finish({**made.document, "files": written}, f"{made.text}\n{ending}", as_json)
 
 
 def _image_size(text: str | None) -> tuple[int, int] | None:

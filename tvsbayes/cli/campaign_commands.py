@@ -83,8 +83,8 @@ def _sampled(campaign: Campaign, progress: Show | None) -> FitSummary:
     from tvsbayes.posterior.sampling import sample
 
     with Job({FITTING: 1.0, SAMPLING: 1.0}, progress) as job:
-        found = fit(campaign, progress=job.part(FITTING))
-        return summarise(found, sample(found, "importance", progress=job.part(SAMPLING)))
+        result = fit(campaign, progress=job.part(FITTING))
+        return summarise(result, sample(result, "importance", progress=job.part(SAMPLING)))
 
 
 def simulate(
@@ -120,9 +120,9 @@ def simulate(
         sides_recorded=not unrecorded_sides,
     )
     moves, spots = len(result.campaign.moves), result.campaign.spots
-    seen = sum(spot.status == "ok" for spot in spots)
-    document = {"campaign": str(out), "moves": moves, "spots": len(spots), "ok": seen, "seed": seed}
-    text = f"{escaped(str(out), 200)}: {moves} moves, {seen} of {len(spots)} spots seen; the truth is in truth.json"
+    in_view = sum(spot.status == "ok" for spot in spots)
+    document = {"campaign": str(out), "moves": moves, "spots": len(spots), "ok": in_view, "seed": seed}
+    text = f"{escaped(str(out), 200)}: {moves} moves, {in_view} of {len(spots)} spots seen; the truth is in truth.json"
     if frames:
         from tvsbayes.twin.board_pictures import Board
         from tvsbayes.twin.frames import write_with_frames
@@ -132,7 +132,7 @@ def simulate(
             pictures = write_with_frames(out, result.undetected(), seed, progress=progress)
         size = f"{board.columns}x{board.rows}"
         drawn = {"columns": board.columns, "rows": board.rows, "pitch_mm": board.pitch_mm}
-        document |= {"ok": 0, "in_view": seen, "pictures": pictures, "board": drawn}
+        document |= {"ok": 0, "in_view": in_view, "pictures": pictures, "board": drawn}
         text += f"\n{pictures} pictures in frames/ and boards/; spots.csv waits for `tvsbayes detect {typed(out)}`"
         text += f"\nboard: {size} inner corners, squares of {board.pitch_mm:g} mm: `tvsbayes stereo "
         text += f"{typed(out / 'boards')} --board {size} --pitch-mm {board.pitch_mm:g} -o stereo.json`"
@@ -179,10 +179,10 @@ def detect(
     pictures = output_place(campaign, "results", "overlay") if overlay else None
     data = read_campaign(campaign)
     with waiting() as progress:
-        found = find(data, method, speckle_contrast=speckle_contrast, dark=dark, overlay=pictures, progress=progress)
-    write_atomically(campaign / "spots.csv", spots_bytes(found.campaign.spots))
-    document = {"campaign": str(campaign), **found.as_json()}
-    text = detection_text(found) + f"\nwritten: {escaped(str(campaign / 'spots.csv'), 200)}"
+        looks = find(data, method, speckle_contrast=speckle_contrast, dark=dark, overlay=pictures, progress=progress)
+    write_atomically(campaign / "spots.csv", spots_bytes(looks.campaign.spots))
+    document = {"campaign": str(campaign), **looks.as_json()}
+    text = detection_text(looks) + f"\nwritten: {escaped(str(campaign / 'spots.csv'), 200)}"
     if overlay:
         document["overlay"] = str(pictures)
         text += f", {escaped(str(pictures), 200)}"
@@ -247,8 +247,8 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         rig = read_rig(path)
         return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
     instrument = instrument_of(path)
-    own = instrument is not None and "check" not in instrument.shared
-    return campaign_held(path) if instrument is None or not own else instrument.command("held")(path)
+    separate = instrument is not None and "check" not in instrument.shared
+    return campaign_held(path) if instrument is None or not separate else instrument.command("held")(path)
 
 
 def _refuse_other_than_rig(path: Path, plan_file: Path) -> None:

@@ -86,12 +86,12 @@ def compensate(
     spared(out)
     if (mechanism := _mechanism(campaign)) is not None:
         # Counters of two axes follow from the calibration as a whole: it is the table.
-        own = "urdf" if mechanism.terms else "header"
-        if to != own:
+        default = "urdf" if mechanism.terms else "header"
+        if to != default:
             what = "a pan-tilt head" if mechanism.terms else "a scanner"
             message = f"compensate --to {escaped(to)} is for an axis, and {escaped(str(campaign), 200)} is {what}"
             counters = "; `tvsbayes steps-for` gives the counters of a direction" if mechanism.terms else ""
-            remedy = f"its compensation is `tvsbayes compensate CAMPAIGN --to {own}`{counters}"
+            remedy = f"its compensation is `tvsbayes compensate CAMPAIGN --to {default}`{counters}"
             raise InputError("usage", message, remedy=remedy)
         if mechanism.terms:
             compensate_head(campaign, out, as_json)
@@ -184,16 +184,16 @@ def verify(
         message = "--distance-mm is not for an axis, nor for a head that says where it points"
         raise InputError("usage", message, remedy="leave it out")
     judge = _verified_scanner if scanner else _verified_axis
-    found, made_of = judge(campaign, fresh, seed, distance_mm)
+    result, made_of = judge(campaign, fresh, seed, distance_mm)
     keep(
-        {"format": VERIFICATION_FORMAT, **made_of, **found.as_json()},
+        {"format": VERIFICATION_FORMAT, **made_of, **result.as_json()},
         output_place(campaign, "results") / "verification.json",
     )
-    for remark in found.remarks if as_json else ():
+    for remark in result.remarks if as_json else ():
         report_line(f"warning: {remark}")
-    finish(found.as_json(), verification_text(found), as_json)
-    if found.verdict != KEPT:
-        raise Ended(NothingToEstimate.exit_code if found.verdict == CANNOT_TELL else TARGET_MISSED)
+    finish(result.as_json(), verification_text(result), as_json)
+    if result.verdict != KEPT:
+        raise Ended(NothingToEstimate.exit_code if result.verdict == CANNOT_TELL else TARGET_MISSED)
 
 
 def _verified_axis(folder: Path, fresh: Path, seed: int, _: float | None) -> tuple[Verification, dict[str, object]]:
@@ -204,8 +204,8 @@ def _verified_axis(folder: Path, fresh: Path, seed: int, _: float | None) -> tup
     data = read_axis(folder)
     made = stored_compensation(data)
     with waiting() as progress:
-        found = verify_axis(data, fresh, made=made, seed=seed, progress=progress)
-    return found, {"inputs": axis_hashes(data), "table": made.digest}
+        result = verify_axis(data, fresh, made=made, seed=seed, progress=progress)
+    return result, {"inputs": axis_hashes(data), "table": made.digest}
 
 
 def _verified_scanner(
@@ -217,8 +217,10 @@ def _verified_scanner(
 
     data = read_campaign(folder)
     with waiting() as progress:
-        found = verified(data, fresh, distance_mm=distance_mm or 1000.0, seed=seed, tell=report_line, progress=progress)
-    return found, {"inputs": input_hashes(data), "table": content_sha256(calibration_json(load_calibration(folder)))}
+        judged = verified(
+            data, fresh, distance_mm=distance_mm or 1000.0, seed=seed, tell=report_line, progress=progress
+        )
+    return judged, {"inputs": input_hashes(data), "table": content_sha256(calibration_json(load_calibration(folder)))}
 
 
 def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bool) -> None:
@@ -240,10 +242,10 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
     with waiting() as progress, Job({FITTING: 1.0, "choosing stops": 1.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed)
         job.begin("choosing stops")
-        found = plan_verification(results.fit, made, seed=seed)
-    document, text = plain(found), verify_plan_text(found)
+        stops = plan_verification(results.fit, made, seed=seed)
+    document, text = plain(stops), verify_plan_text(stops)
     if out is not None:
-        write_atomically(out, found.plan_bytes())
+        write_atomically(out, stops.plan_bytes())
         document["plan"] = str(out)
         text += f"\nwritten: {escaped(str(out), 200)}"
     finish({**document, "seed": seed}, text, as_json)
@@ -260,11 +262,11 @@ def _plan_looks(folder: Path, out: Path | None, as_json: bool) -> None:
     from tvsbayes.results.records import plain
 
     data = read_campaign(folder)
-    found = plan_looks(data, accepted_calibration(data))
-    document, text = plain(found), aim_plan_text(found)
+    looks = plan_looks(data, accepted_calibration(data))
+    document, text = plain(looks), aim_plan_text(looks)
     if out is not None:
         target = Counter(spot.target for spot in data.spots).most_common(1)[0][0]
-        write_plan(found.steps(target), out, not data.rig.mechanism.sightings)
+        write_plan(looks.steps(target), out, not data.rig.mechanism.sightings)
         document["plan"] = str(out)
         text += f"\nwritten: {escaped(str(out), 200)}"
     finish(document, text, as_json)

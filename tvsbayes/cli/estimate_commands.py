@@ -228,8 +228,8 @@ def _compare_positions(campaign: Path, as_json: bool) -> None:
     data = read_campaign(campaign)
     with waiting() as progress, Job({FITTING: 1.0, HOLDING_OUT: 6.0}, progress) as job:
         fitted = StoredOrFitted(data, report_line, job.part(FITTING)).fit
-        found = hold_out_positions(fitted, progress=job.part(HOLDING_OUT))
-    finish({**hold_out_document(found, "deg"), "files": {}}, positions_text(found), as_json)
+        holdout = hold_out_positions(fitted, progress=job.part(HOLDING_OUT))
+    finish({**hold_out_document(holdout, "deg"), "files": {}}, positions_text(holdout), as_json)
 
 
 def _compare_pointing(data: Campaign, as_json: bool) -> None:
@@ -259,7 +259,7 @@ def _no_experiments() -> NothingToEstimate:
     )
 
 
-def _classic_against_joint(found: JointFit, by: str, seed: int, progress: Show | None) -> ComparisonRecord:
+def _classic_against_joint(joint: JointFit, by: str, seed: int, progress: Show | None) -> ComparisonRecord:
     """Why both estimators differ, and which predicts what it has not seen.
 
     Raises:
@@ -270,8 +270,8 @@ def _classic_against_joint(found: JointFit, by: str, seed: int, progress: Show |
     from tvsbayes.instrument.campaign import input_hashes
     from tvsbayes.results.comparison_record import ComparisonRecord
 
-    gaps = explain_gap(found)
+    gaps = explain_gap(joint)
     if not any(gaps.values()):
         raise _no_experiments()
-    held_out = hold_out(found, by, seed, progress=progress)
-    return ComparisonRecord(directions=gaps, held_out=held_out, inputs=input_hashes(found.campaign), seed=seed)
+    held_out = hold_out(joint, by, seed, progress=progress)
+    return ComparisonRecord(directions=gaps, held_out=held_out, inputs=input_hashes(joint.campaign), seed=seed)

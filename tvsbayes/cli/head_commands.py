@@ -99,7 +99,7 @@ def import_urdf(
     lines = [f"nominal: {name} = {prior.value:.6g}" for name, prior in priors.items()]
     lines += [f"assumed: {text}" for text in assumed]
     yes = confirmed(lines, to, yes, as_json)
-    said = "nothing written: add --yes"
+    ending = "nothing written: add --yes"
     if yes:
         if kind is SIGHTING_HEAD:
             make_folder(to, empty=True)
@@ -109,10 +109,10 @@ def import_urdf(
         following = f"log {log} there, then `tvsbayes check {typed(to)}`"
         if kind is SIGHTING_HEAD:
             following = f"`tvsbayes import LOG --sightings --to {typed(to)}` with moves and sightings"
-        said = f"written: {escaped(str(to), 200)}\nnext: {following}"
+        ending = f"written: {escaped(str(to), 200)}\nnext: {following}"
     document = {"campaign": str(to), "joints": dict(head.names), "signs": dict(head.sign), "assumed": assumed}
     document |= {"nominal": {name: prior.value for name, prior in priors.items()}}
-    finish({**document, "written": yes, "files": list(files) if yes else []}, "\n".join([*lines, said]), as_json)
+    finish({**document, "written": yes, "files": list(files) if yes else []}, "\n".join([*lines, ending]), as_json)
 
 
 def import_sightings(
@@ -143,22 +143,22 @@ def import_sightings(
     if missing or known.claimed:
         wanted = [*missing, *(field for field in known.claimed if field not in missing)]
         raise not_sure(table, known, wanted, SIGHTING_FIELDS, NEEDED)
-    found = sightings_of_table(table, known.columns, notation, correction, u_deg)
-    written = _sighting_files(found, to, table.file)
-    ok = sum(sighting.status == "ok" for sighting in found.sightings)
+    sightings = sightings_of_table(table, known.columns, notation, correction, u_deg)
+    written = _sighting_files(sightings, to, table.file)
+    ok = sum(sighting.status == "ok" for sighting in sightings.sightings)
     lines = [*table_lines(table, known, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in written.assumed)]
-    lines.append(f"gives: {len(found.moves)} moves, {len(found.sightings)} sightings, {ok} of use")
+    lines.append(f"gives: {len(sightings.moves)} moves, {len(sightings.sightings)} sightings, {ok} of use")
     yes = confirmed(lines, to, yes, as_json)
-    said = "nothing written: add --yes, or correct it with --column"
+    ending = "nothing written: add --yes, or correct it with --column"
     if yes:
         to.mkdir(parents=True, exist_ok=True)
         for name, data in written.files.items():
             write_atomically(to / name, data)
-        said = f"written: {', '.join(str(to / name) for name in written.files)}\nnext: `tvsbayes check {typed(to)}`"
-    document = {**table_document(table, known), "assumed": written.assumed, "moves": len(found.moves)}
-    document |= {"sightings": len(found.sightings), "ok": ok, "campaign": str(to)}
+        ending = f"written: {', '.join(str(to / name) for name in written.files)}\nnext: `tvsbayes check {typed(to)}`"
+    document = {**table_document(table, known), "assumed": written.assumed, "moves": len(sightings.moves)}
+    document |= {"sightings": len(sightings.sightings), "ok": ok, "campaign": str(to)}
     document |= {"files": [str(to / name) for name in written.files] if yes else []}
-    finish(document, "\n".join([*lines, said]), as_json)
+    finish(document, "\n".join([*lines, ending]), as_json)
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class _SightingFiles:
     assumed: list[str]
 
 
-def _sighting_files(found: ForeignSightings, to: Path, table: str) -> _SightingFiles:
+def _sighting_files(rows: ForeignSightings, to: Path, table: str) -> _SightingFiles:
     """The tables, and campaign and rig file with ratios where those of the folder state none.
 
     Raises:
@@ -196,16 +196,16 @@ def _sighting_files(found: ForeignSightings, to: Path, table: str) -> _SightingF
         if place.is_file() and place.read_bytes() != templates[name]:
             allowed, remedy = "no rows yet", "name another folder with --to; nothing is overwritten"
             raise refusal("occupied", file=escaped(str(place), 200), found="rows", allowed=allowed, remedy=remedy)
-    for axis in sorted(found.encoders):
+    for axis in sorted(rows.encoders):
         if (name := f"degrees_per_step.{axis}") in known:
             what, allowed = f"angles of an encoder, and {name} in campaign.toml", "counters of the stated ratio"
             remedy = "give a table of counters, or name a new folder with --to"
             raise refusal("encoder", file=table, found=what, allowed=allowed, remedy=remedy)
-    priors = {name: prior for name, prior in found.priors.items() if name not in known}
+    priors = {name: prior for name, prior in rows.priors.items() if name not in known}
     files = dict(templates) if fresh else {}
     files |= with_priors(kept, priors) if priors else {}
-    files |= {MOVES.file: MOVES.content(found.moves), SIGHTINGS.file: SIGHTINGS.content(found.sightings)}
-    return _SightingFiles(files, [text for text in found.assumed if text.partition(":")[0] not in known])
+    files |= {MOVES.file: MOVES.content(rows.moves), SIGHTINGS.file: SIGHTINGS.content(rows.sightings)}
+    return _SightingFiles(files, [text for text in rows.assumed if text.partition(":")[0] not in known])
 
 
 def _stated_priors(folder: Path) -> set[str]:

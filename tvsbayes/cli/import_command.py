@@ -176,12 +176,12 @@ def import_(
     lines = [_understood_text(table, known, notation, looks)]
     written = _write_looks(to, looks) if confirmed(lines, to, yes, as_json) else []
     document |= {"campaign": str(to), "files": written}
-    said = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
+    ending = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
     cameras = f"tvsbayes stereo --import CALIBRATION -o {typed(to / 'stereo.json')}"
     after = f"\nnext: `{cameras}`, or of pictures of a board, then `tvsbayes check {typed(to)}`" * bool(written)
     if (to / "stereo.json").is_file():
         after = f"\nnext: `tvsbayes check {typed(to)}`" * bool(written)
-    finish(document, "\n".join([*lines, f"{said}{after}"]), as_json)
+    finish(document, "\n".join([*lines, f"{ending}{after}"]), as_json)
 
 
 def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
@@ -203,12 +203,12 @@ def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
         assumed.append(f"{table.left_out} blocks without RAA:, TAA: or LST: are no pointings")
     lines = [f"gives: {moves} moves, {sightings} sightings", *(f"assumed: {text}" for text in assumed)]
     yes = confirmed(lines, to, yes, as_json)
-    said = "nothing written: add --yes"
+    ending = "nothing written: add --yes"
     if yes:
         write_campaign(campaign, to)
-        said = f"written: {escaped(str(to), 200)}\nnext: `tvsbayes check {typed(to)}`"
+        ending = f"written: {escaped(str(to), 200)}\nnext: `tvsbayes check {typed(to)}`"
     document = {"campaign": str(to), "moves": moves, "sightings": sightings, "assumed": assumed, "written": yes}
-    finish(document, "\n".join([*lines, said]), as_json)
+    finish(document, "\n".join([*lines, ending]), as_json)
 
 
 def _field_and_column(text: str) -> tuple[str, str]:
@@ -252,10 +252,10 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
         remedy = "say what to correct: --flip, --shift-moves, --swap, --pixels-from 1, --relative"
         raise InputError("usage", f"{escaped(str(folder), 200)} is a campaign already", remedy=remedy)
     campaign = read_campaign(folder)
-    found = corrected(campaign.moves, campaign.spots, correction)
-    moves, spots = found.moves or (), found.spots or ()
+    changed = corrected(campaign.moves, campaign.spots, correction)
+    moves, spots = changed.moves or (), changed.spots or ()
     ok = sum(spot.status == "ok" for spot in spots)
-    lines = [f"corrected: {text}" for text in found.changes]
+    lines = [f"corrected: {text}" for text in changed.changes]
     lines.append(f"gives: {len(moves)} moves, {len(spots)} looks, {ok} with a spot")
     yes = confirmed(lines, to, yes, as_json)
     written = []
@@ -268,7 +268,7 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
         written = [str(to / name) for name in contents]
     lines.append(f"written: {', '.join(written)}" if written else "nothing written: add --yes")
     lines += [f"next: `tvsbayes check {typed(to)}`"] * bool(written)
-    document = {"assumed": list(found.changes), "moves": len(moves), "spots": len(spots), "ok": ok}
+    document = {"assumed": list(changed.changes), "moves": len(moves), "spots": len(spots), "ok": ok}
     finish({**document, "campaign": str(to), "files": written}, "\n".join(lines), as_json)
 
 

@@ -86,7 +86,7 @@ def _run(arguments: list[str]) -> int:
         # Wrong options are bad input like any other; typer's own classes carry the text to show.
         if not (hasattr(error, "format_message") and hasattr(error, "show")):
             raise
-        commas = [found[1] for word in arguments if (found := _DECIMAL_COMMA.fullmatch(word))]
+        commas = [match[1] for word in arguments if (match := _DECIMAL_COMMA.fullmatch(word))]
         remedy = f"write a decimal point: {commas[0].replace(',', '.')}" if commas else "see tvsbayes --help"
         if wants_json:
             print_json(error_document(InputError("usage", error.format_message(), remedy=remedy)))

@@ -167,7 +167,7 @@ class PageWish:
             find_browser()
         from tvsbayes.report.evidence import gather
 
-        asked = {"limit_deg_per_step": self.limit_deg_per_step, "limit_mm": self.limit_mm}
+        limits = {"limit_deg_per_step": self.limit_deg_per_step, "limit_mm": self.limit_mm}
         path = self.out or output_place(self.campaign, "results") / "report.html"
         files = {"report": str(path)}
         stages = {FITTING: 3.0, GATHERING: 1.5, DRAWING: 1.5, PRINTING: 3.0 if self.pdf else 0.0}
@@ -176,7 +176,7 @@ class PageWish:
             job.begin(GATHERING)
             doubts = campaign_held(self.campaign, data)["warnings"]
             calibration = load_calibration(self.campaign)
-            evidence = gather(data, record, calibration, range_mm=self.range_mm, doubts=doubts, **asked)
+            evidence = gather(data, record, calibration, range_mm=self.range_mm, doubts=doubts, **limits)
             job.begin(DRAWING)
             page = report_document(evidence, self.issue)
             html = page_html(page)
@@ -321,7 +321,7 @@ def _classic(data: Campaign) -> tuple[dict[str, Any] | None, str]:
     from tvsbayes.report.fit_text import classic_text
 
     try:
-        found = classic(data)
+        result = classic(data)
     except NothingToEstimate as error:
         return None, f"classic four-point estimator: {error.message}"
-    return found.as_json(), classic_text(found)
+    return result.as_json(), classic_text(result)

@@ -67,7 +67,7 @@ def not_sure(
     besides: str = "",
 ) -> InputError:
     """The refusal of a table whose columns do not say enough, with what they say; `needed` ones must be there."""
-    claims = [f"{field} ({' or '.join(escaped(name) for name in own)})" for field, own in known.claimed.items()]
+    claims = [f"{field} ({' or '.join(escaped(name) for name in columns)})" for field, columns in known.claimed.items()]
     found = f"no column that is surely {', '.join([*(f for f in missing if f not in known.claimed), *claims])}"
     understood = ", ".join(f"{field} = {escaped(known.columns[field])}" for field in fields if field in known.columns)
     found += f"; understood so far: {understood or 'nothing'}"

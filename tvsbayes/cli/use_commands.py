@@ -107,11 +107,11 @@ def locate(
     from tvsbayes.report.command_text import budget_text, locations_text
 
     refuse_head(calibration)
-    found = locate_points(calibration, *where, draws=draws, seed=seed)
-    if found.refused[0] is not None:
-        raise found.refused[0]
-    document = {"estimator": found.estimator, "draws": found.draws, **found.as_json(0)}
-    text = locations_text(found)
+    located = locate_points(calibration, *where, draws=draws, seed=seed)
+    if located.refused[0] is not None:
+        raise located.refused[0]
+    document = {"estimator": located.estimator, "draws": located.draws, **located.as_json(0)}
+    text = locations_text(located)
     if budget:
         from tvsbayes.metrology.look_budget import budget as point_budget
 
@@ -134,10 +134,10 @@ def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool
         from tvsbayes.report.command_text import locations_text
 
         refuse_head(calibration)
-        found = locate_points(calibration, *where, draws=draws, seed=seed, progress=job.part(LOCATING))
-    entries = [found.as_json(k) for k in range(len(found.refused))]
-    document = {"estimator": found.estimator, "draws": found.draws, "points": entries}
-    finish(document, locations_text(found), as_json)
+        located = locate_points(calibration, *where, draws=draws, seed=seed, progress=job.part(LOCATING))
+    entries = [located.as_json(k) for k in range(len(located.refused))]
+    document = {"estimator": located.estimator, "draws": located.draws, "points": entries}
+    finish(document, locations_text(located), as_json)
 
 
 def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int, as_json: bool) -> None:
@@ -217,9 +217,9 @@ def steps_for(
 
     azimuth, elevation = direction or (None, None)
     sides = None if pan_approach is tilt_approach is None else (pan_approach or "left", tilt_approach or "up")
-    found = calibration.steps_for(point, azimuth_deg=azimuth, elevation_deg=elevation, approach=sides, limits=limits)
-    document = {"estimator": calibration.estimator, **found.as_json()}
-    finish(document, steps_text(found), as_json)
+    steps = calibration.steps_for(point, azimuth_deg=azimuth, elevation_deg=elevation, approach=sides, limits=limits)
+    document = {"estimator": calibration.estimator, **steps.as_json()}
+    finish(document, steps_text(steps), as_json)
 
 
 TargetText = Annotated[
@@ -338,15 +338,15 @@ def _next_looks(
         job.begin(PLANNING)
         from tvsbayes.planning.next_looks import next_looks
 
-        found = next_looks(fitted, rig, target, count, confirm_below=confirm)
+        looks = next_looks(fitted, rig, target, count, confirm_below=confirm)
     from tvsbayes.instrument.plan import outline
 
-    lines = [found.why, *outline(rig, found.steps)]
-    if found.confirmed is not None:
-        state = "" if found.confirmed.accepted else ", whose weights must not be used"
-        values = ", ".join(f"{d} {u:.2e}" for d, u in found.confirmed.u_deg_per_step.items())
+    lines = [looks.why, *outline(rig, looks.steps)]
+    if looks.confirmed is not None:
+        state = "" if looks.confirmed.accepted else ", whose weights must not be used"
+        values = ", ".join(f"{d} {u:.2e}" for d, u in looks.confirmed.u_deg_per_step.items())
         lines.append(f"u by importance sampling{state}, deg/step: {values}")
-    finish(found.as_json(), "\n".join(lines), as_json)
+    finish(looks.as_json(), "\n".join(lines), as_json)
 
 
 def study(

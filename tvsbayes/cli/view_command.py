@@ -50,7 +50,7 @@ def view(
         make_folder(path.parent)
     write_atomically(path, html)
     counts = [len(one.looks.spot) for one in looked.scenes]
-    pictured, fitted = [len(own) for own in pictures], [one.fitted for one in looked.scenes]
+    pictured, fitted = [len(few) for few in pictures], [one.fitted for one in looked.scenes]
     result = {"view": str(path), "bytes": len(html), "looks": counts, "pictures": pictured, "fitted": fitted}
     notes = "".join(f"note: {note}\n" for one in looked.scenes for note in one.notes)
     finish(result, f"{notes}written: {path} ({len(html) / 1e6:.1f} MB); open it in a browser", as_json)

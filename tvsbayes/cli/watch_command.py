@@ -46,19 +46,19 @@ def watch(
         from tvsbayes.comparison.watched_looks import POWER_MIN
         from tvsbayes.comparison.watched_looks import watch as watch_looks
 
-        found = watch_looks(fitted, new, seed=seed)
-    if not found.same_cameras:
+        result = watch_looks(fitted, new, seed=seed)
+    if not result.same_cameras:
         report_line("warning: the new looks state other cameras; those of the campaign are used")
     from tvsbayes.report.watch_text import watch_text
     from tvsbayes.results.watch_record import CANNOT_TELL, OK
 
-    error = None if append is None else _append(append, found)
-    finish(found.as_json(), watch_text(found, POWER_MIN), as_json, error)
-    if found.verdict != OK:
-        raise Ended(NothingToEstimate.exit_code if found.verdict == CANNOT_TELL else TARGET_MISSED)
+    error = None if append is None else _append(append, result)
+    finish(result.as_json(), watch_text(result, POWER_MIN), as_json, error)
+    if result.verdict != OK:
+        raise Ended(NothingToEstimate.exit_code if result.verdict == CANNOT_TELL else TARGET_MISSED)
 
 
-def _append(table: Path, found: Watch) -> InputError | None:
+def _append(table: Path, result: Watch) -> InputError | None:
     """Add the line of now, UTC; why it could not be added costs nobody the result."""
     import datetime
 
@@ -66,9 +66,9 @@ def _append(table: Path, found: Watch) -> InputError | None:
     from tvsbayes.report.watch_text import moved_words
 
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    moved = "; ".join(map(moved_words, found.moved))
+    moved = "; ".join(map(moved_words, result.moved))
     try:
-        append_line(table, TABLE_COLUMNS, (now, found.verdict, float(f"{found.p:.3g}"), found.looks, moved))
+        append_line(table, TABLE_COLUMNS, (now, result.verdict, float(f"{result.p:.3g}"), result.looks, moved))
     except InputError as error:
         return error
     return None
@@ -107,12 +107,12 @@ def plan_watch(
         job.begin(PLANNING)
         from tvsbayes.planning.watch_plan import MINUTES, watch_plan
 
-        found = watch_plan(fitted, rig, minutes=MINUTES if minutes is None else minutes, seed=seed)
+        looks = watch_plan(fitted, rig, minutes=MINUTES if minutes is None else minutes, seed=seed)
     from tvsbayes.report.watch_text import watch_plan_text
 
-    text = watch_plan_text(found)
+    text = watch_plan_text(looks)
     if out is not None:
-        write_plan(found.steps, out, not known.rig.mechanism.sightings)
-        found = structs.replace(found, plan=str(out))
+        write_plan(looks.steps, out, not known.rig.mechanism.sightings)
+        looks = structs.replace(looks, plan=str(out))
         text += f"\nwritten: {escaped(str(out), 200)}"
-    finish(found.as_json(), text, as_json)
+    finish(looks.as_json(), text, as_json)

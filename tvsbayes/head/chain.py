@@ -43,10 +43,10 @@ class HeadOptics(NamedTuple):
     @classmethod
     def of(cls, value: Callable[[str], Numbers]) -> HeadOptics:
         """From the value, in mm and rad, of each term by its name; those of two parts become pairs."""
-        found: dict[str, tuple[Numbers, ...]] = {}
+        terms: dict[str, tuple[Numbers, ...]] = {}
         for term in list(HEAD_TERMS.values())[1:]:
-            found[term.block] = (*found.get(term.block, ()), value(term.name))
-        return cls(*(own if len(own) > 1 else own[0] for own in found.values()))
+            terms[term.block] = (*terms.get(term.block, ()), value(term.name))
+        return cls(*(parts if len(parts) > 1 else parts[0] for parts in terms.values()))
 
     def leaving(
         self, pan_rad: Numbers, tilt_rad: Numbers, functions: ModuleType, materialise: Materialise = unchanged

@@ -80,8 +80,8 @@ def _off_deg(values: dict[str, float | complex], steps: np.ndarray, frames: np.n
     pan, tilt = (np.radians(1.0) * values[name] * steps[:, k] for k, name in enumerate(RATIOS))
     optics = HeadOptics.of(lambda name: values[name] * np.radians(1.0))
     sight = optics.leaving(pan, tilt + np.radians(1.0) * values["elevation_zero_deg"], np).direction
-    seen = np.stack(np.broadcast_arrays(*sight), axis=1)
-    across, above, along = (np.sum(frames[:, k] * seen, axis=1) for k in range(3))
+    sighted = np.stack(np.broadcast_arrays(*sight), axis=1)
+    across, above, along = (np.sum(frames[:, k] * sighted, axis=1) for k in range(3))
     # Of small angles tangent and angle are one; far away the tangent plane keeps the way home.
     return -np.degrees(1.0) * np.stack([across, above], axis=1) / np.maximum(along.real, 0.5)[:, None]
 
@@ -142,6 +142,6 @@ def pointing_model(campaign: Campaign) -> PointingModel:
         if np.all(np.abs(change) <= SETTLED * np.maximum(errors, np.abs([values[n] for n in names]))):
             break
     residual = _off_deg(values, steps, frames).real
-    found = np.array([float(np.real(values[n])) for n in names])
+    fitted = np.array([float(np.real(values[n])) for n in names])
     known = {n: float(np.real(v)) for n, v in values.items() if n not in names}
-    return PointingModel(names, found, errors, residual, known)
+    return PointingModel(names, fitted, errors, residual, known)

@@ -79,10 +79,10 @@ def _blocks(text: str) -> Iterator[tuple[int, dict[str, str]]]:
 
 def _numbers(text: str, count: int) -> tuple[float, ...]:
     """So many finite numbers of a line."""
-    found = tuple(map(float, text.replace(":", " ").split()))
-    if len(found) != count or not all(map(math.isfinite, found)):
-        raise ValueError(f"{len(found)} numbers where {count} are expected")
-    return found
+    numbers = tuple(map(float, text.replace(":", " ").split()))
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{len(numbers)} numbers where {count} are expected")
+    return numbers
 
 
 @dataclass(frozen=True)

@@ -51,8 +51,8 @@ class _Tag:
 
     def first(self, name: str) -> _Tag | None:
         """The first element of this name in it, at any depth."""
-        found = (child if child.name == name else child.first(name) for child in self.children)
-        return next((tag for tag in found if tag is not None), None)
+        tags = (child if child.name == name else child.first(name) for child in self.children)
+        return next((tag for tag in tags if tag is not None), None)
 
     def named(self, part: str, attribute: str) -> str:
         """A text attribute of an element in it, "" without it."""
@@ -296,7 +296,7 @@ def _named(urdf: Urdf, names: Mapping[str, str | None], file: str) -> dict[str, 
     joints = urdf.listed("joint")
     turning = [name for name, joint in joints.items() if joint.type in MOVING]
     shown = "joints that turn: " + (escaped(listed(turning, LISTED), 400) or "none")
-    found: dict[str, str] = {}
+    joint_names: dict[str, str] = {}
     for k, axis in enumerate(AXES):
         name = names[axis]
         if name is None:
@@ -310,11 +310,11 @@ def _named(urdf: Urdf, names: Mapping[str, str | None], file: str) -> dict[str, 
         elif name not in turning:
             what = f"joint {escaped(name)} is {escaped(joints[name].type)}"
             raise _refused(file, what, shown, "name a joint that is revolute or continuous")
-        found[axis] = name
-    if found["pan"] == found["tilt"]:
-        what, remedy = f"{escaped(found['pan'])} twice", "name two joints by --pan-joint and --tilt-joint"
+        joint_names[axis] = name
+    if joint_names["pan"] == joint_names["tilt"]:
+        what, remedy = f"{escaped(joint_names['pan'])} twice", "name two joints by --pan-joint and --tilt-joint"
         raise _refused(file, what, shown, remedy)
-    return found
+    return joint_names
 
 
 def _between(joints: Mapping[str, _Tag], pan: _Tag, tilt: _Tag, file: str) -> tuple[Rotation, np.ndarray]:
@@ -381,8 +381,8 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
 def _attribute(text: bytes, name: str, values: np.ndarray) -> bytes:
     """A start tag with other numbers in an attribute."""
     words = " ".join(f"{0.0 if abs(value) < SAME else value:.12g}" for value in values.tolist()).encode()
-    found = re.compile(rb"(\b" + name.encode() + rb"\s*=\s*)(\"[^\"]*\"|'[^']*')")
-    written, count = found.subn(rb'\1"' + words + b'"', text)
+    pattern = re.compile(rb"(\b" + name.encode() + rb"\s*=\s*)(\"[^\"]*\"|'[^']*')")
+    written, count = pattern.subn(rb'\1"' + words + b'"', text)
     if count:
         return written
     end = -2 if text.endswith(b"/>") else -1
@@ -454,12 +454,12 @@ class HeadModel:
 
     def properties(self, head: HeadJoints | None) -> dict[str, str]:
         """By name: estimates with their u, and counters per radian of each joint."""
-        found = {CORRECTS: self.data_sha256}
-        found |= {f"head_{axis}_steps_per_rad": f"{n:.12g}" for axis, n in self.steps_per_rad(head).items()}
+        properties = {CORRECTS: self.data_sha256}
+        properties |= {f"head_{axis}_steps_per_rad": f"{n:.12g}" for axis, n in self.steps_per_rad(head).items()}
         for (name, value), u in zip(self.by_name.items(), np.sqrt(np.diag(self.covariance)), strict=True):
             word = name.replace(".", "_")
-            found |= {f"head_{word}": f"{value:.12g}", f"head_u_{word}": f"{u:.4g}"}
-        return found
+            properties |= {f"head_{word}": f"{value:.12g}", f"head_u_{word}": f"{u:.4g}"}
+        return properties
 
     def urdf(self, head: HeadJoints | None) -> bytes:
         """The URDF with what was estimated, or where none is known a file of xacro properties.

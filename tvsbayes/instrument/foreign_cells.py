@@ -72,8 +72,8 @@ def plain_column(name: str, cells: Sequence[str]) -> PlainColumn:
     if all(NUMBER.fullmatch(cell) for cell in filled):
         return PlainColumn(tuple(cells), None, "")
     for read in (_in(_degrees, "deg", "degrees, minutes and seconds"), _one_unit, _in(_fraction, None, "fractions")):
-        if (found := read(name, cells)) is not None:
-            return found
+        if (column := read(name, cells)) is not None:
+            return column
     return PlainColumn(tuple(cells), None, "")
 
 
@@ -83,10 +83,10 @@ def _in(
     """A reader of columns in one notation."""
 
     def read(name: str, cells: Sequence[str]) -> PlainColumn | None:
-        found = [value_of(cell) if cell else None for cell in cells]
-        if any(value is None and cell for value, cell in zip(found, cells, strict=True)):
+        values = [value_of(cell) if cell else None for cell in cells]
+        if any(value is None and cell for value, cell in zip(values, cells, strict=True)):
             return None
-        plain = tuple("" if value is None else repr(value) for value in found)
+        plain = tuple("" if value is None else repr(value) for value in values)
         return PlainColumn(plain, unit, f"column {escaped(name)}: {words}, read as decimal numbers")
 
     return read
