@@ -84,7 +84,7 @@ def next_look(chain: Chain, convergence: Convergence) -> int:
 
 
 class Run[D: Density]:
-    """One call of a sampler: emcee in blocks, looks on a schedule that depends on the chain alone."""
+    """One call of a sampler: steps in blocks, looks on a schedule that depends on the chain alone."""
 
     def __init__(
         self,
