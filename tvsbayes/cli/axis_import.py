@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tvsbayes.cli.app import confirmed, finish, refuse_options
-from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
+from tvsbayes.cli.understood_columns import CORRECT_IT, import_end, not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, write_atomically
 from tvsbayes.files.documents import toml_line
@@ -103,9 +103,8 @@ def _finish_import(understood: _Understood, to: Path, *, yes: bool, as_json: boo
     document = {**understood.document, "notes": list(table.notes), "assumed": assumed, "moves": len(table.moves)}
     following = f"tvsbayes calibrate {typed(to)}" if written else None
     document |= {"readings": len(table.readings), "ok": ok, "campaign": str(to), "files": written, "next": following}
-    ending = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
-    after = f"\nnext: `{following}`" * bool(written)
-    finish(document, "\n".join([*lines, f"{ending}{after}"]), as_json)
+    lines.append(import_end(written, f"`{following}`", CORRECT_IT))
+    finish(document, "\n".join(lines), as_json)
 
 
 def _minutes(readings: ForeignReadings) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from tvsbayes.cli.app import command_line, confirmed, finish, report_line, spared, tell_removed
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
+from tvsbayes.cli.understood_columns import CORRECT_IT, import_end, not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
@@ -99,20 +99,18 @@ def import_urdf(
     lines = [f"nominal: {name} = {prior.value:.6g}" for name, prior in priors.items()]
     lines += [f"assumed: {text}" for text in assumed]
     yes = confirmed(lines, to, yes, as_json)
-    ending = "nothing written: add --yes"
+    following = f"log moves and spots there, then `tvsbayes check {typed(to)}`"
+    if kind is SIGHTING_HEAD:
+        following = f"`tvsbayes import LOG --sightings --to {typed(to)}` with moves and sightings"
     if yes:
         if kind is SIGHTING_HEAD:
             make_folder(to, empty=True)
         for name, text in files.items():
             write_atomically(to / name, text)
-        log = "moves and sightings" if kind is SIGHTING_HEAD else "moves and spots"
-        following = f"log {log} there, then `tvsbayes check {typed(to)}`"
-        if kind is SIGHTING_HEAD:
-            following = f"`tvsbayes import LOG --sightings --to {typed(to)}` with moves and sightings"
-        ending = f"written: {escaped(str(to), 200)}\nnext: {following}"
+    lines.append(import_end([escaped(str(to), 200)] * yes, following))
     document = {"campaign": str(to), "joints": dict(head.names), "signs": dict(head.sign), "assumed": assumed}
     document |= {"nominal": {name: prior.value for name, prior in priors.items()}}
-    finish({**document, "written": yes, "files": list(files) if yes else []}, "\n".join([*lines, ending]), as_json)
+    finish({**document, "written": yes, "files": list(files) if yes else []}, "\n".join(lines), as_json)
 
 
 def import_sightings(
@@ -149,16 +147,15 @@ def import_sightings(
     lines = [*table_lines(table, known, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in written.assumed)]
     lines.append(f"gives: {len(sightings.moves)} moves, {len(sightings.sightings)} sightings, {ok} of use")
     yes = confirmed(lines, to, yes, as_json)
-    ending = "nothing written: add --yes, or correct it with --column"
+    files = [str(to / name) for name in written.files] if yes else []
     if yes:
         to.mkdir(parents=True, exist_ok=True)
         for name, data in written.files.items():
             write_atomically(to / name, data)
-        ending = f"written: {', '.join(str(to / name) for name in written.files)}\nnext: `tvsbayes check {typed(to)}`"
+    lines.append(import_end(files, f"`tvsbayes check {typed(to)}`", CORRECT_IT))
     document = {**table_document(table, known), "assumed": written.assumed, "moves": len(sightings.moves)}
-    document |= {"sightings": len(sightings.sightings), "ok": ok, "campaign": str(to)}
-    document |= {"files": [str(to / name) for name in written.files] if yes else []}
-    finish(document, "\n".join([*lines, ending]), as_json)
+    document |= {"sightings": len(sightings.sightings), "ok": ok, "campaign": str(to), "files": files}
+    finish(document, "\n".join(lines), as_json)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from tvsbayes.cli.app import Json, confirmed, finish, refuse_options, report_lin
 from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
 from tvsbayes.cli.head_commands import import_sightings, import_urdf
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
-from tvsbayes.cli.understood_columns import not_sure, table_document, table_lines
+from tvsbayes.cli.understood_columns import CORRECT_IT, import_end, not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, closest, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
@@ -176,12 +176,11 @@ def import_(
     lines = [_understood_text(table, known, notation, looks)]
     written = _write_looks(to, looks) if confirmed(lines, to, yes, as_json) else []
     document |= {"campaign": str(to), "files": written}
-    ending = f"written: {', '.join(written)}" if written else "nothing written: add --yes, or correct it with --column"
-    cameras = f"tvsbayes stereo --import CALIBRATION -o {typed(to / 'stereo.json')}"
-    after = f"\nnext: `{cameras}`, or of pictures of a board, then `tvsbayes check {typed(to)}`" * bool(written)
-    if (to / "stereo.json").is_file():
-        after = f"\nnext: `tvsbayes check {typed(to)}`" * bool(written)
-    finish(document, "\n".join([*lines, f"{ending}{after}"]), as_json)
+    following = f"`tvsbayes check {typed(to)}`"
+    if not (to / "stereo.json").is_file():
+        cameras = f"tvsbayes stereo --import CALIBRATION -o {typed(to / 'stereo.json')}"
+        following = f"`{cameras}`, or of pictures of a board, then {following}"
+    finish(document, "\n".join([*lines, import_end(written, following, CORRECT_IT)]), as_json)
 
 
 def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
@@ -203,12 +202,11 @@ def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
         assumed.append(f"{table.left_out} blocks without RAA:, TAA: or LST: are no pointings")
     lines = [f"gives: {moves} moves, {sightings} sightings", *(f"assumed: {text}" for text in assumed)]
     yes = confirmed(lines, to, yes, as_json)
-    ending = "nothing written: add --yes"
     if yes:
         write_campaign(campaign, to)
-        ending = f"written: {escaped(str(to), 200)}\nnext: `tvsbayes check {typed(to)}`"
+    lines.append(import_end([escaped(str(to), 200)] * yes, f"`tvsbayes check {typed(to)}`"))
     document = {"campaign": str(to), "moves": moves, "sightings": sightings, "assumed": assumed, "written": yes}
-    finish(document, "\n".join([*lines, ending]), as_json)
+    finish(document, "\n".join(lines), as_json)
 
 
 def _field_and_column(text: str) -> tuple[str, str]:
@@ -266,8 +264,7 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
         for name, data in contents.items():
             write_atomically(to / name, data)
         written = [str(to / name) for name in contents]
-    lines.append(f"written: {', '.join(written)}" if written else "nothing written: add --yes")
-    lines += [f"next: `tvsbayes check {typed(to)}`"] * bool(written)
+    lines.append(import_end(written, f"`tvsbayes check {typed(to)}`"))
     document = {"assumed": list(changed.changes), "moves": len(moves), "spots": len(spots), "ok": ok}
     finish({**document, "campaign": str(to), "files": written}, "\n".join(lines), as_json)
 

@@ -14,10 +14,9 @@ if TYPE_CHECKING:
 
 SAMPLES = 3
 """First values of a column that are shown."""
-
-
 NAMES_LISTED = 6
 """Of columns that are not used, in a line."""
+CORRECT_IT = ", or correct it with --column"
 
 
 def first_values(cells: Sequence[str]) -> list[str]:
@@ -79,3 +78,10 @@ def not_sure(
     names = ", ".join(escaped(name) for name in table.columns)
     line, allowed = table.first_line, f"any of {names}"
     return refusal("missing-column", file=table.file, line=line, found=found, allowed=allowed, remedy=remedy)
+
+
+def import_end(written: Sequence[str], following: str, otherwise: str = "") -> str:
+    """The last lines of an import: what was written and what is next, or how to write it."""
+    if not written:
+        return f"nothing written: add --yes{otherwise}"
+    return f"written: {', '.join(written)}\nnext: {following}"
