@@ -93,7 +93,8 @@ def draw(beams: Sequence[Beam]) -> None:
             axes.imshow(np.sqrt(small), cmap="inferno")
             if beam.whole.status == "ok":
                 axes.plot(*(beam.whole.located.centre_px * 160 / grey.shape[1]), "+", color="cyan", markersize=9)
-            end = f", RMS z {beam.rms:.2f}" if beam.z.size else ""
+            ((parts, _),) = beam.statuses.most_common(1)
+            end = f", RMS z {beam.rms:.2f}" if beam.z.size else f", parts {parts}" * (parts != beam.whole.status)
             axes.set_title(f"{beam.name}: {beam.whole.status}{end}", fontsize=7)
             axes.set_axis_off()
 

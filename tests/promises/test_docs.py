@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import typer
 from support.package_imports import MODULES, ORDER, imports_of, room
+from support.printed_pages import first_difference
 
 import tvsbayes
 from tvsbayes.cli.main import app, run
@@ -311,3 +312,18 @@ def test_site_is_built_without_a_warning(tmp_path):
     for page in tmp_path.rglob("*.html"):
         text = page.read_text(encoding="utf-8")
         assert not re.findall(r'(?:src|<link[^>]*href)="https?://', text), page
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("page", "script"),
+    [
+        ("data/docs/you-have.md", "experiments.inputs.you_have"),
+        ("data/docs/compensation.md", "experiments.compensation.ten_minutes"),
+    ],
+)
+def test_a_page_that_a_script_prints_is_what_it_prints(page, script):
+    """Whole, fits included; last digits may differ with the processor."""
+    done = subprocess.run([sys.executable, "-m", script], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (difference := first_difference(done.stdout, read(page))) is None, difference

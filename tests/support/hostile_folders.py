@@ -244,7 +244,7 @@ def piped(file: str) -> Edit:
     """A named pipe in a file's place."""
 
     def edit(folder: Path) -> None:
-        (folder / file).unlink()
+        (folder / file).unlink(missing_ok=True)
         os.mkfifo(folder / file)
 
     return edit
@@ -498,6 +498,7 @@ CRAFTED: dict[str, Crafted] = {
         "path traversal", linked("results", "elsewhere"), ("detect @ --overlay", "fit @ --no-sample", "report @")
     ),
     "moves.csv is a pipe": Crafted("path traversal", piped("moves.csv"), ESTIMATE),
+    "log.jsonl is a pipe": Crafted("path traversal", piped("log.jsonl"), ("check @",)),
     "frame is a pipe": Crafted("path traversal", piped("frames/000010_left.png"), ("detect @",)),
     "draws.npz is a pipe": Crafted("path traversal", piped("results/draws.npz"), (LOCATE,)),
     "frames in capitals": Crafted(

@@ -281,7 +281,7 @@ def campaign_held(path: Path, campaign: Campaign | None = None) -> dict[str, Any
     from tvsbayes.instrument.campaign import read_campaign
 
     journal: dict[str, Any] | None = None
-    if (path / "log.jsonl").is_file():
+    if (path / "log.jsonl").exists():
         from tvsbayes.acquisition.campaign_files import check_journal
 
         journal = check_journal(path)

@@ -36,6 +36,7 @@ from tvsbayes.report.drawing import (
     legend,
 )
 from tvsbayes.report.parameter_words import share_in_words
+from tvsbayes.report.tables import three_digits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -398,7 +399,7 @@ def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, dark_ab
             value = values[row, column]
             if np.isfinite(value):
                 colour = "white" if value > dark_above else "black"
-                axes.text(xx, yy, f"{value:.3g}", ha="center", va="center", color=colour)
+                axes.text(xx, yy, three_digits(value), ha="center", va="center", color=colour)
 
 
 def shares(budget: Budget) -> Figure:

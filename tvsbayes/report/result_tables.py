@@ -16,7 +16,7 @@ from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.parameters import HEAD_TERMS, HEADLINES, QUANTITIES, names_of
 from tvsbayes.metrology.look_budget import Budget
 from tvsbayes.report.parameter_words import name_in_words, share_in_words
-from tvsbayes.report.tables import TableView, interval_text, signed, two_digits
+from tvsbayes.report.tables import TableView, interval_text, signed, three_digits, two_digits
 from tvsbayes.results.comparison_record import Gap, GapTerm, HoldOut
 from tvsbayes.results.estimates import Estimate, FitSummary, PeriodEstimate
 
@@ -187,7 +187,7 @@ def point_budget_table(budget: Budget, caption: str = "uncertainty by cause") ->
         [
             share_in_words(budget.causes[k]),
             f"{100 * budget.share[k]:.1f}",
-            *(f"{np.sqrt(v):.3g}" for v in budget.variance_mm2[k]),
+            *(three_digits(np.sqrt(v)) for v in budget.variance_mm2[k]),
         ]
         for k in order[budget.share[order] >= SHARE_SHOWN]
     ]

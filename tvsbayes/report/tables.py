@@ -25,6 +25,11 @@ def two_digits(value: float) -> str:
     return f"{Decimal(f'{value:.1e}'):f}" if math.isfinite(value) and value else f"{value:g}"
 
 
+def three_digits(value: float) -> str:
+    """Three digits, without an exponent where the number is large."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
 def signed(value: float, sd: float) -> str:
     """A difference with its sign, as `concise`."""
     text = concise(value, sd)

@@ -20,7 +20,7 @@ from tvsbayes.report.document import FigureView, Section, sentence
 from tvsbayes.report.drawing import SMALLEST_SHARE
 from tvsbayes.report.parameter_words import made_by, name_in_words, share_in_words, source_in_words
 from tvsbayes.report.result_tables import point_budget_table
-from tvsbayes.report.tables import TableView, interval_text, two_digits
+from tvsbayes.report.tables import TableView, interval_text, three_digits, two_digits
 from tvsbayes.results.metrology_tables import FIGURES, BudgetRow, BudgetTable, Predicted
 from tvsbayes.statistics.intervals import NORMAL_95
 
@@ -159,7 +159,7 @@ def _gum_table(tables: Sequence[BudgetTable], caption: str) -> TableView:
         cells = ["; ".join(dict.fromkeys(two_digits(row.u) for row in stated if row.u is not None))]
         cells.append("; ".join(dict.fromkeys(_freedom(row.dof) for row in stated)))
         if alone:
-            cells = [first.distribution, *cells, "" if first.sensitivity is None else _digits(first.sensitivity)]
+            cells = [first.distribution, *cells, "" if first.sensitivity is None else three_digits(first.sensitivity)]
         parts = [cell for of_source in of_name for cell in _contributed(of_source.get(name))]
         rows.append([_named(first), first.kind, *cells, *parts])
     columns = ["source", "type", *(["distribution", "u", "dof", "sensitivity"] if alone else ["u", "dof"])]
@@ -205,11 +205,6 @@ def _apart(table: BudgetTable, result: Estimate | None) -> str:
         note += f" (the first page, which counts: {interval_text(low, high, result.sd)}, U = {two_digits(half)} "
         note += f"{table.unit})"
     return note
-
-
-def _digits(value: float) -> str:
-    """Three digits, without an exponent where the number is large."""
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def _freedom(dof: float | None) -> str:
