@@ -176,12 +176,12 @@ class LivePage {
   }
 
   showEstimates(told) {
-    const { estimates, aim, temperature } = told;
+    const { estimates, aim, temperature, simulated } = told;
     const target = aim.target_u_deg_per_step;
     const names = DIRECTIONS.filter((name) => aim.directions.includes(name));
     const wanted = target === null ? "" : `; wanted: u at most ${target.toPrecision(2)} in ${names.join(", ")}`;
     if (!estimates.length) {
-      by("estimate-remark").textContent = `no estimate yet${wanted}`;
+      by("estimate-remark").textContent = `no estimate yet${simulated ? "; a simulation makes them with --estimate" : ""}${wanted}`;
       return;
     }
     const last = estimates.at(-1);
