@@ -15,7 +15,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Before JAX is: what one process has compiled the other loads, and so does the next run. Keys are hashes of the code.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # Commands, in this process or in another, keep theirs there too: not in the user's own folder.
 os.environ["TVSBAYES_CACHE"] = os.environ["JAX_COMPILATION_CACHE_DIR"]
 
