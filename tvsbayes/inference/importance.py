@@ -1,10 +1,11 @@
 """The posterior by importance sampling: independent draws from a proposal that follows it, weighted (formulation 4.3).
 
-Pilot rounds of draws teach the proposal: pooled, each draw weighted by the target over the mixture of all proposals
-that made them, the balance heuristic (Veach and Guibas, SIGGRAPH 95, 419; Owen and Zhou, J. Am. Stat. Assoc. 95 (2000)
-135), so that a poor first round costs little. They take no part in the posterior: a proposal fitted to a draw is high
-where that draw is, whose weight would come out too small (Marin, Pudlo and Sedki, Bernoulli 25 (2019) 1977). Where the
-draws of a proposal would take too long to be accepted, they in turn are the pilot of the next one.
+Where the draws of a proposal would take too long to be accepted, they teach the next one, and take no part in the
+posterior: a proposal fitted to a draw is high where that draw is, whose weight would come out too small (Marin, Pudlo
+and Sedki, Bernoulli 25 (2019) 1977). Pilot rounds teach the proposal of a density of its own kind before the first of
+these draws: pooled, each weighted by the target over the mixture of all proposals that made them, the balance
+heuristic (Veach and Guibas, SIGGRAPH 95, 419; Owen and Zhou, J. Am. Stat. Assoc. 95 (2000) 135), so that a poor first
+round costs little.
 """
 
 from __future__ import annotations
@@ -43,12 +44,12 @@ from tvsbayes.statistics.weighted_draws import (
 
 ROUND = 1024
 PILOT_ROUNDS = 2
-"""Rounds after each of which the proposal is fitted to all draws so far."""
+"""Pilot rounds, at least, where there are any; after each of them the proposal is fitted to all draws so far."""
 PILOT_EFFECTIVE = 200.0
-"""Draws that weighted pilot draws must be worth where their number is not fixed."""
+"""Draws that weighted pilot draws must be worth."""
 ROUNDS_MAX = 64
 """All rounds of all proposals: the budget."""
-ROUNDS_LEAST = 4
+ROUNDS_LEAST = 3
 """Of fewer rounds nobody knows how many effective draws they have."""
 PATIENCE = 3
 """A proposal is fitted anew if it would take more than this many times the rounds that it has had."""
@@ -120,17 +121,16 @@ class Pool:
         return pool
 
 
-def piloted(density: Density, generator: np.random.RandomState, rounds_max: int | None = None) -> Pool:
+def piloted(density: Density, generator: np.random.RandomState, rounds_max: int) -> Pool:
     """Without draws, from the proposal that the pilot rounds arrive at.
 
-    Every round is fitted to all before it. They are `PILOT_ROUNDS`, or go on up to `rounds_max` until their weights are
-    worth `PILOT_EFFECTIVE` draws: a density of its own kind, which the first proposal does not know, is learnt in many.
+    Every round is fitted to all before it. They go on up to `rounds_max` until their weights are worth
+    `PILOT_EFFECTIVE` draws: a density of its own kind, which the first proposal does not know, is learnt in many.
     """
     pilot = Pool.empty(density.first_proposal())
-    limit = max(PILOT_ROUNDS, rounds_max or 0)
-    for number in range(1, limit + 1):
+    for number in range(1, rounds_max + 1):
         pilot = pilot.extended(density, generator, fitted=True)
-        if PILOT_ROUNDS <= number < limit and _learnt(pilot):
+        if PILOT_ROUNDS <= number < rounds_max and _learnt(pilot):
             break
     return Pool.empty(pilot.next_proposal, pilot.invalid)
 
@@ -344,7 +344,7 @@ def weighted_run[D: Density](
     advance: Advance = unshown,
     rounds_max: int | None = None,
     rounds_least: int | None = None,
-    pilots_max: int | None = None,
+    pilots_max: int = 0,
 ) -> ImportanceRun[D]:
     """Draw rounds until the answer is accepted; where that would take too long, from a proposal fitted anew.
 
@@ -354,7 +354,7 @@ def weighted_run[D: Density](
         advance: told how far it is.
         rounds_max: of all proposals together, by default `ROUNDS_MAX`.
         rounds_least: of the proposal that gives the answer, by default `ROUNDS_LEAST`.
-        pilots_max: rounds from which the first proposal is learnt, as in `piloted`.
+        pilots_max: pilot rounds at most, as in `piloted`.
 
     Raises:
         NotConverged: the density is not finite around the mode.
@@ -365,7 +365,7 @@ def weighted_run[D: Density](
     try:
         pool = piloted(density, generator, pilots_max)
         wanted = ROUNDS_LEAST if rounds_least is None else rounds_least
-        total, rounds, patience = PILOT_ROUNDS, 0, PATIENCE * wanted
+        total, rounds, patience = 0, 0, PATIENCE * wanted
         while True:
             while rounds < wanted:
                 rounds, total = rounds + 1, total + 1
@@ -379,10 +379,10 @@ def weighted_run[D: Density](
             if needed > patience and left >= 2 * rounds:
                 # These draws teach the next proposal, which is allowed twice as many.
                 pool = Pool.empty(pool.refitted, pool.invalid)
-                rounds, wanted, patience = 0, min(2 * rounds, left), 2 * patience
+                rounds, wanted, patience = 0, rounds, 2 * patience
             else:
-                # Few draws do not say well how many more it takes.
-                more = max(rounds + 1, rounds * 9 // 8, int(min(np.ceil(1.1 * needed), 2 * rounds)))
+                # Few draws do not say well how many more it takes: half of them, and another look.
+                more = max(rounds + 1, rounds * 9 // 8, int(min(np.ceil(0.5 * (rounds + 1.1 * needed)), 2 * rounds)))
                 wanted = min(rounds + left, more)
     except FloatingPointError as error:
         raise NotConverged("no-density", str(error), remedy="see the weak directions of --no-sample") from error

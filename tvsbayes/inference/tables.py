@@ -12,8 +12,8 @@ import numpy as np
 
 NODES = np.linspace(-8.0, 12.0, 41)
 """Of the tabulated densities, in w. Noise scales have their long tail above."""
-CUT_NODES = NODES[::2]
-"""Where the target is cut: its logarithm is smooth."""
+CUT_NODES = np.array([-8.0, -5.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0])
+"""Where the target is cut, places of `NODES`: its logarithm is smooth, and far out little is drawn."""
 STEP = float(NODES[1] - NODES[0])
 FLOOR = -40.0
 """Of a tabulated log density below its largest: what lies lower is never drawn, and zero has no logarithm."""
@@ -43,8 +43,8 @@ def between_cuts(log_density: np.ndarray) -> np.ndarray:
     least = np.min(np.where(none, np.inf, log_density), axis=-1, keepdims=True)
     finite = np.where(none, np.where(np.isfinite(least), least, 0.0), log_density)
     finite = np.maximum(_filled(finite), finite.max(axis=-1, keepdims=True) + CUT_FLOOR)
-    beside = np.zeros((*none.shape[:-1], len(NODES)), dtype=bool)
-    beside[..., ::2], beside[..., 1::2] = none, none[..., :-1] | none[..., 1:]
+    below, above = (np.searchsorted(CUT_NODES, NODES, side) - shift for side, shift in (("right", 1), ("left", 0)))
+    beside = none[..., below] | none[..., above]
     return np.where(beside, -np.inf, Akima1DInterpolator(CUT_NODES, finite, axis=-1)(NODES))
 
 
@@ -117,7 +117,7 @@ def _point_below(share: np.ndarray, lines: np.ndarray, reached: np.ndarray) -> n
     return NODES[node] + np.clip(along, 0.0, STEP)
 
 
-LEADER_NODES = np.linspace(-4.0, 4.0, 11)
+LEADER_NODES = np.linspace(-4.0, 4.0, 7)
 """Places of a leader, in w, at which its follower has tables of its own."""
 
 
