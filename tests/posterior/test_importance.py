@@ -156,7 +156,7 @@ def test_a_campaign_is_sampled_in_few_rounds_and_accepted(sampled):
     every = posterior.convergence.monte_carlo_error
     assert set(every) == set(headline_names(fitted)) and all(error.within(0.1, 0.2) for error in every.values())
     assert found.draws == importance.ROUND * found.rounds and found.rounds <= 2 * importance.ROUNDS_LEAST
-    assert found.effective_share > 0.5 and found.pareto_k < 0.6 and found.heaviest_share < 0.01
+    assert found.effective_share > 0.3 and found.pareto_k < 0.6 and found.heaviest_share < 0.01
     weights = posterior.weights
     assert weights.shape == posterior.z.shape[:2] == (1, found.draws)
     assert weights.sum() == pytest.approx(1.0, rel=1e-12)
@@ -175,7 +175,7 @@ def test_draws_of_its_own_say_the_same_of_a_way_of_homing(sampled, monkeypatch):
     with jax.enable_x64(True):
         beside = run_beside(fitted, run, SEED + 1)
     one, other = posterior.convergence.importance, beside.convergence.importance
-    assert other.draws == 2 * importance.ROUND and other.effective_share > 0.5
+    assert other.draws == 2 * importance.ROUND and other.effective_share > 0.3
     error = np.hypot(one.log_evidence_mcse, other.log_evidence_mcse)
     assert error < 0.05 and other.log_evidence == pytest.approx(one.log_evidence, abs=SIGMAS * error)
 
@@ -217,17 +217,13 @@ def narrowed(proposal: Independence, factor: float) -> Independence:
 
 @pytest.fixture
 def too_narrow(sampled, monkeypatch):
-    """The run's map, no heavy tails, and pilot rounds that arrive at a proposal of half the width."""
+    """The run's map, no heavy tails, and a first proposal of half the width."""
     fitted, run, _ = sampled
     monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
     for name in ("HEAVY_SHARE", "COUPLED_SHARE"):
         monkeypatch.setattr(f"tvsbayes.inference.proposal.{name}", 1e-12)
-    arrived = importance.piloted
-
-    def piloted(target, generator, rounds_max=None):
-        return Pool.empty(narrowed(arrived(target, generator).next_proposal, 0.5))
-
-    monkeypatch.setattr(importance, "piloted", piloted)
+    first = run.density.first_proposal()
+    monkeypatch.setattr(Target, "first_proposal", lambda target: narrowed(first, 0.5))
     return fitted
 
 
@@ -244,10 +240,10 @@ def test_a_proposal_that_is_too_narrow_is_fitted_anew(too_narrow, sampled, monke
     posterior = run.density.posterior(run.sample, SEED)
     found, other = posterior.convergence, sampled[2].convergence
     assert found.answer == "accepted" and found.missing == ()
-    # The pilot, what it arrives at, and the same narrowed: what comes then are proposals fitted anew.
-    assert len(begun) > 3 and run.pool.proposals == (begun[-1],)
+    # After the narrowed one come proposals fitted anew.
+    assert len(begun) > 1 and run.pool.proposals == (begun[-1],)
     assert run.pool.counts == (found.importance.draws,), "draws of the narrow proposal are in the answer"
-    # Fitted to draws of a bad proposal it is worth less than one from good pilot rounds, but no tenth of it.
+    # Fitted to draws of a bad proposal it is worth less than a good one, but no tenth of it.
     assert found.importance.effective_share > 0.1 * other.importance.effective_share
     name = other.importance.least_ess.quantity
     one, two = (each.propagate(lambda p: p[name]) for each in (posterior, sampled[2]))
@@ -255,8 +251,8 @@ def test_a_proposal_that_is_too_narrow_is_fitted_anew(too_narrow, sampled, monke
 
 
 def test_a_budget_that_is_used_up_leaves_a_worse_answer(too_narrow):
-    """Two pilot rounds and four of the narrow proposal: none is left for another."""
-    run = importance_run(too_narrow, SEED, rounds_max=6)
+    """Rounds of the narrow proposal: none is left for another."""
+    run = importance_run(too_narrow, SEED, rounds_max=importance.ROUNDS_LEAST)
     posterior, found = run.density.posterior(run.sample, SEED), run.sample.convergence.importance
     assert found.rounds == importance.ROUNDS_LEAST and found.answer == "laplace" and not posterior.converged
     assert found.pareto_k > importance.K_MAX
@@ -275,7 +271,7 @@ def test_few_draws_of_a_good_proposal_are_a_rough_answer(sampled, monkeypatch):
     monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
     monkeypatch.setattr(importance, "ROUNDS_LEAST", 1)
     monkeypatch.setattr(importance, "ROUND", 512)
-    run = importance_run(fitted, SEED, rounds_max=3)
+    run = importance_run(fitted, SEED, rounds_max=1)
     posterior = run.density.posterior(run.sample, SEED)
     found = posterior.convergence
     assert (found.importance.draws, found.answer, posterior.converged) == (512, "rough", True), found.missing
@@ -342,7 +338,7 @@ def test_no_chain_is_kept_or_resumed_without_one(sampled, tmp_path):
         sample(sampled[0], "nested")
 
 
-def test_the_paper_twin_against_nuts():
+def test_the_paper_twin_against_nuts(monkeypatch):
     """The reference of `experiments/sampler/nuts_reference.py`, of perfect gears, which shares no sampling code."""
     campaign = read_campaign(shipped_data() / "twins" / "paper_twin")
     # Errors of a nanodegree are none, and need no functions of other shapes than gears that err.
@@ -352,6 +348,8 @@ def test_the_paper_twin_against_nuts():
     nearly |= dict.fromkeys(BLOCKS["look_scatter_deg"], Prior(0.0, 0.0, "half-normal"))
     perfect = fit(replace(campaign, rig=replace(table, priors={**table.priors, **nearly})))
     reference = json.loads((shipped_data() / "reference" / "posterior_paper.json").read_text())["quantities"]
+    # What is accepted knows an sd to 4 %; the reference knows it better.
+    monkeypatch.setattr(importance, "ROUNDS_LEAST", 6)
     posterior = sample(perfect, "importance")
     assert posterior.converged
     columns = posterior.by_name

@@ -324,6 +324,15 @@ class ImportanceRun[D: Density]:
     sample: Sample
     seed: int
 
+    def extended(self, rounds: int) -> ImportanceRun[D]:
+        """With so many rounds in all, the further ones from the same proposal."""
+        began, pool = time.monotonic(), self.pool
+        generator = np.random.RandomState([self.seed, len(pool.drawn)])
+        for _ in range(rounds - len(pool.drawn) // ROUND):
+            pool = pool.extended(self.density, generator, fitted=False)
+        sample = Weighing(self.density, pool).sample(self.sample.seconds + time.monotonic() - began)
+        return replace(self, pool=pool, sample=sample)
+
     @cached_property
     def proposal(self) -> Proposal:
         """Fitted to all draws: a chain that starts from them is right whatever it is proposed."""

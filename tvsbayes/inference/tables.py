@@ -35,7 +35,7 @@ def _filled(values: np.ndarray) -> np.ndarray:
 def between_cuts(log_density: np.ndarray) -> np.ndarray:
     """Log densities at `NODES` from those at `CUT_NODES` (..., cuts); -inf beside where none is, no valley.
 
-    By Akima's (1970) cubics, exact for parabolas. They are local: the map's own tables bend at nodes.
+    By Akima's (1970) cubics, exact for parabolas where cuts are evenly spaced, to 0.2 elsewhere. They are local: the map's own tables bend at nodes.
     """
     from scipy.interpolate import Akima1DInterpolator
 

@@ -36,7 +36,6 @@ def importance_run(
     seed: int,
     advance: Advance = unshown,
     rounds_max: int | None = None,
-    rounds_least: int | None = None,
 ) -> ImportanceRun[Target]:
     """`weighted_run` of a converged fit."""
     began, path = time.monotonic(), transport(fit)
@@ -45,7 +44,7 @@ def importance_run(
     def drawing(share: float, detail: str = "") -> None:
         advance(MAPPED_SHARE + (1 - MAPPED_SHARE) * share)
 
-    run = weighted_run(Target(fit, path), seed, drawing, rounds_max, rounds_least)
+    run = weighted_run(Target(fit, path), seed, drawing, rounds_max)
     return replace(run, sample=replace(run.sample, seconds=time.monotonic() - began))
 
 

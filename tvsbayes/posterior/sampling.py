@@ -12,7 +12,7 @@ import numpy as np
 
 from tvsbayes.errors import NotConverged, require_kind
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.inference.importance import ROUNDS_LEAST, ImportanceRun
+from tvsbayes.inference.importance import ImportanceRun
 from tvsbayes.posterior.chain import stored_chain, write_chain
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.importance import importance_run, mixed, run_beside
@@ -21,7 +21,7 @@ from tvsbayes.progress import Job, Show
 from tvsbayes.results.convergence import Convergence
 from tvsbayes.results.records import CHAIN, IMPORTANCE, TIERS, Tier
 
-MIXTURE_ROUNDS, MIXTURE_MARGIN = 4 * ROUNDS_LEAST, 1.2
+MIXTURE_ROUNDS, MIXTURE_MARGIN = 16, 1.2
 """Rounds of the most probable way of homing, at most, where fewer leave the mixture of all rough; and how many times as
 many it has as the errors of the mixture ask for."""
 DRAWING, WALKING = "drawing weighted samples", f"sampling with {CHAIN}"
@@ -91,7 +91,7 @@ def sample(
         early = _mixture(start, seed)
         if early.convergence.answer == "rough" and start.sample.convergence.answer == "accepted" and chain is None:
             # The share of a less probable way of homing asks for more draws than the most probable one needs.
-            start = importance_run(fit, seed, job.at, rounds_least=_rounds_of_mixture(start, early))
+            start = start.extended(_rounds_of_mixture(start, early))
             early = _mixture(start, seed)
         if tier == IMPORTANCE:
             return early

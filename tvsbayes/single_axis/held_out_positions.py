@@ -147,7 +147,7 @@ def _drawn(model: AxisModel, count: int, seed: int, rng: np.random.Generator) ->
     mode = find_mode(model)
     if not len(mode.w):
         return _Drawn(np.zeros((count, 0)), "; ".join(mode.missing))
-    sample = weighted_run(AxisDensity(model, mode), seed, rounds_least=HELD_ROUNDS).sample
+    sample = weighted_run(AxisDensity(model, mode), seed, rounds_least=HELD_ROUNDS, pilots_max=PILOT_ROUNDS).sample
     return _Drawn(sample.equal(count, rng), "; ".join(sample.convergence.missing))
 
 
