@@ -168,7 +168,7 @@ def test_fitting_tilts_the_tables_of_followers():
 
 
 def test_between_cuts_a_density_goes_on_as_it_does_at_them():
-    """A normal density where cuts are evenly spaced, nearly so elsewhere; Gumbel's, a noise scale's, better than by lines; none where there is none."""
+    """A normal density; Gumbel's, a noise scale's, better than by lines; none where there is none."""
     parabola, width = -0.5 * ((NODES - 0.3) / 0.9) ** 2, 0.8
     gumbel = -NODES / width - np.exp(-NODES / width)
     cuts = np.isin(NODES, CUT_NODES)

@@ -35,7 +35,8 @@ def _filled(values: np.ndarray) -> np.ndarray:
 def between_cuts(log_density: np.ndarray) -> np.ndarray:
     """Log densities at `NODES` from those at `CUT_NODES` (..., cuts); -inf beside where none is, no valley.
 
-    By Akima's (1970) cubics, exact for parabolas where cuts are evenly spaced, to 0.2 elsewhere. They are local: the map's own tables bend at nodes.
+    By Akima's (1970) cubics, exact for parabolas where cuts are evenly spaced, to 0.2 elsewhere. They are
+    local: the map's own tables bend at nodes.
     """
     from scipy.interpolate import Akima1DInterpolator
 
@@ -43,7 +44,7 @@ def between_cuts(log_density: np.ndarray) -> np.ndarray:
     least = np.min(np.where(none, np.inf, log_density), axis=-1, keepdims=True)
     finite = np.where(none, np.where(np.isfinite(least), least, 0.0), log_density)
     finite = np.maximum(_filled(finite), finite.max(axis=-1, keepdims=True) + CUT_FLOOR)
-    below, above = (np.searchsorted(CUT_NODES, NODES, side) - shift for side, shift in (("right", 1), ("left", 0)))
+    below, above = np.searchsorted(CUT_NODES, NODES, "right") - 1, np.searchsorted(CUT_NODES, NODES, "left")
     beside = none[..., below] | none[..., above]
     return np.where(beside, -np.inf, Akima1DInterpolator(CUT_NODES, finite, axis=-1)(NODES))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
-from tvsbayes.inference.importance import K_MAX, weighted_run
+from tvsbayes.inference.importance import K_MAX, PILOT_ROUNDS, weighted_run
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.comparison_record import AxisHoldOut, HeldOutReadings
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
