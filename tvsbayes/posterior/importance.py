@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.inference.density import Points
 from tvsbayes.inference.importance import K_MAX, ROUND, ImportanceRun, Pool, Weighing, uncertain, weighted_run
 from tvsbayes.inference.summaries import monte_carlo_errors
 from tvsbayes.instrument.homing import prior_chance
@@ -23,12 +24,8 @@ from tvsbayes.statistics.weighted_draws import weighted_summary
 
 MAPPED_SHARE = 0.25
 """Of the time, for the map to nearly normal coordinates: what progress predicts with."""
-SHARED_DRAWS_LEAST = 2 * ROUND
-"""Draws of one way of homing, at least, by which another one is known."""
-SHARED_MARGIN = 2.0
-"""A way of homing takes so many times the draws that its share of the posterior asks for."""
-BESIDE_ROUNDS_MAX = 12
-"""Of a way of homing that has draws of its own."""
+ALONE_ROUNDS_LEAST, BESIDE_ROUNDS_MAX = 2, 12
+"""Rounds of a way of homing that has draws of its own."""
 
 
 def importance_run(
@@ -52,23 +49,25 @@ def run_beside(fit: JointFit, run: ImportanceRun[Target], seed: int) -> Posterio
     """The posterior under another way of homing, from the draws of the most probable one weighted anew.
 
     Both posteriors mostly lie over each other. Where they do not, the other one has draws of its own, by its own map
-    from the proposal that the most probable one has learnt: so many that the whole is known.
+    from the proposal that the most probable one has learnt; of either so many that the whole is known.
 
     Args:
         fit: under the other way.
         run: of the most probable way.
         seed: of draws of the errors at places.
     """
-    began, ways, every = time.monotonic(), run.density.fit.mixture, len(run.pool.drawn)
-    share = next(way.probability for way in ways if way.sides == fit.sides) / ways[0].probability
-    count = int(max(SHARED_MARGIN * share * every, SHARED_DRAWS_LEAST))
+    began = time.monotonic()
+    first = run.sample.convergence
+    assert isinstance(first, Reweighted)
+    odds = float(np.log(prior_chance(fit.sides) / prior_chance(run.density.fit.sides)))
 
     def known(weighed: Weighing) -> bool:
         error = max(e.rounds_factor for e in weighed.monte_carlo_error.values())
+        share = np.exp(weighed.log_evidence - first.importance.log_evidence + odds)
         # An error of a part is as large in the whole as the part.
-        return weighed.importance.pareto_k < K_MAX and error * share**2 <= 1
+        return weighed.importance.pareto_k < K_MAX and bool(error * share**2 <= 1)
 
-    weighed = _weighed_anew(fit, run, min(count, every), seed)
+    weighed = _weighed_anew(fit, run, known, seed)
     if not known(weighed):
         weighed = _weighing_alone(fit, run, known, seed)
     density = weighed.density
@@ -85,17 +84,24 @@ def _weighing_alone(
     for count in range(1, BESIDE_ROUNDS_MAX + 1):
         pool = pool.extended(target, generator, fitted=False)
         weighed = Weighing(target, pool)
-        if count * ROUND >= SHARED_DRAWS_LEAST and known(weighed):
+        if count >= ALONE_ROUNDS_LEAST and known(weighed):
             break
     return weighed
 
 
-def _weighed_anew(fit: JointFit, run: ImportanceRun[Target], count: int, seed: int) -> Weighing:
-    """The first draws of a run, weighted by the density under another way of homing."""
-    target, some = Target(fit, run.density.path), run.pool.drawn.taken(slice(count))
-    normal = target.place_normals(count, random_stream(seed, Stream.OTHER_HOMING))
-    points = target.at(some.w, Mapped(some.parts["z"], some.parts["log_jacobian"]), normal)
-    return Weighing(target, replace(run.pool, points=points, counts=(count,), invalid=target.invalid))
+def _weighed_anew(fit: JointFit, run: ImportanceRun[Target], known: Callable[[Weighing], bool], seed: int) -> Weighing:
+    """The draws of a run, weighted by the density under another way of homing, round by round until it is known."""
+    target, drawn, parts = Target(fit, run.density.path), run.pool.drawn, []
+    normal = target.place_normals(len(drawn), random_stream(seed, Stream.OTHER_HOMING))
+    for begin in range(0, len(drawn), ROUND):
+        some = slice(begin, begin + ROUND)
+        own = drawn.taken(some)
+        parts.append(target.at(own.w, Mapped(own.parts["z"], own.parts["log_jacobian"]), normal[some]))
+        points = Points.joined(parts)
+        weighed = Weighing(target, replace(run.pool, points=points, counts=(len(points),), invalid=target.invalid))
+        if known(weighed):
+            break
+    return weighed
 
 
 def mixed(parts: Sequence[Posterior]) -> Posterior:

@@ -21,7 +21,7 @@ from tvsbayes.progress import Job, Show
 from tvsbayes.results.convergence import Convergence
 from tvsbayes.results.records import CHAIN, IMPORTANCE, TIERS, Tier
 
-MIXTURE_ROUNDS, MIXTURE_MARGIN = 16, 1.2
+MIXTURE_ROUNDS, MIXTURE_MARGIN = 16, 1.5
 """Rounds of the most probable way of homing, at most, where fewer leave the mixture of all rough; and how many times as
 many it has as the errors of the mixture ask for."""
 DRAWING, WALKING = "drawing weighted samples", f"sampling with {CHAIN}"
