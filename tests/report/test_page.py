@@ -59,6 +59,7 @@ KNOWN = {
 
 
 def test_the_command_writes_this_page(reported, page):
+    """Made a second time from the same results, to the byte."""
     assert (reported / "results" / "report.html").read_bytes() == page
     assert len(page) < BYTES_MAX
 
@@ -267,10 +268,6 @@ def test_no_paragraph_stands_twice_and_details_are_folded(page):
 )
 def test_numbers_get_true_signs_and_names_stay(plain, set):
     assert typeset(plain) == set
-
-
-def test_the_same_results_give_the_same_bytes(page, reported):
-    assert report_html(evidence_of(reported)) == page
 
 
 def test_traceability_is_what_the_certificate_says(evidence, no_pictures):
