@@ -13,7 +13,14 @@ from tvsbayes.errors import InputError
 from tvsbayes.single_axis.axis_campaign import read_axis, write_axis
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
-from tvsbayes.single_axis.axis_record import keep_fit, results_for, summarise_axis
+from tvsbayes.single_axis.axis_record import (
+    CURVE_DRAWS,
+    deviation_strata,
+    drawn_deviations,
+    keep_fit,
+    results_for,
+    summarise_axis,
+)
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +39,18 @@ def test_what_was_kept_is_taken_up(kept):
     found = results_for(read_axis(folder), tell=told.append)
     assert not told and found.fit.seed == fit.seed
     np.testing.assert_array_equal(found.fit.w, fit.w)
+
+
+def test_strata_have_the_band_of_all_draws(kept):
+    """The band that a page draws, beside draws of every equal draw of the scales."""
+    fit = kept[1]
+    commands = fit.rows.positions
+    every = drawn_deviations(fit, commands, np.random.default_rng(1))
+    sd = every.std(axis=0)
+    ends, expected = (np.percentile(values, [2.5, 97.5], axis=0) for values in (deviation_strata(fit, commands), every))
+    # Standard error of an end by n draws is sqrt(0.025 0.975 / n) / 0.058 sd of a normal law.
+    allowed = 5 * sum(np.sqrt(0.025 * 0.975 / n) / 0.058 for n in (len(every), CURVE_DRAWS))
+    assert np.abs((ends - expected) / sd).max() < allowed < 1.1
 
 
 def npz(**arrays):

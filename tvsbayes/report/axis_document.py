@@ -45,11 +45,10 @@ from tvsbayes.single_axis.axis_record import (
     AxisResults,
     AxisSummary,
     PositionDeviation,
-    drawn_deviations,
+    deviation_strata,
 )
 from tvsbayes.single_axis.classic_line import ClassicAxis
 from tvsbayes.single_axis.next_stops import AxisPlan, unit_of
-from tvsbayes.statistics.streams import AxisStream, random_stream
 
 DEVIATIONS_SHOWN = 40
 TABLE_ROWS = 60
@@ -314,10 +313,9 @@ def _error_figures(fit: AxisFit) -> list[FigureView]:
     if fit.rows.in_motion:
         return []
     commands = curve_commands(float(fit.rows.command.min()), float(fit.rows.command.max()))
-    drawn = drawn_deviations(fit, commands, random_stream(fit.seed, AxisStream.ERROR_CURVE))
     alt = "The error that repeats by position over the command as a curve with a band, and every stop as a marker."
     caption = "Deviation from the line through the stops: what repeats by position with its 95 % band, and the stops."
-    return [FigureView(axis_errors(fit, commands, drawn), alt, caption)]
+    return [FigureView(axis_errors(fit, commands, deviation_strata(fit, commands)), alt, caption)]
 
 
 def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[Section]:

@@ -71,7 +71,7 @@ def axis_errors(fit: AxisFit, commands: np.ndarray, drawn: np.ndarray) -> Figure
     Args:
         fit: of the axis.
         commands: shape (t,).
-        drawn: the error there, in the axis' unit, shape (draws, t).
+        drawn: values that the error there takes equally often, in the axis' unit, shape (n, t).
     """
     rows = fit.rows
     design = np.column_stack([np.ones(len(rows.value)), rows.command - fit.model.middle])

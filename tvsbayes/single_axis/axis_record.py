@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -258,16 +258,34 @@ def deviation_functionals(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
 
 
 CURVE_DRAWS = 400
-"""Of the error by position where its functionals are each draw's own."""
+"""Of the error by position in a figure, and where its functionals are each draw's own."""
+STRATA = 16
+"""Of the normal law of one draw in a figure: its band is then as smooth as that of thousands of draws."""
 
 
 def drawn_deviations(fit: AxisFit, commands: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The error that repeats by position at commands (t,), off the line, drawn: (draws, t)."""
     if not fit.model.repeats_by_draw:
         return fit.linear.drawn(deviation_functionals(fit, commands), rng)
-    w = fit.w[np.linspace(0, len(fit.w) - 1, CURVE_DRAWS).astype(int)]
-    parts = (AxisFit.of_draws(fit.campaign, fit.model, part, fit.seed) for part in blocks_of(w))
+    parts = _curve_parts(fit)
     return np.concatenate([part.linear.drawn(deviation_functionals(part, commands), rng) for part in parts])
+
+
+def deviation_strata(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
+    """Values that the error at each command takes equally often, for its band alone: (`CURVE_DRAWS` x `STRATA`, t).
+
+    What is linear is computed for so many draws only; values of two commands do not belong together.
+    """
+    from scipy.special import ndtri
+
+    normal = ndtri((np.arange(STRATA) + 0.5) / STRATA)[:, None]
+    laws = [part.linear.of(deviation_functionals(part, commands)) for part in _curve_parts(fit)]
+    return np.concatenate([(mean[:, None] + normal * u[:, None]).reshape(-1, len(commands)) for mean, u in laws])
+
+
+def _curve_parts(fit: AxisFit) -> Iterator[AxisFit]:
+    w = fit.w[np.linspace(0, len(fit.w) - 1, CURVE_DRAWS).astype(int)]
+    return (AxisFit.of_draws(fit.campaign, fit.model, part, fit.seed) for part in blocks_of(w))
 
 
 def _deviations(fit: AxisFit) -> tuple[PositionDeviation, ...]:

@@ -57,7 +57,6 @@ class AxisStream(IntEnum):
     LINEAR_TERMS = 3
     DEVIATIONS = 4
     HELD_OUT = 5
-    ERROR_CURVE = 6
     HELD_OUT_BY_WEIGHTS = 8
     PERIODS = 9
     PREDICTED_STOPS = 21
