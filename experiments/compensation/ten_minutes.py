@@ -123,8 +123,8 @@ END = """`tvsbayes report stage` shows table, promise and verdict beside the cal
 
 ## A mount that tracks
 
-A drive at constant rate, of a guide log for instance, never stops and never turns back. Its controller can take out what
-repeats with a turn of the worm:
+A drive at constant rate, of a guide log for instance, never stops and never turns back. Its controller can take out
+what repeats with a turn of the worm:
 
 ```sh
 tvsbayes import PHD2_GuideLog.txt --axis --run 2 --to mount --yes
@@ -132,10 +132,10 @@ tvsbayes fit mount
 tvsbayes compensate mount --to pec -o worm.csv
 ```
 
-The table holds the strongest wave and those of a half, a third ... an eighth of its period, over one period in the middle
-of the log; `--period` takes another. Its phase counts from command 0 of `moves.csv`: shift it to the index of the worm.
-The promise is of errors off the drive's own line within one period; the walk of the zero is in it. `verify` needs stops:
-of a mount log again with the table in force, and `fit` says which wave is left.
+The table holds the strongest wave and those of a half, a third ... an eighth of its period, over one period in the
+middle of the log; `--period` takes another. Its phase counts from command 0 of `moves.csv`: shift it to the index of
+the worm. The promise is of errors off the drive's own line within one period; the walk of the zero is in it. `verify`
+needs stops: of a mount log again with the table in force, and `fit` says which wave is left.
 """
 
 if __name__ == "__main__":
