@@ -88,9 +88,8 @@ class Room:
         free, rest = slice(len(NAMES)), slice(len(NAMES), None)
         if not self.products[rest].size:
             return np.zeros(len(z))
-        values = np.stack([physical_at(one, self.space).value for one in z])
         root = place_root(
-            scales_at(values, np.asarray(self.space.harmonic_period_deg)),
+            scales_at(self.space.values(z), np.asarray(self.space.harmonic_period_deg)),
             self.angle_rad,
             self.places.on_tilt,
             self.places.valid,
