@@ -296,7 +296,7 @@ def _by_homing(first: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
         return laplace_evidence(mode, problem.free) + float(np.log(prior_chance(sides)))
 
     def fit_under(sides: Sides) -> JointFit:
-        return replace(fit_at(first.campaign, *mode_under(sides), seed), sides=dict(sides))
+        return replace(fit_at(first.campaign, *mode_under(sides), seed, first.prior_draws), sides=dict(sides))
 
     weighed_ways = weighed(axes, evidence)
     alternatives = tuple(
@@ -395,7 +395,7 @@ def with_places(z: np.ndarray, covariance: np.ndarray, information: StopInformat
     return Gaussian(np.append(z, information.place_mean), np.block([[own, follows.T], [follows, lower]]))
 
 
-def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> JointFit:
+def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_draws: Derived | None = None) -> JointFit:
     """The fit that ends at a mode: residuals, information, Laplace draws and diagnoses there.
 
     Args:
@@ -403,6 +403,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
         problem: model, priors and the weights of the spots.
         mode: converged, or with the problems that `JointFit.problems` then states.
         seed: of the Laplace draws.
+        prior_draws: of a fit of the same campaign and seed; made where None are given.
     """
     used = np.asarray(problem.arrays.spots.valid)[: len(problem.spots)] > 0
     lin = problem.linearised(mode.z)
@@ -423,19 +424,20 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
     both[:, drawn] = laplace_draws(joint.mean[drawn], joint.covariance[np.ix_(drawn, drawn)], seed)
     draws_z, draws_rad = both[:, :count], both[:, count:] @ np.asarray(lin.place_root).T
     centre_rad = np.asarray(lin.place_root) @ information.place_mean
-    prior_both = np.zeros_like(both)
-    prior_both[:, drawn] = laplace_draws(np.zeros(drawn.sum()), np.eye(drawn.sum()), seed + 1)
-    prior_z = prior_both[:, :count]
-    prior_rad = np.asarray(prior_errors_at_places(prior_z, prior_both[:, count:], problem.space, problem.arrays))
 
-    def derived(*parts: tuple[np.ndarray, np.ndarray]) -> Derived:
-        z, errors = (np.concatenate([np.atleast_2d(part[k]) for part in parts]) for k in range(2))
+    def derived(z: np.ndarray, errors_rad: np.ndarray) -> Derived:
+        """At the mode, and of draws."""
+        z, errors = np.concatenate([mode.z[None], z]), np.concatenate([centre_rad[None], errors_rad])
         return jax.tree.map(np.asarray, derived_quantities(z, errors, problem.space, seen))
 
-    at_mode_and_draws = derived((mode.z, centre_rad), (draws_z, draws_rad))
-    prior = derived((mode.z, centre_rad), (prior_z, prior_rad))
+    at_mode_and_draws = derived(draws_z, draws_rad)
+    if prior_draws is None:
+        prior_both = np.zeros_like(both)
+        prior_both[:, drawn] = laplace_draws(np.zeros(drawn.sum()), np.eye(drawn.sum()), seed + 1)
+        prior_z = prior_both[:, :count]
+        prior_rad = np.asarray(prior_errors_at_places(prior_z, prior_both[:, count:], problem.space, problem.arrays))
+        prior_draws = jax.tree.map(lambda x: x[1:], derived(prior_z, prior_rad))
     reach = NORMAL_95 * np.sqrt(np.diag(mode.covariance))
-    ends = derived((mode.z - reach, centre_rad), (mode.z + reach, centre_rad), (prior_z[1:], prior_rad[1:]))
     ids = np.array([s.spot for s in problem.spots])
     problems = mode.problems
     chi2 = sum(float(np.asarray(lin.residual)[g.rows].ravel() @ g.residual) for g in information.groups)
@@ -460,9 +462,9 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int) -> Joint
         draws_z=draws_z,
         draws_places=both[:, count:],
         draws=jax.tree.map(lambda x: np.asarray(x)[1:], at_mode_and_draws),
-        prior_draws=jax.tree.map(lambda x: np.asarray(x)[1:], prior),
+        prior_draws=prior_draws,
         mode=jax.tree.map(lambda x: np.asarray(x)[0], at_mode_and_draws),
-        ends95=np.asarray(ends.physical)[:2],
+        ends95=problem.space.values(np.stack([mode.z - reach, mode.z + reach])),
         excluded_spots=tuple(int(i) for i in ids[~used]),
         suspect_spots=tuple(int(i) for i in ids[suspect]),
         converged=not problems,
