@@ -295,16 +295,18 @@ def _by_homing(first: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
         mode = mode_under(sides)[1]
         return laplace_evidence(mode, problem.free) + float(np.log(prior_chance(sides)))
 
-    def fit_under(sides: Sides) -> JointFit:
-        return replace(fit_at(first.campaign, *mode_under(sides), seed, first.prior_draws), sides=dict(sides))
+    def fit_under(sides: Sides, prior_draws: Derived | None = None) -> JointFit:
+        return replace(fit_at(first.campaign, *mode_under(sides), seed, prior_draws), sides=dict(sides))
 
     weighed_ways = weighed(axes, evidence)
-    alternatives = tuple(
-        Alternative(way.sides, way.probability, fit_under(way.sides) if way.probability > WORTH_A_FIT else None)
-        for way in weighed_ways
+    best = fit_under(weighed_ways[0].sides)
+    others = (
+        fit_under(way.sides, best.prior_draws) if way.probability > WORTH_A_FIT else None for way in weighed_ways[1:]
     )
-    best = alternatives[0].fit
-    assert best is not None
+    alternatives = tuple(
+        Alternative(way.sides, way.probability, fitted)
+        for way, fitted in zip(weighed_ways, (best, *others), strict=True)
+    )
     return replace(best, alternatives=alternatives)
 
 
