@@ -19,7 +19,7 @@ from tvsbayes.files.disk import make_folder, output_place, require_writable
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.model_choice import AS_STATED, ModelChoice
 from tvsbayes.progress import Job, Show
-from tvsbayes.results.records import CHAIN, IMPORTANCE, Tier
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from tvsbayes.results.compensation_record import Compensation, Verification
     from tvsbayes.results.estimates import FitSummary
     from tvsbayes.results.fit_record import FitEvidence, FitRecord
+    from tvsbayes.results.records import Tier
     from tvsbayes.results.stored_draws import ResultDraws
     from tvsbayes.single_axis.axis_campaign import AxisCampaign
 

@@ -13,7 +13,7 @@ from tvsbayes.inference.summaries import propagated
 from tvsbayes.instrument.mechanisms import TWO_MIRROR
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.results.records import CHAIN
+from tvsbayes.results.tiers import CHAIN
 
 SIGMAS = 5.0
 

@@ -15,7 +15,8 @@ from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, write_atomically
 from tvsbayes.pipeline import MAX_MINUTES
 from tvsbayes.progress import Job
-from tvsbayes.results.records import CHAIN, IMPORTANCE, plain
+from tvsbayes.results.records import plain
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     from tvsbayes.report.document import Issue

@@ -28,7 +28,7 @@ from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
 from tvsbayes.pipeline import FITTING, MAX_MINUTES, StoredOrFitted, calibrate, compile_for
 from tvsbayes.progress import Job, Show
-from tvsbayes.results.records import CHAIN, IMPORTANCE
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit

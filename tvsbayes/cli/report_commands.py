@@ -36,7 +36,7 @@ from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
 from tvsbayes.pipeline import calibrate as calibrate_campaign
 from tvsbayes.progress import Job
-from tvsbayes.results.records import CHAIN, IMPORTANCE
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Campaign

@@ -17,7 +17,7 @@ from tvsbayes.inference.density import Density, columns_of
 from tvsbayes.inference.importance import ImportanceRun, Sample, uncertain
 from tvsbayes.inference.summaries import monte_carlo_errors, propagated
 from tvsbayes.results.convergence import Agreement, Convergence, MonteCarloError, extreme
-from tvsbayes.results.records import CHAIN
+from tvsbayes.results.tiers import CHAIN
 from tvsbayes.statistics.streams import Stream, random_stream
 
 GROUPS = 4

@@ -30,7 +30,8 @@ from tvsbayes.results.convergence import (
     Reweighted,
     extreme,
 )
-from tvsbayes.results.records import IMPORTANCE, Tier
+from tvsbayes.results.records import Tier
+from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import (
     SmoothedWeights,

@@ -23,7 +23,7 @@ from tvsbayes.planning.planner import design_problem
 from tvsbayes.planning.search import Chosen, DesignProblem
 from tvsbayes.planning.target import Target
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.results.records import IMPORTANCE
+from tvsbayes.results.tiers import IMPORTANCE
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from tvsbayes.posterior.chain import fingerprint
 from tvsbayes.posterior.draws import Draws, Posterior, derived_names
 from tvsbayes.posterior.predictive import PIXEL_LABELS, move_log_likelihood, predictive_pixels
 from tvsbayes.results.convergence import Convergence
-from tvsbayes.results.records import CHAIN, IMPORTANCE
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
 RESAMPLED = 4, 1024

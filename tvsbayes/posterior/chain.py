@@ -25,7 +25,7 @@ from tvsbayes.inference.tables import Followers, Tables
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.posterior.target import Target
 from tvsbayes.posterior.transport import transport
-from tvsbayes.results.records import CHAIN
+from tvsbayes.results.tiers import CHAIN
 
 CHAIN_KIND = "tvsbayes-chain/"
 CHAIN_FORMAT = f"{CHAIN_KIND}7"

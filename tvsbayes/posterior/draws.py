@@ -24,7 +24,8 @@ from tvsbayes.instrument.stops import legs_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.headlines import DERIVED, Derived, derived_quantities
 from tvsbayes.results.convergence import Convergence, Reweighted
-from tvsbayes.results.records import IMPORTANCE, Tier
+from tvsbayes.results.records import Tier
+from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic, weighted_mean
 

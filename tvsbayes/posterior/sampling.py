@@ -19,7 +19,8 @@ from tvsbayes.posterior.importance import importance_run, mixed, run_beside
 from tvsbayes.posterior.target import Target
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.convergence import Convergence
-from tvsbayes.results.records import CHAIN, IMPORTANCE, TIERS, Tier
+from tvsbayes.results.records import Tier
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE, TIERS
 
 MIXTURE_ROUNDS, MIXTURE_MARGIN = 16, 1.5
 """Rounds of the most probable way of homing, at most, where fewer leave the mixture of all rough; and how many times as

@@ -36,7 +36,8 @@ from tvsbayes.results.comparison_record import AxisHoldOut
 from tvsbayes.results.compensation_record import stored_verification
 from tvsbayes.results.estimates import Estimate, PeriodEstimate
 from tvsbayes.results.fit_record import provenance
-from tvsbayes.results.records import IMPORTANCE, plain
+from tvsbayes.results.records import plain
+from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import axis_hashes
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES

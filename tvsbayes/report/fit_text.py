@@ -25,7 +25,7 @@ from tvsbayes.report.result_tables import (
 from tvsbayes.report.tables import TableView
 from tvsbayes.results.convergence import Importance, Sampling
 from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
-from tvsbayes.results.records import CHAIN
+from tvsbayes.results.tiers import CHAIN
 
 PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from tvsbayes.instrument.parameters import QUANTITIES
-from tvsbayes.results.records import CHAIN, IMPORTANCE
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 _MADE_BY = {
     "laplace": "Laplace approximation at the mode",

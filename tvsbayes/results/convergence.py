@@ -11,7 +11,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from tvsbayes.results.records import CHAIN, IMPORTANCE, AnswerKind, Count, FromOne, NotNegative, Tier
+from tvsbayes.results.records import AnswerKind, Count, FromOne, NotNegative, Tier
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 MEAN_ERROR_MAX, END_ERROR_MAX = 0.1, 0.2
 """Monte Carlo standard error of a headline's mean and of the ends of its 95 % interval, in its sd, with which an answer

@@ -29,7 +29,6 @@ from tvsbayes.results.comparison_record import Gap
 from tvsbayes.results.estimates import Cause, FitSummary, StopResidual
 from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning, BudgetTable
 from tvsbayes.results.records import (
-    CHAIN,
     ByDirection,
     ClosedRecord,
     Matrix,
@@ -39,6 +38,7 @@ from tvsbayes.results.records import (
     read_record,
     schema_of,
 )
+from tvsbayes.results.tiers import CHAIN
 
 FIT_FORMAT = "tvsbayes-fit/1"
 FIT_FORMATS = (FIT_FORMAT,)

@@ -25,6 +25,7 @@ from tvsbayes.errors import shown
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
+from tvsbayes.results.tiers import TIERS
 
 if TYPE_CHECKING:
     from jsonschema import Draft202012Validator
@@ -43,8 +44,6 @@ type ByDirection[T] = dict[Direction, T]
 type BothAxes[T] = Annotated[dict[AxisName, T], Meta(extra_json_schema={"required": AXES})]
 type AllDirections[T] = Annotated[dict[Direction, T], Meta(extra_json_schema={"required": DIRECTIONS})]
 type EstimatorName = Annotated[str, Meta(extra_json_schema={"enum": ("laplace", "posterior")})]
-IMPORTANCE, CHAIN = TIERS = ("importance", "emcee")
-"""What made the draws of a posterior: weighted independent draws, or a chain, named by the library that runs it."""
 type Tier = Annotated[str, Meta(extra_json_schema={"enum": TIERS})]
 type AnswerKind = Annotated[str, Meta(extra_json_schema={"enum": ("accepted", "rough", "laplace")})]
 

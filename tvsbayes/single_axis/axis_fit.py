@@ -18,7 +18,8 @@ from tvsbayes.errors import NotConverged, TvsError
 from tvsbayes.inference.importance import Sample, weighted_run
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.estimates import CONFLICT_LIMIT, conflict_sentence
-from tvsbayes.results.records import CHAIN, AnswerKind, EstimatorName, Tier
+from tvsbayes.results.records import AnswerKind, EstimatorName, Tier
+from tvsbayes.results.tiers import CHAIN
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, AxisDensity, headline_functionals
 from tvsbayes.single_axis.axis_mode import AxisMode, find_mode

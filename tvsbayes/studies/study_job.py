@@ -33,7 +33,7 @@ from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.posterior.draws import Posterior
 from tvsbayes.posterior.sampling import sample
-from tvsbayes.results.records import CHAIN, IMPORTANCE
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 from tvsbayes.statistics.weighted_draws import TAILS, weighted_mean, weighted_quantiles
 from tvsbayes.studies.rows import STUDY_FORMAT, HeadlineRow, StudyRow
 from tvsbayes.twin.simulated_campaign import simulate
