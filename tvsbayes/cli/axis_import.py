@@ -50,7 +50,7 @@ class _Understood:
 
     lines: list[str]
     document: dict[str, Any]
-    found: ForeignReadings
+    readings: ForeignReadings
     unit: str | None
 
 
@@ -93,7 +93,7 @@ def import_readings(
 
 def _finish_import(understood: _Understood, to: Path, *, yes: bool, as_json: bool) -> None:
     """Show what was understood, write it if that is wanted, and say what is next."""
-    table, named = understood.found, understood.unit
+    table, named = understood.readings, understood.unit
     unit_line = _unit_line(to, named)
     assumed = [*table.assumed, unit_line, *_drive_lines(table)]
     lines = [*understood.lines, *table.notes, *(f"assumed: {text}" for text in assumed)]

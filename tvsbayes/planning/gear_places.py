@@ -180,7 +180,7 @@ def windows_of(counters: np.ndarray, deg_per_step: float) -> list[np.ndarray]:
     """Different counters (n,) of an axis, apart where nothing lies within `GAP_DEG`; best filled, nearest 0 first."""
     different = np.unique(counters).astype(float)
     apart = np.flatnonzero(np.diff(different) * deg_per_step > GAP_DEG) + 1
-    return sorted(np.split(different, apart), key=lambda own: (-len(own), abs(own.mean())))
+    return sorted(np.split(different, apart), key=lambda window: (-len(window), abs(window.mean())))
 
 
 def regular_places(reached: np.ndarray, ratio_deg_per_step: np.ndarray, scales: GearScales) -> GearPlaces:

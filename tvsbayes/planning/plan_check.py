@@ -191,9 +191,8 @@ def _cure(
     """Fewest looks after which the axis has no fault, on the sheet that stands; None if there are none."""
     shown = LookArrays(possible.looks, knowledge, False).at(knowledge.z, knowledge.space)
     rows = before.rows(axis)
-    slopes = np.zeros(len(rows))
     precision = knowledge.precision + before.information.fisher
-    search = Search(shown.rows[..., :-2], precision, before.gradient[rows], slopes, "A")
+    search = Search(shown.rows[..., :-2], precision, before.gradient[rows], np.zeros(len(rows)), "A")
     placed = run_plan(steps, knowledge.rig).sheet
     allowed = possible.looks.sheet == (knowledge.sheets.index(placed) if placed in knowledge.sheets else 0)
     picks = np.array(search.among(allowed).greedy(CURE_LOOKS), dtype=int)

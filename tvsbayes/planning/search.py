@@ -85,7 +85,7 @@ class Search:
         rows: of all candidates, shape (m, 4, P); a candidate that is not to be chosen has zero rows.
         precision: before any look, shape (P, P).
         gradient: d(quantity)/d(column), shape (q, P).
-        own: variance beside it, shape (q,).
+        variance: beside it, shape (q,).
         criterion: see `scores`.
         numbers: by which candidates are called, ascending, shape (m,); by default their places in `rows`.
 
@@ -95,21 +95,21 @@ class Search:
     rows: np.ndarray
     precision: np.ndarray
     gradient: np.ndarray
-    own: np.ndarray
+    variance: np.ndarray
     criterion: str = "c"
     numbers: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.covariance = covariance_of(self.precision)
         uncertain = np.diag(self._quantities(self.covariance)) > 0
-        self.gradient, self.own = self.gradient[uncertain], self.own[uncertain]
+        self.gradient, self.variance = self.gradient[uncertain], self.variance[uncertain]
         self.reference = np.diag(self._quantities(self.covariance)).copy()
         self.numbers = np.arange(len(self.rows)) if self.numbers is None else self.numbers
         # Candidates last, as prospects have them: the wide products then need no copy.
         self.columns = np.ascontiguousarray(self.rows.transpose(2, 1, 0)).reshape(self.rows.shape[2], -1)
 
     def _quantities(self, covariance: np.ndarray) -> np.ndarray:
-        return self.gradient @ covariance @ self.gradient.T + np.diag(self.own)
+        return self.gradient @ covariance @ self.gradient.T + np.diag(self.variance)
 
     def _prospects(self, covariance: np.ndarray) -> _Prospects:
         count, components, columns = self.rows.shape

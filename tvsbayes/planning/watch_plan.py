@@ -165,11 +165,11 @@ class WatchDesigns:
     def _learn(self, linear: LinearSpots, first: int, places: list[int]) -> None:
         """What the first day knows, and what every candidate (its row) would show, stop errors integrated out."""
         errors = linear.places.shape[2]
-        self.own = len(NAMES)
+        self.parameters = len(NAMES)
         spelled = linear.spelled_out(linear.places)
         shifts = columns_of(self.changes)[-1].stop
         fisher = stop_information(rows_of(spelled, slice(first))).fisher
-        keep = np.r_[: self.own, self.own + shifts : self.own + shifts + errors]
+        keep = np.r_[: self.parameters, self.parameters + shifts : self.parameters + shifts + errors]
         self.known = fisher[np.ix_(keep, keep)] + np.eye(len(keep))
         shown = []
         for one, row in zip(self.candidates, places, strict=True):
@@ -179,7 +179,7 @@ class WatchDesigns:
             kept = columns[:, keep].copy()
             # The path since homing is short in these plans: the contrast is left to the first day.
             kept[:, [INDEX[f"ratio_contrast_deg_per_step.{axis}"] for axis in AXES]] = 0.0
-            whole = np.concatenate([kept, columns[:, self.own : self.own + shifts], slope], axis=1)
+            whole = np.concatenate([kept, columns[:, self.parameters : self.parameters + shifts], slope], axis=1)
             root = np.linalg.cholesky(np.eye(4) + slope @ np.diag(variance) @ slope.T)
             shown.append(np.linalg.solve(root, whole))
         rows = np.array(shown)
