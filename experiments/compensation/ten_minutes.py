@@ -134,8 +134,8 @@ tvsbayes compensate mount --to pec -o worm.csv
 
 The table holds the strongest wave and those of a half, a third ... an eighth of its period, over one period in the
 middle of the log; `--period` takes another. Its phase counts from command 0 of `moves.csv`: shift it to the index of
-the worm. The promise is of errors off the drive's own line within one period; the walk of the zero is in it. `verify`
-needs stops: of a mount log again with the table in force, and `fit` says which wave is left.
+the worm. The promise is of errors off the drive's own line within a period of its slowest wave; walk and creep of the
+zero are in it. `verify` needs stops: of a mount log again with the table in force, and `fit` says which wave is left.
 """
 
 if __name__ == "__main__":

@@ -60,7 +60,7 @@ def stated(made: Compensation, origin: Origin) -> list[str]:
         before = f"{left.without95:.3g} without"
         lines.append(f"promise, arriving {side}: 95 % of errors at most {left.error95:.3g} {unit} ({before})")
     if made.in_motion:
-        lines.append("within one period, off the drive's own line, but for one shift")
+        lines.append(f"within {number(made.travel_command, 6)} commands, off the drive's own line, but for one shift")
     else:
         lines += [
             f"within {made.hours:.3g} h and {number(made.travel_command, 4)} commands of travel since homing",

@@ -2,8 +2,8 @@
 
 A drive that tracks never stops and never turns back: a controller can take out what repeats with a turn of its worm.
 The table is the expected wave over one period in the middle of the record, where its phase is known best. The promise
-is of errors off the drive's own line within one period, but for one shift. Commands as the campaign counts them, the
-rest in its unit. No JAX.
+is of errors off the drive's own line, but for one shift, within a period of its slowest wave. Commands as the campaign
+counts them, the rest in its unit. No JAX.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
 
 NODES = 129
 """Of the table, both ends of the period included."""
-DRAWS, TRIED = 200, 400
-"""Draws of the waves, and commands of the record, over which the promise is taken."""
+DRAWS, TRIED, TRIED_MAX = 200, 24, 4000
+"""Draws over which the promise is taken, and commands of a period; of the record at most."""
 HARMONICS = 8
 """Parts of a period that a table holds: waves of P, P/2 ... P/8."""
 SLIP_TURNS = 0.25
@@ -77,6 +77,28 @@ def _waves(fit: AxisFit, samples: Sequence[WaveSample], command: np.ndarray) -> 
     return total
 
 
+def _creep(fit: AxisFit, values: dict[str, np.ndarray], drawn: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """Of the zero while the drive warms up, at commands (m,): shape (`DRAWS`, m), zero where there is none."""
+    if "creep" not in fit.draws:
+        return np.zeros((DRAWS, len(command)))
+    rows = fit.rows
+    order = np.argsort(rows.command)
+    minutes = np.interp(command, rows.command[order], rows.warm_s[order]) / 60.0
+    return fit.draws["creep"][drawn, None] * -np.expm1(-minutes / values["creep_minutes"][:, None])
+
+
+def _off_their_mean(errors: np.ndarray, spans: int) -> np.ndarray:
+    """Errors (n, m) of so many spans, less the mean of each: a shift is none of the table's errors."""
+    each = errors.reshape(len(errors), spans, -1)
+    return (each - each.mean(axis=-1, keepdims=True)).reshape(errors.shape)
+
+
+def _span(period: float, record: float, waves: Sequence[float]) -> float:
+    """Commands within which the promise is: whole periods as long as the slowest wave, where the record has them."""
+    count = max(1, round(max(waves) / period + 0.25))
+    return period * min(count, int(record / period))
+
+
 def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
     """The table of one period and its promise.
 
@@ -114,12 +136,17 @@ def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
     wave = _waves(fit, kept, command)
     added = -wave.mean(axis=0) / slope
     correction = Correction(command, added, added, wish.resolution)
-    tried = np.linspace(low, high, TRIED)
-    before = _waves(fit, every, tried)
+    drawn = np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)
+    values = fit.model.coordinates.values(fit.w[drawn])
+    span = _span(period, high - low, [commands_of(fit, sample) for sample in every])
+    spans = int((high - low) / span)
+    each = max(4, min(TRIED * round(span / period), TRIED_MAX // spans))
+    tried = low + span * np.arange(spans).repeat(each) + span * np.tile((np.arange(each) + 0.5) / each, spans)
     phase = begins + (tried - begins) % period
-    after = before + slope * (correction.sent(phase, np.zeros(TRIED)) - phase)
-    values = fit.model.coordinates.values(fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)])
-    hours = period / abs(rows.rate or 1.0) / HOUR_S
+    sent = slope * (correction.sent(phase, np.zeros(len(phase))) - phase)
+    without = _waves(fit, every, tried) + _creep(fit, values, drawn, tried)
+    before, after = (_off_their_mean(errors, spans) for errors in (without, without + sent))
+    hours = span / abs(rows.rate or 1.0) / HOUR_S
     # A random walk of variance s^2 t scatters by s^2 T / 6 about its own mean within T.
     drift = values["drift_per_root_hour"] * np.sqrt(hours / 6.0)
     reading = values["reading_scale"] * rows.reading_u
@@ -139,7 +166,7 @@ def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
         resolution=wish.resolution,
         reversal_command=0.0,
         hours=hours,
-        travel_command=period,
+        travel_command=span,
         homings=len(np.unique(rows.segment)),
         table=tuple(TableRow(*map(float, row)) for row in zip(*columns, strict=True)),
         settings={"period_command": period},

@@ -121,10 +121,8 @@ def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
 def _where(made: Compensation) -> list[str]:
     """For which errors the promise is."""
     if made.in_motion:
-        period = made.travel_command
-        return [
-            f"the promise holds within one period of {period:.6g} commands, off the drive's own line, but for a shift"
-        ]
+        travel = f"{made.travel_command:.6g}"
+        return [f"the promise holds within {travel} commands, off the drive's own line, but for one shift"]
     return [
         f"the promise holds between these commands, within {two_digits(made.hours)} h and {made.travel_command:.4g} "
         "commands of travel since homing",

@@ -1,0 +1,104 @@
+"""Is the promise of a period's table kept by drives at constant rate?
+
+    python -m experiments.compensation.periodic_drives run --n 100 --cores 0 1     # 6 CPU s a drive
+    python -m experiments.compensation.periodic_drives table > experiments/compensation/periodic_drives.md
+
+Drives are drawn and read as those of `experiments.intervals.axis_in_time`, half of them with a wave, whose period is
+not known beforehand. Where the fit is accepted and knows a wave, its table is applied to the true wave and creep at
+40 times of one span of the promise, drawn somewhere in the record, with a walk of the zero, seeing and noise drawn
+anew; errors are off the true line of the drive, but for their mean.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+
+from experiments.common.command_line import act, study_parser
+from experiments.common.rows import commit, output, read_rows, run_rows
+from experiments.intervals.axis_in_time import template
+from tvsbayes.compensation.correction import Correction
+from tvsbayes.compensation.formats import Wish
+from tvsbayes.compensation.promise import compensation_of
+from tvsbayes.errors import TvsError
+from tvsbayes.results.compensation_record import Compensation
+from tvsbayes.single_axis.axis_record import results_for
+from tvsbayes.statistics.chances import binomial_bounds
+from tvsbayes.twin.simulated_axis import SimulatedAxis, drive_of, simulate_axis
+
+ROWS = output(__file__, "periodic_drives.jsonl")
+READINGS = 40
+
+
+def errors_of(made: SimulatedAxis, table: Compensation | None, span: float, seed: int) -> np.ndarray:
+    """Errors (40,) within one span of commands, under a table or without one."""
+    rng, campaign = np.random.default_rng([seed, 6]), made.campaign
+    rate, move = float(campaign.rate or 1.0), campaign.moves[0]
+    first, last = (float(f([r.time_s for r in campaign.readings])) for f in (np.min, np.max))
+    begins = rng.uniform(first, max(first, last - span / rate))
+    time_s = np.sort(rng.uniform(begins, begins + span / rate, READINGS))
+    command = rate * time_s
+    true = made.truth.parameters
+    # The walk up to the span is a shift: it begins with the span, creep and waves keep their own clocks.
+    still = replace(made.truth, parameters={**true, "drift_per_root_hour": 0.0, "seeing_scale": 0.0})
+    stands = drive_of(still, move, rate, time_s, rng) - true["per_command"] * command
+    walk = np.cumsum(
+        true["drift_per_root_hour"] * np.sqrt(np.diff(time_s, prepend=begins) / 3600.0) * rng.standard_normal(READINGS)
+    )
+    noise = true["reading_u"] * np.hypot(true["reading_scale"], true["seeing_scale"]) * rng.standard_normal(READINGS)
+    errors = stands + walk + noise
+    if table is not None:
+        start = table.table[0].command
+        phase = start + (command - start) % table.settings["period_command"]
+        errors = errors + table.per_command * (Correction.of(table).sent(phase, np.zeros(READINGS)) - phase)
+    return errors - errors.mean()
+
+
+def one_drive(task: tuple[int]) -> dict[str, object]:
+    """Draw, read, fit and compensate one drive."""
+    (seed,) = task
+    made = simulate_axis(template("drive", seed), seed=seed)
+    row: dict[str, object] = {"seed": seed, "commit": commit(), "there": any(w.amplitude > 0 for w in made.truth.waves)}
+    try:
+        table = compensation_of(results_for(made.campaign, seed=seed), Wish("pec"), seed=seed)
+    except TvsError as error:
+        return {**row, "refused": error.message}
+    promise, span = table.promise["forward"], table.travel_command
+    after, before = (errors_of(made, by, span, seed) for by in (table, None))
+    row |= {"promised": promise.error95, "inside": int(np.sum(np.abs(after) <= promise.error95))}
+    row |= {"without_promised": promise.without95, "without": int(np.sum(np.abs(before) <= promise.without95))}
+    return {**row, "rms": [float(np.sqrt(np.mean(e**2))) for e in (before, after)]}
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Rows of drawn drives."""
+    run_rows(one_drive, [(seed,) for seed in range(arguments.n)], arguments.rows, ("seed",), arguments.cores)
+
+
+def table(arguments: argparse.Namespace) -> None:
+    """The page."""
+    rows = read_rows(arguments.rows)
+    made = [row for row in rows if "promised" in row]
+    there = [row for row in rows if row["there"]]
+    commits = ", ".join(dict.fromkeys(str(row["commit"]) for row in rows))
+    print("# Tables of one period, of drives at constant rate\n")
+    print(f"Made by `python -m experiments.compensation.periodic_drives`, commit {commits}. Errors in arcsec.\n")
+    kept = sum(row["there"] for row in made)
+    print(
+        f"{len(rows)} drives, {len(there)} with a wave: {kept} of these got a table, {len(made) - kept} of the others."
+    )
+    low, high = (100 * bound for bound in binomial_bounds(len(made), 0.95))
+    print(f"Bounds of a share over {len(made)} independent readings: {low:.0f} to {high:.0f} %; the {READINGS}")
+    print("readings of a drive share its wave and walk.\n")
+    print("| | without | with the table |\n|---|---|---|")
+    cells = [f"{100 * sum(row[k] for row in made) / (READINGS * len(made)):.1f} %" for k in ("without", "inside")]
+    print(f"| within the promise | {' | '.join(cells)} |")
+    rms = np.array([row["rms"] for row in made])
+    print(f"| median RMS | {np.median(rms[:, 0]):.2f} | {np.median(rms[:, 1]):.2f} |")
+    print(f"| drives with less error | | {int(np.sum(rms[:, 1] < rms[:, 0]))} of {len(made)} |")
+
+
+if __name__ == "__main__":
+    act(study_parser(__doc__, ROWS, 100), run=run, table=table)
