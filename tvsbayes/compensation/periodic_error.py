@@ -149,7 +149,7 @@ def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
     hours = span / abs(rows.rate or 1.0) / HOUR_S
     # A random walk of variance s^2 t scatters by s^2 T / 6 about its own mean within T.
     drift = values["drift_per_root_hour"] * np.sqrt(hours / 6.0)
-    reading = values["reading_scale"] * rows.reading_u
+    reading = np.hypot(values["reading_scale"], values["seeing_scale"]) * rows.reading_u
     promise = _promise(before, after, drift, reading)
     expected = offset + slope * command + wave.mean(axis=0)
     u = np.sqrt(wave.var(axis=0) + np.mean(drift**2 + reading**2))
