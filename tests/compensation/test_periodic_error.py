@@ -50,9 +50,9 @@ def test_the_table_takes_off_the_wave_within_the_promise():
     # 95 % of a wave's errors: the table's cause is the bound of its own error alone.
     assert np.quantile(np.abs(left), 0.95) <= promise.causes["table"] + promise.causes["format"]
     assert np.std(left) < 0.1 * np.std(before)
-    # Noise of 0.3 adds to a wave whose 95 % lie within 3.5.
     assert promise.error95 < 0.4 * promise.without95
-    assert promise.without95 == pytest.approx(float(np.quantile(np.abs(before), 0.95)), rel=0.1)
+    # Beside the wave stand noise of 0.3, seeing, walk and creep of the zero.
+    assert promise.without95 == pytest.approx(float(np.quantile(np.abs(before), 0.95)), rel=0.2)
 
 
 def test_a_part_of_the_period_is_folded_alone_and_another_period_refused():
