@@ -3,8 +3,7 @@
     python -m experiments.compensation.periodic_drives run --n 100 --cores 0 1     # 6 CPU s a drive
     python -m experiments.compensation.periodic_drives table > experiments/compensation/periodic_drives.md
 
-Drives are drawn and read as those of `experiments.intervals.axis_in_time`, half of them with a wave, whose period is
-not known beforehand. Where the fit is accepted and knows a wave, its table is applied to the true wave and creep at
+Drives are drawn from their priors, half of them with a wave, whose period is not known beforehand. Where the fit is accepted and knows a wave, its table is applied to the true wave and creep at
 40 times of one span of the promise, drawn somewhere in the record, with a walk of the zero, seeing and noise drawn
 anew; errors are off the true line of the drive, but for their mean.
 """
@@ -18,18 +17,34 @@ import numpy as np
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.rows import commit, output, read_rows, run_rows
-from experiments.intervals.axis_in_time import template
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
 from tvsbayes.compensation.promise import compensation_of
 from tvsbayes.errors import TvsError
 from tvsbayes.results.compensation_record import Compensation
+from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
+from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import results_for
+from tvsbayes.single_axis.waves import AskedPeriods
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_axis import SimulatedAxis, drive_of, simulate_axis
 
 ROWS = output(__file__, "periodic_drives.jsonl")
 READINGS = 40
+RATE, RECORD_S, LOGGED = 15.0, 1600.0, 400
+
+
+def template(seed: int) -> AxisCampaign:
+    """A log of 400 readings in 1600 s with seeing, and a period of 60 to 600 s that is looked for."""
+    times = np.sort(np.random.default_rng([seed, 99]).uniform(0.0, RECORD_S, LOGGED))
+    readings = tuple(Reading(k, 0, RATE * float(t), 0.5, "ok", float(t)) for k, t in enumerate(times))
+    stated = {
+        "per_command": AxisPrior(1.0, 1e-3),
+        "transmission_error": AxisPrior(0.0, 5.0),
+        "reading_scale": AxisPrior(1.0, 0.0),
+    }
+    asked = AskedPeriods((), ((60.0, 600.0),), True)
+    return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": RATE}, asked)
 
 
 def errors_of(made: SimulatedAxis, table: Compensation | None, span: float, seed: int) -> np.ndarray:
@@ -59,7 +74,7 @@ def errors_of(made: SimulatedAxis, table: Compensation | None, span: float, seed
 def one_drive(task: tuple[int]) -> dict[str, object]:
     """Draw, read, fit and compensate one drive."""
     (seed,) = task
-    made = simulate_axis(template("drive", seed), seed=seed)
+    made = simulate_axis(template(seed), seed=seed)
     row: dict[str, object] = {"seed": seed, "commit": commit(), "there": any(w.amplitude > 0 for w in made.truth.waves)}
     try:
         table = compensation_of(results_for(made.campaign, seed=seed), Wish("pec"), seed=seed)
