@@ -18,7 +18,7 @@ from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.results.compensation_record import CAUSES, Compensation, SidePromise, TableRow
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_periods import WaveSample, wave_samples
-from tvsbayes.single_axis.axis_rows import HOUR_S
+from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows
 from tvsbayes.single_axis.waves import wave_columns
 from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
 
@@ -40,24 +40,21 @@ def known_waves(fit: AxisFit) -> list[WaveSample]:
     return sorted(likely, key=lambda each: -float(each.amplitude.mean()))
 
 
-def commands_of(fit: AxisFit, sample: WaveSample) -> float:
+def commands_of(rows: AxisRows, sample: WaveSample) -> float:
     """Period of a wave in commands, mean."""
-    per_command = fit.rows.rate if sample.wave.clock == "seconds" else fit.rows.line[1]
     period = float(np.mean(sample.period[sample.likeliest]))
-    return period * abs(per_command or 0.0) if sample.wave.clock == "seconds" else period / abs(per_command or 1.0)
+    return period * abs(rows.rate or 0.0) if sample.wave.clock == "seconds" else period / abs(rows.line[1])
 
 
-def period_of(fit: AxisFit, wanted: float | None) -> float:
-    """Period of a table, in commands: what is wanted, else that of the strongest wave.
+def strongest_period(rows: AxisRows, waves: Sequence[WaveSample]) -> float:
+    """Of the strongest wave that repeats with the command, in commands; `waves` as `known_waves` has them.
 
     Raises:
-        InputError: nothing is wanted, and no wave is known that repeats with the command.
+        InputError: there is none.
     """
-    if wanted is not None:
-        return wanted
-    for sample in known_waves(fit):
-        if fit.rows.in_motion or sample.wave.clock == "position":
-            return commands_of(fit, sample)
+    for sample in waves:
+        if rows.in_motion or sample.wave.clock == "position":
+            return commands_of(rows, sample)
     message = "--to pec needs a period, and the fit knows no wave of the gear"
     remedy = "add --period, in commands; or ask for one by `periods` or `period_between` in [axis], and fit again"
     raise InputError("usage", message, remedy=remedy)
@@ -111,16 +108,16 @@ def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
         message = f"--to {wish.target}: the readings are of a drive at constant rate, which never stops nor turns back"
         raise InputError("usage", message, allowed="--to pec", remedy="read stops from both sides for other formats")
     rows, campaign = fit.rows, fit.campaign
-    period = period_of(fit, wish.period)
+    every = known_waves(fit)
+    period = strongest_period(rows, every) if wish.period is None else wish.period
     low, high = float(rows.command.min()), float(rows.command.max())
     if not 0 < period <= high - low:
         message = f"--period {period:g}: the record is {high - low:g} commands long"
         raise InputError("usage", message, allowed="a whole period in the record", remedy="log a longer run")
-    every = known_waves(fit)
     turns = (high - low) / period
-    kept = []
-    for sample in every:
-        ratio = period / commands_of(fit, sample)
+    kept, lengths = [], [commands_of(rows, sample) for sample in every]
+    for sample, length in zip(every, lengths, strict=True):
+        ratio = period / length
         if 1 <= round(ratio) <= HARMONICS and abs(ratio - round(ratio)) * turns <= SLIP_TURNS:
             kept.append(sample)
     if not kept:
@@ -138,7 +135,7 @@ def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
     correction = Correction(command, added, added, wish.resolution)
     drawn = np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)
     values = fit.model.coordinates.values(fit.w[drawn])
-    span = _span(period, high - low, [commands_of(fit, sample) for sample in every])
+    span = _span(period, high - low, lengths)
     spans = int((high - low) / span)
     each = max(4, min(TRIED * round(span / period), TRIED_MAX // spans))
     tried = low + span * np.arange(spans).repeat(each) + span * np.tile((np.arange(each) + 0.5) / each, spans)

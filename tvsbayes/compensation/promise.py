@@ -18,7 +18,7 @@ from msgspec import structs
 
 from tvsbayes.compensation.correction import Correction, Cycles, cycles
 from tvsbayes.compensation.formats import FORMATS, LINUXCNC_DECIMALS, Format, Origin, Wish, checked, number
-from tvsbayes.compensation.periodic_error import drive_compensation, period_of
+from tvsbayes.compensation.periodic_error import drive_compensation, known_waves, strongest_period
 from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.compensation_record import Compensation, SidePromise, TableRow
@@ -307,8 +307,8 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
     draws = fit.draws["effective_per_command"]
     fitted = float(draws.mean())
     form = checked(wish)
-    if form.holds == "period":
-        wish = replace(wish, period=period_of(fit, wish.period))
+    if form.holds == "period" and wish.period is None:
+        wish = replace(wish, period=strongest_period(rows, known_waves(fit)))
     if wish.per_command is not None and not (np.isfinite(wish.per_command) and wish.per_command * fitted > 0):
         message = f"--per-command {wish.per_command:g}: the readings go by {fitted:.6g} per command"
         raise InputError("usage", message, remedy="give the nominal ratio with the sign of the readings")

@@ -32,7 +32,7 @@ BAD = {
     *("non", "mauvais", "mauvaise", "invalide"),
 }
 """Words of a status, in small letters without accents."""
-WORDS_TOLD = 5
+WORDS_SHOWN = 5
 """Of those that leave rows out."""
 NO_NUMBER = {"nan", "n/a", "#n/a", "null"}
 """What programs write into a cell that has no number, in small letters."""
@@ -264,8 +264,8 @@ def left_out(cells: FieldCells, statuses: Iterable[str], what: str) -> list[str]
     counts = Counter(escaped(text, 24) for text in statuses if text.strip() and word_of(text) not in GOOD)
     if not counts:
         return []
-    common = [f"{text} {count}" for text, count in counts.most_common(WORDS_TOLD)]
-    named = ", ".join(common) + " ..." * (len(counts) > WORDS_TOLD)
+    common = [f"{text} {count}" for text, count in counts.most_common(WORDS_SHOWN)]
+    named = ", ".join(common) + " ..." * (len(counts) > WORDS_SHOWN)
     count = sum(counts.values())
     return [
         f"status: {count} {what}{'s' * (count != 1)} left out by column {escaped(cells.columns['status'])}: {named}"
