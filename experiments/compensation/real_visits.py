@@ -8,7 +8,9 @@ every reading left out the error is counted: as it is, from the nominal line thr
 taking off one constant play; the mean of the others at its command and side; what the table of `compensate` expects
 there, which is for a machine that was homed anew; the same with the zero of the others, as the constant play has it,
 since nothing was homed here; and what the fit expects at its own time, the walk of the zero followed. `home_sd` is 0; a
-zero that warms up is no matter of a table.
+zero that warms up is no matter of a table. The places of the rotary axis were read one after the other, so that place,
+time and travel are one to the data. Its last row states what is known of a train of gears in a steady room: teeth keep
+step (`ratio_contrast` 0, u 0), and the zero does not creep (`creep` 0, u 0).
 """
 
 from __future__ import annotations
@@ -34,6 +36,8 @@ from tvsbayes.single_axis.predicted_stops import DRAWS, carried_scales
 
 COUNTS_PER_DEG = -22466.7
 """Of the encoder by the least-squares line through all stops: readings in degrees of the axis."""
+STEADY = {name: AxisPrior(0.0, 0.0) for name in ("ratio_contrast", "creep")}
+"""Of gears whose teeth keep step, in a steady room."""
 REVERSAL_DEG = 0.45
 """How far beyond a place the axis went before it came back to it."""
 
@@ -140,7 +144,10 @@ def main() -> None:
     print("|" + "---|" * 10)
     for table in tables_of(arguments.axes):
         print(row_of(table.stem, "um", *linear_axis(table)), flush=True)
-    print(row_of("rotary", "mdeg", *rotary_axis(arguments.rotary)), flush=True)
+    rotary, visits = rotary_axis(arguments.rotary)
+    print(row_of("rotary", "mdeg", rotary, visits), flush=True)
+    steady = replace(rotary, stated={**rotary.stated, **STEADY})
+    print(row_of("rotary, steady", "mdeg", steady, visits), flush=True)
 
 
 if __name__ == "__main__":

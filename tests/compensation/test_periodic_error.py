@@ -65,9 +65,11 @@ def test_a_part_of_the_period_is_folded_alone_and_another_period_refused():
         compensation_of(results(), Wish("pec", period=7 * PERIOD))
 
 
-def test_other_formats_need_stops():
+def test_other_formats_need_stops_and_a_rate_is_not_in_the_table():
     with pytest.raises(InputError, match="drive at constant rate"):
         compensation_of(results(), Wish("csv"))
+    with pytest.raises(InputError, match="not its rate"):
+        compensation_of(results(), Wish("pec", per_command=1.0))
 
 
 def test_the_file_repeats_and_says_how_to_see_what_is_left():

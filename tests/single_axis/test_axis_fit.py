@@ -114,8 +114,20 @@ def test_a_reversal_of_the_wrong_sign_is_said():
     assert any("negative" in text for text in summary.warnings)
 
 
-def test_a_constant_unit_is_held():
-    made = drawn(2, None, per_command=AxisPrior(0.01, 0.0)).campaign
+@pytest.mark.parametrize("name, value", [("per_command", 0.01), ("ratio_contrast", 2e-6)])
+def test_a_constant_is_held(name, value):
+    made = drawn(2, None, **{name: AxisPrior(value, 0.0)}).campaign
     found = fit_axis(AxisCampaign("deg", made.moves, made.readings, made.stated), tier="importance")
     # What rounding leaves of a variance that is zero.
-    assert np.ptp(found.draws["per_command"]) < 1e-10
+    np.testing.assert_allclose(found.draws[name], value, atol=1e-10)
+
+
+def test_places_read_one_after_the_other_are_weak():
+    """Place and time are one: said, until gears that keep step and a warm machine are stated."""
+    commands = [c + beside for c in (0.0, 1000.0, 2000.0, 3000.0) for beside in (-300.0, 0.0, 300.0, 0.0) * 2]
+    moves = [AxisMove(k, 0, 120.0 * k, c, "" if k else "forward") for k, c in enumerate(commands)]
+    values = [0.01 * m.command + 0.003 * (k % 3) for k, m in enumerate(moves)]
+    steady = {"ratio_contrast": AxisPrior(0.0, 0.0), "creep": AxisPrior(0.0, 0.0)}
+    for stated, weak in (({}, True), (steady, False)):
+        summary = summarise_axis(fit_axis(campaign(moves, values, 0.001, **stated), sampled=False))
+        assert any("one after the other" in text for text in summary.weak_directions) is weak

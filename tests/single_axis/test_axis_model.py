@@ -9,14 +9,14 @@ from support.axes import FIRST_EDITION, campaign, drawn, random_moves, runs
 from tvsbayes.single_axis import axis_model, process_places
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_fit import model_of
-from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE
+from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_rows import play_places
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
 
 
 def a_campaign(seed: int = 1) -> AxisCampaign:
-    """Short legs, stops held, two homings, readings with u."""
-    return drawn(seed, random_moves(seed, 36, 3)).campaign
+    """Short legs, stops held, two homings, readings with u, a contrast of the directions that is not about 0."""
+    return drawn(seed, random_moves(seed, 36, 3), ratio_contrast=AxisPrior(3e-6, 1e-6)).campaign
 
 
 def dense(model, w):
@@ -44,13 +44,15 @@ def dense(model, w):
     total += np.diag(at["reading_scale"] ** 2 * rows.variance + (axis_model.FLOOR * rows.travel) ** 2)
     g = anchor - model.middle
     total += rows.travel**2 * axis_model.OFFSET_TRAVELS**2 + model.priors["per_command"].u ** 2 * np.outer(g, g)
-    total += (CONTRAST_SHARE * slope) ** 2 * np.outer(path, path) / 4
+    contrast = model.priors["ratio_contrast"]
+    total += contrast.u**2 * np.outer(path, path) / 4
     if not sampled:
         total += model.priors["backlash"].u ** 2 * np.outer(side, side) / 4
     if "creep" in model.shifts:
         warmed = 1 - np.exp(-rows.time_s / 60 / at["creep_minutes"])
         total += model.priors["creep"].u ** 2 * np.outer(warmed, warmed)
     residual = rows.value - rows.line[0] - slope * model.middle - model.priors["per_command"].value * g
+    residual = residual - 0.5 * contrast.value * path
     return total, residual - (0.5 * side * at["backlash"] if sampled else 0.0)
 
 

@@ -25,10 +25,11 @@ def test_coordinates_have_the_quantiles_of_their_priors():
 def test_defaults_grow_with_the_travel():
     small, large = axis_priors({}, 1.0, 0.5), axis_priors({}, 10.0, 0.5)
     for name in small:
-        if name not in ("per_command", "reading_scale", "creep_minutes", "seeing_scale", "seeing_s"):
+        if name not in ("per_command", "ratio_contrast", "reading_scale", "creep_minutes", "seeing_scale", "seeing_s"):
             grown = (large[name].value or large[name].u) / (small[name].value or small[name].u)
             assert grown == pytest.approx(10.0), name
     assert small["per_command"] == AxisPrior(0.5, 0.5)
+    assert small["ratio_contrast"] == AxisPrior(0.0, 5e-5)
 
 
 def test_sds_of_priors():

@@ -100,13 +100,17 @@ def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
     """The table of one period and its promise.
 
     Raises:
-        InputError: the format holds no period, no wave is known, or the period is longer than the record.
+        InputError: the format holds no period, a ratio is given, no wave is known, or the period is longer than the
+            record.
         NothingToEstimate: no known wave repeats with the period.
     """
     form = FORMATS[wish.target]
     if form.holds != "period":
         message = f"--to {wish.target}: the readings are of a drive at constant rate, which never stops nor turns back"
         raise InputError("usage", message, allowed="--to pec", remedy="read stops from both sides for other formats")
+    if wish.per_command is not None:
+        message = f"--per-command {wish.per_command:g}: a table of a drive holds its waves, not its rate"
+        raise InputError("usage", message, remedy="leave it out; correct the rate in the controller")
     rows, campaign = fit.rows, fit.campaign
     every = known_waves(fit)
     period = strongest_period(rows, every) if wish.period is None else wish.period

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, AxisCoordinates, AxisPrior
+from tvsbayes.single_axis.axis_parameters import AxisCoordinates, AxisPrior
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_are_long, play_places, reversal_of
 from tvsbayes.single_axis.filter_of_rows import averaged_variance, whitened
 from tvsbayes.single_axis.process_places import ProcessPlaces, process_places
@@ -263,6 +263,7 @@ class AxisModel:
         level = rows.line[0] + rows.line[1] * self.middle
         anchor = play.anchor - self.middle
         filled[:, :, 0] = rows.value - level - self.priors["per_command"].value * anchor
+        filled[:, :, 0] -= 0.5 * self.priors["ratio_contrast"].value * play.path
         filled[:, :, 0] -= 0.5 * play.side * backlash[:blocks, None]
         filled[:, :, 1 + OFFSET], filled[:, :, 1 + SLOPE], filled[:, :, 1 + CONTRAST] = 1.0, anchor, 0.5 * play.path
         filled[:, :, 1 + BACKLASH] = 0.5 * play.side
@@ -339,7 +340,7 @@ class AxisModel:
         slope = abs(self.rows.line[1])
         factor[:, OFFSET, OFFSET] = OFFSET_TRAVELS * self.rows.travel
         factor[:, SLOPE, SLOPE] = self.priors["per_command"].u
-        factor[:, CONTRAST, CONTRAST] = CONTRAST_SHARE * slope
+        factor[:, CONTRAST, CONTRAST] = self.priors["ratio_contrast"].u
         factor[:, BACKLASH, BACKLASH] = 0.0 if self.play_is_sampled else self.priors["backlash"].u
         homes = HEAD + np.arange(len(self.homed))
         factor[:, homes, homes] = values["home_sd"][:, None]
@@ -425,6 +426,7 @@ class AxisModel:
         means = np.zeros((len(w), self.columns))
         means[:, OFFSET] = self.rows.line[0] + self.rows.line[1] * self.middle
         means[:, SLOPE] = self.priors["per_command"].value
+        means[:, CONTRAST] = self.priors["ratio_contrast"].value
         means[:, BACKLASH] = self.coordinates.values(w)["backlash"]
         for k, name in enumerate(self.shifts, start=HEAD + len(self.homed) + len(self.unknown_segments)):
             means[:, k] = self.priors[name].value

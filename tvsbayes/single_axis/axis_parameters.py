@@ -53,7 +53,7 @@ def _key(
 _SIDES, _PER_COMMAND = ("forward", "backward"), "{unit} per command"
 AXIS_QUANTITIES: Quantities[Quantity] = Quantities(
     _key("per_command", "normal", None, 1.0, "unit per command", _PER_COMMAND, target="per_command"),
-    *Quantity.many("ratio_contrast", (), unit=_PER_COMMAND, label="forward less backward"),
+    _key("ratio_contrast", "normal", None, 0.0, "forward less backward", _PER_COMMAND),
     *Quantity.many("per_command", _SIDES, unit=_PER_COMMAND, headline=True),
     *Quantity.many("effective_per_command", (), unit=_PER_COMMAND, target="effective_per_command"),
     _key("backlash", "normal", 0.05, 0.0, "play lost in a reversal", headline=True, target="backlash"),
@@ -109,6 +109,8 @@ def axis_priors(
     for name, key in AXIS_KEYS.items():
         if name == "per_command":
             default = AxisPrior(per_command, abs(per_command) + 2 * u_per_command)
+        elif name == "ratio_contrast":
+            default = AxisPrior(0.0, CONTRAST_SHARE * abs(per_command))
         elif key.share is None:
             default = AxisPrior(key.median, key.u)
         elif key.kind == "log-normal":

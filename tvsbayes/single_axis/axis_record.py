@@ -36,7 +36,7 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
 from tvsbayes.single_axis.axis_density import FUNCTIONALS, blocks_of, line_weights
 from tvsbayes.single_axis.axis_doubts import axis_warnings
 from tvsbayes.single_axis.axis_fit import AxisFit, conflict_text, fit_axis, model_of
-from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_SHARE, kind_of, prior_sd
+from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, kind_of, prior_sd
 from tvsbayes.single_axis.axis_periods import period_estimate, wave_samples, waves_at_an_end, weak_waves
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
@@ -175,12 +175,11 @@ def _prior_sds(fit: AxisFit) -> dict[str, float]:
     priors = fit.model.priors
     sampled = [name for name in fit.free if not name.startswith("wave_")]
     sds = {name: prior_sd(kind_of(name), priors[name.split(".")[0]]) for name in (*sampled, *fit.model.shifts)}
-    contrast = CONTRAST_SHARE * abs(fit.rows.line[1])
-    side = float(np.hypot(priors["per_command"].u, 0.5 * contrast))
+    side = float(np.hypot(priors["per_command"].u, 0.5 * priors["ratio_contrast"].u))
     return sds | {
         "per_command": priors["per_command"].u,
         "backlash": priors["backlash"].u,
-        "ratio_contrast": contrast,
+        "ratio_contrast": priors["ratio_contrast"].u,
         "per_command.forward": side,
         "per_command.backward": side,
     }
@@ -353,9 +352,20 @@ CREEP_SHARE = 0.5
 """Correlation with the creep from which the contrast of the directions, or the play, is said to be weak."""
 
 
+ORDER_SHARE = 0.9
+"""Correlation of commands and travel from which the places are said to have been read one after the other."""
+
+
 def _weak_in_time(fit: AxisFit) -> list[str]:
     """What a shift of the zero in time cannot be told from."""
-    sentences = []
+    rows, sentences = fit.rows, []
+    in_turn = rows.both_sides and abs(np.corrcoef(rows.command, rows.path)[0, 1]) > ORDER_SHARE
+    if in_turn and (fit.model.priors["ratio_contrast"].u or "creep" in fit.model.shifts):
+        sentences.append(
+            "the places were read one after the other: errors by position, a creep of the zero and a contrast of the "
+            "directions are hardly separated: read them again in another order; of gears whose teeth keep step state "
+            "`ratio_contrast = { value = 0, u = 0 }` in [axis], of a warm machine `creep` likewise"
+        )
     for shift, cure in {
         "creep": "alternate the directions, come back to the first stop, wait until it is warm",
         "thermal_per_K": "come back to the first stop at another temperature",

@@ -18,7 +18,7 @@ from tvsbayes.display import Shown, View
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, write_axis
-from tvsbayes.single_axis.axis_parameters import CONTRAST_SHARE, AxisPrior, axis_priors, kind_of
+from tvsbayes.single_axis.axis_parameters import AxisPrior, axis_priors, kind_of
 from tvsbayes.single_axis.waves import SECOND, WANDER, AskedPeriods
 from tvsbayes.twin.gear_errors import kelvin_of, zero_shift
 
@@ -110,7 +110,7 @@ def _drawn(name: str, prior: AxisPrior, rng: np.random.Generator) -> float:
     normal = float(rng.standard_normal())
     if kind == "log-normal":
         return prior.value * float(np.exp(prior.u * normal))
-    if name in ("creep", "thermal_per_K"):
+    if name in ("ratio_contrast", "creep", "thermal_per_K"):
         return prior.value + prior.u * normal
     # True play is never negative, whatever a fit allows for.
     return abs(prior.value + prior.u * normal) if kind == "half-normal" or name == "backlash" else prior.value
@@ -146,7 +146,7 @@ def draw_axis(
     at = np.unique(np.asarray(commands, dtype=float))
     priors = axis_priors(stated, travel, per_command)
     names = [
-        *(name for name in priors if name not in ("per_command", "stop_sd", *IN_TIME)),
+        *(name for name in priors if name not in ("per_command", "ratio_contrast", "stop_sd", *IN_TIME)),
         "stop_sd.forward",
         "stop_sd.backward",
     ]
@@ -155,7 +155,7 @@ def draw_axis(
     [gear_rng] = rng.spawn(1)
     true |= {name: _drawn(name, priors[name], gear_rng) for name in IN_TIME}
     true["per_command"] = per_command
-    true["ratio_contrast"] = CONTRAST_SHARE * abs(per_command) * float(rng.standard_normal())
+    true["ratio_contrast"] = _drawn("ratio_contrast", priors["ratio_contrast"], rng)
     distance = abs(per_command) * (at[:, None] - at)
     length = max(true["transmission_error_length"], 1e-9 * travel)
     error = _curve(distance, length, true["transmission_error"], rng)
