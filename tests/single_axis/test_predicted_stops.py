@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import ndtri
+from support.axes import drawn, runs
 from support.compensated import driven, results, to_and_fro, true_axis
 
-from tvsbayes.single_axis.predicted_stops import predicted_stops
+from tvsbayes.single_axis.axis_fit import fit_axis
+from tvsbayes.single_axis.predicted_stops import DRAWS, predicted_stops
 
 
 def test_further_readings_lie_where_they_are_predicted():
@@ -38,3 +41,15 @@ def test_draws_have_the_moments_of_the_mixture_and_its_density():
     flat = 1e4 * np.ones((4, 4))
     shifts = found.log_density(mean, flat) - found.log_density(mean + 1.0, flat)
     assert shifts == pytest.approx(0.0, abs=1e-3)
+
+
+def test_the_scatter_of_homings_is_spread_evenly():
+    """Its draws are those of the fit at even ranks; of its prior where one homing was read."""
+    known, once = results().fit, fit_axis(drawn(1, runs(2)).campaign, tier="importance")
+    prior, at = once.model.priors["home_sd"], (np.arange(DRAWS) + 0.5) / DRAWS
+    of_prior = prior.value * np.exp(prior.u * ndtri(at))
+    of_fit = np.sort(known.draws["home_sd"])[(at * len(known.w)).astype(int)]
+    asked, read = to_and_fro(np.array([-5.0, 5.0]))
+    for fit, even in ((known, of_fit), (once, of_prior)):
+        scales = predicted_stops(fit, asked, read, np.full(4, 0.002)).scales
+        np.testing.assert_allclose(np.sort(scales["home_sd"]), even, rtol=1e-9)

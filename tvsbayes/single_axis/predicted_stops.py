@@ -72,10 +72,13 @@ def log_mean(logs: Sequence[float] | np.ndarray) -> float:
 def carried_scales(of: AxisModel, drawn: np.ndarray, into: AxisModel, rng: np.random.Generator) -> np.ndarray:
     """Coordinates (n, d) for a model of more rows, from draws (n, d) for one of fewer.
 
-    What the fewer rows do not hold, as the scatter of homings where there was one, has its prior; a backlash that was
-    linear there is drawn given the scales.
+    What the fewer rows do not hold, as the scatter of homings where there was one, has its prior, one draw of each of n
+    equal shares of it; a backlash that was linear there is drawn given the scales.
     """
-    w = rng.standard_normal((len(drawn), len(into.coordinates.names)))
+    from scipy.special import ndtri
+
+    shares = np.tile(np.arange(len(drawn)) + 0.5, (len(into.coordinates.names), 1)) / len(drawn)
+    w = ndtri(rng.permuted(shares, axis=1).T)
     for column, name in enumerate(into.coordinates.names):
         if name in of.coordinates.names:
             w[:, column] = drawn[:, of.coordinates.names.index(name)]
@@ -84,6 +87,13 @@ def carried_scales(of: AxisModel, drawn: np.ndarray, into: AxisModel, rng: np.ra
             prior = into.priors[name]
             w[:, column] = (values[:, 0] + sd[:, 0] * rng.standard_normal(len(drawn)) - prior.value) / prior.u
     return w
+
+
+def _spread_draws(fit: AxisFit) -> np.ndarray:
+    """So many equal draws (n, d) of a fit, even in the scatter of homings: few tell of its long tail by chance."""
+    names = fit.model.coordinates.names
+    order = np.argsort(fit.w[:, names.index("home_sd")]) if "home_sd" in names else np.arange(len(fit.w))
+    return fit.w[order[((np.arange(DRAWS) + 0.5) * len(order) / DRAWS).astype(int)]]
 
 
 def predicted_stops(
@@ -128,7 +138,6 @@ def predicted_stops(
     longer = replace(known, moves=(*known.moves, *joined), readings=(*known.readings, *readings))
     rows = replace(rows_of(longer), line=fit.rows.line)
     model = AxisModel.of(rows, fit.model.priors, None, fit.model.coordinates.waves)
-    drawn = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
-    w = carried_scales(fit.model, drawn, model, rng)
+    w = carried_scales(fit.model, _spread_draws(fit), model, rng)
     mean, covariance = model.left_out(w, np.flatnonzero(rows.move >= count))
     return PredictedStops(mean, covariance, model.coordinates.values(w))
