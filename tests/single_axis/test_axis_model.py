@@ -108,14 +108,13 @@ def test_places_that_no_row_depends_on_are_predicted_from_those_that_rows_do():
         np.testing.assert_allclose(across, seen.covariance[k][: plain.processes, : plain.processes], rtol=1e-6)
 
 
-def test_without_processes_it_is_the_least_squares_line(monkeypatch):
-    monkeypatch.setattr(axis_model, "CONTRAST_SHARE", 1e-9)
+def test_without_processes_it_is_the_least_squares_line():
     moves = runs(3)
     rng = np.random.default_rng(4)
     side = np.array([-1.0, *np.sign(np.diff([m.command for m in moves]))])
     commands = np.array([m.command for m in moves])
     values = 0.2 + 0.01 * commands - 0.05 * side + 0.004 * rng.standard_normal(len(moves))
-    model = model_of(campaign(moves, list(values), **FIRST_EDITION))
+    model = model_of(campaign(moves, list(values), ratio_contrast=AxisPrior(0.0, 0.0), **FIRST_EDITION))
     assert model.coordinates.names == ()
     linear = model.linear(np.zeros((1, 0)))
     design = np.column_stack([np.ones(len(side)), commands - model.middle, -0.5 * side])
