@@ -37,7 +37,7 @@ ROWS = output(__file__, "planted_faults.jsonl")
 COMPILED = output(__file__, "planted_faults_compiled")
 LIMIT_S = 900
 """Tests that take longer count as failed: a loop that never ends is a fault that CI sees."""
-COMMAND = ("-m", "pytest", "-q", "-x", "-n", "0", "--tb=no", "-p", "no:cacheprovider", "-rfE")
+COMMAND = ("-m", "pytest", "-q", "-x", "-n", "0", "--tb=no", "-p", "no:cacheprovider", "-rfE", "-m", "not slow")
 ENVIRONMENT = {
     # An edited file may keep its size and, within a second, its time: no compiled module may outlive it.
     "PYTHONDONTWRITEBYTECODE": "1",

@@ -143,6 +143,7 @@ def test_scatters_that_no_second_look_tells_apart_are_named(fitted):
     assert loadings == {"look_scatter_deg.pan": 1.0, "stop_sd_deg.left": -1.0, "stop_sd_deg.right": -1.0}
 
 
+@pytest.mark.thorough
 def test_two_step_counts_and_cleared_approaches_are_not(mounted_rig):
     approaches = {d: ("reversed", "cleared") for d in ("left", "right", "up", "down")}
     plan = four_point_protocol(repeats=6, steps=(100, 200), approaches=approaches)
@@ -162,6 +163,7 @@ def pan_only(mounted_rig) -> Campaign:
     )
 
 
+@pytest.mark.thorough
 def test_the_recorded_approach_of_move_0_is_named_as_leverage(pan_only):
     fitted = fit(pan_only)
     summary = summarise(fitted)
@@ -252,6 +254,7 @@ def test_an_axis_that_never_moved_is_null_and_named(short):
     assert any("tilt axis was never moved" in weak.text for weak in summary.weak_directions)
 
 
+@pytest.mark.thorough
 def test_aperture_readings_bring_their_parameters(mounted_rig):
     plan = four_point_protocol(repeats=3, steps=(100, 200))
     fitted = fit(simulate(mounted_rig, plan, seed=4, aperture=True).campaign)
@@ -265,6 +268,7 @@ def test_aperture_readings_bring_their_parameters(mounted_rig):
     assert fitted.free[INDEX["pan_zero_emission_deg"]]
 
 
+@pytest.mark.thorough
 def test_gears_without_play_are_not_called_weak_for_it(short):
     """Of one |N| the ratio cannot be told from play; of gears said to have none it can."""
     summary = summarise(fit(short, model=ModelChoice(no_backlash=True)))
@@ -277,6 +281,7 @@ def test_gears_without_play_are_not_called_weak_for_it(short):
     json.dumps(summary.as_json(), allow_nan=False)
 
 
+@pytest.mark.thorough
 def test_harmonics_are_listed_where_they_are_free_or_known(short):
     table = replace(
         short.rig,
@@ -312,6 +317,7 @@ def test_json_has_the_contract_keys_and_no_nan(summary):
     assert document["parameters"]["backlash_deg.pan"]["rhat"] is None
 
 
+@pytest.mark.thorough
 def test_prior_sensitivity_is_what_a_refit_finds(paper, fitted, summary):
     """The stereo calibration twice as uncertain: predicted to first order, and fitted."""
     doubled = {

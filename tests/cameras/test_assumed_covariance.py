@@ -33,6 +33,8 @@ from tvsbayes.instrument.stereo_pair import Stereo, read_stereo, rotation_matrix
 from tvsbayes.report.advice import assumed_stereo
 from tvsbayes.results.metrology_tables import BudgetRow, BudgetTable
 
+pytestmark = pytest.mark.thorough
+
 BOARD = Board(9, 6, 25.0)
 BENCHES, NOISE_PX, VIEWS = 12, 0.15, 18
 

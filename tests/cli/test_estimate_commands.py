@@ -191,6 +191,7 @@ def test_weights_that_are_not_sound_leave_laplaces_table_with_its_warning(ask, s
     assert text.rstrip().splitlines()[-1].startswith("verdict: usable with care: the posterior could not be sampled")
 
 
+@pytest.mark.thorough
 def test_per_axis_fit_has_one_gear_ratio_per_axis(ask, grid_folder):
     code, document = ask("fit", grid_folder, "--no-sample", "--per-axis")
     assert code == 0
@@ -200,6 +201,7 @@ def test_per_axis_fit_has_one_gear_ratio_per_axis(ask, grid_folder):
     assert (contrast["value"], contrast["sd"], contrast["prior_sd"], contrast["contraction"]) == (0.0, 0.0, 0.0, None)
 
 
+@pytest.mark.thorough
 def test_fit_without_backlash_and_with_harmonics(ask, grid_campaign, grid_folder, tmp_path):
     code, document = ask("fit", grid_folder, "--no-sample", "--harmonics")
     assert code == 2 and "harmonic_period_deg.pan" in document["error"]["remedy"]
@@ -214,6 +216,7 @@ def test_fit_without_backlash_and_with_harmonics(ask, grid_campaign, grid_folder
     assert parameters["backlash_deg.pan"]["value"] == parameters["backlash_deg.tilt"]["sd"] == 0.0
 
 
+@pytest.mark.thorough
 def test_robust_fit_names_the_spot_it_leaves_out(ask, grid_campaign, tmp_path):
     spots = list(grid_campaign.spots)
     # 40 stated sds.
@@ -257,6 +260,7 @@ def test_spots_at_one_stop_inform_no_headline(ask, mounted_rig, tmp_path):
     assert all(e["contraction"] < 0.1 for e in document["effective_deg_per_step"].values())
 
 
+@pytest.mark.thorough
 def test_swapped_cameras_end_in_words_and_files(ask, mounted_rig, tmp_path):
     """Predicted pixels beyond the lens model, draws far out: no number that JSON cannot hold."""
 
@@ -277,6 +281,7 @@ def test_swapped_cameras_end_in_words_and_files(ask, mounted_rig, tmp_path):
     assert problems(saved, json.loads((DATA / "schemas" / "fit-1.schema.json").read_text())) == []
 
 
+@pytest.mark.thorough
 def test_a_spot_beyond_the_lens_and_one_twice_cost_themselves_only(ask, mounted_rig, tmp_path):
     """One that cannot be undistorted is left out by name; experiments without a ratio have no gap."""
     four = simulate(mounted_rig, mixed_protocol(2), seed=3).campaign
@@ -361,6 +366,7 @@ def test_a_report_for_a_browser_that_is_not_there_ends_at_once(ask, grid_folder,
     assert (code, document["error"]["code"]) == (2, "no-browser")
 
 
+@pytest.mark.thorough
 def test_counters_of_a_scanner_are_left_out_and_predicted(ask, say, grid_folder, monkeypatch):
     """Three counters of pan; two of tilt are too few. No experiments are needed, nothing is kept."""
     monkeypatch.setattr("tvsbayes.comparison.held_positions.refit", lambda fit_of_all, *_: fit_of_all)

@@ -63,6 +63,7 @@ def test_nobody_has_an_empty_name(ask, tmp_path, option):
     )
 
 
+@pytest.mark.thorough
 def test_it_stops_where_a_fit_must_not_be_used(ask, say, grid_campaign, tmp_path, no_page):
     """Relative counters: nothing agrees with anything."""
     moves = tuple(

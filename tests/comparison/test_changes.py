@@ -66,6 +66,7 @@ def test_what_both_hold_fixed_is_compared_as_stated(mixed_fit):
     json.dumps(compare(fits[0], fits[2]).as_json(), allow_nan=False)
 
 
+@pytest.mark.thorough
 def test_a_changed_gear_is_named(mounted_rig):
     """The same rig with 2 % more degrees per pan step, measured again 30 days later; gears known to be perfect."""
     mounted_rig = perfect_rig(mounted_rig)

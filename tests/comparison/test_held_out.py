@@ -20,6 +20,8 @@ from tvsbayes.results.comparison_record import BETTER_JOINT, CANNOT_TELL, Predic
 from tvsbayes.results.records import plain
 from tvsbayes.twin.simulated_campaign import simulate
 
+pytestmark = pytest.mark.thorough
+
 
 def test_a_refit_that_failed_judges_nobody(mixed_fit, monkeypatch):
     lost = replace(mixed_fit, converged=False, problems=("it went astray",))

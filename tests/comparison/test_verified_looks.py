@@ -28,6 +28,8 @@ from tvsbayes.results.compensation_record import (
 )
 from tvsbayes.twin.simulated_campaign import simulate
 
+pytestmark = pytest.mark.thorough
+
 SCHEMAS = Path(__file__).resolve().parents[2] / "data" / "schemas"
 
 

@@ -35,6 +35,8 @@ from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth
 
+pytestmark = pytest.mark.thorough
+
 ROOT = Path(__file__).resolve().parents[2]
 
 

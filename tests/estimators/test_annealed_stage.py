@@ -16,7 +16,7 @@ from tvsbayes.estimators.kalman_filter import no_belief
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
 from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, NAMES
 
-pytestmark = pytest.mark.usefixtures("x64")
+pytestmark = [pytest.mark.thorough, pytest.mark.usefixtures("x64")]
 
 ALGEBRA = 1e-9
 """Relative: products of a dozen spots, of numbers up to 1e4, in another order."""

@@ -75,6 +75,7 @@ def test_the_data_shrink_the_ratios_a_hundredfold(fitted):
     assert np.all(posterior < prior / 30)
 
 
+@pytest.mark.thorough
 def test_a_far_start_is_annealed_to_the_same_mode(simulated, fitted):
     # The nominal rig knows its mounting to 0.5 rad and 100 mm; the true one stands 0.32 rad and 100 mm away.
     wide = {f"extrinsics.rotation_rad.{a}": Prior(0.0, 0.5) for a in "xyz"}
@@ -112,6 +113,7 @@ def test_the_order_of_rows_does_not_matter(simulated, fitted):
     np.testing.assert_array_equal(again.z, fitted.z)
 
 
+@pytest.mark.thorough
 def test_an_outlier_is_blamed_on_the_right_spot_of_its_stop(simulated, fitted):
     spots = ordered_spots(simulated.campaign)
     # The first of two spots taken at one stop, away from the ends of the campaign.
@@ -139,6 +141,7 @@ def test_the_plain_fit_names_the_outlier_as_suspect(simulated):
     assert result.excluded_spots == ()
 
 
+@pytest.mark.thorough
 def test_robust_on_clean_data_excludes_nothing(simulated, fitted):
     robust = fit(simulated.campaign, model=ModelChoice(robust=True))
     assert robust.excluded_spots == ()
@@ -193,6 +196,7 @@ def test_harmonics_need_a_period_to_be_freed(simulated):
     assert '"harmonic_period_deg.pan" = { value = 360.0, u = 0.0 }' in caught.value.remedy
 
 
+@pytest.mark.thorough
 def test_gears_without_play_put_it_into_the_stops(simulated, fitted):
     result = fit(simulated.campaign, model=ModelChoice(no_backlash=True))
     assert result.converged, result.problems

@@ -134,6 +134,7 @@ def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
     assert abs(wrong.innovations.log_density - right.innovations.log_density) > 0.5 * LOG_UNIT
 
 
+@pytest.mark.thorough
 def test_padding_changes_nothing(grid_campaign, monkeypatch):
     """Against the length that users have."""
     space = parameter_space(grid_campaign.rig, grid_campaign.stereo)

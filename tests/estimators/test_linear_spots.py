@@ -203,6 +203,7 @@ def test_outlier_of_a_stop_is_blamed_on_its_spot(seed, blamed):
     assert distance[pair[blamed]] > 30 > np.median(leave_one_out_chi2(stop_information(replace(spots, residual=clean))))
 
 
+@pytest.mark.thorough
 def test_log_density_of_a_move_is_what_the_campaign_loses_without_it(x64, dozen):
     """The log density log p(all) - log p(all but the spots of one move), by taking each move out of the filter in turn.
 

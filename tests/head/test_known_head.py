@@ -25,6 +25,8 @@ from tvsbayes.planning.looks import covariance_of
 from tvsbayes.twin.head_physics import head_beam
 from tvsbayes.twin.simulated_campaign import simulate
 
+pytestmark = pytest.mark.thorough
+
 UNIT = (Path(__file__).parent / "unit.urdf").read_bytes()
 RATIO = 0.045
 PLACES = [(pan, tilt) for pan in (-1500, -500, 600, 1400) for tilt in (-300, 200, 700, 1200)]

@@ -67,6 +67,7 @@ def off_target(dimension: int) -> Independence:
     return tabulated(np.full(dimension, 0.3), np.linspace(1.0, 1.2, dimension), places)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dimension", DIMENSIONS)
 @pytest.mark.parametrize("which", ["independence", "renewal", "mixture"])
 def test_independence_and_the_mixture_keep_the_target(which, dimension):

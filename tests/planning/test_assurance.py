@@ -17,7 +17,7 @@ from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, information
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
 
-pytestmark = pytest.mark.usefixtures("small_searches")
+pytestmark = [pytest.mark.thorough, pytest.mark.usefixtures("small_searches")]
 
 
 def believers(knowledge, *z) -> Instruments:

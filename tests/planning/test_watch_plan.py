@@ -21,6 +21,8 @@ from tvsbayes.planning import watch_plan as plans
 from tvsbayes.planning.watch_plan import Pattern, WatchDesigns, watch_plan
 from tvsbayes.twin.simulated_campaign import simulate
 
+pytestmark = pytest.mark.thorough
+
 ROOT = Path(__file__).resolve().parents[2]
 RIG = ROOT / "data" / "rigs" / "mounted" / "rig.toml"
 NAMES = [change.what for change in CHANGES]

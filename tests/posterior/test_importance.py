@@ -338,6 +338,7 @@ def test_no_chain_is_kept_or_resumed_without_one(sampled, tmp_path):
         sample(sampled[0], "nested")
 
 
+@pytest.mark.thorough
 def test_the_paper_twin_against_nuts(monkeypatch):
     """The reference of `experiments/sampler/nuts_reference.py`, of perfect gears, which shares no sampling code."""
     campaign = read_campaign(shipped_data() / "twins" / "paper_twin")

@@ -81,6 +81,7 @@ def stored(file):
         return {key: chain[key] for key in chain.files}
 
 
+@pytest.mark.thorough
 def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, monkeypatch):
     limits(monkeypatch, SHORT)
     whole_wait, told = [], []
@@ -180,6 +181,7 @@ def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
         assert word in said
 
 
+@pytest.mark.thorough
 def test_a_stuck_walker_is_found(fitted, long):
     with jax.enable_x64(True):
         start, chain = stored_chain(long[1], fitted, SEED)

@@ -282,6 +282,7 @@ def followed() -> dict[str, object]:
     return {"globals": example.globs, "results": results, "report": "".join(report)}
 
 
+@pytest.mark.thorough
 def test_python_examples_do_what_they_say(followed):
     assert followed["results"].attempted >= 20
     assert not followed["results"].failed, followed["report"]

@@ -274,6 +274,7 @@ def good(tmp_path_factory) -> Path:
     return good_folder(tmp_path_factory.mktemp("good") / "c")
 
 
+@pytest.mark.thorough
 def test_random_mutations_are_read_or_refused(good):
     """1300 seeded mutations of a good folder: success or a documented error, whatever else is a defect."""
     refused = dict.fromkeys(TARGETS, 0)

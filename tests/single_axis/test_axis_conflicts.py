@@ -12,6 +12,8 @@ from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import summarise_axis
 
+pytestmark = pytest.mark.thorough
+
 PLAY, RATIO, SCATTER = 0.2, 0.01, 0.003
 
 

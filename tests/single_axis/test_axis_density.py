@@ -63,6 +63,7 @@ def test_both_answers_of_a_short_time_are_given_and_said():
     assert set(found.sample.convergence.monte_carlo_error) >= {"backlash", "per_command.forward"}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("tier", ["importance", "emcee"])
 def test_errors_of_the_headlines_are_within_what_is_accepted(tier):
     found = fit_axis(drawn(3, random_moves(5, 60)).campaign, tier=tier, seed=2)

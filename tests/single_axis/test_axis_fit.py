@@ -14,6 +14,7 @@ from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import summarise_axis
 
 
+@pytest.mark.thorough
 def test_truths_lie_where_the_fit_says():
     """Six drawn axes of two protocols; a sum of squares that 1 in 1e4 sets of honest z exceeds."""
     z = []
@@ -31,6 +32,7 @@ def test_truths_lie_where_the_fit_says():
     assert 1.4 < np.sum(np.square(z)) < 39.1
 
 
+@pytest.mark.thorough
 def test_both_tiers_agree_and_a_seed_gives_the_same():
     made = drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign
     one = fit_axis(made, seed=1)

@@ -11,6 +11,8 @@ from tvsbayes.single_axis import held_out_positions
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.held_out_positions import hold_out_positions
 
+pytestmark = pytest.mark.thorough
+
 
 def test_positions_are_predicted_and_the_first_edition_is_too_sure():
     """Errors by position ten times the scatter: independent stops are too sure, processes are not."""

@@ -152,12 +152,14 @@ def test_readings_in_motion_are_averaged_without_losing_the_wave():
     assert abs(found.amplitude.value - AMPLITUDE) < 5 * np.sqrt(2 / 4000)
 
 
+@pytest.mark.thorough
 def test_no_wave_is_claimed_of_noise():
     found = fit_axis(drive(6, 0.0, AskedPeriods((), ((100.0, 800.0),), True)), tier="importance")
     [estimate] = summarise_axis(found).periods
     assert not found.missing and estimate.probability < 0.5
 
 
+@pytest.mark.thorough
 def test_a_range_holds_more_waves_than_were_asked_for():
     """Three waves, two in one range: the strongest of every range first, in the order of the ranges, then the third."""
     made, waves = drive(4, AMPLITUDE, AskedPeriods((), ((60.0, 120.0), (120.0, 700.0)), True), 400, 4000.0), {97.0: 1.0}
@@ -227,6 +229,7 @@ def test_a_second_harmonic_that_is_stronger_than_the_first_is_named():
     assert not strong_harmonics((replace(sample, coefficients=coefficients[:, [3, 1, 2, 0, 4, 5]]),), "arcsec")
 
 
+@pytest.mark.thorough
 def test_a_period_at_the_end_of_its_range_is_doubted():
     """A wave of 240 s asked for below 228 s is given there, and said to lie at the end; one inside is not."""
     for high, doubted in ((0.95 * PERIOD, True), (700.0, False)):
