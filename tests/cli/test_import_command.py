@@ -283,6 +283,10 @@ def test_a_log_of_sightings_becomes_a_head(ask, say, tmp_path):
     code, printed, _ = say("check", tmp_path / "mount")
     assert code == 0 and "usable sightings" in printed and "aperture" not in printed
     assert ask(*words, tmp_path / "mount", "--yes")[0] == 2, "nothing is overwritten"
+    assert ask("import", tmp_path / "mount", "--to", tmp_path / "copy", "--flip", "tilt_steps", "--yes")[0] == 0
+    copy = read_campaign(tmp_path / "copy")
+    assert [m.tilt_steps for m in copy.moves] == [-m.tilt_steps for m in found.moves] and copy.spots == found.spots
+    assert ask("import", tmp_path / "mount", "--to", tmp_path / "other", "--swap", "--yes")[0] == 2
     assert ask("new", tmp_path / "new", "--mechanism", "pan-tilt", "--sightings")[0] == 0
     header = (tmp_path / "new" / "campaign.toml").read_bytes()
     assert ask("import", tmp_path / "log.csv", "--to", tmp_path / "new", "--yes")[0] == 0

@@ -95,6 +95,22 @@ def test_a_counter_that_counts_the_other_way_is_named_and_turned():
     assert "--flip" not in " ".join(turned.assumed)
 
 
+def test_angles_of_a_joint_that_falls_are_turned_and_others_are_not():
+    """As on most robots: a tilt joint about +y looks down where its angle grows."""
+    columns = {
+        "pan cmd [rad]": ["-0.5", "0.0", "0.7", "1.0"],
+        "tilt cmd [rad]": ["0.3", "-0.1", "-0.4", "-0.5"],
+        "az": ["331", "0", "41", "57"],
+        "el": ["-17", "6", "23", "29"],
+    }
+    both = understood(columns, falling=("tilt", "pan"))
+    for axis, sign in (("pan", 1), ("tilt", -1)):
+        counters = [round(sign * math.degrees(float(a)) / STEP_DEG) for a in columns[f"{axis} cmd [rad]"]]
+        assert [getattr(move, f"{axis}_steps") for move in both.moves] == counters
+    assert "--flip" not in " ".join(both.assumed)
+    assert "add --flip tilt_steps" in " ".join(understood(columns).assumed)
+
+
 def test_no_ratio_of_angles_that_lie_on_no_line():
     rng = np.random.default_rng(3)
     assert line_slope(np.arange(12.0), rng.uniform(0, 360, 12)) is None

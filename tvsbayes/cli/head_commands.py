@@ -85,8 +85,8 @@ def import_urdf(
     terms = {name: value for name, value in head.terms.items() if value and name in kind.documented}
     priors |= {name: Prior(value, kind.priors[name].u) for name, value in terms.items()}
     assumed = [
-        f"pan is joint {escaped(head.names['pan'])}, tilt joint {escaped(head.names['tilt'])}; zero counters are zero "
-        "of the joints",
+        f"pan is joint {escaped(head.names['pan'])}, tilt joint {escaped(head.names['tilt'])}; counter 0 is angle 0 "
+        "of a joint",
         "the beam is x of the tilt joint's child link; directions are in the parent link of the pan joint, z up",
     ]
     for axis, angle in (("pan", "azimuth"), ("tilt", "elevation")):
@@ -141,7 +141,9 @@ def import_sightings(
     if missing or known.claimed:
         wanted = [*missing, *(field for field in known.claimed if field not in missing)]
         raise not_sure(table, known, wanted, SIGHTING_FIELDS, NEEDED)
-    sightings = sightings_of_table(table, known.columns, notation, correction, u_deg)
+    joints = _joints_of(to)
+    falling = () if joints is None else [axis for axis in AXES if joints.sign[axis] < 0]
+    sightings = sightings_of_table(table, known.columns, notation, correction, u_deg, falling)
     written = _sighting_files(sightings, to, table.file)
     ok = sum(sighting.status == "ok" for sighting in sightings.sightings)
     lines = [*table_lines(table, known, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in written.assumed)]
@@ -205,6 +207,19 @@ def _sighting_files(rows: ForeignSightings, to: Path, table: str) -> _SightingFi
     return _SightingFiles(files, [text for text in rows.assumed if text.partition(":")[0] not in known])
 
 
+def _joints_of(folder: Path) -> HeadJoints | None:
+    """Of the URDF that a campaign folder states and keeps; None where it does not."""
+    from tvsbayes.head.urdf import URDF_BYTES_MAX, head_joints
+    from tvsbayes.instrument.campaign_header import header_values
+
+    if not ((folder / "campaign.toml").is_file() and (folder / HEAD_URDF).is_file()):
+        return None
+    stated = header_values(folder).get("urdf")
+    known: dict[str, Any] = stated if isinstance(stated, dict) else {}
+    joints: dict[str, str | None] = {axis: known.get(f"{axis}_joint") for axis in AXES}
+    return head_joints(read_bytes(folder / HEAD_URDF, URDF_BYTES_MAX, folder), HEAD_URDF, joints)
+
+
 def _stated_priors(folder: Path) -> set[str]:
     """Names in [rig.prior] of a campaign folder."""
     from tvsbayes.instrument.campaign_header import header_values
@@ -262,7 +277,7 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
     from tvsbayes.calibration.calibration_file import Origin
     from tvsbayes.comparison.verified_looks import accepted_calibration
     from tvsbayes.display import concise
-    from tvsbayes.head.urdf import URDF_BYTES_MAX, HeadModel, head_joints
+    from tvsbayes.head.urdf import HeadModel
     from tvsbayes.instrument.campaign import input_hashes, read_campaign
 
     data = read_campaign(folder)
@@ -284,16 +299,14 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
         data_sha256=hashlib.sha256("".join(input_hashes(data).values()).encode()).hexdigest(),
         steps_per_turn=known.get("steps_per_turn"),
     )
-    place = folder / HEAD_URDF
-    joints: dict[str, str | None] = {axis: known.get(f"{axis}_joint") for axis in AXES}
-    head = head_joints(read_bytes(place, URDF_BYTES_MAX, folder), HEAD_URDF, joints) if place.is_file() else None
+    head = _joints_of(folder)
     text, document = model.urdf(head), model.document(head)
     lines = [f"{name} {concise(v, u)}" for name, v, u in zip(model.names, model.values, document["u"], strict=True)]
     lines += [
         f"{axis}: {joint['steps_per_rad']:.9g} counters per radian of joint {escaped(joint['name'])}"
         for axis, joint in document["joints"].items()
     ]
-    lines += [f"not said: {words}" for words in document["unsaid"]]
+    lines += [f"not in the file: {words}" for words in document["unsaid"]]
     files: dict[str, str] = {}
     if out is None:
         what = "xacro properties" if head is None else f"{HEAD_URDF} with these terms"

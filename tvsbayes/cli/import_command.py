@@ -14,7 +14,7 @@ import typer
 
 from tvsbayes.cli.app import Json, confirmed, finish, refuse_options, report_line, somebody_there
 from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
-from tvsbayes.cli.head_commands import import_sightings, import_urdf
+from tvsbayes.cli.head_commands import HEAD_URDF, import_sightings, import_urdf
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
 from tvsbayes.cli.understood_columns import CORRECT_IT, import_end, not_sure, table_document, table_lines
 from tvsbayes.errors import InputError, closest, escaped, refusal, typed
@@ -241,7 +241,7 @@ def _assumption(text: str, known: Mapping[str, str], example: str) -> tuple[str,
 
 def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bool, as_json: bool) -> None:
     """Write a copy of a campaign with corrected tables; what else lies in its folder stays there alone."""
-    from tvsbayes.instrument.campaign import moves_bytes, read_campaign, spots_bytes
+    from tvsbayes.instrument.campaign import looks_bytes, looks_file, moves_bytes, read_campaign
     from tvsbayes.instrument.corrections import Correction, corrected
 
     if serve("import", folder, to=to, correction=correction, yes=yes, as_json=as_json):
@@ -250,17 +250,22 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
         remedy = "say what to correct: --flip, --shift-moves, --swap, --pixels-from 1, --relative"
         raise InputError("usage", f"{escaped(str(folder), 200)} is a campaign already", remedy=remedy)
     campaign = read_campaign(folder)
+    if campaign.rig.mechanism.sightings:
+        unfit = {"swap": correction.swapped or None, "pixels_from": correction.pixels_from or None}
+        refuse_options("for spots in pictures, and these are sightings", "leave it out", **unfit)
     changed = corrected(campaign.moves, campaign.spots, correction)
     moves, spots = changed.moves or (), changed.spots or ()
+    campaign = replace(campaign, moves=moves, spots=spots)
     ok = sum(spot.status == "ok" for spot in spots)
     lines = [f"corrected: {text}" for text in changed.changes]
-    lines.append(f"gives: {len(moves)} moves, {len(spots)} looks, {ok} with a spot")
+    lines.append(f"gives: {len(moves)} moves, {len(spots)} looks, {ok} of use")
     yes = confirmed(lines, to, yes, as_json)
     written = []
     if yes:
         make_folder(to, empty=True)
-        contents = {name: read_bytes(folder / name, CSV_BYTES_MAX, folder) for name in ("campaign.toml", "stereo.json")}
-        contents |= {"moves.csv": moves_bytes(moves), "spots.csv": spots_bytes(spots)}
+        beside = [name for name in ("campaign.toml", "stereo.json", HEAD_URDF) if (folder / name).is_file()]
+        contents = {name: read_bytes(folder / name, CSV_BYTES_MAX, folder) for name in beside}
+        contents |= {"moves.csv": moves_bytes(moves), looks_file(campaign): looks_bytes(campaign)}
         for name, data in contents.items():
             write_atomically(to / name, data)
         written = [str(to / name) for name in contents]

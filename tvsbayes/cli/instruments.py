@@ -81,7 +81,7 @@ INSTRUMENTS = {
         "of such a head: check, classic, fit, compare, report, watch, verify, plan, study, compensate --to urdf, "
         "steps-for --azimuth-deg --elevation-deg",
         {"calibrate": "fit, then report"},
-        ("check", "fit", "compare", "steps-for", "watch", "plan"),
+        ("import", "check", "fit", "compare", "steps-for", "watch", "plan"),
     ),
 }
 """By mechanism, as `campaign.toml` states it."""

@@ -6,7 +6,7 @@ assumed and listed in words. Degrees, u standard.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -88,6 +88,7 @@ def sightings_of_table(
     notation: Notation,
     correction: Correction,
     u_deg: float | None = None,
+    falling: Collection[Axis] = (),
 ) -> ForeignSightings:
     """Moves and sightings of a table.
 
@@ -97,6 +98,7 @@ def sightings_of_table(
         notation: how its numbers are meant; `angle_unit` where names of columns say none.
         correction: of moves and sightings.
         u_deg: of a sighting where no column has it.
+        falling: axes whose joint falls where azimuth or elevation grows; angles that do so are those of the joint.
 
     Raises:
         InputError: a cell that is no value of its field, or no row.
@@ -133,6 +135,10 @@ def sightings_of_table(
     changed = corrected(listing.moves, cast(list[Spot], sightings), correction)
     moves, sightings = changed.moves or (), sightings_of(changed.spots or ())
     encoders = frozenset(axis for axis, field in zip(AXES, COUNTERS, strict=True) if field in units)
+    if turned := tuple(axis for axis in AXES if axis in encoders & set(falling) and _falls(moves, sightings, axis)):
+        assumed += [f"{axis}_steps: angles of the joint of the URDF, which falls there" for axis in turned]
+        of_joint = corrected(moves, None, Correction(flipped=turned))
+        moves, assumed = of_joint.moves or (), [*assumed, *of_joint.changes]
     priors = _ratios(moves, sightings, encoders, assumed)
     return ForeignSightings(moves, tuple(sightings), priors, encoders, (*assumed, *changed.changes))
 
@@ -174,10 +180,8 @@ def _ratios(
 ) -> dict[str, Prior]:
     """Ratios and contrasts of encoders' steps, and of counters by a line through what was sighted there."""
     priors: dict[str, Prior] = {}
-    ok = [s for s in sightings if s.status == "ok"]
     for axis, field, angle in zip(AXES, COUNTERS, ANGLES, strict=True):
-        counters = np.array([getattr(moves[s.move], field) for s in ok], float)
-        slope = line_slope(counters, np.array([getattr(s, angle) for s in ok], float))
+        slope = _slope(moves, sightings, axis)
         if slope is not None and slope < 0:
             remedy = f"add --flip {field}, or exchange two columns by --column"
             assumed.append(f"{field}: falls where {angle} grows; {remedy}")
@@ -191,6 +195,20 @@ def _ratios(
         priors[f"degrees_per_step.{axis}"] = Prior(ratio, u * ratio)
         priors[f"ratio_contrast_deg_per_step.{axis}"] = Prior(0.0, CONTRAST_U * ratio)
     return priors
+
+
+def _slope(moves: Sequence[Move], sightings: Sequence[Sighting], axis: Axis) -> float | None:
+    """Degrees a step of an axis by `line_slope`."""
+    field, angle = COUNTERS[AXES.index(axis)], ANGLES[AXES.index(axis)]
+    ok = [s for s in sightings if s.status == "ok"]
+    counters = np.array([getattr(moves[s.move], field) for s in ok], float)
+    return line_slope(counters, np.array([getattr(s, angle) for s in ok], float))
+
+
+def _falls(moves: Sequence[Move], sightings: Sequence[Sighting], axis: Axis) -> bool:
+    """Whether counters certainly fall where the angle grows."""
+    slope = _slope(moves, sightings, axis)
+    return slope is not None and slope < 0
 
 
 def _is_whole(cell: str) -> bool:
