@@ -19,7 +19,7 @@ def drawn_states(seed: int) -> StopStates:
     load = np.zeros((SPOTS, 4, STATES))
     for state in range(STATES):
         load[generator.choice(SPOTS, SEEN_BY, replace=False), :, state] = generator.normal(size=(SEEN_BY, 4))
-    none = np.zeros((STATES, 4)), np.zeros(STATES), np.zeros((STATES, 2))
+    none = np.zeros((STATES, 4)), np.zeros(STATES)
     return StopStates(load.reshape(4 * SPOTS, STATES), *none)
 
 
@@ -34,7 +34,7 @@ def test_the_elimination_is_the_dense_cholesky_factor(seed):
     assert filled > 0, "nothing is filled in"
     assert sum(map(len, states.later)) < count * (count - 1) / 2, "nothing is left out"
     products = states.load.T @ generator.normal(size=(4 * SPOTS, 3))
-    found = Elimination.of(states, sd)
+    found = Elimination.of(states, sd, states.gram[None, *states.overlapping])
     for point in range(POINTS):
         scaled = states.load * sd[point]
         dense = np.linalg.cholesky(np.eye(count) + scaled.T @ scaled)
@@ -56,7 +56,7 @@ def test_what_states_leave_of_residuals_is_woodburys():
     generator = np.random.default_rng(8)
     sd = np.exp(generator.normal(size=(1, len(states.constant))))
     columns = generator.normal(size=(4 * SPOTS, 4))
-    white = Elimination.of(states, sd).whitened(states.load.T @ columns)[0]
+    white = Elimination.of(states, sd, states.gram[None, *states.overlapping]).whitened(states.load.T @ columns)[0]
     scaled = states.load * sd[0]
     covariance = np.eye(4 * SPOTS) + scaled @ scaled.T
     dense = columns.T @ np.linalg.solve(covariance, columns)
@@ -66,8 +66,8 @@ def test_what_states_leave_of_residuals_is_woodburys():
 
 
 def test_no_states_take_nothing():
-    nothing = StopStates(np.zeros((8, 0)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 2)))
-    found = Elimination.of(nothing, np.zeros((3, 0)))
+    nothing = StopStates(np.zeros((8, 0)), np.zeros((0, 4)), np.zeros(0))
+    found = Elimination.of(nothing, np.zeros((3, 0)), np.zeros((3, 0)))
     assert found.whitened(np.zeros((0, 2))).shape == (3, 0, 2)
 
 

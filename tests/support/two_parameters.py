@@ -12,6 +12,7 @@ from support.partial_arrays import no_gears, partial_arrays
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.instrument.parameters import INDEX, NAMES, PERIODS_MAX
 from tvsbayes.posterior.linear_campaign import LinearCampaign
+from tvsbayes.posterior.look_noise import LookNoise
 from tvsbayes.posterior.stop_states import StopStates
 from tvsbayes.posterior.transport import GEAR_SCALES, Transport, curvatures
 
@@ -25,7 +26,7 @@ ROWS = 4
 
 def no_states() -> StopStates:
     """Of axes that stop exactly."""
-    return StopStates(np.zeros((ROWS, 0)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 2)))
+    return StopStates(np.zeros((ROWS, 0)), np.zeros((0, 4)), np.zeros(0))
 
 
 def linear_campaign(along: np.ndarray, prior: np.ndarray, noise: int) -> LinearCampaign:
@@ -33,7 +34,9 @@ def linear_campaign(along: np.ndarray, prior: np.ndarray, noise: int) -> LinearC
     seen = np.zeros((ROWS, len(along)))
     seen[0] = along
     nothing = np.zeros(0)
-    return LinearCampaign(np.zeros(ROWS), seen, no_states(), np.zeros((0, noise)), nothing, np.zeros((ROWS, 0)), prior)
+    looks = LookNoise.of(np.zeros((1, ROWS, 2)), np.ones(1), np.zeros(2), np.ones(2))
+    of_states = np.zeros((0, noise)), nothing
+    return LinearCampaign(np.zeros(ROWS), seen, no_states(), *of_states, np.zeros((ROWS, 0)), prior, looks)
 
 
 def route() -> Transport:
@@ -50,6 +53,7 @@ def route() -> Transport:
         slope=np.array([[STRETCH]]),
         half=np.zeros(1, bool),
         pixels=np.ones(1),
+        scatter=np.zeros((2, 1)),
         linear=linear_campaign(np.ones(1), np.zeros((1, 1)), 1),
         residuals=lambda z: np.zeros((len(z), ROWS)),
         bend=np.zeros((1, 0, 0)),
@@ -95,6 +99,7 @@ def ridge() -> Transport:
         slope=np.zeros((0, 0)),
         half=np.zeros(0, bool),
         pixels=np.zeros(0),
+        scatter=np.zeros((2, 0)),
         linear=linear_campaign(np.array([0.0, sd / NARROW_SD]), np.diag([1.0, sd**2]), 0),
         residuals=ridge_residual,
         bend=np.zeros((2, 1, 1)),

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import lapack
 
+from tvsbayes.posterior.look_noise import LookNoise
 from tvsbayes.posterior.stop_states import Elimination, StopStates
 
 
@@ -18,13 +19,13 @@ class Creep:
     Attributes:
         warm_minutes: since the machine was switched on, of every spot, shape (s,).
         minutes: time constant at the mode.
-        slope: d(predicted)/d(zero, rad), shape (s, 4, 2).
-        rows: how far the zeros creep in all, rad, by the columns of `LinearCampaign`, shape (2, c).
+        looks: whose angles move as the zeros do.
+        rows: how far the zeros creep in all, in its units, by the columns of `LinearCampaign`, shape (2, c).
     """
 
     warm_minutes: np.ndarray
     minutes: float
-    slope: np.ndarray
+    looks: LookNoise
     rows: np.ndarray
 
     def later(self, log_scale: np.ndarray) -> np.ndarray:
@@ -36,23 +37,15 @@ class Creep:
         over = -np.expm1(-self.warm_minutes / minutes)
         return over[1:] - over[0]
 
-    def seen(self, rows: np.ndarray) -> np.ndarray:
-        """Products of rows (4 s, c), spot by spot, with the slopes, shape (s, 2, c)."""
-        return np.einsum("sia,sic->sac", self.slope, rows.reshape(*self.slope.shape[:2], -1))
-
-    @cached_property
-    def square(self) -> np.ndarray:
-        """Products of the slopes with each other, shape (s, 2, 2)."""
-        return np.einsum("sia,sib->sab", self.slope, self.slope)
-
     def products(self, misfit: np.ndarray, later: np.ndarray) -> np.ndarray:
         """Of misfits (n, 4 s) with what `more` sees of either zero, shares (n, s) or (1, s), shape (n, 2)."""
-        by_spot = np.einsum("nsi,sia->nsa", misfit.reshape(len(misfit), *self.slope.shape[:2]), self.slope)
+        load = self.looks.load
+        by_spot = np.einsum("nsi,sia->nsa", misfit.reshape(len(misfit), *load.shape[:2]), load)
         return np.einsum("nsa,ns->na", by_spot, np.broadcast_to(later, by_spot.shape[:2]))
 
     def more(self, later: np.ndarray, crept_rad: np.ndarray) -> np.ndarray:
         """What spots are seen farther on where zeros (n, 2) creep, by shares (n, s) of it, shape (n, 4 s)."""
-        return np.einsum("sia,ns,na->nsi", self.slope, later, crept_rad, optimize=True).reshape(len(later), -1)
+        return np.einsum("sia,ns,na->nsi", self.looks.load, later, crept_rad, optimize=True).reshape(len(later), -1)
 
 
 @dataclass(frozen=True)
@@ -67,9 +60,10 @@ class LinearCampaign:
         along: d(predicted)/dy of the coordinates that are no noise scales, shape (4 n, g).
         states: stop errors and their like.
         by_noise: variance of every state at the mode by the noise coordinates that scale it, shape (m, q).
-        constant: variance that scales with none, less what the noise of the looks has already, shape (m,).
+        constant: variance that scales with none, shape (m,).
         places: d(predicted)/d(errors at places, then terms of the drifts), shape (4 n, e).
         prior: precision of y without data, shape (g, g).
+        looks: their noise at other scales.
         creep: None where its time constant is not estimated.
     """
 
@@ -80,6 +74,7 @@ class LinearCampaign:
     constant: np.ndarray
     places: np.ndarray
     prior: np.ndarray
+    looks: LookNoise
     creep: Creep | None = None
 
     @cached_property
@@ -88,38 +83,62 @@ class LinearCampaign:
         return np.column_stack([self.places, self.along[:, ::-1], self.residual])
 
     @cached_property
-    def gram(self) -> np.ndarray:
-        """Products of the columns."""
-        return self.columns.T @ self.columns
+    def _seen(self) -> np.ndarray:
+        return self.looks.seen(np.concatenate([self.columns, self.states.load], axis=1))
 
     @cached_property
-    def by_states(self) -> np.ndarray:
-        """Products of the states with the columns, shape (m, e + g + 1)."""
-        return self.states.load.T @ self.columns
+    def _at_mode(self) -> np.ndarray:
+        """All of `Products` in a row, shape (k,)."""
+        by_states, of_states = self.states.load.T @ self.columns, self.states.gram[self.states.overlapping]
+        return np.concatenate([(self.columns.T @ self.columns).ravel(), by_states.ravel(), of_states])
 
     @cached_property
-    def _by_creep(self) -> np.ndarray:
-        assert self.creep is not None
-        return self.creep.seen(np.concatenate([self.columns, self.states.load], axis=1))
+    def _lost(self) -> np.ndarray:
+        """What every function of `LookNoise.basis` takes off `_at_mode`, shape (r, k)."""
+        count = self.columns.shape[1]
+        seen, (rows, columns) = self._seen, self.states.overlapping
+        own = seen[..., count:]
+        of_states = (own[:, :, None, rows] * own[:, None, :, columns]).reshape(4 * len(own), len(rows))
+        by_columns = self.looks.products(seen, seen[..., :count])
+        flat = by_columns.reshape(len(by_columns), seen.shape[2] * count)
+        return np.concatenate([flat, self.looks.basis @ of_states], axis=1)
 
-    def at(self, later: np.ndarray | None) -> Products:
-        """Products of the columns where so much more of the creep is over, as `Creep.later` gives it."""
+    def at(self, inner: np.ndarray, later: np.ndarray | None) -> Products:
+        """Products of the columns by the inverse noise covariance of K, as `LookNoise.inner` gives it.
+
+        Args:
+            inner: K, shape (n, s, 2, 2).
+            later: how much more of a creep is over, as `Creep.later` gives it.
+        """
+        count, states = self.columns.shape[1], self.states.load.shape[1]
+        whole = self._at_mode - self.looks.shares(inner) @ self._lost
+        by_columns, of_states = np.split(whole, [(count + states) * count], axis=1)
+        gram, by_states = np.split(by_columns.reshape(-1, count + states, count), [count], axis=1)
         creep = self.creep
         if creep is None or later is None:
-            return Products(self.gram, self.by_states)
-        new, count = np.tensordot(later, self._by_creep, 1), len(self.gram)
+            return Products(gram, by_states, of_states)
+        left = later[..., None, None] * (np.eye(2) - self.looks.square @ inner)
+        new = np.tensordot(np.swapaxes(left, 1, 2), self._seen, ((2, 3), (0, 1)))
         cross = np.swapaxes(new[..., :count], 1, 2) @ creep.rows
-        both = creep.rows.T @ np.tensordot(later**2, creep.square, 1) @ creep.rows
-        by_states = self.by_states + np.swapaxes(new[..., count:], 1, 2) @ creep.rows
-        return Products(self.gram + cross + np.swapaxes(cross, 1, 2) + both, by_states)
+        square = np.sum(later[..., None, None] * left @ self.looks.square, axis=1)
+        by_states = by_states + np.swapaxes(new[..., count:], 1, 2) @ creep.rows
+        both = creep.rows.T @ square @ creep.rows
+        return Products(gram + cross + np.swapaxes(cross, 1, 2) + both, by_states, of_states)
 
 
 @dataclass(frozen=True)
 class Products:
-    """Of the columns of a linearised campaign with each other (..., c, c), and of the states with them (..., m, c)."""
+    """Of a linearised campaign's columns and states, by the inverse noise covariance of n points.
+
+    Attributes:
+        gram: of the columns with each other, shape (n, c, c).
+        by_states: of the states with the columns, shape (n, m, c).
+        of_states: of states with each other where they are `StopStates.overlapping`, shape (n, k).
+    """
 
     gram: np.ndarray
     by_states: np.ndarray
+    of_states: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -128,6 +147,7 @@ class Conditional:
 
     Attributes:
         weight: of squared residuals, by the pixel scale, shape (n,).
+        inner: as `LookNoise.inner` gives it.
         elimination: of the states.
         white: of the products of states and columns, shape (n, m, e + g + 1).
         root: of the covariance of the errors at places, shape (n, e, e).
@@ -138,6 +158,7 @@ class Conditional:
     """
 
     weight: np.ndarray
+    inner: np.ndarray
     elimination: Elimination
     white: np.ndarray
     root: np.ndarray
@@ -166,6 +187,7 @@ class Conditional:
         """
         places = self.root.shape[1]
         count = places + narrow
+        misfit = linear.looks.whitened(misfit, self.inner)
         white = self.elimination.whitened((misfit @ linear.states.load)[..., None])
         right = misfit @ linear.columns[:, :count] - np.einsum("nmc,nmo->nc", self.white[..., :count], white)
         if linear.creep is not None and self.later is not None:

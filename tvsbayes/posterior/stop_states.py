@@ -15,7 +15,7 @@ import numpy as np
 
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots
-from tvsbayes.model.parameter_space import SCATTER_COLUMNS, STOP_COLUMNS
+from tvsbayes.model.parameter_space import STOP_COLUMNS
 
 
 @dataclass(frozen=True)
@@ -26,19 +26,21 @@ class StopStates:
         load: d(predicted)/d(state) of the spots' components, shape (4 n, m).
         variance: at the fit's noise scales, by direction (right, left, down, up), shape (m, 4).
         constant: of states of another kind, shape (m,).
-        scatter: what the scatter of looks (pan, tilt) adds to the variance with which the looks of a stop error know
-            it, at the fit's noise scales, shape (m, 2); it is in the noise of the looks already.
     """
 
     load: np.ndarray
     variance: np.ndarray
     constant: np.ndarray
-    scatter: np.ndarray
 
     @cached_property
     def gram(self) -> np.ndarray:
         """G'G, shape (m, m)."""
         return self.load.T @ self.load
+
+    @cached_property
+    def overlapping(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the upper triangle of G'G where spots see both states, the diagonal included."""
+        return np.nonzero(np.triu(self.gram))
 
     @cached_property
     def later(self) -> tuple[tuple[int, ...], ...]:
@@ -57,18 +59,16 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
     mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
     physical = np.asarray(fit.mode.physical)
     variance_of = np.radians(physical[STOP_COLUMNS]) ** 2
-    scatter_of = np.radians(physical[SCATTER_COLUMNS]) ** 2
     found = []
     for state in range(states):
         drawn = np.flatnonzero(linear.renewed[:, state])
         for begin, end in zip(drawn, [*drawn[1:], spots], strict=True):
-            by_direction, scatter = np.zeros((2, 2)), np.zeros(2)
+            by_direction = np.zeros((2, 2))
             if state < 2:
                 by_direction[state] = mix[begin, state] * variance_of[state]
-                scatter[state] = scatter_of[state] / (end - begin)
             rest = 0.0 if state < 2 else linear.variance[begin, state]
-            if linear.load[begin:end, :, state].any() and by_direction.sum() + scatter.sum() + rest > 0:
-                found.append((end, begin, state, by_direction.ravel(), rest, scatter))
+            if linear.load[begin:end, :, state].any() and by_direction.sum() + rest > 0:
+                found.append((end, begin, state, by_direction.ravel(), rest))
     found.sort(key=lambda each: each[:3])
     load = np.zeros((spots, 4, len(found)))
     for column, (end, begin, state, *_) in enumerate(found):
@@ -77,13 +77,12 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
         load.reshape(4 * spots, len(found)),
         np.array([each[3] for each in found]).reshape(len(found), 4),
         np.array([each[4] for each in found], dtype=float),
-        np.array([each[5] for each in found]).reshape(len(found), 2),
     )
 
 
 @dataclass(frozen=True)
 class Elimination:
-    """The Cholesky factor of 1 + T G'G T for many T.
+    """The Cholesky factor of 1 + T G'G T for many T, and as many noise covariances by which the products are taken.
 
     Attributes:
         sd: standard deviations of the states in units of the noise, shape (n, m).
@@ -98,15 +97,13 @@ class Elimination:
     below: tuple[np.ndarray, ...]
 
     @classmethod
-    def of(cls, states: StopStates, sd: np.ndarray) -> Elimination:
-        """The factor, column by column."""
-        later, gram = states.later, states.gram
-        diagonal = 1 + sd**2 * np.diag(gram)
-        rest = {
-            (i, j): sd[:, i] * sd[:, j] * gram[i, j] if gram[i, j] else np.zeros(len(sd))
-            for i, own in enumerate(later)
-            for j in own
-        }
+    def of(cls, states: StopStates, sd: np.ndarray, gram: np.ndarray) -> Elimination:
+        """The factor, column by column; `gram` is G'G of each point where states are `overlapping`, shape (n, k)."""
+        later, (rows, columns) = states.later, states.overlapping
+        scaled = np.ascontiguousarray((sd[:, rows] * sd[:, columns] * gram).T)
+        diagonal = 1 + scaled[rows == columns].T
+        rest = {(i, j): np.zeros(len(sd)) for i, own in enumerate(later) for j in own}
+        rest |= dict(zip(zip(rows.tolist(), columns.tolist(), strict=True), scaled, strict=True))
         pivot, below = np.empty_like(sd), []
         for i, own in enumerate(later):
             pivot[:, i] = np.sqrt(diagonal[:, i])

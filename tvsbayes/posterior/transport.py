@@ -34,6 +34,7 @@ from tvsbayes.model.parameter_space import (
     half_normal_slope,
 )
 from tvsbayes.posterior.linear_campaign import Conditional, Creep, LinearCampaign
+from tvsbayes.posterior.look_noise import LookNoise
 from tvsbayes.posterior.plays import Cut, HalfNormal
 from tvsbayes.posterior.stop_states import Elimination, stop_states
 
@@ -54,6 +55,8 @@ LEAST_SCALE = 1e-6
 """Of a noise scale over that at the mode: what is smaller moves nothing."""
 FAR_ABOVE = 1e200
 """A last diagonal element that keeps a matrix positive definite whatever stands in its row; nothing reads its root."""
+FAR_SD, FAR_PIXELS = 4.0, 4.0
+"""How far the map follows scatter of looks: sds of its prior, and pixel variance at the mode over that of a draw."""
 BLOCK_ROWS = 64
 """Points that are mapped at a time: their matrices stay in the processor's cache."""
 CENTRINGS = 1
@@ -127,6 +130,7 @@ class Transport:
             half-normal scales, whose logarithm is no linear function, the step of z instead.
         half: which noise scales are half-normal, shape (q,).
         pixels: 1 at the noise coordinate that scales all pixels, shape (q,).
+        scatter: 1 at the noise coordinates that are the scatter of looks (pan, tilt), shape (2, q).
         linear: the campaign at the mode.
         residuals: of the model, for centring.
         bend: how the slopes of the narrow coordinates change with all others, as these move away from the mode: by
@@ -150,6 +154,7 @@ class Transport:
     slope: np.ndarray
     half: np.ndarray
     pixels: np.ndarray
+    scatter: np.ndarray
     linear: LinearCampaign
     residuals: Residuals
     bend: np.ndarray
@@ -250,13 +255,12 @@ class Transport:
         """
         linear, log_scale = self.linear, self._log_scale(noise)
         weight = np.exp(-2 * log_scale @ self.pixels)
-        places, count = linear.places.shape[1], len(linear.gram)
+        places, count = linear.places.shape[1], linear.columns.shape[1]
         later = None if linear.creep is None else linear.creep.later(log_scale @ self.creep_noise)
-        products = linear.at(later)
+        inner = linear.looks.inner(weight[:, None] * np.exp(2 * log_scale @ self.scatter.T))
+        products = linear.at(inner, later)
         variance = linear.constant + np.exp(2 * log_scale) @ linear.by_noise.T
-        # Less scatter of looks than at the mode leaves less than the stops' own variance: never none.
-        variance = np.maximum(variance, LEAST_SCALE * (linear.constant + linear.by_noise.sum(axis=1)))
-        elimination = Elimination.of(linear.states, np.sqrt(weight[:, None] * variance))
+        elimination = Elimination.of(linear.states, np.sqrt(weight[:, None] * variance), products.of_states)
         white = elimination.whitened(products.by_states)
         whole = weight[:, None, None] * (products.gram - np.swapaxes(white, 1, 2) @ white)
         root = self._place_roots(log_scale)
@@ -271,7 +275,8 @@ class Transport:
         whole[:, -1, -1] = FAR_ABOVE
         found = np.linalg.cholesky(whole)
         last = count - 1
-        return Conditional(weight, elimination, white, root, found[:, :last, :last], found[:, last, places:last], later)
+        own, shift = found[:, :last, :last], found[:, last, places:last]
+        return Conditional(weight, inner, elimination, white, root, own, shift, later)
 
     @cached_property
     def _score_at_mode(self) -> np.ndarray:
@@ -425,23 +430,33 @@ def walks(fit: JointFit) -> Walks:
     return Walks(np.reshape(columns, (len(columns), rows)).T, np.reshape(walk, (len(walk), 2)))
 
 
-def creep(fit: JointFit, by_y: np.ndarray, errors: int) -> Creep | None:
+def creep(fit: JointFit, by_y: np.ndarray, errors: int, looks: LookNoise) -> Creep | None:
     """Of zeros whose creep's time constant is estimated.
 
     Args:
         fit: converged.
         by_y: the coordinates z of how far each zero creeps by y, shape (2, g).
         errors: at places and of drifts, columns before those of y.
+        looks: all of them.
     """
     minutes = INDEX["creep_minutes"]
     if not fit.free[minutes]:
         return None
-    slope, physical = np.asarray(fit.linearised.slope), np.asarray(fit.mode.physical)
-    moves = np.asarray(fit.arrays.spots.move_index)[: len(slope)]
+    physical, moves = np.asarray(fit.mode.physical), np.asarray(fit.arrays.spots.move_index)[: len(looks.load)]
     unit_rad = np.radians(np.asarray(fit.space.u)[CREEP_COLUMNS])
     at_mode = -np.radians(physical[CREEP_COLUMNS])
     rows = np.column_stack([np.zeros((2, errors)), unit_rad[:, None] * by_y[:, ::-1], at_mode])
-    return Creep(np.asarray(fit.arrays.moves.warm_minutes)[moves], float(physical[minutes]), slope, rows)
+    rows /= looks.unit_rad[:, None]
+    return Creep(np.asarray(fit.arrays.moves.warm_minutes)[moves], float(physical[minutes]), looks, rows)
+
+
+def look_noise(fit: JointFit) -> LookNoise:
+    """Of the looks of a fit, as far as its prior of their scatter goes."""
+    slope, held = np.asarray(fit.linearised.slope), ~fit.free[SCATTER_COLUMNS]
+    variance_rad2 = np.radians(np.asarray(fit.mode.physical)[SCATTER_COLUMNS]) ** 2
+    at = np.where(held, FAR_SD, fit.z[SCATTER_COLUMNS])
+    most = FAR_PIXELS * (half_normal(np.array(FAR_SD)) / half_normal(at)) ** 2
+    return LookNoise.of(slope, np.asarray(fit.arrays.spots.weight)[: len(slope)], variance_rad2, most)
 
 
 def transport(fit: JointFit) -> Transport:
@@ -492,8 +507,8 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
     noise = free[scales]
     noise = noise[np.argsort(~np.isin(names[noise], names_of("look_scatter_deg")), kind="stable")]
     of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
-    stops, drifts = stop_states(fit, linear), walks(fit)
-    by_noise, by_scatter = STOP_COLUMNS.reshape(4, 1) == noise, SCATTER_COLUMNS.reshape(2, 1) == noise
+    stops, drifts, looks = stop_states(fit, linear), walks(fit), look_noise(fit)
+    by_noise = STOP_COLUMNS.reshape(4, 1) == noise
     places = fit.arrays.gears.without_padding().places
     seen = np.flatnonzero(places.valid)
     columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, 2 * len(places.steps))
@@ -516,16 +531,18 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
         slope=np.where(half, 1.0, np.asarray(fit.space.u)[noise])[:, None] * of_noise,
         half=half,
         pixels=(noise == INDEX["pixel_scale"]).astype(float),
+        scatter=(SCATTER_COLUMNS[:, None] == noise).astype(float),
         linear=LinearCampaign(
             residual=linear.residual.ravel(),
             along=(linear.jacobian[..., others] @ wide).reshape(4 * spots, -1),
             states=stops,
-            by_noise=stops.variance @ by_noise + stops.scatter @ by_scatter,
+            by_noise=stops.variance @ by_noise,
             # Stop errors whose sd is not estimated keep their variance.
-            constant=stops.constant + stops.variance @ ~by_noise.any(axis=1) - stops.scatter @ by_scatter.any(axis=1),
+            constant=stops.constant + stops.variance @ ~by_noise.any(axis=1),
             places=np.column_stack([columns[:, np.concatenate([seen, len(places.steps) + seen])], drifts.columns]),
             prior=(wide.T * precision) @ wide,
-            creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, 2 * len(seen) + len(drifts.walk)),
+            looks=looks,
+            creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, 2 * len(seen) + len(drifts.walk), looks),
         ),
         residuals=misfit,
         bend=np.zeros((len(others), 0, 0)),
