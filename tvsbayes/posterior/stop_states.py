@@ -40,7 +40,8 @@ class StopStates:
     @cached_property
     def overlapping(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the upper triangle of G'G where spots see both states, the diagonal included."""
-        return np.nonzero(np.triu(self.gram))
+        rows, columns = np.nonzero(np.triu(self.gram))
+        return rows, columns
 
     @cached_property
     def later(self) -> tuple[tuple[int, ...], ...]:
