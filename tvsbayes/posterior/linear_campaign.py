@@ -87,21 +87,17 @@ class LinearCampaign:
         return self.looks.seen(np.concatenate([self.columns, self.states.load], axis=1))
 
     @cached_property
-    def _at_mode(self) -> np.ndarray:
-        """All of `Products` in a row, shape (k,)."""
+    def _spanned(self) -> np.ndarray:
+        """All of `Products` at the mode, then what every function of `LookNoise.basis` takes off, shape (1 + r, k)."""
         by_states, of_states = self.states.load.T @ self.columns, self.states.gram[self.states.overlapping]
-        return np.concatenate([(self.columns.T @ self.columns).ravel(), by_states.ravel(), of_states])
-
-    @cached_property
-    def _lost(self) -> np.ndarray:
-        """What every function of `LookNoise.basis` takes off `_at_mode`, shape (r, k)."""
+        at_mode = np.concatenate([(self.columns.T @ self.columns).ravel(), by_states.ravel(), of_states])
         count = self.columns.shape[1]
         seen, (rows, columns) = self._seen, self.states.overlapping
         own = seen[..., count:]
-        of_states = (own[:, :, None, rows] * own[:, None, :, columns]).reshape(4 * len(own), len(rows))
+        lost = (own[:, :, None, rows] * own[:, None, :, columns]).reshape(4 * len(own), len(rows))
         by_columns = self.looks.products(seen, seen[..., :count])
         flat = by_columns.reshape(len(by_columns), seen.shape[2] * count)
-        return np.concatenate([flat, self.looks.basis @ of_states], axis=1)
+        return np.concatenate([at_mode[None], np.concatenate([flat, self.looks.basis @ lost], axis=1)])
 
     def at(self, inner: np.ndarray, later: np.ndarray | None) -> Products:
         """Products of the columns by the inverse noise covariance of K, as `LookNoise.inner` gives it.
@@ -111,7 +107,7 @@ class LinearCampaign:
             later: how much more of a creep is over, as `Creep.later` gives it.
         """
         count, states = self.columns.shape[1], self.states.load.shape[1]
-        whole = self._at_mode - self.looks.shares(inner) @ self._lost
+        whole = np.column_stack([np.ones(len(inner)), -self.looks.shares(inner)]) @ self._spanned
         by_columns, of_states = np.split(whole, [(count + states) * count], axis=1)
         gram, by_states = np.split(by_columns.reshape(-1, count + states, count), [count], axis=1)
         creep = self.creep
@@ -120,7 +116,7 @@ class LinearCampaign:
         left = later[..., None, None] * (np.eye(2) - self.looks.square @ inner)
         new = np.tensordot(np.swapaxes(left, 1, 2), self._seen, ((2, 3), (0, 1)))
         cross = np.swapaxes(new[..., :count], 1, 2) @ creep.rows
-        square = np.sum(later[..., None, None] * left @ self.looks.square, axis=1)
+        square = np.tensordot(later[..., None, None] * left, self.looks.square, ((1, 3), (0, 1)))
         by_states = by_states + np.swapaxes(new[..., count:], 1, 2) @ creep.rows
         both = creep.rows.T @ square @ creep.rows
         return Products(gram + cross + np.swapaxes(cross, 1, 2) + both, by_states, of_states)
