@@ -11,6 +11,7 @@ import pytest
 import yaml
 from support.commands import assert_error
 
+from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.head.urdf import head_joints
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
@@ -22,6 +23,7 @@ from tvsbayes.instrument.stereo_pair import NO_STEREO
 from tvsbayes.pipeline import calibrate
 from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.looks import covariance_of
+from tvsbayes.posterior.transport import transport
 from tvsbayes.twin.head_physics import head_beam
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -65,6 +67,16 @@ def known_head(tmp_path_factory):
     results = calibrate(simulated.campaign, folder / "results", tier="importance")
     assert results.record.summary.answer == "accepted"
     return folder, simulated.truth
+
+
+def test_the_map_exists_at_scales_far_from_the_mode(known_head, monkeypatch):
+    """Where sightings are far better than stated their scatter alone is left, and rounding is all of a difference."""
+    path = transport(fit(read_campaign(known_head[0])))
+    noise = 6 * np.random.default_rng(0).standard_t(4, size=(768, path.noise))
+    assert np.all(np.isfinite(path.conditional(noise).factor))
+    monkeypatch.setattr("tvsbayes.posterior.transport.WEIGHT_MAX", np.inf)
+    with pytest.raises(np.linalg.LinAlgError):
+        path.conditional(noise)
 
 
 def fresh(truth, steps, folder, seed=5, counters=lambda pan, tilt: (pan, tilt)):
