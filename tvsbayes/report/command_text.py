@@ -133,7 +133,8 @@ def plan_text(result: PlanResult) -> str:
             f"{LOOKS_PER_EXPERIMENT * p.experiments:5d}  {p.minutes:7.1f}  {classic_value:>10}  {p.joint:>10.3g}  "
             f"{100 * p.assurance:6.0f} +- {100 * p.assurance_se:.1f} %"
         )
-    lines.append(f"u in {unit}, medians over {result.draws} drawn instruments;")
+    symbol = result.target.text.partition("(")[0]
+    lines.append(f"{symbol} in {unit}, medians over {result.draws} drawn instruments;")
     lines.append("chance of success (assurance): that the fit of such a campaign reports the target as met")
     most = LOOKS_PER_EXPERIMENT * result.curve[-1].experiments
     for level, n in zip(ASSURED, (result.n80, result.n95), strict=True):

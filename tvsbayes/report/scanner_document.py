@@ -241,8 +241,9 @@ def _steps(e: Evidence) -> list[str]:
     unmet = next((c for c in e.criteria if c.verdict != MET), None)
     if unmet is not None and e.planned is None and summary.explained:
         limit = f"{unmet.limit:g} {unmet.unit}"
-        aim = f"u(worst) <= {limit}" if unmet.unit != "mm" else f"U95(x) at {e.range_mm:g},0,0 mm <= {limit}"
-        given = f"`tvsbayes plan {folder}/rig.toml --given {folder} --target '{aim}'`"
+        aim = f"U95(worst) <= {limit}" if unmet.unit != "mm" else f"U95(x) at {e.range_mm:g},0,0 mm <= {limit}"
+        known = e.campaign.path is not None and (e.campaign.path / "rig.toml").is_file()
+        given = f"`tvsbayes plan {f'{folder}/rig.toml' if known else 'RIG'} --given {folder} --target '{aim}'`"
         steps.append(f"Add looks until the limit is met; the fewest: {given}.")
     if not steps:
         steps.append("Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped.")
