@@ -107,7 +107,10 @@ def opened(path: Path, allowed: str, folder: Path | None = None) -> Iterator[Bin
     except FileNotFoundError as error:
         remedy = f"create it, or correct {escaped(str(path), 200)}"
         if Path(path).name == "stereo.json":
-            remedy = f"`tvsbayes stereo` makes one of pictures, of OpenCV's, ROS' or Kalibr's calibration, or of nominal numbers; {remedy}"
+            remedy = (
+                "`tvsbayes stereo` makes one of pictures, of OpenCV's, ROS' or Kalibr's calibration, or of nominal "
+                f"numbers; {remedy}"
+            )
         raise bad("missing-file", "no such file", remedy) from error
     except (OSError, ValueError) as error:
         reason = escaped(getattr(error, "strerror", None) or str(error))
