@@ -102,9 +102,9 @@ def stereo(
         remedy = "--export opencv or ros, --finder classic or sector, --pair name or order"
         raise InputError("usage", f"{', '.join(odd)}: no option of stereo takes this value", remedy=remedy)
     if (folder is None) == (not imports):
-        found = "stereo needs pictures of a board, or a calibration to import"
-        found = found if folder is None else "stereo takes pictures or a calibration to import, not both"
-        raise InputError("usage", found, remedy="give FOLDER with --board and --pitch-mm, or --import FILE")
+        message = "stereo needs pictures of a board, or a calibration to import"
+        message = wanted if folder is None else "stereo takes pictures or a calibration to import, not both"
+        raise InputError("usage", message, remedy="give FOLDER with --board and --pitch-mm, or --import FILE")
     uncertainties = {"u_focal_percent": u_focal_percent, "u_principal_px": u_principal_px}
     uncertainties |= {"u_rotation_mrad": u_rotation_mrad, "u_baseline_mm": u_baseline_mm}
     finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, marker_mm=marker_mm, rms_px=rms_px, **uncertainties)

@@ -167,54 +167,54 @@ def counter_findings(pattern: SpotPattern) -> list[Finding]:
     seen = _seen(pattern)
     table = {axis: steps[seen.at] for axis, steps in seen.counters.items()}
     summed = {axis: _summed(seen.campaign, axis)[seen.at] for axis in AXES}
-    own: dict[Axis, _Followed] = {}
+    followed: dict[Axis, _Followed] = {}
     crossed: dict[Axis, _Followed] = {}
     added: dict[Axis, _Followed] = {}
     for axis in AXES:
         other = table[AXES[axis == AXES[0]]]
-        own[axis] = _followed(seen, axis, table[axis], other)
+        followed[axis] = _followed(seen, axis, table[axis], other)
         crossed[axis] = _followed(seen, axis, other, table[axis])
         added[axis] = _followed(seen, axis, summed[axis], summed[AXES[axis == AXES[0]]])
-    enough = [axis for axis in AXES if own[axis].stops_free >= STOPS_FREE_MIN]
+    enough = [axis for axis in AXES if followed[axis].stops_free >= STOPS_FREE_MIN]
     expected = [
-        axis for axis in enough if own[axis].spread_steps * seen.ratios[axis] > EXPECTED * seen.hidden_deg[axis]
+        axis for axis in enough if followed[axis].spread_steps * seen.ratios[axis] > EXPECTED * seen.hidden_deg[axis]
     ]
-    if len(expected) == 2 and all(own[axis].share < LOST and crossed[axis].follows for axis in AXES):
+    if len(expected) == 2 and all(followed[axis].share < LOST and crossed[axis].follows for axis in AXES):
         message = "spots move across with the tilt counter and up with the pan counter: are both columns exchanged?"
         return [Finding("columns-exchanged", message, file="moves.csv")]
-    steps = [axis for axis in enough if _are_steps(seen, axis, own[axis], added[axis])]
+    steps = [axis for axis in enough if _are_steps(seen, axis, followed[axis], added[axis])]
     if steps:
-        return [_steps_finding(seen, steps, own)]
+        return [_steps_finding(seen, steps, followed)]
     if enough and (shifted := _row_finding(seen)) is not None:
         return [shifted]
-    signs = [axis for axis in expected if _runs_back(seen, axis, own[axis])]
-    found = [_sign_finding(seen, signs, own)] if signs else []
-    return found + [
+    signs = [axis for axis in expected if _runs_back(seen, axis, followed[axis])]
+    findings = [_sign_finding(seen, signs, followed)] if signs else []
+    return findings + [
         Finding(
             "counter-lost",
             f"spots do not follow {axis}_steps: rows of moves.csv and spots.csv shifted, or counters of another run?",
             file="moves.csv",
         )
         for axis in expected
-        if own[axis].share < LOST
+        if followed[axis].share < LOST
     ]
 
 
-def _runs_back(seen: _Seen, axis: Axis, own: _Followed) -> bool:
+def _runs_back(seen: _Seen, axis: Axis, followed: _Followed) -> bool:
     """Whether spots run against a counter, with cameras that cannot be upside down."""
     roll = seen.campaign.rig.priors["extrinsics.rotation_rad.x"]
     mounted = PRIOR_SDS * roll.u < np.pi / 2
-    return mounted and own.follows and own.slope < -LEAST_SLOPE * seen.ratios[axis]
+    return mounted and followed.follows and followed.slope < -LEAST_SLOPE * seen.ratios[axis]
 
 
-def _are_steps(seen: _Seen, axis: Axis, own: _Followed, added: _Followed) -> bool:
+def _are_steps(seen: _Seen, axis: Axis, followed: _Followed, added: _Followed) -> bool:
     """Whether the cells of a counter are the steps of each move."""
     # What play and scatter may hide, sums of a few counters explain by chance.
-    told = own.stops_free >= STOPS_MANY or own.left_deg > UNEXPLAINED * seen.hidden_deg[axis]
-    return told and added.follows and own.left_deg**2 > BETTER * added.left_deg**2
+    decided = followed.stops_free >= STOPS_MANY or followed.left_deg > UNEXPLAINED * seen.hidden_deg[axis]
+    return decided and added.follows and followed.left_deg**2 > BETTER * added.left_deg**2
 
 
-def _steps_finding(seen: _Seen, axes: list[Axis], own: Mapping[Axis, _Followed]) -> Finding:
+def _steps_finding(seen: _Seen, axes: list[Axis], followed: Mapping[Axis, _Followed]) -> Finding:
     names = " and ".join(f"{axis}_steps" for axis in axes)
     remedy = f"moves.csv holds absolute counters AFTER the move: {mending_command(seen.campaign, '--relative')}"
     return Finding(
@@ -222,14 +222,14 @@ def _steps_finding(seen: _Seen, axes: list[Axis], own: Mapping[Axis, _Followed])
         f"spots follow the sum of {names}, not {names}: are these the steps of each move?",
         remedy,
         certain=any(
-            own[axis].stops_free >= STOPS_CERTAIN and own[axis].left_deg > UNEXPLAINED * seen.hidden_deg[axis]
+            followed[axis].stops_free >= STOPS_CERTAIN and followed[axis].left_deg > UNEXPLAINED * seen.hidden_deg[axis]
             for axis in axes
         ),
         file="moves.csv",
     )
 
 
-def _sign_finding(seen: _Seen, axes: list[Axis], own: Mapping[Axis, _Followed]) -> Finding:
+def _sign_finding(seen: _Seen, axes: list[Axis], followed: Mapping[Axis, _Followed]) -> Finding:
     """That counters run the wrong way; with rows that are one apart where that shows the same."""
     parts, pair = [], (0, 0)
     for axis in axes:
@@ -258,7 +258,7 @@ def _sign_finding(seen: _Seen, axes: list[Axis], own: Mapping[Axis, _Followed]) 
         "counter-sign",
         "; ".join(parts),
         remedy,
-        certain=min(own[axis].stops_free for axis in axes) >= STOPS_CERTAIN,
+        certain=min(followed[axis].stops_free for axis in axes) >= STOPS_CERTAIN,
         file="moves.csv",
         line=line_of(seen.pattern.spots[pair[1]].move),
     )
@@ -292,9 +292,9 @@ def _row_finding(seen: _Seen) -> Finding | None:
         moved = at + lag * (np.arange(len(at)) >= begin)
         return left(table[np.clip(moved, 0, len(table) - 1)])
 
-    own, motion = left(table[at]), left(np.zeros((len(at), 2)))
+    unmoved, motion = left(table[at]), left(np.zeros((len(at), 2)))
     hidden = np.array([seen.hidden_deg[axis] for axis in AXES])
-    if np.all(own < (UNEXPLAINED * hidden) ** 2):
+    if np.all(unmoved < (UNEXPLAINED * hidden) ** 2):
         return None
 
     def rest(lag: int, begin: int) -> float:
@@ -302,14 +302,14 @@ def _row_finding(seen: _Seen) -> Finding | None:
 
     last = len(at) - SPOTS_MIN
     tried = np.unique(np.linspace(0, last, BEGINS_TRIED).astype(int)).tolist()
-    found = []
+    rows = []
     for lag in (-1, 1):
         near = min(tried, key=partial(rest, lag))
         around = range(max(near - last // BEGINS_TRIED, 0), min(near + last // BEGINS_TRIED, last) + 1)
         begin = min(around, key=partial(rest, lag))
-        found.append((rest(lag, begin), lag, begin))
-    least, lag, begin = min(found)
-    if own.sum() <= BETTER * least or least > (1 - FOLLOWED) * motion.sum():
+        rows.append((rest(lag, begin), lag, begin))
+    least, lag, begin = min(rows)
+    if unmoved.sum() <= BETTER * least or least > (1 - FOLLOWED) * motion.sum():
         return None
     free = len(np.unique(at)) - np.linalg.matrix_rank(_columns(nearness, *table[at].T))
     first = spots[int(chosen[begin])]
@@ -322,7 +322,7 @@ def _row_finding(seen: _Seen) -> Finding | None:
         f"spots.csv names (spot {first.spot}: move {first.move}): do pictures or rows count from 1, or is a row of "
         "moves.csv missing or one too many?",
         f"{'add 1 to' if lag > 0 else 'take 1 from'} their column move: {mending_command(seen.campaign, option)}",
-        certain=bool(own.sum() > CERTAIN * least and free >= STOPS_CERTAIN),
+        certain=bool(unmoved.sum() > CERTAIN * least and free >= STOPS_CERTAIN),
         file="spots.csv",
         line=line_of(row),
     )
@@ -330,9 +330,9 @@ def _row_finding(seen: _Seen) -> Finding | None:
 
 def _summed(campaign: Campaign, axis: Axis) -> np.ndarray:
     """What the counters of an axis add up to, anew in every segment."""
-    total, before, found = 0, -1, []
+    total, before, sums = 0, -1, []
     for move in campaign.moves:
         total = (total if move.segment == before else 0) + getattr(move, f"{axis}_steps")
         before = move.segment
-        found.append(total)
-    return np.array(found, dtype=float)
+        sums.append(total)
+    return np.array(sums, dtype=float)

@@ -260,12 +260,12 @@ def fit(
             job.begin(NEWTON)
             mode = problem.mode(z)
             job.begin(DIAGNOSING)
-            found = fit_at(campaign, problem, mode, seed)
+            result = fit_at(campaign, problem, mode, seed)
             axes = unrecorded(campaign.moves)
-            if not axes or not found.converged:
-                return found
+            if not axes or not result.converged:
+                return result
             job.begin(HOMING)
-            return _by_homing(found, problem, axes, seed, job.at)
+            return _by_homing(result, problem, axes, seed, job.at)
         except np.linalg.LinAlgError as error:
             raise diverged from error
 
@@ -417,7 +417,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     seen_at = seen_places(campaign.moves, [spot.move for spot in problem.spots], campaign.rig)
     places = place_arrays(seen_at)
     share = placed(np.pad(line_share(seen_at, used), (0, len(places.steps) - len(seen_at.steps))))
-    seen = SeenLine(np.asarray(pose), places, share)
+    line = SeenLine(np.asarray(pose), places, share)
     count, joint = len(NAMES), with_places(mode.z, mode.covariance, information)
     # What the campaign cannot tell of has no draws: those of the others are then the same whether it is known or not.
     drawn = np.ones(len(joint.mean), dtype=bool)
@@ -430,7 +430,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     def derived(z: np.ndarray, errors_rad: np.ndarray) -> Derived:
         """At the mode, and of draws."""
         z, errors = np.concatenate([mode.z[None], z]), np.concatenate([centre_rad[None], errors_rad])
-        return jax.tree.map(np.asarray, derived_quantities(z, errors, problem.space, seen))
+        return jax.tree.map(np.asarray, derived_quantities(z, errors, problem.space, line))
 
     at_mode_and_draws = derived(draws_z, draws_rad)
     if prior_draws is None:
@@ -459,7 +459,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
         information=information,
         chi2=chi2,
         reference_pose_rad=np.asarray(pose),
-        seen_line=seen,
+        seen_line=line,
         free=problem.free,
         draws_z=draws_z,
         draws_places=both[:, count:],

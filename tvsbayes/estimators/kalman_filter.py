@@ -116,8 +116,8 @@ def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
         variances.append(variance_ahead)
         gains.append(gain / jnp.sqrt(variance_ahead))
     variance = jnp.stack(variances)
-    found = Gains(jnp.stack(gains), jnp.sqrt(variance))
-    return KalmanUpdate(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(variance)), found)
+    update = Gains(jnp.stack(gains), jnp.sqrt(variance))
+    return KalmanUpdate(Belief(mean, covariance), jnp.stack(errors), jnp.sum(jnp.log(variance)), update)
 
 
 def no_belief(*columns: int) -> Belief:
@@ -141,8 +141,8 @@ def filtered(rows: FilterRows, before: Belief) -> Seen:
     """Run the filter over spots in time order, from the belief before them."""
 
     def step(belief, row):
-        seen = kalman_update(belief.renewed(row), row)
-        return seen.belief, (seen.standardised, seen.log_variance, seen.gains)
+        updated = kalman_update(belief.renewed(row), row)
+        return updated.belief, (updated.standardised, updated.log_variance, updated.gains)
 
     after, (standardised, log_variance, gains) = jax.lax.scan(step, before, rows)
     return Seen(standardised, log_variance, after, gains)
@@ -162,12 +162,12 @@ def columns_filtered(
     before: Float[Array, "6 columns"],
 ) -> ColumnsSeen:
     """Send further columns through a filter whose gains are known: a product of few numbers before and after."""
-    load, own = rows.load / gains.sd[..., None], columns / gains.sd[..., None]
+    load, whitened = rows.load / gains.sd[..., None], columns / gains.sd[..., None]
     loads: list[Any] = []
     residuals: list[Any] = []
     # What earlier components have moved stands in the load of later ones.
-    for component in range(own.shape[1]):
-        slope, residual = load[:, component], own[:, component]
+    for component in range(whitened.shape[1]):
+        slope, residual = load[:, component], whitened[:, component]
         for earlier in range(component):
             share = jnp.sum(load[:, component] * gains.gain[:, earlier], axis=1)[:, None]
             slope, residual = slope - share * loads[earlier], residual - share * residuals[earlier]

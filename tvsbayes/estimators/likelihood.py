@@ -134,11 +134,11 @@ def root_at_places(model: Model, gears: GearArrays) -> Float[Array, "errors erro
 
 def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | None = None) -> FilterInput:
     """Linearise all spots for the filter; `angles` are the spots', if they are known."""
-    found = standing(model, arrays, angles=angles)
-    terms, turned = found.terms, found.to_states
+    stood = standing(model, arrays, angles=angles)
+    terms, turned = stood.terms, stood.to_states
     first, second, *free = turned.of_many(terms.residual)
-    seen, slope = jnp.stack([first, second], axis=1), turned.slope
-    rows = filter_rows(seen, slope, found.play_sd_rad, found.stop_variance, found.drift_variance, arrays.spots)
+    load, slope = jnp.stack([first, second], axis=1), turned.slope
+    rows = filter_rows(load, slope, stood.play_sd_rad, stood.stop_variance, stood.drift_variance, arrays.spots)
     log_scale = terms.log_scale + turned.log_scale - 0.5 * sum(number**2 for number in free)
     return FilterInput(rows, slope, jnp.stack(free, axis=1), log_scale)
 
@@ -218,8 +218,8 @@ def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -
         # The first group goes along with the residuals: its columns cost no loop of their own.
         both = [given.rows.residual[..., None], place_columns(given.slope, part.gears.some(0, together))]
         rows = eqx.tree_at(lambda r: r.residual, given.rows, jnp.concatenate(both, axis=2))
-        seen = filtered(rows, so_far.belief)
-        standardised, leading = seen.standardised[..., 0], seen.standardised[..., 1:].reshape(-1, columns)
+        after = filtered(rows, so_far.belief)
+        standardised, leading = after.standardised[..., 0], after.standardised[..., 1:].reshape(-1, columns)
 
         def along_with(flat):
             return jnp.sum(flat * standardised.reshape(-1, 1), axis=0)
@@ -227,9 +227,9 @@ def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -
         def of_group(group, of_places):
             means, block, along = of_places
             own = place_columns(given.slope, part.gears.some(group * together, together))
-            found = columns_filtered(own, given.rows, seen.gains, means[group])
-            flat = found.standardised.reshape(-1, columns)
-            return means.at[group].set(found.mean), block.at[group].set(flat), along.at[group].add(along_with(flat))
+            passed_on = columns_filtered(own, given.rows, after.gains, means[group])
+            flat = passed_on.standardised.reshape(-1, columns)
+            return means.at[group].set(passed_on.mean), block.at[group].set(flat), along.at[group].add(along_with(flat))
 
         def of_pair(pair, gram):
             return gram.at[pair].add(block[one[pair]].T @ block[two[pair]])
@@ -239,10 +239,10 @@ def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -
             block, along = block.at[0].set(leading), along.at[0].add(along_with(leading))
             means, block, along = jax.lax.fori_loop(1, groups, of_group, (means, block, along))
             gram = jax.lax.fori_loop(0, pairs_of(groups), of_pair, gram)
-        squares = jnp.sum(seen.log_variance) + jnp.sum(standardised**2)
+        squares = jnp.sum(after.log_variance) + jnp.sum(standardised**2)
         log_density = so_far.sums.log_density + jnp.sum(given.log_scale) - 0.5 * squares
         return Passed(
-            seen.belief,
+            after.belief,
             means,
             block,
             jax.lax.dynamic_update_slice_in_dim(so_far.standardised, standardised, start, 0),
@@ -476,12 +476,12 @@ def _residuals(
         model = space.model_at(values)
 
         def through(number, so_far):
-            seen, stretch = so_far
+            before, stretch = so_far
             part = arrays.of_spots(first + number * size, size)
-            found = angles_at(model.transmission, model.tilt_zero_rad, arrays.moves, part.spots.move_index, stretch)
-            stood = standing(model, part, angles=found.angles)
-            own = jnp.stack(stood.to_states.in_place(stood.terms.residual), axis=1)
-            return jax.lax.dynamic_update_slice_in_dim(seen, own, number * size, 0), found.stretch
+            angles = angles_at(model.transmission, model.tilt_zero_rad, arrays.moves, part.spots.move_index, stretch)
+            stood = standing(model, part, angles=angles.angles)
+            residual = jnp.stack(stood.to_states.in_place(stood.terms.residual), axis=1)
+            return jax.lax.dynamic_update_slice_in_dim(before, residual, number * size, 0), angles.stretch
 
         return jax.lax.fori_loop(0, blocks, through, (jnp.zeros((window, 4)), no_moves(arrays.moves)))[0]
 

@@ -51,11 +51,11 @@ LISTED = 6
 def sighting_findings(campaign: Campaign) -> tuple[Finding, ...]:
     """What no head can have seen, as `plausibility.implausible` lists it."""
     misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
-    found = []
+    findings = []
     if misspelt:
         named = listed(misspelt, LISTED)
         said = f"sightings {named} are left out: their status is not spelt ok, in small letters"
-        found.append(Finding("status", said, file=SIGHTINGS.file))
+        findings.append(Finding("status", said, file=SIGHTINGS.file))
     ok = ordered_spots(campaign)
     steps = np.array([(m.pan_steps, m.tilt_steps) for m in (campaign.moves[s.move] for s in ok)], float).reshape(-1, 2)
     angles_deg = sighted_deg(sightings_of(ok))
@@ -63,21 +63,21 @@ def sighting_findings(campaign: Campaign) -> tuple[Finding, ...]:
     for k, axis in enumerate(AXES):
         if len(np.unique(steps[:, k])) < LEAST:
             continue
-        own, other = (_misfit_deg(campaign, axis, steps[:, k], angles_deg[:, j]) for j in (k, 1 - k))
+        misfit_deg, other = (_misfit_deg(campaign, axis, steps[:, k], angles_deg[:, j]) for j in (k, 1 - k))
         turned = _misfit_deg(campaign, axis, -steps[:, k], angles_deg[:, k])
-        if own < FAR_DEG:
+        if misfit_deg < FAR_DEG:
             continue
-        what = f"{names[k]} does not follow {axis}_steps by the stated ratio ({own:.0f} deg off in the middle)"
-        if turned * NEARER < own:
+        what = f"{names[k]} does not follow {axis}_steps by the stated ratio ({misfit_deg:.0f} deg off in the middle)"
+        if turned * NEARER < misfit_deg:
             remedy = f"it does with the other sign: turn the sign of {axis}_steps, or of {names[k]}"
-            found.append(Finding("counter-sign", what, remedy, certain=True, file=SIGHTINGS.file))
-        elif other * NEARER < own:
+            findings.append(Finding("counter-sign", what, remedy, certain=True, file=SIGHTINGS.file))
+        elif other * NEARER < misfit_deg:
             remedy = f"{names[1 - k]} does: the columns are exchanged, or the counters"
-            found.append(Finding("exchanged", what, remedy, certain=True, file=SIGHTINGS.file))
+            findings.append(Finding("exchanged", what, remedy, certain=True, file=SIGHTINGS.file))
         else:
             remedy = f"correct degrees_per_step.{axis} in [rig.prior], or the table"
-            found.append(Finding("counters", what, remedy, file=SIGHTINGS.file))
-    return tuple(found)
+            findings.append(Finding("counters", what, remedy, file=SIGHTINGS.file))
+    return tuple(findings)
 
 
 def _misfit_deg(campaign: Campaign, axis: str, steps: np.ndarray, angle_deg: np.ndarray) -> float:

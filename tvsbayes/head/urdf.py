@@ -107,8 +107,8 @@ class Urdf:
 
     def reduction(self, joint: str) -> _Tag | None:
         """`mechanicalReduction` of the transmission of a joint, None where none is stated."""
-        found = (tag for tag in self.listed("transmission").values() if tag.named("joint", "name") == joint)
-        return next((tag.first("mechanicalReduction") for tag in found), None)
+        tags = (tag for tag in self.listed("transmission").values() if tag.named("joint", "name") == joint)
+        return next((tag.first("mechanicalReduction") for tag in tags), None)
 
 
 def read_urdf(data: bytes, file: str) -> Urdf:
@@ -202,8 +202,8 @@ class HeadJoints:
 
     def reduction(self, axis: str) -> float | None:
         """`mechanicalReduction` of its transmission, None where none is stated."""
-        found = self.urdf.reduction(self.names[axis])
-        return None if found is None else float(found.text)
+        tag = self.urdf.reduction(self.names[axis])
+        return None if tag is None else float(tag.text)
 
     def limits_deg(self, axis: str) -> tuple[float, float] | None:
         """Lowest and highest angle from the joint's zero, where azimuth or elevation grows; None without limits."""

@@ -333,11 +333,11 @@ def forest(target: Callable[[np.ndarray], np.ndarray], places: np.ndarray, dimen
     alone = target(np.concatenate([np.zeros((1, dimension)), steps, -steps]))
     centre, (ahead, behind) = alone[0], np.reshape(alone[1:], (2, count))
     strength = np.zeros(len(first))
-    for one, own in ((1, ahead), (-1, behind)):
+    for one, side in ((1, ahead), (-1, behind)):
         for other, its in ((1, ahead), (-1, behind)):
             both = target(one * steps[first] + other * steps[second])
             with np.errstate(invalid="ignore"):
-                beyond = both - own[first] - its[second] + centre
+                beyond = both - side[first] - its[second] + centre
             strength += np.abs(np.where(np.isfinite(beyond), beyond, 0.0))
     tree = np.arange(count)
     edges: dict[int, list[int]] = {row: [] for row in range(count)}
@@ -381,18 +381,18 @@ def _planes(target: Callable[[np.ndarray], np.ndarray], pairs: np.ndarray, dimen
     """
     turn = np.array([np.sum(pairs[:k, 0] == leader) for k, leader in enumerate(pairs[:, 0])], dtype=int)
     points = np.zeros((len(pairs), len(LEADER_NODES), len(CUT_NODES), dimension))
-    found = np.zeros((len(pairs), len(LEADER_NODES), len(NODES)))
+    planes = np.zeros((len(pairs), len(LEADER_NODES), len(NODES)))
     for now in range(turn.max(initial=-1) + 1):
-        own = np.flatnonzero(turn == now)
-        for k in own:
+        members = np.flatnonzero(turn == now)
+        for k in members:
             leader, follower = pairs[k]
             points[k, :, :, leader], points[k, :, :, follower] = LEADER_NODES[:, None], CUT_NODES
-        found[own] = between_cuts(_at_each(target, points[own]))
-        for k in own:
-            best = NODES[np.argmax(np.nan_to_num(found[k], nan=-np.inf), axis=1)]
+        planes[members] = between_cuts(_at_each(target, points[members]))
+        for k in members:
+            best = NODES[np.argmax(np.nan_to_num(planes[k], nan=-np.inf), axis=1)]
             later = (pairs[:, 0] == pairs[k, 0]) & (turn > now)
             points[later, :, :, pairs[k, 1]] = best[:, None]
-    return found
+    return planes
 
 
 def first_proposal(

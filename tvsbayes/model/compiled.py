@@ -52,18 +52,18 @@ def sources_of(module: str, package: Path) -> dict[Path, bytes]:
         module: its name.
         package: folder.
     """
-    found: dict[Path, bytes] = {}
+    sources: dict[Path, bytes] = {}
     start = _file_of(module, package)
     waiting = [start] if start is not None else [*package.rglob("*.py")]
     while waiting:
         path = waiting.pop()
-        if path in found:
+        if path in sources:
             continue
-        found[path] = path.read_bytes()
-        for name, part in IMPORTS.findall(found[path]):
+        sources[path] = path.read_bytes()
+        for name, part in IMPORTS.findall(sources[path]):
             files = _file_of(name.decode(), package), _file_of(f"{name.decode()}.{part.decode()}", package)
             waiting += [file for file in files if file is not None]
-    return dict(sorted(found.items()))
+    return dict(sorted(sources.items()))
 
 
 def _file_of(module: str, package: Path) -> Path | None:
@@ -86,10 +86,10 @@ class Traces:
 
     def code(self, module: str) -> bytes:
         """Hash of the sources that a function of a module is traced through, and of the versions of the libraries."""
-        found = hashlib.sha256(" ".join(version(library) for library in LIBRARIES).encode())
+        digest = hashlib.sha256(" ".join(version(library) for library in LIBRARIES).encode())
         for path, content in sources_of(module, PACKAGE).items():
-            found.update(f"{path.relative_to(PACKAGE)} {len(content)}\n".encode() + content)
-        return found.digest()
+            digest.update(f"{path.relative_to(PACKAGE)} {len(content)}\n".encode() + content)
+        return digest.digest()
 
     def name(self, key: str, module: str = "") -> str:
         """The file of a trace; "" where its source has changed since this process read it, or cannot be read."""
@@ -145,10 +145,10 @@ def _as_array(leaf: Any) -> np.ndarray | jax.Array:
     their device: for them as arguments JAX would compile the same function once more.
     """
     free = isinstance(leaf, jax.Array) and not leaf.weak_type and not leaf.committed
-    found = leaf if free else np.asarray(leaf)
-    if found.dtype == object or found.dtype.kind in "USV":
+    array = leaf if free else np.asarray(leaf)
+    if array.dtype == object or array.dtype.kind in "USV":
         raise TypeError(f"a compiled function takes arrays, not {type(leaf).__name__}")
-    return found
+    return array
 
 
 class Compiled[**P, Result]:
@@ -191,17 +191,17 @@ class Compiled[**P, Result]:
         with self._lock:
             run = self._ready.get(key)
             run = self._made(structure, arrays) if run is None else run
-            found = run(*arrays)
+            results = run(*arrays)
             self._ready[key] = run
-            return found
+            return results
 
     def _made(self, structure: Any, arrays: list) -> Callable:
         def flat(*leaves):
             self.traces += 1
             args, kwargs = jax.tree.unflatten(structure, leaves)
-            found = self.plain(*args, **kwargs)
-            parts = jax.tree.leaves(found)
-            if not isinstance(found, self._result) or len(parts) != len(self._fields()):
+            result = self.plain(*args, **kwargs)
+            parts = jax.tree.leaves(result)
+            if not isinstance(result, self._result) or len(parts) != len(self._fields()):
                 raise TypeError(f"{self.plain.__name__} must return a flat {self._result.__name__}")
             return tuple(parts)
 

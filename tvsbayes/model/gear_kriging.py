@@ -89,9 +89,10 @@ class KnownPlaces:
     def between(self, steps: np.ndarray, axis: int) -> Between:
         """Errors of an axis at counters (m,)."""
         different, which = np.unique(steps, return_inverse=True)
-        own = len(self.steps)
+        count = len(self.steps)
         error, play = (
-            part[own:][which] for part in self.factors_with(different.astype(float), np.full(len(different), axis == 1))
+            part[count:][which]
+            for part in self.factors_with(different.astype(float), np.full(len(different), axis == 1))
         )
-        rests = (np.linalg.norm(part[:, own:], axis=1) for part in (error, play))
-        return Between(error[:, :own], play[:, :own], *rests)
+        rests = (np.linalg.norm(part[:, count:], axis=1) for part in (error, play))
+        return Between(error[:, :count], play[:, :count], *rests)

@@ -57,9 +57,9 @@ class Places(eqx.Module):
 
 def errors_at(errors: np.ndarray, places: int) -> np.ndarray:
     """Transmission errors, then plays (n, e) at the first places, with those at all (n, 2 places); nothing behind."""
-    found = np.zeros((len(errors), 2, places))
-    found[:, :, : errors.shape[1] // 2] = np.reshape(errors, (len(errors), 2, -1))
-    return found.reshape(len(errors), -1)
+    errors_rad = np.zeros((len(errors), 2, places))
+    errors_rad[:, :, : errors.shape[1] // 2] = np.reshape(errors, (len(errors), 2, -1))
+    return errors_rad.reshape(len(errors), -1)
 
 
 def _by_axis(of_axis: Any, on_tilt: Any, functions: ModuleType) -> Any:

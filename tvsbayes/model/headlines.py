@@ -194,10 +194,10 @@ def line_deg_per_step(
         # The beam turns with the mirrors but for degrees: the rest tells on which turn it is.
         rest = jnp.where(places.on_tilt, elevation, azimuth) - turned
         parts = seen.share * (turned + rest - jnp.round(rest / (2 * jnp.pi)) * (2 * jnp.pi))
-        return jnp.sum(jnp.where(own, parts, 0.0), axis=1)
+        return jnp.sum(jnp.where(on_axis, parts, 0.0), axis=1)
 
-    own = jnp.stack([~places.on_tilt, places.on_tilt])
-    lined, local = jnp.any(own & (seen.share != 0), axis=1), jnp.diagonal(mirrors.jacobian)
+    on_axis = jnp.stack([~places.on_tilt, places.on_tilt])
+    lined, local = jnp.any(on_axis & (seen.share != 0), axis=1), jnp.diagonal(mirrors.jacobian)
     ideal = counted + places.by_axis(zero)
     whole = jnp.where(lined, slope(ideal + error), gears.ratio_rad_per_step * local)
     of_mirrors = jnp.where(lined, slope(ideal) / gears.ratio_rad_per_step, local)

@@ -63,7 +63,7 @@ def _of_block(block: str, names: tuple[str, ...]) -> Variable:
     if len(names) == 1:
         return Variable(names)
     labels = tuple(name.removeprefix(f"{block}.") for name in names)
-    return Variable(names, next(dim for dim, own in COORDS.items() if own == labels))
+    return Variable(names, next(dim for dim, of_dim in COORDS.items() if of_dim == labels))
 
 
 _RIG_BLOCKS = sorted(
@@ -144,13 +144,13 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
     stats = {"lp": xr.DataArray(posterior.log_density, coords, ("chain", "draw"))}
     lengths: dict[str, int] = {}
     if isinstance(posterior.convergence, Convergence):
-        found = posterior.convergence
-        stats["acceptance_rate"] = xr.DataArray(found.acceptance, {"chain": coords["chain"]}, ("chain",))
-        lengths = {"steps": found.steps, "discarded": found.discarded, "thin": found.thin}
+        convergence = posterior.convergence
+        stats["acceptance_rate"] = xr.DataArray(convergence.acceptance, {"chain": coords["chain"]}, ("chain",))
+        lengths = {"steps": convergence.steps, "discarded": convergence.discarded, "thin": convergence.thin}
     places = {"spot": [s.spot for s in spots], "pixel": list(PIXEL_LABELS)}
-    seen = np.zeros((len(spots), len(PIXEL_LABELS))) if mechanism.sightings else pixels_of(spots)
+    pixels = np.zeros((len(spots), len(PIXEL_LABELS))) if mechanism.sightings else pixels_of(spots)
     # Of sightings angles about the direction sighted, rad, in the columns of `campaign_arrays.SIGHTED`.
-    observed = xr.DataArray(seen, places, tuple(places), name="pixels")
+    observed = xr.DataArray(pixels, places, tuple(places), name="pixels")
     tree = xr.DataTree.from_dict(
         {
             "posterior": _dataset(_variables(posterior.draws, varying, shape, mechanism)),

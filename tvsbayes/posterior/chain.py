@@ -118,17 +118,17 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun[Ta
         raise InputError("no-chain", f"{name}: there is no chain to resume", file=name, remedy="run without --resume")
     try:
         stored = read_arrays(path, CHAIN_BYTES_MAX)
-        found = str(stored["format"])[:60]
-        if found.startswith(CHAIN_KIND) and found != CHAIN_FORMAT:
+        stored_format = str(stored["format"])[:60]
+        if stored_format.startswith(CHAIN_KIND) and stored_format != CHAIN_FORMAT:
             raise InputError(
                 "other-chain",
-                f"{name} was written by another version of tvsbayes: {escaped(found)}",
+                f"{name} was written by another version of tvsbayes: {escaped(stored_format)}",
                 file=name,
                 allowed=f"format {CHAIN_FORMAT}",
                 remedy="run without --resume; the chain starts anew",
             )
-        if found != CHAIN_FORMAT:
-            raise ValueError(f"format {found!r}")
+        if stored_format != CHAIN_FORMAT:
+            raise ValueError(f"format {stored_format!r}")
         same = str(stored["fingerprint"]) == fingerprint(fit) and int(stored["seed"]) == seed
         target = Target(fit, transport(fit))
         pool, chain, spent = _pool_of(stored, target), _chain_of(stored), float(stored["start_seconds"])

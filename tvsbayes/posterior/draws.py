@@ -104,8 +104,8 @@ class Posterior(Shown):
         state = "converged" if self.converged else "NOT CONVERGED"
         title = f"Posterior by {self.tier}, {self.weights.size} draws, {state}"
         names = headline_names(self.fit)
-        told = self.propagate(lambda p: np.stack([p[name] for name in names], axis=1))
-        columns = (each.tolist() for each in (told.mean, told.sd, *told.interval95))
+        values = self.propagate(lambda p: np.stack([p[name] for name in names], axis=1))
+        columns = (each.tolist() for each in (values.mean, values.sd, *values.interval95))
         rows = list(zip(names, *columns, strict=True))
         return View(title, ("quantity", "mean", "sd", "2.5 %", "97.5 %"), rows)
 
@@ -221,11 +221,11 @@ def derived_of(
     fit: JointFit, z: np.ndarray, place_errors_rad: np.ndarray, pose_rad: np.ndarray | None = None
 ) -> Derived:
     """Parameters and headlines of draws (..., p) with their errors at places (..., e), by default at the fit's pose."""
-    seen = fit.seen_line if pose_rad is None else replace(fit.seen_line, pose_rad=pose_rad)
+    line = fit.seen_line if pose_rad is None else replace(fit.seen_line, pose_rad=pose_rad)
     points = z.reshape(-1, z.shape[-1])
     # Gears that repeat nothing have no places, and -1 divides by none.
     given = points, place_errors_rad.reshape(len(points), place_errors_rad.shape[-1])
-    flat = in_batches(lambda z, errors: derived_quantities(z, errors, fit.space, seen), *given, size=DERIVED_BATCH)
+    flat = in_batches(lambda z, errors: derived_quantities(z, errors, fit.space, line), *given, size=DERIVED_BATCH)
     return jax.tree.map(lambda x: x.reshape(*z.shape[:-1], *x.shape[1:]), flat)
 
 

@@ -95,8 +95,8 @@ def _weighed_anew(fit: JointFit, run: ImportanceRun[Target], known: Callable[[We
     normal = target.place_normals(len(drawn), random_stream(seed, Stream.OTHER_HOMING))
     for begin in range(0, len(drawn), ROUND):
         some = slice(begin, begin + ROUND)
-        own = drawn.taken(some)
-        parts.append(target.at(own.w, Mapped(own.parts["z"], own.parts["log_jacobian"]), normal[some]))
+        subset = drawn.taken(some)
+        parts.append(target.at(subset.w, Mapped(subset.parts["z"], subset.parts["log_jacobian"]), normal[some]))
         points = Points.joined(parts)
         weighed = Weighing(target, replace(run.pool, points=points, counts=(len(points),), invalid=target.invalid))
         if known(weighed):

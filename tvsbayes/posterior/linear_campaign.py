@@ -92,11 +92,11 @@ class LinearCampaign:
         by_states, of_states = self.states.load.T @ self.columns, self.states.gram[self.states.overlapping]
         at_mode = np.concatenate([(self.columns.T @ self.columns).ravel(), by_states.ravel(), of_states])
         count = self.columns.shape[1]
-        seen, (rows, columns) = self._seen, self.states.overlapping
-        own = seen[..., count:]
-        lost = (own[:, :, None, rows] * own[:, None, :, columns]).reshape(4 * len(own), len(rows))
-        by_columns = self.looks.products(seen, seen[..., :count])
-        flat = by_columns.reshape(len(by_columns), seen.shape[2] * count)
+        by_angle, (rows, columns) = self._seen, self.states.overlapping
+        of_state = by_angle[..., count:]
+        lost = (of_state[:, :, None, rows] * of_state[:, None, :, columns]).reshape(4 * len(of_state), len(rows))
+        by_columns = self.looks.products(by_angle, by_angle[..., :count])
+        flat = by_columns.reshape(len(by_columns), by_angle.shape[2] * count)
         return np.concatenate([at_mode[None], np.concatenate([flat, self.looks.basis @ lost], axis=1)])
 
     def at(self, inner: np.ndarray, later: np.ndarray | None) -> Products:
@@ -192,8 +192,8 @@ class Conditional:
         right[:, :places] = np.einsum("nji,nj->ni", self.root, right[:, :places])
         factors = np.broadcast_to(self.factor[:, :count, :count], (len(misfit), count, count))
         pairs = zip(factors, right, strict=True)
-        found = [lapack.dpotrs(factor, each, lower=1)[0][places:] for factor, each in pairs]
-        return np.reshape(found, (len(misfit), narrow))
+        solved = [lapack.dpotrs(factor, each, lower=1)[0][places:] for factor, each in pairs]
+        return np.reshape(solved, (len(misfit), narrow))
 
     def means(self, wide: np.ndarray) -> np.ndarray:
         """Of the narrow coordinates (n, k) by the linearised campaign, at y of the others (n, g - k)."""

@@ -69,9 +69,9 @@ class LookNoise:
         scale = np.stack(np.meshgrid(*knots), axis=-1).reshape(-1, 2)
         # What the smallest eigenvalue of 1 - U K U' is at least: that of 1 + U T U' is 1 + U'U T at most.
         widest = 1 + np.max((self.variance * scale)[:, None] / self.weight[:, None] * self._squares, axis=(1, 2))
-        found = np.linalg.svd(widest[:, None] * self.inner(scale).reshape(len(scale), -1), full_matrices=False)
-        left = np.sqrt(np.cumsum((found.U * found.S)[:, ::-1] ** 2, axis=1)).max(axis=0)
-        return found.Vh[: int(np.sum(left > LEFT_OUT))]
+        spanned = np.linalg.svd(widest[:, None] * self.inner(scale).reshape(len(scale), -1), full_matrices=False)
+        left = np.sqrt(np.cumsum((spanned.U * spanned.S)[:, ::-1] ** 2, axis=1)).max(axis=0)
+        return spanned.Vh[: int(np.sum(left > LEFT_OUT))]
 
     @cached_property
     def _squares(self) -> np.ndarray:

@@ -103,9 +103,9 @@ def _by_move(
         row, first, beyond, log_scale = row_and_first
         belief = belief.renewed(row)
         cavity = jax.tree.map(lambda a, b: jnp.where(first, a, b), beyond.joined(belief), cavity)
-        seen = kalman_update(cavity, row)
-        log_density = log_scale - 0.5 * seen.log_variance - 0.5 * jnp.sum(seen.standardised**2)
-        return (kalman_update(belief, row).belief, seen.belief), log_density
+        updated = kalman_update(cavity, row)
+        log_density = log_scale - 0.5 * updated.log_variance - 0.5 * jnp.sum(updated.standardised**2)
+        return (kalman_update(belief, row).belief, updated.belief), log_density
 
     def one(z, turned_rad):
         given = filter_input(space.model(z), arrays)
@@ -139,10 +139,10 @@ def move_log_density(
         spots): the sum over a move's spots is the move's log density, without `campaign_arrays.spot_constants`.
     """
     count = int(arrays.count)
-    own = arrays.of_spots(0, min(bucket(count, WINDOW), len(arrays.spots.valid)))
-    turned_rad = np.zeros((len(z), len(own.spots.valid), 2))
+    window = arrays.of_spots(0, min(bucket(count, WINDOW), len(arrays.spots.valid)))
+    turned_rad = np.zeros((len(z), len(window.spots.valid), 2))
     turned_rad[:, :count] = turned_by(arrays, place_errors_rad)
-    return np.asarray(_by_move(z, turned_rad, space, own))[:, :count]
+    return np.asarray(_by_move(z, turned_rad, space, window))[:, :count]
 
 
 @dataclass(frozen=True)
@@ -170,8 +170,8 @@ def by_way(ways: Sequence[OneWay], function: Callable[[JointFit, np.ndarray], np
         ways: of the draws.
         function: of a fit and the rows of its draws, a row for each.
     """
-    found = np.concatenate([function(way.fit, way.rows) for way in ways])
-    return found[np.argsort(np.concatenate([way.rows for way in ways]))]
+    values = np.concatenate([function(way.fit, way.rows) for way in ways])
+    return values[np.argsort(np.concatenate([way.rows for way in ways]))]
 
 
 PIXEL_LABELS = tuple(name.removesuffix("_px") for name in PIXELS)
@@ -202,8 +202,8 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
 
 def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarray:
     """Noiseless pixels of all ordered spots, shape (draws, spots, 4), for coordinates (draws, p)."""
-    seen = in_batches(lambda z, e: observe_with_stop_errors(z, e, fit.space, fit.arrays), z, stop_error_rad)
-    return seen[..., :4]
+    observed = in_batches(lambda z, e: observe_with_stop_errors(z, e, fit.space, fit.arrays), z, stop_error_rad)
+    return observed[..., :4]
 
 
 def turned_by(arrays: CampaignArrays, place_errors_rad: np.ndarray) -> np.ndarray:
@@ -211,9 +211,9 @@ def turned_by(arrays: CampaignArrays, place_errors_rad: np.ndarray) -> np.ndarra
     gears = arrays.gears.without_padding()
     count, spots = len(gears.places.steps), int(arrays.count)
     axes = []
-    for own in (~gears.places.on_tilt, gears.places.on_tilt):
-        error = place_errors_rad[:, :count][:, own] @ gears.error_share[:spots, own].T
-        axes.append(error + place_errors_rad[:, count:][:, own] @ gears.play_share[:spots, own].T)
+    for of_axis in (~gears.places.on_tilt, gears.places.on_tilt):
+        error = place_errors_rad[:, :count][:, of_axis] @ gears.error_share[:spots, of_axis].T
+        axes.append(error + place_errors_rad[:, count:][:, of_axis] @ gears.play_share[:spots, of_axis].T)
     return np.stack(axes, axis=2)
 
 
@@ -250,9 +250,12 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
     places = np.arange(chains * draws).reshape(chains, draws)[:, chosen].ravel()
 
     def of_way(fit: JointFit, rows: np.ndarray) -> np.ndarray:
-        own = places[rows]
-        physical, errors_rad = np.asarray(drawn.physical)[own], np.asarray(drawn.place_errors_rad)[own]
-        return looks_again(fit, z[own], physical, errors_rad, generator)
+        places_of_way = places[rows]
+        physical, errors_rad = (
+            np.asarray(drawn.physical)[places_of_way],
+            np.asarray(drawn.place_errors_rad)[places_of_way],
+        )
+        return looks_again(fit, z[places_of_way], physical, errors_rad, generator)
 
     values = by_way(ways_of(posterior, places), of_way).reshape(chains, len(chosen), -1, 4)
     spots = [spot.spot for spot in ordered_spots(fit.campaign)]

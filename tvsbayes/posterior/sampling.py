@@ -103,9 +103,9 @@ def sample(
         job.begin(WALKING)
         keep = None if checkpoint is None else partial(write_chain, checkpoint, fit, start)
         walked = start.density.posterior(Run(start, chain, keep, job.at, began).until_converged(60 * max_minutes), seed)
-        found = walked.convergence
-        assert isinstance(found, Convergence)
-        agrees = found.agreement is None or found.agreement.agrees
+        convergence = walked.convergence
+        assert isinstance(convergence, Convergence)
+        agrees = convergence.agreement is None or convergence.agreement.agrees
         # A chain knows one way of homing; where others count, the weighted draws of all have the last word.
         return early if len(early.fit.mixture) > 1 and walked.converged and agrees else better(early, walked)
 

@@ -47,11 +47,11 @@ class StopStates:
     def later(self) -> tuple[tuple[int, ...], ...]:
         """For each state, the later states in its column of the Cholesky factor, fill included."""
         coupled = [set(np.flatnonzero(row[k + 1 :]) + k + 1) for k, row in enumerate(self.gram)]
-        for own in coupled:
-            ordered = sorted(own)
+        for after in coupled:
+            ordered = sorted(after)
             if ordered:
                 coupled[ordered[0]] |= set(ordered[1:])
-        return tuple(tuple(sorted(map(int, own))) for own in coupled)
+        return tuple(tuple(sorted(map(int, after))) for after in coupled)
 
 
 def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
@@ -60,7 +60,7 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
     mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
     physical = np.asarray(fit.mode.physical)
     variance_of = np.radians(physical[STOP_COLUMNS]) ** 2
-    found = []
+    times = []
     for state in range(states):
         drawn = np.flatnonzero(linear.renewed[:, state])
         for begin, end in zip(drawn, [*drawn[1:], spots], strict=True):
@@ -69,15 +69,15 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
                 by_direction[state] = mix[begin, state] * variance_of[state]
             rest = 0.0 if state < 2 else linear.variance[begin, state]
             if linear.load[begin:end, :, state].any() and by_direction.sum() + rest > 0:
-                found.append((end, begin, state, by_direction.ravel(), rest))
-    found.sort(key=lambda each: each[:3])
-    load = np.zeros((spots, 4, len(found)))
-    for column, (end, begin, state, *_) in enumerate(found):
+                times.append((end, begin, state, by_direction.ravel(), rest))
+    times.sort(key=lambda each: each[:3])
+    load = np.zeros((spots, 4, len(times)))
+    for column, (end, begin, state, *_) in enumerate(times):
         load[begin:end, :, column] = linear.load[begin:end, :, state]
     return StopStates(
-        load.reshape(4 * spots, len(found)),
-        np.array([each[3] for each in found]).reshape(len(found), 4),
-        np.array([each[4] for each in found], dtype=float),
+        load.reshape(4 * spots, len(times)),
+        np.array([each[3] for each in times]).reshape(len(times), 4),
+        np.array([each[4] for each in times], dtype=float),
     )
 
 
@@ -103,17 +103,17 @@ class Elimination:
         later, (rows, columns) = states.later, states.overlapping
         scaled = np.ascontiguousarray((sd[:, rows] * sd[:, columns] * gram).T)
         diagonal = 1 + scaled[rows == columns].T
-        rest = {(i, j): np.zeros(len(sd)) for i, own in enumerate(later) for j in own}
+        rest = {(i, j): np.zeros(len(sd)) for i, after in enumerate(later) for j in after}
         rest |= dict(zip(zip(rows.tolist(), columns.tolist(), strict=True), scaled, strict=True))
         pivot, below = np.empty_like(sd), []
-        for i, own in enumerate(later):
+        for i, after in enumerate(later):
             pivot[:, i] = np.sqrt(diagonal[:, i])
-            column = np.stack([rest[i, j] / pivot[:, i] for j in own], axis=1) if own else np.empty((len(sd), 0))
+            column = np.stack([rest[i, j] / pivot[:, i] for j in after], axis=1) if after else np.empty((len(sd), 0))
             below.append(column)
-            for a, j in enumerate(own):
+            for a, j in enumerate(after):
                 diagonal[:, j] -= column[:, a] ** 2
-                for b in range(a + 1, len(own)):
-                    rest[j, own[b]] -= column[:, a] * column[:, b]
+                for b in range(a + 1, len(after)):
+                    rest[j, after[b]] -= column[:, a] * column[:, b]
         return cls(sd, states, pivot, tuple(below))
 
     def whitened(self, products: np.ndarray) -> np.ndarray:
@@ -125,10 +125,10 @@ class Elimination:
         Returns:
             Shape (n, m, c).
         """
-        found = self.sd[..., None] * products
-        for i, own in enumerate(self.states.later):
-            row = found[:, i]
+        rows = self.sd[..., None] * products
+        for i, after in enumerate(self.states.later):
+            row = rows[:, i]
             row /= self.pivot[:, i, None]
-            for a, j in enumerate(own):
-                found[:, j] -= self.below[i][:, a, None] * row
-        return found
+            for a, j in enumerate(after):
+                rows[:, j] -= self.below[i][:, a, None] * row
+        return rows

@@ -87,14 +87,14 @@ class Target:
         """What `evaluate` makes draws of the errors at places from."""
         return generator.standard_normal((count, 2 * self.fit.arrays.gears.filled))
 
-    def at(self, w: np.ndarray, found: Mapped, normal: np.ndarray) -> Points:
+    def at(self, w: np.ndarray, mapped: Mapped, normal: np.ndarray) -> Points:
         """Of points that are mapped already, with draws of the errors from standard normal numbers (n, e)."""
-        seen = evaluate(found.z, normal, self.fit.space, self.fit.arrays)
-        value, errors_rad = seen.log_density, seen.place_errors_rad
+        evaluated = evaluate(mapped.z, normal, self.fit.space, self.fit.arrays)
+        value, errors_rad = evaluated.log_density, evaluated.place_errors_rad
         invalid = np.isnan(value)
         self.invalid += int(invalid.sum())
-        log_target = np.where(invalid, -np.inf, value - self.fit.log_density + found.log_jacobian)
-        parts = {"z": found.z, "log_jacobian": found.log_jacobian, "place_errors_rad": errors_rad}
+        log_target = np.where(invalid, -np.inf, value - self.fit.log_density + mapped.log_jacobian)
+        parts = {"z": mapped.z, "log_jacobian": mapped.log_jacobian, "place_errors_rad": errors_rad}
         return Points(w, log_target, parts)
 
     def log_density(self, points: Points) -> np.ndarray:
@@ -103,8 +103,8 @@ class Target:
 
     def quantities(self, points: Points) -> Draws:
         """Parameters and headlines."""
-        found = derived_of(self.fit, points.parts["z"][None], points.parts["place_errors_rad"][None])
-        return Draws(found, self.fit.space.mechanism)
+        derived = derived_of(self.fit, points.parts["z"][None], points.parts["place_errors_rad"][None])
+        return Draws(derived, self.fit.space.mechanism)
 
     def first_proposal(self) -> Independence:
         """Standard normal but for heavy and coupled coordinates."""

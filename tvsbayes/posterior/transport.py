@@ -220,13 +220,13 @@ class Transport:
         columns = self.free[self.noise + np.array(self.plays, dtype=int)]
         return np.log(half_normal_slope(self.mode[columns]) / half_normal_slope(z[:, columns])).sum(axis=1)
 
-    def _bounds(self, place: int, found: Conditional, y: np.ndarray) -> np.ndarray:
+    def _bounds(self, place: int, given: Conditional, y: np.ndarray) -> np.ndarray:
         """Where a backlash is zero, in its coordinate w less the mean's shift, given y (n, g) of the wider ones."""
         row = self.root[self.noise + place, self.noise :]
         least = (self._play_at_mode(place).least - y[:, :place] @ row[:place]) / row[place]
-        factor = found.own[:, ::-1, ::-1][:, :, place]
+        factor = given.own[:, ::-1, ::-1][:, :, place]
         others = np.einsum("nj,nj->n", y[:, :place], factor[:, :place])
-        return others + least * factor[:, place] - found.shift[:, ::-1][:, place]
+        return others + least * factor[:, place] - given.shift[:, ::-1][:, place]
 
     def _log_scale(self, noise: np.ndarray) -> np.ndarray:
         """Ln of the noise scales over those at the mode, at noise coordinates (n, q)."""
@@ -270,24 +270,24 @@ class Transport:
         whole[:, :places] = np.swapaxes(root, 1, 2) @ whole[:, :places]
         whole[:, places:, :places] = np.swapaxes(whole[:, :places, places:], 1, 2)
         whole[:, :places, :places] = whole[:, :places, :places] @ root
-        own = np.arange(places)
-        whole[:, own, own] += 1.0
+        diagonal = np.arange(places)
+        whole[:, diagonal, diagonal] += 1.0
         whole[:, places:-1, places:-1] += linear.prior[::-1, ::-1]
         whole[:, -1, places:-1] -= score_at_mode
         whole[:, -1, -1] = FAR_ABOVE
-        found = np.linalg.cholesky(whole)
+        factor = np.linalg.cholesky(whole)
         last = count - 1
-        own, shift = found[:, :last, :last], found[:, last, places:last]
-        return Conditional(weight, inner, elimination, white, root, own, shift, later)
+        leading, shift = factor[:, :last, :last], factor[:, last, places:last]
+        return Conditional(weight, inner, elimination, white, root, leading, shift, later)
 
     @cached_property
     def _score_at_mode(self) -> np.ndarray:
         """What is left of the score there that stays: of the likelihood by other ways than the residuals."""
-        found = self._conditional(np.zeros((1, self.noise)), np.zeros(len(self.linear.prior)))
-        own = np.zeros(len(self.linear.prior))
+        given = self._conditional(np.zeros((1, self.noise)), np.zeros(len(self.linear.prior)))
+        score = np.zeros(len(self.linear.prior))
         for place in self.plays:
-            own += self._play_at_mode(place).score * self.root[self.noise + place, self.noise :]
-        return found.own[0] @ found.shift[0] - own[::-1]
+            score += self._play_at_mode(place).score * self.root[self.noise + place, self.noise :]
+        return given.own[0] @ given.shift[0] - score[::-1]
 
     def conditional(self, noise: np.ndarray) -> Conditional:
         """The normal density of y at noise coordinates (n, q), its mean at the mode where the scales are those.
@@ -296,20 +296,20 @@ class Transport:
         """
         return self._conditional(noise, self._score_at_mode)
 
-    def _centred(self, noise: np.ndarray, wide: np.ndarray, found: Conditional) -> Centred:
+    def _centred(self, noise: np.ndarray, wide: np.ndarray, given: Conditional) -> Centred:
         """The narrow coordinates given noise coordinates (n, q) and y of the wide ones (n, g - k)."""
-        mean, linear = found.means(wide[:, ::-1])[:, ::-1], self.linear
+        mean, linear = given.means(wide[:, ::-1])[:, ::-1], self.linear
         centre, still = mean, self.free[: self.noise][self.creep_noise == 0]
         for _ in range(CENTRINGS):
             y = np.concatenate([noise, wide, centre], axis=1)
-            own, z = y[:, self.noise :], self.from_whitened(y)
+            y_own, z = y[:, self.noise :], self.from_whitened(y)
             z[:, still] = self.mode[still]
-            beyond = self.residuals(z) - linear.residual + own @ linear.along.T
-            if linear.creep is not None and found.later is not None:
+            beyond = self.residuals(z) - linear.residual + y_own @ linear.along.T
+            if linear.creep is not None and given.later is not None:
                 places, rows = linear.places.shape[1], linear.creep.rows
-                beyond += linear.creep.more(found.later, own[:, ::-1] @ rows[:, places:-1].T - rows[:, -1])
-            step = found.centring(linear, np.nan_to_num(beyond), self.narrow)[:, ::-1]
-            turn = np.eye(self.narrow) + np.tensordot(own, self.bend, 1)
+                beyond += linear.creep.more(given.later, y_own[:, ::-1] @ rows[:, places:-1].T - rows[:, -1])
+            step = given.centring(linear, np.nan_to_num(beyond), self.narrow)[:, ::-1]
+            turn = np.eye(self.narrow) + np.tensordot(y_own, self.bend, 1)
             centre = centre + np.linalg.solve(turn, (mean + step - centre)[..., None])[..., 0]
         return Centred(mean, centre, turn)
 
@@ -319,19 +319,19 @@ class Transport:
 
     def _mapped(self, w: np.ndarray) -> Mapped:
         noise, y, w = w[:, : self.noise], w.copy(), w.copy()
-        own = w[:, self.noise :]
-        found = self.conditional(noise)
-        y[:, self.noise :] = found.solved(own[:, ::-1] + found.shift)[:, ::-1]
-        log_jacobian = -np.log(np.diagonal(found.own, axis1=1, axis2=2)).sum(axis=1)
+        rest = w[:, self.noise :]
+        given = self.conditional(noise)
+        y[:, self.noise :] = given.solved(rest[:, ::-1] + given.shift)[:, ::-1]
+        log_jacobian = -np.log(np.diagonal(given.own, axis1=1, axis2=2)).sum(axis=1)
         for place in self.plays:
-            cut = Cut(self._bounds(place, found, y[:, self.noise :]))
-            within = cut.within(own[:, place])
-            log_jacobian += cut.log_slope(own[:, place], within)
-            own[:, place] = within
-            y[:, self.noise :] = found.solved(own[:, ::-1] + found.shift)[:, ::-1]
+            cut = Cut(self._bounds(place, given, y[:, self.noise :]))
+            within = cut.within(rest[:, place])
+            log_jacobian += cut.log_slope(rest[:, place], within)
+            rest[:, place] = within
+            y[:, self.noise :] = given.solved(rest[:, ::-1] + given.shift)[:, ::-1]
         if self.narrow:
             narrow = self.dimension - self.narrow
-            about = self._centred(noise, y[:, self.noise : narrow], found)
+            about = self._centred(noise, y[:, self.noise : narrow], given)
             y[:, narrow:] = about.centre + np.linalg.solve(about.turn, (y[:, narrow:] - about.mean)[..., None])[..., 0]
             log_jacobian -= np.linalg.slogdet(about.turn)[1]
         z = self.from_whitened(y)
@@ -341,14 +341,14 @@ class Transport:
         """From z (n, p) to w (n, d); the inverse of `mapped` on the sampled columns."""
         y = self.to_whitened(z)
         noise, narrow = y[:, : self.noise], self.dimension - self.narrow
-        found = self.conditional(noise)
+        given = self.conditional(noise)
         if self.narrow:
-            about = self._centred(noise, y[:, self.noise : narrow], found)
+            about = self._centred(noise, y[:, self.noise : narrow], given)
             y[:, narrow:] = about.mean + np.einsum("nij,nj->ni", about.turn, y[:, narrow:] - about.centre)
-        own = (np.einsum("nij,ni->nj", found.own, y[:, self.noise :][:, ::-1]) - found.shift)[:, ::-1].copy()
+        rest = (np.einsum("nij,ni->nj", given.own, y[:, self.noise :][:, ::-1]) - given.shift)[:, ::-1].copy()
         for place in self.plays:
-            own[:, place] = Cut(self._bounds(place, found, y[:, self.noise :])).without(own[:, place])
-        return np.concatenate([noise, own], axis=1)
+            rest[:, place] = Cut(self._bounds(place, given, y[:, self.noise :])).without(rest[:, place])
+        return np.concatenate([noise, rest], axis=1)
 
 
 def curvatures(path: Transport) -> np.ndarray:
@@ -364,15 +364,15 @@ def curvatures(path: Transport) -> np.ndarray:
 
     def curvature(y: np.ndarray) -> np.ndarray:
         both = np.concatenate([np.zeros((1, count)), y, -y])
-        seen = path.residuals(path.from_whitened(np.concatenate([np.repeat(whole, len(both), axis=0), both], axis=1)))
-        centre, ahead, behind = np.split(np.nan_to_num(seen), [1, 1 + len(y)])
+        misfit = path.residuals(path.from_whitened(np.concatenate([np.repeat(whole, len(both), axis=0), both], axis=1)))
+        centre, ahead, behind = np.split(np.nan_to_num(misfit), [1, 1 + len(y)])
         return (ahead + behind - 2 * centre) / BEND_STEP**2
 
-    own, found = curvature(steps), path.conditional(whole)
+    bend, given = curvature(steps), path.conditional(whole)
     moved = np.empty((count, count, count))
     for one in range(count):
-        mixed = 0.5 * (curvature(steps[one:] + steps[one]) - own[one:] - own[one])
-        moved[one, one:] = found.centring(path.linear, -mixed, count)[:, ::-1]
+        mixed = 0.5 * (curvature(steps[one:] + steps[one]) - bend[one:] - bend[one])
+        moved[one, one:] = given.centring(path.linear, -mixed, count)[:, ::-1]
         moved[one:, one] = moved[one, one:]
     return moved
 
@@ -476,8 +476,10 @@ def transport(fit: JointFit) -> Transport:
     turned = np.concatenate([np.setdiff1d(np.arange(len(others)), last), last])
     order = order[turned]
     path = uncentred(fit, others[order], np.linalg.cholesky(covariance[np.ix_(order, order)]))
-    own, wide = slice(path.noise, None), len(others) - narrow
-    before = np.linalg.solve(straight.root[own, own], path.root[own, own][np.argsort(turned)])
+    beside_noise, wide = slice(path.noise, None), len(others) - narrow
+    before = np.linalg.solve(
+        straight.root[beside_noise, beside_noise], path.root[beside_noise, beside_noise][np.argsort(turned)]
+    )
     after = np.linalg.inv(before)[wide:]
     bend = np.einsum("abc,ai,bp,kc->ikp", moved, before, before[:, wide:], after, optimize=True)
     return replace(path, narrow=narrow, bend=bend)
@@ -512,7 +514,7 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
     stops, drifts, looks = stop_states(fit, linear), walks(fit), look_noise(fit)
     by_noise = STOP_COLUMNS.reshape(4, 1) == noise
     places = fit.arrays.gears.without_padding().places
-    seen = np.flatnonzero(places.valid)
+    present = np.flatnonzero(places.valid)
     columns = np.asarray(fit.linearised.place_columns).reshape(linear.residual.size, 2 * len(places.steps))
     half = np.asarray(fit.space.kind)[noise] == KINDS.index("half-normal")
     ratio = np.radians([fit.mode.physical[INDEX[name]] for name in names_of("degrees_per_step")])
@@ -541,15 +543,17 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
             by_noise=stops.variance @ by_noise,
             # Stop errors whose sd is not estimated keep their variance.
             constant=stops.constant + stops.variance @ ~by_noise.any(axis=1),
-            places=np.column_stack([columns[:, np.concatenate([seen, len(places.steps) + seen])], drifts.columns]),
+            places=np.column_stack(
+                [columns[:, np.concatenate([present, len(places.steps) + present])], drifts.columns]
+            ),
             prior=(wide.T * precision) @ wide,
             looks=looks,
-            creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, 2 * len(seen) + len(drifts.walk), looks),
+            creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, 2 * len(present) + len(drifts.walk), looks),
         ),
         residuals=misfit,
         bend=np.zeros((len(others), 0, 0)),
-        place_angle_rad=(places.steps * ratio[places.on_tilt.astype(int)])[seen],
-        place_on_tilt=np.asarray(places.on_tilt)[seen],
+        place_angle_rad=(places.steps * ratio[places.on_tilt.astype(int)])[present],
+        place_on_tilt=np.asarray(places.on_tilt)[present],
         walk=drifts.walk,
         drift_scale=np.radians(np.asarray(fit.mode.physical)[DRIFT_COLUMNS]),
         drift_noise=(DRIFT_COLUMNS[:, None] == noise).astype(float),

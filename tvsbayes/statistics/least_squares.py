@@ -136,23 +136,23 @@ class _Descended:
 
 def _descended(begin: _Surroundings, inverse: np.ndarray) -> _Descended:
     """Newton steps with one inverse curvature; where they end whence they came, that place itself."""
-    here, first = begin, begin.at(np.zeros((1, len(inverse))))[0]
+    point, first = begin, begin.at(np.zeros((1, len(inverse))))[0]
     value = first
     shortened = 0.5 ** np.arange(12)[:, None]
     for _ in range(12):
-        step = -inverse @ here.slope()
+        step = -inverse @ point.slope()
         if step @ step < NEWTON_SETTLED:
-            return _Descended(here, True)
-        trials = here.at(shortened * step)
+            return _Descended(point, True)
+        trials = point.at(shortened * step)
         lower = np.isfinite(trials) & (trials < value + 1e-9 * abs(value))
         if not lower.any():
-            return _Descended(here, bool(step @ step < KINK_STEP**2), kinked=True)
+            return _Descended(point, bool(step @ step < KINK_STEP**2), kinked=True)
         chosen = int(np.argmax(lower))
         value = trials[chosen]
-        here = replace(here, z=here.z + here.ways @ (shortened[chosen] * step))
+        point = replace(point, z=point.z + point.ways @ (shortened[chosen] * step))
     if step @ step < KINK_STEP**2 and first - value < KINK_FALL:
         return _Descended(begin, True, kinked=True)
-    return _Descended(here, False)
+    return _Descended(point, False)
 
 
 def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curvature: np.ndarray) -> Mode:
@@ -176,30 +176,35 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
     rows = np.flatnonzero(free)
     ways = np.zeros((start.size, len(rows)))
     ways[rows] = np.linalg.inv(np.linalg.cholesky(curvature[np.ix_(rows, rows)])).T
-    here, expected = _nearly_there(_Surroundings(objective, start, ways)), ways
+    surroundings, expected = _nearly_there(_Surroundings(objective, start, ways)), ways
     problems: list[str] = []
     for _ in range(6):
-        begin = here.z
-        hessian = here.curvature()
+        begin = surroundings.z
+        hessian = surroundings.curvature()
         if not np.all(np.isfinite(hessian)):
             raise np.linalg.LinAlgError("the density is not finite about the mode")
         eigenvalues, vectors = np.linalg.eigh(hessian)
         # Far from the mode the density may be flat or convex along a direction: step by the expected scale.
-        descent = _descended(here, (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T)
-        here = descent.here
-        if descent.settled and np.linalg.norm(np.linalg.solve(here.ways[rows], (here.z - begin)[rows])) < HESSIAN_KEPT:
+        descent = _descended(surroundings, (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T)
+        surroundings = descent.here
+        if (
+            descent.settled
+            and np.linalg.norm(np.linalg.solve(surroundings.ways[rows], (surroundings.z - begin)[rows])) < HESSIAN_KEPT
+        ):
             break
-        here = replace(here, ways=here.ways @ (vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 0.1))) @ vectors.T)
+        surroundings = replace(
+            surroundings, ways=surroundings.ways @ (vectors / np.sqrt(np.maximum(np.abs(eigenvalues), 0.1))) @ vectors.T
+        )
     else:
         problems.append("the Newton steps on the full density did not settle")
     if descent.kinked and descent.settled and not 0 < eigenvalues[0] <= eigenvalues[-1] < KINK_CURVATURE:
-        here, eigenvalues, vectors = replace(here, ways=expected), np.ones(len(rows)), np.eye(len(rows))
+        surroundings, eigenvalues, vectors = replace(surroundings, ways=expected), np.ones(len(rows)), np.eye(len(rows))
     if eigenvalues[0] <= 0:
         problems.append("the density has no maximum here: its Hessian is not negative definite")
     covariance = np.eye(start.size)
     whitened = (vectors / np.maximum(eigenvalues, 1e-3)) @ vectors.T
-    covariance[np.ix_(rows, rows)] = (here.ways @ whitened @ here.ways.T)[np.ix_(rows, rows)]
-    return Mode(here.z, covariance, float(objective(here.z[None])[0]), tuple(problems))
+    covariance[np.ix_(rows, rows)] = (surroundings.ways @ whitened @ surroundings.ways.T)[np.ix_(rows, rows)]
+    return Mode(surroundings.z, covariance, float(objective(surroundings.z[None])[0]), tuple(problems))
 
 
 def neighbouring_mode(objective: Objective, known: Mode, free: np.ndarray) -> Mode | None:
@@ -216,20 +221,23 @@ def neighbouring_mode(objective: Objective, known: Mode, free: np.ndarray) -> Mo
     rows = np.flatnonzero(free)
     ways = np.zeros((len(free), len(rows)))
     ways[rows] = np.linalg.cholesky(known.covariance[np.ix_(rows, rows)])
-    here = _Surroundings(objective, known.z, ways)
+    surroundings = _Surroundings(objective, known.z, ways)
     value, shortened = float(objective(known.z[None])[0]), 0.5 ** np.arange(6)[:, None]
     for _ in range(NEIGHBOUR_STEPS):
         with np.errstate(invalid="ignore"):
-            step = -here.slope()
+            step = -surroundings.slope()
         if not np.all(np.isfinite(step)):
             return None
-        trials = here.at(shortened * step)
+        trials = surroundings.at(shortened * step)
         chosen = int(np.argmin(trials))
         gain = value - float(trials[chosen])
         if gain > 0:
-            here, value = replace(here, z=here.z + ways @ (shortened[chosen] * step)), float(trials[chosen])
+            surroundings, value = (
+                replace(surroundings, z=surroundings.z + ways @ (shortened[chosen] * step)),
+                float(trials[chosen]),
+            )
         if gain < NEIGHBOUR_SETTLED:
-            return Mode(here.z, known.covariance, value, ())
+            return Mode(surroundings.z, known.covariance, value, ())
     return None
 
 
