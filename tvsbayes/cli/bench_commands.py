@@ -103,7 +103,7 @@ def stereo(
         raise InputError("usage", f"{', '.join(odd)}: no option of stereo takes this value", remedy=remedy)
     if (folder is None) == (not imports):
         message = "stereo needs pictures of a board, or a calibration to import"
-        message = wanted if folder is None else "stereo takes pictures or a calibration to import, not both"
+        message = message if folder is None else "stereo takes pictures or a calibration to import, not both"
         raise InputError("usage", message, remedy="give FOLDER with --board and --pitch-mm, or --import FILE")
     uncertainties = {"u_focal_percent": u_focal_percent, "u_principal_px": u_principal_px}
     uncertainties |= {"u_rotation_mrad": u_rotation_mrad, "u_baseline_mm": u_baseline_mm}

@@ -74,7 +74,7 @@ FAULTS = (
     Fault("the drift of the zero is left out of the filter", "drift_variances", Reads("spots.hours", "0 * value"),
           "test_log_density_is_that_of_the_dense_gaussian"),
     Fault("the log-determinant of the stop errors is dropped", "likelihood.passed",
-          Reads("seen.log_variance", "0 * value"), "test_filter_equals_dense_gaussian"),
+          Reads("after.log_variance", "0 * value"), "test_filter_equals_dense_gaussian"),
     Fault("stop errors and zeros are forgotten between blocks of spots", "likelihood.passed",
           Call("filtered", "function(arg0, jax.tree.map(jnp.zeros_like, arg1))"),
           "test_blocks_of_spots_are_one_campaign"),
@@ -104,7 +104,7 @@ FAULTS = (
     Fault("U95 is taken with k = 1.64", "NORMAL_95", Constant("1.6448536269514722"),
           "test_95_percent_are_two_sided_and_normal"),
     # Sampling, weights, convergence.
-    Fault("the Jacobian of the map is dropped", "Target.at", Reads("found.log_jacobian", "0 * value"),
+    Fault("the Jacobian of the map is dropped", "Target.at", Reads("mapped.log_jacobian", "0 * value"),
           "test_the_density_of_walkers_is_the_models_times_the_jacobian"),
     Fault("the acceptance of independent proposals is upside down", "Independence.__call__",
           Returns("(value[0], -value[1])"), "test_the_proposal_density_and_draws_agree_in_many_dimensions"),
