@@ -48,6 +48,13 @@ PROMISED_DRAWS = 4000
 """Of errors, behind what 95 % of points do not exceed."""
 
 
+SURER = (
+    "state how the axes came to the first row, if you know it; run `tvsbayes fit` again, without --no-sample or "
+    "--quick, or with --perfect-gears where gears err by less than looks scatter"
+)
+"""What makes a rough answer an accepted one."""
+
+
 def accepted_calibration(campaign: Campaign) -> Calibration:
     """The calibration in force: that of `results/`, of these data and of an accepted fit.
 
@@ -65,7 +72,7 @@ def accepted_calibration(campaign: Campaign) -> Calibration:
             remedy="run `tvsbayes fit`, aim by `tvsbayes steps-for` or the header, and look there",
         )
     old = "accepted" if document.values.get("estimator") == "posterior" else "laplace"
-    refuse_answer(str(document.values.get("answer") or old))
+    refuse_answer(str(document.values.get("answer") or old), SURER)
     return calibration
 
 

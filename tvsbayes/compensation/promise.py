@@ -95,8 +95,12 @@ def _run(
     return predicted_stops(fit, moves, run.read.tolist(), np.full(len(run.read), u), seed), run
 
 
-def refuse_answer(answer: str) -> None:
+def refuse_answer(answer: str, remedy: str = "run `tvsbayes fit` again, without --no-sample or --quick") -> None:
     """A table is made of an accepted answer alone: it moves a machine.
+
+    Args:
+        answer: of the fit.
+        remedy: what makes it an accepted one.
 
     Raises:
         NotConverged: the answer is rough, or a Laplace approximation.
@@ -104,8 +108,7 @@ def refuse_answer(answer: str) -> None:
     if answer != "accepted":
         what = "a rough answer" if answer == "rough" else "a Laplace approximation"
         message = f"the fit is {what}, not an accepted answer: the promise of a table made of it cannot be trusted"
-        remedy = "run `tvsbayes fit` again, without --no-sample or --quick, then compensate"
-        raise NotConverged("unaccepted", message, remedy=remedy)
+        raise NotConverged("unaccepted", message, remedy=f"{remedy}, then compensate")
 
 
 def _nominal(campaign: AxisCampaign, fitted: float, wish: Wish) -> float:
