@@ -359,7 +359,8 @@ ORDER_SHARE = 0.9
 def _weak_in_time(fit: AxisFit) -> list[str]:
     """What a shift of the zero in time cannot be told from."""
     rows, sentences = fit.rows, []
-    in_turn = rows.both_sides and abs(np.corrcoef(rows.command, rows.path)[0, 1]) > ORDER_SHARE
+    several = rows.both_sides and len(rows.positions) > 2
+    in_turn = several and abs(np.corrcoef(rows.command, rows.path)[0, 1]) > ORDER_SHARE
     if in_turn and (fit.model.priors["ratio_contrast"].u or "creep" in fit.model.shifts):
         sentences.append(
             "the places were read one after the other: errors by position, a creep of the zero and a contrast of the "
