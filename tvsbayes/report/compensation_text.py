@@ -40,7 +40,8 @@ SCANNER_REMEDIES = {
     "those of `tvsbayes steps-for` with `via_pan_steps` and `via_tilt_steps`, or the header's",
     TWICE: "the calibration acts in the host and in the controller: take one of them out",
     WRONG_SIGN: "the correction is taken off instead of added, or left and right, up and down are exchanged",
-    OTHER_MACHINE: "something moved, or the calibration is of another scanner: `tvsbayes watch CAMPAIGN FRESH` tells",
+    OTHER_MACHINE: "something moved, a counter has the other sign, or the calibration is of another machine: "
+    "`tvsbayes check FRESH` and `tvsbayes watch CAMPAIGN FRESH` tell",
     APPLIED: "looks lie farther off than the calibration allows: `tvsbayes watch CAMPAIGN FRESH` says what moved",
 }
 """The same of a scanner."""
