@@ -8,9 +8,10 @@ from support.small_results import small_summary
 
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
+from tvsbayes.head.foreign_sightings import STEP_DEG
 from tvsbayes.report.advice import steps_ahead
 from tvsbayes.report.evidence import Criterion
-from tvsbayes.report.fit_text import classic_text, demo_text, fit_text
+from tvsbayes.report.fit_text import FINE_DEG, classic_text, demo_text, fit_text
 from tvsbayes.report.result_tables import KEY_PARAMETERS
 from tvsbayes.report.scanner_document import verdict_of
 from tvsbayes.results.convergence import Importance, MonteCarloError, NamedValue, Sampling
@@ -54,6 +55,16 @@ def test_fit_text_shows_what_the_reader_must_know():
     # A flood of ids helps nobody.
     assert "spots that disagree with all others: 0, 1, 2" in text
     assert ", 19 and 10 more; look at them" in text
+
+
+def test_an_encoder_says_what_a_degree_does():
+    summary = small_summary()
+    known = next(iter(summary.parameters.values()))
+    fine = structs.replace(known, value=1.01234e-5, sd=3.1e-9)
+    both = {**summary.parameters, "degrees_per_step.pan": fine}
+    assert "turn pan by 1.01234(31) deg\n" in fit_text(structs.replace(summary, parameters=both))
+    assert "counts, 1 deg" not in fit_text(summary)
+    assert FINE_DEG == STEP_DEG
 
 
 def test_a_fit_ends_with_its_table_and_its_verdict():

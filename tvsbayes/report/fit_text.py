@@ -9,7 +9,7 @@ from tvsbayes.display import concise
 from tvsbayes.errors import NotConverged, listed
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult
-from tvsbayes.instrument.axes import DIRECTIONS
+from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.report.advice import SPOTS_LISTED, factor_told, failed, noise_line, remedy, verdict_line
 from tvsbayes.report.document import Part, terminal
 from tvsbayes.report.result_tables import (
@@ -27,6 +27,8 @@ from tvsbayes.results.convergence import Importance, Sampling
 from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
 from tvsbayes.results.tiers import CHAIN
 
+FINE_DEG = 1e-5
+"""Of a step of an encoder's angles, as `head.foreign_sightings` counts them; motors turn by far more."""
 PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 
 
@@ -67,11 +69,25 @@ def fit_text(
     # Where the model fails, its scatter is no noise.
     if failed(summary) is None and (noise := noise_line(summary)) is not None:
         lines.append(noise)
+    if (encoder := encoder_line(summary)) is not None:
+        lines.append(encoder)
     if written:
         lines.append(f"written: {', '.join(written)}")
     if not details and (more := more_line(summary)):
         lines.append(more)
     return terminal(*lines, "" if lines else None, headline_table(summary), verdict_line(summary))
+
+
+def encoder_line(summary: FitSummary) -> str | None:
+    """What a degree of an encoder does, whose steps are too small to say it; None of motors."""
+    ratios = {axis: summary.parameters.get(f"degrees_per_step.{axis}") for axis in AXES}
+    shown = [
+        f"{axis} by {concise(ratio.value / FINE_DEG, ratio.sd / FINE_DEG)} deg"
+        for axis, ratio in ratios.items()
+        if ratio is not None and 0 < abs(ratio.value) < 10 * FINE_DEG
+    ]
+    counts = f"{1 / FINE_DEG:.0f} counts, 1 deg of angles as `import` takes them,"
+    return f"{counts} turn {' and '.join(shown)}" if shown else None
 
 
 def more_line(summary: FitSummary) -> str:
