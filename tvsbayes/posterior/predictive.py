@@ -250,12 +250,9 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
     places = np.arange(chains * draws).reshape(chains, draws)[:, chosen].ravel()
 
     def of_way(fit: JointFit, rows: np.ndarray) -> np.ndarray:
-        places_of_way = places[rows]
-        physical, errors_rad = (
-            np.asarray(drawn.physical)[places_of_way],
-            np.asarray(drawn.place_errors_rad)[places_of_way],
-        )
-        return looks_again(fit, z[places_of_way], physical, errors_rad, generator)
+        at = places[rows]
+        physical, errors_rad = np.asarray(drawn.physical)[at], np.asarray(drawn.place_errors_rad)[at]
+        return looks_again(fit, z[at], physical, errors_rad, generator)
 
     values = by_way(ways_of(posterior, places), of_way).reshape(chains, len(chosen), -1, 4)
     spots = [spot.spot for spot in ordered_spots(fit.campaign)]
