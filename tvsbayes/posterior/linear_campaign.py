@@ -107,13 +107,17 @@ class LinearCampaign:
             later: how much more of a creep is over, as `Creep.later` gives it.
         """
         count, states = self.columns.shape[1], self.states.load.shape[1]
-        whole = np.column_stack([np.ones(len(inner)), -self.looks.shares(inner)]) @ self._spanned
+        shares = self.looks.shares(inner)
+        whole = np.column_stack([np.ones(len(inner)), -shares]) @ self._spanned
         by_columns, of_states = np.split(whole, [(count + states) * count], axis=1)
         gram, by_states = np.split(by_columns.reshape(-1, count + states, count), [count], axis=1)
         creep = self.creep
         if creep is None or later is None:
             return Products(gram, by_states, of_states)
-        left = later[..., None, None] * (np.eye(2) - self.looks.square @ inner)
+        # All products belong to one covariance, that of the functions that span K: only then is what is left of the
+        # columns without the states positive.
+        spanned = (shares @ self.looks.basis).reshape(inner.shape)
+        left = later[..., None, None] * (np.eye(2) - self.looks.square @ spanned)
         new = np.tensordot(np.swapaxes(left, 1, 2), self._seen, ((2, 3), (0, 1)))
         cross = np.swapaxes(new[..., :count], 1, 2) @ creep.rows
         square = np.tensordot(later[..., None, None] * left, self.looks.square, ((1, 3), (0, 1)))
