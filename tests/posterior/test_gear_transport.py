@@ -181,6 +181,25 @@ def test_looks_that_scatter_more_or_less_than_at_the_mode(scattered):
         assert np.abs(one @ one.T - other @ other.T).max() > 1e-3, axis
 
 
+def test_products_of_a_creep_are_those_of_the_covariance_of_all_others(dozen):
+    """Scatter of looks and creep at once: of two covariances, nearly alike, the Schur complement need not be positive."""
+    held = names_of("drift_deg_per_root_hour")
+    path = transport(fit_of(dozen, dozen.campaign, VALUES | SCATTER | CREEP, held, redraw=False))
+    linear, noise = path.linear, 1.5 * np.random.default_rng(15).standard_normal((3, path.noise))
+    inner = linear.looks.inner(np.exp(noise[:, :2]))
+    later = linear.creep.later(noise @ path.creep_noise)
+    spanned = (linear.looks.shares(inner) @ linear.looks.basis).reshape(inner.shape)
+    load, products = linear.looks.load, linear.at(inner, later)
+    for one, k in enumerate(spanned):
+        moved = load @ (later[one][:, None, None] * linear.creep.rows)
+        columns = (linear.columns.reshape(*load.shape[:2], -1) + moved).reshape(len(linear.columns), -1)
+        weight = np.eye(4) - load @ k @ np.swapaxes(load, 1, 2)
+        weighted = (weight @ columns.reshape(*load.shape[:2], -1)).reshape(columns.shape)
+        for found, rows in ((products.gram[one], columns), (products.by_states[one], linear.states.load)):
+            bound = ROUNDING * len(columns) * np.abs(rows).T @ np.abs(weighted)
+            assert (np.abs(found - rows.T @ weighted) <= bound).all()
+
+
 def test_to_w_undoes_the_map(fitted, path):
     w = np.random.default_rng(14).standard_normal((40, path.dimension))
     z = path.mapped(w).z
