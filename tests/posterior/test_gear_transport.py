@@ -182,7 +182,7 @@ def test_looks_that_scatter_more_or_less_than_at_the_mode(scattered):
 
 
 def test_products_of_a_creep_are_those_of_the_covariance_of_all_others(dozen):
-    """Scatter of looks and creep at once: of two covariances, nearly alike, the Schur complement need not be positive."""
+    """Scatter of looks and creep at once: of two covariances the Schur complement need not be positive."""
     held = names_of("drift_deg_per_root_hour")
     path = transport(fit_of(dozen, dozen.campaign, VALUES | SCATTER | CREEP, held, redraw=False))
     linear, noise = path.linear, 1.5 * np.random.default_rng(15).standard_normal((3, path.noise))
