@@ -14,7 +14,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -129,6 +129,31 @@ def spots() -> None:
     for path in sorted(Path("drawn/frames").glob("*.png")):
         spot, side = path.stem.split("_")
         shutil.copy(path, f"pictures/{side}_{int(moves[int(spot)]):03d}.png")
+
+
+def plan_of(places: Iterable[tuple[int, int]]) -> str:
+    """A plan that looks at counters."""
+    rows = [f"{action},{pan},{tilt}" for pan, tilt in places for action in ("move", "look")]
+    steps = [f"{k},{row if row[0] == 'm' else 'look,,'},,," for k, row in enumerate(rows, 1)]
+    return "\n".join(["step,action,pan_steps,tilt_steps,target,experiment,point", "0,home,0,0,,,", *steps, ""])
+
+
+def sightings() -> None:
+    """A log of a head whose nominal geometry is that of the URDF, and looks of the same head later; by the twin."""
+    quietly("import", "--urdf", "unit.urdf", "--to", "nominal", "--steps-per-turn", "200", "--yes")
+    grid = [(pan, tilt) for pan in range(-900, 901, 300) for tilt in (-150, 50, 250, 450)]
+    order = [grid[k] for _ in range(2) for k in np.random.default_rng(SEED).permutation(len(grid))]
+    again = [(sign * pan, sign * tilt) for pan, tilt in ((700, 300), (200, 100), (-600, 200)) for sign in (1, -1)]
+    for name, places in (("measured", order), ("fresh", again)):
+        Path("plan.csv").write_text(plan_of(places), encoding="utf-8")
+        quietly("simulate", "nominal/rig.toml", "plan.csv", name, "--seed", str(SEED))
+    seen = {row["move"]: row for row in rows_of(Path("measured/sightings.csv"))}
+    lines = ["time_s,pan_steps,tilt_steps,azimuth_deg,elevation_deg,u_deg"]
+    for row in rows_of(Path("measured/moves.csv")):
+        sighting = seen.get(row["move"], {})
+        cells = [row[name] for name in ("time_s", "pan_steps", "tilt_steps")]
+        lines.append(",".join([*cells, *(sighting.get(name, "") for name in ("azimuth_deg", "elevation_deg", "u_deg"))]))
+    Path("log.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
 def boards() -> None:
@@ -279,6 +304,20 @@ KINDS = (
         "counters in `moves.csv` and with `stereo.json`.",
         (longer("new mine --pictures pictures"), longer("detect mine")),
         before=spots,
+    ),
+    Kind(
+        "A robot's head: its URDF and a log",
+        "Counters of both motors, and where its camera was found to point. `fresh` are later looks at counters of\n"
+        "`steps-for`, with the calibration in force. More of [heads](head.md).",
+        (
+            Command("import --urdf unit.urdf --to head --steps-per-turn 200 --yes"),
+            Command("import log.csv --sightings --to head --yes"),
+            longer("fit head --quick"),
+            longer("compensate head --to urdf -o new.urdf"),
+            longer("verify head fresh"),
+        ),
+        {"unit.urdf": ROOT / "tests" / "head" / "unit.urdf"},
+        before=sightings,
     ),
     Kind(
         "A dial gauge: runs side by side",
