@@ -152,7 +152,9 @@ def sightings() -> None:
     for row in rows_of(Path("measured/moves.csv")):
         sighting = seen.get(row["move"], {})
         cells = [row[name] for name in ("time_s", "pan_steps", "tilt_steps")]
-        lines.append(",".join([*cells, *(sighting.get(name, "") for name in ("azimuth_deg", "elevation_deg", "u_deg"))]))
+        lines.append(
+            ",".join([*cells, *(sighting.get(name, "") for name in ("azimuth_deg", "elevation_deg", "u_deg"))])
+        )
     Path("log.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 

@@ -12,7 +12,7 @@ from support.small_campaign import small_stereo
 
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.model.gear_processes import GearScales, Places, place_root
+from tvsbayes.model.gear_processes import BlockRoot, GearScales, Places, place_blocks, place_root
 from tvsbayes.model.headlines import SeenLine, effective_deg_per_step, line_deg_per_step
 from tvsbayes.model.laser_path import beam_angles, trace
 from tvsbayes.model.parameter_space import parameter_space
@@ -71,6 +71,25 @@ def test_the_factor_is_that_of_the_covariance_of_both_processes(functions):
         # Padding belongs to no other place.
         rest = np.setdiff1d(np.arange(2 * size), known)
         assert not (covariance[np.ix_(rest, known)]).any()
+
+
+def test_blocks_are_those_of_the_factor():
+    """Its products too, of two points at once; three places of pan, two of tilt and one of padding."""
+    rng, dense = np.random.default_rng(5), place_root(scales(np), ANGLE_RAD, ON_TILT, VALID, np)
+    root = place_blocks(scales(np), ANGLE_RAD, ON_TILT, VALID)
+    assert [block.shape for block in root.blocks] == [(2, 3, 3), (2, 2, 2), (2, 1, 1)] * 2 and root.size == 12
+    x, y = rng.standard_normal((2, 12)), rng.standard_normal((2, 12, 4))
+    symmetric = y @ np.swapaxes(y, 1, 2)
+    back = np.swapaxes(dense, 1, 2)
+    for one in (root, BlockRoot((dense,))):
+        for value, expected in (
+            (one.times(x), (dense @ x[..., None])[..., 0]),
+            (one.transposed_times(y), back @ y),
+            (one.congruent(symmetric), back @ symmetric @ dense),
+        ):
+            np.testing.assert_allclose(value, expected, rtol=RELATIVE, atol=RELATIVE * np.abs(expected).max())
+    with pytest.raises(ValueError, match="then padding"):
+        place_blocks(scales(np), ANGLE_RAD, ON_TILT, VALID[::-1])
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ from tvsbayes.estimators.spot_residuals import NoiseScales, SpotResiduals, ToSta
 from tvsbayes.instrument.parameters import INDEX, names_of
 from tvsbayes.model.compiled import compiled, in_batches
 from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.gear_processes import place_root
+from tvsbayes.model.gear_processes import BlockRoot, place_blocks, place_root
 from tvsbayes.model.geometry import Scalar
 from tvsbayes.model.laser_path import MirrorAngles, Stretch, angles_at, mirror_angles, no_moves
 from tvsbayes.model.parameter_space import Model, ParameterSpace
@@ -272,12 +272,12 @@ class RepeatedErrors(eqx.Module):
     A priori they are N(0, 1). `explained` is the mean times the transposed factor. Many points with leading axes.
     """
 
-    root: Float[Array | np.ndarray, "*batch errors errors"]
+    root: BlockRoot
     factor: Float[Array | np.ndarray, "*batch errors errors"]
     explained: Float[Array | np.ndarray, "*batch errors"]
 
     @classmethod
-    def of(cls, sums: Sums, root: Any, functions: ModuleType = jnp) -> RepeatedErrors:
+    def of(cls, sums: Sums, root: BlockRoot, functions: ModuleType = jnp) -> RepeatedErrors:
         """Normal equations of the errors at places.
 
         Args:
@@ -289,13 +289,12 @@ class RepeatedErrors(eqx.Module):
         one, two = np.indices((groups, groups))
         given = sums.gram[..., pairs_of(np.maximum(one, two)) + np.minimum(one, two), :, :]
         whole = xp.where((one < two)[:, :, None, None], given.swapaxes(-2, -1), given)
-        size, half = root.shape[-1], sums.along.shape[-1] // 2
+        size, half = root.size, sums.along.shape[-1] // 2
         batch = sums.along.shape[:-2]
         along = xp.einsum("...gkp->...kgp", sums.along.reshape(*batch, groups, 2, half)).reshape(*batch, size)
         whole = xp.einsum("...ghkplq->...kgplhq", whole.reshape(*batch, groups, groups, 2, half, 2, half))
-        back = root.swapaxes(-2, -1)
-        precision = xp.eye(size) + back @ whole.reshape(*batch, size, size) @ root
-        slope = (back @ along[..., None])[..., 0]
+        precision = xp.eye(size) + root.congruent(whole.reshape(*batch, size, size))
+        slope = root.transposed_times(along[..., None])[..., 0]
         # Its last row divides the slope by the factor; its last pivot, which nobody reads, is positive.
         corner = 1 + xp.sum(slope**2, axis=-1)[..., None, None]
         below = xp.concatenate([slope[..., None, :], corner], axis=-1)
@@ -348,17 +347,19 @@ def innovations(
     standardised, log_density, none = result.standardised, jnp.asarray(result.sums.log_density), jnp.zeros(0)
     if not arrays.gears.groups:
         return Innovations(jnp.concatenate([standardised, result.free], axis=1), none, none, log_density)
-    errors = RepeatedErrors.of(result.sums, root_at_places(model, arrays.gears))
+    errors = RepeatedErrors.of(result.sums, BlockRoot((root_at_places(model, arrays.gears),)))
     mean = jnp.asarray(errors.drawn(jnp.zeros_like(normal)))
-    by_group = (errors.root @ mean).reshape(2, arrays.gears.groups, -1).swapaxes(0, 1).reshape(arrays.gears.groups, -1)
+    by_group = (
+        errors.root.times(mean).reshape(2, arrays.gears.groups, -1).swapaxes(0, 1).reshape(arrays.gears.groups, -1)
+    )
     standardised = standardised - jnp.einsum("gsce,ge->sc", result.columns, by_group)
-    drawn = jnp.asarray(errors.root @ errors.drawn(normal))
+    drawn = jnp.asarray(errors.root.times(errors.drawn(normal)))
     whole = jnp.concatenate([standardised, result.free], axis=1)
     return Innovations(whole, mean, drawn, jnp.asarray(log_density + errors.log_density()))
 
 
-def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> np.ndarray:
-    """Factors of the covariance of errors at places as in `root_at_places`, shape (n, errors, errors).
+def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> BlockRoot:
+    """Factors of the covariance of errors at places as in `root_at_places`, of n points.
 
     Args:
         values: of all parameters in the units of their names, shape (n, p).
@@ -368,7 +369,7 @@ def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> np
     places, ratio = gears.places, np.radians(values[:, RATIO_COLUMNS])
     angle_rad = places.steps * np.where(places.on_tilt, ratio[:, 1:], ratio[:, :1])
     scales = scales_at(values, np.asarray(space.harmonic_period_deg))
-    return np.asarray(place_root(scales, angle_rad, places.on_tilt, places.valid, np))
+    return place_blocks(scales, np.asarray(angle_rad), np.asarray(places.on_tilt), np.asarray(places.valid))
 
 
 def prior_errors_at_places(
@@ -385,7 +386,7 @@ def prior_errors_at_places(
     gears = arrays.gears.without_padding()
 
     def drawn(z: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        return (roots_at(space.values(z), space, gears) @ normal[..., None])[..., 0]
+        return roots_at(space.values(z), space, gears).times(normal)
 
     return in_batches(drawn, z, normal)
 
@@ -440,7 +441,7 @@ def evaluate(
                 return Evaluation(np.full(1, np.nan), np.zeros(normal.shape))
             rows = [slice(k, k + 1) for k in range(len(values))]
             return _joined([added(values[k], jax.tree.map(lambda x, k=k: x[k], sums), normal[k]) for k in rows])
-        errors_rad = (errors.root @ errors.drawn(normal, np)[..., None])[..., 0]
+        errors_rad = errors.root.times(errors.drawn(normal, np))
         return Evaluation(sums.log_density + errors.log_density(np), errors_rad)
 
     def block(z: np.ndarray, normal: np.ndarray) -> Evaluation:

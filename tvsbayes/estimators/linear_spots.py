@@ -66,7 +66,8 @@ class Linearised(LinearLooks):
             for field in fields(LinearLooks)
         }
         given["place_columns"] = given["place_columns"][..., arrays.gears.errors_filled]
-        root = roots_at(np.asarray(point.values)[None], space, gears)[0] if gears.filled else np.zeros((0, 0))
+        blocks = roots_at(np.asarray(point.values)[None], space, gears).blocks
+        root = linalg.block_diag(*(block[0] for block in blocks))
         return cls(**given, z=np.asarray(point.z), place_root=root)
 
     @property

@@ -6,6 +6,8 @@ over places as `Places` lists them (formulation 3.1).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import pairwise
 from types import ModuleType
 from typing import Any
 
@@ -15,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tvsbayes.instrument.parameters import PERIODS_MAX
-from tvsbayes.statistics.gaussian_process import JITTER, matern52, repeated
+from tvsbayes.statistics.gaussian_process import JITTER, matern52, with_waves
 
 FLOOR_RAD2 = 1e-24
 """Least variance of a place: below every angle that anybody measures, above zero."""
@@ -67,6 +69,94 @@ def _by_axis(of_axis: Any, on_tilt: Any, functions: ModuleType) -> Any:
     return functions.where(on_tilt, of_axis[..., 1:], of_axis[..., :1])
 
 
+class BlockRoot(eqx.Module):
+    """A lower triangular factor that is zero but in blocks along its diagonal, of many points; of one block for JAX."""
+
+    blocks: tuple[Float[Array | np.ndarray, "*batch _ _"], ...]
+
+    @property
+    def size(self) -> int:
+        """Number of its rows."""
+        return sum(block.shape[-1] for block in self.blocks)
+
+    @property
+    def spans(self) -> tuple[slice, ...]:
+        """Rows of each block."""
+        ends = np.cumsum([0, *(block.shape[-1] for block in self.blocks)]).tolist()
+        return tuple(slice(*pair) for pair in pairwise(ends))
+
+    def times(self, x: Any) -> Any:
+        """R x of vectors (..., e)."""
+        return _joined([(block @ x[..., span, None])[..., 0] for block, span in self._parts], -1)
+
+    def transposed_times(self, x: Any) -> Any:
+        """R'X of matrices (..., e, c)."""
+        return _joined([block.swapaxes(-2, -1) @ x[..., span, :] for block, span in self._parts], -2)
+
+    def congruent(self, x: Any) -> Any:
+        """R'X R of symmetric matrices (..., e, e)."""
+        if len(self.blocks) == 1:
+            return self.blocks[0].swapaxes(-2, -1) @ x @ self.blocks[0]
+        result = np.empty(np.broadcast_shapes(x.shape, (*self.blocks[0].shape[:-2], 1, 1)))
+        for k, (block, rows) in enumerate(self._parts):
+            half = block.swapaxes(-2, -1) @ x[..., rows, rows.start :]
+            for other, columns in self._parts[k:]:
+                whole = half[..., columns.start - rows.start : columns.stop - rows.start] @ other
+                result[..., rows, columns], result[..., columns, rows] = whole, whole.swapaxes(-2, -1)
+        return result
+
+    @property
+    def _parts(self) -> tuple[tuple[Any, slice], ...]:
+        return tuple(zip(self.blocks, self.spans, strict=True))
+
+
+def _joined(parts: list[Any], axis: int) -> Any:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=axis)
+
+
+def _roots(
+    scales: GearScales, rows: Callable[[Any], Any], angle_rad: Any, together: Any, xp: ModuleType
+) -> tuple[Any, Any]:
+    """Factors for transmission errors and for plays; `rows` gives a number of an axis to the rows of its places."""
+    size, distance = angle_rad.shape[-1], angle_rad[..., :, None] - angle_rad[..., None, :]
+    amplitudes, periods = (
+        [rows(x[..., k]) for k in range(PERIODS_MAX)] for x in (scales.amplitude_rad, scales.period_rad)
+    )
+    # A traced amplitude may be zero at one point only.
+    waves = [pair for pair in zip(amplitudes, periods, strict=True) if xp is not np or np.any(pair[0])]
+    error, near = rows(scales.error_rad), matern52(distance, rows(scales.length_rad), xp)
+    covariance = with_waves(error**2 * near, distance, waves, xp)
+    floor = JITTER * sum((amplitude**2 for amplitude, _ in waves), error**2) + FLOOR_RAD2
+    error_root = xp.linalg.cholesky(xp.where(together, covariance, error**2 * xp.eye(size)) + floor * xp.eye(size))
+    # Scaled after its factor: where there is no play its slope exists all the same.
+    near = xp.where(together, near, xp.eye(size))
+    return error_root, rows(scales.play_rad) * xp.linalg.cholesky(near + JITTER * xp.eye(size))
+
+
+def place_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray, valid: np.ndarray) -> BlockRoot:
+    """`place_root` by blocks: pan's places, then those of tilt, then padding, which do not know of each other; NumPy.
+
+    Args:
+        scales: of the processes, fields with any leading axes.
+        angle_rad: k n of the places, shape (..., places).
+        on_tilt: as in `Places`.
+        valid: likewise.
+    """
+    kinds = np.where(valid, on_tilt, 2)
+    if np.any(np.diff(kinds) < 0):
+        raise ValueError("places are those of pan, then of tilt, then padding")
+
+    def roots(kind: int) -> tuple[Any, Any]:
+        def rows(of_axis: Any) -> Any:
+            return of_axis[..., kind % 2, None, None]
+
+        return _roots(scales, rows, angle_rad[..., kinds == kind], kind < 2, np)
+
+    by_kind = [roots(kind) for kind in np.unique(kinds).tolist()]
+    blocks = tuple(root for roots in zip(*by_kind, strict=True) for root in roots)
+    return BlockRoot(blocks or (np.zeros((*scales.error_rad.shape[:-1], 0, 0)),))
+
+
 def place_root(
     scales: GearScales, angle_rad: Any, on_tilt: Any, valid: Any, functions: ModuleType = jnp
 ) -> Float[Array | np.ndarray, "*batch errors errors"]:
@@ -84,22 +174,13 @@ def place_root(
     Returns:
         Rad; zero but on the diagonal for padding.
     """
-    xp, size = functions, angle_rad.shape[-1]
-    distance = angle_rad[..., :, None] - angle_rad[..., None, :]
+    xp = functions
     together = (on_tilt[:, None] == on_tilt[None, :]) & valid[:, None] & valid[None, :]
 
     def rows(of_axis: Any) -> Any:
         return _by_axis(of_axis, on_tilt, xp)[..., None]
 
-    numbers = range(PERIODS_MAX)
-    amplitudes, periods = ([rows(x[..., k]) for k in numbers] for x in (scales.amplitude_rad, scales.period_rad))
-    error, length = rows(scales.error_rad), rows(scales.length_rad)
-    covariance = repeated(distance, error, length, zip(amplitudes, periods, strict=True), xp)
-    floor = JITTER * sum((amplitude**2 for amplitude in amplitudes), error**2) + FLOOR_RAD2
-    error_root = xp.linalg.cholesky(xp.where(together, covariance, error**2 * xp.eye(size)) + floor * xp.eye(size))
-    # Scaled after its factor: where there is no play its slope exists all the same.
-    near = xp.where(together, matern52(distance, length, xp), xp.eye(size))
-    play_root = rows(scales.play_rad) * xp.linalg.cholesky(near + JITTER * xp.eye(size))
+    error_root, play_root = _roots(scales, rows, angle_rad, together, xp)
     nothing = xp.zeros_like(error_root)
     above = xp.concatenate([error_root, nothing], axis=-1)
     return xp.concatenate([above, xp.concatenate([nothing, play_root], axis=-1)], axis=-2)

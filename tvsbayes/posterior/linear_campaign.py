@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import lapack
 
+from tvsbayes.model.gear_processes import BlockRoot
 from tvsbayes.posterior.look_noise import LookNoise
 from tvsbayes.posterior.stop_states import Elimination, StopStates
 
@@ -150,7 +151,7 @@ class Conditional:
         inner: as `LookNoise.inner` gives it.
         elimination: of the states.
         white: of the products of states and columns, shape (n, m, e + g + 1).
-        root: of the covariance of the errors at places, shape (n, e, e).
+        root: of the covariance of the errors at places, of n points.
         factor: lower triangular factor of the precision of errors at places (N(0, 1) a priori) and y together, shape
             (n, e + g, e + g).
         shift: factor' x the mean of y, shape (n, g).
@@ -161,7 +162,7 @@ class Conditional:
     inner: np.ndarray
     elimination: Elimination
     white: np.ndarray
-    root: np.ndarray
+    root: BlockRoot
     factor: np.ndarray
     shift: np.ndarray
     later: np.ndarray | None = None
@@ -169,7 +170,7 @@ class Conditional:
     @property
     def own(self) -> np.ndarray:
         """The factor of the precision of y alone, shape (n, g, g)."""
-        places = self.root.shape[1]
+        places = self.root.size
         return self.factor[:, places:, places:]
 
     def solved(self, right: np.ndarray) -> np.ndarray:
@@ -185,7 +186,7 @@ class Conditional:
             misfit: residuals beyond the linear ones, shape (n, 4 k); for one point of noise scales any number of them.
             narrow: number of narrow coordinates, the first of y here.
         """
-        places = self.root.shape[1]
+        places = self.root.size
         count = places + narrow
         misfit = linear.looks.whitened(misfit, self.inner)
         white = self.elimination.whitened((misfit @ linear.states.load)[..., None])
@@ -193,7 +194,7 @@ class Conditional:
         if linear.creep is not None and self.later is not None:
             right += linear.creep.products(misfit, self.later) @ linear.creep.rows[:, :count]
         right *= self.weight[:, None]
-        right[:, :places] = np.einsum("nji,nj->ni", self.root, right[:, :places])
+        right[:, :places] = self.root.transposed_times(right[:, :places, None])[..., 0]
         factors = np.broadcast_to(self.factor[:, :count, :count], (len(misfit), count, count))
         pairs = zip(factors, right, strict=True)
         solved = [lapack.dpotrs(factor, each, lower=1)[0][places:] for factor, each in pairs]

@@ -25,7 +25,7 @@ from tvsbayes.estimators.linear_spots import linear_spots
 from tvsbayes.instrument.parameters import BLOCKS, INDEX, KINDS, NAMES, NOISE_NAMES, OPTICS_NAMES, names_of
 from tvsbayes.model.compiled import in_batches
 from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.gear_processes import place_root
+from tvsbayes.model.gear_processes import BlockRoot, place_blocks
 from tvsbayes.model.parameter_space import (
     FARTHEST_SD,
     SCATTER_COLUMNS,
@@ -137,8 +137,8 @@ class Transport:
         residuals: of the model, for centring.
         bend: how the slopes of the narrow coordinates change with all others, as these move away from the mode: by
             bend' y their parts along each other grow, shape (g, narrow, narrow).
-        place_angle_rad, place_on_tilt: of places, as `gear_processes.place_root` takes them; their transmission errors
-            and plays are the first of the e errors, terms of the drifts the others.
+        place_angle_rad, place_on_tilt: of places, as `gear_processes.place_blocks` takes them; their transmission
+            errors and plays are the first of the e errors, terms of the drifts the others.
         walk: sds of those terms, in units of the drift of their axis (pan, tilt), h^(1/2), shape (terms, 2).
         drift_scale: of the drifts at the mode, rad h^(-1/2), shape (2,).
         drift_noise: which noise coordinate each of them is, shape (2, q).
@@ -236,18 +236,15 @@ class Transport:
         ratio = half_normal(z) / half_normal(np.where(self.half, at, 0.0))
         return np.where(self.half, np.log(np.maximum(ratio, LEAST_SCALE)), step)
 
-    def _place_roots(self, log_scale: np.ndarray) -> np.ndarray:
-        """Factors of the covariance of the errors at places, shape (n, e, e), at logs of the noise scales (n, q)."""
+    def _place_roots(self, log_scale: np.ndarray) -> BlockRoot:
+        """Factors of the covariance of errors at places, then of the terms of drifts, at ln of noise scales (n, q)."""
         values = np.zeros((len(log_scale), len(NAMES)))
         values[:, GEAR_SCALES] = self.gear_scale * np.exp(log_scale @ self.gear_noise.T)
         scales, valid = scales_at(values, self.period_deg), np.ones(len(self.place_on_tilt), dtype=bool)
-        errors, terms = 2 * len(valid), len(self.walk)
-        root = np.zeros((len(log_scale), errors + terms, errors + terms))
-        if errors:
-            root[:, :errors, :errors] = place_root(scales, self.place_angle_rad, self.place_on_tilt, valid, np)
+        errors = place_blocks(scales, self.place_angle_rad, self.place_on_tilt, valid)
         drift = self.drift_scale * np.exp(log_scale @ self.drift_noise.T)
-        root[:, errors + np.arange(terms), errors + np.arange(terms)] = drift @ self.walk.T
-        return root
+        terms = (drift @ self.walk.T)[..., None] * np.eye(len(self.walk))
+        return BlockRoot((*errors.blocks, terms))
 
     def _conditional(self, noise: np.ndarray, score_at_mode: np.ndarray) -> Conditional:
         """What the linearised campaign and the prior say of y at noise coordinates (n, q), slopes from one at the mode.
@@ -267,14 +264,14 @@ class Transport:
         whole = weight[:, None, None] * (products.gram - np.swapaxes(white, 1, 2) @ white)
         root = self._place_roots(log_scale)
         # Errors at places in units of their prior sds: their covariance may be as good as singular.
-        whole[:, :places] = np.swapaxes(root, 1, 2) @ whole[:, :places]
-        whole[:, places:, :places] = np.swapaxes(whole[:, :places, places:], 1, 2)
-        whole[:, :places, :places] = whole[:, :places, :places] @ root
+        whole[:, places:, :places] = np.swapaxes(root.transposed_times(whole[:, :places, places:]), 1, 2)
+        whole[:, :places, :places] = root.congruent(whole[:, :places, :places])
         diagonal = np.arange(places)
         whole[:, diagonal, diagonal] += 1.0
         whole[:, places:-1, places:-1] += linear.prior[::-1, ::-1]
         whole[:, -1, places:-1] -= score_at_mode
         whole[:, -1, -1] = FAR_ABOVE
+        # NumPy reads the lower triangle.
         factor = np.linalg.cholesky(whole)
         last = count - 1
         leading, shift = factor[:, :last, :last], factor[:, last, places:last]

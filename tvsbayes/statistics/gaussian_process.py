@@ -44,7 +44,16 @@ def repeated[Numbers: Any](
         waves: sd and period of each cosine.
         functions: numpy or jax.numpy.
     """
-    covariance = sd**2 * matern52(distance, length, functions)
+    return with_waves(sd**2 * matern52(distance, length, functions), distance, waves, functions)
+
+
+def with_waves[Numbers: Any](
+    covariance: Numbers,
+    distance: Numbers,
+    waves: Iterable[tuple[Numbers, Numbers | float]],
+    functions: ModuleType = np,
+) -> Numbers:
+    """A covariance and that of cosines of these sds and periods."""
     for amplitude, period in waves:
         covariance = covariance + amplitude**2 * periodic(distance, period, functions)
     return covariance
