@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,7 +32,7 @@ from tvsbayes.instrument.stereo_pair import NO_STEREO
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
-from tvsbayes.twin.simulated_campaign import simulate
+from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
 ROWS = output(__file__, "heads.jsonl")
 KINDS = ("sightings", "spots")
@@ -74,38 +75,42 @@ def plan_of(kind: str, seed: int) -> tuple[PlanStep, ...]:
 
 
 def one_head(task: tuple[str, int]) -> dict[str, object]:
-    """One head; whatever fails is recorded as a failure."""
+    """One head."""
+    kind, seed = task
+    names = (*(term.name for term in HEAD_TERMS.values()), *names_of("backlash_deg"))
+    return scored(task, simulate(head_of(kind), plan_of(kind, seed), seed), names)
+
+
+def scored(task: tuple[str, int], simulated: SimulatedCampaign, names: Sequence[str]) -> dict[str, object]:
+    """Headlines and parameters of a simulated campaign against their truth; a fit that fails is a row without them."""
     kind, seed = task
     use_compilation_cache()
-    simulated = simulate(head_of(kind), plan_of(kind, seed), seed)
     campaign, began = simulated.campaign, time.process_time()
     row: dict[str, object] = {"kind": kind, "seed": seed, "commit": commit(), "answer": "none", "problems": []}
     try:
-        found = fit(campaign)
-        row["problems"] = list(found.problems)
-        if found.converged:
-            posterior = sample(found, "importance")
-            row |= {"answer": posterior.convergence.answer, "quantities": _quantities(found, posterior, simulated)}
+        estimate = fit(campaign)
+        row["problems"] = list(estimate.problems)
+        if estimate.converged:
+            posterior = sample(estimate, "importance")
+            quantities = _quantities(estimate, posterior, simulated, names)
+            row |= {"answer": posterior.convergence.answer, "quantities": quantities}
     except TvsError as error:
         row["problems"] = [error.message]
     return {**row, "cpu_s": time.process_time() - began}
 
 
-def _quantities(found, posterior, simulated) -> dict[str, dict[str, float]]:
-    """Of headlines and terms: z of the truth, share of the draws below it, share of the prior's variance taken away."""
+def _quantities(estimate, posterior, simulated, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Of each: z of the truth, share of the draws below it, share of the prior's variance that the data take away."""
     draws, weights = posterior.by_name, posterior.weights.ravel()
     true = dict(simulated.truth.parameters)
     headline = simulated.truth.effective_deg_per_step(simulated.campaign) or {}
     true |= {f"effective_deg_per_step.{direction}": value for direction, value in headline.items()}
     for axis, (one, other) in {"pan": ("left", "right"), "tilt": ("up", "down")}.items():
         true[f"effective_contrast_deg_per_step.{axis}"] = headline[one] - headline[other]
-    terms = [term.name for term in HEAD_TERMS.values()]
-    others = (*terms, *names_of("backlash_deg"))
-    names = [name for name in (*draws, *terms) if name.startswith("effective_") or name in others]
-    prior = {name: np.asarray(found.prior_draws.physical)[:, k].var() for k, name in enumerate(found.names)}
+    prior = {name: np.asarray(estimate.prior_draws.physical)[:, k].var() for k, name in enumerate(estimate.names)}
     result = {}
-    for name in dict.fromkeys(names):
-        if name not in draws or (name in terms and prior[name] == 0):
+    for name in draws:
+        if name not in true or not (name in names or name.startswith("effective_")) or prior.get(name) == 0:
             continue
         values = draws[name]
         mean = weights @ values
@@ -134,36 +139,41 @@ a tenth of the prior's variance in the median head, which is not judged. Bounds 
 
 def table(arguments: argparse.Namespace) -> None:
     """A table for each kind."""
-    print(TEXT)
-    for kind in KINDS:
+    tables(arguments, TEXT, {kind: f"Heads with {kind}" for kind in KINDS}, "head")
+
+
+def tables(arguments: argparse.Namespace, text: str, titles: Mapping[str, str], what: str) -> None:
+    """Text, and a table for each kind that has rows; `what`: a word for what is drawn."""
+    print(text)
+    for kind, title in titles.items():
         rows = [row for row in read_rows(arguments.rows) if row["kind"] == kind]
         good = [row for row in rows if row["answer"] in ("accepted", "rough")]
         if not good:
             continue
         answers = Counter(row["answer"] for row in rows)
-        told = ", ".join(f"{count} {word}" for word, count in answers.most_common())
+        counts = ", ".join(f"{count} {word}" for word, count in answers.most_common())
         cpu = np.median([row["cpu_s"] for row in rows])
         commits = ", ".join(dict.fromkeys(str(row.get("commit", "?")) for row in rows))
         low, high = (100 * share for share in binomial_bounds(len(good), LEVEL))
         least, most = rms_bounds(len(good))
-        print(f"\n## Heads with {kind}\n\n{len(rows)} heads: {told}; median {cpu:.0f} CPU s. ", end="")
+        print(f"\n## {title}\n\n{len(rows)} {what}s: {counts}; median {cpu:.0f} CPU s. ", end="")
         print(f"Commit {commits}. Bounds {low:.0f} to {high:.0f} % and {least:.2f} to {most:.2f}.\n")
         print("| quantity | 95 % interval holds | RMS z | prior's variance taken away |\n|---|---|---|---|")
         every = []
         for name in good[0]["quantities"]:
-            own = [row["quantities"][name] for row in good]
-            taken = float(np.median([q["taken"] for q in own]))
-            inside = np.array([abs(q["pit"] - 0.5) < LEVEL / 2 for q in own])
-            rms = float(np.sqrt(np.mean([q["z"] ** 2 for q in own])))
+            scores = [row["quantities"][name] for row in good]
+            taken = float(np.median([score["taken"] for score in scores]))
+            inside = np.array([abs(score["pit"] - 0.5) < LEVEL / 2 for score in scores])
+            rms = float(np.sqrt(np.mean([score["z"] ** 2 for score in scores])))
             share = f"{100 * inside.mean():.1f} %" + ("" if low <= 100 * inside.mean() <= high else " **!**")
-            score = f"{rms:.2f}" + ("" if least <= rms <= most else " **!**")
+            spread = f"{rms:.2f}" + ("" if least <= rms <= most else " **!**")
             every += inside.tolist() if taken >= SETTLED else []
-            cells = (share, score) if taken >= SETTLED else ("*prior*", "")
+            cells = (share, spread) if taken >= SETTLED else ("*prior*", "")
             print(f"| `{name}` | {cells[0]} | {cells[1]} | {100 * taken:.0f} % |")
         print(f"| all judged | {100 * np.mean(every):.1f} % of {len(every)} | | |")
         for row in good:
             if far := [f"`{name}` {q['z']:+.1f}" for name, q in row["quantities"].items() if abs(q["z"]) > FAR]:
-                print(f"\nHead {row['seed']} lies beyond {FAR:g} u: {', '.join(far)}.")
+                print(f"\n{what.capitalize()} {row['seed']} lies beyond {FAR:g} u: {', '.join(far)}.")
 
 
 if __name__ == "__main__":
