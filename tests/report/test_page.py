@@ -160,14 +160,13 @@ def test_ratios_that_are_one_number_share_a_row(evidence):
     """Without the classic method's own column; the contrast says what they differ by."""
     summary = evidence.fit.summary
     alike = structs.replace(summary, effective=summary.effective | {"right": summary.effective["left"]})
-    fit = replace(evidence.fit, summary=alike)
-    heads = [row[0] for row in answer_table(replace(evidence, fit=fit, classic=None)).rows]
+    heads = [row[0] for row in answer_table(alike, None).rows]
     assert heads[0] == "left and right, deg/step" and {"up, deg/step", "down, deg/step"} <= set(heads)
     assert "left - right, \u00b5deg/step" in heads
     # A narrow screen hides one column by its place: every row has all cells.
-    for shown in (answer_table(evidence), answer_table(replace(evidence, fit=fit, classic=None))):
+    for shown in (answer_table(evidence.fit.summary, evidence.classic), answer_table(alike, None)):
         assert {len(row) for row in shown.rows} == {len(shown.columns)}
-    assert [row[0] for row in answer_table(replace(evidence, fit=fit)).rows][:2] == [
+    assert [row[0] for row in answer_table(alike, evidence.classic).rows][:2] == [
         "left, deg/step",
         "right, deg/step",
     ]

@@ -10,16 +10,15 @@ from collections.abc import Sequence
 from tvsbayes.head.pointing_model import pointing_model
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
-from tvsbayes.instrument.parameters import HEAD_TERMS
 from tvsbayes.report.advice import LAPLACE_SHORT
-from tvsbayes.report.document import Document, Issue, Section, about_table
+from tvsbayes.report.document import Document, FigureView, Issue, Section, about_table
+from tvsbayes.report.figures import intervals
 from tvsbayes.report.fit_sections import stop_views
 from tvsbayes.report.fit_text import validation_lines
 from tvsbayes.report.page import numbered
-from tvsbayes.report.parameter_words import name_in_words, sentence_in_words
-from tvsbayes.report.result_tables import ESTIMATE_COLUMNS, estimate_row, headline_table, pointing_table
-from tvsbayes.report.scanner_document import measured_days, verdict_of
-from tvsbayes.report.tables import TableView
+from tvsbayes.report.parameter_words import sentence_in_words
+from tvsbayes.report.result_tables import headline_table, pointing_table
+from tvsbayes.report.scanner_document import answer_table, measured_days, verdict_of
 from tvsbayes.results.fit_record import FitRecord
 
 METHOD = (
@@ -54,7 +53,6 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
             "Result",
             tables=[
                 headline_table(summary),
-                term_table(record),
                 pointing_table(
                     pointing_model(campaign), {name: (e.value, e.sd) for name, e in summary.parameters.items()}
                 ),
@@ -75,8 +73,10 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
             name=campaign.title,
             about=about_table(campaign.header, measured_days(campaign, issue), issue),
             verdict=verdict_of(summary, (), doubts),
-            answer=term_table(record),
-            picture=None,
+            answer=answer_table(summary, None, "the line of sight"),
+            picture=FigureView(
+                intervals(summary), "Ratios with 95 % intervals; values in the table", "Effective ratios."
+            ),
             steps=["`tvsbayes compare CAMPAIGN --by positions` says how well the fit predicts sightings left out."],
             traceable="The sightings are taken as stated.",
             warnings=warnings,
@@ -86,17 +86,6 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
             issue=issue,
         )
     )
-
-
-def term_table(record: FitRecord) -> TableView:
-    """The terms of the head's geometry, as a fit has them."""
-    parameters = record.summary.parameters
-    rows = [
-        estimate_row(name_in_words(term.name), parameters[term.name], "")
-        for term in HEAD_TERMS.values()
-        if term.name in parameters
-    ]
-    return TableView("terms of the line of sight", ESTIMATE_COLUMNS, rows)
 
 
 def _noise_text(record: FitRecord) -> list[str]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from tvsbayes.display import concise
 from tvsbayes.errors import typed
+from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.estimators.plausibility import misfit_causes
 from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign
@@ -55,7 +56,7 @@ def report_document(e: Evidence, issue: Issue | None = None) -> Document:
             verdict=verdict_of(e.fit.summary, e.criteria, e.doubts),
             numbers=distances(e),
             why=why_far(e),
-            answer=answer_table(e),
+            answer=answer_table(e.fit.summary, e.classic),
             picture=both_estimators(e),
             steps=_steps(e),
             criteria=criteria_table(e.criteria),
@@ -122,12 +123,12 @@ def measured_days(campaign: Campaign, issue: Issue) -> str:
     return " to ".join(days) if when.recorded else ""
 
 
-def answer_table(e: Evidence) -> TableView:
-    """Ratios, their contrasts and both backlashes, classic beside joint where there are experiments for it.
+def answer_table(summary: FitSummary, classic: ClassicResult | None, what: str = "the beam") -> TableView:
+    """Ratios of `what`, their contrasts and both backlashes, classic beside joint where there are experiments for it.
 
     Ratios of both directions that are one number at their uncertainty share a row.
     """
-    summary, rows, applicable = e.fit.summary, [], e.classic is not None
+    rows, applicable = [], classic is not None
     for direction in DIRECTIONS:
         pair = next(pair for pair in SENSES.values() if direction in pair)
         cells = _cells(summary.effective[direction])
@@ -135,10 +136,11 @@ def answer_table(e: Evidence) -> TableView:
             if direction == pair[0]:
                 rows.append([f"{' and '.join(pair)}, deg/step", *cells])
             continue
-        classic = None if e.classic is None else e.classic.directions[direction]
+        four_point = None if classic is None else classic.directions[direction]
         measured = "no experiment"
-        if classic is not None:
-            measured = f"{concise(classic.mean_deg_per_step, classic.u_gum_deg_per_step or 0.0)}, n = {classic.n}"
+        if four_point is not None:
+            mean = concise(four_point.mean_deg_per_step, four_point.u_gum_deg_per_step or 0.0)
+            measured = f"{mean}, n = {four_point.n}"
         rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), *[measured] * applicable])
     for axis, pair in SENSES.items():
         if (contrast := summary.contrasts[axis]) is not None:
@@ -148,7 +150,7 @@ def answer_table(e: Evidence) -> TableView:
         rows.append([f"backlash {axis}, deg", *play, *[CLASSIC_BLIND] * applicable])
     pose = summary.reference_pose_deg
     where = f"pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
-    caption = f"Degrees of the beam per motor step at {where}, and play; U: half the 95 % interval"
+    caption = f"Degrees of {what} per motor step at {where}, and play; U: half the 95 % interval"
     columns = ["", "joint value(u)", "95 % interval", "U, 95 %", *["classic value(u)"] * applicable]
     return TableView(caption, columns, rows)
 
