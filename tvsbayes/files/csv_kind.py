@@ -1,7 +1,7 @@
 """Kinds of CSV files: a dataclass whose fields say what their columns hold.
 
 One declaration is reader, writer, the table in the documentation and the comment in a template. Name, type and default
-are those of the field; the rest stands in its `Column`: `aperture_deg: Annotated[float | None, Column(...)] = None`.
+are those of the field; its `Column` holds the rest: `aperture_deg: Annotated[float | None, Column(...)] = None`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Values = Mapping[str, Sequence[Any]]
 
 @dataclass(frozen=True)
 class Column:
-    """What a field of a row says of its column.
+    """A column of a table, as the field of a row declares it.
 
     Attributes:
         meaning: what it holds, in Markdown; "" where it shares the words of the column before.
@@ -73,7 +73,7 @@ class Column:
 
 def _leaves(hint: object) -> list[object]:
     """The types and the words of literals in a type."""
-    return [leaf for part in get_args(hint) for leaf in _leaves(part)] or [hint]
+    return [leaf for argument in get_args(hint) for leaf in _leaves(argument)] or [hint]
 
 
 class CsvKind[Row]:
@@ -103,16 +103,11 @@ class CsvKind[Row]:
             hint, column = get_args(hints[entry.name])
             leaves = _leaves(hint)
             words = tuple(leaf for leaf in leaves if isinstance(leaf, str))
-            number = next((known for known in (int, float) if known in leaves), str)
+            kind = next((candidate for candidate in (int, float) if candidate in leaves), str)
             meaning = column.meaning or meaning
-            attributes = {
-                "name": entry.name,
-                "kind": number,
-                "words": words,
-                "default": entry.default,
-                "meaning": meaning,
-            }
-            self.columns[entry.name] = replace(column, **attributes)
+            self.columns[entry.name] = replace(
+                column, name=entry.name, kind=kind, words=words, default=entry.default, meaning=meaning
+            )
 
     def __getitem__(self, name: str) -> Column:
         return self.columns[name]
@@ -145,10 +140,10 @@ class CsvKind[Row]:
         Args:
             data: its bytes.
             file: its name, for errors.
-            checks: what is refused besides, for reasons that stand in no column.
+            checks: further checks, of more than one column.
 
         Raises:
-            InputError: what `parse_table`, `values` and `checks` refuse, and no rows where there must be some.
+            InputError: what `parse_table`, `values` and `checks` refuse, or no rows where some are required.
         """
         table = parse_table(data, file, self.required, self.optional)
         if self.no_rows and not len(table):
@@ -163,10 +158,10 @@ class CsvKind[Row]:
     def content(self, rows: Iterable[Row]) -> bytes:
         """The content of a file; columns of a group only where one of them is not at its default."""
         rows = list(rows)
-        used = {
+        groups = {
             c.group for c in self.columns.values() if c.group and any(getattr(r, c.name) != c.default for r in rows)
         }
-        names = [name for name, column in self.columns.items() if not column.group or column.group in used]
+        names = [name for name, column in self.columns.items() if not column.group or column.group in groups]
         return csv_bytes(names, ([getattr(row, name) for name in names] for row in rows))
 
     def _meanings(self) -> list[tuple[list[str], str]]:
@@ -181,7 +176,7 @@ class CsvKind[Row]:
         return "\n".join(lines) + "\n"
 
     def comment(self) -> str:
-        """The columns in the words of a comment in a template."""
+        """The columns as a comment in a template."""
         lines = [f"# {self.file}: {self.about}."]
         for names, meaning in self._meanings():
             text = f"{', '.join(names)}: {meaning}"
@@ -190,7 +185,7 @@ class CsvKind[Row]:
 
 
 def templates(folder: str, *kinds: CsvKind[Any]) -> dict[str, bytes]:
-    """The commented files that `new` writes: shipped ones, in which a line `# {moves.csv}` stands for its columns."""
+    """The commented files that `new` writes: shipped ones, with a line `# {moves.csv}` replaced by its comment."""
     files = {path.name: path.read_bytes() for path in (shipped_data() / folder).iterdir()}
     for kind in kinds:
         line = f"# {{{kind.file}}}".encode()
@@ -206,16 +201,16 @@ def counted(table: Table, column: Column, values: Values) -> None:
 
 
 def unique(table: Table, column: Column, values: Values) -> None:
-    """Refuses a number that stands twice."""
+    """Refuses a repeated number."""
     refuse_repeated(table, column.name, values[column.name], "unique ids")
 
 
 def refuse_repeated(table: Table, column: str, values: Iterable[object], allowed: str) -> None:
-    """Refuses a value that stands twice; None does not count."""
-    first: dict[object, int] = {}
+    """Refuses a repeated value; None does not count."""
+    first_rows: dict[object, int] = {}
     for row, value in enumerate(values):
-        if value is not None and first.setdefault(value, row) != row:
-            found = f"{shown(table.columns[column][row])} again (first on line {table.lines[first[value]]})"
+        if value is not None and first_rows.setdefault(value, row) != row:
+            found = f"{shown(table.columns[column][row])} again (first on line {table.lines[first_rows[value]]})"
             raise table.refuse(row, column, "duplicate", allowed, "renumber one of them", found)
 
 
@@ -223,9 +218,9 @@ def segments_in_time(table: Table, column: Column, values: Values) -> None:
     """Refuses segments that do not count from 0 by one at most, and a `time_s` that goes back."""
     segments, times_s = values[column.name], values["time_s"]
     for row, (segment, time_s) in enumerate(zip(segments, times_s, strict=True)):
-        before = segments[row - 1] if row else -1
-        if segment not in ((before, before + 1) if row else (0,)):
-            allowed = f"{before} or {before + 1}" if row else "0"
+        previous = segments[row - 1] if row else -1
+        if segment not in ((previous, previous + 1) if row else (0,)):
+            allowed = f"{previous} or {previous + 1}" if row else "0"
             raise table.refuse(row, column.name, "order", allowed, "count segments 0, 1, 2 ... without gaps")
         if row and time_s < times_s[row - 1]:
             allowed = f"at least {times_s[row - 1]!r}, the time of the row before"
@@ -236,11 +231,11 @@ def first_of_segment(table: Table, column: Column, values: Values) -> None:
     """Refuses anything but one of the column's words in the first row of a segment, and nothing in the others."""
     segments = values["segment"]
     for row, word in enumerate(values[column.name]):
-        first = row == 0 or segments[row] != segments[row - 1]
-        words = tuple(filter(None, column.words)) if first else ("",)
+        begins = row == 0 or segments[row] != segments[row - 1]
+        words = tuple(filter(None, column.words)) if begins else ("",)
         if word not in words:
-            allowed = ", ".join(words) if first else "an empty cell inside a segment"
-            remedy = "state how the axis arrived there" if first else "leave it empty, or begin a segment"
+            allowed = ", ".join(words) if begins else "an empty cell inside a segment"
+            remedy = "state how the axis arrived there" if begins else "leave it empty, or begin a segment"
             raise table.refuse(row, column.name, "approach", allowed, remedy)
 
 
@@ -260,7 +255,7 @@ def filled_where_ok(
 
 
 def follows_a_move(moves: int, what: str) -> Callable[[Table, Values], None]:
-    """The check that `move` names one of so many rows of moves.csv: the last before `what`."""
+    """The check that `move` names one of the `moves` rows of moves.csv, the last before `what`."""
 
     def check(table: Table, values: Values) -> None:
         for row, move in enumerate(values["move"]):

@@ -1,7 +1,7 @@
 """Strict CSV: cells by column name, each error with its line and column; and tables that grow by one line at a time.
 
-Numbers obey an own ASCII pattern: `float` alone would take "9_4.7", "infinity" and Arabic digits. Size, rows and the
-length of a line are capped; lines count from 1.
+Numbers match the ASCII pattern `NUMBER`: `float` alone would accept "9_4.7", "infinity" and Arabic digits. Size,
+rows and the length of a line are capped; lines count from 1.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _CSV_LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")
 
 
 FOREIGN = "`tvsbayes import FILE --to NEW` reads it"
-"""What to do with a table that another program wrote in its own way."""
+"""Remedy for a table in the format of another program."""
 
 
 def number_remedy(cell: str, *, whole: bool = False) -> str:
@@ -55,8 +55,8 @@ def number_remedy(cell: str, *, whole: bool = False) -> str:
     return "write a whole number such as 200" if whole else "write a decimal number such as 9.47"
 
 
-def _plain[N: (int, float)](cells: Sequence[str], kind: type[N], low: float, high: float) -> list[N] | None:
-    """The numbers of a column without a single odd cell, fast; else None, and each cell is looked at."""
+def _plain_numbers[N: (int, float)](cells: Sequence[str], kind: type[N], low: float, high: float) -> list[N] | None:
+    """The numbers of a column of valid cells, fast; None where any cell needs a closer check."""
     # Of what these characters can spell, float() and int() take exactly NUMBER and INTEGER.
     if not cells or not set().union(*cells) <= set("0123456789+-" if kind is int else "0123456789+-.eE"):
         return None
@@ -85,7 +85,7 @@ class Table:
     def refuse(
         self, row: int, column: str, code: str, allowed: str, remedy: str, found: str | None = None
     ) -> InputError:
-        """The error of one cell; `found` defaults to what stands in it."""
+        """The error of one cell; `found` defaults to its content."""
         if not any(cells[row] for cells in self.columns.values()):
             # A spreadsheet ends with rows that hold separators alone.
             found, remedy = "a line without any value", "delete the line"
@@ -98,7 +98,7 @@ class Table:
         self, column: str, kind: type[N], low: float, high: float, empty: bool = False
     ) -> Sequence[N | None]:
         """Finite numbers in [low, high], whole ones of the kind int; None for an empty cell where `empty` allows it."""
-        if (plain := _plain(self.columns[column], kind, low, high)) is not None:
+        if (plain := _plain_numbers(self.columns[column], kind, low, high)) is not None:
             return plain
         values: list[N | None] = []
         match = (INTEGER if kind is int else NUMBER).fullmatch
@@ -108,22 +108,22 @@ class Table:
                 continue
             value = kind(cell) if match(cell) else math.nan
             if not (math.isfinite(value) and low <= value <= high):
-                raise self._no_number(row, column, kind, low, high, empty)
+                raise self._number_refusal(row, column, kind, low, high, empty)
             values.append(kind(value))
         return values
 
-    def _no_number(
+    def _number_refusal(
         self, row: int, column: str, kind: type[int] | type[float], low: float, high: float, empty: bool
     ) -> InputError:
         """The error of a cell that is no number of a kind and range."""
         cell = self.columns[column][row]
-        matched = NUMBER.fullmatch(cell) is not None
+        is_decimal = NUMBER.fullmatch(cell) is not None
         if kind is int:
             code, allowed = "integer", f"a whole number from {low} to {high}"
-            remedy = "write a whole number, no point" if matched else number_remedy(cell, whole=True)
+            remedy = "write a whole number, no point" if is_decimal else number_remedy(cell, whole=True)
         else:
             code, allowed = "number", f"a finite decimal number from {low:g} to {high:g}"
-            remedy = "mind the unit of the column" if matched and math.isfinite(float(cell)) else number_remedy(cell)
+            remedy = "mind the unit of the column" if is_decimal and math.isfinite(float(cell)) else number_remedy(cell)
         return self.refuse(row, column, code, allowed + ", or an empty cell" * empty, remedy)
 
     def texts(self, column: str, chars_max: int = 100, empty: bool = True) -> list[str]:
@@ -138,17 +138,17 @@ class Table:
 
 
 def _csv_rows(text: str, file: str, skipped: int) -> Iterator[tuple[int, list[str]]]:
-    """Rows of a CSV text with the line on which each begins; `skipped` lines of the file follow its first."""
-    in_file = partial(line_in_file, skipped=skipped)
-    bad = partial(refusal, file=file)
+    """Rows of a CSV text with the line on which each begins; `skipped` lines were left out after the first."""
+    line_of = partial(line_in_file, skipped=skipped)
+    refuse = partial(refusal, file=file)
 
     def capped_lines() -> Iterator[str]:
-        # A StringIO would hold the text once more, with four bytes a character.
-        for number, found_line in enumerate(_CSV_LINE.finditer(text), start=1):
-            line = found_line.group()
+        # A StringIO would copy the text, with four bytes per character.
+        for number, match in enumerate(_CSV_LINE.finditer(text), start=1):
+            line = match.group()
             if len(line) > CSV_LINE_CHARS_MAX:
                 found, allowed = f"{len(line)} characters in one line", f"at most {CSV_LINE_CHARS_MAX}"
-                raise bad("size", line=in_file(number), found=found, allowed=allowed, remedy="one row per line")
+                raise refuse("size", line=line_of(number), found=found, allowed=allowed, remedy="one row per line")
             yield line
 
     reader = csv.reader(capped_lines(), strict=True)
@@ -157,12 +157,12 @@ def _csv_rows(text: str, file: str, skipped: int) -> Iterator[tuple[int, list[st
         for row in reader:
             if reader.line_num > start:
                 raise csv.Error("a line break inside a cell")
-            yield in_file(start), row
+            yield line_of(start), row
             start = reader.line_num + 1
     except csv.Error as error:
         allowed, remedy = "comma-separated cells, one row per line", 'close every quote " in its own line'
         found = escaped(str(error), 120)
-        raise bad("csv", line=in_file(start), found=found, allowed=allowed, remedy=remedy) from error
+        raise refuse("csv", line=line_of(start), found=found, allowed=allowed, remedy=remedy) from error
 
 
 def table_blocks(path: Path, columns: Sequence[str], rows: int, advance: Advance = unshown) -> Iterator[Table]:
@@ -175,7 +175,7 @@ def table_blocks(path: Path, columns: Sequence[str], rows: int, advance: Advance
         advance: called with the share of the file that is read.
 
     Raises:
-        InputError: as `parse_table`, in the block where it stands.
+        InputError: as `parse_table`, when it comes to that block.
     """
     file, skipped = escaped(path.name), 0
     with opened(path, "a readable file") as stream:
@@ -199,38 +199,38 @@ def parse_table(
         file: name of the file.
         columns: that must be there.
         optional: that may.
-        skipped: how many lines of the file stand between the header and these rows.
+        skipped: number of lines of the file between the header and these rows.
 
     Raises:
         InputError: not UTF-8, control characters, no or a wrong header, rows of another length than it.
     """
-    bad = partial(refusal, file=file)
+    refuse = partial(refusal, file=file)
     for marks, found in (((b"PK\x03\x04",), "a workbook (XLSX)"), ((b"\xff\xfe", b"\xfe\xff"), "UTF-16")):
         if data.startswith(marks):
-            raise bad("encoding", found=found, allowed="CSV as UTF-8 text", remedy=f"{FOREIGN}; or save it as UTF-8")
+            raise refuse("encoding", found=found, allowed="CSV as UTF-8 text", remedy=f"{FOREIGN}; or save it as UTF-8")
     rows = _csv_rows(decode(data, file, skipped), file, skipped)
     _, header = next(rows, (1, []))
     allowed = "the columns " + ",".join(columns) + (f" and optionally {','.join(optional)}" * bool(optional))
-    bad_header = partial(bad, line=1, allowed=allowed)
+    refuse_header = partial(refuse, line=1, allowed=allowed)
     if not header:
-        raise bad_header("empty", found="no header", remedy="write the column names into the first line")
+        raise refuse_header("empty", found="no header", remedy="write the column names into the first line")
     if len(header) == 1 and re.search(r"[;\t]", header[0]):
-        raise bad_header(
+        raise refuse_header(
             "csv", found=shown(header[0]), remedy=f"{FOREIGN}; or use commas between cells, decimal points"
         )
-    known = (*columns, *optional)
+    names = (*columns, *optional)
     for name in header:
-        if name not in known:
+        if name not in names:
             found, otherwise = f"an unknown column {shown(name)}", "remove it; remarks go into notes of campaign.toml"
-            remedy = closest(name, known, otherwise)
-            raise bad_header("unknown-column", column=name, found=found, remedy=remedy)
+            remedy = closest(name, names, otherwise)
+            raise refuse_header("unknown-column", column=name, found=found, remedy=remedy)
         if header.count(name) > 1:
-            raise bad_header("duplicate-column", column=name, found="the column twice", remedy="remove one")
+            raise refuse_header("duplicate-column", column=name, found="the column twice", remedy="remove one")
     for name in columns:
         if name not in header:
-            raise bad_header("missing-column", column=name, found="no such column", remedy=f"add {name}")
+            raise refuse_header("missing-column", column=name, found="no such column", remedy=f"add {name}")
 
-    lines: list[int] = []
+    line_numbers: list[int] = []
     cells: list[list[str]] = []
     blank = None
     for line, row in rows:
@@ -242,14 +242,14 @@ def parse_table(
             remedy = "one cell per column; a decimal comma splits a number in two: write a point"
             if blank:
                 remedy = "remove it; only the end of the file may be empty"
-            raise bad("row-length", line=blank or line, found=found, allowed=cells_allowed, remedy=remedy)
-        if len(lines) >= CSV_ROWS_MAX:
+            raise refuse("row-length", line=blank or line, found=found, allowed=cells_allowed, remedy=remedy)
+        if len(line_numbers) >= CSV_ROWS_MAX:
             found, rows_allowed = "a row more", f"at most {CSV_ROWS_MAX} rows"
-            raise bad("size", line=line, found=found, allowed=rows_allowed, remedy="split the campaign")
-        lines.append(line)
+            raise refuse("size", line=line, found=found, allowed=rows_allowed, remedy="split the campaign")
+        line_numbers.append(line)
         cells.append(row)
     by_column = list(zip(*cells, strict=True)) or [()] * len(header)
-    return Table(file, lines, dict(zip(header, by_column, strict=True)))
+    return Table(file, line_numbers, dict(zip(header, by_column, strict=True)))
 
 
 def csv_bytes(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
@@ -273,33 +273,33 @@ def append_line(path: Path, columns: Sequence[str], row: Sequence[object]) -> No
 
     Args:
         path: of the table.
-        columns: that its first line must hold.
-        row: a cell for each; None is empty.
+        columns: names in its first line.
+        row: one cell per column; None is empty.
 
     Raises:
         InputError: a table with other columns, or a disk that is full or not writable.
     """
-    file, whole = escaped(str(path), 200), csv_bytes(columns, [row])
-    head = whole[: len(csv_bytes(columns, []))]
+    file, data = escaped(str(path), 200), csv_bytes(columns, [row])
+    header = data[: len(csv_bytes(columns, []))]
     try:
-        fresh = not path.exists()
+        is_new = not path.exists()
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
         try:
             size = os.lseek(descriptor, 0, os.SEEK_END)
             if size:
                 os.lseek(descriptor, 0, os.SEEK_SET)
-                first = os.read(descriptor, HEAD_MAX).splitlines()[0]
-                if first != head.rstrip():
-                    named = escaped(first.decode(errors="replace"), 80)
+                first_line = os.read(descriptor, HEAD_MAX).splitlines()[0]
+                if first_line != header.rstrip():
+                    columns_found = escaped(first_line.decode(errors="replace"), 80)
                     remedy = "name another file: this one is kept as it is"
-                    allowed = head.decode().rstrip()
-                    raise refusal("header", file=file, line=1, found=named, allowed=allowed, remedy=remedy)
+                    allowed = header.decode().rstrip()
+                    raise refusal("header", file=file, line=1, found=columns_found, allowed=allowed, remedy=remedy)
                 os.lseek(descriptor, size - 1, os.SEEK_SET)
-                whole = (b"" if os.read(descriptor, 1) == b"\n" else b"\n") + whole[len(head) :]
-            _write_all(descriptor, whole, size)
+                data = (b"" if os.read(descriptor, 1) == b"\n" else b"\n") + data[len(header) :]
+            _write_all(descriptor, data, size)
         finally:
             os.close(descriptor)
-        if fresh:
+        if is_new:
             flush_folder(path.parent)
     except OSError as error:
         found, allowed = escaped(error.strerror or str(error)), "a writable file on a disk with free space"

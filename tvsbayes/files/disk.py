@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 FLUSHES_NO_FOLDER = frozenset({errno.EINVAL, errno.ENOTSUP})
-"""How a file system (some network shares) says that it can flush files only, fsync(2): its own order has to do."""
+"""Errors of a file system (some network shares) that flushes files only, fsync(2): no folder can be flushed there."""
 RESULTS_BYTES_MAX = 128 * 1024 * 1024
 """Of a file of results, and of its arrays unpacked."""
 ARRAYS_MAX = 256
@@ -87,19 +87,19 @@ def opened(path: Path, allowed: str, folder: Path | None = None) -> Iterator[Bin
     path = Path(path)
     file = escaped(path.name) or escaped(str(path))
 
-    def bad(code: str, found: str, remedy: str) -> InputError:
+    def refuse(code: str, found: str, remedy: str) -> InputError:
         return refusal(code, file=file, found=found, allowed=allowed, remedy=remedy)
 
     try:
         real = path.resolve(strict=True)
         if folder is not None and not real.is_relative_to(Path(folder).resolve()):
-            raise bad("path", "a link that leaves the folder", "put the file itself into the folder")
+            raise refuse("path", "a link that leaves the folder", "put the file itself into the folder")
         # Without O_NONBLOCK the opening of a pipe would wait for a writer for ever.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
         descriptor = os.open(real, flags | getattr(os, "O_BINARY", 0))
         try:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise bad("not-a-file", "a folder, pipe or device", "name a regular file")
+                raise refuse("not-a-file", "a folder, pipe or device", "name a regular file")
             with open(descriptor, "rb", closefd=False) as stream:
                 yield stream
         finally:
@@ -111,14 +111,14 @@ def opened(path: Path, allowed: str, folder: Path | None = None) -> Iterator[Bin
                 "`tvsbayes stereo` makes one of pictures, of OpenCV's, ROS' or Kalibr's calibration, or of nominal "
                 f"numbers; {remedy}"
             )
-        raise bad("missing-file", "no such file", remedy) from error
+        raise refuse("missing-file", "no such file", remedy) from error
     except (OSError, ValueError) as error:
         reason = escaped(getattr(error, "strerror", None) or str(error))
-        raise bad("unreadable", reason, "check the path and its permissions") from error
+        raise refuse("unreadable", reason, "check the path and its permissions") from error
 
 
 def line_in_file(number: int, skipped: int) -> int:
-    """The line of a file that is the given one of its first and those after the `skipped` that follow it."""
+    """The line in a file of line `number` of a text without the `skipped` lines after the first."""
     return number + (skipped if number > 1 else 0)
 
 
@@ -126,14 +126,14 @@ def decode(data: bytes, file: str, skipped: int = 0) -> str:
     """UTF-8 text with or without BOM; refuses other encodings, NUL and other control characters.
 
     Args:
-        data: the text, or its first line and what follows some that were left out.
+        data: the text, or its first line and the lines after some that were left out.
         file: its name, for errors.
         skipped: how many lines were left out after the first.
 
     Raises:
         InputError: with the line in the file.
     """
-    bad = partial(refusal, file=file)
+    refuse = partial(refusal, file=file)
     utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         text = data.decode("utf-8-sig")
@@ -141,25 +141,25 @@ def decode(data: bytes, file: str, skipped: int = 0) -> str:
         line = None if utf16 else line_in_file(data.count(b"\n", 0, error.start) + 1, skipped)
         found = "UTF-16" if utf16 else f"the byte 0x{data[error.start]:02x}"
         allowed, remedy = "UTF-8 text", "save it as UTF-8"
-        raise bad("encoding", line=line, found=found, allowed=allowed, remedy=remedy) from error
+        raise refuse("encoding", line=line, found=found, allowed=allowed, remedy=remedy) from error
     if control := CONTROL.search(text):
         line = line_in_file(text.count("\n", 0, control.start()) + 1, skipped)
         found = shown(control.group())
-        raise bad("control-character", line=line, found=found, allowed="printable text", remedy="remove it")
+        raise refuse("control-character", line=line, found=found, allowed="printable text", remedy="remove it")
     return text
 
 
 class Flushing(Protocol):
-    """What the flushing of a folder asks of a disk: the module `os` has it."""
+    """The calls that `flush_folder` makes; the module `os` has them."""
 
     def open(self, path: Path, flags: int, /) -> int:
         """A descriptor of the folder."""
 
     def fsync(self, descriptor: int, /) -> None:
-        """Make durable what is behind it."""
+        """Make its content durable."""
 
     def close(self, descriptor: int, /) -> None:
-        """Give it back."""
+        """Close it."""
 
 
 def flush_folder(folder: Path, disk: Flushing = os) -> None:
@@ -167,7 +167,7 @@ def flush_folder(folder: Path, disk: Flushing = os) -> None:
 
     Args:
         folder: which.
-        disk: through which calls.
+        disk: its calls.
 
     Raises:
         OSError: the disk failed.
@@ -196,11 +196,11 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[BinaryIO]:
-    """A stream that replaces `path` when its block ends well; else there stands what stood there before.
+    """A stream that replaces `path` when its block ends without an error; else `path` stays as it was.
 
     Raises:
-        InputError: the folder is missing, full or not writable; there stands the old file, or where only the flush
-            of the folder failed, the new one.
+        InputError: the folder is missing, full or not writable; `path` is the old file then, or the new one where
+            only the flush of the folder failed.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
@@ -223,7 +223,7 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
 
 
 def remove_unfinished(folder: Path, names: Iterable[str]) -> list[str]:
-    """Removes what `write_atomically` left of files with these names when its process was killed.
+    """Removes temporary files of these names that a killed `write_atomically` left behind.
 
     Only for a folder that nobody else writes these files into.
 
@@ -248,23 +248,23 @@ def make_folder(folder: Path, *, empty: bool = False) -> None:
     Raises:
         InputError: it cannot be created, or holds something.
     """
-    place = escaped(str(folder), 200)
+    shown_path = escaped(str(folder), 200)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         occupied = empty and any(folder.iterdir())
     except OSError as error:
         found, allowed = escaped(error.strerror or str(error)), "a new or empty folder"
-        raise refusal("write", file=place, found=found, allowed=allowed, remedy="name another") from error
+        raise refusal("write", file=shown_path, found=found, allowed=allowed, remedy="name another") from error
     if occupied:
         allowed, remedy = "a new or empty folder", "name another folder; nothing is overwritten"
-        raise refusal("occupied", file=place, found="a folder with files", allowed=allowed, remedy=remedy)
+        raise refusal("occupied", file=shown_path, found="a folder with files", allowed=allowed, remedy=remedy)
 
 
 def require_writable(folder: Path) -> None:
-    """Refuse a folder for results that takes none, before the work; nothing is left of the trial.
+    """Refuse a folder for results that cannot be written, before the work; the trial leaves no file.
 
     Args:
-        folder: where to; where it is missing, that in which it would be made.
+        folder: where to; if it is missing, its nearest parent is tried.
 
     Raises:
         InputError: no file can be written there.
@@ -273,29 +273,29 @@ def require_writable(folder: Path) -> None:
 
     folder = Path(folder)
     try:
-        tempfile.TemporaryFile(dir=next(each for each in (folder, *folder.absolute().parents) if each.exists())).close()
+        tempfile.TemporaryFile(dir=next(path for path in (folder, *folder.absolute().parents) if path.exists())).close()
     except OSError as error:
         found, allowed = escaped(error.strerror or str(error)), "a folder that can be written"
-        remedy, place = "free it, or name another place where the command has --out", escaped(str(folder), 200)
-        raise refusal("write", file=place, found=found, allowed=allowed, remedy=remedy) from error
+        remedy, shown_path = "free it, or name another place where the command has --out", escaped(str(folder), 200)
+        raise refusal("write", file=shown_path, found=found, allowed=allowed, remedy=remedy) from error
 
 
 def output_place(folder: Path, *names: str) -> Path:
     """`folder / names`, a place for output that no link leads out of the folder.
 
     Raises:
-        InputError: a link inside the folder leads elsewhere: a stranger's folder chooses no place to write to.
+        InputError: a link inside the folder leads elsewhere: a stranger's folder must not choose where to write.
     """
-    place = Path(folder).joinpath(*names)
+    path = Path(folder).joinpath(*names)
     try:
-        inside = place.resolve().is_relative_to(Path(folder).resolve())
+        inside = path.resolve().is_relative_to(Path(folder).resolve())
     except (OSError, RuntimeError):
         inside = False
     if not inside:
-        shown_place, allowed = escaped(str(place), 200), "a folder inside the campaign"
+        shown_path, allowed = escaped(str(path), 200), "a folder inside the campaign"
         remedy = "remove the link, or name the place for results with --out where the command has it"
-        raise refusal("path", file=shown_place, found="a link that leaves it", allowed=allowed, remedy=remedy)
-    return place
+        raise refusal("path", file=shown_path, found="a link that leaves it", allowed=allowed, remedy=remedy)
+    return path
 
 
 def shipped_data() -> Path:
@@ -303,8 +303,8 @@ def shipped_data() -> Path:
 
     In a wheel it lies inside the package; in a checkout (also an editable install) beside it.
     """
-    inside = Path(str(resources.files("tvsbayes") / "data"))
-    return inside if inside.is_dir() else Path(str(resources.files("tvsbayes"))).resolve().parent / "data"
+    packaged = Path(str(resources.files("tvsbayes") / "data"))
+    return packaged if packaged.is_dir() else Path(str(resources.files("tvsbayes"))).resolve().parent / "data"
 
 
 def _array_of(content: bytes, name: str) -> np.ndarray:

@@ -22,7 +22,7 @@ from tvsbayes.files.disk import decode
 TOML_BYTES_MAX = 65_536
 JSON_BYTES_MAX = 4 * 1024 * 1024
 LINES_CHARS_MAX = 1024 * 1024
-"""As far as lines of keys are looked for: a stranger's file must not cost a refusal more than a second."""
+"""Characters that are searched for lines of keys: a refusal takes less than a second, whatever the file."""
 DOTTED_PARTS_MAX = 8
 NESTING_MAX = 16
 # Both patterns always match from an opening quote to its end or the end of the line (or file), never
@@ -33,10 +33,10 @@ _TOML_STRING_OR_COMMENT = re.compile(
     re.DOTALL,
 )
 _TOKEN = re.compile(rf"{_TOML_STRING_OR_COMMENT.pattern}|[\[\]{{}}=:,.\n]|[^\s\[\]{{}}=:,.\"'#]++", re.DOTALL)
-"""What keys are found by: strings and comments whole, marks, and words between them."""
+"""Tokens by which keys are located: whole strings and comments, marks, and words between them."""
 
 
-def _bad(file: str, code: str, found: str, allowed: str, remedy: str, line: int | None = None) -> InputError:
+def _refusal(file: str, code: str, found: str, allowed: str, remedy: str, line: int | None = None) -> InputError:
     return refusal(code, file=file, line=line, found=found, allowed=allowed, remedy=remedy)
 
 
@@ -47,55 +47,56 @@ def _check_nesting(bare: str, file: str) -> None:
         depth = depth + 1 if bracket.group() in "[{" else max(depth - 1, 0)
         if depth > NESTING_MAX:
             found, allowed = f"brackets nested more than {NESTING_MAX} deep", f"at most {NESTING_MAX} levels"
-            raise _bad(file, "nesting", found, allowed, "flatten the file", bare.count("\n", 0, bracket.start()) + 1)
+            line = bare.count("\n", 0, bracket.start()) + 1
+            raise _refusal(file, "nesting", found, allowed, "flatten the file", line)
 
 
 def _key_lines(text: str) -> dict[str, int]:
-    """The line of every key and table of a TOML or JSON text that parses, by its dotted path; of two the first.
+    """The first line of every key and table of a valid TOML or JSON text, by dotted path.
 
-    Paths leave out which entry of a list they lead through. Comments and what stands in values are no keys.
+    Paths have no indices of lists. Comments and the content of values are no keys.
     """
-    stated: dict[str, int] = {}
+    explicit: dict[str, int] = {}
     implied: dict[str, int] = {}
     in_value = text.lstrip().startswith("{")
-    # What stands open, and the path of what is in it; "" is the top of a TOML file, where a line ends a value.
-    opened: list[tuple[str, tuple[str, ...]]] = [("[" if in_value else "", ())]
-    parts: list[str] = []
-    begins, line = 1, 1
+    # Open brackets with the path of their content; "" is the top of a TOML file, where a line ends a value.
+    brackets: list[tuple[str, tuple[str, ...]]] = [("[" if in_value else "", ())]
+    key_parts: list[str] = []
+    key_line, line = 1, 1
 
-    def keep(base: tuple[str, ...]) -> tuple[str, ...]:
-        path = (*base, *parts)
+    def record_key(base: tuple[str, ...]) -> tuple[str, ...]:
+        path = (*base, *key_parts)
         for count in range(len(base) + 1, len(path)):
-            implied.setdefault(".".join(path[:count]), begins)
-        stated.setdefault(".".join(path), begins)
-        parts.clear()
+            implied.setdefault(".".join(path[:count]), key_line)
+        explicit.setdefault(".".join(path), key_line)
+        key_parts.clear()
         return path
 
     path: tuple[str, ...] = ()
     for match in _TOKEN.finditer(text, 0, LINES_CHARS_MAX):
         token = match.group()
-        kind, base = opened[-1]
+        kind, base = brackets[-1]
         if token == "\n" and not kind:
             in_value = False
         elif in_value and token in "{[":
-            opened.append((token, path))
+            brackets.append((token, path))
             in_value = token == "["
         elif token in "}]" and kind:
             if kind == "header":
-                opened[0] = "", keep(())
-            opened.pop()
+                brackets[0] = "", record_key(())
+            brackets.pop()
             in_value = True
         elif token == "," and kind:
             path, in_value = base, kind == "["
         elif token == "[" and not kind:
-            opened.append(("header", ()))
+            brackets.append(("header", ()))
         elif token in "=:" and not in_value:
-            path, in_value = keep(base), True
+            path, in_value = record_key(base), True
         elif not in_value and token[0] not in "#.\n[":
-            begins = begins if parts else line
-            parts.append(_unquoted(token))
+            key_line = key_line if key_parts else line
+            key_parts.append(_unquoted(token))
         line += token.count("\n")
-    return {**implied, **stated}
+    return {**implied, **explicit}
 
 
 def _unquoted(key: str) -> str:
@@ -120,18 +121,18 @@ class Keys:
         return key in self.values
 
     def refuse(self, key: str, code: str, allowed: str, remedy: str, found: str | None = None) -> InputError:
-        """The error of one key; `found` defaults to the value that stands there."""
+        """The error of one key; `found` defaults to its value."""
         if found is None:
             found = shown(self.values[key]) if key in self.values else "nothing"
         keys = (*self.path, key)
-        place = partial(refusal, file=self.file, line=self._line(keys), column=".".join(map(escaped, keys)))
-        return place(code, found=found, allowed=allowed, remedy=remedy)
+        line, column = self._line(keys), ".".join(map(escaped, keys))
+        return refusal(code, file=self.file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
 
     def _line(self, keys: tuple[str, ...]) -> int | None:
-        """The line of the innermost of `keys` that stands in the text."""
+        """The line of the innermost of `keys` that is in the text."""
         lines = _key_lines(self.text)
-        places = (".".join(keys[:count]) for count in range(len(keys), 0, -1))
-        return next((lines[place] for place in places if place in lines), None)
+        paths = (".".join(keys[:count]) for count in range(len(keys), 0, -1))
+        return next((lines[path] for path in paths if path in lines), None)
 
     def only(self, names: Iterable[str]) -> None:
         """Refuses keys outside `names`."""
@@ -205,8 +206,8 @@ class Keys:
         """The table under `key`; an absent one is empty."""
         value = self.values.get(key, {})
         if not isinstance(value, dict):
-            place = escaped(".".join((*self.path, key)))
-            raise self.refuse(key, "table", "a table", f"write it as [{place}] with keys below")
+            path = escaped(".".join((*self.path, key)))
+            raise self.refuse(key, "table", "a table", f"write it as [{path}] with keys below")
         return Keys(value, self.file, self.text, (*self.path, key))
 
     def quantity(self, key: str, low: float, high: float, u_max: float) -> tuple[float, float]:
@@ -221,37 +222,38 @@ class Keys:
 
 def parse_toml(data: bytes, file: str) -> Keys:
     """The top table of a TOML file; size, nesting and dotted keys are capped before parsing."""
-    bad = partial(_bad, file)
+    refuse = partial(_refusal, file)
     if len(data) > TOML_BYTES_MAX:
-        raise bad("size", f"{len(data)} bytes", f"at most {TOML_BYTES_MAX} bytes", "shorten it")
+        raise refuse("size", f"{len(data)} bytes", f"at most {TOML_BYTES_MAX} bytes", "shorten it")
     text = decode(data, file)
     bare = _TOML_STRING_OR_COMMENT.sub(lambda m: "Q" + "\n" * m.group().count("\n"), text)
     _check_nesting(bare, file)
     for number, line in enumerate(bare.split("\n"), start=1):
         if any(part.count(".") >= DOTTED_PARTS_MAX for part in re.split(r"[^\w.\- \t]", line)):
             found, allowed = f"a key of more than {DOTTED_PARTS_MAX} dotted parts", f"at most {DOTTED_PARTS_MAX}"
-            raise bad("nesting", found, allowed, "use the keys of the format only", number)
+            raise refuse("nesting", found, allowed, "use the keys of the format only", number)
     try:
         values = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        place = re.search(r"\(at line (\d+), column \d+\)", str(error))
-        at = int(place[1]) if place else None
-        if place and (twice := re.match(r"Cannot declare \((.*?),?\) twice", str(error))):
-            name = ".".join(re.findall(r"'([^']*)'", twice[1]))
+        position = re.search(r"\(at line (\d+), column \d+\)", str(error))
+        error_line = int(position[1]) if position else None
+        if position and (repeated := re.match(r"Cannot declare \((.*?),?\) twice", str(error))):
+            name = ".".join(re.findall(r"'([^']*)'", repeated[1]))
             first = _key_lines(text).get(name)
             found = f"the table [{escaped(name, 60)}] a second time" + (f", first in line {first}" if first else "")
             remedy = "put the entries below the first header, and remove the second"
-            raise bad("toml", found, "every table once", remedy, at) from error
+            raise refuse("toml", found, "every table once", remedy, error_line) from error
         remedy = "correct the syntax; text needs quotes, numbers a decimal point"
-        raise bad("toml", escaped(re.sub(r" \(at .*\)", "", str(error)), 120), "TOML 1.0", remedy, at) from error
+        found = escaped(re.sub(r" \(at .*\)", "", str(error)), 120)
+        raise refuse("toml", found, "TOML 1.0", remedy, error_line) from error
     return Keys(values, file, text)
 
 
 def parse_json(data: bytes, file: str) -> Keys:
     """The top object of a JSON file: capped, no duplicate keys, finite numbers only."""
-    bad = partial(_bad, file)
+    refuse = partial(_refusal, file)
     if len(data) > JSON_BYTES_MAX:
-        raise bad("size", f"{len(data)} bytes", f"at most {JSON_BYTES_MAX} bytes", "shorten it")
+        raise refuse("size", f"{len(data)} bytes", f"at most {JSON_BYTES_MAX} bytes", "shorten it")
     text = decode(data, file)
     _check_nesting(_JSON_STRING.sub(lambda m: '""' + "\n" * m.group().count("\n"), text), file)
 
@@ -261,12 +263,12 @@ def parse_json(data: bytes, file: str) -> Keys:
         value = float(literal)
         if not math.isfinite(value) or literal.lstrip("-").isdigit():
             line = text.count("\n", 0, text.find(literal)) + 1
-            raise bad("number", shown(literal), "finite numbers, integers of 18 digits", "correct it", line)
+            raise refuse("number", shown(literal), "finite numbers, integers of 18 digits", "correct it", line)
         return value
 
     def constant(literal: str) -> float:
         line = text.count("\n", 0, text.find(literal)) + 1
-        raise bad("number", shown(literal), "finite numbers", "give the value", line)
+        raise refuse("number", shown(literal), "finite numbers", "give the value", line)
 
     def unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
         values: dict[str, object] = {}
@@ -276,7 +278,7 @@ def parse_json(data: bytes, file: str) -> Keys:
                 continue
             literal = json.dumps(key, ensure_ascii=False)
             line = text.count("\n", 0, text.find(literal, text.find(literal) + 1)) + 1
-            raise bad("duplicate-key", f"{shown(key)} twice", "every key once", "remove one of them", line)
+            raise refuse("duplicate-key", f"{shown(key)} twice", "every key once", "remove one of them", line)
         return values
 
     try:
@@ -285,9 +287,9 @@ def parse_json(data: bytes, file: str) -> Keys:
         )
     except (ValueError, RecursionError) as error:
         found = escaped(getattr(error, "msg", str(error)), 120)
-        raise bad("json", found, "JSON", "correct the syntax", getattr(error, "lineno", None)) from error
+        raise refuse("json", found, "JSON", "correct the syntax", getattr(error, "lineno", None)) from error
     if not isinstance(values, dict):
-        raise bad("json", shown(values), "an object { ... } at the top", "write the keys of the format", 1)
+        raise refuse("json", shown(values), "an object { ... } at the top", "write the keys of the format", 1)
     return Keys(values, file, text)
 
 

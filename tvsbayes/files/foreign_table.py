@@ -1,7 +1,7 @@
 """Tables that other programs wrote, as text cells: CSV of any usual kind, lines of "name: value", sheets of XLSX files.
 
-Found out, and said in words: encoding, what stands between cells, decimal commas, lines above the names of columns.
-Numbers come out with decimal points; nothing else of a cell changes. Rows count from 1 as in the file; sizes are capped
+Detected and described: encoding, separator of cells, decimal commas, lines above the names of columns.
+Numbers get decimal points; nothing else of a cell changes. Rows count from 1 as in the file; sizes are capped
 before anything is unpacked.
 """
 
@@ -25,22 +25,22 @@ from tvsbayes.files.disk import read_bytes
 
 COLUMNS_MAX = 200
 UNPACKED_BYTES_MAX = 512 * 1024 * 1024
-"""Of all parts of an XLSX file together, as they state themselves."""
+"""Sum of the sizes that the parts of an XLSX file state."""
 CELL_CHARS_MAX = 1000
 CELLS_MAX = 10_000_000
 """Of a sheet, empty ones before the last of each row included."""
 SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
-"""In the order in which they are tried: a decimal comma must not pass for one between cells."""
+"""In the order in which they are tried: a decimal comma must not pass for a separator."""
 ROWS_TRIED = 50
 ABOVE_MAX = 50
 """Lines that may stand above the names of columns: serial number, date, operator."""
 PAIRED_SHARE = 0.6
-"""Of the lines, from which on a file of "name: value" is one; the others are what a program says at its start."""
+"""Share of "name: value" lines that makes a file of pairs; the others are messages at a program's start."""
 _WIDE = {
     SEPARATORS[","]: "decimal commas beside commas between cells? export with semicolons, or with decimal points",
     SEPARATORS[" "]: "dates or texts with spaces? export with semicolons or tabs between cells",
 }
-"""Why rows may have more cells than there are names, and what to do, by what stands between cells."""
+"""Why rows may have more cells than there are names, and what to do, by separator."""
 _MARKS = (
     (b"\xff\xfe\x00\x00", "utf-32", "UTF-32"),
     (b"\x00\x00\xfe\xff", "utf-32", "UTF-32"),
@@ -56,7 +56,7 @@ _PAIR = re.compile(
 )
 """One of "Step: 200, Angle: 12.5 deg"."""
 _CLOCK = re.compile(r"\[?(\d{1,2}):(\d{2}):(\d{2}(?:\.\d+)?)\]?\s*(?:->|>)?\s*")
-"""What a serial monitor puts before a line."""
+"""Time of day that a serial monitor puts before a line."""
 DAY_S = 86400.0
 _GROUPED_COMMA = re.compile(r"[+-]?[0-9]{1,3}(?:\.[0-9]{3})+,[0-9]+")
 
@@ -67,10 +67,10 @@ class ForeignTable:
 
     Attributes:
         file: its name, for messages.
-        kind: what was found out of it, in words.
-        lines: the row of the file in which each row stands.
-        columns: cells by the name of their column; "column 1" ... where no row holds names.
-        first_line: the row of the file in which the names stand, or where there are none the first row.
+        kind: what was detected, in words.
+        lines: row of the file of each row.
+        columns: cells by name of column; "column 1" ... where the file has no names.
+        first_line: row of the file with the names, or the first row where there are none.
     """
 
     file: str
@@ -112,31 +112,31 @@ def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
     """
     path = Path(path)
     data, file = read_bytes(path, CSV_BYTES_MAX), escaped(path.name)
-    bad = partial(refusal, file=file, allowed="a table as CSV (text) or XLSX")
+    refuse = partial(refusal, file=file, allowed="a table as CSV (text) or XLSX")
     if data.startswith(b"\xd0\xcf\x11\xe0"):
-        raise bad("kind", found="a workbook of an old Excel", remedy="save it as XLSX or CSV")
+        raise refuse("kind", found="a workbook of an old Excel", remedy="save it as XLSX or CSV")
     if data.startswith(b"PK\x03\x04"):
-        rows, words = _sheet_rows(data, file, sheet)
-        rows, above = _without_heading(rows)
-        words += above
+        rows, description = _sheet_rows(data, file, sheet)
+        rows, notes = _without_heading(rows)
+        description += notes
     elif sheet is not None:
-        raise bad("usage", found="text, which has no sheets", remedy="leave out --sheet")
+        raise refuse("usage", found="text, which has no sheets", remedy="leave out --sheet")
     else:
         text, encoding = text_of(data, file)
         if paired := _paired_rows(text):
             return _table(file, *paired)
-        rows, between = _csv_rows(text, file)
-        rows, above = _without_heading(rows)
-        _refuse_wide(rows, between, file)
-        words = [f"CSV with {between} between cells", encoding, *above]
+        rows, separator = _csv_rows(text, file)
+        rows, notes = _without_heading(rows)
+        _refuse_wide(rows, separator, file)
+        description = [f"CSV with {separator} between cells", encoding, *notes]
     rows = [(line, cells) for line, cells in rows if any(cells)]
     if not rows:
-        raise bad("empty", found="no cells", remedy="name the file, or with --sheet the sheet, that holds the table")
-    return _table(file, rows, words)
+        raise refuse("empty", found="no cells", remedy="name the file, or with --sheet the sheet, that holds the table")
+    return _table(file, rows, description)
 
 
 def table_of(file: str, kind: str, columns: Mapping[str, Sequence[object]], lines: Sequence[int]) -> ForeignTable:
-    """A table of values that a log of another kind gave, as `read_foreign` has them.
+    """A table of the values of another kind of log, as `read_foreign` makes it.
 
     Args:
         file: name of the log, for messages.
@@ -149,7 +149,7 @@ def table_of(file: str, kind: str, columns: Mapping[str, Sequence[object]], line
 
 
 def is_foreign(head: bytes) -> bool:
-    """Whether a file that begins so is a table of another kind than ours: a workbook, UTF-16, other separators."""
+    """Whether the first bytes are those of a foreign table: a workbook, UTF-16, other separators."""
     marks = (b"PK\x03\x04", *(mark for mark, codec, _ in _MARKS if codec != "utf-8-sig"))
     return head.startswith(marks) or re.search(rb"[;\t|]", head.partition(b"\n")[0]) is not None
 
@@ -165,7 +165,7 @@ def text_of(
     try:
         text = data.decode(codec)
     except UnicodeDecodeError:
-        # Every byte is a letter there: only names of columns can be wrong.
+        # Every byte is a letter in it: only names of columns can come out wrong.
         text, name = data.decode("cp1252", errors="replace"), "Windows-1252"
     if control := CONTROL.search(text):
         line = text.count("\n", 0, control.start()) + 1
@@ -176,17 +176,17 @@ def text_of(
 def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | None:
     """Rows of a file whose lines are "name: value" pairs, as a serial monitor shows them; None of any other file.
 
-    A row ends where a name comes again; a clock before the lines becomes seconds since the first of them.
+    A repeated name begins a new row; a clock before the lines becomes seconds since the first row.
     """
     names: dict[str, None] = {}
     rows: list[tuple[int, dict[str, str]]] = []
     lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1) if line.strip()]
-    paired, day_s, before_s = 0, 0.0, -1.0
+    paired, day_s, previous_s = 0, 0.0, -1.0
     for number, line in lines:
         clock = _CLOCK.match(line)
-        remainder = line[clock.end() if clock else 0 :]
-        pairs = list(_PAIR.finditer(remainder))
-        if not pairs or pairs[0].start() or "".join(match.group() for match in pairs) != remainder:
+        content = line[clock.end() if clock else 0 :]
+        pairs = list(_PAIR.finditer(content))
+        if not pairs or pairs[0].start() or "".join(match.group() for match in pairs) != content:
             continue
         paired += 1
         values = {
@@ -198,9 +198,9 @@ def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | N
         if not rows or rows[-1][1].keys() & values.keys():
             rows.append((number, {}))
             if clock:
-                at_s = int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]) + day_s
-                day_s, at_s = (day_s + DAY_S, at_s + DAY_S) if at_s < before_s else (day_s, at_s)
-                rows[-1][1]["time (s)"], before_s = f"{at_s:.6f}", at_s
+                time_s = int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]) + day_s
+                day_s, time_s = (day_s + DAY_S, time_s + DAY_S) if time_s < previous_s else (day_s, time_s)
+                rows[-1][1]["time (s)"], previous_s = f"{time_s:.6f}", time_s
         rows[-1][1].update(values)
     if len(names) < 2 or len(rows) < 2 or paired < PAIRED_SHARE * len(lines):
         return None
@@ -209,36 +209,36 @@ def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | N
         for _, cells in rows:
             cells["time (s)"] = f"{float(cells['time (s)']) - start_s:.6f}"
     columns = ["time (s)"] * timed + list(names)
-    words = ['lines of "name: value"']
-    if other := len(lines) - paired:
-        words.append(f"{other} other line{'s' * (other > 1)} left out")
+    description = ['lines of "name: value"']
+    if unpaired := len(lines) - paired:
+        description.append(f"{unpaired} other line{'s' * (unpaired > 1)} left out")
     body = [(line, [cells.get(name, "") for name in columns]) for line, cells in rows]
-    return [(rows[0][0], columns), *body], words
+    return [(rows[0][0], columns), *body], description
 
 
 def _without_heading(rows: list[tuple[int, list[str]]]) -> tuple[list[tuple[int, list[str]]], list[str]]:
-    """The rows from the names of the columns on, and the lines above them in words.
+    """The rows from the names of the columns on, and a note on the lines above them.
 
-    The names stand in the first row that is as wide as most rows or wider, and are no numbers: a last column of remarks
-    is empty in most rows.
+    The names are in the first row that is at least as wide as most rows, and are no numbers. It may be wider: a last
+    column of remarks is empty in most rows.
     """
 
     def width(cells: Sequence[str]) -> int:
         return max((k for k, cell in enumerate(cells, start=1) if cell), default=0)
 
     filled = [(width(cells), k) for k, (_, cells) in enumerate(rows) if any(cells)]
-    often = Counter(count for count, _ in filled).most_common(1)
-    if not often or often[0][0] < 2 or 2 * often[0][1] <= len(filled):
+    commonest = Counter(count for count, _ in filled).most_common(1)
+    if not commonest or commonest[0][0] < 2 or 2 * commonest[0][1] <= len(filled):
         return rows, []
-    cells_usual = often[0][0]
-    first = next(k for count, k in filled if count >= cells_usual)
-    above = [k for _, k in filled if k < first]
+    usual_width = commonest[0][0]
+    first = next(k for count, k in filled if count >= usual_width)
+    heading = [k for _, k in filled if k < first]
     names = [cell for cell in rows[first][1] if cell]
-    if not above or len(above) > ABOVE_MAX or any(map(_is_number, names)):
+    if not heading or len(heading) > ABOVE_MAX or any(map(_is_number, names)):
         return rows, []
-    text = " ".join(cell for cell in rows[above[0]][1] if cell)
-    several = f"{len(above)} lines" if len(above) > 1 else "a line"
-    return rows[first:], [f'{several} above the names left out ("{escaped(text, 40)}")']
+    text = " ".join(cell for cell in rows[heading[0]][1] if cell)
+    amount = f"{len(heading)} lines" if len(heading) > 1 else "a line"
+    return rows[first:], [f'{amount} above the names left out ("{escaped(text, 40)}")']
 
 
 def _is_number(cell: str) -> bool:
@@ -246,100 +246,101 @@ def _is_number(cell: str) -> bool:
 
 
 def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
-    """Rows with their lines, and what stands between their cells; lines that begin with # or % are remarks."""
+    """Rows with their lines, and the name of the separator; lines that begin with # or % are remarks."""
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
-    stated = next((line[4:5] for _, line in lines[:1] if line.lower().startswith("sep=")), None)
-    kept = [(n, line) for n, line in lines if line.strip() and not line.startswith(("#", "%"))][stated is not None :]
-    if len(kept) > CSV_ROWS_MAX + 1:
+    declared = next((line[4:5] for _, line in lines[:1] if line.lower().startswith("sep=")), None)
+    body = [(n, line) for n, line in lines if line.strip() and not line.startswith(("#", "%"))][declared is not None :]
+    if len(body) > CSV_ROWS_MAX + 1:
         allowed, remedy = f"at most {CSV_ROWS_MAX} rows", "split it"
-        raise refusal("size", file=file, found=f"{len(kept)} rows", allowed=allowed, remedy=remedy)
-    if stated == '"':
+        raise refusal("size", file=file, found=f"{len(body)} rows", allowed=allowed, remedy=remedy)
+    if declared == '"':
         found, allowed = 'the quote " between cells', ", ".join(SEPARATORS.values())
         raise refusal("csv", file=file, line=1, found=found, allowed=allowed, remedy="correct or remove the line sep=")
-    separator = stated or _separator([line for _, line in kept])
+    separator = declared or _separator([line for _, line in body])
     if separator == " ":
-        rows = [(number, line.split()) for number, line in kept]
+        rows = [(number, line.split()) for number, line in body]
     else:
-        reader = csv.reader((line for _, line in kept), delimiter=separator, skipinitialspace=True, strict=True)
+        reader = csv.reader((line for _, line in body), delimiter=separator, skipinitialspace=True, strict=True)
         rows = []
         try:
             for row in reader:
                 if reader.line_num > len(rows) + 1:
                     raise csv.Error("a line break inside a cell")
-                rows.append((kept[len(rows)][0], [cell.strip() for cell in row]))
+                rows.append((body[len(rows)][0], [cell.strip() for cell in row]))
         except csv.Error as error:
-            line, found, remedy = kept[len(rows)][0], escaped(str(error), 120), 'close every quote " in its own line'
+            line, found, remedy = body[len(rows)][0], escaped(str(error), 120), 'close every quote " in its own line'
             raise refusal(
                 "csv", file=file, line=line, found=found, allowed="one row per line", remedy=remedy
             ) from error
     return rows, SEPARATORS.get(separator, f"'{escaped(separator)}'")
 
 
-def _refuse_wide(rows: Sequence[tuple[int, list[str]]], between: str, file: str) -> None:
-    """Refuse rows with more cells than the first row has: every cell after a divided one stands under a wrong name.
+def _refuse_wide(rows: Sequence[tuple[int, list[str]]], separator: str, file: str) -> None:
+    """Refuse rows with more cells than the first row has: every cell after a divided one is under a wrong name.
 
     Raises:
         InputError: such a row; empty cells at its end do not count.
     """
     filled = [(line, cells) for line, cells in rows if any(cells)]
-    names = len(filled[0][1]) if filled else 0
+    width = len(filled[0][1]) if filled else 0
     for line, cells in filled:
         count = len(cells)
-        while count > names and not cells[count - 1]:
+        while count > width and not cells[count - 1]:
             count -= 1
-        if count <= names:
+        if count <= width:
             continue
-        found = f"{count} cells under the {names} {'name' if names == 1 else 'names'} of line {filled[0][0]}"
-        remedy = _WIDE.get(between, "a separator inside a cell? put such cells in quotes; or a name is missing")
-        remedy = "put # before lines that stand above the names of the columns" if names == 1 else remedy
+        found = f"{count} cells under the {width} {'name' if width == 1 else 'names'} of line {filled[0][0]}"
+        remedy = _WIDE.get(separator, "a separator inside a cell? put such cells in quotes; or a name is missing")
+        remedy = "put # before lines that stand above the names of the columns" if width == 1 else remedy
         allowed = "as many cells in a row as there are names"
         raise refusal("csv", file=file, line=line, found=found, allowed=allowed, remedy=remedy)
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """The first that divides nine of ten lines into equally many cells, two or more; at the file's end, else its begin.
+    """The first separator that gives nine of ten lines the same number of cells, two or more.
 
-    If none does, some row is damaged: then the first that divides most lines, that of the names too, and else commas.
+    The first lines are tried, then the last. If none fits, some row is damaged: then the first separator that divides
+    most lines and the names, else commas.
     """
-    for tried in (lines[:ROWS_TRIED], lines[-ROWS_TRIED:]):
-        counted = {s: [len(line.split(None if s == " " else s)) for line in tried] for s in SEPARATORS}
-        often = {s: max(Counter(of).items(), key=lambda item: item[1], default=(1, 0)) for s, of in counted.items()}
-        clear = (s for s, (cells, count) in often.items() if cells > 1 and count >= 0.9 * len(tried))
-        frequent = (s for s, (cells, count) in often.items() if 1 < cells == counted[s][0] and 2 * count > len(tried))
-        if separator := next(clear, None) or next(frequent, None):
+    for sample in (lines[:ROWS_TRIED], lines[-ROWS_TRIED:]):
+        widths = {s: [len(line.split(None if s == " " else s)) for line in sample] for s in SEPARATORS}
+        modes = {s: max(Counter(w).items(), key=lambda item: item[1], default=(1, 0)) for s, w in widths.items()}
+        regular = (s for s, (cells, count) in modes.items() if cells > 1 and count >= 0.9 * len(sample))
+        frequent = (s for s, (cells, count) in modes.items() if 1 < cells == widths[s][0] and 2 * count > len(sample))
+        if separator := next(regular, None) or next(frequent, None):
             return separator
     # A short table below a heading: names and rows alone are divided.
-    whole = {s: Counter(len(line.split(None if s == " " else s)) for line in lines) for s in SEPARATORS}
-    divided = {s: max(((n, c) for c, n in of.items() if c > 1), default=(0, 0)) for s, of in whole.items() if s != " "}
+    totals = {s: Counter(len(line.split(None if s == " " else s)) for line in lines) for s in SEPARATORS}
+    divided = {s: max(((n, c) for c, n in w.items() if c > 1), default=(0, 0)) for s, w in totals.items() if s != " "}
     return next((s for s, (count, _) in divided.items() if 2 * count > len(lines)), ",")
 
 
 def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[int, list[str]]], list[str]]:
     """Rows of one sheet of an XLSX file: values, not formulas."""
-    bad = partial(refusal, file=file)
+    refuse = partial(refusal, file=file)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             parts = archive.infolist()
     except zipfile.BadZipFile as error:
-        raise bad("kind", found="a damaged XLSX file", allowed="CSV or XLSX", remedy="save it again") from error
-    packed = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
-    if sum(part.file_size for part in parts) > UNPACKED_BYTES_MAX or any(p.compress_type not in packed for p in parts):
+        raise refuse("kind", found="a damaged XLSX file", allowed="CSV or XLSX", remedy="save it again") from error
+    known = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
+    if sum(part.file_size for part in parts) > UNPACKED_BYTES_MAX or any(p.compress_type not in known for p in parts):
         allowed = f"at most {UNPACKED_BYTES_MAX // 2**20} MiB when unpacked"
-        raise bad("size", found="more", allowed=allowed, remedy="save the one sheet that is needed")
+        raise refuse("size", found="more", allowed=allowed, remedy="save the one sheet that is needed")
     import openpyxl
 
     with warnings.catch_warnings():
-        # Of styles and validation rules that it does not know.
+        # Warnings of unknown styles and validation rules.
         warnings.simplefilter("ignore")
         try:
             book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
             # Charts have sheets of their own, without cells.
             names = [table.title for table in book.worksheets]
             if sheet is not None and sheet not in names:
-                listed_names = ", ".join(escaped(name) for name in names)
-                raise bad("sheet", found=f"no sheet {escaped(sheet)}", allowed=listed_names, remedy="name one of them")
+                listed = ", ".join(escaped(name) for name in names)
+                raise refuse("sheet", found=f"no sheet {escaped(sheet)}", allowed=listed, remedy="name one of them")
             for name in [sheet] if sheet is not None else names:
-                # What a sheet says of its size is believed otherwise, and rows are filled up to it.
+                # Else the size that a sheet states is believed, and rows are filled up to it.
                 book[name].reset_dimensions()
                 rows = _cells(book[name].iter_rows(values_only=True), file)
                 if any(any(cells) for _, cells in rows):
@@ -347,8 +348,9 @@ def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[i
         except InputError:
             raise
         except Exception as error:
-            # Whatever a damaged file makes the library raise.
-            raise bad("kind", found=escaped(str(error), 120), allowed="CSV or XLSX", remedy="save it as CSV") from error
+            # A damaged file can make the library raise anything.
+            found = escaped(str(error), 120)
+            raise refuse("kind", found=found, allowed="CSV or XLSX", remedy="save it as CSV") from error
     return rows, [f"XLSX, sheet {escaped(str(name))}"]
 
 
@@ -365,7 +367,7 @@ def _cells(rows: Iterable[tuple[object, ...]], file: str) -> list[tuple[int, lis
 
 
 class _Number(str):
-    """A cell that a workbook holds as a number: with a point, whatever texts beside it have."""
+    """A cell that a workbook holds as a number: it has a decimal point whatever the notation of texts."""
 
 
 def _cell(value: object) -> str:
@@ -382,37 +384,37 @@ def _cell(value: object) -> str:
     return str(value).strip()
 
 
-def _table(file: str, rows: Sequence[tuple[int, list[str]]], words: list[str]) -> ForeignTable:
+def _table(file: str, rows: Sequence[tuple[int, list[str]]], description: list[str]) -> ForeignTable:
     """Rows of equal length under their names, numbers with points."""
     width = max(len(cells) for _, cells in rows)
     if width > COLUMNS_MAX:
         allowed, remedy = f"at most {COLUMNS_MAX} columns", "save the table alone in a file"
         raise refusal("size", file=file, found=f"{width} columns", allowed=allowed, remedy=remedy)
     filled = [(line, cells + [""] * (width - len(cells))) for line, cells in rows]
-    named = not all(_is_number(cell) for cell in filled[0][1] if cell)
-    names = _unique(filled[0][1]) if named else [f"column {k}" for k in range(1, width + 1)]
-    body = filled[1:] if named else filled
-    if named and len(body) > 1 and _units_below(body[0][1], body[1][1]):
+    has_header = not all(_is_number(cell) for cell in filled[0][1] if cell)
+    names = _unique(filled[0][1]) if has_header else [f"column {k}" for k in range(1, width + 1)]
+    body = filled[1:] if has_header else filled
+    if has_header and len(body) > 1 and _units_below(body[0][1], body[1][1]):
         names = [name and f"{name} {unit}".strip() for name, unit in zip(names, body[0][1], strict=True)]
-        words, body = [*words, "units in the row below the names"], body[1:]
+        description, body = [*description, "units in the row below the names"], body[1:]
     cells = [cell for _, row in body for cell in row if not isinstance(cell, _Number)]
     commas = any(_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell) for cell in cells)
-    # "1.5" beside "1,5" is nobody's notation: such cells stay as they are and are refused where a number is needed.
+    # No notation has both "1.5" and "1,5": such cells stay as they are and are refused where a number is needed.
     mixed = commas and any("." in cell and NUMBER.fullmatch(cell) for cell in cells)
     if commas and not mixed:
-        words = [*words, "decimal commas"]
+        description = [*description, "decimal commas"]
     columns = {}
     for k, name in enumerate(names):
         if name is not None:
             body_cells = (row[k] if isinstance(row[k], _Number) else row[k][:CELL_CHARS_MAX] for _, row in body)
             columns[name] = tuple(str(cell) if mixed else _with_point(cell, commas) for cell in body_cells)
-    return ForeignTable(file, ", ".join(words), tuple(line for line, _ in body), columns, rows[0][0])
+    return ForeignTable(file, ", ".join(description), tuple(line for line, _ in body), columns, rows[0][0])
 
 
-def _units_below(cells: Sequence[str], after: Sequence[str]) -> bool:
-    """Whether a row stands between names and numbers: no number in it, most of the next row numbers."""
-    numbers = sum(map(_is_number, after))
-    return not any(map(_is_number, cells)) and any(cells) and numbers > 1 and 2 * numbers > len(after)
+def _units_below(cells: Sequence[str], next_cells: Sequence[str]) -> bool:
+    """Whether a row below the names holds units: no number in it, most of the next row numbers."""
+    numbers = sum(map(_is_number, next_cells))
+    return not any(map(_is_number, cells)) and any(cells) and numbers > 1 and 2 * numbers > len(next_cells)
 
 
 def _unique(names: Sequence[str]) -> list[str | None]:

@@ -1,7 +1,7 @@
 """PNG and JPEG: their size before anything is decoded, their pixels, and PNG written.
 
 Pictures are (height, width, 3), blue, green, red (OpenCV's order), uint8 or, from PNG of 16 bits, uint16 as the file
-has them; pixel coordinates those of the sensor. What a header announces is checked against a cap first: a small file
+has them; pixel coordinates those of the sensor. The size in a header is checked against a cap first: a small file
 can ask for gigabytes.
 """
 
@@ -23,9 +23,9 @@ IMAGE_PIXELS_MAX = 50_000_000
 """A PNG of 0.9 MB can ask for 30000 x 30000 pixels: 4 s and 1.8 GB in the decoder."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
-"""The last chunk with its checksum: decoders forgive its loss, a copy cut short has lost more."""
+"""The last chunk with its checksum: decoders accept its loss, but a copy cut short has lost more."""
 _PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 6: (8, 16)}
-"""Colour type of a PNG -> bit depths taken: grey, RGB, palette, RGBA (PNG specification 3, 11.2.1)."""
+"""Accepted bit depths by colour type of a PNG: grey, RGB, palette, RGBA (PNG specification 3, 11.2.1)."""
 _JPEG_MAGIC = b"\xff\xd8\xff"
 _JPEG_FRAMES = (0xC0, 0xC1, 0xC2)
 """Baseline, extended and progressive Huffman frames (ITU-T T.81, table B.1)."""
@@ -52,24 +52,24 @@ def image_size(data: bytes, file: str) -> tuple[int, int]:
         InputError: neither PNG nor JPEG, an unusual kind, or too many pixels.
     """
 
-    def bad(code: str, found: str, remedy: str) -> InputError:
+    def refuse(code: str, found: str, remedy: str) -> InputError:
         return refusal(code, file=file, found=found, allowed=IMAGES_ALLOWED, remedy=remedy)
 
     if data.startswith(PNG_SIGNATURE):
         if len(data) < 33 or data[8:16] != b"\x00\x00\x00\rIHDR":
-            raise bad("image", "a PNG without its header", "copy the file again")
+            raise refuse("image", "a PNG without its header", "copy the file again")
         if not data.endswith(_PNG_END):
-            raise bad("image", "a PNG cut short", "copy the file again")
+            raise refuse("image", "a PNG cut short", "copy the file again")
         width, height = int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
         if data[24] not in _PNG_DEPTHS.get(data[25], ()):
-            raise bad("image", f"{data[24]} bits, colour type {data[25]}", "save it with 8 bits per channel")
+            raise refuse("image", f"{data[24]} bits, colour type {data[25]}", "save it with 8 bits per channel")
     elif data.startswith(_JPEG_MAGIC):
-        width, height = _jpeg_size(data, bad)
+        width, height = _jpeg_size(data, refuse)
     else:
-        raise bad("image", f"a file that begins with {data[:8].hex(' ') or 'nothing'}", "save it as PNG")
+        raise refuse("image", f"a file that begins with {data[:8].hex(' ') or 'nothing'}", "save it as PNG")
     pixels_max = IMAGE_PIXELS_MAX // (2 if is_deep(data) else 1)
     if not 0 < width * height <= pixels_max:
-        raise bad("image-size", f"{width} x {height} pixels", "crop or scale it")
+        raise refuse("image-size", f"{width} x {height} pixels", "crop or scale it")
     return width, height
 
 
@@ -78,12 +78,12 @@ def is_deep(data: bytes) -> bool:
     return data.startswith(PNG_SIGNATURE) and data[24] == _PNG_DEEP
 
 
-def _jpeg_size(data: bytes, bad: Callable[[str, str, str], InputError]) -> tuple[int, int]:
+def _jpeg_size(data: bytes, refuse: Callable[[str, str, str], InputError]) -> tuple[int, int]:
     """Size in the first frame header of a JPEG."""
     position = 2
     while position + 9 <= len(data):
         if data[position] != 0xFF:
-            raise bad("image", "a JPEG with bytes between its segments", "copy the file again")
+            raise refuse("image", "a JPEG with bytes between its segments", "copy the file again")
         marker = data[position + 1]
         if marker == 0xFF:
             position += 1
@@ -91,19 +91,19 @@ def _jpeg_size(data: bytes, bad: Callable[[str, str, str], InputError]) -> tuple
             position += 2
         elif marker in _JPEG_FRAMES:
             if data[position + 4] != 8:
-                raise bad("image", f"{data[position + 4]} bits", "save it with 8 bits per channel")
+                raise refuse("image", f"{data[position + 4]} bits", "save it with 8 bits per channel")
             return int.from_bytes(data[position + 7 : position + 9]), int.from_bytes(data[position + 5 : position + 7])
         elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            raise bad("image", f"JPEG of kind SOF{marker - 0xC0}", "save it as PNG")
+            raise refuse("image", f"JPEG of kind SOF{marker - 0xC0}", "save it as PNG")
         else:
             position += 2 + int.from_bytes(data[position + 2 : position + 4])
-    raise bad("image", "a JPEG without a frame", "copy the file again")
+    raise refuse("image", "a JPEG without a frame", "copy the file again")
 
 
 def decode_image(data: bytes, file: str) -> np.ndarray:
     """The picture in `data` as (height, width, 3) uint8 or uint16, channels blue, green, red (OpenCV's order).
 
-    The orientation tag of a JPEG is left out of account: pixel coordinates are those of the sensor.
+    The orientation tag of a JPEG is ignored: pixel coordinates are those of the sensor.
 
     Raises:
         InputError: what `image_size` refuses, and data that the decoder cannot read.
@@ -142,14 +142,14 @@ def png_bytes(image: np.ndarray) -> bytes:
 
     if image.dtype not in (np.uint8, np.uint16):
         raise TypeError(f"pixels must be uint8 or uint16, not {image.dtype}")
-    done, data = cv2.imencode(".png", image)
-    if not done:
+    encoded, data = cv2.imencode(".png", image)
+    if not encoded:
         raise ValueError(f"no PNG of shape {image.shape}")
     return data.tobytes()
 
 
 def white_level(largest: int) -> int:
-    """The largest value that a converter of usual bits has, which gave `largest`: 4095 for 3000."""
+    """Full scale of the smallest usual converter that can give `largest`: 4095 for 3000."""
     return next((2**bits - 1 for bits in WHITE_BITS if largest < 2**bits), 2 ** WHITE_BITS[-1] - 1)
 
 
@@ -158,7 +158,7 @@ def in_grey_levels(image: np.ndarray, white: int | None = None) -> np.ndarray:
 
     Args:
         image: uint8 or uint16 of any shape.
-        white: the largest value that the camera gives; default by the picture itself.
+        white: the largest value that the camera gives; by default that of the picture.
     """
     import numpy as np
 
@@ -168,7 +168,7 @@ def in_grey_levels(image: np.ndarray, white: int | None = None) -> np.ndarray:
 
 
 def small_picture(image: np.ndarray, centre_px: tuple[float, float] | None = None, width_px: int = WHOLE_PX) -> bytes:
-    """A picture for a page: all of it, at most so wide, or a window around a centre; JPEG.
+    """JPEG of a picture for a page: all of it, at most `width_px` wide, or a window around a centre.
 
     The window has `WINDOW_PX` pixels a side, the pixel of the centre at WINDOW_PX / 2; black beyond the picture.
 
@@ -186,11 +186,11 @@ def small_picture(image: np.ndarray, centre_px: tuple[float, float] | None = Non
     image = np.clip(in_grey_levels(image), 0, 255).astype(np.uint8)
     height, width = image.shape[:2]
     if centre_px is not None:
-        half = WINDOW_PX // 2
+        half_px = WINDOW_PX // 2
         u, v = (round(value) for value in centre_px)
         if not (0 <= u < width and 0 <= v < height):
             raise ValueError(f"no pixel {u}, {v} in a picture of {width} x {height}")
-        padded = np.pad(image, ((half, half), (half, half), (0, 0)))
+        padded = np.pad(image, ((half_px, half_px), (half_px, half_px), (0, 0)))
         image = padded[v : v + WINDOW_PX, u : u + WINDOW_PX]
     elif width > width_px:
         image = cv2.resize(image, (width_px, max(1, round(height * width_px / width))), interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""A folder that nobody but its user can have written, and sealed files in it: what a program may run again.
+"""A folder that only its user can have written, with sealed files that a program may run again.
 
 A file begins with a magic and the SHA-256 of what follows. It is read only where file and folder belong to the user
 who runs this and neither may be written by anybody else (POSIX; Windows keeps a user's folders apart by itself). A
@@ -27,9 +27,9 @@ class OwnFolder:
     """A folder of sealed files.
 
     Attributes:
-        path: where it lies; `make` creates it.
+        path: of the folder; `make` creates it.
         file_bytes_max: a larger file is not read.
-        bytes_max: of all files together, those used longest ago are removed by `write`.
+        bytes_max: of all files together; `write` removes those used longest ago.
     """
 
     path: Path
@@ -37,7 +37,7 @@ class OwnFolder:
     bytes_max: int = 128 * 2**20
 
     def fault(self) -> str:
-        """Why the folder is not to be trusted, in words; "" where it may be."""
+        """Why the folder cannot be trusted, in words; "" where it can."""
         try:
             status = os.lstat(self.path)
         except FileNotFoundError:
@@ -60,7 +60,7 @@ class OwnFolder:
         return self.fault()
 
     def read(self, name: str) -> bytes | None:
-        """The content of a sealed file, None where it is missing, damaged, too large or may be of another's making."""
+        """The content of a sealed file, None where it is missing, damaged, too large or perhaps written by another."""
         if self.fault():
             return None
         try:
@@ -76,11 +76,11 @@ class OwnFolder:
         except OSError:
             return None
         seal, content = data[: len(MAGIC) + 32], data[len(MAGIC) + 32 :]
-        whole = len(data) <= self.file_bytes_max and seal == MAGIC + hashlib.sha256(content).digest()
-        return content if whole else None
+        intact = len(data) <= self.file_bytes_max and seal == MAGIC + hashlib.sha256(content).digest()
+        return content if intact else None
 
     def write(self, name: str, content: bytes) -> bool:
-        """Seal a content under a name, whole or not at all; whether it was kept."""
+        """Seal a content under a name, whole or not at all; True where it was written."""
         data = MAGIC + hashlib.sha256(content).digest() + content
         if self.make() or len(data) > self.file_bytes_max:
             return False
@@ -106,5 +106,5 @@ class OwnFolder:
                 path.unlink(missing_ok=True)
                 total -= status.st_size
         except OSError:
-            # Another process may be at the same work.
+            # Another process may be removing the same files.
             return
