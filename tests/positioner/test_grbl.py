@@ -80,7 +80,7 @@ def test_light_behind_a_motion_is_cut_as_it_is_told():
     board = GrblBoard()
     positioner = connected(board)
     positioner.home()
-    told = positioner._asked
+    told = positioner._status_report
 
     def lit():
         status = told()
@@ -88,7 +88,7 @@ def test_light_behind_a_motion_is_cut_as_it_is_told():
         board.out.clear()
         return status
 
-    positioner._asked = lit
+    positioner._status_report = lit
     with pytest.raises(DeviceFault, match="after a motion"):
         positioner.move_to(100, 20)
     board.advance()

@@ -1,10 +1,10 @@
 """Host side of the positioner: one request at a time, safe repeats, resynchronisation, replugging.
 
-What a caller may rely on: `move_to` and `home` return only after the device said, in a frame with a good CRC, that
-this very motion reached its target, at the counters asked for, in the same life of the device (boot id). Everything
-else ends in a `DeviceFault` within a bounded time. After a time-out the same line is sent again; that is safe,
-because the device executes a sequence number once. A device that was reset has lost its counters: that is a
-`PositionLost`, never a silent continuation.
+`move_to` and `home` return only after the device has reported, in a frame with a good CRC, that this very motion
+reached its target, at the counters ordered, without a reset in between (same boot id). Everything else ends in a
+`DeviceFault` within a bounded time. After a time-out the same line is sent again; that is safe, because the device
+executes a sequence number once. A device that was reset has lost its counters: that is a `PositionLost`, never a
+silent continuation.
 
 Counters are absolute motor steps (pan, tilt); seconds where a name says `_s`. Time comes from a `Clock`, bytes from
 a `Link`: tests drive both without hardware and without waiting.
@@ -36,11 +36,11 @@ from tvsbayes.positioner.silence import HEARD_BYTES_MAX, explained
 ATTEMPTS = 6
 """How often a request is sent before the device counts as dead."""
 CLOSING_ATTEMPTS = 3
-"""The same when the line is given back anyway."""
+"""The same while closing."""
 REPLY_S = 0.5
 """Silence after which a request is sent again. A clean round trip takes about 1 ms on USB, 0.2 s at 9600 baud."""
 NAK_S = 0.05
-"""Silence after a negative acknowledgement that is enough."""
+"""The same after a negative acknowledgement."""
 REPLY_MAX_S = 3.0
 """Longest wait for one answer while bytes keep arriving: a slow line, or noise."""
 DRAIN_S, DRAIN_MAX_S = 0.05, 1.0
@@ -72,7 +72,7 @@ class SerialPositioner:
 
     Args:
         open_link: opens the line, also after an unplugging; raises OSError while there is none.
-        settings: device settings by protocol name (`protocol.SETTINGS`) to set and read back.
+        settings: device settings by protocol name (`protocol.SETTINGS`), set and read back.
         clock: where time comes from.
 
     Raises:
@@ -90,15 +90,15 @@ class SerialPositioner:
         self._link: Link | None = None
         self._buffer, self._dropping = bytearray(), False
         self._sequence, self._boot = 0, -1
-        self._homed_here, self._compares, self._lit = False, False, False
+        self._homed_here, self._device_homed, self._lit = False, False, False
         self.repeats = 0
         """Requests sent again so far: the quality of the line."""
-        self._heard = bytearray()
+        self._received = bytearray()
         self._link = opened(open_link)
         try:
             self._drain()
             identity = self._identify()
-            self._boot, self._compares = identity.state.boot, identity.state.status == "idle"
+            self._boot, self._device_homed = identity.state.boot, identity.state.status == "idle"
             self.identity = dict(identity.extra)
             for key, value in self._settings.items():
                 self._set(key, value)
@@ -109,11 +109,11 @@ class SerialPositioner:
 
     def home(self) -> HomeReport:
         """See `Positioner.home`."""
-        known, compared = self._homed_here, self._compares
+        known, compared = self._homed_here, self._device_homed
         # A homing that is broken off leaves no counters to compare with.
-        self._homed_here = self._compares = False
-        state = self._wait(self._command("HOME"), HOME_S)
-        self._homed_here = self._compares = True
+        self._homed_here = self._device_homed = False
+        state = self._wait_for_motion(self._command("HOME"), HOME_S)
+        self._homed_here = self._device_homed = True
         if state.laser_on:
             raise fault("laser", "the laser is on after homing", "cut the laser's supply and check the firmware")
         self._lit = False
@@ -128,16 +128,17 @@ class SerialPositioner:
         """
         if self._lit:
             self.laser(False)
-        wanted = (int(pan_steps), int(tilt_steps))
-        reply = self._command("MA", *wanted)
-        before = reply.state
-        distance = max(abs(wanted[0] - before.pan_steps), abs(wanted[1] - before.tilt_steps))
+        target = (int(pan_steps), int(tilt_steps))
+        reply = self._command("MA", *target)
+        start = reply.state
+        distance_steps = max(abs(target[0] - start.pan_steps), abs(target[1] - start.tilt_steps))
         # Twice the whole way at the speed before any ramp, and two full ramps; 5 s for the line.
-        top, ramp = self._limits["vmax"], self._limits["amax"]
-        state = self._wait(reply, 5.0 + 2.0 * (distance / min(top, START_SPEED) + 2.0 * top / ramp))
+        speed, acceleration = self._limits["vmax"], self._limits["amax"]
+        timeout_s = 5.0 + 2.0 * (distance_steps / min(speed, START_SPEED) + 2.0 * speed / acceleration)
+        state = self._wait_for_motion(reply, timeout_s)
         reached = (state.pan_steps, state.tilt_steps)
-        if reached != wanted or (state.pan_target_steps, state.tilt_target_steps) != wanted:
-            found = f"the device says done at {reached}, ordered was {wanted}"
+        if reached != target or (state.pan_target_steps, state.tilt_target_steps) != target:
+            found = f"the device says done at {reached}, ordered was {target}"
             raise fault("position", found, "home again; if it happens twice, flash the firmware anew")
         return state
 
@@ -170,11 +171,11 @@ class SerialPositioner:
             if self._boot >= 0:
                 self._switch_off()
             else:
-                # Anyone who is there and understands it: a run before this one may have left the light on.
+                # Not identified yet, but an earlier run may have left its laser on.
                 self._link.write(b"\n" + request(0, "L", 0))
                 self._link.read(NAK_S)
         except (DeviceFault, OSError):
-            # The device's own watchdog switches the laser off when it no longer hears from us.
+            # The device's watchdog switches the laser off when requests stop.
             pass
         finally:
             self._link.close()
@@ -182,19 +183,19 @@ class SerialPositioner:
 
     def _switch_off(self) -> None:
         """Laser off and motors at rest, with few attempts."""
-        few = partial(self._exchange, attempts=CLOSING_ATTEMPTS, reconnect=False)
-        # Without a number: another program may have counted on, and whatever it does, our laser goes off.
-        if few("L", 0, sequence=0).state.status == "moving":
-            # Interrupted in a motion: a blocked axis must not be driven on when nobody watches it any more. Numbered,
-            # so that the motion of another program goes on.
-            few("STOP")
+        exchange = partial(self._exchange, attempts=CLOSING_ATTEMPTS, reconnect=False)
+        # Unnumbered: it is accepted even if another program has used later numbers.
+        if exchange("L", 0, sequence=0).state.status == "moving":
+            # Interrupted in a motion: a blocked axis must not be driven on unattended. Numbered, so that the motion of
+            # another program goes on.
+            exchange("STOP")
 
     def _drain(self) -> None:
-        """Throw away what an earlier conversation left on the line."""
+        """Discard bytes that an earlier program left on the line."""
         deadline = self._clock.monotonic() + DRAIN_MAX_S
         try:
             while self._link is not None and (data := self._link.read(DRAIN_S)) and self._clock.monotonic() < deadline:
-                self._hear(data)
+                self._keep_received(data)
         except OSError:
             # The first request meets the same error and reconnects.
             pass
@@ -213,23 +214,23 @@ class SerialPositioner:
         return int(text)
 
     def _identify(self) -> Reply:
-        """The device's identity; its last sequence is where ours goes on."""
+        """The device's identity; numbers continue from its last sequence."""
         reply = self._exchange("ID", sequence=0)
         version, firmware = reply.extra.get("proto"), escaped(reply.extra.get("fw", "unknown"))
         if version != str(VERSION):
             found = f"firmware {firmware} speaks protocol {escaped(str(version))}, this program speaks {VERSION}"
             remedy = "flash the firmware shipped with tvsbayes: see README.md in its positioner/firmware folder"
             raise fault("firmware", found, remedy)
-        last = unsigned(reply.extra.get("q", ""))
-        if last is None:
+        last_sequence = unsigned(reply.extra.get("q", ""))
+        if last_sequence is None:
             raise fault("firmware", f"firmware {firmware} names no last sequence", "flash the shipped firmware")
-        self._sequence = max(self._sequence, last)
+        self._sequence = max(self._sequence, last_sequence)
         if self._sequence == SEQUENCE_MAX:
-            raise _used_up(self._sequence)
+            raise _sequence_exhausted(self._sequence)
         return reply
 
     def _command(self, *words: object) -> Reply:
-        """A request that a healthy, homed device does not refuse."""
+        """A request whose refusal is a fault."""
         reply = self._exchange(*words)
         self._check(reply.state)
         if reply.error is not None:
@@ -239,20 +240,20 @@ class SerialPositioner:
 
     def _check(self, state: DeviceState) -> None:
         if state.boot != self._boot:
-            self._homed_here = self._compares = False
+            self._homed_here = self._device_homed = False
             raise PositionLost(
                 "reset",
                 "positioner: the device was reset, its counters are lost",
                 remedy="check its supply and cable, then go on with --resume: it homes again",
             )
         if state.status == "alarm":
-            self._homed_here = self._compares = False
+            self._homed_here = self._device_homed = False
             remedy = _ALARMS.get(state.last_error, "home again")
             raise fault(f"alarm-{state.last_error}", f"the device is in alarm: {state.last_error}", remedy)
 
-    def _wait(self, reply: Reply, longest_s: float) -> DeviceState:
-        """Until the motion that `reply` accepted is done."""
-        deadline = self._clock.monotonic() + longest_s
+    def _wait_for_motion(self, reply: Reply, timeout_s: float) -> DeviceState:
+        """The state once the motion that `reply` accepted is done."""
+        deadline = self._clock.monotonic() + timeout_s
         state = reply.state
         while not (state.status == "idle" and state.done_sequence == reply.sequence):
             if state.status != "moving":
@@ -265,7 +266,7 @@ class SerialPositioner:
                     raise fault("stopped", found, "home again")
             if self._clock.monotonic() > deadline:
                 self._exchange("STOP")
-                found = f"the motion is not done after {longest_s:.0f} s"
+                found = f"the motion is not done after {timeout_s:.0f} s"
                 raise fault("stall", found, "look for a blocked axis or a missing home switch; then home again")
             self._clock.sleep(POLL_S)
             state = self._command("?").state
@@ -277,7 +278,7 @@ class SerialPositioner:
         """One request and its answer, repeated while it is unanswered and reconnected when the line is gone."""
         if sequence is None:
             if self._sequence == SEQUENCE_MAX:
-                raise _used_up(self._sequence)
+                raise _sequence_exhausted(self._sequence)
             self._sequence += 1
             sequence = self._sequence
         line = request(sequence, *map(str, words))
@@ -287,25 +288,25 @@ class SerialPositioner:
                     raise OSError("the line is closed")
                 if attempt:
                     self.repeats += 1
-                    # Ends whatever half line the device holds.
+                    # Ends a partial line in the device's buffer.
                     self._link.write(b"\n")
                 self._link.write(line)
-                reply = self._await(sequence)
+                reply = self._wait_for_reply(sequence)
             except OSError as error:
                 if not reconnect:
                     raise
                 self._reconnect(error)
                 continue
             if reply is not None:
-                self._heard.clear()
+                self._received.clear()
                 return reply
-        heard = explained(bytes(self._heard))
-        found = f"no answer to {' '.join(map(str, words))} after {attempts} attempts: {heard.found}"
-        # What was ours a moment ago has no other speed and no other firmware now.
-        ours = "check cable and supply; unplug it and plug it in again, then go on with --resume"
-        raise fault("no-answer", found, ours if self._boot >= 0 else heard.remedy)
+        report = explained(bytes(self._received))
+        found = f"no answer to {' '.join(map(str, words))} after {attempts} attempts: {report.found}"
+        # A device that has answered before has the right speed and firmware.
+        remedy = "check cable and supply; unplug it and plug it in again, then go on with --resume"
+        raise fault("no-answer", found, remedy if self._boot >= 0 else report.remedy)
 
-    def _await(self, sequence: int) -> Reply | None:
+    def _wait_for_reply(self, sequence: int) -> Reply | None:
         """The answer to `sequence`; None for silence, at once after a negative acknowledgement."""
         start = self._clock.monotonic()
         deadline = start + REPLY_S
@@ -328,14 +329,14 @@ class SerialPositioner:
             if data:
                 deadline = min(self._clock.monotonic() + REPLY_S, start + REPLY_MAX_S)
                 self._buffer += data
-                self._hear(data)
+                self._keep_received(data)
 
-    def _hear(self, data: bytes) -> None:
-        """Keep the beginning of what arrives before an answer: it tells why there is none."""
-        self._heard += data[: max(HEARD_BYTES_MAX - len(self._heard), 0)]
+    def _keep_received(self, data: bytes) -> None:
+        """Keep the first bytes received before an answer: they show why there is none."""
+        self._received += data[: max(HEARD_BYTES_MAX - len(self._received), 0)]
 
     def _next_line(self) -> bytes | None:
-        """A complete line from the buffer; one that is too long to be an answer is thrown away."""
+        """A complete line from the buffer; one that is too long for an answer is dropped."""
         while (end := self._buffer.find(b"\n")) >= 0:
             line = bytes(self._buffer[:end])
             del self._buffer[: end + 1]
@@ -348,7 +349,7 @@ class SerialPositioner:
         return None
 
     def _reconnect(self, cause: OSError) -> None:
-        """Wait for the device to come back, and make sure that it is the same one in the same life."""
+        """Wait for the device to come back, and check that it is the same one and was not reset."""
         if self._link is not None:
             self._link.close()
             self._link = None
@@ -365,19 +366,19 @@ class SerialPositioner:
         self._dropping = False
         if self._boot < 0:
             return
-        before = self._sequence
+        sequence = self._sequence
         try:
             self._link.write(b"\n")
             self._link.write(request(0, "ID"))
-            reply = self._await(0)
+            reply = self._wait_for_reply(0)
         except OSError:
-            # Gone again: the next attempt of the caller comes back here.
+            # Unplugged again: the caller's next attempt reconnects.
             return
         if reply is None:
             return
         self._check(reply.state)
-        last = reply.extra.get("q", "")
-        if not (last.isdigit() and last.isascii() and int(last) <= before):
+        last_sequence = reply.extra.get("q", "")
+        if not (last_sequence.isdigit() and last_sequence.isascii() and int(last_sequence) <= sequence):
             raise PositionLost(
                 "foreign",
                 "positioner: another program has driven the device meanwhile",
@@ -385,6 +386,6 @@ class SerialPositioner:
             )
 
 
-def _used_up(sequence: int) -> DeviceFault:
+def _sequence_exhausted(sequence: int) -> DeviceFault:
     found = f"the device has used up its sequence numbers (the last one was {sequence})"
     return fault("sequence", found, "unplug it and plug it in again: they begin anew with a reset; then home")

@@ -1,9 +1,9 @@
 """The shipped firmware on an emulated processor: QEMU's Cortex-M7 board with motors and switches behind its pins.
 
 The unchanged sketch is cross-compiled with `firmware/emulated` and run; the host reaches it through a serial port like
-any other. Guest time follows this computer's clock and falls behind where the computer is busy, never ahead. A hand at
-the bench breaks wires and holds motors, as `firmware/emulated/board.cpp` lists; the laser pin is read from outside the
-processor, so that it tells also of one that crashed.
+any other. Guest time follows this computer's clock; it may fall behind, never run ahead. Orders of a "hand at the
+bench" break wires and hold motors, as `firmware/emulated/board.cpp` lists. The laser pin is read from outside the
+processor, so that its level is known after a crash too.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _MOTORS = {"+": (0, 1), "-": (0, -1), "^": (1, 1), "v": (1, -1)}
 
 
 def missing_tools() -> list[str]:
-    """Programs that the emulation needs and this computer has not."""
+    """Programs that the emulation needs and this computer lacks."""
     return [name for name in (COMPILER, EMULATOR) if shutil.which(name) is None]
 
 
@@ -128,7 +128,7 @@ class EmulatedBoard:
         os.write(self._files[1], text.encode("ascii") + b"\n")
 
     def drain(self) -> None:
-        """Tells the listeners what has happened since: all of it that the host has had an answer to, and maybe more."""
+        """Reports to the listeners what happened since the last call, at least all before the host's last answer."""
         while True:
             try:
                 data = os.read(self._files[0], 65_536)
@@ -150,19 +150,19 @@ class EmulatedBoard:
 
     def laser_pin(self) -> bool:
         """The level of the laser pin now, read from outside the processor."""
-        answer = self._ask("human-monitor-command", **{"command-line": _LASER_PIN})
-        return bool(int(str(answer).split()[-1], 16) & 1)
+        reply = self._ask("human-monitor-command", **{"command-line": _LASER_PIN})
+        return bool(int(str(reply).split()[-1], 16) & 1)
 
     def _start(self, folder: Path) -> None:
         program, hand, monitor = folder / "sketch.elf", folder / "hand", folder / "monitor"
-        built = build_sketch(program)
-        if built.returncode:
+        compilation = build_sketch(program)
+        if compilation.returncode:
             remedy = f"install {PACKAGES} anew, or rehearse with --simulate alone"
-            raise InputError("emulator", f"the firmware does not compile: {built.stderr[-300:]}", remedy=remedy)
-        for end in (".in", ".out"):
-            os.mkfifo(f"{hand}{end}")
+            raise InputError("emulator", f"the firmware does not compile: {compilation.stderr[-300:]}", remedy=remedy)
+        for suffix in (".in", ".out"):
+            os.mkfifo(f"{hand}{suffix}")
         # 256 ns an instruction: a few percent of a core, so that a busy computer is fast enough.
-        # A pipe holds what nobody has read yet without holding up the board; a socket would, byte by byte.
+        # A pipe buffers unread bytes without delaying the board; a socket delays it at every byte.
         self._process = subprocess.Popen(
             [
                 *(*BOARD, "-kernel", str(program), "-icount", "shift=8,align=on"),
@@ -177,32 +177,32 @@ class EmulatedBoard:
         self._monitor = self._connect(monitor)
         self._monitor.readline()
         self._ask("qmp_capabilities")
-        lines = {line["label"]: line["filename"] for line in self._ask("query-chardev")}
-        self.port = str(lines["host"]).removeprefix("pty:")
+        chardevs = {line["label"]: line["filename"] for line in self._ask("query-chardev")}
+        self.port = str(chardevs["host"]).removeprefix("pty:")
         self._files = [os.open(f"{hand}.out", os.O_RDONLY | os.O_NONBLOCK), os.open(f"{hand}.in", os.O_WRONLY)]
 
     def _connect(self, monitor: Path) -> Any:
         deadline = time.monotonic() + STARTED_S
         while True:
-            link = socket.socket(socket.AF_UNIX)
+            connection = socket.socket(socket.AF_UNIX)
             try:
-                link.connect(str(monitor))
-                with link:
-                    return link.makefile("rwb", buffering=0)
+                connection.connect(str(monitor))
+                with connection:
+                    return connection.makefile("rwb", buffering=0)
             except OSError as error:
-                link.close()
-                ended = self._process is None or self._process.poll() is not None
-                if ended or time.monotonic() > deadline:
+                connection.close()
+                exited = self._process is None or self._process.poll() is not None
+                if exited or time.monotonic() > deadline:
                     remedy = f"try `{EMULATOR} -M help`; QEMU 7 or later has the board mps2-an500"
                     raise InputError("emulator", f"{EMULATOR} does not start: {error}", remedy=remedy) from error
             time.sleep(0.02)
 
     def _ask(self, command: str, **arguments: str) -> Any:
-        """An order to the emulator itself, and its answer; events in between are of no interest."""
+        """An order to the emulator itself, and its answer; events in between are ignored."""
         self._monitor.write(json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n")
         while True:
-            answer = json.loads(self._monitor.readline() or '{"error": "ended"}')
-            if "error" in answer:
-                raise DeviceFault("emulator", f"emulated board: {answer['error']}", remedy="begin the rehearsal anew")
-            if "return" in answer:
-                return answer["return"]
+            reply = json.loads(self._monitor.readline() or '{"error": "ended"}')
+            if "error" in reply:
+                raise DeviceFault("emulator", f"emulated board: {reply['error']}", remedy="begin the rehearsal anew")
+            if "return" in reply:
+                return reply["return"]

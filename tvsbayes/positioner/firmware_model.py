@@ -38,7 +38,7 @@ HOME_CLEAR_STEPS = 20
 HOME_TRAVEL_MAX_STEPS = 20_000
 """The most that one axis may travel while homing."""
 HOME_OPEN_MAX_STEPS = 200
-"""The most of it with a limit switch open from the start: back from behind a switch, not into the stop."""
+"""The most of it with a limit switch open from the start: enough to leave the switch, not to hit the stop."""
 HOME_READS, HOME_READ_US = 4, 500
 """Readings of a home switch after the first that must agree with it, and the time between them: spikes are no zeros."""
 LIMIT_OPEN_US = 5_000
@@ -133,7 +133,7 @@ class DeviceModel:
         self.loop(now_us)
 
     def next_us(self) -> int:
-        """When `loop` has something to do again, should nothing happen before."""
+        """When `loop` is due next, if no request arrives before."""
         return min(self._step_us()[0], self._laser_off_us(), self._trigger_off_us, self._limit_due_us)
 
     def loop(self, now_us: int) -> None:
@@ -155,7 +155,7 @@ class DeviceModel:
         self._watch_limits(now_us)
 
     def darkened(self) -> None:
-        """The board has switched the laser off by itself, because `loop` did not come round."""
+        """The board has switched the laser off by itself, because `loop` was late."""
         if self.mechanics.laser_on:
             self._set_laser(False)
             self._error = "stall"
@@ -216,7 +216,7 @@ class DeviceModel:
         self._last_sequence, self._last_request = sequence, line
         refused, extra = self._command(sequence, words[1:], now_us)
         self._refused = refused is not None
-        # Only a host that counts on and is obeyed keeps the light on.
+        # Only new, accepted requests keep the laser on.
         self._heard_us = self._heard_us if self._refused else now_us
         self._last_reply = self._reply(sequence, refused, extra)
         return self._write(self._last_reply)
@@ -228,7 +228,7 @@ class DeviceModel:
         return frame(f"<{sequence} {'ok' if error is None else 'err ' + error} {state_text(self.state)}{extra}")
 
     def _command(self, sequence: int, words: list[str], now_us: int) -> tuple[str | None, str]:
-        """Executes one command: the reason of refusal or None, and fields beside the state."""
+        """Executes one command: the reason of refusal or None, and further fields of the reply."""
         name, arguments = words[0], words[1:]
         counts = {"ID": 0, "?": 0, "MA": 2, "HOME": 0, "STOP": 0, "ABORT": 0, "L": 1, "TRIG": 1, "GET": 1, "SET": 2}
         if name not in counts:
@@ -329,7 +329,7 @@ class DeviceModel:
         if remaining == 0:
             axis.direction = 0
             return self._finish_if_at_rest()
-        # A motor that was left waiting stands: it starts up the ramp again.
+        # A motor whose step is late has stopped: it starts the ramp again.
         stalled = now_us - axis.due_us > self._delay_us(0)
         # Slow down so that the last step is done at the starting speed.
         axis.level = min(0 if stalled else axis.level + 1, self._top_level(), remaining - 1)
@@ -397,8 +397,8 @@ class DeviceModel:
         self.mechanics.step(self._home_axis, 1 if positive else -1)
         axis.position += 1 if positive else -1
         axis.target = axis.position
-        # Homing also leads back from an open limit, a little way; one that opens on the way means that no home switch
-        # will come.
+        # Homing may begin behind an open limit switch and leave it; one that opens on the way means that the home
+        # switch was missed.
         limit = self.mechanics.limit_switch(self._home_axis)
         self._home_travel += 1
         if limit and (not self._home_limit or self._home_travel > HOME_OPEN_MAX_STEPS):
@@ -430,7 +430,7 @@ class DeviceModel:
         return self._enter_phase("back", now_us) if self._home_phase == "fast" else self._home_found(now_us)
 
     def _home_found(self, now_us: int) -> None:
-        # Behind an open limit the switch of a homed axis cannot lie: a wire is broken, or the wrong switch was found.
+        # The home switch is never behind an open limit: a wire is broken, or the wrong switch was found.
         if self._limit_open() if self._home_axis else self.mechanics.limit_switch(0):
             return self._halt("alarm", "limit")
         axis = self._axes[self._home_axis]

@@ -3,8 +3,8 @@
 Counters are motor steps: machine position times `$100` (`$101`). Zero is where the board's homing puts it. GRBL 1.1 has
 no checksum, no sequence numbers and no boot id, so it promises less than our firmware: lost steps are not found at the
 next homing, and a computer that dies leaves the laser on, because no watchdog of the board switches it off. What it
-does say is used: every order waits for its `ok`, arrival is read back, a greeting in mid-run is a reset and with it the
-loss of the counters, an alarm ends the run, and the laser's mode is read back by `$G`.
+does report is used: every order waits for its `ok`, arrival is read back, a greeting in mid-run is a reset that has
+lost the counters, an alarm ends the run, and the laser's mode is read back by `$G`.
 
 Counters in motor steps; seconds where a name says `_s`. Time from a `Clock`, bytes from a `Link`.
 """
@@ -42,7 +42,7 @@ from tvsbayes.positioner.protocol import Status as DeviceStatus
 from tvsbayes.positioner.silence import HEARD_BYTES_MAX, explained
 
 GREETING_S, GREETING_ATTEMPTS = 1.5, 4
-"""An Arduino sits in its boot loader for about a second after its port was opened, and hears nothing."""
+"""An Arduino stays in its boot loader for about a second after its port is opened, and reads nothing."""
 REPLY_S = 2.0
 """Longest wait for the answer to an order that moves nothing."""
 POLL_S = 0.1
@@ -67,7 +67,7 @@ class GrblSettings:
     Attributes:
         laser: the order that switches it on.
         laser_power: `S` of a spindle order, None for the board's full power.
-        unwatched: whether the user has said that the laser may stay on when the computer dies.
+        unwatched: whether the user accepts that the laser may stay on when the computer dies.
         limits: soft limits, held here.
         speed_steps_per_s: of the faster axis, None for the board's own.
     """
@@ -95,13 +95,13 @@ class GrblSettings:
             remedy = "name what switches the laser: M3 the spindle, M7 mist, M8 flood coolant"
             raise _refused("options.laser", escaped(laser), ", ".join(LASER_ORDERS), remedy)
         speed, unwatched = table.get("speed_steps_per_s"), options.get("unwatched_laser", 0)
-        # Text would be true, also "false" and "no": the light would be free with nobody having said so.
+        # Any text is true in Python, also "false" and "no": it would permit the laser without consent.
         if unwatched not in (0, 1):
             remedy = "write true, without quotes, once something else cuts the light when the computer dies; else false"
             raise _refused("options.unwatched_laser", escaped(str(unwatched)), "true or false (1 or 0)", remedy)
         return cls(
             laser,
-            _power(options.get("laser_power")),
+            _laser_power(options.get("laser_power")),
             bool(unwatched),
             CounterLimits.of(table),
             None if speed is None else float(speed),
@@ -122,8 +122,8 @@ class GrblPositioner:
     """
 
     def __init__(self, open_link: Callable[[], Link], stated: GrblSettings | None = None, clock: Clock = time):
-        self._stated, self._clock = stated or GrblSettings(), clock
-        self._buffer, self._heard = bytearray(), bytearray()
+        self._settings, self._clock = stated or GrblSettings(), clock
+        self._buffer, self._received = bytearray(), bytearray()
         self._pending, self._homed, self._greeted, self._done = 0, False, False, 0
         self._lit = False
         self._target: tuple[int, int] = (0, 0)
@@ -131,16 +131,16 @@ class GrblPositioner:
         self.repeats = 0
         """Status reports asked for again."""
         self.warnings = (NO_WATCHDOG,)
-        """What the user should know of this kind of board."""
+        """Warnings about this kind of board."""
         self._link = opened(open_link)
         try:
             self.identity: dict[str, str] = {"fw": self._greeting(), "driver": "grbl"}
             values: dict[int, float] = {}
-            self._order("$$", REPLY_S, lambda line: values.update([one]) if (one := parse_setting(line)) else None)
-            self._board = BoardSettings.of(values, self._stated.laser)
-            if (self._stated.laser_power or 0.0) > self._board.power_max:
+            self._order("$$", REPLY_S, lambda line: values.update([entry]) if (entry := parse_setting(line)) else None)
+            self._board = BoardSettings.of(values, self._settings.laser)
+            if (power := self._settings.laser_power or 0.0) > self._board.power_max:
                 # The board would take it for full power.
-                found, allowed = f"{self._stated.laser_power:g}", f"at most {self._board.power_max:g}, the board's $30"
+                found, allowed = f"{power:g}", f"at most {self._board.power_max:g}, the board's $30"
                 raise _refused("options.laser_power", found, allowed, "lower it, or leave it out for full power")
             self.identity |= {f"${number}": f"{values[number]:g}" for number in (100, 101, 110, 111)}
         except BaseException:
@@ -148,9 +148,9 @@ class GrblPositioner:
             raise
 
     def home(self) -> HomeReport:
-        """See `Positioner.home`; what was lost before is not known afterwards, nor in which sense $23 had it end."""
+        """See `Positioner.home`; the board reports neither steps lost before nor the sense in which $23 lets it end."""
         self._homed = False
-        # Out of any alarm, and dark.
+        # A reset ends an alarm and switches the laser off.
         self._greeting()
         self._order("$H", HOME_S)
         self._order("G21 G90 G94", REPLY_S)
@@ -159,39 +159,39 @@ class GrblPositioner:
         if state.status != "idle":
             raise fault("stopped", f"homing ended in {state.status}", "home again")
         self._target = (state.pan_steps, state.tilt_steps)
-        return HomeReport(self._dark(state), (0, 0), known=False, compared=False)
+        return HomeReport(self._require_dark(state), (0, 0), known=False, compared=False)
 
     def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
         """See `Positioner.move_to`."""
-        wanted = (int(pan_steps), int(tilt_steps))
+        target = (int(pan_steps), int(tilt_steps))
         self._require_homed("a motion")
-        for axis, counter in zip(AXES, wanted, strict=True):
-            if not self._stated.limits.allow(axis, counter) or abs(counter) > COUNTERS_MAX:
-                found = f"{axis} {counter}, allowed is {self._stated.limits.words(axis)}"
+        for axis, counter in zip(AXES, target, strict=True):
+            if not self._settings.limits.allow(axis, counter) or abs(counter) > COUNTERS_MAX:
+                found = f"{axis} {counter}, allowed is {self._settings.limits.words(axis)}"
                 raise fault("refused-limit", found, "correct the plan or the limits in [positioner]")
         if self._lit:
             self.laser(False)
-        before = self._asked()
-        self._target = wanted
-        words, seconds = self._way(self._board.counters(before.position_mm), wanted)
-        self._order(words, REPLY_S)
-        # Answered once everything before it has been done.
-        self._order("G4 P0.01", 5.0 + 2.0 * (seconds + self._board.ramps_s))
-        status = self._asked()
+        start = self._status_report()
+        self._target = target
+        order, motion_s = self._motion_order(self._board.counters(start.position_mm), target)
+        self._order(order, REPLY_S)
+        # Its `ok` comes once everything before it is done.
+        self._order("G4 P0.01", 5.0 + 2.0 * (motion_s + self._board.ramps_s))
+        status = self._status_report()
         if status.state != "Idle":
             raise fault("stopped", f"the motion ended in {status.state}", "home again")
         reached = self._board.counters(status.position_mm)
-        if reached != wanted:
-            found = f"the board stands at {reached}, ordered was {wanted}"
+        if reached != target:
+            found = f"the board stands at {reached}, ordered was {target}"
             raise fault("position", found, "home again; look for soft limits ($20) and feed hold")
         self._done += 1
-        return self._dark(self._state(status, laser_on=self._laser_on()))
+        return self._require_dark(self._state(status, laser_on=self._laser_on()))
 
     def laser(self, on: bool) -> DeviceState:
         """See `Positioner.laser`."""
         if on:
             self._require_homed("light")
-            if not self._stated.unwatched:
+            if not self._settings.unwatched:
                 raise fault(
                     "laser",
                     "a GRBL board leaves the laser on when this computer dies",
@@ -204,7 +204,7 @@ class GrblPositioner:
             state = self.state()
         except DeviceFault:
             if not on:
-                # Dark at any price; at rest a reset keeps the position.
+                # A reset switches it off; at rest it keeps the position.
                 self._write(RESET)
             raise
         if state.laser_on != on:
@@ -216,7 +216,7 @@ class GrblPositioner:
 
     def state(self) -> DeviceState:
         """See `Positioner.state`."""
-        status = self._asked()
+        status = self._status_report()
         return self._state(status, laser_on=self._laser_on())
 
     def close(self) -> None:
@@ -225,71 +225,71 @@ class GrblPositioner:
             self._link.write(RESET)
             self._link.read(POLL_S)
         except OSError:
-            # Gone: nothing of ours reaches it any more.
+            # The board is unplugged: nothing reaches it any more.
             pass
         finally:
             self._link.close()
 
     def _greeting(self) -> str:
-        """Resets the board, which stands still and dark then, and reads its name."""
+        """Resets the board, which ends motion and light, and reads its name."""
         self._greeted, self._pending = False, 0
-        self._heard.clear()
+        self._received.clear()
         for attempt in range(GREETING_ATTEMPTS):
-            # The empty line makes other firmware speak, too.
+            # The empty line makes other firmware answer too.
             self._write(RESET + b"\n" if attempt else RESET)
             deadline = self._clock.monotonic() + GREETING_S
-            while (line := self._next(deadline)) is not None:
+            while (line := self._next_line(deadline)) is not None:
                 name = parse_greeting(line)
                 if name is not None:
                     self._settle_line()
                     self._greeted, self._lit = True, False
                     return name
-        heard = explained(bytes(self._heard))
-        found, remedy = f"no GRBL board answers: {heard.found}", heard.remedy
-        if b"!boot" in self._heard or b"!nak" in self._heard or b"<0 " in self._heard:
-            found, remedy = f"our own firmware answers: {heard.found}", 'write driver = "serial" into [positioner]'
+        report = explained(bytes(self._received))
+        found, remedy = f"no GRBL board answers: {report.found}", report.remedy
+        if b"!boot" in self._received or b"!nak" in self._received or b"<0 " in self._received:
+            found, remedy = f"our own firmware answers: {report.found}", 'write driver = "serial" into [positioner]'
         raise fault("no-answer", found, remedy)
 
     def _settle_line(self) -> None:
-        """Lines behind a greeting, such as the reminder to unlock."""
+        """Skip the lines after a greeting, such as the reminder to unlock."""
         deadline = self._clock.monotonic() + POLL_S
-        while self._next(deadline) is not None:
+        while self._next_line(deadline) is not None:
             pass
 
     def _laser_order(self, on: bool) -> str:
-        """What is written for light or darkness."""
-        stated = self._stated
+        """The order that switches the laser on or off."""
+        settings = self._settings
         if not on:
-            return LASER_ORDERS[stated.laser]
-        if stated.laser not in ("M3", "M4"):
-            return stated.laser
-        power = self._board.power_max if stated.laser_power is None else stated.laser_power
-        return f"{stated.laser} S{power:g}"
+            return LASER_ORDERS[settings.laser]
+        if settings.laser not in ("M3", "M4"):
+            return settings.laser
+        power = self._board.power_max if settings.laser_power is None else settings.laser_power
+        return f"{settings.laser} S{power:g}"
 
-    def _way(self, start: tuple[int, int], end: tuple[int, int]) -> tuple[str, float]:
-        """The order of a motion in machine coordinates, and the longest that it may take without ramps, s."""
+    def _motion_order(self, start: tuple[int, int], end: tuple[int, int]) -> tuple[str, float]:
+        """The order of a motion in machine coordinates, and its longest duration without ramps, s."""
         x, y = self._board.position_mm(end)
         steps = [abs(b - a) for a, b in zip(start, end, strict=True)]
         rates = [r * k / 60 for r, k in zip(self._board.rate_mm_per_min, self._board.steps_per_mm, strict=True)]
-        speed = self._stated.speed_steps_per_s
+        speed = self._settings.speed_steps_per_s
         slowest = [rate if speed is None else min(rate, speed) for rate in rates]
-        seconds = max(n / rate for n, rate in zip(steps, slowest, strict=True))
-        if speed is None or not seconds:
-            return f"G53 G0 X{x:.5f} Y{y:.5f}", seconds
-        way_mm = sum((n / k) ** 2 for n, k in zip(steps, self._board.steps_per_mm, strict=True)) ** 0.5
-        return f"G53 G1 X{x:.5f} Y{y:.5f} F{60 * way_mm / seconds:.4f}", seconds
+        motion_s = max(n / rate for n, rate in zip(steps, slowest, strict=True))
+        if speed is None or not motion_s:
+            return f"G53 G0 X{x:.5f} Y{y:.5f}", motion_s
+        distance_mm = sum((n / k) ** 2 for n, k in zip(steps, self._board.steps_per_mm, strict=True)) ** 0.5
+        return f"G53 G1 X{x:.5f} Y{y:.5f} F{60 * distance_mm / motion_s:.4f}", motion_s
 
-    def _dark(self, state: DeviceState) -> DeviceState:
-        """The state behind a motion, in which no light may be."""
+    def _require_dark(self, state: DeviceState) -> DeviceState:
+        """The state after a motion; a laser that is on is a fault."""
         if state.laser_on:
             # At rest a reset keeps the position.
             self._write(RESET)
             raise fault("laser", "the laser is on after a motion", "cut the laser's supply and check the board")
         return state
 
-    def _require_homed(self, what: str) -> None:
+    def _require_homed(self, action: str) -> None:
         if not self._homed:
-            raise fault("refused-unhomed", f"{what} was ordered before homing", "home first")
+            raise fault("refused-unhomed", f"{action} was ordered before homing", "home first")
 
     def _state(self, status: Status, laser_on: bool) -> DeviceState:
         pan, tilt = self._board.counters(status.position_mm)
@@ -297,44 +297,44 @@ class GrblPositioner:
         if status.state == "Idle":
             word = "idle" if self._homed else "unhomed"
         error = "none" if word != "alarm" else escaped(status.state).lower()
-        # GRBL homes onto its limit switches: pressed says nothing of a broken wire.
+        # GRBL homes onto its limit switches: a pressed switch and a broken wire look the same.
         pressed = int("X" in status.pins), int("Y" in status.pins)
         return DeviceState(0, word, pan, tilt, *self._target, self._done, laser_on, 0, 0, error, *pressed)
 
     def _laser_on(self) -> bool:
-        modes: list[frozenset[str]] = []
-        self._order("$G", REPLY_S, lambda line: modes.append(one) if (one := parse_modes(line)) else None)
-        if not modes:
+        reports: list[frozenset[str]] = []
+        self._order("$G", REPLY_S, lambda line: reports.append(report) if (report := parse_modes(line)) else None)
+        if not reports:
             raise fault("no-answer", "$G was answered without modes", "check the board's firmware: GRBL 1.1 is known")
-        # Both coolants may be on at once; M5 and M9 stand for darkness.
-        return self._stated.laser in modes[-1]
+        # Both coolants may be on at once; M5 and M9 mean off.
+        return self._settings.laser in reports[-1]
 
-    def _asked(self) -> Status:
+    def _status_report(self) -> Status:
         """A status report."""
         self._status = None
         for attempt in range(3):
             self.repeats += attempt > 0
             self._write(ASK)
             deadline = self._clock.monotonic() + REPLY_S
-            while self._status is None and (line := self._next(deadline)) is not None:
-                self._take(line)
+            while self._status is None and (line := self._next_line(deadline)) is not None:
+                self._handle_line(line)
             if self._status is not None:
                 return self._status
-        raise self._silent("?")
+        raise self._no_answer("?")
 
-    def _order(self, words: str, longest_s: float, take: Callable[[str], object] = lambda line: None) -> None:
-        """One line, and everything up to its `ok`; lines between go to `take`."""
+    def _order(self, order: str, timeout_s: float, on_line: Callable[[str], object] = lambda line: None) -> None:
+        """Sends one line and waits for its `ok`; lines in between go to `on_line`."""
         self._resynchronise()
-        self._write(words.encode("ascii") + b"\n")
+        self._write(order.encode("ascii") + b"\n")
         self._pending = 1
-        deadline = self._clock.monotonic() + longest_s
-        asks = longest_s > REPLY_S
+        deadline = self._clock.monotonic() + timeout_s
+        polls = timeout_s > REPLY_S
         while self._pending:
             now = self._clock.monotonic()
-            line = self._next(min(deadline, now + POLL_S) if asks else deadline)
+            line = self._next_line(min(deadline, now + POLL_S) if polls else deadline)
             if line is None:
                 if self._clock.monotonic() >= deadline:
-                    self._give_up(words, longest_s)
+                    self._give_up(order, timeout_s)
                 self._write(ASK)
                 continue
             error = number_of(line, "error")
@@ -342,46 +342,46 @@ class GrblPositioner:
                 self._pending = 0
             elif error is not None:
                 self._pending = 0
-                found = f"{words} was refused: error {error}, {ERRORS.get(error, 'see the GRBL manual')}"
+                found = f"{order} was refused: error {error}, {ERRORS.get(error, 'see the GRBL manual')}"
                 raise fault(f"refused-{error}", found, "home first" if error == 9 else "see the GRBL manual")
             else:
-                self._take(line)
-                take(line)
+                self._handle_line(line)
+                on_line(line)
 
     def _resynchronise(self) -> None:
-        """An order that was interrupted is still to be answered."""
+        """Waits for the answer to an interrupted order."""
         deadline = self._clock.monotonic() + REPLY_S
-        while self._pending and (line := self._next(deadline)) is not None:
+        while self._pending and (line := self._next_line(deadline)) is not None:
             if line == "ok" or number_of(line, "error") is not None:
                 self._pending = 0
         if self._pending:
             self._write(RESET)
-            raise self._silent("an order that was interrupted")
+            raise self._no_answer("an order that was interrupted")
 
-    def _give_up(self, words: str, longest_s: float) -> None:
+    def _give_up(self, order: str, timeout_s: float) -> None:
         if self._status is not None and self._status.state in _MOVING:
             self._write(HOLD)
             self._write(RESET)
-            found = f"{words} is not done after {longest_s:.0f} s"
+            found = f"{order} is not done after {timeout_s:.0f} s"
             raise fault("stall", found, "look for a blocked axis or a missing home switch; then home again")
-        raise self._silent(words)
+        raise self._no_answer(order)
 
-    def _silent(self, words: str) -> DeviceFault:
-        heard = explained(bytes(self._heard))
-        what = "nothing was heard" if heard.cause == "silence" else heard.found
+    def _no_answer(self, order: str) -> DeviceFault:
+        report = explained(bytes(self._received))
+        cause = "nothing was heard" if report.cause == "silence" else report.found
         remedy = self._darkness_first("check cable and supply, then go on with --resume")
-        return fault("no-answer", f"no answer to {words}: {what}", remedy)
+        return fault("no-answer", f"no answer to {order}: {cause}", remedy)
 
     def _unplugged(self, error: OSError) -> DeviceFault:
         remedy = self._darkness_first("plug it in, then go on with --resume: it homes again")
         return fault("unplugged", f"the board is gone: {reason(error)}", remedy)
 
     def _darkness_first(self, remedy: str) -> str:
-        """A remedy for a board that cannot be reached: no watchdog of its own ends the light."""
+        """A remedy for a board that cannot be reached: it has no watchdog that ends the light."""
         return f"cut the laser's supply, it may be on; {remedy}" if self._lit else remedy
 
-    def _take(self, line: str) -> None:
-        """What a board says unasked, and status reports."""
+    def _handle_line(self, line: str) -> None:
+        """Takes a status report; raises for an alarm and for a greeting, which means a reset."""
         status, alarm = parse_status(line), number_of(line, "ALARM")
         if status is not None:
             self._status = status
@@ -403,8 +403,8 @@ class GrblPositioner:
         except OSError as error:
             raise self._unplugged(error) from error
 
-    def _next(self, deadline_s: float) -> str | None:
-        """The next line without its end, None if none is complete by then; empty ones are left out."""
+    def _next_line(self, deadline_s: float) -> str | None:
+        """The next line that is not empty, without its end; None if none is complete by the deadline."""
         while True:
             while (end := self._buffer.find(b"\n")) >= 0:
                 line = self._buffer[:end].strip().decode("ascii", "replace")
@@ -422,14 +422,14 @@ class GrblPositioner:
                 raise self._unplugged(error) from error
             self._buffer += data
             if not self._greeted:
-                self._heard += data[: max(HEARD_BYTES_MAX - len(self._heard), 0)]
+                self._received += data[: max(HEARD_BYTES_MAX - len(self._received), 0)]
 
 
-def _power(stated: str | int | float | None) -> float | None:
-    """`S` of a spindle order as the rig file states it."""
-    if stated is None:
+def _laser_power(entry: str | int | float | None) -> float | None:
+    """`S` of a spindle order in the rig file."""
+    if entry is None:
         return None
-    if isinstance(stated, str) or not 0 <= stated < math.inf:
+    if isinstance(entry, str) or not 0 <= entry < math.inf:
         remedy = "write a number without quotes, up to the board's $30, or leave it out for full power"
-        raise _refused("options.laser_power", escaped(str(stated)), "a number of 0 or more", remedy)
-    return float(stated)
+        raise _refused("options.laser_power", escaped(str(entry)), "a number of 0 or more", remedy)
+    return float(entry)

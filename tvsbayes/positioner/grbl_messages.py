@@ -1,4 +1,4 @@
-r"""What a GRBL board says: status reports, modes, settings, errors and alarms of GRBL 1.1, as text.
+r"""What a GRBL board sends: status reports, modes, settings, errors and alarms of GRBL 1.1, as text.
 
 Lines end in CR LF; an order is answered by `ok` or `error:N`, `?` by `<State|MPos:x,y,z|...>`, and `ALARM:N` or a
 greeting comes unasked. There is no checksum. Positions are millimetres of machine coordinates with three decimals, or
@@ -68,7 +68,7 @@ def parse_status(line: str) -> Status | None:
     match = _STATUS.fullmatch(line)
     if match is None:
         return None
-    fields = dict(part.partition(":")[::2] for part in match[2].split("|"))
+    fields = dict(field.partition(":")[::2] for field in match[2].split("|"))
     try:
         x, y = map(float, fields["MPos"].split(",")[:2])
     except (KeyError, ValueError):
@@ -102,13 +102,13 @@ def number_of(line: str, kind: str) -> int | None:
 
 @dataclass(frozen=True)
 class BoardSettings:
-    """What of a board's `$$` this package relies on.
+    """The settings of `$$` that this package relies on.
 
     Attributes:
         steps_per_mm: of pan (X) and tilt (Y).
         rate_mm_per_min: top speeds.
         power_max: `S` of full spindle power.
-        ramps_s: time of getting to full speed and back, of the slower axis, s.
+        ramps_s: time to reach full speed and to stop again, of the slower axis.
     """
 
     steps_per_mm: tuple[float, float]
@@ -125,20 +125,20 @@ class BoardSettings:
             laser: the order that switches it on.
 
         Raises:
-            InputError: a setting that does not fit, with the value that would.
+            InputError: a setting that does not fit, with the value required.
         """
-        wanted = {
+        required = {
             1: (255.0, "motors hold their place at rest"),
             13: (0.0, "reports in millimetres"),
             22: (1.0, "homing, without which counters mean nothing"),
             **({32: (0.0, "no laser mode, in which light depends on the motion")} if laser in ("M3", "M4") else {}),
         }
-        for number, (value, why) in wanted.items():
-            # grblHAL keeps more switches in the bits of $22; the first is the one meant.
+        for number, (value, reason) in required.items():
+            # grblHAL has more switches in the bits of $22; bit 0 enables homing.
             setting = values.get(number)
-            good = setting is not None and (int(setting) & 1 if number == 22 else setting == value)
-            if not good:
-                raise _unfit(number, setting, f"{value:g}: {why}")
+            valid = setting is not None and (int(setting) & 1 if number == 22 else setting == value)
+            if not valid:
+                raise _unfit(number, setting, f"{value:g}: {reason}")
         if not int(values.get(10, 0)) & 1:
             raise _unfit(10, values.get(10), "an odd number, such as 1: machine positions in the status")
         for number in (100, 101, 110, 111, 120, 121):
@@ -162,8 +162,8 @@ class BoardSettings:
         return x, y
 
 
-def _unfit(number: int, found: float | None, allowed: str) -> InputError:
-    stands = "nothing" if found is None else f"{found:g}"
+def _unfit(number: int, setting: float | None, allowed: str) -> InputError:
+    found = "nothing" if setting is None else f"{setting:g}"
     remedy = f"set it with any GRBL sender (${number}=...), then connect again"
-    message = f"GRBL setting ${number}: found {stands}; allowed: {allowed}; {remedy}"
-    return InputError("grbl-setting", message, column=f"${number}", found=stands, allowed=allowed, remedy=remedy)
+    message = f"GRBL setting ${number}: found {found}; allowed: {allowed}; {remedy}"
+    return InputError("grbl-setting", message, column=f"${number}", found=found, allowed=allowed, remedy=remedy)

@@ -1,8 +1,8 @@
-"""What a positioner is to anyone who drives it: orders, what they promise, and the faults in which they end.
+"""The interface of a positioner: its orders, their promises, and the faults in which they end.
 
 Drivers of other hardware keep these promises too (data/docs/instrument.md, "Your own hardware"): `move_to` and `home`
-return only after the device has said that this very motion has ended at the counters asked for; what else happens ends
-in a `DeviceFault` within a bounded time; the laser is off in motion and after `home` and `close`, whatever happened.
+return only after the device has reported that this very motion has ended at the counters ordered; all else ends in a
+`DeviceFault` within a bounded time; the laser is off in motion and after `home` and `close`, whatever happened.
 
 Counters are absolute motor steps (pan, tilt); seconds where a name says `_s`. Time comes from a `Clock`, bytes from a
 `Link`: tests drive both without hardware and without waiting.
@@ -19,7 +19,7 @@ from tvsbayes.errors import DeviceFault, escaped
 from tvsbayes.positioner.protocol import DeviceState
 
 DEFAULT_DRIVER = "serial"
-"""Of a rig file that names none: the firmware shipped with this package."""
+"""Driver of a rig file that names none: the firmware shipped with this package."""
 SEE_DOCTOR = "; see `tvsbayes doctor`"
 """Ends a remedy; `doctor` leaves it out of its own."""
 _PORT_REMEDY = "check [positioner] port in the rig file, the cable and your rights on the port" + SEE_DOCTOR
@@ -27,7 +27,7 @@ _HELD_REMEDY = (
     "close the other program (a serial monitor, another run); `fuser -v PORT` names it on Linux and macOS" + SEE_DOCTOR
 )
 _HELD = (errno.EWOULDBLOCK, errno.EBUSY)
-"""What a port says that another program has opened for itself alone (flock(2), TIOCEXCL)."""
+"""Errors of a port that another program has opened exclusively (flock(2), TIOCEXCL)."""
 
 
 class PositionLost(DeviceFault):
@@ -54,7 +54,7 @@ class Link(Protocol):
         """Whatever has arrived; waits up to `timeout_s` for the first byte; may be empty."""
 
     def close(self) -> None:
-        """Give the port back; never raises."""
+        """Close the port; never raises."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class Positioner(Protocol):
 
     @property
     def identity(self) -> Mapping[str, str]:
-        """What the device says of itself: "fw" is its firmware's version; goes into the journal."""
+        """What the device reports about itself: "fw" is its firmware's version; goes into the journal."""
 
     @property
     def repeats(self) -> int:
@@ -93,13 +93,13 @@ class Positioner(Protocol):
         """Find the home switches; the laser is off afterwards."""
 
     def move_to(self, pan_steps: int, tilt_steps: int) -> DeviceState:
-        """Go to absolute counters, in darkness; returns when the device has said that it is there."""
+        """Go to absolute counters, in darkness; returns when the device has reported arrival."""
 
     def laser(self, on: bool) -> DeviceState:
-        """Switch the laser; returns when the device has said so."""
+        """Switch the laser; returns when the device has confirmed it."""
 
     def state(self) -> DeviceState:
-        """Ask the device; also a sign of life for its laser watchdog."""
+        """The device's state; the request also feeds its laser watchdog."""
 
     def close(self) -> None:
         """Laser off and motors at rest as well as possible, then the line closed; never raises."""
@@ -122,11 +122,11 @@ def opened(open_link: Callable[[], Link]) -> Link:
     try:
         return open_link()
     except OSError as error:
-        # Windows says only that access is denied.
-        held = error.errno in _HELD or "PermissionError(13" in str(error)
-        what = "is held by another program" if held else "cannot be opened"
-        code, remedy = ("port-busy", _HELD_REMEDY) if held else ("port", _PORT_REMEDY)
-        raise fault(code, f"the port {what}: {reason(error)}", remedy) from error
+        # Windows reports only that access is denied.
+        busy = error.errno in _HELD or "PermissionError(13" in str(error)
+        problem = "is held by another program" if busy else "cannot be opened"
+        code, remedy = ("port-busy", _HELD_REMEDY) if busy else ("port", _PORT_REMEDY)
+        raise fault(code, f"the port {problem}: {reason(error)}", remedy) from error
 
 
 def reason(error: OSError) -> str:

@@ -1,7 +1,7 @@
-"""What a positioner's firmware cannot see: where motors and switches truly stand, and which wires are broken.
+"""What a positioner's firmware cannot see: the true positions of motors and switches, and broken wires.
 
-`Mechanics` can lose steps, and tells a listener every stretch of motion in one sense, from which the twin's gears
-follow. Positions are motor steps (pan, tilt).
+`Mechanics` can lose steps, and reports to a listener every stretch of motion in one sense, which drives the twin's
+gears. Positions are motor steps (pan, tilt).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Mechanics:
         limit_cut: whether the wire of an axis' limit switches is broken.
         home_dead: whether the wire of an axis' home switch is broken: it never reads as pressed.
         wrong_reads: next readings of an axis' home switch that are wrong: bounce, or a spike.
-        true_steps: where the motors stand; starts at 0, wherever the counters are.
+        true_steps: positions of the motors; they start at 0, whatever the counters.
         missing_steps: next steps that the motors will not do.
         laser_on: whether light comes out.
         lit: how often the laser was switched on.
@@ -59,7 +59,7 @@ class Mechanics:
         self._stretch[axis] += sense
 
     def flush(self, axis: int) -> None:
-        """Tell the listener the stretch of motion so far."""
+        """Report the stretch of motion so far to the listener."""
         stretch, self._stretch[axis] = self._stretch[axis], 0
         if stretch and self.moved is not None:
             self.moved(axis, stretch)

@@ -89,13 +89,13 @@ class FrameError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class DeviceState:
-    """What a device says of itself in every reply.
+    """The state of a device, as every reply carries it.
 
     Attributes:
-        boot: number drawn at every start; another one means that counters are lost.
+        boot: number drawn at every start; a new one means that counters are lost.
         status: "unhomed", "idle", "moving" (also while homing) or "alarm".
         pan_steps, tilt_steps: counters now.
-        pan_target_steps, tilt_target_steps: where the last motion leads.
+        pan_target_steps, tilt_target_steps: target of the last motion.
         done_sequence: sequence of the last motion that reached its target, 0 for none.
         laser_on: whether the laser line is on.
         pan_home_deviation_steps, tilt_home_deviation_steps: at the last homing, counter where the switch was found
@@ -214,17 +214,17 @@ def parse_answer(line: bytes) -> Reply | Unasked:
     if body.startswith("!"):
         kind, _, text = body[1:].partition(" ")
         return Unasked(kind, text)
-    head, *rest = body.split(" ")
+    head, *words = body.split(" ")
     sequence = unsigned(head[1:])
-    if not head.startswith("<") or sequence is None or not rest:
+    if not head.startswith("<") or sequence is None or not words:
         raise FrameError("parse")
     error = None
-    if rest[0] == "err" and len(rest) > 1 and _WORD.fullmatch(rest[1]):
-        error, rest = rest[1], rest[1:]
-    elif rest[0] != "ok":
+    if words[0] == "err" and len(words) > 1 and _WORD.fullmatch(words[1]):
+        error, words = words[1], words[1:]
+    elif words[0] != "ok":
         raise FrameError("parse")
     fields: dict[str, str] = {}
-    for item in rest[1:]:
+    for item in words[1:]:
         match = _FIELD.fullmatch(item)
         if match is None or match[1] in fields:
             raise FrameError("parse")
@@ -233,7 +233,7 @@ def parse_answer(line: bytes) -> Reply | Unasked:
 
 
 def _pair(text: str) -> tuple[int, int]:
-    numbers = [signed(part) for part in text.split(",")]
+    numbers = [signed(number) for number in text.split(",")]
     if len(numbers) != 2 or None in numbers:
         raise FrameError("parse")
     return cast("tuple[int, int]", tuple(numbers))
@@ -242,11 +242,11 @@ def _pair(text: str) -> tuple[int, int]:
 def _state(fields: dict[str, str]) -> DeviceState:
     if any(key not in fields for key in _STATE_KEYS):
         raise FrameError("parse")
-    boot, done = unsigned(fields["b"]), unsigned(fields["d"])
-    good = fields["st"] in STATUSES and fields["l"] in ("0", "1") and _WORD.fullmatch(fields["e"])
-    if boot is None or done is None or not good:
+    boot, done_sequence = unsigned(fields["b"]), unsigned(fields["d"])
+    valid = fields["st"] in STATUSES and fields["l"] in ("0", "1") and _WORD.fullmatch(fields["e"])
+    if boot is None or done_sequence is None or not valid:
         raise FrameError("parse")
-    # Firmware of protocol 1 tells no switches; that it is too old is said where its version is read.
+    # Firmware of protocol 1 reports no switches; it is refused where its version is read.
     switches = _pair(fields.get(_SWITCHES_KEY, "0,0"))
     if not all(0 <= value <= 3 for value in switches):
         raise FrameError("parse")
@@ -255,7 +255,7 @@ def _state(fields: dict[str, str]) -> DeviceState:
         cast("Status", fields["st"]),
         *_pair(fields["p"]),
         *_pair(fields["t"]),
-        done,
+        done_sequence,
         fields["l"] == "1",
         *_pair(fields["h"]),
         fields["e"],
@@ -265,11 +265,11 @@ def _state(fields: dict[str, str]) -> DeviceState:
 
 def device_settings(positioner: Mapping[str, str | int | float]) -> dict[str, int]:
     """Device settings that `[positioner]` of a rig file states: limits, counters at home, ramp and laser watchdog."""
-    stated = CounterLimits.of(positioner).steps
+    limits = CounterLimits.of(positioner).steps
     settings = {
         key: limit
         for axis, keys in LIMIT_SETTINGS.items()
-        for key, limit in zip(keys, stated[axis], strict=True)
+        for key, limit in zip(keys, limits[axis], strict=True)
         if limit is not None
     }
     if "speed_steps_per_s" in positioner:

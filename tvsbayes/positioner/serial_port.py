@@ -1,7 +1,7 @@
 """Serial ports: those of this computer, and one of them as the driver's `Link`.
 
-A port is opened by name and for this program alone; after an unplugging the same USB device is found again under
-whatever name it came back. Seconds where a name says `_s`.
+A port is opened by name and exclusively; after an unplugging the same USB device is found again, also under another
+name. Seconds where a name says `_s`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BAUD = 115_200
 
 @dataclass(frozen=True, slots=True)
 class Port:
-    """A serial port of this computer, with what its USB device says of itself (empty where it says nothing)."""
+    """A serial port of this computer, with the description of its USB device (empty where it has none)."""
 
     name: str
     description: str
@@ -45,23 +45,23 @@ def serial_ports() -> list[Port]:
 
 
 def _ports_of(device: Port) -> list[str]:
-    """Names of all ports of a USB device, one of which is known."""
-    same = (device.vid, device.pid, device.serial_number)
-    return [p.name for p in serial_ports() if (p.vid, p.pid, p.serial_number) == same]
+    """Names of all ports of the USB device that has this port."""
+    usb_id = (device.vid, device.pid, device.serial_number)
+    return [p.name for p in serial_ports() if (p.vid, p.pid, p.serial_number) == usb_id]
 
 
 def serial_opener(port: str, baud: int) -> Callable[[], Link]:
-    """Opens a port by name; after an unplugging, the same USB device under whatever name it came back."""
-    known = next((p for p in serial_ports() if p.name == port and p.serial_number), None)
+    """Opens a port by name; after an unplugging, the same USB device under its new name."""
+    device = next((p for p in serial_ports() if p.name == port and p.serial_number), None)
     # A device may have several ports; the order of their names stays.
-    place = 0 if known is None else _ports_of(known).index(port)
+    index = 0 if device is None else _ports_of(device).index(port)
 
     def open_link() -> Link:
         name = port
-        if known is not None and port not in (names := _ports_of(known)):
-            if len(names) <= place:
-                raise OSError(f"no port with the USB serial number {known.serial_number}")
-            name = names[place]
+        if device is not None and port not in (names := _ports_of(device)):
+            if len(names) <= index:
+                raise OSError(f"no port with the USB serial number {device.serial_number}")
+            name = names[index]
         return _SerialLink(name, baud)
 
     return open_link
@@ -72,7 +72,7 @@ def serial_positioner(rig: Rig) -> SerialPositioner:
 
     Raises:
         InputError: `[positioner]` names no serial port.
-        DeviceFault: the port cannot be opened, or nothing of ours answers.
+        DeviceFault: the port cannot be opened, or no board with this firmware answers.
     """
     return SerialPositioner(_opener_of(rig), device_settings(rig.positioner))
 
@@ -85,8 +85,8 @@ def grbl_positioner(rig: Rig) -> GrblPositioner:
             board that do not fit.
         DeviceFault: the port cannot be opened, or no GRBL board answers.
     """
-    stated = GrblSettings.of(rig.positioner)
-    return GrblPositioner(_opener_of(rig), stated)
+    settings = GrblSettings.of(rig.positioner)
+    return GrblPositioner(_opener_of(rig), settings)
 
 
 def _opener_of(rig: Rig) -> Callable[[], Link]:
@@ -103,9 +103,8 @@ class _SerialLink:
     def __init__(self, port: str, baud: int):
         import serial
 
-        # Exclusive: a second program on the line would eat our answers. A write time-out, else a stalled peer
-        # would hold us for ever.
-        # Not `serial_for_url`, whose addresses run other code and one of which writes files.
+        # Exclusive: a second program on the line would read our answers. Without a write time-out a stalled peer would
+        # block this program. Not `serial_for_url`, whose addresses run other code, one of which writes files.
         self._serial = serial.Serial(None, baud, timeout=0.1, write_timeout=1.0)
         if hasattr(self._serial, "exclusive"):
             self._serial.exclusive = True
@@ -122,7 +121,7 @@ class _SerialLink:
     def read(self, timeout_s: float) -> bytes:
         self._serial.timeout = timeout_s
         first = self._serial.read(1)
-        # A pulled plug makes in_waiting raise a bare OSError, a read SerialException, which is one.
+        # After an unplugging in_waiting raises OSError, a read its subclass SerialException.
         return first + self._serial.read(self._serial.in_waiting) if first else b""
 
     def close(self) -> None:

@@ -1,7 +1,6 @@
-"""Why nothing answers: what was heard on the line instead, and what to do about it.
+"""Why a device does not answer: what was received instead, and the remedy.
 
-A missing answer has as many causes as a bench has cables. The bytes that did arrive tell most of them apart; they are
-quoted. No input or output here.
+The bytes that did arrive distinguish most causes; they are quoted. No input or output here.
 """
 
 from __future__ import annotations
@@ -14,10 +13,10 @@ from tvsbayes.errors import escaped
 from tvsbayes.positioner.protocol import FrameError, parse_answer
 
 HEARD_BYTES_MAX = 400
-"""As much of what was heard is kept, from the beginning: greetings and first errors stand there."""
+"""Received bytes that are kept, from the beginning: greetings and first errors are there."""
 QUOTED_CHARS_MAX = 80
 UNREADABLE_SHARE = 0.3
-"""Share of bytes that are no text above which a line counts as read at a wrong speed; sentences of boards have none."""
+"""Share of bytes that are no text above which the baud rate counts as wrong; texts of boards have none."""
 Cause = Literal["silence", "grbl", "marlin", "cr-lf", "nak", "unreadable", "other"]
 _GRBL = re.compile(rb"Grbl |ALARM:\d|error:\d|\[MSG:|<(?:Idle|Alarm|Run|Home|Hold|Door|Check|Sleep)[|,]")
 _MARLIN = re.compile(rb"Marlin|echo:|Unknown command|^start\r?$|\bT:\d", re.MULTILINE)
@@ -35,12 +34,12 @@ _BOARDS: tuple[tuple[Cause, re.Pattern[bytes], str, str], ...] = (
         "correct [positioner] port, or flash the firmware shipped with tvsbayes",
     ),
 )
-"""Boards that are known by what they say: cause, pattern, name, remedy."""
+"""Known boards: cause, pattern of their output, name, remedy."""
 
 
 @dataclass(frozen=True)
 class Heard:
-    """What was on the line instead of an answer.
+    """What was received instead of an answer.
 
     Attributes:
         cause: in a word.
@@ -54,7 +53,7 @@ class Heard:
 
 
 def explained(heard: bytes) -> Heard:
-    """Reads the cause off the bytes that arrived while an answer was waited for; whole lines or not."""
+    """The cause, from the bytes that arrived before the time-out; lines may be incomplete."""
     quote = _quoted(heard)
     if not heard:
         remedy = "check the device's supply, the cable and [positioner] port; flash the firmware if it is a new board"
@@ -88,7 +87,7 @@ def _is_message(line: bytes) -> bool:
 
 
 def _quoted(heard: bytes) -> str:
-    """The beginning of what was heard, printable."""
+    """The first bytes received, printable."""
     text = heard[:QUOTED_CHARS_MAX].decode("latin-1")
-    marks = text.encode("unicode_escape").decode() if not text.isascii() else escaped(text, QUOTED_CHARS_MAX)
-    return f'"{marks}{"..." if len(heard) > QUOTED_CHARS_MAX else ""}" ({len(heard)} bytes)'
+    printable = text.encode("unicode_escape").decode() if not text.isascii() else escaped(text, QUOTED_CHARS_MAX)
+    return f'"{printable}{"..." if len(heard) > QUOTED_CHARS_MAX else ""}" ({len(heard)} bytes)'
