@@ -12,12 +12,17 @@ import pytest
 from tvsbayes.calibration.optics import beam_components
 from tvsbayes.head.chain import HeadOptics
 from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
-from tvsbayes.instrument.parameters import HEAD_TERMS, Prior
+from tvsbayes.instrument.parameters import HEAD_TERMS, Prior, names_of
+from tvsbayes.instrument.places import line_share, seen_places
+from tvsbayes.instrument.plan import PlanBuilder
 from tvsbayes.instrument.rig import Rig, RigTable
 from tvsbayes.instrument.stereo_pair import NO_STEREO
-from tvsbayes.model.laser_path import trace
+from tvsbayes.model.gear_processes import Places
+from tvsbayes.model.headlines import SeenLine, line_deg_per_step
+from tvsbayes.model.laser_path import beam_angles, trace
 from tvsbayes.model.parameter_space import model_of
 from tvsbayes.twin.physics import mirror_chain
+from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import draw_truth
 
 SMALL_RAD = np.radians(10 / 3600)
@@ -35,6 +40,7 @@ POINTING = {
     "tangent_flexure_deg": lambda a, e: (0.0, -1 / np.tan(e)),
 }
 """TPOINT's -IA, AN, -AW, NPAE, CA, TF, TX: what they add to azimuth and elevation."""
+TERM_DEG = 0.3
 ROUNDING = 1e-11
 """Of unit vectors; mm of origins are a hundred times longer."""
 
@@ -87,6 +93,42 @@ def test_twin_and_model_are_the_same_optics(truths):
         for seen, own, wanted in zip(found, robot, expected, strict=True):
             assert np.abs(np.stack([x[k] for x in seen], axis=1) - wanted).max() < 100 * ROUNDING
             assert np.abs(np.stack(np.broadcast_arrays(*own), axis=1) - wanted).max() < 100 * ROUNDING
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("azimuth_zero_deg", [0.0, 180.0])
+def test_headlines_count_on_around_the_circle_and_through_the_zenith(azimuth_zero_deg):
+    """Pan over 300 deg, tilt from 20 to 130: model and twin have the line over all of it, that of the gears."""
+    rng, plan = np.random.default_rng(52), PlanBuilder()
+    plan.home()
+    for pan, tilt in zip(rng.permutation(range(-3000, 3001, 600)), rng.permutation(range(400, 2601, 220)), strict=True):
+        plan.move(int(pan), int(tilt))
+        plan.look()
+    still = names_of("transmission_error_deg", "play_variation_deg", "creep_deg")
+    table = RigTable(dict.fromkeys(names_of("degrees_per_step"), Prior(0.05, 0.0005)), mechanism=SIGHTING_HEAD)
+    terms = dict.fromkeys(
+        (term.name for term in HEAD_TERMS.values() if term.name in table.priors), Prior(0.0, TERM_DEG)
+    )
+    true = {**table.priors, **terms, **dict.fromkeys(still, Prior(0.0, 0.0))}
+    true |= {"azimuth_zero_deg": Prior(azimuth_zero_deg, 0.1), "tangent_flexure_deg": Prior(0.0, 0.0)}
+    rig = Rig(table, NO_STEREO, true, {}, {}, {"sighting_sd_deg": 0.005}, {"move_s": 1.0, "look_s": 1.0})
+    for seed in range(4):
+        run = simulate(rig, tuple(plan.steps), seed)
+        p, spots = run.truth.parameters, run.campaign.spots
+        at = seen_places(run.campaign.moves, [spot.move for spot in spots], table)
+        with jax.enable_x64(True):
+            model = model_of(jnp.array([*(p[n] for n in HEAD.rig_names), *np.zeros(24)]), mechanism=HEAD)
+            places = Places(*map(jnp.asarray, (at.steps, at.on_tilt, np.ones(len(at.steps), bool))))
+            pose_rad = np.radians(run.truth.reference_pose_deg)
+            line = SeenLine(pose_rad, places, line_share(at, np.ones(len(spots), bool)))
+            none, mirrors = jnp.zeros(2 * len(at.steps)), beam_angles(model.optics, *jnp.asarray(pose_rad))
+            found = np.asarray(line_deg_per_step(model, line, none, mirrors)).reshape(2, 2).mean(axis=1)
+        expected = np.array(list(run.truth.effective_deg_per_step(run.campaign).values()))
+        both = expected.reshape(2, 2).mean(axis=1)
+        assert np.abs(found - both).max() < 1e-9 * 0.05
+        ratios = np.array([p["degrees_per_step.pan"], p["degrees_per_step.tilt"]])
+        # Terms move a direction by some of them, more by the tangent of the elevation, over at least 110 deg.
+        assert np.abs(both / ratios - 1).max() < 6 * TERM_DEG / 110
 
 
 def test_offsets_by_hand():

@@ -191,13 +191,19 @@ def line_deg_per_step(
         tilt = jnp.where(places.on_tilt, turned, seen.pose_rad[1])
         beam = trace(model.optics, pan, tilt).direction
         azimuth, elevation = jnp.arctan2(beam.y, beam.x), jnp.arctan2(beam.z, jnp.hypot(beam.x, beam.y))
-        # The beam turns with the mirrors but for degrees: the rest tells on which turn it is.
+        # An axis that goes through the zenith counts on.
+        beyond = jnp.cos(jnp.pi - elevation - turned) > jnp.cos(elevation - turned)
+        elevation = jnp.where(beyond, jnp.pi - elevation, elevation)
         rest = jnp.where(places.on_tilt, elevation, azimuth) - turned
-        parts = seen.share * (turned + rest - jnp.round(rest / (2 * jnp.pi)) * (2 * jnp.pi))
+        # The beam turns with the mirrors but for degrees and a constant: their mean tells on which turn it is.
+        sine, cosine = (jnp.sum(jnp.where(used, part(rest), 0.0), axis=1) for part in (jnp.sin, jnp.cos))
+        turns = jnp.round((rest - places.by_axis(jnp.arctan2(sine, cosine))) / (2 * jnp.pi))
+        parts = seen.share * (turned + rest - turns * (2 * jnp.pi))
         return jnp.sum(jnp.where(on_axis, parts, 0.0), axis=1)
 
     on_axis = jnp.stack([~places.on_tilt, places.on_tilt])
-    lined, local = jnp.any(on_axis & (seen.share != 0), axis=1), jnp.diagonal(mirrors.jacobian)
+    used = on_axis & (seen.share != 0)
+    lined, local = jnp.any(used, axis=1), jnp.diagonal(mirrors.jacobian)
     ideal = counted + places.by_axis(zero)
     whole = jnp.where(lined, slope(ideal + error), gears.ratio_rad_per_step * local)
     of_mirrors = jnp.where(lined, slope(ideal) / gears.ratio_rad_per_step, local)

@@ -82,13 +82,19 @@ def _mirror_deg(
 
 
 def _beam_deg(parameters: Mapping[str, float], axis: int, angle_deg: np.ndarray, others_deg: float) -> np.ndarray:
-    """Azimuth or elevation (n,) of the beam for mirror angles of that axis, counted on over full turns."""
+    """Azimuth or elevation (n,) of the beam for mirror angles of that axis, counted on over full turns and zenith."""
     moving, other = np.radians(angle_deg), np.full(len(angle_deg), np.radians(others_deg))
     psi, beta = (moving, other) if axis == 0 else (other, moving)
     direction = mirror_chain(psi, beta, parameters)[1]
-    beam = np.arctan2(direction[:, 1], direction[:, 0]) if axis == 0 else np.arcsin(direction[:, 2])
-    # The beam follows its mirror to some degrees.
-    return np.degrees(moving + np.angle(np.exp(1j * (beam - moving))))
+    beam = np.arctan2(direction[:, 1], direction[:, 0])
+    if axis == 1:
+        beam = np.arcsin(direction[:, 2])
+        folded = np.abs(np.angle(np.exp(1j * (np.pi - beam - moving)))) < np.abs(np.angle(np.exp(1j * (beam - moving))))
+        beam[folded] = np.pi - beam[folded]
+    # The beam follows its mirror to some degrees, but for the azimuth of a head's zero.
+    ahead = np.exp(1j * (beam - moving))
+    constant = np.angle(ahead.mean())
+    return np.degrees(moving + constant + np.angle(ahead * np.exp(-1j * constant)))
 
 
 def _mirror_slope(parameters: Mapping[str, float], axis: int, angle_deg: np.ndarray, others_deg: float) -> np.ndarray:
