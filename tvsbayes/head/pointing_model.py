@@ -121,9 +121,11 @@ def pointing_model(campaign: Campaign) -> PointingModel:
             remedy="sight more directions",
         )
     frames = tangent_frames(angles)
-    turned = np.exp(1j * np.radians(angles[:, 0] - float(np.real(values[RATIOS[0]])) * steps[:, 0]))
     if "azimuth_zero_deg" in names:
-        values["azimuth_zero_deg"] = float(np.degrees(np.angle(turned.mean())))
+        # On the turn that is nearest to the prior.
+        zero = priors["azimuth_zero_deg"].value
+        ahead = np.exp(1j * np.radians(angles[:, 0] - priors[RATIOS[0]].value * steps[:, 0] - zero))
+        values["azimuth_zero_deg"] = zero + float(np.degrees(np.angle(ahead.mean())))
     errors = np.ones(len(names))
     for _ in range(STEPS_MAX):
         off = _off_deg(values, steps, frames).real.ravel()
