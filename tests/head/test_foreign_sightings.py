@@ -12,7 +12,7 @@ from tvsbayes.files.foreign_table import table_of
 from tvsbayes.head.foreign_sightings import (
     SIGHTING_FIELDS,
     STEP_DEG,
-    line_slope,
+    line_of,
     sighting_field,
     sightings_of_table,
 )
@@ -72,6 +72,20 @@ def test_counters_and_radians_with_a_row_that_was_refused():
     assert "1 sighting left out" in " ".join(found.assumed)
 
 
+@pytest.mark.parametrize(("azimuth_deg", "zeros"), [(0.0, {}), (170.0, {"azimuth_zero_deg": 170.0})])
+def test_a_zero_far_from_the_default_is_stated(azimuth_deg, zeros):
+    """On any turn of the azimuth; a near one lies within the default prior."""
+    columns = {
+        "pan_steps": [str(pan) for pan, _ in STEPS],
+        "tilt_steps": [str(tilt) for _, tilt in STEPS],
+        "azimuth": [str((0.01 * pan + azimuth_deg) % 360) for pan, _ in STEPS],
+        "elevation": [str(0.005 * tilt) for _, tilt in STEPS],
+    }
+    found = understood(columns)
+    assert {name: prior.value for name, prior in found.priors.items() if "zero" in name} == pytest.approx(zeros)
+    assert ("azimuth_zero_deg" in " ".join(found.assumed)) == bool(zeros)
+
+
 def test_encoders_in_radians_become_counters():
     """A scale known to a hundredth; whole turns as they stand."""
     pan = [-0.5, 0.0, 7.0]
@@ -113,8 +127,8 @@ def test_angles_of_a_joint_that_falls_are_turned_and_others_are_not():
 
 def test_no_ratio_of_angles_that_lie_on_no_line():
     rng = np.random.default_rng(3)
-    assert line_slope(np.arange(12.0), rng.uniform(0, 360, 12)) is None
-    assert line_slope(np.array([0.0, 0.0, 5.0]), np.array([1.0, 1.0, 2.0])) is None
+    assert line_of(np.arange(12.0), rng.uniform(0, 360, 12)) is None
+    assert line_of(np.array([0.0, 0.0, 5.0]), np.array([1.0, 1.0, 2.0])) is None
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ assumed and listed in words. Degrees, u standard.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
@@ -29,8 +30,11 @@ U_DEG = 0.01
 """Standard uncertainty of a sighting where a table states none; the fit scales it by what the sightings show."""
 ENCODER_U, LINE_U, CONTRAST_U = 0.01, 0.1, 0.003
 """Relative u of a ratio: of an encoder's scale, and of a line through the table; and of a contrast of directions."""
+ZERO_U_DEG, FAR_ZERO_DEG = 10.0, 20.0
+"""Of the angle at counter 0 by that line, and from where on it is stated: nearer ones lie within the default prior."""
 OFF_LINE_DEG = 10.0
 """Median distance of sightings from the line over their counters, above which it says no ratio."""
+BY_LINE = "by a line through the table; correct it in [rig.prior]"
 ANGLES = ("azimuth_deg", "elevation_deg")
 SIGHTING_FIELDS = (*MOVES.columns, *ANGLES, "u_deg", "status")
 """All that a table of sightings can give."""
@@ -70,7 +74,7 @@ class ForeignSightings:
     Attributes:
         moves: rows of `moves.csv`.
         sightings: rows of `sightings.csv`.
-        priors: of ratios, by their names, as encoders or a line through the table say them.
+        priors: of ratios and zeros, by their names, as encoders or a line through the table say them.
         encoders: axes whose counters are angles of an encoder.
         assumed: what it does not say, in words.
     """
@@ -139,7 +143,7 @@ def sightings_of_table(
         assumed += [f"{axis}_steps: angles of the joint of the URDF, which falls there" for axis in turned]
         of_joint = corrected(moves, None, Correction(flipped=turned))
         moves, assumed = of_joint.moves or (), [*assumed, *of_joint.changes]
-    priors = _ratios(moves, sightings, encoders, assumed)
+    priors = _priors(moves, sightings, encoders, assumed)
     return ForeignSightings(moves, tuple(sightings), priors, encoders, (*assumed, *changed.changes))
 
 
@@ -175,40 +179,43 @@ def _plain_numbers(table: ForeignTable, columns: dict[str, str], notation: Notat
     return _PlainTable(table, units)
 
 
-def _ratios(
+def _priors(
     moves: Sequence[Move], sightings: Sequence[Sighting], encoders: frozenset[Axis], assumed: list[str]
 ) -> dict[str, Prior]:
-    """Ratios and contrasts of encoders' steps, and of counters by a line through what was sighted there."""
+    """Ratios and contrasts of encoders' steps, and of counters by a line through what was sighted there; far zeros."""
     priors: dict[str, Prior] = {}
     for axis, field, angle in zip(AXES, COUNTERS, ANGLES, strict=True):
-        slope = _slope(moves, sightings, axis)
-        if slope is not None and slope < 0:
+        line = _line(moves, sightings, axis)
+        if line is not None and line.slope_deg < 0:
             remedy = f"add --flip {field}, or exchange two columns by --column"
             assumed.append(f"{field}: falls where {angle} grows; {remedy}")
+        elif line is not None and abs(line.zero_deg) > FAR_ZERO_DEG:
+            name = angle.replace("_deg", "_zero_deg")
+            priors[name] = Prior(line.zero_deg, ZERO_U_DEG)
+            assumed.append(f"{name}: {line.zero_deg:.3g}, u {ZERO_U_DEG:g}, {BY_LINE}")
         ratio, u = STEP_DEG, ENCODER_U
         if axis not in encoders:
-            if slope is None:
+            if line is None:
                 continue
-            ratio, u = abs(slope), LINE_U
-            line = f"{ratio:.3g} deg, u {LINE_U:.0%}, by a line through the table"
-            assumed.append(f"degrees_per_step.{axis}: {line}; correct it in [rig.prior]")
+            ratio, u = abs(line.slope_deg), LINE_U
+            assumed.append(f"degrees_per_step.{axis}: {ratio:.3g} deg, u {LINE_U:.0%}, {BY_LINE}")
         priors[f"degrees_per_step.{axis}"] = Prior(ratio, u * ratio)
         priors[f"ratio_contrast_deg_per_step.{axis}"] = Prior(0.0, CONTRAST_U * ratio)
     return priors
 
 
-def _slope(moves: Sequence[Move], sightings: Sequence[Sighting], axis: Axis) -> float | None:
-    """Degrees a step of an axis by `line_slope`."""
+def _line(moves: Sequence[Move], sightings: Sequence[Sighting], axis: Axis) -> Line | None:
+    """`line_of` what was sighted over the counters of an axis."""
     field, angle = COUNTERS[AXES.index(axis)], ANGLES[AXES.index(axis)]
     ok = [s for s in sightings if s.status == "ok"]
     counters = np.array([getattr(moves[s.move], field) for s in ok], float)
-    return line_slope(counters, np.array([getattr(s, angle) for s in ok], float))
+    return line_of(counters, np.array([getattr(s, angle) for s in ok], float))
 
 
 def _falls(moves: Sequence[Move], sightings: Sequence[Sighting], axis: Axis) -> bool:
     """Whether counters certainly fall where the angle grows."""
-    slope = _slope(moves, sightings, axis)
-    return slope is not None and slope < 0
+    line = _line(moves, sightings, axis)
+    return line is not None and line.slope_deg < 0
 
 
 def _is_whole(cell: str) -> bool:
@@ -216,12 +223,20 @@ def _is_whole(cell: str) -> bool:
     return NUMBER.fullmatch(cell) is None or float(cell).is_integer()
 
 
-def line_slope(counters: np.ndarray, angles_deg: np.ndarray) -> float | None:
-    """Degrees a step of a line through angles of any turn, shape (n,) each; None where there is none."""
+@dataclass(frozen=True)
+class Line:
+    """Of angles over counters: degrees a step, and the angle at counter 0, -180 to 180."""
+
+    slope_deg: float
+    zero_deg: float
+
+
+def line_of(counters: np.ndarray, angles_deg: np.ndarray) -> Line | None:
+    """A line through angles of any turn, shape (n,) each; None where there is none."""
     order = np.argsort(counters, kind="stable")
     steps, angles = counters[order], np.unwrap(angles_deg[order], period=360.0)
     if len(np.unique(steps)) < 3:
         return None
     slope, level = np.polyfit(steps, angles, 1).tolist()
     off = float(np.median(np.abs(angles - slope * steps - level)))
-    return slope if off < OFF_LINE_DEG and slope != 0.0 else None
+    return Line(slope, math.remainder(level, 360.0)) if off < OFF_LINE_DEG and slope != 0.0 else None
