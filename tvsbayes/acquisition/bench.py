@@ -1,8 +1,8 @@
 """Everything a run needs beside its plan and its journal: the bench of a rig file, or its twin on a virtual clock.
 
 A simulated bench draws its true rig from the seed; what its cameras see comes from the twin as centroids, or, with a
-`renderer`, as pictures that are looked at as those of the bench are. Its time goes on where the last run of its journal
-stood.
+`renderer`, as pictures that the same detector searches as on the bench. Its time continues from the end of the last run
+in its journal.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SIMULATED_START = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 
 @dataclass(frozen=True)
 class Vision:
-    """How pictures come to be seen.
+    """How pictures are made and searched for spots.
 
     Attributes:
         detector: finds spots in pictures; by default they wait as `undetected`.
@@ -63,10 +63,10 @@ class Bench:
         operator: is asked before the laser and for every sheet.
         clock: for settling.
         utc: the time of day, for `time_s`.
-        details: what to write down of device and cameras at the start.
+        details: of device and cameras, for the event `start`.
         annotate: further entries of every motion's event (the twin's true angles).
         conclude: called with the campaign folder once the run has ended.
-        warnings: what the user should know before it begins.
+        warnings: shown before the run begins.
     """
 
     positioner: Positioner
@@ -109,22 +109,22 @@ def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench
 
 @contextmanager
 def simulated(
-    rig: Rig, seed: int, before: Recorded, vision: Vision, board: EmulatedBoard | None = None
+    rig: Rig, seed: int, record: Recorded, vision: Vision, board: EmulatedBoard | None = None
 ) -> Iterator[Bench]:
-    """The twin on the device model; with a renderer, seen by its cameras.
+    """The twin on the device model; with a renderer, its cameras take pictures.
 
     Args:
         rig: the declared rig.
         seed: of everything random.
-        before: what the journal holds of earlier runs.
-        vision: how its pictures are made and seen.
-        board: runs the firmware itself, in real time, in the place of its model.
+        record: earlier runs, from the journal.
+        vision: how its pictures are made and searched.
+        board: runs the firmware itself, in real time, instead of its model.
     """
-    starts = before.starts
+    starts = record.starts
     instrument = Instrument(rig, seed, starts) if board is None else EmulatedInstrument(rig, seed, starts, board)
     positioner, clock = instrument.positioner(), instrument.clock
-    # Virtual time goes on where the last run stood.
-    start = SIMULATED_START + datetime.timedelta(seconds=max((move.time_s for move in before.moves), default=0.0))
+    # Virtual time continues from the end of the last run.
+    start = SIMULATED_START + datetime.timedelta(seconds=max((move.time_s for move in record.moves), default=0.0))
 
     def bench(observer: Observer) -> Bench:
         return Bench(

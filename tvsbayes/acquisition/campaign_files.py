@@ -1,4 +1,4 @@
-"""The campaign files beside a journal: derived from it at any time, kept where somebody edited them, repaired with it.
+"""The campaign files beside a journal: derived from it at any time, copied where they were edited, repaired with it.
 
 `moves.csv` and `spots.csv` follow `log.jsonl` and can be derived again; `campaign.toml` and `stereo.json` are written
 once a homing is logged. A reader finds a whole campaign at any moment.
@@ -43,19 +43,19 @@ def campaign_of(record: Recorded, settings: Campaign) -> Campaign:
 def write_derived(campaign: Campaign, folder: Path, tables_only: bool = False) -> None:
     """Writes the four campaign files, or the tables that grow, so that the folder is readable at any moment.
 
-    Moves go before spots: a spot never names a move that is not there yet. Spots that `detect` has found since in
-    frames that waited keep what it found. A file that is as it should be is not written again.
+    Moves are written before spots: a spot never names a move that is missing. Spots that `detect` has found since then
+    in waiting frames keep its result. A file that is up to date is not written again.
 
     Raises:
         InputError: the folder cannot be written.
     """
     folder = Path(folder)
     for name, data in _files(campaign, folder, tables_only).items():
-        if not _holds(folder / name, data):
+        if not _has_content(folder / name, data):
             write_atomically(folder / name, data)
 
 
-def _holds(path: Path, data: bytes) -> bool:
+def _has_content(path: Path, data: bytes) -> bool:
     try:
         return path.read_bytes() == data
     except OSError:
@@ -77,21 +77,21 @@ def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[
 
 
 def keep_edited(campaign: Campaign, folder: Path) -> dict[str, Path]:
-    """Copies of campaign files that hold what is not in the journal, before they are written again.
+    """Copies campaign files that hold more than the journal, before they are written again.
 
-    Somebody may have refused spots, written readings, or stated priors since. Tables that only lack the latest rows
-    were left so by the run itself.
+    Spots may have been refused, readings or priors added by hand. Tables that only lack the latest rows are not copied:
+    the run itself leaves them so.
 
     Args:
-        campaign: what the journal says.
+        campaign: from the journal.
         folder: campaign folder.
 
     Returns:
         The copies made, by the name of the file: `spots.edited-1.csv` and so on, or `spots.longer-1.csv` where the
-        table only goes on behind what the journal has, as after a loss of the journal's end.
+        table only has more rows than the journal, as after a loss of the journal's end.
     """
-    folder, kept = Path(folder), {}
-    longer = _longer(campaign, folder)
+    folder, copies = Path(folder), {}
+    longer = _extra_rows(campaign, folder)
     for name, data in _files(campaign, folder).items():
         path = folder / name
         if not path.is_file():
@@ -103,14 +103,14 @@ def keep_edited(campaign: Campaign, folder: Path) -> dict[str, Path]:
         while (copy := path.with_name(f"{path.stem}.{kind}-{number}{path.suffix}")).exists():
             number += 1
         write_atomically(copy, present)
-        kept[name] = copy
-    return kept
+        copies[name] = copy
+    return copies
 
 
-def _longer(campaign: Campaign, folder: Path) -> dict[str, int]:
-    """Tables that have what the journal has and more behind it, by name with the number of rows more.
+def _extra_rows(campaign: Campaign, folder: Path) -> dict[str, int]:
+    """Number of additional rows of tables that have all rows of the journal and more, by name.
 
-    Whether steps were lost in a segment stands in the journal at its end: a status may be older or newer.
+    The journal knows at the end of a segment whether steps were lost: a status may be older or newer.
     """
     try:
         present = read_campaign(folder)
@@ -121,15 +121,15 @@ def _longer(campaign: Campaign, folder: Path) -> dict[str, int]:
         return len(table) == len(journal) and all(map(_same_look, table, journal))
 
     moves, looks = len(campaign.moves), len(campaign.spots)
-    more = {
+    extra_rows = {
         "moves.csv": len(present.moves) - moves if present.moves[:moves] == campaign.moves else 0,
         "spots.csv": len(present.spots) - looks if same(present.spots[:looks], campaign.spots) else 0,
     }
-    return {name: rows for name, rows in more.items() if rows > 0}
+    return {name: rows for name, rows in extra_rows.items() if rows > 0}
 
 
 def _same_look(row: Spot, journal: Spot) -> bool:
-    """Whether a row of spots.csv is the journal's look, whatever `detect` or a homing has said of it since."""
+    """Whether a row of spots.csv is the journal's look, whatever `detect` or a homing has changed since."""
     if journal.status == UNDETECTED and row.spot == journal.spot:
         return True
     lost = LOST_STEPS in (row.status, journal.status)
@@ -137,7 +137,7 @@ def _same_look(row: Spot, journal: Spot) -> bool:
 
 
 def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
-    """Spots of the present spots.csv that wait in the journal and were found since."""
+    """Spots that wait in the journal and that `detect` has found since, from the present spots.csv."""
     if not (folder / "spots.csv").is_file() or all(spot.status != UNDETECTED for spot in campaign.spots):
         return {}
     waiting = {spot.spot: spot for spot in campaign.spots if spot.status == UNDETECTED}
@@ -193,7 +193,7 @@ def check_journal(folder: Path) -> dict[str, object]:
 
 
 def _compared(record: Recorded, present: Campaign, empty: bool) -> list[str]:
-    """What the tables of a campaign lack of its journal, and what the journal lacks of them."""
+    """Warnings of rows that the tables of a campaign lack, or its journal."""
     moves, looks = len(record.moves) - len(present.moves), len(record.spots) - len(present.spots)
     warnings = []
     if moves > 0 or looks > 0:
@@ -212,9 +212,9 @@ def _compared(record: Recorded, present: Campaign, empty: bool) -> list[str]:
 
 
 def behind_journal(folder: Path, present: Campaign) -> str:
-    """Which looks the journal of a campaign holds and its table lacks, in words; "" for none or without a journal.
+    """A message about looks that spots.csv lacks and the journal has; "" for none or without a journal.
 
-    What is wrong with a damaged journal is left to `check_journal`.
+    A damaged journal is left to `check_journal`.
     """
     try:
         require_journal(folder, "")
@@ -230,28 +230,28 @@ def behind_journal(folder: Path, present: Campaign) -> str:
 
 
 def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
-    """Copies what is whole of a journal, and writes the campaign that it holds, into a new folder.
+    """Copies the intact lines of a journal into a new folder, and writes their campaign there.
 
-    Moves and looks that follow a gap without a new homing are kept in the journal, do not count, and are counted apart.
+    Moves and looks after a gap without a new homing stay in the journal, do not count, and are counted separately.
 
     Raises:
-        InputError: no journal, nothing whole, a folder that holds something, or campaign files that are damaged too.
+        InputError: no journal, no intact line, a folder that is not empty, or campaign files that are damaged too.
     """
     require_journal(folder, "only folders written by `tvsbayes acquire` have a journal to repair")
-    # Rig, stereo and header stand in files of their own, written once and not touched since.
-    before = _settings_of(folder)
-    done = repair(folder, to)
+    # Rig, stereo and header are in other files, written once and not changed since.
+    settings = _settings_of(folder)
+    result = repair(folder, to)
     records = read_journal(to).records
     record = recorded(records)
     if record.moves:
-        write_derived(campaign_of(record, before), to)
+        write_derived(campaign_of(record, settings), to)
     ignored = set(record.ignored_lines)
     return {
-        **asdict(done),
+        **asdict(result),
         "moves": len(record.moves),
         "looks": len(record.spots),
-        "moves_not_counted": sum(one.event == "moved" for one in records if one.line in ignored),
-        "looks_not_counted": sum(one.event == "looked" for one in records if one.line in ignored),
+        "moves_not_counted": sum(r.event == "moved" for r in records if r.line in ignored),
+        "looks_not_counted": sum(r.event == "looked" for r in records if r.line in ignored),
     }
 
 

@@ -1,6 +1,6 @@
-"""Is the instrument fit for a campaign? One check after the other, each with what to do.
+"""Whether the instrument is fit for a campaign: a series of checks, each with its remedy.
 
-Nothing moves but in `contract`. The laser stays off unless the caller asks for the laser check, and then is on for one
+Nothing moves but in `contract`. The laser stays off unless the caller asks for the laser check, and is then on for one
 picture; a positioner that is not homed refuses it. Seconds where a name says `_s`; grey levels 0 to 255.
 """
 
@@ -49,7 +49,7 @@ SHARPNESS_MIN = 3.0
 
 @dataclass(frozen=True)
 class Check:
-    """One finding: `status` is "ok", "warning", "fault" or "skipped"; `remedy` says what to do, "" for ok."""
+    """One result: `status` is "ok", "warning", "fault" or "skipped"; `remedy` is "" for ok."""
 
     name: str
     status: str
@@ -58,7 +58,7 @@ class Check:
 
     @classmethod
     def judged(cls, name: str, found: str, remedy: str) -> Check:
-        """A warning where there is something to do, else "ok"."""
+        """A warning where there is a remedy, else "ok"."""
         return cls(name, "warning" if remedy else "ok", found, remedy)
 
 
@@ -71,7 +71,7 @@ def examine(
     open_camera: Callable[[], StereoCamera] | None = None,
     clock: Clock = time,
 ) -> list[Check]:
-    """All checks of an instrument, in the order in which their faults should be cured.
+    """All checks of an instrument, in the order in which to remove their faults.
 
     Args:
         rig: the rig file.
@@ -79,11 +79,11 @@ def examine(
         laser: whether the laser may be switched on for one picture; the caller has stated the hazard.
         open_positioner: in place of the rig file's.
         open_camera: in place of the rig file's cameras.
-        clock: for the timings.
+        clock: of the timings.
     """
     checks = [_rig(rig), *_disk(folder, clock)]
     positioner: Positioner | None = None
-    more: list[Check] = []
+    device_checks: list[Check] = []
     try:
         if open_positioner is None:
             on_port = rig.positioner.get("driver", DEFAULT_DRIVER) in ON_PORTS
@@ -92,10 +92,10 @@ def examine(
             if rig.positioner.get("port") or not on_port:
                 open_positioner = partial(positioner_of, rig)
         if open_positioner is not None:
-            positioner, more = _positioner(open_positioner, clock)
-        checks += more
-        camera, more = _camera(rig, open_camera, positioner, clock)
-        checks += more
+            positioner, device_checks = _positioner(open_positioner, clock)
+        checks += device_checks
+        camera, device_checks = _camera(rig, open_camera, positioner, clock)
+        checks += device_checks
         try:
             checks.append(_laser(positioner, camera, laser))
         finally:
@@ -122,17 +122,17 @@ def contract(
         return [Check("contract", "fault", found, remedy)]
     ranges = [(low or 0, high or 0) for low, high in (rig.limits.steps[axis] for axis in AXES)]
     (a, b), (c, d) = ranges
-    quarter, three = ((a + k * (b - a) // 4, c + k * (d - c) // 4) for k in (1, 3))
+    quarter, three_quarters = ((a + k * (b - a) // 4, c + k * (d - c) // 4) for k in (1, 3))
     beyond = b + 1, quarter[1]
     stop = StopKey()
     broken: dict[str, list[str]] = {}
-    # There is no look worth finishing: the first Ctrl-C interrupts, and the driver is closed by it.
+    # No look is to be finished: the first Ctrl-C interrupts, and the driver is closed.
     stop.requested = True
     size = rig.stereo.image_width, rig.stereo.image_height
     try:
         with stop:
             positioner = positioner_of(rig) if open_positioner is None else open_positioner()
-            broken["positioner"] = positioner_violations(positioner, [quarter, three], beyond)
+            broken["positioner"] = positioner_violations(positioner, [quarter, three_quarters], beyond)
             camera = cameras_of(rig) if open_camera is None else open_camera()
             broken["cameras"] = camera_violations(camera, *size)
     except TvsError as error:
@@ -160,26 +160,25 @@ def _rig(rig: Rig) -> Check:
 
 def _disk(folder: Path, clock: Clock) -> list[Check]:
     """Room, and the time that a flush takes."""
-    place = folder
-    while not place.is_dir() and place != place.parent:
-        place = place.parent
+    while not folder.is_dir() and folder != folder.parent:
+        folder = folder.parent
     try:
-        free = shutil.disk_usage(place).free
+        free = shutil.disk_usage(folder).free
         remedy = f"free at least {DISK_FREE_BYTES / 1e9:.0f} GB for 700 looks" * (free < DISK_FREE_BYTES)
         room = Check.judged("disk", f"{free / 1e9:.1f} GB free", remedy)
-        disk, name = Disk(), place / f".tvsbayes-doctor-{os.getpid()}"
+        disk, path = Disk(), folder / f".tvsbayes-doctor-{os.getpid()}"
         start = clock.monotonic()
-        descriptor = disk.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        descriptor = disk.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         try:
             disk.write(descriptor, b"x" * 4096)
             disk.fsync(descriptor)
         finally:
             disk.close(descriptor)
-            name.unlink()
+            path.unlink()
         seconds = clock.monotonic() - start
     except OSError as error:
         found = escaped(error.strerror or str(error))
-        return [Check("disk", "fault", found, f"make {escaped(str(place), 200)} writable, or name another folder")]
+        return [Check("disk", "fault", found, f"make {escaped(str(folder), 200)} writable, or name another folder")]
     remedy = "write to a local disk, not to a network or a memory card" * (seconds > FLUSH_SLOW_S)
     return [room, Check.judged("disk flush", f"{1000 * seconds:.1f} ms", remedy)]
 
@@ -188,13 +187,13 @@ def _ports(rig: Rig) -> Check:
     ports = serial_ports()
     listed = ", ".join(f"{p.name} ({p.description}{', Teensy' if p.teensy else ''})" for p in ports) or "none"
     listed = escaped(listed, 400)
-    wanted = rig.positioner.get("port")
-    if not wanted:
+    stated_port = rig.positioner.get("port")
+    if not stated_port:
         return Check("port", "fault", f"ports: {listed}", 'write port = "..." into [positioner] of the rig file')
-    if all(port.name != wanted for port in ports) and not Path(str(wanted)).exists():
+    if all(port.name != stated_port for port in ports) and not Path(str(stated_port)).exists():
         remedy = "plug the device in, or correct [positioner] port; on Linux join the group dialout"
-        return Check("port", "fault", f"{escaped(str(wanted))} is not there; ports: {listed}", remedy)
-    return Check("port", "ok", escaped(str(wanted)))
+        return Check("port", "fault", f"{escaped(str(stated_port))} is not there; ports: {listed}", remedy)
+    return Check("port", "ok", escaped(str(stated_port)))
 
 
 def _failed(name: str, error: TvsError) -> Check:
@@ -210,9 +209,9 @@ def _positioner(open_positioner: Callable[[], Positioner], clock: Clock) -> tupl
     except TvsError as error:
         return None, [_failed("firmware", error)]
     version = escaped(positioner.identity.get("fw", "unknown"))
-    other = version != FIRMWARE_VERSION and "driver" not in positioner.identity
-    found = f"version {version}" + f", shipped is {FIRMWARE_VERSION}" * other
-    remedy = "flash the firmware shipped with tvsbayes; this one speaks the same protocol" * other
+    unlike = version != FIRMWARE_VERSION and "driver" not in positioner.identity
+    found = f"version {version}" + f", shipped is {FIRMWARE_VERSION}" * unlike
+    remedy = "flash the firmware shipped with tvsbayes; this one speaks the same protocol" * unlike
     checks = [Check.judged("firmware", found, remedy)]
     for warning in getattr(positioner, "warnings", ()):
         checks.append(Check("positioner", "warning", warning, "see data/docs/instrument.md, Your own hardware"))
@@ -238,14 +237,14 @@ def _positioner(open_positioner: Callable[[], Positioner], clock: Clock) -> tupl
 
 
 def _switches(state: DeviceState) -> Check:
-    """Home and limit switches, so that their wiring shows before anything moves; press them by hand and ask again."""
+    """Home and limit switches: pressed by hand, they show their wiring before anything moves."""
     pairs = zip(AXES, state.home_pressed, state.limit_open, strict=True)
-    words = (
+    states = (
         f"{axis}: home {'pressed' if home else 'free'}, limit {'open' if limit else 'closed'}"
         for axis, home, limit in pairs
     )
     remedy = "turn the axis back by hand; if it stands free, check the wire of its limit switches"
-    return Check.judged("switches", "; ".join(words), remedy * any(state.limit_open))
+    return Check.judged("switches", "; ".join(states), remedy * any(state.limit_open))
 
 
 def _camera(
@@ -295,14 +294,14 @@ def _picture(side: str, picture: np.ndarray, white: int) -> list[Check]:
     return [exposure, Check.judged(f"focus {side}", f"Laplacian variance {sharpness:.1f}", blurred)]
 
 
-def _laser(positioner: Positioner | None, camera: StereoCamera | None, wanted: bool) -> Check:
+def _laser(positioner: Positioner | None, camera: StereoCamera | None, requested: bool) -> Check:
     """Whether both cameras see the spot; the laser is off afterwards, whatever happens."""
     if positioner is None or camera is None:
         return Check("laser", "skipped", "needs positioner and cameras", "cure the faults above first")
-    if not wanted:
+    if not requested:
         return Check("laser", "skipped", "not requested", "run doctor with --laser, goggles on")
     stop = StopKey()
-    # There is no look worth finishing: the first Ctrl-C interrupts.
+    # No look is to be finished: the first Ctrl-C interrupts.
     stop.requested = True
     try:
         with stop:

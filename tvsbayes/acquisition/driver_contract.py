@@ -1,8 +1,8 @@
-"""What every driver of a positioner or of cameras must do, tried out on one: for authors of drivers, and for ours.
+"""A test of what every driver of a positioner or of cameras must do, our own and those of others.
 
-`positioner_violations` moves the motors and switches the laser on: on real hardware goggles on, nothing in the way.
-Nobody can try a reset, an unplugging or a blocked axis from here; data/docs/instrument.md, "Your own hardware", has the
-promises that these concern. Counters in motor steps.
+`positioner_violations` moves the motors and switches the laser on: on real hardware goggles on, nothing in the way. A
+reset, an unplugging or a blocked axis cannot be tested here; data/docs/instrument.md, "Your own hardware", has their
+promises. Counters in motor steps.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def positioner_violations(
     """
     broken: list[str] = []
 
-    def expect(good: bool, promise: str) -> None:
-        if not good:
+    def expect(kept: bool, promise: str) -> None:
+        if not kept:
             broken.append(promise)
 
     try:
@@ -49,9 +49,9 @@ def positioner_violations(
         for on in (True, False):
             expect(positioner.laser(on).laser_on is on, f"laser({on}) returns once the device has said so")
             expect(positioner.state().laser_on is on, f"state tells the laser behind laser({on})")
-        before = _at(positioner.state())
+        counters = _at(positioner.state())
         expect(_refused(lambda: positioner.move_to(*forbidden)), f"{forbidden} is refused: a DeviceFault with a remedy")
-        expect(_at(positioner.state()) == before, "what is refused moves nothing")
+        expect(_at(positioner.state()) == counters, "what is refused moves nothing")
         positioner.laser(True)
         expect(not positioner.home().state.laser_on, "the laser is off behind home")
         positioner.laser(True)
@@ -59,7 +59,7 @@ def positioner_violations(
         positioner.laser(True)
     finally:
         positioner.close()
-        # A second call finds nothing to close.
+        # A second close is harmless.
         positioner.close()
     return list(dict.fromkeys(broken))
 

@@ -2,7 +2,7 @@
 
 A driver is an entry point of the group `tvsbayes.positioners` or `tvsbayes.cameras`: a function that takes the `Rig`
 and returns a connected `Positioner` or an open `StereoCamera` (data/docs/instrument.md, "Your own hardware"). Our own
-are known without one, so that a source tree without an installation has them.
+need none, so that a source tree without an installation has them.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def positioner_of(rig: Rig) -> Positioner:
         InputError: no such driver, or one that cannot work with what the rig file states.
         DeviceFault: it cannot be reached.
     """
-    made: Positioner = _made(POSITIONERS, str(rig.positioner.get("driver", DEFAULT_DRIVER)), rig)
-    return made
+    positioner: Positioner = _connected(POSITIONERS, str(rig.positioner.get("driver", DEFAULT_DRIVER)), rig)
+    return positioner
 
 
 def cameras_of(rig: Rig) -> StereoCamera:
@@ -54,15 +54,15 @@ def cameras_of(rig: Rig) -> StereoCamera:
         InputError: no such driver, or one that cannot work with what the rig file states.
         DeviceFault: they cannot be opened or set.
     """
-    made: StereoCamera = _made(CAMERAS, str(rig.cameras.get("driver", DEFAULT_CAMERAS)), rig)
-    return made
+    camera: StereoCamera = _connected(CAMERAS, str(rig.cameras.get("driver", DEFAULT_CAMERAS)), rig)
+    return camera
 
 
 def connect_trigger(positioner: Positioner, camera: StereoCamera) -> None:
-    """Lets a positioner's trigger line start the exposures of cameras that wait for one.
+    """Connects a positioner's trigger line to cameras that expose on a pulse.
 
     Raises:
-        InputError: they wait, and the positioner has no such line.
+        InputError: the cameras need a pulse, and the positioner has no such line.
     """
     if not getattr(camera, "wants_pulse", False):
         return
@@ -78,8 +78,8 @@ def known(group: str) -> dict[str, str]:
     return {**OWN[group], **{name: value for name, value in installed.items() if name not in OWN[group]}}
 
 
-def _made(group: str, name: str, rig: Rig) -> Any:
-    """What a driver makes of a rig file; its own errors become faults with its name."""
+def _connected(group: str, name: str, rig: Rig) -> Any:
+    """The device that a driver makes from a rig file; the driver's errors become faults with its name."""
     factory = _factory(group, name)
     try:
         return factory(rig)
@@ -97,11 +97,11 @@ def _factory(group: str, name: str) -> Callable[[Rig], Any]:
         raise entry_refusal("driver", _TABLES[group], "driver", escaped(name), ", ".join(drivers), remedy)
     module, _, function = drivers[name].partition(":")
     try:
-        made: Callable[[Rig], Any] = getattr(importlib.import_module(module), function)
+        factory: Callable[[Rig], Any] = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
         found = f"driver {escaped(name)} cannot be loaded: {escaped(str(error), 200)}"
         remedy = "install the package that brings it anew, with all that it needs"
         raise InputError(
             "driver", f"{found}; {remedy}", column=f"{_TABLES[group]}.driver", found=found, remedy=remedy
         ) from error
-    return made
+    return factory

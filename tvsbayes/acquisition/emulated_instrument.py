@@ -18,7 +18,7 @@ from tvsbayes.positioner.serial_port import BAUD, serial_opener
 
 
 class BoardClock(VirtualClock):
-    """This computer's clock, which the board follows; `now_us` is when it was last asked."""
+    """This computer's clock, which the board follows; `now_us` is its last reading."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ class EmulatedInstrument(Instrument):
 
 
 class _BoardLink:
-    """A serial link after whose every answer the twin knows what the board has done."""
+    """A serial link that brings the twin up to date with the board at every answer."""
 
     def __init__(self, link: Link, board: EmulatedBoard):
         self._link, self._board = link, board

@@ -1,8 +1,8 @@
 """The engine that runs a plan on an instrument: home, place, move, look, each on the disk before the next.
 
-A plan describes, the engine does. Whatever ends a run (the plan's end, Ctrl-C, a fault of device, camera or disk),
-the laser is switched off, the end is written down, and the folder is a readable campaign as soon as the first homing
-is logged. `recorded` tells from the journal what is done; a resumed run homes into a new segment, asks for the sheet,
+A plan describes, the engine does. Whatever ends a run (the plan's end, Ctrl-C, a fault of device, camera or disk), the
+laser is switched off, the end is written down, and the folder is a readable campaign as soon as the first homing is
+logged. `recorded` derives from the journal what is done; a resumed run homes into a new segment, asks for the sheet,
 repeats reference looks and goes on with the first step that is not done.
 
 Counters in motor steps, seconds where a name says `_s`, raw px.
@@ -42,7 +42,7 @@ PLACEMENTS_MAX = 3
 """How often the operator is asked for the same sheet before the run stops."""
 REFERENCE_LOOKS = 3
 REFERENCE_SHIFT_MAX_PX = 20.0
-"""Change of a reference spot after a resume that is worth a word. A stop error and a home offset of 0.1 degrees
+"""Change of a reference spot after a resume that is worth a warning. A stop error and a home offset of 0.1 degrees
 together move it by 2 px, a sheet put back within 1 mm by as much (f 700 px, 85 mm baseline, 175 mm)."""
 SETTLE_S = 0.3
 """Rest between motion and picture where the rig file states none: a light mechanism rings for about 0.1 s."""
@@ -54,7 +54,7 @@ DEPTH_SHARE = 0.25
 
 
 class _Stopped(Exception):
-    """Ends the plan early, in good order."""
+    """Ends the plan early, in an orderly way."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class _Scene:
 
     Attributes:
         target: where the sheet stands, "" before the first placement.
-        placement: which placement of the plan that is, from 0; -1 before the first.
-        counters: (pan, tilt) of the motion before the last and of the last, fewer at the beginning.
+        placement: its number in the plan, from 0; -1 before the first.
+        counters: (pan, tilt) of the last two motions, fewer at the beginning.
     """
 
     target: str
@@ -83,7 +83,7 @@ class Acquisition:
         stop: the stop key, in force while `run` runs.
         show: called with the progress.
         estimate: the running estimate; a run that meets its target ends.
-        live: where the run is published, and what is asked of it; by default nobody looks.
+        live: where the run is published, and its requests; by default not shown.
         place_command: a program that places the sheet before the operator is asked; by default there is none.
     """
 
@@ -119,7 +119,7 @@ class Acquisition:
             DeviceFault: device, camera or disk failed; the journal says so too.
             KeyboardInterrupt: interrupted twice, or ended from outside; laser off, journal closed.
         """
-        # What stands in the journal where an error of the program itself ends the run.
+        # For the journal, where an error of the program itself ends the run.
         reason, exit_code, fault = "crashed", 1, None
         with self._stop:
             try:
@@ -137,7 +137,7 @@ class Acquisition:
                     reason, exit_code = error.code, error.exit_code
                 raise
             finally:
-                # An assignment, no call: Python lets no signal in before it has taken effect.
+                # An assignment, no call: no signal handler runs before it takes effect.
                 self._stop.closing = True
                 # The positioner is closed first: light matters more than the log.
                 try:
@@ -154,17 +154,17 @@ class Acquisition:
         setup = setup_entries(self.rig, bool(self.journal.records[0].data.get("synthetic")))
         self._log.write(Start(utc=self._log.utc_text(), setup=setup, **self.bench.details))
         resumed = self._log.recorder.result()
-        # Before the first homing nothing counts, whatever was placed.
+        # Before the first homing nothing counts, placements included.
         next_row = resumed.next_step if resumed.moves else 0
         self._log.keep_edited()
-        self._recover(resumed, next_row)
-        reason = self._followed(next_row)
+        self._restore(resumed, next_row)
+        reason = self._follow_plan(next_row)
         if reason != "interrupted" and self._log.recorder.moves:
             self._log.close_segment(self.bench.positioner.home())
         return reason
 
-    def _followed(self, row: int) -> str:
-        """Follows the plan from a row on, as it is changed meanwhile; why it ended."""
+    def _follow_plan(self, row: int) -> str:
+        """Follows the plan from a row on, with its changes; returns why it ended."""
         while row < len(self.plan):
             step = self.plan[row]
             self._control.heed()
@@ -175,12 +175,12 @@ class Acquisition:
             self._report(step)
             self._do(step)
             row += 1
-            if step.action == "look" and self._estimate is not None and self._estimated(row, self._estimate):
+            if step.action == "look" and self._estimate is not None and self._update_estimate(row, self._estimate):
                 return "target met"
         return "done"
 
-    def _estimated(self, row: int, estimate: RunningEstimate) -> bool:
-        """Takes in what the fits say after the look before a row; whether the target is met."""
+    def _update_estimate(self, row: int, estimate: RunningEstimate) -> bool:
+        """Takes the result of the fits after the look before `row`; whether the target is met."""
         met = estimate.update(self._log.ok_looks)
         if not isinstance(estimate, Replanning):
             self._live.estimated(estimate.latest)
@@ -200,7 +200,7 @@ class Acquisition:
         return plan_seconds(self.rig, self.plan[:row]) / 60
 
     def _adapt(self, row: int, proposal: Proposal | None) -> None:
-        """Puts proposed looks in the place of those that are left; the change is in the journal before it holds."""
+        """Replaces the remaining looks by proposed ones; the journal has the change before it takes effect."""
         if proposal is None:
             return
         steps = proposal.continued(row, self._log.recorder.state.target)
@@ -229,8 +229,8 @@ class Acquisition:
         switches = report.state.pan_steps, report.state.tilt_steps
         state = self.bench.positioner.move_to(*counters)
         self.bench.clock.sleep(self._settle_s)
-        ways = zip(AXES, counters, switches, strict=True)
-        pan, tilt = (_approach(axis, to - start, report.ends_negative) for axis, to, start in ways)
+        legs = zip(AXES, counters, switches, strict=True)
+        pan, tilt = (_approach(axis, target - start, report.ends_negative) for axis, target, start in legs)
         event = Homed(
             step=step,
             time_s=self._log.now_s(),
@@ -245,36 +245,36 @@ class Acquisition:
     def _place(self, target: str, placement: int, remark: str, step: int | None) -> None:
         if self._place_command is not None:
             self.bench.positioner.laser(False)
-            done = self._place_command.run(target, self.rig.sheets_mm[target], placement, self._control.meanwhile)
-            self._log.write(structs.replace(done, time_s=self._log.now_s()))
+            event = self._place_command.run(target, self.rig.sheets_mm[target], placement, self._control.meanwhile)
+            self._log.write(structs.replace(event, time_s=self._log.now_s()))
             self._heed_stop()
-            require_placed(done)
+            require_placed(event)
         if not self.bench.operator.place(target, self.rig.sheets_mm[target], placement, remark):
             raise _Stopped
         self._log.write(Placed(step=step, target=target, again=step is None, utc=self._log.utc_text()))
         self._placement, self._check_depth = placement, True
 
-    def _move(self, pan: int, tilt: int, step: int | None, **more: Any) -> None:
+    def _move(self, pan: int, tilt: int, step: int | None, **entries: Any) -> None:
         self.journal.append("intent", step=step, action="move", pan_steps=pan, tilt_steps=tilt)
         state = self.bench.positioner.move_to(pan, tilt)
         self.bench.clock.sleep(self._settle_s)
-        reached: dict[str, Any] = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps}
-        more = {**more, **self.bench.annotate()}
-        self._log.write(Moved(step=step, time_s=self._log.now_s(), **reached, **more))
+        counters: dict[str, Any] = {"pan_steps": state.pan_steps, "tilt_steps": state.tilt_steps}
+        entries |= self.bench.annotate()
+        self._log.write(Moved(step=step, time_s=self._log.now_s(), **counters, **entries))
 
     def _look(self, step: int | None, experiment: int | None, point: int | None, reference: Spot | None = None) -> None:
         for _ in range(PLACEMENTS_MAX):
             observation = self._observe()
-            wrong = self._misplaced(observation)
-            if wrong is None:
+            misplacement = self._misplaced(observation)
+            if misplacement is None:
                 break
-            self._place(self._log.recorder.state.target, self._placement, wrong, None)
+            self._place(self._log.recorder.state.target, self._placement, misplacement, None)
         else:
             remedy = "check the sheet and [sheets] of the rig file, then go on with --resume"
-            raise fault("placement", f"the sheet is not where it should be: {wrong}", remedy)
+            raise fault("placement", f"the sheet is not where it should be: {misplacement}", remedy)
         frames = tuple(self.journal.store(name, data) for name, data in observation.pictures.items())
         sighting = observation.sighting
-        more = {} if reference is None else self._compared(reference, sighting.pixels_px)
+        comparison = {} if reference is None else self._compared(reference, sighting.pixels_px)
         event = Looked(
             step=step,
             spot=self._spot,
@@ -287,7 +287,7 @@ class Acquisition:
             correlations=sighting.correlations,
             frames=frames,
             time_s=self._log.now_s(),
-            **more,
+            **comparison,
         )
         self._log.write(event)
         pictures = {name: data for name, data in observation.pictures.items() if name.startswith("frames/")}
@@ -297,7 +297,7 @@ class Acquisition:
         self._log.derive()
 
     def _compared(self, reference: Spot, pixels_px: Four | None) -> dict[str, Any]:
-        """What a look at a spot seen before says of it; a large change is worth a word."""
+        """The change of a reference spot, for the event of the look; a large one is a warning."""
         shift_px = None if pixels_px is None else _shift_px(reference, pixels_px)
         if shift_px is None or shift_px > REFERENCE_SHIFT_MAX_PX:
             change = "is not seen" if shift_px is None else f"has moved by {shift_px:.0f} px"
@@ -305,13 +305,13 @@ class Acquisition:
         return {"reference_of": reference.spot, "shift_px": shift_px}
 
     def _observe(self) -> Observation:
-        """A look; one that finds no spot is repeated, the last one counts."""
+        """A look, repeated while it finds no spot; the last one counts."""
         attempt = 0
         while True:
             try:
                 observation = self.bench.observer.observe(self.bench.positioner, self._spot)
             except LightRefused:
-                # Laser off was asked for in mid-look: the look is taken again once the run goes on.
+                # Laser off was requested in mid-look: the look is repeated once the run goes on.
                 self._heed_stop()
                 continue
             attempt += 1
@@ -322,55 +322,55 @@ class Acquisition:
             self._live.remarked(f"look {self._spot}: {status}; taken again")
 
     def _misplaced(self, observation: Observation) -> str | None:
-        """Why the sheet seems to stand elsewhere, judged by the first spot after it was placed."""
+        """Why the sheet seems misplaced, by the first spot after its placement; None where it does not."""
         pixels = observation.sighting.pixels_px
         if not self._check_depth or observation.sighting.status != "ok" or pixels is None:
             return None
-        depth = float(triangulate(self.rig.stereo, np.array([pixels]))[0, 0])
-        nominal = self.rig.sheets_mm[self._log.recorder.state.target]
-        others = [abs(x - nominal) for x in self.rig.sheets_mm.values() if x != nominal]
-        tolerance = DEPTH_SHARE * min([*others, nominal])
-        if abs(depth - nominal) > tolerance:
-            return f"its spot lies at X = {depth:.0f} mm, {self._log.recorder.state.target} is at {nominal:.0f} mm"
+        depth_mm = float(triangulate(self.rig.stereo, np.array([pixels]))[0, 0])
+        target = self._log.recorder.state.target
+        nominal_mm = self.rig.sheets_mm[target]
+        distances_mm = [abs(x - nominal_mm) for x in self.rig.sheets_mm.values() if x != nominal_mm]
+        tolerance_mm = DEPTH_SHARE * min([*distances_mm, nominal_mm])
+        if abs(depth_mm - nominal_mm) > tolerance_mm:
+            return f"its spot lies at X = {depth_mm:.0f} mm, {target} is at {nominal_mm:.0f} mm"
         self._check_depth = False
         return None
 
     def _scene(self, row: int) -> _Scene:
-        """What the plan has made of sheet and counters when the step in this row begins."""
-        done = run_plan(self.plan[:row], self.rig)
-        counters = tuple((move.pan_steps, move.tilt_steps) for move in done.moves[-2:])
-        return _Scene(done.sheet, len(done.targets) - 1, counters)
+        """Sheet and counters at the beginning of the step in this row, by the plan."""
+        run = run_plan(self.plan[:row], self.rig)
+        counters = tuple((move.pan_steps, move.tilt_steps) for move in run.moves[-2:])
+        return _Scene(run.sheet, len(run.targets) - 1, counters)
 
-    def _recover(self, before: Recorded, next_row: int) -> None:
-        """Goes back to where the plan stood: the sheet, a new segment with reference looks, and what a repair lost.
+    def _restore(self, record: Recorded, next_row: int) -> None:
+        """Restores the state of the plan: the sheet, a new segment with reference looks, and looks that a repair lost.
 
-        Where the plan stood is read off the plan. What the journal has last may be a reference look that was
-        interrupted too.
+        That state comes from the plan: the last event of the journal may be of an interrupted reference look.
         """
-        rest, scene = self.plan[next_row:], self._scene(next_row)
-        lost = [s for s in self.plan[:next_row] if s.action == "look" and s.step not in before.looked_steps]
-        if not (rest or lost):
+        remaining, scene = self.plan[next_row:], self._scene(next_row)
+        lost = [s for s in self.plan[:next_row] if s.action == "look" and s.step not in record.looked_steps]
+        if not (remaining or lost):
             return
         if scene.target:
             self._place(scene.target, scene.placement, "as before the interruption", None)
-        homes_next = bool(rest) and rest[0].action == "home"
-        if not before.moves or (homes_next and not lost):
+        homes_next = bool(remaining) and remaining[0].action == "home"
+        if not record.moves or (homes_next and not lost):
             return
-        self._home(None, before.home_steps)
-        self._look_at_references(before)
+        self._home(None, record.home_steps)
+        self._look_at_references(record)
         for step in lost:
             self._retake(step)
-        if lost and rest and rest[0].action != "place":
+        if lost and remaining and remaining[0].action != "place":
             self._put_sheet(scene, "as before the looks that were taken again")
-        if rest and not homes_next:
+        if remaining and not homes_next:
             self._move(*scene.counters[-1], None)
 
-    def _look_at_references(self, before: Recorded) -> None:
-        """Looks again where the last spots on the present sheet were seen."""
+    def _look_at_references(self, record: Recorded) -> None:
+        """Looks again at the last spots on the present sheet."""
         candidates: dict[tuple[int, int], Spot] = {}
-        for spot in reversed(before.spots):
+        for spot in reversed(record.spots):
             if spot.status == "ok" and spot.target == self._log.recorder.state.target:
-                move = before.moves[spot.move]
+                move = record.moves[spot.move]
                 candidates.setdefault((move.pan_steps, move.tilt_steps), spot)
         for (pan, tilt), spot in list(candidates.items())[:REFERENCE_LOOKS]:
             self._heed_stop()
@@ -378,12 +378,12 @@ class Acquisition:
             self._look(None, None, None, reference=spot)
 
     def _retake(self, step: PlanStep) -> None:
-        """Takes a look of the plan that a repair of the journal lost, reached as the plan reached it."""
+        """Repeats a look of the plan that a repair of the journal lost, reached by the same motions."""
         self._heed_stop()
         self._report(step)
         scene = self._scene(step.step)
         self._put_sheet(scene, "for a look that was lost")
-        # From the counters before: the same sense, so the same side of the play.
+        # From the previous counters: the same sense, so the same side of the play.
         for counters in scene.counters:
             self._move(*counters, None)
         self._look(step.step, step.experiment, step.point)
@@ -398,7 +398,7 @@ class Acquisition:
             raise _Stopped
 
     def _report(self, step: PlanStep) -> None:
-        left = self.plan[step.step :]
+        remaining = self.plan[step.step :]
         spots = self._log.recorder.spots
         latest = None if self._estimate is None else self._estimate.latest
         progress = Progress(
@@ -408,20 +408,20 @@ class Acquisition:
             sum(s.action == "look" for s in self.plan),
             sum(spot.status not in ("ok", UNDETECTED) for spot in spots),
             self._retries,
-            plan_seconds(self.rig, left),
-            _doing(step),
+            plan_seconds(self.rig, remaining),
+            _step_text(step),
             "" if latest is None else latest.text,
         )
         self._show(progress)
         self._live.estimated(latest)
-        self._live.publish(progress=progress, coming=tuple(map(_doing, left[1 : 1 + COMING_MAX])))
+        self._live.publish(progress=progress, coming=tuple(map(_step_text, remaining[1 : 1 + COMING_MAX])))
         self._publish()
 
     def _write_request(self, event: Asked) -> None:
         self._log.write(structs.replace(event, time_s=self._log.now_s()))
 
     def _begin_live(self) -> None:
-        """What does not change while the run goes on."""
+        """Publishes what does not change during the run."""
         stereo, created = self.rig.stereo, self.journal.records[0].data
         self._live.publish(
             name=str(created.get("name", "")),
@@ -432,12 +432,12 @@ class Acquisition:
         self._live.begun()
 
     def _publish(self) -> None:
-        """Device, pause and warnings as they are now."""
+        """Publishes device, pause and warnings."""
         state = PAUSED if self._control.paused else RUNNING
         self._live.publish(state=state, device=self._control.device, warnings=tuple(self._log.warnings[-REMARKS_MAX:]))
 
 
-def _doing(step: PlanStep) -> str:
+def _step_text(step: PlanStep) -> str:
     """A step in words."""
     return {
         "home": "homing",
@@ -448,11 +448,11 @@ def _doing(step: PlanStep) -> str:
 
 
 def _approach(axis: str, steps: int, ends_negative: bool) -> str:
-    """The side from which an axis stands after homing, which may end in the negative sense, and so many steps more."""
-    known = abs(steps) >= CLEARED_STEPS or (steps <= 0 and ends_negative)
-    return direction_of(axis, 1 if steps > 0 else -1) if known else "unknown"
+    """The side from which an axis arrives by `steps` after a homing, which may end in the negative sense."""
+    cleared = abs(steps) >= CLEARED_STEPS or (steps <= 0 and ends_negative)
+    return direction_of(axis, 1 if steps > 0 else -1) if cleared else "unknown"
 
 
-def _shift_px(before: Spot, now: Four) -> float:
+def _shift_px(reference: Spot, pixels_px: Four) -> float:
     """Largest change of a coordinate since the reference, px."""
-    return round(max(abs(float(a) - b) for a, b in zip(pixels_of([before])[0], now, strict=True)), 3)
+    return round(max(abs(float(a) - b) for a, b in zip(pixels_of([reference])[0], pixels_px, strict=True)), 3)

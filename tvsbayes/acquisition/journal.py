@@ -1,10 +1,10 @@
 """The journal of an acquisition, `log.jsonl`: append-only, a CRC on every line, chained, on the disk before it counts.
 
 One event per line: `CRC32 NUMBER PREVIOUS-CRC32 JSON`. The first CRC, in eight lower-case hexadecimal digits, covers
-the rest of the line; the second is the first one of the line before, so that a missing, swapped or repeated line
-shows. Frames are files of their own, written under a temporary name, flushed to the disk, renamed, their folder
-flushed; only then is the line with their SHA-256 appended and flushed; only then has the event happened. So a crash
-or a power cut at any moment leaves every acknowledged event whole, and at most one torn line at the end.
+the rest of the line; the second is the first one of the line before, so that a missing, swapped or repeated line is
+detected. Frames are files of their own, written under a temporary name, flushed to the disk, renamed, their folder
+flushed; only then is the line with their SHA-256 appended and flushed; only then has the event happened. So a crash or
+a power cut at any moment leaves every acknowledged event whole, and at most one torn line at the end.
 
 Times in the events: UTC for people, `time_s` for the campaign (seconds since the first start, never decreasing).
 """
@@ -45,7 +45,7 @@ FRAME_FOLDERS = ("frames", "dark")
 """Pictures with the laser on and, for the background, off."""
 LOG_LINE = re.compile(rb"([0-9a-f]{8}) (0|[1-9][0-9]{0,8}) ([0-9a-f]{8}) (\{[ -~]*\})")
 EMPTY_REMEDY = "nothing was written down: begin anew in another folder, without --resume"
-"""For a run that was killed before its first event, or whose journal was emptied."""
+"""Remedy for a run that was killed before its first event, or whose journal was emptied."""
 REPAIR_REMEDY = "copy what is whole to a new folder: tvsbayes check FOLDER --repair-to NEW"
 
 
@@ -93,7 +93,7 @@ class Record:
 
 
 def refused(record: Record, found: object) -> InputError:
-    """The refusal of an event that states what it cannot, or contradicts those before it."""
+    """The refusal of an event that is invalid or contradicts those before it."""
     allowed, remedy = f"the entries of the event {record.event}", "tvsbayes check FOLDER --repair-to NEW"
     found = escaped(str(found), 80)
     return refusal("event", file=LOG, line=record.line, found=found, allowed=allowed, remedy=remedy)
@@ -105,7 +105,7 @@ def kind_of(event: type[Event]) -> str:
 
 
 def event_of[E: Event](record: Record, *kinds: type[E]) -> E | None:
-    """An event of one of these kinds, its entries held to their types; None of every other kind.
+    """An event of one of these kinds, its entries checked by type; None for every other kind.
 
     Raises:
         InputError: an entry is missing or of another type, with the line of the journal.
@@ -150,8 +150,8 @@ def encode(number: int, previous: int, event: str, data: dict[str, object]) -> b
     return line
 
 
-def parse_line(line: bytes, place: int) -> Record | str:
-    """The line of a file, without its line feed, or what is wrong with it, whatever stands before it."""
+def parse_line(line: bytes, line_number: int) -> Record | str:
+    """The line of a file, without its line feed, or its fault; the lines before it do not matter."""
     match = LOG_LINE.fullmatch(line) if len(line) < LINE_BYTES_MAX else None
     if match is None:
         return "no event"
@@ -163,11 +163,13 @@ def parse_line(line: bytes, place: int) -> Record | str:
     except InputError:
         return "no JSON"
     event = data.pop("event", None)
-    return Record(int(match[2]), event, data, place, int(match[3], 16), crc) if isinstance(event, str) else "no event"
+    if not isinstance(event, str):
+        return "no event"
+    return Record(int(match[2]), event, data, line_number, int(match[3], 16), crc)
 
 
 def _following(line: bytes, number: int, previous: int) -> Record | str:
-    """The line that belongs behind `number` others, the last of which has the CRC `previous`; or what is wrong."""
+    """The line that follows `number` others, the last of which has the CRC `previous`; or its fault."""
     record = parse_line(line, number + 1)
     if isinstance(record, str):
         return record
@@ -180,7 +182,7 @@ def _is_torn(tail: bytes, number: int, previous: int) -> bool:
     """Whether a bad end of the file can be an append that a crash cut short, and nothing else.
 
     An append begins at a line's start and ends with its line feed; power loss may leave any part of it, and blocks of
-    zero bytes for what was not written. A whole line with one wrong byte is none of that.
+    zero bytes for what was not written. A whole line with one wrong byte is no such append.
     """
     if tail.endswith(b"\n"):
         return b"\x00\x00" in tail
@@ -193,8 +195,8 @@ def _is_torn(tail: bytes, number: int, previous: int) -> bool:
 def require_journal(folder: Path, remedy: str) -> None:
     """Refuses a folder without `log.jsonl`."""
     if not (folder / LOG).is_file():
-        place = escaped(str(folder / LOG), 200)
-        raise refusal("missing-file", file=place, found="no journal", allowed="a journal", remedy=remedy)
+        shown_path = escaped(str(folder / LOG), 200)
+        raise refusal("missing-file", file=shown_path, found="no journal", allowed="a journal", remedy=remedy)
 
 
 def read_log(folder: Path) -> bytes:
@@ -204,9 +206,9 @@ def read_log(folder: Path) -> bytes:
         "events": (data.count(b"\n"), LOG_EVENTS_MAX),
         "entries": (sum(map(data.count, (b",", b"[", b"{"))), LOG_ENTRIES_MAX),
     }
-    for what, (count, most) in counts.items():
-        if count > most:
-            found, allowed, remedy = f"{count} {what}", f"at most {most}", "split the run into several campaigns"
+    for unit, (count, limit) in counts.items():
+        if count > limit:
+            found, allowed, remedy = f"{count} {unit}", f"at most {limit}", "split the run into several campaigns"
             raise refusal("size", file=LOG, found=found, allowed=allowed, remedy=remedy)
     return data
 
@@ -243,15 +245,15 @@ def read_journal(folder: Path) -> Reading:
 class Journal:
     """A journal open for appending; one writer at a time.
 
-    After a failure nothing more is written: a failed flush may have dropped what it was to save, so that trying again
-    would acknowledge what is not there.
+    After a failure nothing more is written: a failed flush may have dropped its data, and a second try would
+    acknowledge an event that is not on the disk.
     """
 
     def __init__(self, folder: Path, descriptor: int, reading: Reading, disk: Disk):
         self.folder = Path(folder)
         self.records = list(reading.records)
         self.torn = reading.torn
-        """Bytes that were cut off when this journal was opened; they are kept in a file of their own."""
+        """Bytes that were cut off when this journal was opened; a separate file keeps them."""
         self._descriptor: int | None = descriptor
         self._crc, self._size, self._disk = reading.crc, reading.size, disk
         self._dirty: set[Path] = set()
@@ -289,7 +291,7 @@ class Journal:
 
     @classmethod
     def open(cls, folder: Path, disk: Disk | None = None) -> Journal:
-        """An existing journal, to go on with; a torn last line is kept aside and cut off, half a frame removed.
+        """An existing journal, to be continued; a torn last line is cut off and kept, an unfinished frame removed.
 
         Raises:
             InputError: damaged, or another program writes it.
@@ -314,7 +316,7 @@ class Journal:
                     "journal", file=LOG, found="no event", allowed="at least the event created", remedy=EMPTY_REMEDY
                 )
             for name in FRAME_FOLDERS:
-                # Nobody else writes frames, and their lock is ours.
+                # This program holds the lock: no other one writes frames.
                 for unfinished in (folder / name).glob(".*.png.tmp"):
                     unfinished.unlink(missing_ok=True)
         except OSError as error:
@@ -329,7 +331,7 @@ class Journal:
         """Writes a frame; it counts once an event that names it is appended.
 
         Raises:
-            ValueError: a name that is no frame's.
+            ValueError: not the name of a frame.
             DeviceFault: the disk refuses; the journal is closed.
         """
         if not FRAME_NAME.fullmatch(name):
@@ -337,7 +339,7 @@ class Journal:
         target = self.folder / name
         temporary = target.with_name(f".{target.name}.tmp")
         with self._guarded():
-            # Only for a frame: a run that states centroids leaves no empty folders behind.
+            # Created for the first frame: a run without pictures leaves no empty folders.
             if not target.parent.is_dir():
                 target.parent.mkdir()
                 self._dirty.add(self.folder)
@@ -373,7 +375,7 @@ class Journal:
         return record
 
     def close(self) -> None:
-        """Gives the journal back; everything appended is on the disk already."""
+        """Closes the journal; everything appended is on the disk already."""
         if self._descriptor is not None:
             descriptor, self._descriptor = self._descriptor, None
             os.close(descriptor)
@@ -409,7 +411,7 @@ def _lock(descriptor: int) -> None:
         if sys.platform == "win32":
             import msvcrt
 
-            # Far behind the end, so that readers are not kept out.
+            # Far behind the end, so that readers are not locked out.
             os.lseek(descriptor, LOG_BYTES_MAX + 1, os.SEEK_SET)
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
         else:
@@ -417,7 +419,7 @@ def _lock(descriptor: int) -> None:
 
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        # What flock(2) and _locking say of a lock that somebody holds; anything else is a disk without locks.
+        # Errors of flock(2) and _locking for a lock that is held; any other is a disk without locks.
         if error.errno not in (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK):
             found, allowed = escaped(error.strerror or str(error)), "a disk that can lock files"
             raise refusal("lock", file=LOG, found=found, allowed=allowed, remedy="use a local disk") from error

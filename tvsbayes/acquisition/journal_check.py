@@ -1,7 +1,7 @@
-"""A journal and its frames checked, and what is whole of a damaged one copied.
+"""Checks a journal and its frames, and copies the intact lines of a damaged one.
 
-CRC and chain find accidents; they are no seal against forgery. A missing end is not visible from inside: a run that
-ended by itself has a `stop` event, and frames without a line are listed.
+CRC and chain find accidents; they do not prevent forgery. A missing end leaves no trace in the lines: a run that ended
+by itself has a `stop` event, and frames without an event are listed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tvsbayes.files.disk import make_folder, read_bytes
 
 @dataclass(frozen=True)
 class Verification:
-    """What a check of a journal and its frames found; whatever is damaged raises instead.
+    """The result of a check of a journal and its frames; damage raises instead.
 
     Attributes:
         records: number of events.
@@ -50,7 +50,7 @@ class Verification:
 
     @property
     def warnings(self) -> list[str]:
-        """What the user should know."""
+        """Warnings for the user."""
         warnings = []
         if self.torn_bytes:
             warnings.append(f"{LOG} ends in {self.torn_bytes} bytes of an unfinished line, which --resume cuts off")
@@ -68,7 +68,7 @@ def frames_of(record: Record) -> list[Frame]:
     """The frames that an event names.
 
     Raises:
-        InputError: entries that no journal of ours holds.
+        InputError: entries that no journal of this program has.
     """
     try:
         return msgspec.convert(record.data.get("frames", []), list[Frame])
@@ -78,7 +78,7 @@ def frames_of(record: Record) -> list[Frame]:
 
 
 def _frame_problem(folder: Path, frame: Frame) -> str | None:
-    """What is wrong with a stored frame, None for nothing."""
+    """The fault of a stored frame, None for none."""
     try:
         data = read_bytes(folder / frame.name, FRAME_BYTES_MAX, folder)
     except InputError as error:
@@ -90,26 +90,26 @@ def _frame_problem(folder: Path, frame: Frame) -> str | None:
 
 def orphans(folder: Path, records: tuple[Record, ...]) -> list[str]:
     """Frames on the disk that no event names, sorted."""
-    named = {frame.name for record in records for frame in frames_of(record)}
+    in_events = {frame.name for record in records for frame in frames_of(record)}
     stored = (f"{name}/{p.name}" for name in FRAME_FOLDERS for p in sorted((Path(folder) / name).glob("*.png")))
-    return [name for name in stored if name not in named]
+    return [name for name in stored if name not in in_events]
 
 
 def verify(folder: Path) -> Verification:
     """Reads the journal of a folder and compares every frame with its SHA-256.
 
     Raises:
-        InputError: damage, with line number and what to do.
+        InputError: damage, with line number and remedy.
     """
     folder = Path(folder)
     reading = read_journal(folder)
-    named: set[str] = set()
+    names: set[str] = set()
     count = 0
     for record in reading.records:
         for frame in frames_of(record):
-            # Each is read once: a log of thousands of lines that name one large file would take hours.
-            problem = "a frame that an event before it names" if frame.name in named else _frame_problem(folder, frame)
-            named.add(frame.name)
+            # Each frame is read once: thousands of lines that name one large file would take hours.
+            problem = "a frame that an event before it names" if frame.name in names else _frame_problem(folder, frame)
+            names.add(frame.name)
             if problem is not None:
                 raise refusal(
                     "frame",
@@ -132,9 +132,9 @@ class Repair:
 
     Attributes:
         kept: events copied.
-        lost_lines: lines of the old journal that are not whole.
+        lost_lines: damaged lines of the old journal.
         lost_frames: frames that are missing or changed; their looks stay, without these frames.
-        torn_bytes: length of an unfinished last line that was left out.
+        torn_bytes: length of an unfinished last line, which is not copied.
     """
 
     kept: int = 0
@@ -148,60 +148,59 @@ IN_MOTION, ENDS_OF_MOTION = {"created", "gap", "intent", "verified"}, {"homed", 
 
 
 def _in_written_order(records: list[Record]) -> list[Record]:
-    """Whole lines by their numbers, which their checksums hold; as they stand where two have one number."""
+    """Intact lines by their numbers, which their checksums cover; in file order where a number is repeated."""
     numbers = {record.number for record in records}
     return sorted(records, key=lambda record: record.number) if len(numbers) == len(records) else records
 
 
 def repair(folder: Path, to: Path) -> Repair:
-    """Copies what is whole into a new folder; the old one stays as it is.
+    """Copies the intact lines into a new folder; the old one stays as it is.
 
-    Whole lines that stand in another order than they were written in are put back into it. Where lines are missing a
-    `gap` event stands: what followed it without a new homing cannot be trusted, because nobody knows which motion is
-    missing; one that says that it lost no motion leaves the rest its worth. Frames that
-    are not what their event says are left out and named.
+    Intact lines are sorted into the order in which they were written. A `gap` event replaces missing lines: events
+    after it do not count until a new homing, because an unknown motion may be missing, unless it states that no motion
+    was lost. Frames that differ from their event are left out and listed.
 
     Raises:
-        InputError: nothing whole, or `to` holds something.
+        InputError: no intact line, or `to` is not empty.
     """
     folder, to = Path(folder), Path(to)
     data = read_log(folder)
-    lines = [parse_line(line, place) for place, line in enumerate(data.split(b"\n")[:-1], start=1)]
-    done = Repair(torn_bytes=len(data) - data.rfind(b"\n") - 1)
-    events = _in_written_order([line for line in lines if isinstance(line, Record)])
-    done.lost_lines = [place for place, line in enumerate(lines, start=1) if isinstance(line, str)]
+    parsed = [parse_line(line, number) for number, line in enumerate(data.split(b"\n")[:-1], start=1)]
+    result = Repair(torn_bytes=len(data) - data.rfind(b"\n") - 1)
+    events = _in_written_order([line for line in parsed if isinstance(line, Record)])
+    result.lost_lines = [number for number, line in enumerate(parsed, start=1) if isinstance(line, str)]
     if not events:
         allowed, remedy = "at least one whole line", "take the campaign again"
         raise refusal("journal", file=LOG, found="nothing whole", allowed=allowed, remedy=remedy)
     make_folder(to, empty=True)
-    first = events[0].data if events[0].event == "created" else {}
-    created = {key: value for key, value in first.items() if key != "format"}
+    header = events[0].data if events[0].event == "created" else {}
+    created = {key: value for key, value in header.items() if key != "format"}
     journal = Journal.create(to, **{**created, "repaired": True})
-    expected, ended, last = 1 if first else 0, False, "created"
-    named: set[str] = set()
+    expected, stopped, previous = 1 if header else 0, False, "created"
+    names: set[str] = set()
     try:
-        for record in events[1:] if first else events:
+        for record in events[1:] if header else events:
             if record.number != expected:
-                lost = record.number - expected != 1 or last in IN_MOTION or record.event in ENDS_OF_MOTION
+                lost = record.number - expected != 1 or previous in IN_MOTION or record.event in ENDS_OF_MOTION
                 journal.append("gap", before_line=record.line, **({} if lost else {"motion_lost": False}))
-            expected, last = record.number + 1, record.event
-            kept = []
+            expected, previous = record.number + 1, record.event
+            frames = []
             for frame in frames_of(record):
-                twice = frame.name in named
-                named.add(frame.name)
-                if not twice and _frame_problem(folder, frame) is None:
-                    kept.append(journal.store(frame.name, read_bytes(folder / frame.name, FRAME_BYTES_MAX, folder)))
+                repeated = frame.name in names
+                names.add(frame.name)
+                if not repeated and _frame_problem(folder, frame) is None:
+                    frames.append(journal.store(frame.name, read_bytes(folder / frame.name, FRAME_BYTES_MAX, folder)))
                 else:
-                    done.lost_frames.append(frame.name)
+                    result.lost_frames.append(frame.name)
             content = {key: value for key, value in record.data.items() if key != "frames"}
             if "frames" in record.data:
-                content["frames"] = [frame.as_json() for frame in kept]
+                content["frames"] = [frame.as_json() for frame in frames]
             journal.append(record.event, **content)
-            done.kept += 1
-            ended = record.event == "stop"
-        if not ended:
-            journal.append("gap", before_line=len(lines) + 1)
+            result.kept += 1
+            stopped = record.event == "stop"
+        if not stopped:
+            journal.append("gap", before_line=len(parsed) + 1)
     finally:
         journal.close()
-    done.kept += bool(first)
-    return done
+    result.kept += bool(header)
+    return result

@@ -1,13 +1,13 @@
 """The events of a run's journal, as their JSON objects stand in `log.jsonl`: structs, distinguished by the key `event`.
 
-`created` opens a journal. Every motion of the plan is an `intent` before, and an order has an event of its own once it
-is done: `homed`, `placed`, `moved`, `looked`. `place_command` is a program that was to place the sheet. `adapted`
-changes the plan, `confirmed` says whether the posterior meets the target, `asked` is what somebody asked for on the
-live page, `verified` closes a segment, `start` and `stop` enclose a run, `gap` stands where a repair lost lines.
-Counters in motor steps, raw px, degrees and seconds by suffix; `utc` and `created` are ISO 8601. Fields stand in the
-order in which they are written; those that are UNSET by default may be missing.
+`created` opens a journal. An `intent` precedes every motion of the plan, and an order has an event once it is done:
+`homed`, `placed`, `moved`, `looked`. `place_command` is a run of a program that places the sheet. `adapted` changes the
+plan, `confirmed` says whether the posterior meets the target, `asked` is a request from the live page, `verified`
+closes a segment, `start` and `stop` enclose a run, `gap` stands where a repair lost lines. Counters in motor steps, raw
+px, degrees and seconds by suffix; `utc` and `created` are ISO 8601. Fields stand in the order in which they are
+written; those that are UNSET by default may be missing.
 
-A checksum finds accidents, not forgery: `journal.event_of` holds what an event states to its declaration.
+A checksum finds accidents, not forgery: `journal.event_of` checks the entries of an event against its declaration.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Four = tuple[float, float, float, float]
 
 
 class Event(Struct, frozen=True, kw_only=True, tag_field="event", tag=str.lower):
-    """Base of the events; keys that one does not know are passed over."""
+    """Base of the events; unknown keys are ignored."""
 
     def entries(self) -> dict[str, Any]:
         """The entries of its JSON object but for its kind."""
@@ -49,7 +49,7 @@ class Created(Event, frozen=True):
 
 
 class Start(Event, frozen=True):
-    """A run begins, for the first time or again: what may differ between runs, and who takes part."""
+    """A run begins, for the first time or again: settings that may differ between runs, device and cameras."""
 
     utc: str = ""
     setup: dict[str, Any] | UnsetType = UNSET
@@ -92,7 +92,7 @@ class TrueAngles(Struct, frozen=True):
 
 
 class Motion(Event, frozen=True):
-    """A motion has ended at these counters, since the campaign was created `time_s` ago.
+    """A motion has ended at these counters, `time_s` after the campaign was created.
 
     `step` is that of the plan, None for motions of a resumed run.
     """
@@ -119,7 +119,7 @@ class Homed(Motion, frozen=True):
 
 
 class Verified(Event, frozen=True):
-    """What a homing found of the segment before: (pan, tilt) switches minus counters; None where it cannot tell."""
+    """Result of a homing for the segment before: (pan, tilt) switches minus counters; None where it is unknown."""
 
     segment: int
     deviation_steps: tuple[int, int] | None
@@ -166,7 +166,7 @@ class Looked(Event, frozen=True):
 class Adapted(Event, frozen=True):
     """A change of plan: the steps that stand from row `row` on, and why they were chosen.
 
-    Each look says what the target was expected to be before it and after; `looks` are those of the estimate behind it.
+    Each look has the expected target value before and after it; `looks` is the number behind the estimate.
     """
 
     row: int
@@ -190,7 +190,7 @@ class Confirmed(Event, frozen=True):
 
 
 class AskedDevice(Struct, frozen=True):
-    """What the device answered: status, laser, boot id and counters."""
+    """The device's answer to a request: status, laser, boot id and counters."""
 
     status: str
     laser_on: bool
@@ -200,11 +200,10 @@ class AskedDevice(Struct, frozen=True):
 
 
 class Asked(Event, frozen=True, kw_only=True):
-    """What somebody asked of a run while it went on (pause, resume, stop, laser off), once the device had answered.
+    """A request to a run in progress (pause, resume, stop, laser off), once the device has answered.
 
-    `control passed on`: another browser controls, because the one before had not asked for a while.
-
-    `number` counts the requests of a run from 1; `time_s` since the campaign was created, when the device had answered.
+    `control passed on`: another browser controls, because the one before was silent for a while. `number` counts the
+    requests of a run from 1; `time_s` is the time of the device's answer since the campaign was created.
     """
 
     time_s: float | UnsetType = UNSET
@@ -224,7 +223,7 @@ class Stop(Event, frozen=True):
 class Gap(Event, frozen=True):
     """Lines were lost before a line of the journal that was repaired.
 
-    `motion_lost` is false where what is missing can be no motion: what follows counts.
+    `motion_lost` is false where the missing lines held no motion: what follows counts.
     """
 
     before_line: int

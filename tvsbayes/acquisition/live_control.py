@@ -1,13 +1,13 @@
-"""A run that heeds requests: between two looks, and for the laser at every exchange with the device.
+"""Requests to a run: served between two looks, and for the laser at every exchange with the device.
 
-Requests wait in a short queue between a page's thread and the engine's: who asks never waits for the engine, and the
-engine looks into the queue between two looks; only its own pauses wait for what comes next.
+Requests wait in a short queue between a page's thread and the engine's: the page never waits for the engine, and the
+engine reads the queue between two looks; only a paused run waits for the next request.
 
-Each request is put to the device first: it counts as acknowledged once the device has answered and the journal holds
-an `asked` event. Pause, stop and laser off switch the laser off, whatever it was. Laser off is heeded in the middle of
-a look as well: the look is broken off, the run pauses, and the look is taken again after resume. A pause ends by
-resume, stop or Ctrl-C only: if the page is gone, no light comes on until a person says so, and nothing moves after the
-step under way. Seconds where a name says `_s`.
+Each request goes to the device first: it is acknowledged once the device has answered and the journal holds an `asked`
+event. Pause, stop and laser off switch the laser off, whatever its state. Laser off is served in the middle of a look
+as well: the look is broken off, the run pauses, and the look is taken again after resume. A pause ends by resume, stop
+or Ctrl-C only: if the page is gone, the laser stays off until a person resumes, and nothing moves after the step under
+way. Seconds where a name says `_s`.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from tvsbayes.positioner.protocol import DeviceState
 PAUSE, RESUME, STOP, LASER_OFF = "pause", "resume", "stop", "laser off"
 REQUESTS = (PAUSE, RESUME, STOP, LASER_OFF)
 CONTROL_PASSED = "control passed on"
-"""No request of a page but news for the journal: another browser controls."""
+"""No request but an entry for the journal: another browser controls."""
 KEPT_MAX = 20
 """Settled requests that are still listed."""
 REQUESTED, ACKNOWLEDGED, FAILED = "requested", "acknowledged", "failed"
 PAUSE_POLL_S = 0.2
-"""How often a paused run looks whether Ctrl-C was pressed."""
+"""How often a paused run checks for Ctrl-C."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What was asked for, and what became of it.
+    """A request and its outcome.
 
     Attributes:
         number: from 1, in the order in which they came.
         what: one of `REQUESTS`, or `CONTROL_PASSED`.
-        asked_s: when, by this computer's steady clock.
+        asked_s: its time, by this computer's steady clock.
         state: requested, acknowledged (the device has answered and the journal holds it), or failed.
-        waited_s: from asking to the answer, None while it waits.
-        answer: what the device said, or why it did not.
+        waited_s: from the request to the answer, None while it waits.
+        answer: the device's answer, or why there is none.
     """
 
     number: int
@@ -55,7 +55,7 @@ class Request:
 
 
 class Requests:
-    """Those of one run, each kind waiting once at most; safe between threads. Only `wait` waits."""
+    """The requests of one run, at most one of each kind waiting; thread-safe. Only `wait` blocks."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -64,10 +64,10 @@ class Requests:
         self._closed = False
 
     def ask(self, what: str) -> Request | None:
-        """A new request; one that waits already is not made a second time. None once the run has ended.
+        """A new request, or the waiting one of the same kind. None once the run has ended.
 
-        Whatever stops the run or its light withdraws a resume that still waits: the last word counts, though laser off
-        goes before all others.
+        A request that stops the run or its light withdraws a waiting resume: the later one counts, and laser off goes
+        before all others.
 
         Raises:
             ValueError: neither one of `REQUESTS` nor `CONTROL_PASSED`.
@@ -86,29 +86,29 @@ class Requests:
             if self._closed:
                 return None
             self._count += 1
-            made = Request(self._count, what, time.monotonic())
+            new = Request(self._count, what, time.monotonic())
             settled = [request for request in self._all if request.state != REQUESTED]
-            self._all = (*settled[-KEPT_MAX:], *waiting, made)
+            self._all = (*settled[-KEPT_MAX:], *waiting, new)
             self._changed.notify_all()
-            return made
+            return new
 
     def _waiting(self) -> tuple[Request, ...]:
         return tuple(request for request in self._all if request.state == REQUESTED)
 
     def next(self, what: str | None = None) -> Request | None:
-        """The oldest that waits, of one kind where one is named; laser off goes before all others."""
+        """The oldest waiting request, of kind `what` where given; laser off goes before all others."""
         waiting = [request for request in self._waiting() if what in (None, request.what)]
         return min(waiting, key=lambda request: (request.what != LASER_OFF, request.number), default=None)
 
     def settle(self, request: Request, state: str, answer: str) -> Request:
-        """Write down what became of a request."""
+        """Record the outcome of a request."""
         settled = replace(request, state=state, waited_s=time.monotonic() - request.asked_s, answer=answer)
         with self._changed:
-            self._all = tuple(settled if one.number == request.number else one for one in self._all)
+            self._all = tuple(settled if entry.number == request.number else entry for entry in self._all)
         return settled
 
     def close(self, answer: str) -> None:
-        """The run has ended: what still waits is not carried out, and nothing new is taken."""
+        """The run has ended: waiting requests fail, and no new ones are accepted."""
         with self._changed:
             self._closed = True
             for request in self._waiting():
@@ -119,21 +119,21 @@ class Requests:
         return self._all
 
     def wait(self, longest_s: float) -> None:
-        """Until something new is asked for, or so long."""
+        """Block until there is a request, or for `longest_s`."""
         with self._changed:
             if not self._waiting():
                 self._changed.wait(longest_s)
 
 
 class LightRefused(Exception):
-    """The laser was asked to be off: the look under way is broken off."""
+    """Laser off was requested: the look under way is broken off."""
 
 
 class Control:
     """Carries requests out.
 
     Args:
-        requests: what is asked for.
+        requests: of the run.
         positioner: the device itself.
         stop: the stop key, which a request to stop presses.
         write: appends the event to the journal, with its time.
@@ -141,7 +141,7 @@ class Control:
 
     Attributes:
         paused: whether the run stands still.
-        device: what the device said last, None before it was asked.
+        device: its last state, None before the first exchange.
     """
 
     def __init__(
@@ -158,7 +158,7 @@ class Control:
         self._write, self._changed = write, changed
 
     def heed(self) -> None:
-        """Between two steps: does what was asked for; returns once the run may go on, or the stop key is pressed.
+        """Between two steps: carries requests out; returns once the run may go on, or the stop key is pressed.
 
         Raises:
             DeviceFault: the device does not answer, or the disk refuses.
@@ -169,7 +169,7 @@ class Control:
             self._carry_out_all()
 
     def meanwhile(self) -> bool:
-        """While the run waits for a computation: does what was asked for; whether the run is to go on afterwards.
+        """While the run waits for a computation: carries requests out; whether the run is to go on afterwards.
 
         Raises:
             DeviceFault: as `heed`.
@@ -178,14 +178,14 @@ class Control:
         return not self._stop.requested
 
     def darken(self) -> bool:
-        """Within a step: carries out a request for laser off; whether light is refused now."""
+        """Within a step: carries out a request for laser off; whether the laser must stay off."""
         request = self._requests.next(LASER_OFF)
         if request is not None:
             self._carry_out(request)
         return self.paused
 
     def noticed(self, state: DeviceState) -> DeviceState:
-        """What the device has just said."""
+        """Keeps and publishes a new state of the device."""
         self.device = state
         self._changed()
         return state
@@ -212,13 +212,13 @@ class Control:
 
 
 def device_text(state: DeviceState) -> str:
-    """What the device says, in words."""
+    """A device's state in words."""
     light = "on" if state.laser_on else "off"
     return f"device {state.status} at pan {state.pan_steps}, tilt {state.tilt_steps}, laser {light}"
 
 
 class HeedingPositioner:
-    """A positioner whose every exchange heeds a request for laser off first; see `Positioner` for the rest.
+    """A positioner that serves a request for laser off before every exchange; see `Positioner` for the rest.
 
     Args:
         inner: the device.
@@ -254,7 +254,7 @@ class HeedingPositioner:
         """See `Positioner.laser`.
 
         Raises:
-            LightRefused: it was to come on, and was asked to be off.
+            LightRefused: it should come on, but laser off was requested.
         """
         if self._control.darken() and on:
             raise LightRefused
@@ -264,7 +264,7 @@ class HeedingPositioner:
         """See `Positioner.state`.
 
         Raises:
-            LightRefused: the laser was asked to be off.
+            LightRefused: laser off was requested.
         """
         if self._control.darken():
             raise LightRefused

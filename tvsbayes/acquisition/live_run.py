@@ -1,9 +1,9 @@
-"""A run as it is looked at while it goes on: the engine publishes, anyone who looks reads the latest and may ask.
+"""A run in progress as its readers see it: the engine publishes snapshots, readers take the latest and send requests.
 
-Publication goes one way and is one assignment: a reader that is slow, many or dead costs the engine nothing, and
-misses what it did not read. The only way back is the queue of `live_control`. Pictures are made small by the reader.
-What is published is frozen, and bounded whatever the length of a run: the last look with its pictures, the last
-centres, estimates and remarks. Raw px, counters in motor steps, degrees per step, seconds where a name says `_s`.
+Publication is one assignment: slow, many or dead readers cost the engine nothing, and miss what they do not read. The
+only way back is the queue of `live_control`. The reader scales pictures down. Snapshots are frozen, and bounded
+whatever the length of a run: the last look with its pictures, the last centres, estimates and remarks. Raw px, counters
+in motor steps, degrees per step, seconds where a name says `_s`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class SeenLook:
 
 @dataclass(frozen=True)
 class Fault:
-    """What has ended a run: a code, the message, and what to do."""
+    """A fault that has ended a run: code, message and remedy."""
 
     code: str
     message: str
@@ -72,13 +72,13 @@ class Snapshot:
         state: running, paused or ended.
         progress: None before the first step.
         coming: the next steps, in words.
-        device: what it said last.
+        device: its last state.
         look: the last one.
         trail: centres of the last looks that count.
-        estimates: one after the other.
-        aim: what they are for.
-        remarks: what happened beside the plan, newest last.
-        warnings: what the user should know.
+        estimates: oldest first.
+        aim: of the estimates.
+        remarks: events outside the plan, newest last.
+        warnings: for the user.
         fault: what ended the run.
         reason: why it ended, "" before.
     """
@@ -105,7 +105,7 @@ class Snapshot:
 class Temperature:
     """How far an estimate has moved by its latest looks, measured by how far they should move it.
 
-    The second fit holds the looks of the first, so their difference has the variance that the new looks took away:
+    The second fit holds the looks of the first, so their difference has the variance that the new looks removed:
     u_before^2 - u_after^2 (Hausman, Econometrica 46, 1251, 1978). A drift, a knocked camera or lost steps show as
     differences of many of these.
 
@@ -120,22 +120,22 @@ class Temperature:
 
 def temperature(estimates: Sequence[Estimate]) -> Temperature | None:
     """Of the newest estimate against the last one of fewer looks and the same kind; None where there is none."""
-    after = estimates[-1] if estimates else None
-    earlier = [e for e in estimates if after is not None and e.tier == after.tier and e.looks < after.looks]
-    if after is None or not earlier:
+    latest = estimates[-1] if estimates else None
+    earlier = [e for e in estimates if latest is not None and e.tier == latest.tier and e.looks < latest.looks]
+    if latest is None or not earlier:
         return None
-    before = earlier[-1]
+    previous = earlier[-1]
     moved: dict[str, float | None] = {}
-    for name, value in after.deg_per_step.items():
-        if name in before.deg_per_step:
-            spare = before.u_deg_per_step[name] ** 2 - after.u_deg_per_step[name] ** 2
-            moved[name] = (value - before.deg_per_step[name]) / math.sqrt(spare) if spare > 0 else None
-    known = [value for value in moved.values() if value is not None]
-    return Temperature(moved, math.sqrt(sum(v * v for v in known) / len(known)) if known else None)
+    for name, value in latest.deg_per_step.items():
+        if name in previous.deg_per_step:
+            variance = previous.u_deg_per_step[name] ** 2 - latest.u_deg_per_step[name] ** 2
+            moved[name] = (value - previous.deg_per_step[name]) / math.sqrt(variance) if variance > 0 else None
+    ratios = [value for value in moved.values() if value is not None]
+    return Temperature(moved, math.sqrt(sum(v * v for v in ratios) / len(ratios)) if ratios else None)
 
 
 KINDS = ("whole", "spot")
-"""Of pictures: all of it, small; the surroundings of the spot as they are."""
+"""Of pictures: the whole picture scaled down, or the surroundings of the spot in full size."""
 
 
 class LiveRun:
@@ -145,7 +145,7 @@ class LiveRun:
         begun: called once when the run begins.
 
     Attributes:
-        requests: what is asked of the run.
+        requests: to the run.
         latest: the newest snapshot; replaced as a whole.
     """
 
@@ -155,7 +155,7 @@ class LiveRun:
         self.latest = Snapshot()
 
     def publish(self, **changes: Any) -> None:
-        """Fields of `Snapshot` that have changed. The engine's alone."""
+        """Replaces fields of the snapshot; only the engine calls it."""
         self.latest = replace(self.latest, number=self.latest.number + 1, **changes)
 
     def looked(self, look: SeenLook) -> None:
@@ -165,20 +165,20 @@ class LiveRun:
         self.publish(look=look, trail=trail)
 
     def estimated(self, estimate: Estimate | None) -> None:
-        """The latest estimate, which may be known already."""
-        before = self.latest.estimates
-        if estimate is not None and (not before or before[-1] is not estimate):
-            self.publish(estimates=(*before, estimate)[-ESTIMATES_MAX:])
+        """The latest estimate; a repeated one is ignored."""
+        estimates = self.latest.estimates
+        if estimate is not None and (not estimates or estimates[-1] is not estimate):
+            self.publish(estimates=(*estimates, estimate)[-ESTIMATES_MAX:])
 
     def remarked(self, remark: str) -> None:
-        """Something that the user should know."""
+        """A remark for the user."""
         self.publish(remarks=(*self.latest.remarks, remark)[-REMARKS_MAX:])
 
     def ended(self, reason: str, error: BaseException | None = None) -> None:
         """The run is over, after a fault where there was one."""
         fault, answer = None, "the run has ended, its last order was laser off"
         if error is not None:
-            # Nor does anybody know whether that order has arrived.
+            # Whether the last order has arrived is unknown.
             answer = "the run has ended in a fault: cut the laser's supply, it may be on"
             code, remedy = getattr(error, "code", type(error).__name__), getattr(error, "remedy", None)
             fault = Fault(str(code), str(error) or str(code), remedy or "")
@@ -189,30 +189,30 @@ class LiveRun:
         """Puts a request in the queue; False once the run has ended.
 
         Raises:
-            ValueError: nothing that can be asked for.
+            ValueError: not one of `REQUESTS`.
         """
         if what not in REQUESTS:
             raise ValueError(what)
         return self.requests.ask(what) is not None
 
     def control_passed(self) -> None:
-        """Another browser controls from now on: written down by the engine, as what was asked for is."""
+        """Another browser controls from now on; the engine logs it like a request."""
         self.requests.ask(CONTROL_PASSED)
 
     def document(self) -> dict[str, Any]:
         """The newest snapshot and the requests, as JSON holds them."""
-        now = self.latest
-        fields = asdict(replace(now, look=None, trail=()))
+        snapshot = self.latest
+        fields = asdict(replace(snapshot, look=None, trail=()))
         look = None
-        if now.look is not None:
-            look = asdict(replace(now.look, pictures={}))
-            look["pictured"] = [c for c in CAMERAS if frame_name(now.look.spot, c) in now.look.pictures]
-        moved = temperature(now.estimates)
+        if snapshot.look is not None:
+            look = asdict(replace(snapshot.look, pictures={}))
+            look["pictured"] = [c for c in CAMERAS if frame_name(snapshot.look.spot, c) in snapshot.look.pictures]
+        agreement = temperature(snapshot.estimates)
         return {
             **fields,
             "look": look,
-            "trail": [list(centre) for centre in now.trail],
-            "temperature": None if moved is None else asdict(moved),
+            "trail": [list(centre) for centre in snapshot.trail],
+            "temperature": None if agreement is None else asdict(agreement),
             "requests": [asdict(request) for request in self.requests.recent()],
         }
 
@@ -224,10 +224,10 @@ class LiveRun:
         png = look.pictures.get(frame_name(spot, camera))
         if png is None or (kind == "spot" and look.pixels_px is None):
             return None
-        first = 2 * CAMERAS.index(camera)
+        index = 2 * CAMERAS.index(camera)
         centre = None
         if look.pixels_px is not None and kind == "spot":
-            centre = look.pixels_px[first], look.pixels_px[first + 1]
+            centre = look.pixels_px[index], look.pixels_px[index + 1]
         try:
             return small_picture(decode_image(png, "picture"), centre)
         except ValueError:

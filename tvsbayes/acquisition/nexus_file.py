@@ -1,9 +1,8 @@
-"""A campaign as one NeXus file (HDF5), for anyone who reads such files and not ours.
+"""A campaign as one NeXus file (HDF5), for programs that read this format.
 
 `/entry/looks` is the default plot: centroids with their uncertainties over the looks, with the counters behind each;
-`/entry/moves` has the counters over time, `/entry/instrument` axes and cameras. The campaign's own files and the
-journal stand in `/entry/files` byte for byte, so that nothing is lost; of pictures the names and SHA-256 that the
-journal has.
+`/entry/moves` has the counters over time, `/entry/instrument` axes and cameras. The campaign's files and the journal
+are in `/entry/files` byte for byte; of pictures only the names and SHA-256 that the journal has.
 
 Counters in steps, px with the integer at the centre of a pixel, mm, degrees, seconds since `/entry/start_time`; every
 number carries its unit. Source: NeXus base classes, https://manual.nexusformat.org.
@@ -34,7 +33,7 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import CAMERAS, MOVES, PIXEL_SDS, SPOTS, Campaign, Move, Spot, read_campaign
 
 NOTHING = -1
-"""In place of an experiment or point that a look does not have."""
+"""For a look without experiment or point."""
 _FILES = {
     "campaign.toml": TOML_BYTES_MAX,
     "stereo.json": JSON_BYTES_MAX,
@@ -43,12 +42,12 @@ _FILES = {
     LOG: LOG_BYTES_MAX,
 }
 _UNITS = ("s", "steps", "px", "deg")
-"""Ends of the names of columns."""
+"""Suffixes of the names of columns."""
 
 
 @dataclass(frozen=True)
 class NexusSummary:
-    """What a file holds: rows of the tables, looks that count, events of the journal, pictures named."""
+    """Numbers in a file: rows of the tables, looks that count, events of the journal, pictures listed."""
 
     moves: int
     looks: int
@@ -65,15 +64,15 @@ def write_nexus(folder: Path, path: Path) -> NexusSummary:
         path: the file.
 
     Raises:
-        InputError: an unreadable campaign or journal, a file that is there, a folder that cannot be written.
+        InputError: an unreadable campaign or journal, an existing file, a folder that cannot be written.
     """
     import h5py
 
     folder, path = Path(folder), Path(path)
     if path.exists():
         remedy = "name another file, or move this one away; nothing is overwritten"
-        place = escaped(str(path), 200)
-        raise refusal("occupied", file=place, found="a file that is there", allowed="a new file", remedy=remedy)
+        shown_path = escaped(str(path), 200)
+        raise refusal("occupied", file=shown_path, found="a file that is there", allowed="a new file", remedy=remedy)
     campaign = read_campaign(folder)
     records = read_journal(folder).records if (folder / LOG).is_file() else ()
     buffer = io.BytesIO()
@@ -98,9 +97,9 @@ def _class(group: Any, name: str, **attributes: object) -> None:
 
 
 def _group(parent: Any, name: str, nexus_class: str, **attributes: object) -> Any:
-    made = parent.create_group(name)
-    _class(made, nexus_class, **attributes)
-    return made
+    group = parent.create_group(name)
+    _class(group, nexus_class, **attributes)
+    return group
 
 
 def _put(group: Any, name: str, value: object, unit: str = "", **attributes: object) -> None:
@@ -122,9 +121,9 @@ def _entry(entry: Any, campaign: Campaign, records: Sequence[Record]) -> None:
     created = header.get("created")
     if created is not None:
         _put(entry, "start_time", created.isoformat() if hasattr(created, "isoformat") else str(created))
-    ends = [end.utc for record in records if (end := event_of(record, Stop)) is not None]
-    if ends and ends[-1]:
-        _put(entry, "end_time", ends[-1])
+    end_times = [end.utc for record in records if (end := event_of(record, Stop)) is not None]
+    if end_times and end_times[-1]:
+        _put(entry, "end_time", end_times[-1])
     if header.get("synthetic"):
         _put(entry, "simulated", True)
     if "notes" in header:
@@ -134,7 +133,7 @@ def _entry(entry: Any, campaign: Campaign, records: Sequence[Record]) -> None:
 
 
 def _instrument(instrument: Any, campaign: Campaign) -> None:
-    """Axes with their counters, cameras with their calibration, and what the rig is believed to be."""
+    """Axes with their counters, cameras with their calibration, and the priors of the rig."""
     if "instrument" in campaign.header:
         _put(instrument, "name", str(campaign.header["instrument"]))
     for axis in AXES:
@@ -153,9 +152,9 @@ def _instrument(instrument: Any, campaign: Campaign) -> None:
     _put(pair, "rotation", np.asarray(stereo.R))
     _put(pair, "translation", np.asarray(stereo.T).ravel(), "mm")
     _put(pair, "parameter_covariance", np.asarray(stereo.parameter_covariance))
-    believed = _group(instrument, "prior", "NXcollection")
+    priors = _group(instrument, "prior", "NXcollection")
     for name, prior in campaign.rig.priors.items():
-        _put(believed, name, prior.value, uncertainty=prior.u, distribution=prior.distribution)
+        _put(priors, name, prior.value, uncertainty=prior.u, distribution=prior.distribution)
 
 
 def _moves(group: Any, campaign: Campaign) -> None:
@@ -166,9 +165,9 @@ def _moves(group: Any, campaign: Campaign) -> None:
 
 
 def _looks(group: Any, campaign: Campaign, records: Sequence[Record]) -> None:
-    """Centroids with uncertainties; what a look does not have is NaN, or -1 where numbers are whole."""
+    """Centroids with uncertainties; missing values are NaN, or -1 in columns of integers."""
     spots, moves = campaign.spots, campaign.moves
-    signals = [f"{way}_{side}" for side in CAMERAS for way in "uv"]
+    signals = [f"{coordinate}_{side}" for side in CAMERAS for coordinate in "uv"]
     _class(group, "NXdata", signal=signals[0], axes=["spot"], auxiliary_signals=signals[1:])
     times = _look_times(records)
     _put(group, "time", [times.get(spot.spot, moves[spot.move].time_s) for spot in spots], "s")
@@ -194,13 +193,13 @@ def _column(group: Any, column: Column, rows: Sequence[Move] | Sequence[Spot]) -
 
 
 def _look_times(records: Sequence[Record]) -> Mapping[int, float]:
-    """When looks were taken, by spot."""
+    """Times of looks by spot, s."""
     looks = [look for record in records if (look := event_of(record, Looked)) is not None]
     return {look.spot: look.time_s for look in looks if look.time_s is not UNSET}
 
 
 def _pictures(group: Any, records: Sequence[Record]) -> int:
-    """Names and hashes of the pictures; they themselves stay beside the campaign."""
+    """Names and hashes of the pictures, which stay in the campaign's folder; returns their number."""
     frames = [frame for record in records for frame in frames_of(record)]
     _put(group, "description", "pictures in the campaign's folder: frames/ with the laser on, dark/ with it off")
     if frames:

@@ -1,10 +1,10 @@
-"""One look: a picture without laser light, one with it, and what a detector finds in them.
+"""One look: a picture without laser light, one with it, and the spot that a detector finds in them.
 
 The laser is on only between the two pictures, and off again whatever happens. Light also proves that no picture is
-older than the look, however deep the buffers are: pictures come in the order of their exposure, so after laser-on we
-wait for the spot to appear and after laser-off for it to vanish. A look then begins with no lit picture under way, and
-what shows a spot was exposed in it. That the spot vanishes shows, too, that the laser is off; one that was there before
-laser-on is a fault.
+older than the look, however deep the buffers are: pictures come in the order of their exposure, so a look waits after
+laser-on for the spot to appear and after laser-off for it to vanish. The next look then begins with no lit picture in
+the buffers, and a picture with a spot was exposed in it. A spot that vanishes also shows that the laser is off; one
+that was there before laser-on is a fault.
 
 Raw px with the integer at the centre of a pixel; grey levels 0 to 255, also of pictures of 16 bits, kept as they are.
 """
@@ -41,12 +41,12 @@ holds back sixty."""
 SAME_PLACE_PX = 2.0
 """A spot moves by less between two pictures of a scene at rest."""
 UNSTEADY = "unsteady"
-"""Status of a look whose background changed: somebody in the picture, or the light in the room."""
+"""Status of a look whose background changed: a person in the picture, or the light in the room."""
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """What was found in a pair of pictures.
+    """The result of a detector for a pair of pictures.
 
     Attributes:
         status: "ok", "undetected", or the reason of refusal.
@@ -73,7 +73,7 @@ class Detector(Protocol):
     """Finds the spot in a pair of pictures."""
 
     def __call__(self, lit: StereoImage, dark: StereoImage) -> Sighting:
-        """`lit` with the laser on, `dark` just before without it; both state what is white."""
+        """`lit` with the laser on, `dark` just before without it; both state their full scale."""
 
 
 class Observer(Protocol):
@@ -84,7 +84,7 @@ class Observer(Protocol):
 
 
 def wait_for_detection(lit: StereoImage, dark: StereoImage) -> Sighting:
-    """The detector of those who detect later: every look is `undetected`."""
+    """The detector for a later detection: every look is `undetected`."""
     return Sighting(UNDETECTED)
 
 
@@ -95,7 +95,7 @@ class CameraObserver:
     Attributes:
         camera: the pair.
         detector: finds the spots.
-        keep_pictures: whether they go into the campaign's folder.
+        keep_pictures: whether pictures go into the campaign's folder.
     """
 
     camera: StereoCamera
@@ -107,9 +107,9 @@ class CameraObserver:
         """See `Observer.observe`.
 
         Raises:
-            DeviceFault: a camera repeats one picture, the laser went off while it was exposed, does not go off, or was
-                on before.
-            LightRefused: somebody asked for the laser to be off; it is.
+            DeviceFault: a camera repeats one picture, or the laser went off during the exposure, stayed on, or was on
+                before.
+            LightRefused: laser off was requested; it is off.
         """
         positioner.laser(False)
         dark = self._grab()
@@ -117,7 +117,7 @@ class CameraObserver:
             positioner.laser(True)
             lit, on = self._lit(positioner, dark)
         except LightRefused:
-            # No lit picture may be under way when the look is taken again; and the light proves that it is off.
+            # The buffers must hold no lit picture when the look is repeated; darkness also proves the laser off.
             self._wait_for_darkness(dark)
             raise
         finally:
@@ -140,9 +140,9 @@ class CameraObserver:
         return Observation(sighting, pictures)
 
     def _grab(self) -> StereoImage:
-        """A pair that states what is white: by its driver, else by the brightest pixel so far.
+        """A pair with its full scale: that of its driver, else by the brightest pixel so far.
 
-        Of 12 bits two dark pictures alone would pass for 8, and their noise for light.
+        Two dark pictures of 12 bits alone would pass for 8 bits, and their noise for light.
         """
         pair = self.camera.grab()
         self._white = max(self._white, pair.full_scale)
@@ -158,7 +158,7 @@ class CameraObserver:
                 raise fault("frozen", "a camera delivers the same picture again and again", remedy)
             if min(rises_dn(dark, lit)) > CHANGE_DN:
                 if number:
-                    # Light came on during the first lit exposure, or in one still older: take a whole one.
+                    # The laser came on during the first lit exposure, or in an older one: take a whole one.
                     lit = self._grab()
                 break
             if not positioner.state().laser_on:
@@ -167,10 +167,10 @@ class CameraObserver:
 
     def _require_new(self, sighting: Sighting, dark: StereoImage) -> None:
         """Refuses a spot that the picture without laser light shows as well: a laser that is always on, or a lamp."""
-        before = self.detector(dark, dark).pixels_px
-        if before is None or sighting.pixels_px is None:
+        dark_px = self.detector(dark, dark).pixels_px
+        if dark_px is None or sighting.pixels_px is None:
             return
-        if max(abs(a - b) for a, b in zip(before, sighting.pixels_px, strict=True)) < SAME_PLACE_PX:
+        if max(abs(a - b) for a, b in zip(dark_px, sighting.pixels_px, strict=True)) < SAME_PLACE_PX:
             remedy = "cut the laser's supply at once; if it is off, cover what else shines in the picture"
             raise fault("light", "the spot is there with the laser off, too", remedy)
 
@@ -183,7 +183,7 @@ class CameraObserver:
 
 
 def rises_dn(before: StereoImage, after: StereoImage) -> tuple[int, int]:
-    """The most by which a pixel grew brighter, left and right, grey levels of 8 bits."""
+    """Largest increase of a pixel, left and right, grey levels of 8 bits."""
     import cv2
 
     white = max(before.full_scale, after.full_scale)
@@ -258,7 +258,7 @@ def twin_renderer(rig: Rig, seed: int) -> Renderer:
     scene, sensor = Scene(), Sensor()
 
     def pictures(light: Light, look: int, frame: int) -> StereoImage:
-        made = render_spots(cameras, light, scene, sensor, seed, look, frame)
-        return StereoImage(made.left, made.right)
+        rendered = render_spots(cameras, light, scene, sensor, seed, look, frame)
+        return StereoImage(rendered.left, rendered.right)
 
     return pictures

@@ -1,7 +1,7 @@
-"""The people of a run: the operator who is asked, the key that stops, and what is shown meanwhile.
+"""The operator of a run, the key that stops it, and its progress display.
 
-The hazard is stated before the laser can come on; where nobody can be asked its class is required. Ctrl-C ends a run
-in good order; what ends the process from outside is turned into an interrupt, so that the laser goes off.
+The hazard is shown before the laser can come on; without a terminal the laser class is required. Ctrl-C ends a run in
+an orderly way; signals that end the process become an interrupt, so that the laser goes off.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Before you go on: goggles rated for 808 nm on everybody in the room; beam path s
 door sign and key switch in place. The laser is on only while a picture is taken. Ctrl-C stops: once after the
 present look, twice at once. The firmware's watchdog is a last resort, no interlock."""
 LASER_CLASSES = ("1", "1M", "2", "2M", "3R", "3B", "4")
-"""IEC 60825-1, the classes that a user may state instead of being asked."""
+"""Classes of IEC 60825-1 that a user may state instead of answering the question."""
 _Handler = Callable[[int, FrameType | None], object] | int | signal.Handlers
 _TERMINATIONS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
 """SIGHUP exists on POSIX only, SIGBREAK on Windows only."""
@@ -37,17 +37,17 @@ class Operator(Protocol):
     def place(self, target: str, x_mm: float, placement: int, remark: str) -> bool:
         """Put the sheet at a target (nominal X in frame S); False stops the run.
 
-        `placement` counts the placements of the plan; the same number again asks for the same place. `remark` says
-        why it is asked, "" for the plan's own.
+        `placement` counts the placements of the plan; a repeated number means the same place again. `remark` is the
+        reason of a placement outside the plan, else "".
         """
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stands.
+    """Progress of a run.
 
-    Steps of the plan and looks done and in all, refused looks, repeated ones, seconds left, what is being done, and
-    the running estimate, "" for none.
+    Steps of the plan and looks, done and in all; refused and repeated looks, seconds left, the present step in words,
+    and the running estimate, "" for none.
     """
 
     step: int
@@ -62,35 +62,35 @@ class Progress:
 
 
 class StopKey:
-    """Ctrl-C: the first asks for an end after the present look, the second interrupts at once.
+    """Ctrl-C: the first ends the run after the present look, the second interrupts at once.
 
-    What ends a process from outside (SIGTERM, SIGHUP of a closed terminal, Ctrl-Break on Windows) interrupts at once
-    too: without a handler the process would die with the laser on.
+    Signals that end a process (SIGTERM, SIGHUP of a closed terminal, Ctrl-Break on Windows) interrupt at once too:
+    without a handler the process would die with the laser on.
     """
 
     def __init__(self, tell: Callable[[str], None] = lambda text: None):
         self.requested = False
         self.at_prompt = False
-        """While the operator is asked there is no look to finish: the first Ctrl-C interrupts the question."""
+        """During a question there is no look to finish: the first Ctrl-C interrupts it."""
         self.closing = False
-        """While laser and journal are being put away nothing interrupts: a third Ctrl-C would leave the laser on."""
+        """While laser and journal are closed nothing interrupts: a third Ctrl-C would leave the laser on."""
         self._tell = tell
         self._before: dict[int, _Handler] = {}
 
     def __enter__(self) -> StopKey:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, *_TERMINATIONS):
-                before = signal.getsignal(number)
+                handler = signal.getsignal(number)
                 # nohup ignores SIGHUP so that the run outlives its terminal.
-                if number == signal.SIGINT or before is not signal.SIG_IGN:
-                    self._before[number] = signal.SIG_DFL if before is None else before
+                if number == signal.SIGINT or handler is not signal.SIG_IGN:
+                    self._before[number] = signal.SIG_DFL if handler is None else handler
                     signal.signal(number, self._interrupt)
         return self
 
     def __exit__(self, *_: object) -> None:
         while self._before:
-            number, before = self._before.popitem()
-            signal.signal(number, before)
+            number, handler = self._before.popitem()
+            signal.signal(number, handler)
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self.closing:
@@ -102,8 +102,8 @@ class StopKey:
         try:
             self._tell("finishing the present look; Ctrl-C again stops at once")
         except (RuntimeError, OSError):
-            # The interrupted code was writing to the same stream, which then refuses, or the same key has ended the
-            # `tee` behind it: the key counts all the same.
+            # The interrupted code was writing to the same stream, or the same key has ended the `tee` that reads it:
+            # the request to stop counts all the same.
             pass
 
 
@@ -123,8 +123,8 @@ class TerminalOperator:
     Attributes:
         stop: the stop key, which may interrupt a question.
         terminal: where.
-        laser_class: stated on the command line: the hazard is shown, nobody is asked.
-        places: whether a person places the sheet; else a program has placed it, and nobody is asked.
+        laser_class: stated on the command line: the hazard is shown without a question.
+        places: whether a person places the sheet; else a program has placed it.
     """
 
     stop: StopKey
@@ -147,8 +147,7 @@ class TerminalOperator:
             self.terminal.say(f"note: {remark}")
         if not self.places:
             return True
-        answer = self._answer(f"Put the sheet at {target} (X = {x_mm:g} mm), then press Enter; q stops: ")
-        return answer != "q"
+        return self._answer(f"Put the sheet at {target} (X = {x_mm:g} mm), then press Enter; q stops: ") != "q"
 
     def _answer(self, question: str) -> str:
         self.stop.at_prompt = True
@@ -166,7 +165,7 @@ class TerminalOperator:
 
 @dataclass
 class SimulatedOperator:
-    """Puts the twin's sheet where it is asked for."""
+    """Puts the twin's sheet at the target."""
 
     instrument: Instrument
 
@@ -181,20 +180,20 @@ class SimulatedOperator:
 
 
 def check_hazard(laser_class: str | None, simulate: bool) -> None:
-    """Refuses a laser class that there is none of, and a real laser where nobody can be asked."""
+    """Refuses an unknown laser class, and a real laser without a terminal or a class."""
     if laser_class is not None and laser_class.upper() not in LASER_CLASSES:
         remedy = "read it off the laser's label"
         raise InputError(
             "usage", f"laser class {escaped(laser_class)}", allowed=", ".join(LASER_CLASSES), remedy=remedy
         )
-    # Closed, it is None.
+    # A closed standard input is None.
     if not simulate and laser_class is None and not (sys.stdin and sys.stdin.isatty()):
         remedy = "run it in a terminal, or state --laser-class"
         raise InputError("usage", "nobody can be asked about the laser hazard", remedy=remedy)
 
 
 class LiveLine:
-    """A line that shows progress on a terminal, plain lines every tenth of the way elsewhere; a context manager."""
+    """A line that shows progress on a terminal, plain lines at every tenth elsewhere; a context manager."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -215,7 +214,7 @@ class LiveLine:
         self._bar.stop()
 
     def show(self, state: Progress) -> None:
-        """Takes the news."""
+        """Shows the present progress."""
         note = f"look {state.looks} of {state.looks_total}, {state.refused} refused, {state.retries} repeated, "
         note += f"{state.seconds_left / 60:.0f} min left"
         if state.estimate:
@@ -227,7 +226,7 @@ class LiveLine:
             self._console.print(f"{10 * tenths} %: {note}", highlight=False)
 
     def ask(self, question: str) -> str:
-        """`input` without the line running over the question, which goes to stderr: stdout is for the result."""
+        """`input` with the progress line stopped; the question goes to stderr, because stdout has the result."""
         self._bar.stop()
         try:
             self._console.print(question, end="", markup=False, highlight=False)

@@ -1,7 +1,7 @@
 """Placements by a program: a robot that drives the rig to the wall, a linear stage under the sheet.
 
 The program is started with three more arguments: the target, its nominal X in mm in frame S, and the number of the
-placement in the plan, from 0. Exit code 0 says that the sheet stands there. Seconds where a name says `_s`.
+placement in the plan, from 0. Exit code 0 means that the sheet is there. Seconds where a name says `_s`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from tvsbayes.errors import InputError, escaped, fault
 LIMIT_S = 600.0
 """Default longest time of one placement."""
 POLL_S = 0.1
-"""How often what is asked of the run is heeded meanwhile."""
+"""Interval at which requests to the run are served meanwhile."""
 GRACE_S = 5.0
-"""For a program that is asked to end (SIGTERM) to stop its motion, before it is killed."""
+"""Time between SIGTERM, after which a program can stop its motion, and SIGKILL."""
 WORDS_MAX = 2000
-"""Characters of its output that are kept: the last ones."""
+"""Last characters of its output that are kept."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class PlaceCommand:
     """A program that places the sheet.
 
     Attributes:
-        command: program and its own arguments.
+        command: program and its first arguments.
         limit_s: longest time of one placement.
     """
 
@@ -42,7 +42,7 @@ class PlaceCommand:
 
     @classmethod
     def parsed(cls, line: str, limit_s: float | None) -> PlaceCommand:
-        """Of a line as a shell splits it; no shell runs it.
+        """The command of a line, split as by a shell; no shell runs it.
 
         Raises:
             InputError: no such program.
@@ -57,41 +57,41 @@ class PlaceCommand:
         return cls(command, LIMIT_S if limit_s is None else limit_s)
 
     def run(self, target: str, x_mm: float, placement: int, meanwhile: Callable[[], bool]) -> PlaceCommanded:
-        """Run it; what it did, also where it failed.
+        """Run it; the event of the placement, also of a failed one.
 
         Args:
-            target: where the sheet shall stand.
+            target: of the sheet.
             x_mm: nominal X of the target in frame S.
             placement: its number in the plan, from 0.
-            meanwhile: called again and again; False ends the program.
+            meanwhile: called repeatedly; False ends the program.
         """
-        begun, exit_code = time.monotonic(), None
+        start_s, exit_code = time.monotonic(), None
         with tempfile.TemporaryFile() as output:
             arguments = [*self.command, target, f"{x_mm:.3f}", str(placement)]
             try:
-                # A session of its own: the Ctrl-C that asks for the end of the run does not reach it.
+                # A new session: the Ctrl-C that ends the run does not reach it.
                 with subprocess.Popen(
                     arguments, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
                 ) as process:
-                    exit_code = self._waited(process, begun, meanwhile)
-                words = _last_words(output)
+                    exit_code = self._exit_code(process, start_s, meanwhile)
+                text = _last_words(output)
             except OSError as error:
-                words = error.strerror or str(error)
+                text = error.strerror or str(error)
         return PlaceCommanded(
             target=target,
             x_mm=x_mm,
             placement=placement,
             command=list(self.command),
             exit_code=exit_code,
-            seconds=round(time.monotonic() - begun, 1),
+            seconds=round(time.monotonic() - start_s, 1),
             limit_s=self.limit_s,
-            words=words,
+            words=text,
         )
 
-    def _waited(self, process: subprocess.Popen[bytes], begun: float, meanwhile: Callable[[], bool]) -> int | None:
+    def _exit_code(self, process: subprocess.Popen[bytes], start_s: float, meanwhile: Callable[[], bool]) -> int | None:
         """The exit code; None of a program that had to be ended."""
         try:
-            while meanwhile() and time.monotonic() - begun < self.limit_s:
+            while meanwhile() and time.monotonic() - start_s < self.limit_s:
                 try:
                     return process.wait(POLL_S)
                 except subprocess.TimeoutExpired:
@@ -106,18 +106,18 @@ class PlaceCommand:
             process.kill()
 
 
-def require_placed(done: PlaceCommanded) -> None:
-    """Refuses to go on without a sheet.
+def require_placed(event: PlaceCommanded) -> None:
+    """Refuses a failed placement.
 
     Raises:
         DeviceFault: the program has failed.
     """
-    if done.exit_code == 0:
+    if event.exit_code == 0:
         return
-    code, limit_s = done.exit_code, done.limit_s
-    how = f"was ended after {done.seconds:g} s (limit {limit_s:g} s)" if code is None else f"ended with code {code}"
-    said = escaped(done.words.strip()[-200:], 300) or "nothing"
-    found = f"the place command for {escaped(done.target)} {how} and said: {said}"
+    code, limit_s = event.exit_code, event.limit_s
+    ending = f"was ended after {event.seconds:g} s (limit {limit_s:g} s)" if code is None else f"ended with code {code}"
+    text = escaped(event.words.strip()[-200:], 300) or "nothing"
+    found = f"the place command for {escaped(event.target)} {ending} and said: {text}"
     raise fault("place-command", found, "bring the sheet into reach, then go on with --resume")
 
 

@@ -1,8 +1,8 @@
-"""What a journal says happened: the campaign that its events hold, at any time.
+"""The campaign that the events of a journal hold, at any time.
 
-A segment begins with a homing and ends with the next one, which tells whether steps were lost in between: then no spot
-of the segment counts. After a gap that a repair left, nothing counts until the next homing where a motion may be
-missing, because nobody knows which. Counters in motor steps, px and seconds as in moves.csv and spots.csv.
+A segment begins with a homing and ends with the next one, which shows whether steps were lost in between: then no spot
+of the segment counts. After a gap that may have lost a motion, nothing counts until the next homing. Counters in motor
+steps, px and seconds as in moves.csv and spots.csv.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import NO_PIXELS, Move, Spot, next_move, with_pixels
 
 HOME_TOLERANCE_STEPS = 2
-"""Scatter of a home switch, as homing finds it again; more than that are lost steps."""
+"""Scatter of a home switch between homings; larger deviations are lost steps."""
 LOST_STEPS = "lost-steps"
 """Status of a spot in whose segment steps were lost."""
 
@@ -32,14 +32,14 @@ class Recorded:
         moves: rows of moves.csv; empty before the first homing.
         spots: rows of spots.csv.
         next_step: first step of the plan behind the last one that is done.
-        looked_steps: steps of the plan whose looks are there; after a repair some before `next_step` may be missing.
-        references: looks beside the plan, with which resumed runs compared what they see with what was seen before.
+        looked_steps: steps of the plan with a look; after a repair some before `next_step` may be missing.
+        references: looks outside the plan, by which resumed runs checked earlier spots.
         target: where the sheet stands, "" before the first placement.
         starts: how often the acquisition was started.
         boot: boot id of the device at its last homing, None before.
         home_steps: counters that the last `home` of the plan asked for.
         lost: segments in which steps were lost, with the deviation found.
-        unverified: segments whose closing homing could not tell, or did not take place.
+        unverified: segments whose closing homing had no result, or did not take place.
         ignored_lines: lines after a gap that cannot be trusted.
         ended: the reason of the last `stop`, None while running or after a crash.
     """
@@ -65,7 +65,7 @@ class Recorder:
     Attributes:
         moves: rows of moves.csv so far.
         spots: rows of spots.csv so far, before it is known whether steps were lost.
-        state: the rest of a `Recorded` that follows from the last event; what grows is empty.
+        state: the fields of `Recorded` that the last event determines; those that grow are empty.
     """
 
     def __init__(self) -> None:
@@ -82,7 +82,7 @@ class Recorder:
         """Takes the next event.
 
         Raises:
-            InputError: one that contradicts those before, with its line.
+            InputError: an event that contradicts those before, with its line.
         """
         event = event_of(record, Gap, Start, Stop, Placed, Verified, Homed, Moved, Looked)
         if isinstance(event, Moved | Looked):
@@ -108,7 +108,7 @@ class Recorder:
                 self._moved(event, self.moves[-1].segment)
             case Looked():
                 self._looks(event)
-                # Where the sheet stood, also if the line of its placement is lost.
+                # The target is known even if the line of the placement is lost.
                 self.state = replace(self.state, target=event.target)
         if isinstance(event, Homed | Moved | Placed | Looked) and event.step is not None:
             self.state = replace(self.state, next_step=max(self.state.next_step, event.step + 1))
@@ -125,7 +125,7 @@ class Recorder:
         self._trusted = True
         segment = self.moves[-1].segment + 1 if self.moves else 0
         pan, tilt = event.approach
-        # What sides they are is checked where the tables are written.
+        # The words are checked where the tables are written.
         approach = cast("PanApproach", pan), cast("TiltApproach", tilt)
         self._moved(event, segment, approach)
         # Only a homing of the plan states counters; one of a resumed run repeats them.

@@ -1,7 +1,7 @@
-"""`acquire --adapt`: looks that are left are chosen anew from the running estimate, until target or time is reached.
+"""`acquire --adapt`: the remaining looks are chosen anew from the running estimate, until target or time is reached.
 
-What `plan --given --next` prints is computed beside the instrument as the running estimate is: one process, which fits
-what is on the disk and says what to look at next. A proposal that leaves the rig's limits is not followed. Where the
+The result of `plan --given --next` is computed beside the instrument like the running estimate: one process fits the
+campaign on the disk and proposes the next looks. A proposal that leaves the rig's limits is not followed. Where the
 Laplace approximation meets the target the same process samples the posterior, and only that ends the run: with few
 looks the scales of the noise are rough, and Laplace's sds too short. Every change of plan is an event of the journal,
 so that a resumed run has the same plan as the one that was interrupted.
@@ -26,15 +26,15 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
 
 NEXT_SHARE, NEXT_LEAST, NEXT_MOST = 0.3, 8, 80
-"""Looks of a proposal: this share of those that are there, more than come before the next one, at least so many.
+"""Looks of a proposal: a share of the looks so far, which lasts beyond the next fit, with its least and most.
 
-At most so many, or the event does not fit into a line of the journal (120 to 160 bytes a look); where they run out
-before the next fit, that is waited for.
+More would not fit into a line of the journal (120 to 160 bytes a look); where they run out before the next fit, the run
+waits for it.
 """
 
 
 def looks_next(looks: int) -> int:
-    """How many looks to propose after so many."""
+    """How many looks to propose after `looks`."""
     return min(NEXT_MOST, max(NEXT_LEAST, math.ceil(NEXT_SHARE * looks)))
 
 
@@ -65,13 +65,13 @@ def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
 
 @dataclass(frozen=True)
 class Proposal:
-    """What to look at next.
+    """The next looks.
 
     Attributes:
         steps: placements, moves and looks, numbered from 0; the first is a placement.
         after_each: the target's value after each look, deg/step.
-        now: before them.
-        looks: of which the estimate was made.
+        now: its value before them.
+        looks: number behind the estimate.
         why: in words.
     """
 
@@ -82,14 +82,14 @@ class Proposal:
     why: str
 
     def continued(self, row: int, sheet: str) -> tuple[PlanStep, ...]:
-        """The steps as they go on a plan from a row on, where a sheet stands already."""
+        """The steps as rows of a plan from `row` on, with `sheet` in place already."""
         steps = self.steps[1:] if self.steps[0].target == sheet else self.steps
         return tuple(replace(step, step=row + number) for number, step in enumerate(steps))
 
 
 @dataclass(frozen=True)
 class Ahead:
-    """What a fit beside the run says: its estimate, that of the sampled posterior where it was asked, looks to take.
+    """Result of a fit beside the run: its estimate, that of the sampled posterior where there is one, the next looks.
 
     `accepted` is whether the weighted draws behind `sampled` may be used.
     """
@@ -102,11 +102,11 @@ class Ahead:
 
 @dataclass(frozen=True)
 class AdaptOptions:
-    """That the looks of a run are to be chosen while it runs.
+    """Options of a run whose looks are chosen while it runs.
 
     Attributes:
-        ahead: from a campaign folder, its number of looks, the u wanted, how many looks to propose and the Laplace u
-            at which to sample, as a process of its own can import it.
+        ahead: from a campaign folder, its number of looks, the target u, how many looks to propose and the Laplace u
+            at which to sample; another process must be able to import it.
         minutes: by `[costs]`, that the whole run may take; None: as long as its plan.
     """
 
@@ -115,12 +115,12 @@ class AdaptOptions:
 
 
 class Replanning(RunningEstimate):
-    """The running estimate that also says what to look at next.
+    """The running estimate that also proposes the next looks.
 
     Args:
         folder: the campaign folder.
         ahead: as of `AdaptOptions`.
-        target_u_deg_per_step: wanted of the effective ratios of all directions.
+        target_u_deg_per_step: of the effective ratios of all directions.
         minutes: that the run may take.
         wait: whether to wait for every proposal.
     """
@@ -142,37 +142,37 @@ class Replanning(RunningEstimate):
 
     @property
     def met(self) -> bool:
-        """Whether the sampled posterior knows every direction as well as wanted."""
+        """Whether the sampled posterior meets the target in every direction."""
         return self.latest is not None and self.latest.tier == "importance" and super().met
 
     @property
     def confirm_below(self) -> float:
-        """Worst Laplace u at which sampling may confirm the target, by how far the two were apart the last time."""
+        """Worst Laplace u at which sampling may confirm the target, by the last ratio of the two."""
         return float(self.target or 0.0) / self._ratio
 
     def _arguments(self, looks: int) -> tuple[object, ...]:
         return self.folder, looks, self.target, looks_next(looks), self.confirm_below
 
     def _read(self, result: Ahead) -> Estimate:
-        """The sampled posterior where it can be used, else Laplace; both are written down."""
+        """The sampled posterior where it can be used, else Laplace; the event has both."""
         self._proposal, laplace, sampled, target = result.proposal, result.laplace, result.sampled, self.target or 0.0
         if sampled is None:
             return laplace
-        before, after = (max(each.u_deg_per_step.values()) for each in (laplace, sampled))
+        laplace_u, sampled_u = (max(estimate.u_deg_per_step.values()) for estimate in (laplace, sampled))
         if result.accepted:
-            self._ratio = max(1.0, after / before)
+            self._ratio = max(1.0, sampled_u / laplace_u)
         self._confirmed = Confirmed(
             looks=laplace.looks,
             target_u_deg_per_step=target,
-            laplace_u_deg_per_step=before,
-            importance_u_deg_per_step=after,
+            laplace_u_deg_per_step=laplace_u,
+            importance_u_deg_per_step=sampled_u,
             accepted=result.accepted,
-            reached=result.accepted and after <= target,
+            reached=result.accepted and sampled_u <= target,
         )
         return sampled if result.accepted else laplace
 
     def proposal(self) -> Proposal | None:
-        """The newest one, once."""
+        """The newest proposal, once."""
         newest, self._proposal = self._proposal, None
         return newest
 
@@ -182,7 +182,7 @@ class Replanning(RunningEstimate):
         return newest
 
     def last(self, looks: int) -> bool:
-        """At the end of the plan: one more estimate of all looks, waited for; whether the target is met."""
+        """At the end of the plan: waits for one more estimate, of all looks; whether the target is met."""
         self._wait_for_fit()
         if self._proposal is None and looks > self._looks:
             self._begin(looks)
@@ -204,31 +204,31 @@ def _step(number: int, entry: Mapping[str, Any]) -> PlanStep:
 def adapted_entries(proposal: Proposal, row: int, steps: Sequence[PlanStep]) -> Adapted:
     """The event of a change of plan: from which row on, the steps, and why each look was chosen."""
     looks = iter(proposal.after_each)
-    before, entries = proposal.now, []
+    u_before, entries = proposal.now, []
     for step in steps:
         entry = step_json(step)
         if step.action == "look":
-            after = next(looks)
-            # What this look adds, those before it taken.
-            entry |= {"u_before_deg_per_step": before, "u_after_deg_per_step": after}
-            before = after
+            u_after = next(looks)
+            # The gain of this look after those before it.
+            entry |= {"u_before_deg_per_step": u_before, "u_after_deg_per_step": u_after}
+            u_before = u_after
         entries.append(entry)
     return Adapted(row=row, looks=proposal.looks, why=proposal.why, steps=tuple(entries))
 
 
 def adapted_plan(plan: Sequence[PlanStep], records: Iterable[Record]) -> tuple[PlanStep, ...]:
-    """The plan as the changes in a journal have left it.
+    """The plan with the changes in a journal.
 
     Raises:
-        InputError: an event that does not hold what it should.
+        InputError: an event with invalid entries.
     """
-    now = tuple(plan)
+    steps = tuple(plan)
     for record in records:
         event = event_of(record, Adapted)
         if event is None:
             continue
         try:
-            now = (*now[: event.row], *(_step(event.row + n, entry) for n, entry in enumerate(event.steps)))
+            steps = (*steps[: event.row], *(_step(event.row + n, entry) for n, entry in enumerate(event.steps)))
         except (KeyError, TypeError, ValueError) as error:
             raise refused(record, repr(error)) from error
-    return now
+    return steps

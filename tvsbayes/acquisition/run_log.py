@@ -1,4 +1,4 @@
-"""What a run writes down: the journal, the campaign that follows from it, its files, and how the run ended.
+"""The records of a run: the journal, the campaign that follows from it, its files, and the outcome.
 
 Seconds where a name says `_s`, since the campaign was created; UTC for people.
 """
@@ -34,12 +34,12 @@ class Outcome:
         looks: looks of this campaign, of all its runs.
         ok: how many of them count.
         refused: how many found no usable spot.
-        references: how many of `looks` are none of the plan's: resumed runs look again at spots seen before. They
-            count as any other.
+        references: how many of `looks` are not in the plan: resumed runs look again at earlier spots. They count as
+            any other.
         retries: looks repeated in this run.
         lost_segments: segments in which steps were lost.
-        warnings: what the user should know.
-        estimate: the last of a run that was fitted beside itself.
+        warnings: for the user.
+        estimate: the last running estimate, None for none.
     """
 
     reason: str
@@ -72,8 +72,8 @@ class RunLog:
 
     Attributes:
         recorder: the campaign so far, of all runs.
-        behind: why the campaign files lack what the journal has, "" where they do not.
-        warnings: what the user should know.
+        behind: why the campaign files are behind the journal, "" where they are not.
+        warnings: for the user.
     """
 
     def __init__(self, journal: Journal, rig: Rig, utc: Callable[[], datetime.datetime]):
@@ -87,7 +87,7 @@ class RunLog:
 
     @property
     def ok_looks(self) -> int:
-        """How many looks count, as far as is known."""
+        """How many looks count so far."""
         return sum(spot.status == "ok" for spot in self.recorder.spots)
 
     def write(self, event: Event) -> None:
@@ -114,16 +114,16 @@ class RunLog:
         """The first number that neither an event nor a frame of an interrupted look has."""
         used = [spot.spot for spot in self.recorder.spots]
         names = orphans(self._journal.folder, tuple(self._journal.records))
-        # Other pictures, which somebody has put there, have no number.
+        # Other pictures in these folders have no number.
         used += [int(name.split("/")[1][:6]) for name in names if FRAME_NAME.fullmatch(name)]
         return max(used, default=-1) + 1
 
     def close_segment(self, report: HomeReport) -> None:
-        """Writes down what a homing says about the segment that it ends."""
+        """Logs what a homing shows of the segment that it ends."""
         if not self.recorder.moves:
             return
-        known = report.known or (report.compared and report.state.boot == self.recorder.state.boot)
-        segment, deviation = self.recorder.moves[-1].segment, report.deviation_steps if known else None
+        comparable = report.known or (report.compared and report.state.boot == self.recorder.state.boot)
+        segment, deviation = self.recorder.moves[-1].segment, report.deviation_steps if comparable else None
         self.write(Verified(segment=segment, deviation_steps=deviation))
         if deviation is not None and max(map(abs, deviation)) > HOME_TOLERANCE_STEPS:
             self.warnings.append(
@@ -132,11 +132,11 @@ class RunLog:
             )
 
     def end(self, reason: str, exit_code: int) -> None:
-        """Writes down how it ended, as well as the disk allows, and closes the journal."""
+        """Logs the end, as far as the disk allows, closes the journal and writes the campaign files."""
         try:
             self.write(Stop(reason=reason, exit_code=exit_code, utc=self.utc_text()))
         except DeviceFault:
-            # A broken disk was the reason, and is on its way to the user already.
+            # A broken disk ended the run, and is reported already.
             pass
         finally:
             self._journal.close()
@@ -145,7 +145,7 @@ class RunLog:
             self.warnings.append(f"the campaign files are behind the journal: {self.behind}")
 
     def derive(self, always: bool = False) -> None:
-        """Writes the campaign files anew, unless it is no time for that yet (see `DERIVED_EVERY`)."""
+        """Writes the campaign files anew, where they are due (see `DERIVED_EVERY`)."""
         count = len(self.recorder.spots)
         if not self.recorder.moves or (not always and count > DERIVED_EVERY and count % (count // DERIVED_EVERY)):
             return
@@ -153,14 +153,14 @@ class RunLog:
             write_derived(self._campaign(), self._journal.folder, tables_only=not always)
             self.behind = ""
         except TvsError as error:
-            # Somebody has the table open, say. The journal has everything, and the next look tries again; after the
-            # last one --resume does.
+            # A table may be open in another program. The journal has everything, and the next look tries again; after
+            # the last one --resume does.
             self.behind = error.message
 
     def keep_edited(self) -> None:
-        """Copies files that hold what the journal does not, before they are written anew, and warns of each.
+        """Copies files that hold more than the journal, before they are written anew, and warns of each.
 
-        What killed runs left unfinished of these files is removed.
+        Unfinished files of killed runs are removed.
         """
         folder, campaign = self._journal.folder, self._campaign()
         remove_unfinished(folder, DERIVED)
@@ -173,27 +173,27 @@ class RunLog:
         ]
 
     def _campaign(self) -> Campaign:
-        """What the journal holds so far; there has been a homing."""
+        """The campaign in the journal so far, after the first homing."""
         created = event_of(self._journal.records[0], Created)
         assert created is not None
         start = datetime.datetime.fromisoformat(created.created).astimezone(datetime.UTC)
         header: dict[str, object] = {"name": NAME_ACQUIRED if created.name is UNSET else created.name, "created": start}
-        stated = {"synthetic": created.synthetic, "seed": created.seed}
-        header |= {name: value for name, value in stated.items() if value is not UNSET}
+        flags = {"synthetic": created.synthetic, "seed": created.seed}
+        header |= {name: value for name, value in flags.items() if value is not UNSET}
         return campaign_of(self.recorder.result(), Campaign((), (), self._rig.stereo, self._rig.table, header))
 
     def outcome(self, reason: str, retries: int) -> Outcome:
-        """How the run ended, for this reason and after so many repeated looks."""
-        done = self.recorder.result()
-        ok = sum(spot.status == "ok" for spot in done.spots)
-        waiting = sum(spot.status == UNDETECTED for spot in done.spots)
+        """The outcome of a run with this reason and number of repeated looks."""
+        record = self.recorder.result()
+        ok = sum(spot.status == "ok" for spot in record.spots)
+        waiting = sum(spot.status == UNDETECTED for spot in record.spots)
         return Outcome(
             reason=reason,
-            looks=len(done.spots),
+            looks=len(record.spots),
             ok=ok,
-            refused=len(done.spots) - ok - waiting,
-            references=done.references,
+            refused=len(record.spots) - ok - waiting,
+            references=record.references,
             retries=retries,
-            lost_segments=tuple(segment for segment, _ in done.lost),
+            lost_segments=tuple(segment for segment, _ in record.lost),
             warnings=tuple(self.warnings),
         )

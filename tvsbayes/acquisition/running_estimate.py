@@ -1,10 +1,10 @@
-"""The running estimate of an acquisition: fits in a process of their own, beside the instrument.
+"""The running estimate of an acquisition: fits in another process, beside the instrument.
 
 The campaign folder is readable at any time, so a fit takes it as it stands, one fit at a time. The acquisition neither
 waits for it nor shares memory with it: a compiler at work must not delay a laser switch. The process stays for the next
 fit, so libraries are imported and functions compiled once a run. The figures are the effective degrees per step of the
-beam with their standard uncertainty from the Laplace approximation (formulation 3.2 and 4.2), of the looks that were
-there when the fit began.
+beam with their standard uncertainty from the Laplace approximation (formulation 3.2 and 4.2), of the looks at the
+beginning of the fit.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from typing import Any
 from tvsbayes.display import concise
 
 FIRST_LOOKS = 12
-"""Fewer looks than three experiments of four points say next to nothing."""
+"""Three experiments of four points: fewer looks determine next to nothing."""
 GROWTH = 1.2
-"""The next fit begins when there are so many times more looks than at the last: their sum costs a few fits."""
+"""Ratio of looks between two fits: all fits together cost as much as a few of the last."""
 FIT_MAX_S = 3600.0
 """Longest wait for a fit; one takes a minute or less."""
 FIT_POLL_S = 0.1
-"""While a fit is waited for: how often what is asked of the run is heeded."""
+"""Interval at which requests to the run are served while it waits for a fit."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Effective degrees per step and their standard uncertainties by direction, from so many looks.
+    """Effective degrees per step and their standard uncertainties by direction, from `looks` looks.
 
-    `tier` is what made them: "laplace", or "importance" for the sampled posterior.
+    `tier` is the method: "laplace", or "importance" for the sampled posterior.
     """
 
     looks: int
@@ -56,11 +56,11 @@ class Estimate:
 
 @dataclass(frozen=True)
 class EstimateOptions:
-    """Whether a run is fitted beside itself, and to what end.
+    """Whether a run is fitted while it runs, and its target.
 
     Attributes:
-        fit: estimates from a campaign folder with so many looks, as a process of its own can import it.
-        target_u_deg_per_step: ends the run once the effective ratio of every direction of its plan is known so well.
+        fit: the estimate from a campaign folder and its number of looks; another process must be able to import it.
+        target_u_deg_per_step: ends the run once the effective ratios of all directions of its plan reach this u.
         enabled: whether to fit; None: on hardware, and for a target.
     """
 
@@ -75,20 +75,20 @@ class EstimateOptions:
 
 @dataclass(frozen=True)
 class Aim:
-    """What the running estimate is for: directions of the plan, and the u wanted of each, None for no target."""
+    """Aim of the running estimate: directions of the plan, and the target u of each, None for no target."""
 
     directions: tuple[str, ...] = ()
     target_u_deg_per_step: float | None = None
 
 
 class Worker:
-    """Calls a function in a process of its own, one call at a time; the first call starts the process.
+    """Calls a function in another process, one call at a time; the first call starts the process.
 
     Args:
-        function: as `multiprocessing` sends it to a new process. What it raises, and what kills it, counts as None.
+        function: importable by a new process. A call that raises or dies returns None.
 
     Attributes:
-        busy: whether a call has begun whose result was not taken.
+        busy: whether a call has begun whose result was not taken yet.
     """
 
     def __init__(self, function: Callable[..., Any]):
@@ -97,13 +97,13 @@ class Worker:
         self._pipe: Connection | None = None
 
     def begin(self, *arguments: object) -> None:
-        """Begin a call; where no process can be started there is none."""
+        """Begin a call; there is none where no process can be started."""
         try:
             if self._process is None or self._pipe is None:
                 context = multiprocessing.get_context("spawn")
-                self._pipe, theirs = context.Pipe()
-                with theirs:
-                    self._process = context.Process(target=_work, args=(theirs, self._function), daemon=True)
+                self._pipe, worker_end = context.Pipe()
+                with worker_end:
+                    self._process = context.Process(target=_work, args=(worker_end, self._function), daemon=True)
                     self._process.start()
             self._pipe.send(arguments)
             self.busy = True
@@ -111,16 +111,16 @@ class Worker:
             self.end()
 
     def done(self, wait_s: float = 0.0) -> bool:
-        """Whether the call has ended, after so long at most."""
+        """Whether the call has ended, within `wait_s`."""
         return self._pipe is not None and self.busy and self._pipe.poll(wait_s)
 
     def take(self) -> Any:
-        """What the call that is `done` returned; None where it failed."""
+        """The result of the call that is `done`; None where it failed."""
         self.busy = False
         try:
             return None if self._pipe is None else self._pipe.recv()
         except (EOFError, OSError):
-            # Its process is gone: the next call starts another.
+            # The process is gone: the next call starts another.
             self.end()
             return None
 
@@ -137,7 +137,7 @@ class Worker:
 def _work(pipe: Connection, function: Callable[..., Any]) -> None:
     """In the process: answers calls until the other end is closed."""
     if hasattr(os, "setsid"):
-        # The Ctrl-C that ends the run after its look is none of the fit's.
+        # The Ctrl-C that ends the run after its look must not end the fit.
         os.setsid()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -151,7 +151,7 @@ def _work(pipe: Connection, function: Callable[..., Any]) -> None:
         try:
             result = function(*arguments)
         except Exception:
-            # A fit that does not work says nothing: the next one has more looks.
+            # A failed fit has no result: the next one has more looks.
             result = None
         try:
             pipe.send(result)
@@ -164,14 +164,14 @@ class RunningEstimate:
 
     Args:
         folder: the campaign folder.
-        fit: what is called with `_arguments`; `_read` takes what it returns.
-        target_u_deg_per_step: the uncertainty wanted of every direction; None wants nothing and is never met.
-        directions: those that must meet it.
-        wait: whether to wait for every fit: in a simulation time stands still meanwhile.
+        fit: called with `_arguments`; `_read` takes its result.
+        target_u_deg_per_step: target u of every direction; None is never met.
+        directions: that must meet it.
+        wait: whether to wait for every fit, as in a simulation, whose time stands still meanwhile.
 
     Attributes:
         latest: the newest estimate.
-        meanwhile: called again and again while a fit is waited for; False ends wait and fit.
+        meanwhile: called repeatedly during the wait for a fit; False ends wait and fit.
     """
 
     def __init__(
@@ -196,19 +196,19 @@ class RunningEstimate:
 
     @property
     def aim(self) -> Aim:
-        """What the fits are for."""
+        """Directions and target of the fits."""
         return Aim(tuple(sorted(self.directions)), self.target)
 
     @property
     def met(self) -> bool:
-        """Whether every direction of the plan is known as well as wanted."""
+        """Whether every direction of the plan meets the target."""
         if self.latest is None or self.target is None:
             return False
         u = self.latest.u_deg_per_step
         return bool(self.directions) and all(u.get(name, float("inf")) <= self.target for name in self.directions)
 
     def update(self, looks: int) -> bool:
-        """Takes in a finished fit, begins the next one where it pays; whether the target is met."""
+        """Takes a finished fit, begins the next one where it is due; whether the target is met."""
         if self._worker.done():
             self._take()
         if not self._worker.busy and looks >= max(FIRST_LOOKS, GROWTH * self._looks):
@@ -218,7 +218,7 @@ class RunningEstimate:
         return self.met
 
     def _arguments(self, looks: int) -> tuple[object, ...]:
-        """Of the fit of so many looks."""
+        """Arguments of the fit of `looks` looks."""
         return self.folder, looks
 
     def _begin(self, looks: int) -> None:
@@ -227,21 +227,21 @@ class RunningEstimate:
         self._worker.begin(*self._arguments(looks))
 
     def _wait_for_fit(self) -> None:
-        """A fit that takes too long is killed, as is that of a run that is to end."""
-        until = time.monotonic() + FIT_MAX_S
+        """Waits for the fit; one that takes too long is killed, as is that of a run that is to end."""
+        deadline_s = time.monotonic() + FIT_MAX_S
         while self._worker.busy and not self._worker.done(FIT_POLL_S):
-            if time.monotonic() > until or not self.meanwhile():
+            if time.monotonic() > deadline_s or not self.meanwhile():
                 self._worker.end()
         if self._worker.busy:
             self._take()
 
     def _take(self) -> None:
-        """A fit that did not work says nothing: the next one has more looks."""
+        """Takes the result of a fit; a failed one has none."""
         result = self._worker.take()
         if result is not None:
             self.latest = self._read(result)
 
     def _read(self, result: Any) -> Estimate:
-        """What a fit that worked says."""
+        """The estimate in the result of a fit."""
         estimate: Estimate = result
         return estimate

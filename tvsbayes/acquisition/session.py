@@ -1,4 +1,4 @@
-"""From a rig file and a plan to a finished run: the plan checked, the journal begun or gone on with, the bench run.
+"""From a rig file and a plan to a finished run: the plan is checked, the journal begun or continued, the bench run.
 
 `acquire` is what the command of that name does, on the bench or on its twin.
 """
@@ -54,29 +54,29 @@ def acquire(
         simulate: the twin instead of hardware; `truth.json` is written beside the campaign.
         emulate: of a simulation: the firmware runs on an emulated processor, in real time.
         resume: go on with an interrupted run.
-        laser_class: states that the hazard is known; without it the operator is asked once.
+        laser_class: states that the hazard is known; without it the operator must confirm.
         seed: of a simulation.
-        estimate: whether the looks so far are fitted beside the run. A simulation waits for every fit.
-        adapt: that the looks which are left are chosen from that fit; `estimate` must have a target.
-        vision: how pictures are made and seen; by default they wait for `detect`, and a simulation states centroids.
-        terminal: where to speak and to ask; by default nothing is shown.
-        live: where the run is published for anyone who looks on, and what is asked of it.
+        estimate: whether the looks so far are fitted while it runs. A simulation waits for every fit.
+        adapt: chooses the remaining looks from that fit; `estimate` must have a target.
+        vision: how pictures are made and searched; by default they wait for `detect`, a simulation states centroids.
+        terminal: for messages and questions; by default nothing is shown.
+        live: where the run is published, and its requests.
         place_command: a program that places the sheet instead of a person.
 
     Raises:
-        InputError: a plan this rig cannot run, another plan than before, nobody to ask, no emulator.
+        InputError: a plan this rig cannot run, another plan than before, no operator, no emulator.
         DeviceFault: device, camera or disk failed.
     """
     folder, vision, terminal = Path(folder), vision or Vision(), terminal or Terminal()
     check_plan(rig, plan)
     check_hazard(laser_class, simulate)
-    before = _before(folder) if resume else Recorded()
+    record = _earlier_runs(folder) if resume else Recorded()
     stop = StopKey(terminal.say)
     with ExitStack() as stack:
-        # Device and cameras first: what cannot be opened leaves no folder behind.
+        # Device and cameras first: a failure to open them leaves no folder behind.
         if simulate:
             board = stack.enter_context(EmulatedBoard()) if emulate else None
-            bench = stack.enter_context(simulated(rig, seed, before, vision, board))
+            bench = stack.enter_context(simulated(rig, seed, record, vision, board))
         else:
             operator = TerminalOperator(stop, terminal, laser_class, place_command is None)
             bench = stack.enter_context(hardware(rig, vision.detector, operator))
@@ -92,10 +92,9 @@ def acquire(
         if running is not None:
             stack.enter_context(running)
         stack.callback(bench.conclude, folder)
-        now = adapted_plan(plan, journal.records)
         run = Acquisition(
             rig,
-            now,
+            adapted_plan(plan, journal.records),
             journal,
             bench,
             stop=stop,
@@ -126,8 +125,8 @@ def _running(
     return RunningEstimate(folder, estimate.fit, target, directions, wait=simulate)
 
 
-def _before(folder: Path) -> Recorded:
-    """What an interrupted run has left."""
+def _earlier_runs(folder: Path) -> Recorded:
+    """The record of an interrupted run."""
     remedy = "leave --resume out to begin, or name the folder of the interrupted run"
     if folder.is_dir() and any(folder.iterdir()):
         remedy = (
@@ -139,7 +138,7 @@ def _before(folder: Path) -> Recorded:
 
 
 def _header(rig: Rig, seed: int | None) -> dict[str, object]:
-    """What the journal of a run says of its campaign; `seed` of a simulation."""
+    """Header entries of a campaign in its journal; `seed` of a simulation."""
     header: dict[str, object] = {"name": str(rig.header.get("name", NAME_ACQUIRED))}
     if seed is not None:
         header |= {"created": SIMULATED_START.isoformat(), "synthetic": True, "seed": int(seed)}
@@ -147,18 +146,18 @@ def _header(rig: Rig, seed: int | None) -> dict[str, object]:
 
 
 def begin(folder: Path, rig: Rig, plan: Sequence[PlanStep], resume: bool, header: Mapping[str, object]) -> Journal:
-    """The journal to write: a new one, or the one to go on with.
+    """The journal to write: a new one, or the one to continue.
 
     Raises:
-        InputError: nothing to go on with, another plan or rig than before, or a folder that has a journal.
+        InputError: no journal to continue, another plan or rig than before, or a folder that has a journal.
     """
     if not resume:
         if folder.is_dir() and any(folder.iterdir()):
-            place, remedy = escaped(str(folder), 200), "name another folder, or go on with --resume"
+            shown_path, remedy = escaped(str(folder), 200), "name another folder, or go on with --resume"
             if (folder / LOG).is_file() and not (folder / LOG).stat().st_size:
                 remedy = EMPTY_REMEDY
             found, allowed = "a folder with files", "a new or empty folder"
-            raise refusal("occupied", file=place, found=found, allowed=allowed, remedy=remedy)
+            raise refusal("occupied", file=shown_path, found=found, allowed=allowed, remedy=remedy)
         created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         return Journal.create(
             folder, **{"created": created, **header}, **identity(rig, plan, bool(header.get("synthetic")))

@@ -1,8 +1,8 @@
 """The twin as drivers: `driver = "simulated"` in `[positioner]` and `[cameras]` of a rig file.
 
-For `doctor`, for trying out code that drives an instrument, and as the example that drivers of other hardware can be
-held against. Positioner and cameras of one rig file and seed (`options.seed`) share one twin, before whose cameras the
-first sheet of `[sheets]` stands. A whole run is rehearsed by `tvsbayes acquire --simulate`, where sheets change places.
+For `doctor`, for trials of code that drives an instrument, and as an example for drivers of other hardware. Positioner
+and cameras of one rig file and seed (`options.seed`) share one twin, with the first sheet of `[sheets]` in front of its
+cameras. A whole run is rehearsed by `tvsbayes acquire --simulate`, where sheets change places.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tvsbayes.instrument.rig import Rig, Setting
 from tvsbayes.positioner.driver import SerialPositioner
 
 _TWINS: WeakValueDictionary[tuple[str, int], Instrument] = WeakValueDictionary()
-"""Those in use, by rig file and seed."""
+"""Twins in use, by rig file and seed."""
 
 
 def simulated_positioner(rig: Rig) -> SerialPositioner:
@@ -32,7 +32,7 @@ def simulated_cameras(rig: Rig) -> SimulatedCamera:
 
 
 class SimulatedCamera:
-    """See `StereoCamera`: a new exposure of the twin for every pair that is asked for."""
+    """See `StereoCamera`: a new exposure of the twin for every pair."""
 
     def __init__(self, instrument: Instrument, renderer: Renderer):
         self._instrument, self._render, self._frame = instrument, renderer, 0

@@ -1,12 +1,12 @@
 """The digital twin at the end of the cable: gears, mirrors, sheet and laser behind a simulated device.
 
-The firmware model drives `Mechanics`; every stretch of its motion goes here through ratio, play and stop error of a
-true rig, homing included. So the light follows from what the motors did, not from what the plan said: lost steps,
-resets and repeated moves show in the pictures as they would on the bench. Physics of `tvsbayes.twin`, no estimator's
-formula. Frame S, mm; degrees where a name says `_deg`; the time of a virtual clock.
+The firmware model drives `Mechanics`; every stretch of its motion goes through ratio, play and stop error of a true
+rig, homing included. So the light follows the motors, not the plan: lost steps, resets and repeated moves show in the
+pictures as on the bench. Physics of `tvsbayes.twin`, no estimator's formula. Frame S, mm; degrees where a name says
+`_deg`; the time of a virtual clock.
 
-Everything random follows from the seed: sheets by the number of their placement, stops by the number of the start,
-so that a run that is resumed finds its rig and its sheet again, and new stop errors.
+Everything random follows from the seed: sheets by the number of their placement, stops by the number of the start, so
+that a resumed run has the same rig and sheet, and new stop errors.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ LATENCY_US = 300
 
 
 class VirtualClock:
-    """Time that passes only when it is slept."""
+    """Time that passes only in `sleep`."""
 
     def __init__(self) -> None:
         self.now_us = 0
@@ -76,15 +76,15 @@ class SimulatedDevice:
         self.model = DeviceModel(self.mechanics, self.first_boot + self.starts - 1, self.clock.now_us, self._send)
 
     def _send(self, line: bytes) -> None:
-        # Without a listening host the line is dropped, as the firmware does.
+        # Without a host the line is dropped, as by the firmware.
         if self.listener is not None:
             self.listener(line)
 
 
 class ModelLink:
-    """A `Link` to a simulated device; subclasses bend what passes through `to_device` and `to_host`.
+    """A `Link` to a simulated device; subclasses change bytes in `to_device` and `to_host`.
 
-    Bytes to the device arrive when their time has come, no matter who moves the clock next.
+    Bytes arrive at the device at their due time, whatever advances the clock next.
     """
 
     def __init__(self, device: SimulatedDevice):
@@ -116,15 +116,15 @@ class ModelLink:
         self.device.listener = None
 
     def to_device(self, data: bytes) -> None:
-        """What the host has written."""
+        """Bytes that the host has written."""
         self.deliver(data, True, LATENCY_US)
 
     def to_host(self, data: bytes) -> None:
-        """What the device has written."""
+        """Bytes that the device has written."""
         self.deliver(data, False, LATENCY_US)
 
     def deliver(self, data: bytes, device: bool, delay_us: int) -> None:
-        """Put bytes on the way; they arrive in order of time, then in order of sending."""
+        """Queue bytes; they arrive in order of time, then in order of sending."""
         self._number += 1
         heapq.heappush(self._queue, (self.clock.now_us + delay_us, self._number, device, data))
 
@@ -135,7 +135,7 @@ class ModelLink:
             due_us, _, device, data = heapq.heappop(self._queue)
             if device:
                 self.device.model.advance(due_us)
-                # The device answers at the time of the bytes, which may lie before the clock's.
+                # The device answers at the time of the bytes, which may be before the clock's.
                 self.clock.now_us = due_us
                 self.device.model.receive(data, due_us)
                 self.clock.now_us = now_us
@@ -155,9 +155,9 @@ class Instrument:
     """A true rig behind a simulated device.
 
     Args:
-        rig: the declared rig; its `truth` is what the true one is drawn from.
+        rig: the declared rig; the true one is drawn from its `truth`.
         seed: of everything random.
-        start: how often this campaign was started before: stop errors go on, they do not repeat.
+        start: number of earlier starts of this campaign; stop errors differ between starts.
         truth: the true rig; None draws one, the same for every start of a seed.
     """
 
@@ -175,13 +175,13 @@ class Instrument:
         p = self.truth.parameters
         self._backlash = [p[f"backlash_deg.{axis}"] for axis in AXES]
         self._q = [0.0, 0.0]
-        # Mean ratio x counter, were no step ever lost: the place of errors that repeat.
+        # Mean ratio x counter without lost steps: the place of errors that repeat.
         self._place_deg = [0.0, 0.0]
         self._drift_deg, self._drifted_us = [0.0, 0.0], [0, 0]
         self._y = [b * self._stops.uniform(-0.5, 0.5) for b in self._backlash]
         self._eta = [0.0, 0.0]
-        stated = device_settings(rig.positioner)
-        home = stated.get("hp", SETTINGS["hp"][2]), stated.get("ht", SETTINGS["ht"][2])
+        settings = device_settings(rig.positioner)
+        home = settings.get("hp", SETTINGS["hp"][2]), settings.get("ht", SETTINGS["ht"][2])
         self.mechanics = Mechanics(home_steps=home, moved=self._moved, found_home=self._found_home)
         # A boot id of its own for every start: a simulated device does not outlive its process.
         self.device = SimulatedDevice(self.clock, self.mechanics, first_boot=1 + 1000 * start)
@@ -232,7 +232,7 @@ class Instrument:
         self._y[axis] = take_up(self._y[axis], driving, float(width))
 
     def _drift(self, axis: int) -> None:
-        """Let the zero drift over the time since it last did; a camera that looks on must not make it do so."""
+        """Let the zero drift over the time since the last call; cameras must not call it."""
         before_us, now_us = self._drifted_us[axis], self.clock.now_us
         self._drifted_us[axis] = now_us
         scale = self.truth.parameters.get(f"drift_deg_per_root_hour.{AXES[axis]}", 0.0)
@@ -254,9 +254,9 @@ class Instrument:
         return float(wobble_deg(angle_deg, harmonics_deg(self.truth.parameters, AXES[axis]), period))
 
     def state_deg(self) -> TrueAngles:
-        """What a row of moves.csv finds.
+        """True angles for a row of moves.csv.
 
-        Ends the way from the home switch: to be called once per motion, by who drives it.
+        Ends the way from the home switch: to be called once per motion, by the engine.
         """
         self._from_switch = [False, False]
         return TrueAngles(self._mirror_angles_deg(), (self._eta[0], self._eta[1]))
@@ -269,7 +269,7 @@ class Instrument:
         return psi, beta + tilt_zero_deg(self.truth.parameters)
 
     def light(self) -> Light:
-        """What the laser does at this moment; changes nothing, so that a camera's thread may ask at any time.
+        """The light at this moment; changes nothing, so that a camera's thread may call it at any time.
 
         A look lasts from laser on to laser off: its scatter is drawn by its number.
         """
