@@ -69,14 +69,11 @@ def known_head(tmp_path_factory):
     return folder, simulated.truth
 
 
-def test_the_map_exists_at_scales_far_from_the_mode(known_head, monkeypatch):
-    """Where sightings are far better than stated their scatter alone is left, and rounding is all of a difference."""
+def test_the_map_exists_at_scales_far_from_the_mode(known_head):
+    """Where sightings are far better than stated their scatter alone is left."""
     path = transport(fit(read_campaign(known_head[0])))
     noise = 6 * np.random.default_rng(0).standard_t(4, size=(768, path.noise))
     assert np.all(np.isfinite(path.conditional(noise).factor))
-    monkeypatch.setattr("tvsbayes.posterior.transport.WEIGHT_MAX", np.inf)
-    with pytest.raises(np.linalg.LinAlgError):
-        path.conditional(noise)
 
 
 def fresh(truth, steps, folder, seed=5, counters=lambda pan, tilt: (pan, tilt)):

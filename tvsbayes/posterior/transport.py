@@ -57,8 +57,6 @@ FAR_ABOVE = 1e200
 """A last diagonal element that keeps a matrix positive definite whatever stands in its row; nothing reads its root."""
 FAR_SD, FAR_PIXELS = 4.0, 4.0
 """How far the map follows scatter of looks: sds of its prior, and pixel variance at the mode over that of a draw."""
-WEIGHT_MAX = 25.0
-"""Of squared residuals over that at the mode: beyond it products of columns lose to rounding what the priors say."""
 BLOCK_ROWS = 64
 """Points that are mapped at a time: their matrices stay in the processor's cache."""
 CENTRINGS = 1
@@ -253,7 +251,7 @@ class Transport:
         the factor and the forward solution that are wanted, the errors integrated out (Schur complement).
         """
         linear, log_scale = self.linear, self._log_scale(noise)
-        weight = np.minimum(np.exp(-2 * log_scale @ self.pixels), WEIGHT_MAX)
+        weight = np.exp(-2 * log_scale @ self.pixels)
         places, count = linear.places.shape[1], linear.columns.shape[1]
         later = None if linear.creep is None else linear.creep.later(log_scale @ self.creep_noise)
         inner = linear.looks.inner(weight[:, None] * np.exp(2 * log_scale @ self.scatter.T))
