@@ -14,7 +14,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +23,7 @@ import numpy as np
 from experiments.common.command_line import print_only
 from experiments.common.console import console, quietly
 from experiments.common.rows import ROOT
+from tvsbayes.instrument.plan import PlanBuilder, write_plan
 
 FOREIGN, DATA = ROOT / "tests" / "data" / "foreign", ROOT / "data"
 TWIN = DATA / "twins" / "grid_twin"
@@ -131,13 +132,6 @@ def spots() -> None:
         shutil.copy(path, f"pictures/{side}_{int(moves[int(spot)]):03d}.png")
 
 
-def plan_of(places: Iterable[tuple[int, int]]) -> str:
-    """A plan that looks at counters."""
-    rows = [f"{action},{pan},{tilt}" for pan, tilt in places for action in ("move", "look")]
-    steps = [f"{k},{row if row[0] == 'm' else 'look,,'},,," for k, row in enumerate(rows, 1)]
-    return "\n".join(["step,action,pan_steps,tilt_steps,target,experiment,point", "0,home,0,0,,,", *steps, ""])
-
-
 def sightings() -> None:
     """A log of a head whose nominal geometry is that of the URDF, and looks of the same head later; by the twin."""
     quietly("import", "--urdf", "unit.urdf", "--to", "nominal", "--steps-per-turn", "200", "--yes")
@@ -145,7 +139,12 @@ def sightings() -> None:
     order = [grid[k] for _ in range(2) for k in np.random.default_rng(SEED).permutation(len(grid))]
     again = [(sign * pan, sign * tilt) for pan, tilt in ((700, 300), (200, 100), (-600, 200)) for sign in (1, -1)]
     for name, places in (("measured", order), ("fresh", again)):
-        Path("plan.csv").write_text(plan_of(places), encoding="utf-8")
+        plan = PlanBuilder()
+        plan.home()
+        for place in places:
+            plan.move(*place)
+            plan.look()
+        write_plan(plan.steps, Path("plan.csv"), sheets=False)
         quietly("simulate", "nominal/rig.toml", "plan.csv", name, "--seed", str(SEED))
     seen = {row["move"]: row for row in rows_of(Path("measured/sightings.csv"))}
     lines = ["time_s,pan_steps,tilt_steps,azimuth_deg,elevation_deg,u_deg"]

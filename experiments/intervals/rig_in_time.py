@@ -35,7 +35,7 @@ def moving_rig() -> Rig:
 
 
 def temperature_degC(time_s: np.ndarray) -> np.ndarray:
-    """Of a room whose heating switches on and off every ten minutes."""
+    """Of a room that swings by 2 K to either side in ten minutes."""
     return 20.0 + 2.0 * np.sin(2 * np.pi * time_s / 600.0)
 
 
