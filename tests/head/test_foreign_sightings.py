@@ -16,7 +16,7 @@ from tvsbayes.head.foreign_sightings import (
     sighting_field,
     sightings_of_table,
 )
-from tvsbayes.instrument.column_names import understand
+from tvsbayes.instrument.column_names import map_columns
 from tvsbayes.instrument.corrections import Correction
 from tvsbayes.instrument.foreign_looks import Notation
 
@@ -26,8 +26,8 @@ STEPS = [(-9000, 100), (0, 2000), (9000, 4000), (25000, 6000), (41000, 8000)]
 
 def understood(columns, notation=Notation(), correction=Correction(), **wish):  # noqa: B008
     table = table_of("log.csv", "CSV", columns, range(2, 2 + len(next(iter(columns.values())))))
-    known = understand(columns, None, SIGHTING_FIELDS, sighting_field)
-    assert not known.claimed
+    known = map_columns(columns, None, SIGHTING_FIELDS, sighting_field)
+    assert not known.ambiguous
     return sightings_of_table(table, known.columns, notation, correction, **wish)
 
 

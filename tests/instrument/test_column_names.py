@@ -11,8 +11,8 @@ from tvsbayes.instrument.column_names import (
     DEGREES,
     READING_UNITS,
     SECONDS,
+    map_columns,
     missing,
-    understand,
     unit_of_name,
 )
 
@@ -33,10 +33,10 @@ PIXEL_NAMES = [
 def test_pixels_by_any_name(names):
     """In any order, beside their spreads."""
     spreads = tuple(f"std {name}" for name in names)
-    found = understand([*spreads, *names][::-1])
+    found = map_columns([*spreads, *names][::-1])
     assert [found.columns[field] for field in PIXELS] == list(names)
     assert [found.columns[field] for field in PIXEL_SDS] == list(spreads)
-    assert not found.unused and not found.claimed
+    assert not found.unused and not found.ambiguous
 
 
 COUNTER_NAMES = [
@@ -55,12 +55,12 @@ COUNTER_NAMES = [
 @pytest.mark.parametrize("names", COUNTER_NAMES, ids=[" ".join(names) for names in COUNTER_NAMES])
 def test_counters_in_four_languages(names):
     """A word that is known of one axis is known of the other one too."""
-    assert understand(names).columns == dict(zip(COUNTERS, names, strict=True))
+    assert map_columns(names).columns == dict(zip(COUNTERS, names, strict=True))
 
 
 @pytest.mark.parametrize("name", ("aperture_deg", "Apertur [\u00b0]", "apertura (grados)", "Blende"))
 def test_the_aperture_in_three_languages(name):
-    assert understand([name]).columns == {"aperture_deg": name}
+    assert map_columns([name]).columns == {"aperture_deg": name}
 
 
 def test_other_fields_in_four_languages():
@@ -70,12 +70,12 @@ def test_other_fields_in_four_languages():
         ("temps", "ouverture (degr\u00e9s)", "\u00e9cran", "\u00e9tat", "essai", "point", "c\u00f4t\u00e9 horizontal"),
     ):
         fields = ("time_s", "aperture_deg", "target", "status", "experiment", "point", "pan_approach")
-        assert understand(names).columns == dict(zip(fields, names, strict=True))
+        assert map_columns(names).columns == dict(zip(fields, names, strict=True))
 
 
 def test_our_own_names_and_other_words():
-    assert understand(SPOTS.columns).columns == {name: name for name in SPOTS.columns}
-    found = understand(["steps pan", "TiltCount", "t (ms)", "Blatt", "B (rad)", "pan_approach", "remark"])
+    assert map_columns(SPOTS.columns).columns == {name: name for name in SPOTS.columns}
+    found = map_columns(["steps pan", "TiltCount", "t (ms)", "Blatt", "B (rad)", "pan_approach", "remark"])
     assert found.columns == {
         "pan_steps": "steps pan",
         "tilt_steps": "TiltCount",
@@ -109,15 +109,15 @@ def test_units_in_names():
 
 
 def test_what_two_columns_claim_is_asked_for():
-    found = understand(["pan_pos", "pan_goal", "tilt"])
-    assert found.claimed == {"pan_steps": ("pan_pos", "pan_goal")}
+    found = map_columns(["pan_pos", "pan_goal", "tilt"])
+    assert found.ambiguous == {"pan_steps": ("pan_pos", "pan_goal")}
     assert "pan_steps" not in found.columns
-    said = understand(["pan_pos", "pan_goal", "tilt"], {"pan_steps": "pan_goal", "tilt_steps": ""})
+    said = map_columns(["pan_pos", "pan_goal", "tilt"], {"pan_steps": "pan_goal", "tilt_steps": ""})
     assert said.columns == {"pan_steps": "pan_goal"}
     assert "pan_pos" in said.unused
     for stated, match in (({"pan": "tilt"}, "did you mean|allowed: move"), ({"pan_steps": "Pan"}, "no such column")):
         with pytest.raises(InputError, match=match):
-            understand(["pan_pos", "tilt"], stated)
+            map_columns(["pan_pos", "tilt"], stated)
 
 
 def test_what_a_table_must_have():

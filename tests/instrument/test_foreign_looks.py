@@ -11,7 +11,7 @@ from support.small_campaign import small_campaign
 from tvsbayes.errors import InputError
 from tvsbayes.files.foreign_table import ForeignTable
 from tvsbayes.instrument.campaign import PIXELS, parse_spots, spots_bytes
-from tvsbayes.instrument.column_names import understand
+from tvsbayes.instrument.column_names import map_columns
 from tvsbayes.instrument.foreign_looks import Notation, looks_of
 
 HEADER = "Pan Tilt XL YL XR YR Sheet"
@@ -25,7 +25,7 @@ def looks(*rows: str, header: str = HEADER, notation: Notation | None = None, li
         zip(*([cell.replace("-", "") if cell == "-" else cell for cell in row.split()] for row in rows), strict=True)
     )
     table = ForeignTable("t.csv", "drawn", tuple(range(2, 2 + len(rows))), dict(zip(names, cells, strict=True)))
-    return looks_of(table, understand(names).columns, notation or Notation(), listed)
+    return looks_of(table, map_columns(names).columns, notation or Notation(), listed)
 
 
 def test_rows_at_the_same_counters_are_looks_after_one_move():

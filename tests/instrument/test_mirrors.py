@@ -17,8 +17,8 @@ from tvsbayes.instrument.mirrors import (
     Ray,
     Turn,
     Vectors,
+    beam_path,
     intersect_plane,
-    laser_way,
     reflect,
     reflected,
 )
@@ -127,7 +127,7 @@ def test_the_chain_is_the_twins():
     """In frame P."""
     values = {name: VECTOR[name] for name in OPTICS_NAMES}
     for pan, tilt in zip(PAN_RAD.tolist(), TILT_RAD.tolist(), strict=True):
-        way = laser_way(optics(), pan, tilt, math)
+        way = beam_path(optics(), pan, tilt, math)
         found = [np.array(way.pan.forward(part)) for part in way.rays[-1]]
         for part, expected in zip(found, mirror_chain(pan, tilt, values), strict=True):
             np.testing.assert_allclose(part, expected, atol=CHAIN_ROUNDING)
@@ -138,7 +138,7 @@ def test_floats_numpy_and_jax_take_the_same_way():
     """Derivatives too: NumPy's by a complex step (Squire and Trapp, SIAM Review 40 (1998) 110), JAX's own."""
 
     def ends(pan, functions):
-        return laser_way(optics(), pan, TILT_RAD, functions).rays[-1]
+        return beam_path(optics(), pan, TILT_RAD, functions).rays[-1]
 
     step = 1e-30
     expected, slopes = jax.jvp(lambda pan: ends(pan, jnp), (jnp.asarray(PAN_RAD),), (jnp.ones(3),))
@@ -146,7 +146,7 @@ def test_floats_numpy_and_jax_take_the_same_way():
     for k in range(2):
         np.testing.assert_allclose(ends(PAN_RAD, np)[k], expected[k], atol=CHAIN_ROUNDING)
         np.testing.assert_allclose(np.array(moved[k]).imag / step, slopes[k], atol=10 * CHAIN_ROUNDING)
-        singles = [laser_way(optics(), p, t, math).rays[-1][k] for p, t in zip(PAN_RAD, TILT_RAD, strict=True)]
+        singles = [beam_path(optics(), p, t, math).rays[-1][k] for p, t in zip(PAN_RAD, TILT_RAD, strict=True)]
         np.testing.assert_allclose(np.transpose(singles), expected[k], atol=CHAIN_ROUNDING)
 
 
@@ -158,5 +158,5 @@ def test_a_compiler_may_be_told_to_compute_each_part_once():
         seen.append(tree)
         return tree
 
-    way = laser_way(optics(), 0.1, 0.2, math, materialise)
+    way = beam_path(optics(), 0.1, 0.2, math, materialise)
     assert seen[0][0] is way.pan and [tuple(ray) for ray in way.rays] == seen[1:]

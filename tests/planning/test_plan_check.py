@@ -13,7 +13,7 @@ from support.waits import check_forward, doings
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS
 from tvsbayes.instrument.counter_limits import CounterLimits
-from tvsbayes.instrument.plan import PlanStep, described, run_plan
+from tvsbayes.instrument.plan import PlanStep, describe_looks, run_plan
 from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol, paper_protocol
 from tvsbayes.instrument.stops import INSEPARABLE, inseparable, separation
 from tvsbayes.planning.expectation import prior_knowledge
@@ -29,12 +29,12 @@ def test_where_a_plan_stands_follows_the_twin(mounted_rig):
         *(PlanStep(0, "home", 0, 0), PlanStep(1, "place", target="d1"), PlanStep(2, "look")),
         *(PlanStep(3, "move", 100, 40), PlanStep(4, "move", 50, None), PlanStep(5, "look")),
     )
-    assert described(mounted_rig, steps) == "d1: (0, 0) by left, up; (50, 40) by right, up"
+    assert describe_looks(mounted_rig, steps) == "d1: (0, 0) by left, up; (50, 40) by right, up"
     looks = Looks(np.array([[50, 60]]), np.array([[1, 1]]), np.array([0]))
     addition = extended(steps, looks, prior_knowledge(mounted_rig), np.array([30, 10]))
     # Tilt stands at 40: 20 steps up take up its play without a run-up; pan stands at its goal and needs one.
     assert [(s.action, s.pan_steps, s.tilt_steps) for s in addition[:-1]] == [("move", 20, 40), ("move", 50, 60)]
-    assert described(mounted_rig, addition, steps) == "d1: (50, 60) by left, up"
+    assert describe_looks(mounted_rig, addition, steps) == "d1: (50, 60) by left, up"
     moves = run_plan((*steps, *addition), mounted_rig, ("left", "up")).moves
     assert [(m.pan_steps, m.tilt_steps) for m in moves] == [(0, 0), (100, 40), (50, 40), (20, 40), (50, 60)]
 

@@ -10,7 +10,7 @@ import pytest
 from tvsbayes.errors import InputError
 from tvsbayes.files.foreign_table import read_foreign
 from tvsbayes.single_axis.axis_campaign import AxisMove, Reading, parse_readings, readings_bytes
-from tvsbayes.single_axis.foreign_readings import ForeignReadings, readings_of, understand_axis, unwrapped
+from tvsbayes.single_axis.foreign_readings import ForeignReadings, map_axis_columns, readings_of, unwrapped
 
 NAMES = [
     ("steps", "encoder_deg"),
@@ -27,23 +27,23 @@ NAMES = [
 
 @pytest.mark.parametrize("names", NAMES, ids=[names[0] for names in NAMES])
 def test_commands_and_readings_by_any_name(names):
-    found = understand_axis(names[::-1])
-    assert (found.columns["command"], found.columns["value"]) == names and not found.claimed
+    found = map_axis_columns(names[::-1])
+    assert (found.columns["command"], found.columns["value"]) == names and not found.ambiguous
 
 
 def test_dates_in_utc_are_times():
-    assert understand_axis(("UTC", "steps", "RA offset arcsec")).columns["time_s"] == "UTC"
+    assert map_axis_columns(("UTC", "steps", "RA offset arcsec")).columns["time_s"] == "UTC"
 
 
 @pytest.mark.parametrize("names", [("step", "target", "mm"), ("steps", "position", "x"), ("steps", "mm", "deg")])
 def test_what_could_be_either_is_left_open(names):
-    assert "value" not in understand_axis(names).columns
-    assert understand_axis(names, {"value": names[1]}).columns["value"] == names[1]
+    assert "value" not in map_axis_columns(names).columns
+    assert map_axis_columns(names, {"value": names[1]}).columns["value"] == names[1]
 
 
 def test_degrees_of_a_thermometer_are_no_reading():
-    assert "value" not in understand_axis(("steps", "temp deg", "foo")).columns
-    assert understand_axis(("steps", "temp deg", "dial gauge mm")).columns["value"] == "dial gauge mm"
+    assert "value" not in map_axis_columns(("steps", "temp deg", "foo")).columns
+    assert map_axis_columns(("steps", "temp deg", "dial gauge mm")).columns["value"] == "dial gauge mm"
 
 
 @pytest.mark.parametrize(("unit", "turn"), [("deg", 360.0), ("rad", 2 * np.pi), ("turn", 1.0)])
@@ -75,7 +75,7 @@ def table(tmp_path, *lines):
     path = tmp_path / "log.csv"
     path.write_text("\n".join(lines) + "\n")
     read = read_foreign(path)
-    return read, understand_axis(read.columns).columns
+    return read, map_axis_columns(read.columns).columns
 
 
 def test_stops_are_read_again_passed_and_homed(tmp_path):

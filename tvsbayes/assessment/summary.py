@@ -53,7 +53,7 @@ ABSENT_AT_ZERO = tuple(
     for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
     if name not in (*LENGTH_NAMES, *names_of("creep_minutes"))
 )
-"""Parameters that are not told of where they are held at 0."""
+"""Parameters that are not told of where they are fixed at 0."""
 MIXING_SEED = 11
 """Fixed, so that everything made of one fit has the same draws row by row."""
 CURVE_POINTS = 7
@@ -130,7 +130,7 @@ def _absent(fit: JointFit) -> set[str]:
     for axis in AXES:
         if {f"transmission_error_deg.{axis}", f"play_variation_deg.{axis}"} <= none:
             none.add(f"transmission_error_length_deg.{axis}")
-    none |= set(fit.space.mechanism.held)
+    none |= set(fit.space.mechanism.fixed)
     return none | ({"creep_minutes"} if set(names_of("creep_deg")) <= none else set())
 
 

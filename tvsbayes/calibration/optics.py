@@ -17,7 +17,7 @@ import numpy as np
 
 from tvsbayes.head.chain import HeadOptics
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG
-from tvsbayes.instrument.mirrors import Optics, Turn, laser_way
+from tvsbayes.instrument.mirrors import Optics, Turn, beam_path
 from tvsbayes.instrument.parameters import BLOCKS, HARMONIC_ORDERS
 
 ERROR_AT, PLAY_AT = "transmission_error_at_deg", "play_variation_at_deg"
@@ -129,7 +129,7 @@ def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: Module
     optics = _optics(values)
     if isinstance(optics, Optics):
         # From Q to P and on to T in one turn.
-        beam, turn = laser_way(optics, psi, beta, m).rays[-1], Turn.by(psi + to_t, m)
+        beam, turn = beam_path(optics, psi, beta, m).rays[-1], Turn.by(psi + to_t, m)
     else:
         beam, turn = optics.leaving(psi, beta, m), Turn.by(to_t, m)
     x, y, z = turn.forward(beam.origin_mm)

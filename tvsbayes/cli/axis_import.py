@@ -174,15 +174,15 @@ def _table_understood(table: ForeignTable, stated: Mapping[str, str], wish: Axis
     from tvsbayes.instrument.column_names import READING_UNITS, SECONDS, unit_of_name
     from tvsbayes.single_axis.axis_campaign import unit_of_folder
     from tvsbayes.single_axis.foreign_columns import deviation_columns, one_reading_a_row, refuse_small
-    from tvsbayes.single_axis.foreign_readings import AXIS_FIELDS, readings_of, understand_axis, unwrapped
+    from tvsbayes.single_axis.foreign_readings import AXIS_FIELDS, map_axis_columns, readings_of, unwrapped
 
     rows = one_reading_a_row(table, stated)
     table, stated, remarks = rows.table, rows.stated, rows.remarks
-    known = understand_axis(table.columns, stated)
+    known = map_axis_columns(table.columns, stated)
     missing = [field for field in NEEDED if field not in known.columns]
-    if missing or known.claimed:
+    if missing or known.ambiguous:
         besides = "; or is a column actual less commanded position: --column value=NAME --deviations"
-        wanted = [*missing, *(f for f in known.claimed if f not in missing)]
+        wanted = [*missing, *(f for f in known.ambiguous if f not in missing)]
         raise not_sure(table, known, wanted, AXIS_FIELDS, NEEDED, besides * ("value" in missing))
     if not wish.deviations and "value" not in stated:
         refuse_small(table, known.columns)

@@ -128,7 +128,7 @@ def import_sightings(
     """A table of moves and sightings into a new campaign of a head, or into one without rows."""
     from tvsbayes.files.foreign_table import read_foreign
     from tvsbayes.head.foreign_sightings import NEEDED, SIGHTING_FIELDS, sighting_field, sightings_of_table
-    from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, understand, unit_of_name
+    from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, map_columns, unit_of_name
 
     def unit(field: str, name: str) -> str:
         of_name = unit_of_name(name, SECONDS if field == "time_s" else DEGREES)
@@ -136,10 +136,10 @@ def import_sightings(
         return (of_name or usual) if field in ("time_s", "u_deg", *NEEDED) else ""
 
     table = read_foreign(file, sheet)
-    known = understand(table.columns, stated, SIGHTING_FIELDS, sighting_field)
+    known = map_columns(table.columns, stated, SIGHTING_FIELDS, sighting_field)
     missing = [field for field in NEEDED if field not in known.columns]
-    if missing or known.claimed:
-        wanted = [*missing, *(field for field in known.claimed if field not in missing)]
+    if missing or known.ambiguous:
+        wanted = [*missing, *(field for field in known.ambiguous if field not in missing)]
         raise not_sure(table, known, wanted, SIGHTING_FIELDS, NEEDED)
     joints = _joints_of(to)
     falling = () if joints is None else [axis for axis in AXES if joints.sign[axis] < 0]

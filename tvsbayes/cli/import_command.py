@@ -24,7 +24,7 @@ from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 if TYPE_CHECKING:
     from tvsbayes.files.foreign_table import ForeignTable
     from tvsbayes.instrument.campaign import Move
-    from tvsbayes.instrument.column_names import Understood
+    from tvsbayes.instrument.column_names import ColumnMapping
     from tvsbayes.instrument.corrections import Correction
     from tvsbayes.instrument.foreign_looks import ForeignLooks, Notation
 
@@ -100,7 +100,7 @@ def import_(
     """
     from tvsbayes.files.foreign_table import read_foreign
     from tvsbayes.instrument.axes import AXES, sides_of
-    from tvsbayes.instrument.column_names import understand
+    from tvsbayes.instrument.column_names import map_columns
     from tvsbayes.instrument.corrections import Correction, corrected, flipped_axis, shift_of
     from tvsbayes.instrument.foreign_looks import SD_PX, Notation, looks_of
 
@@ -166,7 +166,7 @@ def import_(
     listed = _listed_moves(to)
     table = read_foreign(file, sheet)
     asking = not (yes or as_json) and somebody_there()
-    known = _completed(table, understand(table.columns, stated), stated, listed is not None, asking)
+    known = _completed(table, map_columns(table.columns, stated), stated, listed is not None, asking)
     notation = Notation(pixels_from, angles, SD_PX if sd_px is None else sd_px, relative, approach)
     looks = looks_of(table, known.columns, notation, listed)
     mended = corrected(looks.moves, looks.spots, correction, None if listed is None else len(listed))
@@ -304,16 +304,16 @@ def _listed_moves(to: Path) -> tuple[Move, ...] | None:
 
 
 def _completed(
-    table: ForeignTable, known: Understood, stated: Mapping[str, str], moves_known: bool, asking: bool
-) -> Understood:
+    table: ForeignTable, known: ColumnMapping, stated: Mapping[str, str], moves_known: bool, asking: bool
+) -> ColumnMapping:
     """What was understood, with what was missing asked for at a terminal.
 
     Raises:
         InputError: something is missing, or claimed by two columns, and nobody can be asked.
     """
-    from tvsbayes.instrument.column_names import COUNTERS, FIELDS, PIXELS, missing, understand
+    from tvsbayes.instrument.column_names import COUNTERS, FIELDS, PIXELS, map_columns, missing
 
-    open_fields = [*missing(known.columns, moves_known), *known.claimed]
+    open_fields = [*missing(known.columns, moves_known), *known.ambiguous]
     if not open_fields:
         return known
     names = ", ".join(escaped(name) for name in table.columns)
@@ -322,7 +322,7 @@ def _completed(
         report_line(f"{table.file} has the columns {names}")
         for field in dict.fromkeys(open_fields):
             answers[field] = typer.prompt(f"which of them is {field}? (empty: none)", default="", show_default=False)
-        known = understand(table.columns, answers)
+        known = map_columns(table.columns, answers)
         open_fields = missing(known.columns, moves_known)
         if not open_fields:
             return known
@@ -359,7 +359,7 @@ def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
     return [str(to / name) for name in contents]
 
 
-def _understood_document(table: ForeignTable, known: Understood, looks: ForeignLooks) -> dict[str, Any]:
+def _understood_document(table: ForeignTable, known: ColumnMapping, looks: ForeignLooks) -> dict[str, Any]:
     """The same as `_understood_text`, for programs."""
     return {
         **table_document(table, known),
@@ -370,7 +370,7 @@ def _understood_document(table: ForeignTable, known: Understood, looks: ForeignL
     }
 
 
-def _understood_text(table: ForeignTable, known: Understood, notation: Notation, looks: ForeignLooks) -> str:
+def _understood_text(table: ForeignTable, known: ColumnMapping, notation: Notation, looks: ForeignLooks) -> str:
     """The columns that were found beside their fields, units and first values; what was assumed; what comes out."""
     from tvsbayes.instrument.column_names import DEGREES, FIELDS, SECONDS, unit_of_name
 

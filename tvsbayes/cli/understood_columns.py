@@ -10,7 +10,7 @@ from tvsbayes.errors import InputError, escaped, refusal
 
 if TYPE_CHECKING:
     from tvsbayes.files.foreign_table import ForeignTable
-    from tvsbayes.instrument.column_names import Understood
+    from tvsbayes.instrument.column_names import ColumnMapping
 
 SAMPLES = 3
 """First values of a column that are shown."""
@@ -30,7 +30,7 @@ def few(names: Sequence[str]) -> str:
     return ", ".join(escaped(name) for name in names[:NAMES_LISTED]) + more
 
 
-def table_document(table: ForeignTable, known: Understood) -> dict[str, Any]:
+def table_document(table: ForeignTable, known: ColumnMapping) -> dict[str, Any]:
     """What was understood, for programs."""
     columns = {
         field: {"column": name, "first": first_values(table.columns[name]), "empty": table.columns[name].count("")}
@@ -41,7 +41,7 @@ def table_document(table: ForeignTable, known: Understood) -> dict[str, Any]:
 
 
 def table_lines(
-    table: ForeignTable, known: Understood, fields: Sequence[str], unit: Callable[[str, str], str]
+    table: ForeignTable, known: ColumnMapping, fields: Sequence[str], unit: Callable[[str, str], str]
 ) -> list[str]:
     """The columns that were found beside their fields, units and first values; `unit` of a field and its column."""
     rows = [("field", "column", "read as", "first values")]
@@ -59,15 +59,15 @@ def table_lines(
 
 def not_sure(
     table: ForeignTable,
-    known: Understood,
+    known: ColumnMapping,
     missing: Sequence[str],
     fields: Sequence[str],
     needed: Sequence[str],
     besides: str = "",
 ) -> InputError:
     """The refusal of a table whose columns do not say enough, with what they say; `needed` ones must be there."""
-    claims = [f"{field} ({' or '.join(escaped(name) for name in columns)})" for field, columns in known.claimed.items()]
-    found = f"no column that is surely {', '.join([*(f for f in missing if f not in known.claimed), *claims])}"
+    claims = [f"{field} ({' or '.join(map(escaped, columns))})" for field, columns in known.ambiguous.items()]
+    found = f"no column that is surely {', '.join([*(f for f in missing if f not in known.ambiguous), *claims])}"
     understood = ", ".join(f"{field} = {escaped(known.columns[field])}" for field in fields if field in known.columns)
     found += f"; understood so far: {understood or 'nothing'}"
     remedy = f"say which: {' '.join(f'--column {field}=NAME' for field in missing)}"

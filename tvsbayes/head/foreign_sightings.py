@@ -116,7 +116,7 @@ def sightings_of_table(
     angles = []
     for field in (*ANGLES, *(["u_deg"] * ("u_deg" in columns))):
         scale, column = DEGREES[units[field]], SIGHTINGS[field]
-        read = cells_of.read(column, column.low / scale, column.high / scale, empty=True)
+        read = cells_of.read(column, column.low / scale, column.high / scale, optional=True)
         angles.append([None if value is None else scale * value for value in read])
     stated_u = angles[2] if len(angles) > 2 else [U_DEG if u_deg is None else u_deg] * len(table)
     if "u_deg" not in columns:
@@ -130,7 +130,7 @@ def sightings_of_table(
         sightings.append(
             Sighting(
                 sighting=row,
-                move=listing.of_row[row],
+                move=listing.move_of_row[row],
                 **values,
                 status=status_of(cells_of, row, values, "sighting"),
             )

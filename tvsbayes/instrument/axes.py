@@ -22,11 +22,11 @@ SIDES: dict[str, tuple[str, str]] = {axis: (negative, positive) for axis, (posit
 DIRECTION_SIGNS: dict[str, tuple[Axis, int]] = {
     direction: (axis, sign) for axis, pair in SENSES.items() for direction, sign in zip(pair, (1, -1), strict=True)
 }
-"""Axis and sense of motion of a direction."""
+"""Axis and sense of motion by direction."""
 APPROACH_SIGN = {**{direction: sign for direction, (_, sign) in DIRECTION_SIGNS.items()}, "unknown": 0}
 """Sense of motion of an approach (formulation 2)."""
 HOME_APPROACH: tuple[PanApproach, TiltApproach] = ("left", "up")
-"""Side from which homing ends, per axis, where the caller names none."""
+"""Side from which homing ends, per axis, by default."""
 FULL_TURN_DEG = 360.0
 """Period of the wheel (the output member); a shorter one is the pinion's."""
 HOME_SD_DEG = 0.05
@@ -34,12 +34,12 @@ HOME_SD_DEG = 0.05
 
 
 def direction_of(axis: str, change: float) -> str:
-    """Direction of a motion of an axis by the sign of its change; "" where nothing moves, or nobody knows."""
+    """Direction of a motion of an axis by the sign of its change; "" for zero (no motion, or unknown)."""
     return SIDES[axis][int(change > 0)] if change else ""
 
 
 def bad_approach(axis: str, name: object, allowed: tuple[str, ...]) -> InputError:
-    """The refusal of an approach that is not allowed for the axis."""
+    """The error of an approach that is not allowed for the axis."""
     return InputError(
         "approach",
         f"{axis} approach {escaped(str(name))!r}; allowed: {', '.join(allowed)}",

@@ -1,4 +1,4 @@
-"""What was moved and what was seen: moves, spots and the campaign folder.
+"""The data of a campaign: moves, spots and the campaign folder.
 
 Counters are absolute integers; px with the integer at the centre of a pixel; degrees where a name says `_deg`. Columns
 are found by name. No JAX.
@@ -80,7 +80,7 @@ _CORRELATION = Column(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Move:
-    """A row of `moves.csv`: absolute counters AFTER the move; the temperature then, None where nobody read it.
+    """A row of `moves.csv`: absolute counters and temperature AFTER the move; None where it was not read.
 
     Approaches are "left"/"right"/"unknown" and "up"/"down"/"unknown" in the first row of a segment,
     empty elsewhere.
@@ -232,11 +232,11 @@ SPOTS = CsvKind(Spot, "spots.csv", "a row for every look, in any order")
 NAME_ACQUIRED = "acquired campaign"
 """Of a run whose rig file has no name."""
 NAMES_BY_DEFAULT = (NAME_ACQUIRED, "my rig", "my axis", "my campaign")
-"""Names that nobody chose: those of templates, the last of earlier ones."""
+"""Names of templates, the last of earlier versions; a campaign with one of them counts as unnamed."""
 
 
 def title_of(header: Mapping[str, object], path: Path | None) -> str:
-    """The name in a header that somebody gave, else its folder's, without line breaks."""
+    """The name in the header unless it is a template's, else the folder's, without line breaks."""
     name = str(header.get("name") or "").strip()
     if name and name not in NAMES_BY_DEFAULT:
         return name
@@ -260,9 +260,9 @@ class Campaign(Shown):
 
     @cached_property
     def points_mm(self) -> np.ndarray:
-        """Where the stated cameras see each spot, a row each, frame S, shape (n, 3); triangulated once, read-only.
+        """Each spot triangulated by the stated cameras, frame S, shape (n, 3); computed once, read-only.
 
-        Not a number where there is no spot, and where the lens model does not reach.
+        NaN where there is no spot, and outside the range of the lens model.
         """
         points = np.full((len(self.spots), 3), np.nan)
         usable = np.array([spot.status == "ok" for spot in self.spots], dtype=bool)
@@ -272,12 +272,12 @@ class Campaign(Shown):
 
     @property
     def usable_points_mm(self) -> np.ndarray:
-        """Rows of `points_mm` of the spots that may be used, in their order."""
+        """Rows of `points_mm` of the spots with status ok, in their order."""
         return self.points_mm[[spot.status == "ok" for spot in self.spots]]
 
     @property
     def title(self) -> str:
-        """What readers call it: the name that somebody gave it, else its folder's."""
+        """The name in its header, else that of its folder; see `title_of`."""
         return title_of(self.header, self.path)
 
     def shown(self) -> View:
@@ -285,17 +285,17 @@ class Campaign(Shown):
         ok = sum(spot.status == "ok" for spot in self.spots)
         kind, word = (SIGHTINGS, "sightings") if self.rig.mechanism.sightings else (SPOTS, "spots")
         title = f"Campaign {self.title!r}: {len(self.moves)} moves, {len(self.spots)} {word} ({ok} ok)"
-        at = {move.move: (move.pan_steps, move.tilt_steps) for move in self.moves}
-        others = kind.required[2:]
+        counters = {move.move: (move.pan_steps, move.tilt_steps) for move in self.moves}
+        columns = kind.required[2:]
         rows = [
-            (s.spot, s.move, *at.get(s.move, (None, None)), *(getattr(s, column) for column in others))
+            (s.spot, s.move, *counters.get(s.move, (None, None)), *(getattr(s, column) for column in columns))
             for s in self.spots
         ]
-        return View(title, ("spot", "move", "pan_steps", "tilt_steps", *others), rows, most=5)
+        return View(title, ("spot", "move", "pan_steps", "tilt_steps", *columns), rows, most=5)
 
 
 def frame_name(spot: int, camera: str, folder: str = "frames") -> str:
-    """Where a picture of a look lies in a campaign folder: `frames/000012_left.png`, `dark/` without laser light."""
+    """Path of a look's picture in a campaign folder: `frames/000012_left.png`; in `dark/` without laser light."""
     return f"{folder}/{spot:06d}_{camera}.png"
 
 
@@ -306,11 +306,11 @@ def with_pixels(
     sds_px: Sequence[float | None] = NO_PIXELS,
     correlations: Sequence[float] = (0.0, 0.0),
 ) -> Spot:
-    """The row with another answer of a detector.
+    """The row with another result of a detector.
 
     Args:
         spot: the row.
-        status: "ok", or why there is no spot.
+        status: "ok", or the reason for no spot.
         pixels_px: u_left, v_left, u_right, v_right.
         sds_px: their standard uncertainties.
         correlations: of u and v, left and right.
@@ -327,7 +327,7 @@ def next_move(
     steps: tuple[int, int],
     approach: tuple[PanApproach | Literal[""], TiltApproach | Literal[""]] = ("", ""),
 ) -> Move:
-    """The row behind `moves`; counters and approaches of (pan, tilt)."""
+    """The row after `moves`; counters and approaches of (pan, tilt)."""
     (pan, tilt), (pan_side, tilt_side) = steps, approach
     return Move(
         move=len(moves),
@@ -346,7 +346,7 @@ def parse_moves(data: bytes, file: str = MOVES.file) -> tuple[Move, ...]:
 
 
 def check_experiments(
-    table: Table, experiments: Sequence[int | None], points: Sequence[int | None], counts: Sequence[bool]
+    table: Table, experiments: Sequence[int | None], points: Sequence[int | None], usable: Sequence[bool]
 ) -> None:
     """Refuses an experiment without point or the reverse, and twice the same point of an experiment that counts."""
     pairs = list(zip(experiments, points, strict=True))
@@ -355,7 +355,7 @@ def check_experiments(
             column = "experiment" if experiment is None else "point"
             allowed = "experiment and point both given or both empty"
             raise table.refuse(row, column, "missing", allowed, "complete the pair or empty it")
-    keys = [pair if counted and pair != (None, None) else None for pair, counted in zip(pairs, counts, strict=True)]
+    keys = [pair if is_usable and pair != (None, None) else None for pair, is_usable in zip(pairs, usable, strict=True)]
     refuse_repeated(table, "point", keys, "every point of an experiment once")
 
 
@@ -389,7 +389,7 @@ def _in_image(table: Table, values: Values, stereo: Stereo) -> None:
 
 
 def _outside_remedy(values: Sequence[float | None], extent: float, exchanged: bool) -> str:
-    """What to do about pixels outside the image: a column, a cell, or the size of the pictures."""
+    """The remedy of pixels outside the image: correct a column, a cell, or the size of the pictures."""
     if exchanged:
         return "u and v are exchanged: u counts columns to the right, v rows down"
     outside = sum(value is not None and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN for value in values)
@@ -410,7 +410,7 @@ def _exchanged(pixels: Sequence[Sequence[float | None]], statuses: Sequence[str]
     return all(value is None or -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN for value, extent in cells)
 
 
-# campaign.toml is written last: a folder without it is recognisably unfinished.
+# campaign.toml is written last: a folder without it is unfinished.
 _FILES = {
     "stereo.json": JSON_BYTES_MAX,
     "moves.csv": CSV_BYTES_MAX,
@@ -430,8 +430,8 @@ def _parse_files(files: dict[str, bytes], path: Path | None) -> Campaign:
     header, rig = parse_header(keys), parse_rig_table(keys.table("rig"), sightings)
     if sightings:
         moves = parse_moves(files["moves.csv"])
-        sightings_read = parse_sightings(files[SIGHTINGS.file], SIGHTINGS.file, len(moves))
-        return sighted_campaign(moves, sightings_read, rig, header, path)
+        sightings_rows = parse_sightings(files[SIGHTINGS.file], SIGHTINGS.file, len(moves))
+        return sighted_campaign(moves, sightings_rows, rig, header, path)
     stereo = parse_stereo(files["stereo.json"], "stereo.json")
     moves = parse_moves(files["moves.csv"])
     spots = parse_spots(files["spots.csv"], "spots.csv", len(moves), stereo)
@@ -445,7 +445,7 @@ def sighted_campaign(
     header: dict[str, object] | None = None,
     path: Path | None = None,
 ) -> Campaign:
-    """A campaign of a head that says where it points: sightings, which have all that looks share, stand for spots."""
+    """A campaign of a head with sightings in place of spots: they have the attributes that all looks share."""
     looks = cast(tuple[Spot, ...], tuple(sightings))
     return Campaign(tuple(moves), looks, NO_STEREO, rig, header or {}, path)
 
@@ -454,7 +454,7 @@ def read_campaign(folder: Path | str) -> Campaign:
     """Reads and checks a campaign folder (data/docs/campaign-files.md). Never `truth.json`, frames or results.
 
     Args:
-        folder: holds `campaign.toml`, `stereo.json`, `moves.csv` and `spots.csv`; of a head that says where it points
+        folder: contains `campaign.toml`, `stereo.json`, `moves.csv` and `spots.csv`; that of a head with sightings
             `campaign.toml`, `moves.csv` and `sightings.csv`.
 
     Returns:
@@ -478,17 +478,17 @@ def read_campaign(folder: Path | str) -> Campaign:
             "make a campaign of each: a stereo pair sees the spots of the one, the head says where the other pointed"
         )
         raise refusal("two-tables", file=SIGHTINGS.file, found=found, allowed=allowed, remedy=remedy)
-    wanted = _FILES_OF_SIGHTINGS if sightings else _FILES
-    return _parse_files({name: read_bytes(folder / name, cap, folder) for name, cap in wanted.items()}, folder)
+    bytes_max = _FILES_OF_SIGHTINGS if sightings else _FILES
+    return _parse_files({name: read_bytes(folder / name, cap, folder) for name, cap in bytes_max.items()}, folder)
 
 
 def _no_campaign(folder: Path) -> InputError:
-    """The error of a folder without campaign.toml, which names those below it that have one."""
-    below = sorted(path.parent.name for path in folder.glob("*/campaign.toml"))
+    """The error of a folder without campaign.toml; it names subfolders that have one."""
+    campaigns = sorted(path.parent.name for path in folder.glob("*/campaign.toml"))
     remedy = "`tvsbayes new OUT` begins a campaign"
-    if below:
-        names = ", ".join(escaped(name) for name in below[:5])
-        remedy = f"name one of the campaigns in it: {names}{' ...' * (len(below) > 5)}"
+    if campaigns:
+        names = ", ".join(escaped(name) for name in campaigns[:5])
+        remedy = f"name one of the campaigns in it: {names}{' ...' * (len(campaigns) > 5)}"
     elif (folder / "frames").is_dir() or (folder / "log.jsonl").is_file():
         remedy = "an unfinished run: go on with the command that began it (`simulate`, or `acquire --resume`)"
     found, allowed = f"no such file in {escaped(str(folder), 200)}", "the folder of a campaign"
@@ -504,10 +504,10 @@ def head_templates(sightings: bool) -> dict[str, bytes]:
     """The commented files of an empty campaign of a pan-tilt head, with its rig file."""
     files = templates("head_templates", MOVES, SIGHTINGS if sightings else SPOTS)
     # Lines that begin with #sightings or #spots belong to heads of that kind alone.
-    chosen, other = (b"#sightings ", b"#spots ") if sightings else (b"#spots ", b"#sightings ")
+    prefix, other_prefix = (b"#sightings ", b"#spots ") if sightings else (b"#spots ", b"#sightings ")
     return {
         name: b"".join(
-            line.removeprefix(chosen) for line in data.splitlines(keepends=True) if not line.startswith(other)
+            line.removeprefix(prefix) for line in data.splitlines(keepends=True) if not line.startswith(other_prefix)
         )
         for name, data in files.items()
     }
@@ -546,16 +546,16 @@ def campaign_toml(campaign: Campaign) -> bytes:
 
 
 def campaign_bytes(campaign: Campaign) -> dict[str, bytes]:
-    """The four files of a campaign in the order in which they are to be written; what is read back is the same.
+    """The four files of a campaign in the order of writing; reading them gives the same campaign.
 
     Raises:
-        InputError: `campaign` holds what `read_campaign` would refuse.
+        InputError: `read_campaign` would refuse the files.
     """
     tables = moves_bytes(campaign.moves), looks_bytes(campaign)
     sightings = campaign.rig.mechanism.sightings
     cameras = () if sightings else (stereo_bytes(campaign.stereo),)
-    wanted = _FILES_OF_SIGHTINGS if sightings else _FILES
-    files = dict(zip(wanted, (*cameras, *tables, campaign_toml(campaign)), strict=True))
+    names = _FILES_OF_SIGHTINGS if sightings else _FILES
+    files = dict(zip(names, (*cameras, *tables, campaign_toml(campaign)), strict=True))
     _parse_files(files, None)
     return files
 
@@ -564,8 +564,7 @@ def write_campaign(campaign: Campaign, folder: Path) -> None:
     """Writes the four files of a campaign into a new or empty folder.
 
     Raises:
-        InputError: the folder holds something or cannot be written; what `campaign_bytes` refuses (then nothing is
-            written).
+        InputError: the folder is not empty or cannot be written; `campaign_bytes` refuses (then nothing is written).
     """
     folder, files = Path(folder), campaign_bytes(campaign)
     make_folder(folder, empty=True)
@@ -574,7 +573,7 @@ def write_campaign(campaign: Campaign, folder: Path) -> None:
 
 
 def input_hashes(campaign: Campaign) -> dict[str, str]:
-    """SHA-256 of what an estimate depends on, by "moves", "spots", "stereo" and "rig".
+    """SHA-256 of the inputs of an estimate, by "moves", "spots", "stereo" and "rig".
 
     Taken over the values in canonical text, spots in order of id: line endings, digits beyond double
     precision, the order of columns, the campaign's name and its notes do not count.
@@ -589,11 +588,11 @@ def input_hashes(campaign: Campaign) -> dict[str, str]:
 
 
 def ordered_spots(campaign: Campaign) -> list[Spot]:
-    """Spots, or sightings, with status ok in the order in which the filter meets them."""
+    """Spots, or sightings, with status ok in the order of the filter."""
     ok = [s for s in campaign.spots if s.status == "ok"]
     return sorted(ok, key=lambda s: (s.move, s.spot))
 
 
 def pixels_of(spots: Iterable[Spot]) -> np.ndarray:
-    """Their `PIXELS`, shape (spots, 4); not a number where there are none."""
+    """`PIXELS` of the spots, shape (spots, 4); NaN where there are none."""
     return np.array([[getattr(spot, name) for name in PIXELS] for spot in spots], dtype=float).reshape(-1, 4)

@@ -1,4 +1,4 @@
-"""The head of `campaign.toml`: what was measured, when, by whom, under which conditions; everything outside `[rig]`."""
+"""The header of `campaign.toml`: object, time, operator and conditions of a measurement; all keys outside `[rig]`."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def parse_header(keys: Keys) -> dict[str, object]:
     """The keys of `campaign.toml` outside `[rig]`, checked; their list is closed."""
     keys.word("format", ("tvsbayes-campaign/1",))
     keys.only(_HEADER_KEYS)
-    plain = [key for key in keys.values if key not in ("format", "rig", *_HEADER_TABLES)]
-    header = {key: _header_value(keys, key) for key in plain}
+    plain_keys = [key for key in keys.values if key not in ("format", "rig", *_HEADER_TABLES)]
+    header = {key: _header_value(keys, key) for key in plain_keys}
     for name, allowed in _HEADER_TABLES.items():
         table = keys.table(name)
         table.only(allowed)
@@ -68,21 +68,22 @@ def parse_header(keys: Keys) -> dict[str, object]:
 
 
 def mechanism_of(folder: Path) -> str:
-    """Which instrument a campaign folder is of, by the `format` line of its `campaign.toml` and `mechanism` in `[rig]`.
+    """The instrument of a campaign folder, by `format` and `[rig] mechanism` of its `campaign.toml`.
 
-    A head that says where it points has sightings in place of spots.
-
-    What cannot be read is left to the strict reader of scanners, which says what is wrong with it.
+    A file `sightings.csv` means a head with sightings in place of spots. An unreadable folder counts as a scanner's,
+    whose reader reports the fault.
     """
     values = header_values(folder)
-    kind = str(values.get("format", "")).partition("/")[0].removeprefix("tvsbayes-")
+    format_name = str(values.get("format", "")).partition("/")[0].removeprefix("tvsbayes-")
     rig = values.get("rig")
-    word = str(rig.get("mechanism", SCANNER) if isinstance(rig, dict) else SCANNER) if kind == "campaign" else kind
-    return f"{word}-sightings" if (folder / "sightings.csv").is_file() else word
+    mechanism = format_name
+    if format_name == "campaign":
+        mechanism = str(rig.get("mechanism", SCANNER)) if isinstance(rig, dict) else SCANNER
+    return f"{mechanism}-sightings" if (folder / "sightings.csv").is_file() else mechanism
 
 
 def header_values(folder: Path) -> dict[str, object]:
-    """What `campaign.toml` holds, unchecked; nothing where it cannot be read."""
+    """The entries of `campaign.toml`, unchecked; none where it cannot be read."""
     try:
         return parse_toml(read_bytes(folder / "campaign.toml", TOML_BYTES_MAX, folder), "campaign.toml").values
     except InputError:

@@ -1,4 +1,4 @@
-"""Which column of somebody's table is which field of `moves.csv` and `spots.csv`, by the words in its name.
+"""Which column of a foreign table is which field of `moves.csv` and `spots.csv`, by the words in its name.
 
 A name is taken apart into words ("xLeft (px)" is x, left, px); a rule is a set of words that all stand in it. Units in
 the name are read too. What two columns claim is nobody's until it is said which.
@@ -69,17 +69,17 @@ _UNITS = {
 
 
 @dataclass(frozen=True)
-class Understood:
+class ColumnMapping:
     """Columns of a table by the field that they give.
 
     Attributes:
         columns: column by field.
-        claimed: fields that several columns could give, with these.
+        ambiguous: fields that several columns could give, with these.
         unused: columns that give nothing.
     """
 
     columns: dict[str, str]
-    claimed: dict[str, tuple[str, ...]]
+    ambiguous: dict[str, tuple[str, ...]]
     unused: tuple[str, ...]
 
 
@@ -93,8 +93,8 @@ def words_of(name: str) -> list[str]:
     for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+", plain):
         word = part.lower()
         # XL, ur, su: an axis and a camera written together.
-        glued = re.fullmatch(r"(s?)([xyuv])([lr])|([lr])([xyuv])|(s)([xyuv])", word)
-        words += [piece for piece in glued.groups() if piece] if glued else [word]
+        joined = re.fullmatch(r"(s?)([xyuv])([lr])|([lr])([xyuv])|(s)([xyuv])", word)
+        words += [piece for piece in joined.groups() if piece] if joined else [word]
     return words
 
 
@@ -105,16 +105,16 @@ def unit_of_name(name: str, units: Iterable[str]) -> str | None:
 
 
 def _field_of(name: str) -> str | None:
-    """The field that a column's name tells of."""
+    """The field that a column's name means."""
     listed = words_of(name)
-    words = set(listed)
-    axes = [axis for axis, spellings in _IMAGE_AXES.items() if words & spellings]
-    sides = [side for side, spellings in _SIDES.items() if words & spellings]
+    word_set = set(listed)
+    axes = [axis for axis, spellings in _IMAGE_AXES.items() if word_set & spellings]
+    sides = [side for side, spellings in _SIDES.items() if word_set & spellings]
     if len(axes) == len(sides) == 1:
-        return f"{'s' if words & SPREAD else ''}{axes[0]}_{sides[0]}_px"
+        return f"{'s' if word_set & SPREAD else ''}{axes[0]}_{sides[0]}_px"
     for axis in AXES:
         fields = (_COLUMNS[f"{axis}_approach"], _COLUMNS[f"{axis}_steps"])
-        if all(words.intersection(column.names.split()) for column in fields):
+        if all(word_set.intersection(column.names.split()) for column in fields):
             return f"{axis}_approach"
     return field_by_word(listed, _NAMED)
 
@@ -125,19 +125,19 @@ def field_by_word(words: Sequence[str], columns: Iterable[Column]) -> str | None
     return next((known[word] for word in words if word in known), None)
 
 
-def understand(
+def map_columns(
     columns: Iterable[str],
     stated: Mapping[str, str] | None = None,
     fields: Sequence[str] = FIELDS,
     field_of: Callable[[str], str | None] = _field_of,
-) -> Understood:
-    """Guess what columns are.
+) -> ColumnMapping:
+    """Assigns columns to fields, by their names.
 
     Args:
         columns: their names.
-        stated: column by field, where somebody has said it; an empty column: the table has none.
-        fields: all that there are.
-        field_of: the field that a name tells of.
+        stated: column by field, as the user states it; an empty column: the table has none.
+        fields: all fields.
+        field_of: returns the field that a name means.
 
     Raises:
         InputError: a field or column that does not exist.
@@ -151,18 +151,18 @@ def understand(
         if name and name not in names:
             allowed, remedy = ", ".join(map(escaped, names)), closest(name, names)
             raise InputError("usage", f"{option}: no such column; allowed: {allowed}", allowed=allowed, remedy=remedy)
-    understood = {field: name for field, name in stated.items() if name}
-    free = [name for name in names if name not in understood.values()]
-    understood |= {name: name for name in free if name in fields and name not in stated}
+    mapping = {field: name for field, name in stated.items() if name}
+    free = [name for name in names if name not in mapping.values()]
+    mapping |= {name: name for name in free if name in fields and name not in stated}
     claims: dict[str, list[str]] = {}
-    for name in (n for n in free if n not in understood.values()):
+    for name in (n for n in free if n not in mapping.values()):
         named = field_of(name)
-        if named is not None and named not in understood and named not in stated:
+        if named is not None and named not in mapping and named not in stated:
             claims.setdefault(named, []).append(name)
-    understood |= {field: candidates[0] for field, candidates in claims.items() if len(candidates) == 1}
-    claimed = {field: tuple(candidates) for field, candidates in claims.items() if len(candidates) > 1}
-    used = {*understood.values(), *(name for candidates in claimed.values() for name in candidates)}
-    return Understood(understood, claimed, tuple(name for name in names if name not in used))
+    mapping |= {field: candidates[0] for field, candidates in claims.items() if len(candidates) == 1}
+    ambiguous = {field: tuple(candidates) for field, candidates in claims.items() if len(candidates) > 1}
+    used = {*mapping.values(), *(name for candidates in ambiguous.values() for name in candidates)}
+    return ColumnMapping(mapping, ambiguous, tuple(name for name in names if name not in used))
 
 
 def missing(columns: Iterable[str], moves_known: bool) -> list[str]:

@@ -1,7 +1,7 @@
 """Corrections of whole tables that `check` names: the other sign of a counter, rows shifted, cameras exchanged.
 
-Moves and spots in, moves and spots out; steps and px. An approach is the direction in which the beam moved, in words of
-the person who saw it, so it stays where a counter gets the other sign.
+Moves and spots in, moves and spots out; steps and px. An approach is the observed direction of the beam's motion: it
+does not change with the sign of a counter.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Shift:
 
 @dataclass(frozen=True)
 class Correction:
-    """What is to be changed in the tables of a scanner.
+    """Changes to be made in the tables of a scanner.
 
     Attributes:
         flipped: axes whose counter gets the other sign.
@@ -47,11 +47,11 @@ class Correction:
 
 
 @dataclass(frozen=True)
-class Corrected:
-    """Tables as corrected.
+class CorrectedTables:
+    """Corrected tables.
 
     Attributes:
-        moves, spots: rows of `moves.csv` and `spots.csv`; None of a table that there is not.
+        moves, spots: rows of `moves.csv` and `spots.csv`; None where the table is missing.
         changes: what was changed, in words.
     """
 
@@ -64,7 +64,7 @@ def flipped_axis(text: str) -> Axis:
     """The axis of an option `--flip`.
 
     Raises:
-        InputError: no counter is called so.
+        InputError: no counter has this name.
     """
     for axis in AXES:
         if text == f"{axis}_steps":
@@ -89,17 +89,17 @@ def shift_of(text: str) -> Shift:
 
 def corrected(
     moves: Sequence[Move] | None, spots: Sequence[Spot] | None, correction: Correction, count: int | None = None
-) -> Corrected:
+) -> CorrectedTables:
     """Tables with a correction applied.
 
     Args:
         moves: rows of `moves.csv`; None where there are none to write.
         spots: rows of `spots.csv`, in the order of the file; likewise.
         correction: what is to be changed.
-        count: moves that there are, where `moves` is None.
+        count: number of moves, where `moves` is None.
 
     Raises:
-        InputError: a counter of moves that are not there, or a spot that is not there.
+        InputError: moves, spots, or the spot of a shift are missing.
     """
     changes: list[str] = []
     if moves is None and (correction.flipped or correction.relative):
@@ -108,17 +108,17 @@ def corrected(
     if spots is None and (correction.shifts or correction.swapped or correction.pixels_from):
         remedy = "correct the table that lists the looks"
         raise InputError("usage", "the table has no looks: --shift-moves and --swap change nothing", remedy=remedy)
-    changed = None if moves is None else tuple(moves)
-    if changed is not None and correction.relative:
-        changed = _absolute(changed)
+    new_moves = None if moves is None else tuple(moves)
+    if new_moves is not None and correction.relative:
+        new_moves = _absolute(new_moves)
         changes.append("counters: summed up, because --relative says that each is the steps of its move")
-    for axis in correction.flipped if changed is not None else ():
+    for axis in correction.flipped if new_moves is not None else ():
         name = f"{axis}_steps"
-        changed = tuple(replace(move, **{name: -getattr(move, name)}) for move in changed or ())
+        new_moves = tuple(replace(move, **{name: -getattr(move, name)}) for move in new_moves or ())
         changes.append(f"{name}: written with the other sign; approaches stay, they say how the beam moved")
     looks = None if spots is None else tuple(spots)
     for shift in correction.shifts if looks is not None else ():
-        looks, sentence = _shifted(looks or (), shift, count if changed is None else len(changed))
+        looks, sentence = _shifted(looks or (), shift, count if new_moves is None else len(new_moves))
         changes.append(sentence)
     if looks is not None and correction.swapped:
         looks = tuple(map(_swapped, looks))
@@ -126,16 +126,16 @@ def corrected(
     if looks is not None and correction.pixels_from:
         looks = tuple(_from_zero(spot, correction.pixels_from) for spot in looks)
         changes.append(f"pixels: {correction.pixels_from} taken from all centres")
-    return Corrected(changed, looks, tuple(changes))
+    return CorrectedTables(new_moves, looks, tuple(changes))
 
 
 def _absolute(moves: tuple[Move, ...]) -> tuple[Move, ...]:
-    """Counters after each move of counters that are its steps; a segment begins with where homing ended."""
+    """Absolute counters from the steps of each move; the first row of a segment has those after homing."""
     absolute = list(moves[:1])
-    for before, move in pairwise(moves):
-        start = absolute[-1] if move.segment == before.segment else None
-        added = {} if start is None else {n: getattr(start, n) + getattr(move, n) for n in _COUNTERS}
-        absolute.append(replace(move, **added))
+    for previous, move in pairwise(moves):
+        start = absolute[-1] if move.segment == previous.segment else None
+        counters = {} if start is None else {n: getattr(start, n) + getattr(move, n) for n in _COUNTERS}
+        absolute.append(replace(move, **counters))
     return tuple(absolute)
 
 
@@ -144,17 +144,17 @@ _COUNTERS = tuple(f"{axis}_steps" for axis in AXES)
 
 def _shifted(spots: tuple[Spot, ...], shift: Shift, count: int | None) -> tuple[tuple[Spot, ...], str]:
     """Looks with other moves; one whose move is not listed keeps its number and is left out by its status."""
-    begin = (-1, -1)
+    first_key = (-1, -1)
     if shift.spot is not None:
-        first = [(spot.move, spot.spot) for spot in spots if spot.spot == shift.spot]
-        if not first:
+        keys = [(spot.move, spot.spot) for spot in spots if spot.spot == shift.spot]
+        if not keys:
             remedy = "name a number of the column spot"
             raise InputError("usage", f"--shift-moves {shift.moves}@{shift.spot}: no such spot", remedy=remedy)
-        begin = first[0]
+        first_key = keys[0]
     last = max((spot.move for spot in spots), default=0) if count is None else count - 1
     shifted, lost = [], 0
     for spot in spots:
-        if (spot.move, spot.spot) < begin:
+        if (spot.move, spot.spot) < first_key:
             shifted.append(spot)
         elif 0 <= spot.move + shift.moves <= last:
             shifted.append(replace(spot, move=spot.move + shift.moves))
@@ -166,16 +166,16 @@ def _shifted(spots: tuple[Spot, ...], shift: Shift, count: int | None) -> tuple[
 
 
 def _swapped(spot: Spot) -> Spot:
-    """A look with the centres of both cameras exchanged, and all that is stated of them."""
+    """A look with the centres of both cameras exchanged, with their uncertainties and correlations."""
     left, right = CAMERAS
     names = [f.name for f in fields(Spot) if f"_{left}" in f.name]
-    others = {name: name.replace(f"_{left}", f"_{right}") for name in names}
-    exchanged = {a: getattr(spot, b) for a, b in others.items()} | {b: getattr(spot, a) for a, b in others.items()}
+    right_of = {name: name.replace(f"_{left}", f"_{right}") for name in names}
+    exchanged = {a: getattr(spot, b) for a, b in right_of.items()} | {b: getattr(spot, a) for a, b in right_of.items()}
     return replace(spot, **exchanged)
 
 
 def _from_zero(spot: Spot, first: int) -> Spot:
     """A look with centres counted from 0."""
     centre = {name: getattr(spot, name) for name in PIXELS}
-    moved: dict[str, Any] = {name: None if value is None else value - first for name, value in centre.items()}
-    return replace(spot, **moved)
+    shifted: dict[str, Any] = {name: None if value is None else value - first for name, value in centre.items()}
+    return replace(spot, **shifted)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from tvsbayes.instrument.axes import AXES
 
 COUNTER_MAX = 10**8
-"""No counter of a plan, a campaign or a limit lies beyond."""
+"""Largest absolute counter of a plan, a campaign or a limit."""
 LIMIT_KEYS = {axis: (f"{axis}_min_steps", f"{axis}_max_steps") for axis in AXES}
 """Entries of `[positioner]`, lowest first."""
 HOME_KEYS = {axis: f"{axis}_home_steps" for axis in AXES}
@@ -57,12 +57,12 @@ class CounterLimits:
         }
 
     def allow(self, axis: str, counter: int) -> bool:
-        """Whether a counter lies within what is stated."""
+        """Whether a counter lies within the stated limits."""
         low, high = self.steps[axis]
         return (low is None or counter >= low) and (high is None or counter <= high)
 
     def words(self, axis: str) -> str:
-        """What is stated for an axis."""
+        """The stated limits of an axis, in words."""
         low, high = self.steps[axis]
         return (
             f"{low} to {high}"

@@ -1,7 +1,7 @@
-"""Cells of somebody's table by the field that they give: numbers in any notation, times, homings, words of a status.
+"""Cells of a foreign table by field: numbers in any notation, times, homings, words of a status.
 
-Numbers may be degrees, minutes and seconds, have fractions or carry a unit. What a table does not say is assumed and
-listed in words.
+Numbers may be degrees, minutes and seconds, have fractions or carry a unit. Assumptions about what the table does not
+state are listed in words.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ BAD = {
     *("0", "false", "no", "bad", "invalid", "nein", "schlecht", "ungultig", "mal", "malo", "mala", "invalido"),
     *("non", "mauvais", "mauvaise", "invalide"),
 }
-"""Words of a status, in small letters without accents."""
+"""Words of a status, in lower case without accents."""
 WORDS_SHOWN = 5
-"""Of those that leave rows out."""
+"""Words of a status in a message about excluded rows."""
 NO_NUMBER = {"nan", "n/a", "#n/a", "null"}
-"""What programs write into a cell that has no number, in small letters."""
+"""What programs write into a cell that has no number, in lower case."""
 EPOCH_SCALES = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3}
 """Seconds of a unit by the least number that counts it since 1970; smaller ones are seconds."""
 _FLAGS = {"": False, "0": False, "false": False, "1": True, "true": True}
-"""Cells of a column that marks homings, in small letters."""
+"""Cells of a column that marks homings, in lower case."""
 _CLOCK = re.compile(r"[0-9]{1,2}:[0-9]{2}:[0-9]{2}(?:\.[0-9]{1,6})?")
 _DOTTED_DATE = re.compile(r"([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})[ ,T]+")
-"""Day, month and year: with dots in no other order."""
+"""Day, month and year: the only order with dots."""
 _SEXAGESIMAL = re.compile(
     r"(?P<sign>[+-]?)\s*(?P<d>\d+)\s*(?:\u00b0|deg|d|:|\s)\s*(?P<m>\d{1,2}(?:\.\d+)?)\s*(?:['\u2032m:]|\s|$)\s*"
     r"(?:(?P<s>\d{1,2}(?:\.\d+)?)\s*(?:\"|''|\u2033|s)?)?"
@@ -56,9 +56,9 @@ class PlainColumn:
     """A column of numbers.
 
     Attributes:
-        cells: as plain decimal numbers, what is none as it was.
-        unit: that the cells state.
-        remark: which notation they had, "" where they were plain.
+        cells: as plain decimal numbers; those without a number are unchanged.
+        unit: stated in the cells.
+        remark: their notation, "" where they were plain.
     """
 
     cells: tuple[str, ...]
@@ -107,7 +107,7 @@ def _one_unit(name: str, cells: Sequence[str]) -> PlainColumn | None:
 
 
 def _degrees(cell: str) -> float | None:
-    """Decimal degrees; the sign is of the whole, also of -0 deg 12 min."""
+    """Decimal degrees; the sign applies to the sum, also of -0 deg 12 min."""
     match = _SEXAGESIMAL.fullmatch(cell)
     if match is None or NUMBER.fullmatch(cell):
         return None
@@ -118,7 +118,7 @@ def _degrees(cell: str) -> float | None:
 
 
 def _fraction(cell: str) -> float | None:
-    """A number with a common fraction, of inches: 1 3/8; plain ones beside them stay."""
+    """A number with a common fraction, of inches: 1 3/8; plain numbers in the same column are allowed."""
     text = cell.removesuffix('"').removesuffix("in").strip()
     if NUMBER.fullmatch(text):
         return float(text)
@@ -144,27 +144,27 @@ class FieldCells:
         """Cells of a field; empty ones where no column gives it."""
         return list(self.table.columns[self.columns[field]]) if field in self else [""] * len(self.table)
 
-    def read(self, column: Column, low: float | None = None, high: float | None = None, empty: bool = False) -> list:
-        """Values of a column of our files, its default in empty cells, None where it has none and `empty` allows it.
+    def read(self, column: Column, low: float | None = None, high: float | None = None, optional: bool = False) -> list:
+        """Values of a column of our files; an empty cell is the default, or None where `optional` allows it.
 
         Args:
-            column: its limits hold where no others are given; "200.0" is a whole number.
-            low: another limit.
-            high: another limit.
-            empty: whether a cell may be empty although the column has no default.
+            column: its limits apply where no others are given; "200.0" is a whole number.
+            low: in place of the column's.
+            high: in place of the column's.
+            optional: whether a cell may be empty although the column has no default.
         """
-        field, empty = column.name, empty or column.may_be_empty
+        field, optional = column.name, optional or column.may_be_empty
         default = column.default if column.may_be_empty else None
-        least, greatest = column.low if low is None else low, column.high if high is None else high
+        lowest, highest = column.low if low is None else low, column.high if high is None else high
         values: list[Any] = []
         for row, text in enumerate(self.text(field)):
             cell = "" if text.lower() in NO_NUMBER else text
             value = float(cell) if NUMBER.fullmatch(cell) else math.nan
-            if not cell and empty:
+            if not cell and optional:
                 values.append(default)
-            elif not least <= value <= greatest:
+            elif not lowest <= value <= highest:
                 remedy = "correct the cell, or name another column"
-                raise self.refuse(row, field, f"a number from {least:g} to {greatest:g} for {field}", remedy)
+                raise self.refuse(row, field, f"a number from {lowest:g} to {highest:g} for {field}", remedy)
             elif column.kind is int and not value.is_integer():
                 remedy = "give the counters of the motors; angles are what the fit finds" if field in COUNTERS else ""
                 raise self.refuse(row, field, f"a whole number for {field}", remedy or "correct the cell")
@@ -194,18 +194,18 @@ def temperatures_of(cells: FieldCells, assumed: list[str]) -> list[float | None]
 def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
     """Whether the axes homed before each row but the first, which begins a segment anyway.
 
-    Numbers of segments change at a homing. Where all cells are 0 or 1 and a 0 follows a 1, they are no numbers of
-    segments but marks: each 1 is a homing, and the 0 after it is none.
+    Numbers of segments change at a homing. Where all cells are 0 or 1 and a 0 follows a 1, they are marks instead: each
+    1 is a homing, and the 0 after it is none.
     """
     if "segment" not in cells:
         return [False] * len(cells.table)
     words = [word.lower() for word in cells.text("segment")]
     flags = [_FLAGS.get(word) for word in words]
-    marked = None not in flags and any(before and not after for before, after in pairwise(flags))
-    later = map(bool, flags[1:]) if marked else (before != after for before, after in pairwise(words))
-    homings = [False, *later]
+    are_marks = None not in flags and any(previous and not current for previous, current in pairwise(flags))
+    changes = map(bool, flags[1:]) if are_marks else (previous != current for previous, current in pairwise(words))
+    homings = [False, *changes]
     count, name = sum(homings), escaped(cells.columns["segment"])
-    how = "at each 1" if marked else "where it changes"
+    how = "at each 1" if are_marks else "where it changes"
     assumed.append(f"segment: {count} homing{'s' * (count != 1)} after the first row, by column {name} {how}")
     return homings
 
@@ -224,23 +224,23 @@ def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
         unit = unit_of_name(cells.columns["time_s"], SECONDS)
         scale = SECONDS.get(unit or "", 1.0)
         seconds = [scale * float(cell) for cell in texts]
-        since_1970 = next((each for least, each in EPOCH_SCALES.items() if seconds and seconds[0] >= least), None)
-        if unit is None and since_1970 is not None:
-            seconds = [since_1970 * (value - seconds[0]) for value in seconds]
-            assumed.append(f"time_s: counted in {since_1970:g} s since 1970, so seconds since the first row")
+        epoch_scale = next((s for least, s in EPOCH_SCALES.items() if seconds and seconds[0] >= least), None)
+        if unit is None and epoch_scale is not None:
+            seconds = [epoch_scale * (value - seconds[0]) for value in seconds]
+            assumed.append(f"time_s: counted in {epoch_scale:g} s since 1970, so seconds since the first row")
     else:
         seconds = []
         for row, cell in enumerate(texts):
             try:
                 if _CLOCK.fullmatch(cell):
                     clock = datetime.time.fromisoformat(cell.zfill(8))
-                    day = datetime.datetime.combine(datetime.date(1970, 1, 1), clock, datetime.UTC).timestamp()
-                    later = seconds and day < seconds[-1] % DAY_S
-                    seconds.append(day + DAY_S * ((seconds[-1] // DAY_S if seconds else 0) + bool(later)))
+                    day_s = datetime.datetime.combine(datetime.date(1970, 1, 1), clock, datetime.UTC).timestamp()
+                    next_day = seconds and day_s < seconds[-1] % DAY_S
+                    seconds.append(day_s + DAY_S * ((seconds[-1] // DAY_S if seconds else 0) + bool(next_day)))
                     continue
-                when = datetime.datetime.fromisoformat(_DOTTED_DATE.sub(_iso_date, cell, count=1))
-                # Without a zone every hour has its length: this machine's summer time is not the logger's.
-                seconds.append((when if when.tzinfo else when.replace(tzinfo=datetime.UTC)).timestamp())
+                date_time = datetime.datetime.fromisoformat(_DOTTED_DATE.sub(_iso_date, cell, count=1))
+                # Without a zone as UTC: this machine's summer time is not the logger's.
+                seconds.append((date_time if date_time.tzinfo else date_time.replace(tzinfo=datetime.UTC)).timestamp())
             except ValueError as error:
                 allowed = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
                 raise cells.refuse(row, "time_s", allowed, "correct the cell, or write --column time_s=") from error
@@ -254,32 +254,32 @@ def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
 
 
 def word_of(status: str) -> str:
-    """A cell of a status as `GOOD` and `BAD` have it."""
+    """A cell of a status in lower case without accents, as in `GOOD` and `BAD`."""
     plain = unicodedata.normalize("NFKD", status.strip().lower())
     return "".join(letter for letter in plain if not unicodedata.combining(letter))
 
 
 def left_out(cells: FieldCells, statuses: Iterable[str], what: str) -> list[str]:
-    """What a column of statuses leaves out, as a sentence: a word that somebody meant well may be none of `GOOD`."""
+    """A sentence on the rows that a column of statuses excludes: an unknown word may mean that the row is good."""
     counts = Counter(escaped(text, 24) for text in statuses if text.strip() and word_of(text) not in GOOD)
     if not counts:
         return []
-    common = [f"{text} {count}" for text, count in counts.most_common(WORDS_SHOWN)]
-    named = ", ".join(common) + " ..." * (len(counts) > WORDS_SHOWN)
+    listed = [f"{text} {count}" for text, count in counts.most_common(WORDS_SHOWN)]
+    words = ", ".join(listed) + " ..." * (len(counts) > WORDS_SHOWN)
     count = sum(counts.values())
     return [
-        f"status: {count} {what}{'s' * (count != 1)} left out by column {escaped(cells.columns['status'])}: {named}"
+        f"status: {count} {what}{'s' * (count != 1)} left out by column {escaped(cells.columns['status'])}: {words}"
     ]
 
 
 def status_of(cells: FieldCells, row: int, values: Mapping[str, float | None], what: str) -> str:
-    """The word "ok", or why a row is of no use, as the reader of our tables takes it.
+    """The word "ok", or why a row cannot be used, as our tables allow it.
 
     Args:
         cells: of the table.
         row: of it.
-        values: by field, all of which a row that is ok has.
-        what: a row is.
+        values: by field; a row that is ok has all of them.
+        what: noun for a row.
     """
     text = cells.text("status")[row]
     if (word := word_of(text)) in GOOD or not word:
@@ -291,14 +291,14 @@ def status_of(cells: FieldCells, row: int, values: Mapping[str, float | None], w
     return readable(f"refused: {text}" if word_of(text) in BAD else text, "refused:", 200) or "refused"
 
 
-def readable(text: str, before: str, chars_max: int) -> str:
-    """A cell's text as the reader of our tables takes it: printable, on one line, nothing that a spreadsheet runs.
+def readable(text: str, prefix: str, chars_max: int) -> str:
+    """A cell's text as our tables allow it: printable, on one line, no formula of a spreadsheet.
 
     Args:
         text: of the cell.
-        before: word put before a text that begins with = + - or @: without these signs "-50" and "50" were one.
+        prefix: put before a text that begins with = + - or @: without the signs "-50" and "50" would be equal.
         chars_max: longer ones are cut.
     """
-    kept = "".join(c if c.isprintable() else " " for c in text)
-    kept = " ".join(kept.split())
-    return (f"{before} {kept}" if kept.startswith(("=", "+", "-", "@")) else kept)[:chars_max]
+    printable = "".join(c if c.isprintable() else " " for c in text)
+    printable = " ".join(printable.split())
+    return (f"{prefix} {printable}" if printable.startswith(("=", "+", "-", "@")) else printable)[:chars_max]

@@ -1,7 +1,7 @@
-"""Moves and looks of somebody's table: counters, pixels, times and angles turned into those of our files.
+"""Moves and looks of a foreign table: counters, pixels, times and angles converted to those of our files.
 
-One row is one look, one move, or both; rows that follow each other at the same counters are looks after one move. What
-a table does not say is assumed and listed in words. Px with the integer at the centre of a pixel, (0, 0) the first.
+One row is one look, one move, or both; successive rows at the same counters are looks after one move. Assumptions about
+what the table does not state are listed in words. Px with the integer at the centre of a pixel, (0, 0) the first.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ from tvsbayes.instrument.foreign_cells import (
 )
 
 SD_PX = 0.1
-"""Standard uncertainty of a centroid where a table states none; the fit scales it by what the spots show."""
+"""Standard uncertainty of a centroid where a table states none; the fit estimates its scale."""
 FOUR_POINT = ("experiment", "point")
 """Fields of the four-point method: both or neither."""
 
 
 @dataclass(frozen=True)
 class Notation:
-    """How a table's numbers are meant.
+    """Conventions of a table's numbers.
 
     Attributes:
         pixels_from: coordinate of the centre of the first pixel: 0, or 1 as in MATLAB.
-        angle_unit: "deg" or "rad" of aperture readings; None: as the name of the column says, else degrees.
+        angle_unit: "deg" or "rad" of aperture readings; None: by the name of the column, else degrees.
         sd_px: standard uncertainty of a centroid where no column states it.
-        relative: counters are the steps of each move instead of where it ended.
-        approach: side from which pan and tilt came to the first row; "unknown" where nobody recorded it.
+        relative: counters are the steps of each move instead of absolute ones.
+        approach: side from which pan and tilt came to the first row; "unknown" where it was not recorded.
     """
 
     pixels_from: int = 0
@@ -65,12 +65,12 @@ class Notation:
 
 @dataclass(frozen=True)
 class ForeignLooks:
-    """What a table gives.
+    """Moves and looks of a table.
 
     Attributes:
         moves: rows of `moves.csv`; None where the table has no counters.
         spots: rows of `spots.csv`; None where it has no pixels.
-        assumed: what it does not say, in words.
+        assumed: assumptions about what it does not state, in words.
     """
 
     moves: tuple[Move, ...] | None
@@ -79,46 +79,46 @@ class ForeignLooks:
 
 
 def looks_of(
-    table: ForeignTable, columns: Mapping[str, str], notation: Notation, listed: Sequence[Move] | None = None
+    table: ForeignTable, columns: Mapping[str, str], notation: Notation, known_moves: Sequence[Move] | None = None
 ) -> ForeignLooks:
     """Moves and looks of a table.
 
     Args:
-        table: as it was read.
+        table: the foreign table.
         columns: its columns by field; see `column_names`.
-        notation: how its numbers are meant.
-        listed: moves that are there already, for a table of looks alone.
+        notation: conventions of its numbers.
+        known_moves: present moves, for a table of looks alone.
 
     Raises:
-        InputError: a cell that is no value of its field; looks whose moves nobody knows.
+        InputError: a cell that is no value of its field; looks whose moves are unknown.
     """
     cells = FieldCells(table, columns)
     table.require_rows()
     assumed: list[str] = []
     moves: tuple[Move, ...] | None = None
     if all(field in cells for field in COUNTERS):
-        listing = moves_of_rows(cells, notation, assumed)
-        moves, of_row = listing.moves, listing.of_row
-        assumed += _renumbered(cells, of_row)
+        row_moves = moves_of_rows(cells, notation, assumed)
+        moves, move_of_row = row_moves.moves, row_moves.move_of_row
+        assumed += _renumbered(cells, move_of_row)
     else:
-        of_row = tuple(_listed_moves(cells, listed or ()))
-    spots = _spots(cells, of_row, notation, assumed) if any(field in cells for field in PIXELS) else None
+        move_of_row = tuple(_listed_moves(cells, known_moves or ()))
+    spots = _spots(cells, move_of_row, notation, assumed) if any(field in cells for field in PIXELS) else None
     return ForeignLooks(moves, spots, tuple(assumed))
 
 
-def _listed_moves(cells: FieldCells, listed: Sequence[Move]) -> list[int]:
+def _listed_moves(cells: FieldCells, known_moves: Sequence[Move]) -> list[int]:
     """The move of every row of a table without counters."""
     table, count = cells.table, len(cells.table)
     if "move" not in cells:
-        if len(listed) != count:
-            found = f"{count} looks for {len(listed)} moves, and no column that tells which"
+        if len(known_moves) != count:
+            found = f"{count} looks for {len(known_moves)} moves, and no column that tells which"
             allowed, remedy = "a column of move numbers, or a look for every move", "add --column move=NAME"
             raise refusal("missing-column", file=table.file, found=found, allowed=allowed, remedy=remedy)
         return list(range(count))
     numbers = cells.read(MOVES["move"], low=-ID_MAX)
     for row, number in enumerate(numbers):
-        if not 0 <= number < len(listed):
-            allowed = f"the number of a move, 0 to {len(listed) - 1}"
+        if not 0 <= number < len(known_moves):
+            allowed = f"the number of a move, 0 to {len(known_moves) - 1}"
             raise cells.refuse(row, "move", allowed, "moves count from 0; list them first")
     return numbers
 
@@ -128,44 +128,44 @@ class RowMoves:
     """Moves of a table, and the number of the move of every row."""
 
     moves: tuple[Move, ...]
-    of_row: tuple[int, ...]
+    move_of_row: tuple[int, ...]
 
 
 def moves_of_rows(cells: FieldCells, notation: Notation, assumed: list[str]) -> RowMoves:
-    """The moves of a table with counters; adds to `assumed` what the table does not say.
+    """The moves of a table with counters; adds its assumptions to `assumed`.
 
     Raises:
         InputError: a cell that is no value of its field.
     """
     count = len(cells.table)
-    pairs = list(zip(*(cells.read(MOVES[field]) for field in COUNTERS), strict=True))
+    counters = list(zip(*(cells.read(MOVES[field]) for field in COUNTERS), strict=True))
     numbers = cells.text("move") if "move" in cells else None
     homings = homings_of(cells, assumed)
     times_s = seconds_of(cells, assumed)
-    warm = temperatures_of(cells, assumed)
+    temperatures = temperatures_of(cells, assumed)
     approaches = [_approaches(cells, axis, notation.approach[k]) for k, axis in enumerate(AXES)]
     moves: list[Move] = []
-    of_row: list[int] = []
+    move_of_row: list[int] = []
     at, segment = (0, 0), 0
     for row in range(count):
-        step = pairs[row]
+        pair = counters[row]
         homed = homings[row]
         segment += homed
-        again = row > 0 and (numbers[row] == numbers[row - 1] if numbers else True) and not homed
-        same = again and (numbers is not None or step == ((0, 0) if notation.relative else at))
-        if not same:
-            at = (at[0] + step[0], at[1] + step[1]) if notation.relative and row and not homed else step
+        may_repeat = row > 0 and (numbers[row] == numbers[row - 1] if numbers else True) and not homed
+        repeats = may_repeat and (numbers is not None or pair == ((0, 0) if notation.relative else at))
+        if not repeats:
+            at = (at[0] + pair[0], at[1] + pair[1]) if notation.relative and row and not homed else pair
             first = row == 0 or homed
             pan_side, tilt_side = (sides[row] if first else "" for sides in approaches)
             time_s = float(len(moves)) if times_s is None else times_s[row]
             move = next_move(moves, segment, time_s, at, (pan_side, tilt_side))  # type: ignore[arg-type]
-            moves.append(replace(move, temperature_degC=warm[row]))
-        elif not notation.relative and step != at:
+            moves.append(replace(move, temperature_degC=temperatures[row]))
+        elif not notation.relative and pair != at:
             remedy = "a new move begins a new number; or leave the column out with --column move="
             raise cells.refuse(
-                row, COUNTERS[step[1] != at[1]], f"the counters of its move, {at[0]} and {at[1]}", remedy
+                row, COUNTERS[pair[1] != at[1]], f"the counters of its move, {at[0]} and {at[1]}", remedy
             )
-        of_row.append(len(moves) - 1)
+        move_of_row.append(len(moves) - 1)
     if times_s is None:
         assumed.append("time_s: no column, so 0, 1, 2 ...; drift of the zero is then per move")
     if "pan_approach" not in cells and "unknown" in notation.approach:
@@ -176,23 +176,23 @@ def moves_of_rows(cells: FieldCells, notation: Notation, assumed: list[str]) -> 
         )
     if notation.relative:
         assumed.append("counters: summed up, because --relative says that each is the steps of its move")
-    return RowMoves(tuple(moves), tuple(of_row))
+    return RowMoves(tuple(moves), tuple(move_of_row))
 
 
-def _renumbered(cells: FieldCells, of_row: Sequence[int]) -> list[str]:
-    """Where a table without pixels numbers its moves otherwise than `moves.csv`, by which pictures are then paired."""
+def _renumbered(cells: FieldCells, move_of_row: Sequence[int]) -> list[str]:
+    """A note where a table without pixels numbers its moves otherwise than `moves.csv`, which pairs the pictures."""
     field = "move" if "move" in cells else "spot"
     if field not in cells or any(name in cells for name in PIXELS):
         return []
     numbers = [float(cell) if NUMBER.fullmatch(cell) else None for cell in cells.text(field)]
-    apart = [row for row, number in enumerate(numbers) if number is not None and number != of_row[row]]
-    if not apart:
+    differing = [row for row, number in enumerate(numbers) if number is not None and number != move_of_row[row]]
+    if not differing:
         return []
-    name, row = escaped(cells.columns[field]), apart[0]
-    count = f"{len(apart)} of {len(numbers)} rows"
-    other = f"{name} {escaped(cells.text(field)[row])} is move {of_row[row]}"
-    paired = f"pictures are paired by the move, not by {name}"
-    return [f"move: counted from 0, not as {name} does in {count}: {other}; {paired}"]
+    name, row = escaped(cells.columns[field]), differing[0]
+    count = f"{len(differing)} of {len(numbers)} rows"
+    example = f"{name} {escaped(cells.text(field)[row])} is move {move_of_row[row]}"
+    consequence = f"pictures are paired by the move, not by {name}"
+    return [f"move: counted from 0, not as {name} does in {count}: {example}; {consequence}"]
 
 
 def _approaches(cells: FieldCells, axis: Axis, default: str) -> list[str]:
@@ -205,23 +205,23 @@ def _approaches(cells: FieldCells, axis: Axis, default: str) -> list[str]:
     return words
 
 
-def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed: list[str]) -> tuple[Spot, ...]:
+def _spots(cells: FieldCells, move_of_row: Sequence[int], notation: Notation, assumed: list[str]) -> tuple[Spot, ...]:
     """The looks of a table with pixels."""
     pixels = [cells.read(SPOTS[field]) for field in PIXELS]
-    stated = [cells.read(SPOTS[field], low=-PIXEL_SD_MAX) if field in cells else None for field in PIXEL_SDS]
-    if any(column is None for column in stated):
+    sd_columns = [cells.read(SPOTS[field], low=-PIXEL_SD_MAX) if field in cells else None for field in PIXEL_SDS]
+    if any(column is None for column in sd_columns):
         text = f"standard uncertainty of a centroid: {notation.sd_px:g} px; --sd-px states another"
-        assumed.append(f"{text}, the fit finds the scale" if all(c is None for c in stated) else text)
-    numbers = cells.read(SPOTS["spot"], empty=True)
-    others = {name: cells.read(SPOTS[name]) for name in SPOTS.optional}
+        assumed.append(f"{text}, the fit finds the scale" if all(c is None for c in sd_columns) else text)
+    numbers = cells.read(SPOTS["spot"], optional=True)
+    optional = {name: cells.read(SPOTS[name]) for name in SPOTS.optional}
     statuses, targets = cells.text("status"), cells.text("target")
-    # The others are moves that nobody looked at.
-    looked = [
+    # The other rows are moves without a look.
+    is_look = [
         bool(status) or any(value is not None for value in centre)
         for status, *centre in zip(statuses, *pixels, strict=True)
     ]
-    looked_numbers = [number for number, look in zip(numbers, looked, strict=True) if look]
-    unique = None not in looked_numbers and len(set(looked_numbers)) == len(looked_numbers)
+    look_numbers = [number for number, is_one in zip(numbers, is_look, strict=True) if is_one]
+    unique = None not in look_numbers and len(set(look_numbers)) == len(look_numbers)
     if "spot" in cells and not unique:
         assumed.append("spot: numbers are missing or stand twice, so looks are numbered by their rows")
     four_point = [field for field in FOUR_POINT if field in cells]
@@ -230,7 +230,7 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
         column = escaped(cells.columns[four_point[0]])
         assumed.append(f"column {column} is left out: no column gives the other of {' and '.join(FOUR_POINT)}")
     experiments, points = (
-        cells.read(SPOTS[field]) if len(four_point) == 2 else [None] * len(of_row) for field in FOUR_POINT
+        cells.read(SPOTS[field]) if len(four_point) == 2 else [None] * len(move_of_row) for field in FOUR_POINT
     )
     half = sum((a is None) != (b is None) for a, b in zip(experiments, points, strict=True))
     if half:
@@ -239,19 +239,19 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
     limit = APERTURE_MAX_DEG / scale_deg
     readings = cells.read(SPOTS["aperture_deg"], -limit, limit)
     spots = []
-    for row, move in enumerate(of_row):
-        if not looked[row]:
+    for row, move in enumerate(move_of_row):
+        if not is_look[row]:
             continue
         centre = [column[row] for column in pixels]
-        unseen = None in centre and not word_of(statuses[row])
-        at = dict(zip(PIXELS, centre, strict=True))
-        status = "no centre in the table" if unseen else status_of(cells, row, at, "look")
+        no_centre = None in centre and not word_of(statuses[row])
+        centre_by_field = dict(zip(PIXELS, centre, strict=True))
+        status = "no centre in the table" if no_centre else status_of(cells, row, centre_by_field, "look")
         number = numbers[row] if unique else row
-        reading = None if (read := readings[row]) is None else scale_deg * read
+        reading = None if (raw := readings[row]) is None else scale_deg * raw
         of_experiment = (experiments[row], points[row]) if None not in (experiments[row], points[row]) else (None, None)
-        values = {name: column[row] for name, column in others.items()}
+        values = {name: column[row] for name, column in optional.items()}
         if status == "ok":
-            sds = [_sd_px(cells, row, field, column, notation) for field, column in zip(PIXEL_SDS, stated, strict=True)]
+            sds = [_sd_px(cells, row, *column, notation) for column in zip(PIXEL_SDS, sd_columns, strict=True)]
             centre = [value - notation.pixels_from for value in centre]
             values |= dict(zip((*PIXELS, *PIXEL_SDS), (*centre, *sds), strict=True))
         spots.append(
@@ -271,7 +271,7 @@ def _spots(cells: FieldCells, of_row: Sequence[int], notation: Notation, assumed
 
 
 def _sd_px(cells: FieldCells, row: int, field: str, column: Sequence[float | None] | None, notation: Notation) -> float:
-    """The standard uncertainty of a centre: rows without one may hold whatever they like there."""
+    """The standard uncertainty of a centre; cells of rows without a centre are not checked."""
     if column is None:
         return notation.sd_px
     if (sd := column[row]) is None or sd < PIXEL_SD_MIN:

@@ -1,7 +1,7 @@
-"""From which side a machine comes home: what nobody recorded, as a few ways that data can tell apart (formulation 3.1).
+"""Unrecorded homing sides as a few hypotheses that data can distinguish (formulation 3.1).
 
-Always from one side, always from the other, or from anywhere anew; a way for each axis whose first rows all say
-`unknown`. A single unknown among recorded homings stays "anywhere".
+Homing ends always at one side, always at the other, or anywhere each time; one hypothesis ("way") for each axis whose
+first rows all say `unknown`. A single unknown among recorded homings stays "anywhere".
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from tvsbayes.instrument.campaign import Campaign, Move
 
 ANYWHERE = "anywhere"
 ONE_SIDED_CHANCE = 0.45
-"""Prior probability of each side; the rest is "anywhere". Firmware homes onto a switch, always the same way."""
+"""Prior probability of each side; the rest is "anywhere". Firmware homes onto a switch, always in one direction."""
 
 type Sides = Mapping[str, str]
 """Way of homing by axis: one of its two sides, or `ANYWHERE`."""
 
 
 def unrecorded(moves: Sequence[Move]) -> tuple[str, ...]:
-    """Axes of which no homing side was recorded."""
+    """Axes without any recorded homing side."""
     return tuple(axis for axis in AXES if {getattr(m, f"{axis}_approach") for m in moves} <= {"", "unknown"})
 
 
 def ways(axis: str) -> dict[str, float]:
-    """Ways in which an axis may come home, with their prior probabilities."""
-    sides = (side for side, (of, _) in DIRECTION_SIGNS.items() if of == axis)
+    """Possible ways of homing of an axis, with their prior probabilities."""
+    sides = (side for side, (side_axis, _) in DIRECTION_SIGNS.items() if side_axis == axis)
     return {**dict.fromkeys(sides, ONE_SIDED_CHANCE), ANYWHERE: 1 - 2 * ONE_SIDED_CHANCE}
 
 
 def every_way(axes: Sequence[str]) -> list[dict[str, str]]:
-    """All combinations for some axes."""
-    return [dict(zip(axes, chosen, strict=True)) for chosen in product(*(ways(axis) for axis in axes))]
+    """All combinations of ways of the axes."""
+    return [dict(zip(axes, sides, strict=True)) for sides in product(*(ways(axis) for axis in axes))]
 
 
 def prior_chance(sides: Sides) -> float:
-    """Of a combination: axes are independent."""
+    """Prior probability of a combination: axes are independent."""
     chance = 1.0
     for axis, side in sides.items():
         chance *= ways(axis)[side]
@@ -47,13 +47,13 @@ def prior_chance(sides: Sides) -> float:
 
 
 def homed(campaign: Campaign, sides: Sides) -> Campaign:
-    """The campaign as if its axes had come home in these ways."""
+    """The campaign with these homing sides in place of unknown ones."""
     stated = {f"{axis}_approach": side for axis, side in sides.items() if side != ANYWHERE}
     if not stated:
         return campaign
 
-    def one(move: Move) -> Move:
-        first: dict[str, Any] = {name: side for name, side in stated.items() if getattr(move, name) == "unknown"}
-        return replace(move, **first) if first else move
+    def with_sides(move: Move) -> Move:
+        changes: dict[str, Any] = {name: side for name, side in stated.items() if getattr(move, name) == "unknown"}
+        return replace(move, **changes) if changes else move
 
-    return replace(campaign, moves=tuple(map(one, campaign.moves)))
+    return replace(campaign, moves=tuple(map(with_sides, campaign.moves)))

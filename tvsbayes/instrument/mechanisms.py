@@ -1,7 +1,7 @@
-"""The list of instruments with two axes: what carries the beam, what sees it, and the names that its geometry has.
+"""The list of instruments with two axes: mechanism of the beam, kind of observation, names of the geometry.
 
-Vectors of parameters have one layout (`parameters.NAMES`). A mechanism other than the scanner takes the coordinates of
-the mirrors for terms of its own: the gears' coordinates, and every array, are the same.
+Vectors of parameters have one layout (`parameters.NAMES`). A mechanism other than the scanner uses the coordinates of
+the mirrors for its own terms: the gears' coordinates, and every array, are the same.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ class Mechanism:
     Attributes:
         key: its name in the program.
         word: in rig and campaign files.
-        sightings: it says where it was found to point; else a stereo pair sees its spots.
-        terms: of its geometry, by the scanner's parameter whose coordinate they take.
-        held: values of parameters that mean nothing to it; documents do not name them.
-        freed: priors other than the registry's.
+        sightings: looks are sightings; else a stereo pair sees its spots.
+        terms: of its geometry, by the scanner's parameter whose coordinate they use.
+        fixed: values of parameters that do not apply to it; documents do not name them.
+        own_priors: priors other than the registry's.
     """
 
     key: str
     word: str
     sightings: bool = False
     terms: Mapping[str, Parameter] = field(default_factory=dict)
-    held: Mapping[str, float] = field(default_factory=dict)
-    freed: Mapping[str, Prior] = field(default_factory=dict)
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    own_priors: Mapping[str, Prior] = field(default_factory=dict)
 
     def __reduce__(self) -> tuple[Callable[[str], Mechanism], tuple[str]]:
         """A copy, also in another process, is the entry of the list: mechanisms are compared by identity."""
@@ -58,35 +58,35 @@ class Mechanism:
         return tuple(self.parameters)
 
     def named(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Its own names of the coordinates with these names of the scanner's; other names as they are."""
+        """Its names of the coordinates that the scanner has under these names; other names are unchanged."""
         return tuple(self.terms[name].name if name in self.terms else name for name in names)
 
     @cached_property
     def prior_groups(self) -> dict[str, list[int]]:
-        """Coordinates of every prior that can be a cause of uncertainty, the stereo calibration first."""
-        every = list(enumerate(self.parameters.values()))
+        """Coordinates by cause of uncertainty, the stereo calibration first."""
+        columns = list(enumerate(self.parameters.values()))
         groups: dict[str, list[int]] = {}
-        for column, parameter in (*every[len(RIG_NAMES) :], *every[: len(RIG_NAMES)]):
+        for column, parameter in (*columns[len(RIG_NAMES) :], *columns[: len(RIG_NAMES)]):
             groups.setdefault(parameter.cause, []).append(column)
         return groups
 
     @cached_property
     def rig_names(self) -> tuple[str, ...]:
-        """Of those with a prior of their own, which come first."""
+        """Names of coordinates with a prior in `[rig]`, which are the first."""
         return self.names[: len(RIG_NAMES)]
 
     @cached_property
     def documented(self) -> frozenset[str]:
-        """Names that files and documents may have."""
-        return frozenset(self.names) - frozenset(self.held)
+        """Names allowed in files and documents."""
+        return frozenset(self.names) - frozenset(self.fixed)
 
     @cached_property
     def priors(self) -> dict[str, Prior]:
-        """Defaults; what means nothing is fixed."""
+        """Defaults; parameters that do not apply are fixed."""
 
         def prior(name: str) -> Prior:
-            stated = self.freed.get(name, self.parameters[name].prior)
-            return replace(stated, value=self.held[name], u=0.0) if name in self.held else stated
+            stated = self.own_priors.get(name, self.parameters[name].prior)
+            return replace(stated, value=self.fixed[name], u=0.0) if name in self.fixed else stated
 
         return {name: prior(name) for name in self.rig_names}
 
@@ -101,9 +101,9 @@ _SIGHT = {
     **dict.fromkeys(STEREO_PARAMETER_NAMES, 0.0),
     "focal_scale": 1.0,
 }
-"""Of a head that looks at directions there are neither cameras nor lengths."""
+"""A head with sightings has neither cameras nor lengths."""
 TWO_MIRROR = Mechanism("two-mirror", "two-mirror")
-HEAD = Mechanism("pan-tilt", "pan-tilt", terms=HEAD_TERMS, held=_LASER | _RECEIVER)
+HEAD = Mechanism("pan-tilt", "pan-tilt", terms=HEAD_TERMS, fixed=_LASER | _RECEIVER)
 SIGHTING_HEAD = Mechanism(
     "pan-tilt-sightings",
     "pan-tilt",
@@ -112,9 +112,9 @@ SIGHTING_HEAD = Mechanism(
     _SIGHT | _RECEIVER,
     {"flexure_deg": Prior(0.0, 0.1)},
 )
-MECHANISMS: dict[str, Mechanism] = {each.key: each for each in (TWO_MIRROR, HEAD, SIGHTING_HEAD)}
+MECHANISMS: dict[str, Mechanism] = {mechanism.key: mechanism for mechanism in (TWO_MIRROR, HEAD, SIGHTING_HEAD)}
 """By key."""
-WORDS: tuple[str, ...] = tuple(dict.fromkeys(each.word for each in MECHANISMS.values()))
+WORDS: tuple[str, ...] = tuple(dict.fromkeys(mechanism.word for mechanism in MECHANISMS.values()))
 """Of the key `mechanism` in files, the default first."""
 
 
@@ -125,4 +125,4 @@ def mechanism_by_key(key: str) -> Mechanism:
 
 def mechanism_of(word: str, sightings: bool) -> Mechanism:
     """By its word in files, and whether there are sightings instead of spots; the scanner has none."""
-    return next(each for each in MECHANISMS.values() if (each.word, each.sightings) == (word, sightings))
+    return next(m for m in MECHANISMS.values() if (m.word, m.sightings) == (word, sightings))

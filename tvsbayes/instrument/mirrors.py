@@ -1,10 +1,10 @@
 """The laser over the plane mirrors of the positioner, once for Python floats, NumPy and JAX (formulation 3.2).
 
 Lengths in mm, angles in rad. Frame P: z along the pan axis, up; x along the nominal beam at pan angle 0; y left; origin
-where the nominal laser meets mirror 1. Frame Q is P turned by the pan angle: the mirrors stand there. Many vectors are
-three arrays, one for each of x, y, z (`Vectors`): XLA's loops over one wide array run several times faster than over an
-axis of three. Named tuples are trees of arrays for JAX without importing it. `functions` is `math` for floats, `numpy`
-for arrays (also complex, for derivatives) or `jax.numpy`.
+where the nominal laser meets mirror 1. Frame Q is P turned by the pan angle: the mirrors are fixed there. Many vectors
+are three arrays, one for each of x, y, z (`Vectors`): loops of XLA over one wide array are several times faster than
+over an axis of three. Named tuples are trees of arrays for JAX without importing it. `functions` is `math` for floats,
+`numpy` for arrays (also complex, for derivatives) or `jax.numpy`.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 type Numbers = Any
 """A float, or an array of NumPy or JAX; all of a call broadcast."""
 type Materialise = Callable[[Any], Any]
-"""Has a compiler compute a tree of arrays once, see `model.geometry.materialise`."""
+"""Makes the compiler compute a tree of arrays once, see `model.geometry.materialise`."""
 
 
 def unchanged(tree: Any) -> Any:
-    """Where no compiler is."""
+    """The tree itself, without a compiler."""
     return tree
 
 
@@ -54,7 +54,7 @@ class Vectors(NamedTuple):
         return Vectors(self.x * factor, self.y * factor, self.z * factor)
 
     def __rmul__(self, factor: Numbers) -> Vectors:
-        """The same from the other side: a tuple would be repeated."""
+        """The same with the factor on the left; a plain tuple would be repeated."""
         return self * factor
 
     def dot(self, other: Vectors) -> Numbers:
@@ -68,7 +68,7 @@ class Vectors(NamedTuple):
         return Vectors(x, y, self.x * other.y - self.y * other.x)
 
 
-# NumPy's arrays leave a product with vectors to these; they would take a tuple for one more array.
+# NumPy's arrays leave a product with `Vectors` to this class; they would convert the tuple to an array.
 Vectors.__array_ufunc__ = None  # type: ignore[attr-defined]
 
 
@@ -132,13 +132,13 @@ class Optics(NamedTuple):
     def leaving(
         self, pan_rad: Numbers, tilt_rad: Numbers, functions: ModuleType, materialise: Materialise = unchanged
     ) -> Ray:
-        """The beam behind the last mirror, in P; arguments as of `laser_way`."""
-        way = laser_way(self, pan_rad, tilt_rad, functions, materialise)
-        return Ray(*map(way.pan.forward, way.rays[-1]))
+        """The beam after the last mirror, in P; arguments as of `beam_path`."""
+        path = beam_path(self, pan_rad, tilt_rad, functions, materialise)
+        return Ray(*map(path.pan.forward, path.rays[-1]))
 
 
-class Way(NamedTuple):
-    """The laser's way in frame Q: the turn from Q to P, the mirrors in order, and the rays that leave each of them."""
+class BeamPath(NamedTuple):
+    """The path of the laser beam in frame Q: the turn from Q to P, the mirrors in order, the ray after each of them."""
 
     pan: Turn
     mirrors: tuple[Mirror, ...]
@@ -156,7 +156,7 @@ def intersect_plane(origin: Vectors, direction: Vectors, point: Vectors, normal:
 
 
 def reflected(ray: Ray, mirrors: Iterable[Mirror], materialise: Materialise = unchanged) -> tuple[Ray, ...]:
-    """Rays that leave one mirror after the other: each starts where the one before it meets the mirror."""
+    """The ray after each mirror in order: it starts where the previous ray meets the mirror."""
     rays = []
     for mirror in mirrors:
         hit_mm = intersect_plane(*ray, *mirror)
@@ -196,14 +196,14 @@ def mirrors_of(optics: Optics, tilt: Turn, functions: ModuleType) -> tuple[Mirro
     )
 
 
-def laser_way(
+def beam_path(
     optics: Optics,
     pan_rad: Numbers,
     tilt_rad: Numbers,
     functions: ModuleType,
     materialise: Materialise = unchanged,
-) -> Way:
-    """Follow the laser over all mirrors; the signs are part of the contract.
+) -> BeamPath:
+    """Traces the laser over all mirrors; the signs are part of the contract.
 
     Args:
         optics: laser and mirrors.
@@ -213,7 +213,7 @@ def laser_way(
         materialise: applied to the turns of the stages and to every ray.
     """
     pan, tilt = materialise((Turn.by(pan_rad, functions), Turn.by(tilt_rad, functions)))
-    # The laser stands still in P; in the pan stage's frame Q it turns backwards.
-    still = laser_of(optics, functions)
-    met = mirrors_of(optics, tilt, functions)
-    return Way(pan, met, reflected(Ray(*map(pan.back, still)), met, materialise))
+    # The laser is fixed in P; in the pan stage's frame Q it turns backwards.
+    laser = laser_of(optics, functions)
+    mirrors = mirrors_of(optics, tilt, functions)
+    return BeamPath(pan, mirrors, reflected(Ray(*map(pan.back, laser)), mirrors, materialise))

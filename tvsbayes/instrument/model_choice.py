@@ -1,4 +1,4 @@
-"""Which model a fit holds against the data: gears simpler or richer than a rig file states, spots to be left out."""
+"""The model of a fit: gears simpler or richer than the rig file states, exclusion of spots."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ HARMONIC_SD_DEG = 0.1
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """What `fit` is asked for beyond the priors of the rig; the defaults take those as they are stated.
+    """Options of `fit` that change the priors of the rig; the defaults leave them as stated.
 
     Attributes:
-        robust: downweight and exclude spots that disagree with all others (Huber weights and a gate on leave-one-out
-            residuals).
+        robust: downweight and exclude outliers (Huber weights and a gate on leave-one-out residuals).
         per_axis: one ratio per axis, the contrasts of left and right, up and down fixed at 0.
         harmonics: free the transmission error of every axis with a stated period, N(0, 0.1 deg) each, where
-            `[rig.prior]` says nothing else; a harmonic stated as exactly 0 counts as nothing said.
+            `[rig.prior]` states no other prior; a harmonic stated as exactly 0 counts as unstated.
         no_backlash: gears without play, both backlashes fixed at 0.
-        perfect_gears: gears that repeat no error of unknown shape, do not drift and have the same play everywhere;
+        perfect_gears: gears without transmission error of unknown shape, without drift, and with constant play;
             harmonics that `[rig.prior]` states, or that are freed, stay.
     """
 
@@ -37,10 +36,10 @@ class ModelChoice:
     perfect_gears: bool = False
 
     def table(self, stated: RigTable) -> RigTable:
-        """The rig with the priors of the gears that are chosen.
+        """The rig with the chosen priors of the gears.
 
         Raises:
-            InputError: harmonics are wanted and no axis states the period of its error.
+            InputError: `harmonics`, and no axis states the period of its error.
         """
         changed: dict[str, Prior] = {}
         if self.per_axis:
@@ -50,9 +49,9 @@ class ModelChoice:
         if self.no_backlash or self.perfect_gears:
             changed |= dict.fromkeys(names_of("play_variation_deg"), Prior(0.0, 0.0, "half-normal"))
         if self.perfect_gears:
-            repeated = names_of("transmission_error_deg", "drift_deg_per_root_hour", "harmonic_amplitude_deg")
-            changed |= dict.fromkeys(repeated, Prior(0.0, 0.0, "half-normal"))
-            # A length of nothing is not estimated.
+            error_names = names_of("transmission_error_deg", "drift_deg_per_root_hour", "harmonic_amplitude_deg")
+            changed |= dict.fromkeys(error_names, Prior(0.0, 0.0, "half-normal"))
+            # The length of a zero error is not estimated.
             for name in names_of("transmission_error_length_deg"):
                 changed[name] = Prior(stated.priors[name].value, 0.0, "log-normal")
         if self.harmonics:
@@ -66,8 +65,8 @@ class ModelChoice:
                     remedy='add "harmonic_period_deg.pan" = { value = 360.0, u = 0.0 } (or tilt) to [rig]',
                 )
             for name in HARMONIC_NAMES:
-                unasked = stated.priors[name] == REGISTRY[name].prior
-                if unasked and name.split(".")[1] in stated.harmonic_period_deg:
+                is_default = stated.priors[name] == REGISTRY[name].prior
+                if is_default and name.split(".")[1] in stated.harmonic_period_deg:
                     changed[name] = Prior(0.0, HARMONIC_SD_DEG)
         return replace(stated, priors={**stated.priors, **changed})
 

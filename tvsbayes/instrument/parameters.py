@@ -24,7 +24,7 @@ PERIODS_MAX = 3
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """One parameter's state of knowledge before the spots.
+    """Prior distribution of one parameter.
 
     `value` and `u` mean: normal: mean and standard uncertainty; half-normal: 0 and scale;
     log-normal: median and standard deviation of the logarithm. `u = 0` fixes the parameter.
@@ -46,7 +46,7 @@ class Parameter(Quantity):
         place: the table `[rig]` or `[rig.prior]` of a file, or the stereo calibration.
         prior: default; that of the cameras is the covariance of their calibration.
         low, high, u_max: lowest and highest value and highest standard uncertainty that a file may state. Wide: they
-            catch a wrong unit or a slipped key, not an unusual instrument.
+            detect a wrong unit or a typing error, not an unusual instrument.
         noise: a scale of noise: the point estimate alternates it with geometry and stereo.
         receiver: observable only through aperture readings.
     """
@@ -61,7 +61,7 @@ class Parameter(Quantity):
 
     @property
     def cause(self) -> str:
-        """What budgets call it as a cause of uncertainty; the stereo calibration counts as one, and so do blocks."""
+        """Name of its cause in budgets of uncertainty; the stereo calibration is one cause, and so is a block."""
         if self.place == "stereo":
             return "stereo calibration"
         return "focal scale" if self.name == "focal_scale" else f"prior of {self.name.split('.')[0]}"
@@ -76,15 +76,15 @@ def _block(
     words: str,
     label: str = "",
     place: Place = "rig.prior",
-    **more: Any,
+    **fields: Any,
 ) -> list[Parameter]:
-    """Parameters that differ in nothing but their parts; limits are `low`, `high` and `u_max`."""
-    more |= {"unit": unit, "prior": prior, "words": words, "label": label, "place": place}
-    return Parameter.many(block, parts, **more, **dict(zip(("low", "high", "u_max"), limits, strict=True)))
+    """Parameters that differ only in their parts; limits are `low`, `high` and `u_max`."""
+    fields |= {"unit": unit, "prior": prior, "words": words, "label": label, "place": place}
+    return Parameter.many(block, parts, **fields, **dict(zip(("low", "high", "u_max"), limits, strict=True)))
 
 
 def _cameras() -> tuple[Parameter, ...]:
-    """The stereo calibration, named and ordered as OpenCV does; its file has a reader and limits of its own."""
+    """The stereo calibration, with OpenCV's names and order; its file has its own reader and limits."""
     units: dict[str, Unit] = {name: "px" for name in ("fx", "fy", "cx", "cy")}
     units |= {name: "1" for name in ("k1", "k2", "p1", "p2", "k3")}
     units_of = {f"stereo.{side}": units for side in ("left", "right")}
@@ -137,7 +137,7 @@ _PARAMETERS = (
             "the aperture's zero", place="rig", receiver=True),
     *_block("aperture_sd_deg", (), "deg", Prior(0.02, 0.0, "log-normal"), _SD,
             "the scatter of aperture readings", place="rig", noise=True, receiver=True),
-    # No transmission error unless a rig states one or a fit is asked to free it.
+    # No transmission error unless a rig states one or an option of the fit frees it.
     *_block("harmonic_deg", _HARMONICS, "deg", UNSTATED, (-10.0, 10.0, 10.0), "the periodic error of the gears"),
     *_block("transmission_error_deg", AXES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE,
             "the transmission error, sd", "transmission error sd, {0}", noise=True),
@@ -209,7 +209,7 @@ COLUMNS: dict[str, int] = INDEX | {term.name: INDEX[name] for name, term in HEAD
 BLOCKS = REGISTRY.blocks
 """Names by block; the parameters of a block follow each other."""
 RIG_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place != "stereo")
-"""What has a prior of its own; they come first."""
+"""Parameters with a prior in `[rig]`; they are the first."""
 RIG_PRIORS: dict[str, Prior] = {name: REGISTRY[name].prior for name in RIG_NAMES}
 STEREO_PARAMETER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place == "stereo")
 """The 24 stereo parameters in the order of `parameter_covariance` of a stereo file."""
@@ -226,25 +226,25 @@ GEAR_ERROR_NAMES: tuple[str, ...] = (
 )
 """Scales of the gears' errors that repeat by position, of play that varies and of zeros that drift."""
 LOOK_SCATTER_NAMES: tuple[str, ...] = BLOCKS["look_scatter_deg"]
-"""Sds of what the beam's angle at a look is off from where the axis stands."""
+"""Sds of the deviation of the beam's angle at a look from the angle of the axis."""
 CREEP_NAMES: tuple[str, ...] = (*BLOCKS["creep_deg"], *BLOCKS["creep_minutes"])
 """How far the zeros creep while the machine warms up, and the time constant of both."""
 ZERO_SHIFT_NAMES: tuple[str, ...] = (*CREEP_NAMES, *BLOCKS["thermal_deg_per_K"])
 """Shifts of the zeros in time and with the temperature."""
 LATE_NAMES: tuple[str, ...] = (*LOOK_SCATTER_NAMES, *ZERO_SHIFT_NAMES)
-"""Parameters that earlier versions did not know: files leave them out at their defaults."""
+"""Parameters that earlier versions did not have: files omit them at their defaults."""
 NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
 QUANTITIES: Quantities[Quantity] = Quantities(*_LINES, *_PARAMETERS, *_TERMS, *_DERIVED)
-"""What is said of scanner and head: parameters, what follows from them. `HEADLINES` and `TARGETS` keep this order."""
+"""Quantities of scanner and head: parameters and derived ones. `HEADLINES` and `TARGETS` have this order."""
 HEADLINES = tuple(quantity for quantity in QUANTITIES.values() if quantity.headline)
 TARGETS = {quantity.target: quantity for quantity in HEADLINES if quantity.target}
-"""Headlines that plans and studies are for, by the names that they have there."""
+"""Headlines that plans and studies may target, by their names there."""
 TARGET_ROWS = {target: row for row, target in enumerate(TARGETS)}
 
 
 def names_of(*blocks: str) -> tuple[str, ...]:
-    """Names of the parameters of blocks, in the order asked for."""
+    """Names of the parameters of blocks, in the order of the arguments."""
     return tuple(name for block in blocks for name in BLOCKS[block])
 
 
@@ -252,7 +252,7 @@ OPTICS_NAMES: tuple[str, ...] = names_of(
     *("mirror_offset_mm", "mirror1_error_deg", "mirror2_error_deg", "laser_tilt_deg", "laser_offset_mm"),
     *("tilt_axis_skew_deg", "tilt_axis_offset_mm"),
 )
-"""What bends the beam's way through the positioner; all but the first are zero in the nominal rig."""
+"""Geometry of the beam's path through the positioner; all but the first are zero in the nominal rig."""
 
 
 def parameter_of(name: str) -> Parameter | None:

@@ -1,8 +1,8 @@
-"""Where looks found the gears: the counters at which errors that repeat by position are told apart. NumPy.
+"""Places of the gears: counters at which errors that repeat by position are estimated. NumPy.
 
-A few counters are their own places, exactly. Of many, regular places over the range that was seen carry the processes,
-and each counter has a share in the four nearest (cubic interpolation): an error that changes over 8 deg is met within
-4 % of its sd by places 2.7 deg apart, a thousandth of its variance.
+A few counters are their own places, exactly. For many, the processes live on regular places over the observed range,
+and each counter has a share in the four nearest (cubic interpolation): places 2.7 deg apart represent an error that
+changes over 8 deg within 4 % of its sd, a thousandth of its variance.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stops import rests_of
 
 OWN_PLACES_MAX = 12
-"""Counters of an axis that are places of their own; of more, regular ones take their part: as many, or ..."""
+"""Largest number of counters of an axis that are their own places; for more, regular places replace them: as many, or
+..."""
 SPACING_DEG, PLACES_MAX = 2.7, 24
-"""... one on so many degrees of the output, but no more than this."""
+"""... one for so many degrees of the output, but at most this number."""
 NEAREST = 4
 LEAST_ERROR_RAD = 1e-9
-"""Transmission errors below nobody measures: the floor of their covariance is not worth a word."""
+"""No transmission error below this can be measured: floor of their covariance."""
 FEW_COUNTERS = 3
-"""An axis seen at so many counters or fewer tells its transmission error and its ratio apart hardly or not at all."""
+"""With so many observed counters or fewer, transmission error and ratio of an axis are hardly separable."""
 
 
 def gears_vary(table: RigTable) -> bool:
@@ -37,12 +38,12 @@ def gears_vary(table: RigTable) -> bool:
 
 @dataclass(frozen=True)
 class SeenPlaces:
-    """Places of both axes, pan's first, and what the looks have of them.
+    """Places of both axes, pan's first, and the shares of the looks in them.
 
     Attributes:
         steps: counters, shape (c,).
         on_tilt: places of the tilt axis, shape (c,).
-        error_share: how much of the transmission error at each place each look has, shape (looks, c).
+        error_share: share of each look in the transmission error at each place, shape (looks, c).
         play_share: likewise of the play: half of it with the sign against the side from which the axis came.
     """
 
@@ -60,26 +61,26 @@ class SeenPlaces:
 def interpolation(counters: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Share of each counter (n,) in regular or fewer nodes (m,), ascending: Lagrange polynomials, shape (n, m)."""
     count = min(NEAREST, len(nodes))
-    begin = np.clip(np.searchsorted(nodes, counters, side="right") - count // 2, 0, len(nodes) - count)
-    near = begin[:, None] + np.arange(count)
-    at = nodes[near]
-    share = np.ones(near.shape)
+    first = np.clip(np.searchsorted(nodes, counters, side="right") - count // 2, 0, len(nodes) - count)
+    indices = first[:, None] + np.arange(count)
+    near_nodes = nodes[indices]
+    share = np.ones(indices.shape)
     for k in range(count):
         for other in range(count):
             if other != k:
-                share[:, k] *= (counters - at[:, other]) / (at[:, k] - at[:, other])
+                share[:, k] *= (counters - near_nodes[:, other]) / (near_nodes[:, k] - near_nodes[:, other])
     weights = np.zeros((len(counters), len(nodes)))
-    np.put_along_axis(weights, near, share, axis=1)
+    np.put_along_axis(weights, indices, share, axis=1)
     return weights
 
 
 def places_of(counters: np.ndarray, deg_per_step: float) -> np.ndarray:
-    """Places that stand for the counters of an axis whose output turns by so much a step, ascending."""
-    different = np.unique(counters).astype(float)
-    if len(different) <= OWN_PLACES_MAX:
-        return different
-    wanted = np.ceil(np.ptp(different) * deg_per_step / SPACING_DEG) + 1
-    return np.linspace(different[0], different[-1], int(np.clip(wanted, OWN_PLACES_MAX, PLACES_MAX)))
+    """Places of the counters of an axis whose output turns by `deg_per_step`, ascending."""
+    distinct = np.unique(counters).astype(float)
+    if len(distinct) <= OWN_PLACES_MAX:
+        return distinct
+    count = np.ceil(np.ptp(distinct) * deg_per_step / SPACING_DEG) + 1
+    return np.linspace(distinct[0], distinct[-1], int(np.clip(count, OWN_PLACES_MAX, PLACES_MAX)))
 
 
 def seen_places(moves: Sequence[Move], looks: Sequence[int], table: RigTable) -> SeenPlaces:
@@ -109,20 +110,20 @@ def seen_places(moves: Sequence[Move], looks: Sequence[int], table: RigTable) ->
     )
 
 
-def too_few_counters(axis: str, counters: Sequence[int], telling: Sequence[int]) -> str:
-    """That an axis is seen at few counters: what that means for its use elsewhere, and which looks would tell.
+def too_few_counters(axis: str, counters: Sequence[int], suggested: Sequence[int]) -> str:
+    """A note that an axis is observed at few counters: the consequence elsewhere, and looks that would help.
 
     Args:
         axis: pan or tilt.
-        counters: at which it is seen.
-        telling: others.
+        counters: observed ones.
+        suggested: counters of further looks.
     """
     listed = ", ".join(map(str, counters))
     text = (
         f"{axis} is seen at {len(counters)} counters only ({listed}), which cannot tell gear error from ratio: "
         "the ratio holds between them, elsewhere the gear error of the prior is added"
     )
-    return f"{text}; looks at {axis} {', '.join(map(str, telling))} would tell" if telling else text
+    return f"{text}; looks at {axis} {', '.join(map(str, suggested))} would tell" if suggested else text
 
 
 def line_share(places: SeenPlaces, used: np.ndarray) -> np.ndarray:
@@ -140,8 +141,8 @@ def line_share(places: SeenPlaces, used: np.ndarray) -> np.ndarray:
         of_axis = places.on_tilt == axis
         share = places.error_share[np.ix_(used, of_axis)]
         counters = share @ places.steps[of_axis]
-        off = counters - counters.mean()
-        square = off @ off
+        deviations = counters - counters.mean()
+        sum_of_squares = deviations @ deviations
         if np.ptp(counters) > 0:
-            shares[of_axis] = (off / square) @ share
+            shares[of_axis] = (deviations / sum_of_squares) @ share
     return shares

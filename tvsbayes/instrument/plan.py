@@ -1,8 +1,8 @@
 """A plan: its steps and their file, what following it does, how long it takes, and the same in words.
 
-What an action means stands here alone: `home` sets the counters, 0 where its cells are empty, and both axes then stand
-on the side from which homing ends; `place` asks for a target; `move` goes to absolute counters, an empty cell keeps the
-axis where it is; `look` observes. A plan that does not begin with `home` begins as homed at 0, 0. Counters in steps.
+This module alone defines the actions: `home` sets the counters, 0 where its cells are empty, and both axes are then on
+the side from which homing ends; `place` asks for a target; `move` goes to absolute counters, an empty cell leaves the
+axis as it is; `look` observes. A plan that does not begin with `home` begins as homed at 0, 0. Counters in steps.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import rests_of
 
 LOOKS_PER_EXPERIMENT = 4
-"""The paper counts four spots as one experiment; so do all curves of plans, whatever the looks are."""
+"""The paper counts four spots as one experiment; all curves of plans do the same for looks of any kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +45,11 @@ class PlanStep:
     experiment: Annotated[int | None, Column("of the four-point method: number, and 1 to 4; both or neither")] = None
     point: Annotated[int | None, Column("", 1, 4)] = None
 
-    def counters(self, at: tuple[int, int]) -> tuple[int, int]:
-        """Counters (pan, tilt) after this step, where the axes stood at `at` before it."""
+    def counters(self, start: tuple[int, int]) -> tuple[int, int]:
+        """Counters (pan, tilt) after this step, where the axes stood at `start` before it."""
         if self.action not in ("home", "move"):
-            return at
-        pan, tilt = (0, 0) if self.action == "home" else at
+            return start
+        pan, tilt = (0, 0) if self.action == "home" else start
         return pan if self.pan_steps is None else self.pan_steps, tilt if self.tilt_steps is None else self.tilt_steps
 
 
@@ -63,10 +63,10 @@ _PLAN_ACTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def _actions(table: Table, values: Values, sheets: bool = True) -> None:
+def _check_actions(table: Table, values: Values, sheets: bool = True) -> None:
     """Refuses an action without its columns or with another's, and a look before a place where there are sheets."""
     check_experiments(table, values["experiment"], values["point"], [True] * len(table))
-    targets, placed = values["target"], ""
+    targets, sheet = values["target"], ""
     for row, action in enumerate(values["action"]):
         if action not in (_PLAN_ACTIONS if row else ("home",)):
             allowed = "home, place, move or look" if row else "home, the first action"
@@ -77,15 +77,15 @@ def _actions(table: Table, values: Values, sheets: bool = True) -> None:
                 allowed = f"{'a value' if column in filled else 'an empty cell'} with the action {action}"
                 raise table.refuse(row, column, "action", allowed, "give each action its own columns only")
         if action == "place":
-            placed = targets[row]
-        elif action == "look" and sheets and (not placed or targets[row] not in ("", placed)):
-            allowed = f"an empty cell or {placed}, placed last" if placed else "a place before the look"
+            sheet = targets[row]
+        elif action == "look" and sheets and (not sheet or targets[row] not in ("", sheet)):
+            allowed = f"an empty cell or {sheet}, placed last" if sheet else "a place before the look"
             raise table.refuse(row, "target", "target", allowed, "place the target first")
 
 
 def parse_plan(data: bytes, file: str = PLANS.file, sheets: bool = True) -> tuple[PlanStep, ...]:
     """The checked rows of `plan.csv`; see `read_plan`."""
-    steps = PLANS.parse(data, file, partial(_actions, sheets=sheets))
+    steps = PLANS.parse(data, file, partial(_check_actions, sheets=sheets))
     return tuple(
         replace(step, pan_steps=step.pan_steps or 0, tilt_steps=step.tilt_steps or 0) if step.action == "home" else step
         for step in steps
@@ -97,7 +97,7 @@ def read_plan(path: Path, sheets: bool = True) -> tuple[PlanStep, ...]:
 
     Args:
         path: of the file.
-        sheets: looks are at sheets, which must be placed; a head that says where it points has none.
+        sheets: looks are at sheets, which must be placed; a head with sightings has none.
 
     Raises:
         InputError: wrong order, an action without its columns or with another's, a look before a place.
@@ -125,18 +125,18 @@ class PlanBuilder:
         self.steps.append(PlanStep(len(self.steps), "home", pan, tilt))
 
     def place(self, target: str) -> None:
-        """Ask for a target; one without a name is looked at wherever it is."""
+        """Ask for a target; one without a name needs no placement."""
         if target:
             self.steps.append(PlanStep(len(self.steps), "place", target=target))
 
     def move(self, pan: int | None = None, tilt: int | None = None) -> None:
-        """Move to absolute counters; nothing is ordered where they are reached already."""
-        before, self.at = self.at, PlanStep(0, "move", pan, tilt).counters(self.at)
-        if self.at != before:
+        """Move to absolute counters; no step where they are reached already."""
+        previous, self.at = self.at, PlanStep(0, "move", pan, tilt).counters(self.at)
+        if self.at != previous:
             self.steps.append(PlanStep(len(self.steps), "move", *self.at))
 
     def look(self, experiment: int | None = None, point: int | None = None) -> None:
-        """Observe, as a point of an experiment or without."""
+        """Observe, as a point of an experiment or not."""
         self.steps.append(PlanStep(len(self.steps), "look", experiment=experiment, point=point))
 
     def reach(self, axis: Axis, counter: int, sign: int, overshoot: int) -> None:
@@ -151,7 +151,7 @@ COST_KEYS = {"home": "move_s", "place": "placement_s", "move": "move_s", "look":
 
 
 def action_seconds(rig: Rig, actions: Mapping[str, int]) -> float:
-    """Duration by `[costs]` of so many actions of each kind, s; what is left unstated costs nothing."""
+    """Duration by `[costs]` of so many actions of each kind, s; an unstated one takes no time."""
     return sum(count * float(rig.costs_s.get(COST_KEYS[action], 0.0)) for action, count in actions.items())
 
 
@@ -184,7 +184,7 @@ class PlanLog:
 
     @property
     def sheet(self) -> str:
-        """The target that stands at its end, "" if none was placed."""
+        """The target placed last, "" if none was placed."""
         return self.targets[-1] if self.targets else ""
 
 
@@ -198,7 +198,7 @@ def run_plan(
     """
     log, time_s, segment = PlanLog(), 0.0, -1
     if rig.table.mechanism.sightings:
-        # No sheet is asked for.
+        # Sightings need no sheet.
         log.targets.append("")
     for step in plan:
         if step.action == "home" or (not log.moves and step.action in ("move", "look")):
@@ -232,15 +232,15 @@ def run_plan(
 
 
 def outline(rig: Rig, plan: Sequence[PlanStep]) -> list[str]:
-    """What a run would do, in words: the listing of `--dry-run`."""
-    lines, at = [], (0, 0)
+    """The steps of a run in words: the listing of `--dry-run`."""
+    lines, counters = [], (0, 0)
     for step in plan:
-        before, at = at, step.counters(at)
+        previous, counters = counters, step.counters(counters)
         if step.action == "home":
-            lines.append(f"{step.step}: home, then go to pan {at[0]}, tilt {at[1]}")
+            lines.append(f"{step.step}: home, then go to pan {counters[0]}, tilt {counters[1]}")
         elif step.action == "move":
-            by = f"(by {at[0] - before[0]:+d}, {at[1] - before[1]:+d})"
-            lines.append(f"{step.step}: go to pan {at[0]}, tilt {at[1]} {by}")
+            change = f"(by {counters[0] - previous[0]:+d}, {counters[1] - previous[1]:+d})"
+            lines.append(f"{step.step}: go to pan {counters[0]}, tilt {counters[1]} {change}")
         elif step.action == "place":
             lines.append(f"{step.step}: ask for the sheet at {step.target}, X = {rig.sheets_mm[step.target]:g} mm")
         else:
@@ -249,16 +249,16 @@ def outline(rig: Rig, plan: Sequence[PlanStep]) -> list[str]:
     return lines
 
 
-def described(rig: Rig, steps: Sequence[PlanStep], before: Sequence[PlanStep] = ()) -> str:
+def describe_looks(rig: Rig, steps: Sequence[PlanStep], previous: Sequence[PlanStep] = ()) -> str:
     """Looks of a short plan on one sheet in words, after another plan."""
-    log = run_plan((*before, *steps), rig)
+    log = run_plan((*previous, *steps), rig)
     pan, tilt = (rests_of(log.moves, axis) for axis in AXES)
-    words = []
-    for look in log.looks[sum(step.action == "look" for step in before) :]:
+    phrases = []
+    for look in log.looks[sum(step.action == "look" for step in previous) :]:
         stops = pan[look.move], tilt[look.move]
-        came = ", ".join(direction_of(axis, stop.sign) for axis, stop in zip(AXES, stops, strict=True))
-        words.append(f"({stops[0].steps}, {stops[1].steps}) by {came}")
-    return f"{log.sheet}: ".removeprefix(": ") + "; ".join(words)
+        directions = ", ".join(direction_of(axis, stop.sign) for axis, stop in zip(AXES, stops, strict=True))
+        phrases.append(f"({stops[0].steps}, {stops[1].steps}) by {directions}")
+    return f"{log.sheet}: ".removeprefix(": ") + "; ".join(phrases)
 
 
 def step_json(step: PlanStep) -> dict[str, object]:

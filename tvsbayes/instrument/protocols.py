@@ -15,7 +15,7 @@ from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 PAN_RANGE_STEPS = (0, 200)
 TILT_RANGE_STEPS = (-100, 100)
 OVERSHOOT_STEPS = 40
-"""How far beyond a start an approach begins: 2.4 deg at 0.06 deg/step, beyond any play worth measuring."""
+"""Distance beyond a start at which an approach begins: 2.4 deg at 0.06 deg/step, more than any play to be measured."""
 GRID_PAN_STEPS = (-60, 0, 60, 120, 180, 240)
 GRID_TILT_STEPS = (-90, -30, 30, 90)
 
@@ -47,12 +47,12 @@ def four_point_protocol(
     plan.home()
     plan.place(targets[0])
     for direction, (axis, sign) in DIRECTION_SIGNS.items():
-        other = "tilt" if axis == "pan" else "pan"
-        plan.move(**{other: sum(ranges[other]) // 2})
+        other_axis = "tilt" if axis == "pan" else "pan"
+        plan.move(**{other_axis: sum(ranges[other_axis]) // 2})
         start = ranges[axis][0 if sign > 0 else 1]
-        turns = (approaches or {}).get(direction, ("direct",))
+        kinds = (approaches or {}).get(direction, ("direct",))
         for repeat in range(repeats):
-            approach = turns[repeat % len(turns)]
+            approach = kinds[repeat % len(kinds)]
             if approach == "direct":
                 plan.move(**{axis: start})
             else:
@@ -69,9 +69,9 @@ def four_point_protocol(
 
 
 def paper_protocol(repeats: int = 24, targets: tuple[str, str] = ("d1", "d2")) -> tuple[PlanStep, ...]:
-    """The paper's protocol as it reads: one |N| = 200, plain go and return.
+    """The paper's protocol as published: one |N| = 200, plain go and return.
 
-    Every start but the first, where the homing stands, is then reversed.
+    Every start but the first, right after homing, is then reversed.
     """
     return four_point_protocol(repeats, targets=targets)
 
@@ -79,10 +79,10 @@ def paper_protocol(repeats: int = 24, targets: tuple[str, str] = ("d1", "d2")) -
 def twin_protocol(repeats: int = 24) -> tuple[PlanStep, ...]:
     """The history under which one backlash per axis gives Table 1: left, down reversed; right, up cleared.
 
-    The paper does not record how its starts were reached: this is our assumption.
+    The paper does not state how its starts were reached: this is our assumption.
     """
     history = {"left": "reversed", "right": "cleared", "up": "cleared", "down": "reversed"}
-    return four_point_protocol(repeats, approaches={name: (how,) for name, how in history.items()})
+    return four_point_protocol(repeats, approaches={name: (kind,) for name, kind in history.items()})
 
 
 def mixed_protocol(repeats: int = 24, targets: tuple[str, str] = ("d1", "d2")) -> tuple[PlanStep, ...]:
@@ -132,4 +132,4 @@ UNSTATED_STEPS = {
     "pan": (min(GRID_PAN_STEPS) - OVERSHOOT_STEPS, max(GRID_PAN_STEPS) + OVERSHOOT_STEPS),
     "tilt": (min(GRID_TILT_STEPS) - OVERSHOOT_STEPS, max(GRID_TILT_STEPS) + OVERSHOOT_STEPS),
 }
-"""Counters used where `[positioner]` states no limits: those of the grid protocol, not one step more."""
+"""Counters used where `[positioner]` states no limits: those of the grid protocol."""

@@ -1,7 +1,7 @@
-"""What a quantity is, of any instrument: one entry says its name, unit and words, what it serves and where it applies.
+"""Quantities of any instrument: one entry has name, unit, words, purpose and where it applies.
 
-Every instrument has a list of its own. How a quantity follows from draws stands beside the model, how it follows from a
-true instrument in the twin, both under the name of the entry.
+Every instrument has its own list. The model computes a quantity from draws, the twin from a true instrument, both under
+the name of the entry.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ class Quantity:
 
     Attributes:
         name: in JSON, draws, `posterior.nc` and tables.
-        block: all of the name but its part, which quantities that differ in nothing else share.
+        block: the name without its part; quantities that differ only in the part share it.
         unit: of its values; one unit only where all instruments of the kind have it.
         words: of the block, in a sentence.
         label: in tables.
-        headline: what a fit is for: a posterior is judged by it.
-        target: what plans and studies call a headline that a measurement may be for.
+        headline: a main result of a fit: a posterior is judged by it.
+        target: name of a headline that plans and studies may target.
         judged: a headline whose budget, leverage and sensitivity to priors are reported.
-        ratio: degrees of the beam per step: of directions that moved.
-        stated: the parameter whose stated value studies hold it against; 0 where there is none.
+        ratio: degrees of the beam per step; only of directions that moved.
+        stated: the parameter whose stated value studies compare it with; 0 where there is none.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Quantity:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Of the name, behind the block."""
+        """Parts of the name after the block."""
         return tuple(self.name.removeprefix(self.block).split("."))[1:]
 
     @property
@@ -57,7 +57,7 @@ class Quantity:
 
     @property
     def axis(self) -> Axis | None:
-        """The axis that it belongs to; None where that is none alone."""
+        """Its axis; None where it has none or both."""
         return next((axis for axis in AXES if {axis, *SENSES[axis]} & set(self.parts)), None)
 
     @property
@@ -71,17 +71,18 @@ class Quantity:
         return not self.ratio or directions <= set(moved)
 
     @classmethod
-    def many(cls, block: str, parts: Collection[str], **more: Any) -> list[Self]:
-        """Quantities that differ in nothing but their parts; a scalar has none.
+    def many(cls, block: str, parts: Collection[str], **fields: Any) -> list[Self]:
+        """Quantities that differ only in their parts; a scalar has none.
 
         Texts may name parts as {0}, {1} ..., the axis as {axis}, and both of its directions as {sides}.
         """
         quantities = []
         for name in [f"{block}.{part}" for part in parts] or [block]:
-            bare = cls(name=name, block=block, **more)
-            named = {"axis": bare.axis, "sides": " - ".join(bare.sides)}
-            texts = {key: getattr(bare, key).format(*bare.parts, **named) for key in ("label", "target", "stated")}
-            quantities.append(replace(bare, **texts))
+            quantity = cls(name=name, block=block, **fields)
+            parts_by_key = {"axis": quantity.axis, "sides": " - ".join(quantity.sides)}
+            templates = {key: getattr(quantity, key) for key in ("label", "target", "stated")}
+            texts = {key: text.format(*quantity.parts, **parts_by_key) for key, text in templates.items()}
+            quantities.append(replace(quantity, **texts))
         return quantities
 
 
@@ -105,5 +106,5 @@ class Quantities[Q: Quantity](dict[str, Q]):
         return {entry.block: entry.words for entry in self.values() if entry.words}
 
     def of(self, name: str) -> Q | None:
-        """The entry of a name; of one whose parts are counters, the entry of all of them."""
+        """The entry of a name; where its parts are counters, the entry of the block."""
         return self.get(name) or self.get(name.split(".", maxsplit=1)[0])

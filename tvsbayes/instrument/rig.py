@@ -31,11 +31,11 @@ from tvsbayes.instrument.parameters import (
 from tvsbayes.instrument.stereo_pair import NO_STEREO, Stereo, read_stereo
 
 SPOT_SD_PX = 0.08
-"""Standard uncertainty stated for a spot centre where nobody names one."""
+"""Default standard uncertainty of a spot centre."""
 SIGHTING_SD_DEG = 0.005
-"""The same for a sighting."""
+"""Default standard uncertainty of a sighting."""
 PERIODIC_NAMES = (*HARMONIC_NAMES, *AMPLITUDE_NAMES)
-"""Parameters that mean nothing on an axis without their period."""
+"""Parameters that do not apply to an axis without their period."""
 Setting = str | int | float
 """A value of `[positioner]` or `[cameras]`, by the kind that its key asks for."""
 
@@ -111,7 +111,7 @@ class Rig:
 
     @property
     def depths_mm(self) -> dict[str, float]:
-        """Of all that looks may be at: the sheets; a head that says where it points looks at one without a name."""
+        """Depths of the sheets; a head with sightings has one target without a name."""
         return {"": 1.0} if self.table.mechanism.sightings else self.sheets_mm
 
     @property
@@ -123,17 +123,17 @@ class Rig:
 _PERIOD_NAMES = {f"harmonic_period_deg.{axis}": axis for axis in AXES}
 _PERIOD_MIN_DEG = 1e-6
 _GROUPS = {
-    name.rsplit(".", n)[0] for each in MECHANISMS.values() for name in (*each.names, *_PERIOD_NAMES) for n in (1, 2, 3)
+    name.rsplit(".", n)[0] for kind in MECHANISMS.values() for name in (*kind.names, *_PERIOD_NAMES) for n in (1, 2, 3)
 }
 
 
 def _names_at(place: Place, mechanism: Mechanism) -> tuple[str, ...]:
-    """What may stand in a table of a mechanism's file."""
+    """Names allowed in a table of a mechanism's file."""
     return tuple(p.name for p in mechanism.parameters.values() if p.place == place and p.name in mechanism.documented)
 
 
 def _period_number(name: str) -> int:
-    """Which of its axis' periods a periodic parameter belongs to, from 1: the first, or the number of an amplitude."""
+    """Number of the period of a periodic parameter, from 1: the first, or that of an amplitude."""
     return int(name.rpartition(".")[2]) if name in AMPLITUDE_NAMES else 1
 
 
@@ -143,7 +143,7 @@ def _has_period(name: str, period_deg: Mapping[str, tuple[float, ...]]) -> bool:
 
 
 def _without_period(priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> str | None:
-    """The first periodic parameter that is not fixed at 0 and whose period nobody stated."""
+    """The first periodic parameter that is not fixed at 0 and whose period is unstated."""
     for name in PERIODIC_NAMES:
         prior = priors.get(name)
         if prior is not None and (prior.value != 0 or prior.u != 0) and not _has_period(name, period_deg):
@@ -174,7 +174,7 @@ def require_periods(priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[
 
 
 def _explanation(name: str, allowed: tuple[str, ...]) -> str:
-    """What to do about a name that may not stand where it does."""
+    """The remedy of a name that is not allowed in its table."""
     stem, _, last = name.partition(".")
     if name in _PERIOD_NAMES:
         return "it belongs into [rig] itself: tooth counts fix it, so it has no prior and no other truth"
@@ -204,7 +204,7 @@ def _entries(table: Keys, prefix: str = "") -> Iterator[tuple[Keys, str, str]]:
 
 
 def _in_blocks(names: Iterable[str]) -> str:
-    """Names in short: those of a block in one word, as `harmonic_deg.pan|tilt.1|2.cos|sin`."""
+    """Short list of names: those of a block in one word, as `harmonic_deg.pan|tilt.1|2.cos|sin`."""
     blocks: dict[str, list[list[str]]] = {}
     for name in names:
         parameter = parameter_of(name)
@@ -217,15 +217,15 @@ def _in_blocks(names: Iterable[str]) -> str:
 
 
 def _named_entries(table: Keys, allowed: tuple[str, ...]) -> dict[str, tuple[Keys, str]]:
-    """Where each name of a table stands; `allowed` lists those that may."""
+    """Where mechanism name of a table stands; `allowed` lists those that may."""
     entries: dict[str, tuple[Keys, str]] = {}
     for keys, key, name in _entries(table):
         if name not in allowed:
-            # Keys of [rig] itself that are no priors are read before.
-            more = () if "rig" not in table.path or "prior" in table.path else _OWN_KEYS
-            names = "only " + _in_blocks((*allowed, *more))
-            stands = f"the name {escaped(name)}"
-            raise keys.refuse(key, "unknown-key", names, _explanation(name, allowed), stands)
+            # Keys of [rig] itself that are no priors have been read before.
+            own_keys = () if "rig" not in table.path or "prior" in table.path else _OWN_KEYS
+            names = "only " + _in_blocks((*allowed, *own_keys))
+            found = f"the name {escaped(name)}"
+            raise keys.refuse(key, "unknown-key", names, _explanation(name, allowed), found)
         if name in entries:
             raise keys.refuse(key, "duplicate-key", "every name once", "remove one", f"{name} twice")
         entries[name] = keys, key
@@ -233,7 +233,7 @@ def _named_entries(table: Keys, allowed: tuple[str, ...]) -> dict[str, tuple[Key
 
 
 def _parse_priors(entries: Mapping[str, tuple[Keys, str]]) -> dict[str, Prior]:
-    """The priors that stand there, checked."""
+    """The stated priors, checked."""
     priors: dict[str, Prior] = {}
     for name, (keys, key) in entries.items():
         parameter = parameter_of(name)
@@ -271,11 +271,11 @@ def _check_periods(table: Keys, priors: Mapping[str, Prior], period_deg: Mapping
 
 
 _OWN_KEYS = ("aperture_convention", "mechanism", "prior")
-"""Of `[rig]`, besides what has a value and a u."""
+"""Keys of `[rig]` without a value and a u."""
 
 
 def _mechanism(table: Keys, sightings: bool) -> Mechanism:
-    """What carries the beam, by the key `mechanism`."""
+    """The mechanism by its key in `[rig]`."""
     word = table.word("mechanism", WORDS) if "mechanism" in table else TWO_MIRROR.word
     if sightings and word == TWO_MIRROR.word:
         remedy = 'write mechanism = "pan-tilt" into [rig]; a scanner needs stereo.json and spots.csv instead'
@@ -289,7 +289,7 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
 
     Args:
         table: of a campaign or rig file.
-        sightings: a head says where it was found to point: there are no spots and no stereo pair.
+        sightings: of a head with sightings: there are no spots and no stereo pair.
 
     Raises:
         InputError: unknown or misplaced names, entries that are not { value, u }, values out of range,
@@ -319,11 +319,10 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
 
 
 def rig_table_toml(table: RigTable) -> str:
-    """`[rig]` and `[rig.prior]` with every entry, also those at their defaults, so that a file says all.
+    """`[rig]` and `[rig.prior]` with every entry, also those at their defaults: the file is complete.
 
-    Harmonics and amplitudes stand only where they mean something: on an axis with their period. The scatter of looks
-    and shifts of the zeros stand where they are not the defaults, so that campaigns from before they were known keep
-    their text and its hash.
+    Harmonics and amplitudes appear only where they apply: on an axis with their period. The scatter of looks and shifts
+    of the zeros appear where they are not the defaults, so that campaigns of earlier versions keep their text and hash.
     """
 
     def entry(name: str) -> str:
@@ -343,13 +342,13 @@ def rig_table_toml(table: RigTable) -> str:
     ]
     periodic = [entry(name) for name in PERIODIC_NAMES if _has_period(name, table.harmonic_period_deg)]
     declared = map(entry, _names_at("rig", kind))
-    silent = {name for name in LATE_NAMES if table.priors[name] == REGISTRY[name].prior}
-    priors = (entry(name) for name in _names_at("rig.prior", kind) if name not in {*PERIODIC_NAMES, *silent})
+    omitted = {name for name in LATE_NAMES if table.priors[name] == REGISTRY[name].prior}
+    priors = (entry(name) for name in _names_at("rig.prior", kind) if name not in {*PERIODIC_NAMES, *omitted})
     return "\n".join(["[rig]", *declared, *periods, convention, "[rig.prior]", *priors, *periodic]) + "\n"
 
 
 COSTS_S = {"move_s": 1.5, "look_s": 1.0, "placement_s": 60.0}
-"""What a move, a look and the placement of a sheet cost where no rig file says so."""
+"""Default durations of a move, a look and the placement of a sheet."""
 
 
 _NUMBERS = {
@@ -373,9 +372,9 @@ def _parse_options(table: Keys) -> dict[str, Setting]:
         elif isinstance(value, bool):
             values[f"options.{key}"] = int(value)
         else:
-            whole = isinstance(value, int)
+            is_integer = isinstance(value, int)
             values[f"options.{key}"] = (
-                options.integer(key, -(2**53), 2**53) if whole else options.number(key, -1e300, 1e300)
+                options.integer(key, -(2**53), 2**53) if is_integer else options.number(key, -1e300, 1e300)
             )
     return values
 
@@ -398,7 +397,7 @@ def _parse_positioner(table: Keys) -> dict[str, Setting]:
     keys = [key for pair in LIMIT_KEYS.values() for key in pair] + list(HOME_KEYS.values())
     table.only(("driver", "port", "baud", *keys, *_NUMBERS, "options"))
     values: dict[str, Setting] = {key: table.text_value(key) for key in ("driver", "port") if key in table}
-    # Serial libraries read an address as instructions: one of them writes a file of the address' choice.
+    # Serial libraries interpret addresses: one of them writes a file that the address names.
     if "://" in str(values.get("port", "")):
         remedy = "give a port's name, such as /dev/ttyACM0 or COM3; `tvsbayes doctor` lists those there are"
         raise table.refuse("port", "port", "the name of a serial port, no address", remedy)
@@ -408,7 +407,7 @@ def _parse_positioner(table: Keys) -> dict[str, Setting]:
     for lowest, highest in LIMIT_KEYS.values():
         if lowest in steps and highest in steps and steps[lowest] > steps[highest]:
             raise table.refuse(highest, "limits", f"at least {lowest} = {steps[lowest]}", "swap the two limits")
-    values |= {key: table.number(key, *ends) for key, ends in _NUMBERS.items() if key in table}
+    values |= {key: table.number(key, *limits) for key, limits in _NUMBERS.items() if key in table}
     return {**values, **steps, **_parse_options(table)}
 
 
@@ -421,8 +420,8 @@ def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, Setting]:
         values["driver"] = table.text_value("driver")
     for key in ("source", "left", "right"):
         if key in table:
-            device = isinstance(table.values[key], str)
-            values[key] = table.text_value(key) if device else table.integer(key, 0, 1000)
+            is_name = isinstance(table.values[key], str)
+            values[key] = table.text_value(key) if is_name else table.integer(key, 0, 1000)
     if stereo.right_image_size is not None:
         remedy = "record with the cameras' own program, then `tvsbayes new --pictures FOLDER`"
         found = "a stereo file of two picture sizes"
@@ -433,11 +432,11 @@ def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, Setting]:
             if values[key] != calibrated:
                 remedy = "calibrate and observe at one image size"
                 raise table.refuse(key, "image-size", f"{calibrated} px, as in the stereo file", remedy)
-    values |= {key: table.number(key, *ends) for key, ends in numbers.items() if key in table}
+    values |= {key: table.number(key, *limits) for key, limits in numbers.items() if key in table}
     return values
 
 
-def _beside(keys: Keys, key: str, folder: Path) -> Path:
+def _file_beside(keys: Keys, key: str, folder: Path) -> Path:
     """The file that `key` names, which must lie in the folder of the rig file or below."""
     name = keys.text_value(key)
     windows = PureWindowsPath(name)
@@ -459,10 +458,10 @@ def read_rig(path: Path) -> Rig:
     keys.word("format", ("tvsbayes-rig/1",))
     tables = ("rig", "truth", "sheets", "positioner", "cameras", "costs")
     keys.only(("format", "name", "notes", "stereo", *tables))
-    header = {key: keys.text_value(key, cap) for key, cap in (("name", 200), ("notes", 2000)) if key in keys}
+    header = {key: keys.text_value(key, length) for key, length in (("name", 200), ("notes", 2000)) if key in keys}
     sightings = "stereo" not in keys and keys.table("rig").values.get("mechanism") == HEAD.word
     table = parse_rig_table(keys.table("rig"), sightings)
-    stereo = NO_STEREO if sightings else read_stereo(_beside(keys, "stereo", path.parent), folder=path.parent)
+    stereo = NO_STEREO if sightings else read_stereo(_file_beside(keys, "stereo", path.parent), folder=path.parent)
     sheets = keys.table("sheets")
     for name in sheets.values:
         if not (name.isprintable() and 0 < len(name) <= 100):

@@ -1,4 +1,4 @@
-"""Sightings: where a head on two axes was found to point, by its camera or telescope.
+"""Sightings: directions of a head on two axes, observed by its camera or telescope.
 
 Azimuth grows where pan counts up, elevation where tilt does; deg. Directions are unit vectors (x, y, z) of the frame in
 which the user states them: x at azimuth 0, y at azimuth 90 deg, z up. Refraction is the user's: azimuth and elevation
@@ -47,12 +47,12 @@ class Sighting:
 
     @property
     def spot(self) -> int:
-        """Its id, by the name that looks of every instrument have."""
+        """Its id, under the name that all looks share."""
         return self.sighting
 
     @property
     def target(self) -> str:
-        """No sheet is looked at."""
+        """A sighting has no sheet."""
         return ""
 
     @property
@@ -81,12 +81,12 @@ def parse_sightings(data: bytes, file: str, moves: int) -> tuple[Sighting, ...]:
 
 
 def sightings_of(looks: Sequence[object]) -> list[Sighting]:
-    """Those among the looks of a campaign."""
+    """The sightings among the looks of a campaign."""
     return [look for look in looks if isinstance(look, Sighting)]
 
 
 def sighted_deg(sightings: Sequence[Sighting]) -> np.ndarray:
-    """Azimuth and elevation, shape (n, 2), deg; not a number where there are none."""
+    """Azimuth and elevation, shape (n, 2), deg; NaN where there are none."""
     return np.array([(s.azimuth_deg, s.elevation_deg) for s in sightings], dtype=float).reshape(-1, 2)
 
 
@@ -94,6 +94,6 @@ def tangent_frames(angles_deg: np.ndarray) -> np.ndarray:
     """Unit vectors along azimuth and elevation, and the direction itself, of (n, 2) angles: shape (n, 3, 3)."""
     azimuth, elevation = np.radians(angles_deg).T
     c, s, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
-    none = np.zeros_like(c)
-    rows = (-s, c, none), (-se * c, -se * s, ce), (ce * c, ce * s, se)
+    zero = np.zeros_like(c)
+    rows = (-s, c, zero), (-se * c, -se * s, ce), (ce * c, ce * s, se)
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)

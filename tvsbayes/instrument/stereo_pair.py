@@ -53,8 +53,8 @@ def undistort(pixels: np.ndarray, camera: np.ndarray, distortion: np.ndarray) ->
         points = cv2.undistortPoints(pixels[:, None], camera, coefficients, criteria=criteria)
     points = points.reshape(-1, 2)
     returned = distort(points, coefficients) @ camera[:2, :2].T + camera[:2, 2]
-    good = np.max(np.abs(returned - pixels), axis=1) <= UNDISTORT_TOLERANCE_PX
-    return np.where(good[:, None], points, np.nan)
+    converged = np.max(np.abs(returned - pixels), axis=1) <= UNDISTORT_TOLERANCE_PX
+    return np.where(converged[:, None], points, np.nan)
 
 
 def triangulate(stereo: Stereo, pixels: np.ndarray, focal_scale: float = 1.0) -> np.ndarray:
@@ -71,15 +71,15 @@ def triangulate(stereo: Stereo, pixels: np.ndarray, focal_scale: float = 1.0) ->
     scale = np.array([[focal_scale, 1.0, 1.0], [1.0, focal_scale, 1.0], [1.0, 1.0, 1.0]])
     left = undistort(pixels[:, :2], stereo.M1 * scale, stereo.D1)
     right = undistort(pixels[:, 2:], stereo.M2 * scale, stereo.D2)
-    good = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
+    finite = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
     points_S = np.full((len(pixels), 3), np.nan)
-    if good.any():
+    if finite.any():
         first = np.hstack((np.eye(3), np.zeros((3, 1))))
         second = np.hstack((np.asarray(stereo.R, float), np.asarray(stereo.T, float).reshape(3, 1)))
-        rays = left[good].T.copy(), right[good].T.copy()
+        rays = left[finite].T.copy(), right[finite].T.copy()
         homogeneous = cv2.triangulatePoints(first, second, *rays).reshape(4, -1)
         x, y, z = homogeneous[:3] / homogeneous[3]
-        points_S[good] = np.column_stack((z, -x, -y))
+        points_S[finite] = np.column_stack((z, -x, -y))
     return points_S
 
 
@@ -99,7 +99,7 @@ class Stereo:
 
     `D1`, `D2` are k1 k2 p1 p2 k3. `parameter_covariance` orders the 24 parameters as
     `STEREO_PARAMETER_NAMES` (rotation as Rodrigues vector, rad; translation in mm).
-    Where it is `assumed`, `assumed_from` says from what. Where the right camera's pictures have another size, it is
+    Where it is `assumed`, `assumed_from` states the basis. Where the right camera's pictures have another size, it is
     `right_image_size`, width and height; its parameters and pixels are those of pictures scaled to the left one's size.
     """
 
@@ -156,7 +156,7 @@ NO_STEREO = Stereo(
     parameter_covariance=np.zeros((len(STEREO_PARAMETER_NAMES),) * 2),
     rms_px=0.0,
 )
-"""Stands for the cameras of an instrument that has none: exactly known, and seen by nothing."""
+"""Placeholder for the cameras of an instrument that has none: exactly known."""
 
 
 def rotation_matrix(rotation_vector_rad: np.ndarray) -> np.ndarray:
@@ -200,27 +200,27 @@ ASSUMED_REMEDY = (
     "calibrate from pictures (`tvsbayes stereo FOLDER`), or import again with --rms-px, --views, --board, --pitch-mm, "
     "--joint or --fixed-intrinsics, or with --u-focal-percent, --u-principal-px, --u-rotation-mrad, --u-baseline-mm"
 )
-"""What gives a pair whose covariance is assumed a better one."""
+"""Remedy of a pair whose covariance is assumed."""
 _ENTRY_MAX = 1e12
 _ROTATION_TOLERANCE = 1e-6
 _EIGENVALUE_TOLERANCE = 1e-8
 BESIDE_SHARE = 0.5
-"""Of the distance of two cameras that stand beside each other, what lies along the columns of the first at least."""
+"""Least share of the baseline of two cameras side by side that lies along the columns of the first."""
 PRINCIPAL_SHARE_MAX = 0.25
-"""Share of the image's width or height by which a principal point may miss its middle before it is worth a word."""
+"""Share of the image's width or height by which a principal point may miss its middle without a remark."""
 ASPECT_SHARE_MAX = 0.05
-"""The same of fx / fy from 1: pixels of today's sensors are square."""
+"""The same for the deviation of fx / fy from 1: pixels of present sensors are square."""
 VIEW_DEG_MIN, VIEW_DEG_MAX, TURN_DEG_MAX = 2.0, 150.0, 20.0
-"""Of a lens that five coefficients describe, across the picture; of two cameras that look at one scene."""
+"""Field of view of a lens described by five coefficients; angle between two cameras of one scene."""
 SHAPE_SHARE_MAX = 0.005
-"""By which proportions of two picture sizes may differ: rounding to whole pixels."""
+"""Allowed difference of the proportions of two picture sizes: rounding to whole pixels."""
 FOCAL_TIMES_MAX = 1.5
-"""Of the focal lengths of two cameras of one kind."""
+"""Largest ratio of the focal lengths of two cameras of one kind."""
 TANGENTIAL_MAX = 0.01
-"""Of p1 and p2: decentring of real lenses is some 1e-3."""
+"""Largest p1 and p2: decentring of real lenses is about 1e-3."""
 SHORTEST_BASELINE_MM, LONGEST_BASELINE_MM = 2.0, 10_000.0
-"""Two lenses cannot stand closer, and the longest baseline in metres that anybody calls a stereo pair is shorter; no
-cameras on one rig stand farther apart, and the shortest baseline in mm, taken for metres, is longer."""
+"""Two lenses cannot be closer, and the longest baseline of a stereo pair as a number of metres is smaller; no cameras
+on one rig are farther apart, and the shortest baseline in mm, taken for metres, is longer."""
 
 
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -238,8 +238,8 @@ def scaled_px(pixels: np.ndarray, size: tuple[int, int], to: tuple[int, int]) ->
 
 def _array(keys: Keys, key: str, *shapes: tuple[int, ...]) -> np.ndarray:
     """The finite numbers under `key`, in one of `shapes`, returned in the first of them."""
-    wanted = " or ".join("x".join(map(str, shape)) for shape in shapes)
-    allowed = f"finite numbers in a list of {wanted}"
+    shapes_text = " or ".join("x".join(map(str, shape)) for shape in shapes)
+    allowed = f"finite numbers in a list of {shapes_text}"
     value = keys.values.get(key)
     rows = value if isinstance(value, list) else [None]
     lists = [row for row in rows if isinstance(row, list)]
@@ -271,26 +271,26 @@ def _check_covariance(keys: Keys, key: str, covariance: np.ndarray) -> None:
     """Symmetric and positive semi-definite after scaling each row by its standard deviation."""
     allowed = "a symmetric positive semi-definite 24x24 matrix; a zero row fixes a parameter"
 
-    def bad(found: str) -> InputError:
+    def refusal(found: str) -> InputError:
         return keys.refuse(key, "covariance", allowed, "take it from the calibration of M, D, R, T", found)
 
     variances = np.diag(covariance)
     if (variances < 0).any():
         name = STEREO_PARAMETER_NAMES[int(np.argmin(variances))]
-        raise bad(f"the negative variance {variances.min():.6g} of {name}")
+        raise refusal(f"the negative variance {variances.min():.6g} of {name}")
     free = variances > 0
     if covariance[~free].any() or covariance[:, ~free].any():
-        raise bad("a covariance with a parameter of variance 0")
+        raise refusal("a covariance with a parameter of variance 0")
     sds = np.sqrt(variances[free])
     with np.errstate(over="ignore"):
         correlation = covariance[np.ix_(free, free)] / sds[:, None] / sds[None, :]
     if not (np.abs(correlation) <= 1 + 1e-6).all():
-        raise bad(f"a correlation of {np.abs(correlation).max():.6g}")
+        raise refusal(f"a correlation of {np.abs(correlation).max():.6g}")
     if not (np.abs(correlation - correlation.T) <= 1e-9).all():
-        raise bad("a matrix that is not symmetric")
+        raise refusal("a matrix that is not symmetric")
     smallest = float(np.linalg.eigvalsh(correlation).min()) if free.any() else 0.0
     if smallest < -_EIGENVALUE_TOLERANCE:
-        raise bad(f"a smallest eigenvalue of {smallest:.3g} of the correlation matrix")
+        raise refusal(f"a smallest eigenvalue of {smallest:.3g} of the correlation matrix")
 
 
 def parse_stereo(data: bytes, file: str) -> Stereo:
@@ -309,11 +309,11 @@ def parse_stereo(data: bytes, file: str) -> Stereo:
     if not 0 < np.linalg.norm(translation) <= 1e5:
         allowed = "a translation longer than 0 and at most 100000 mm"
         raise keys.refuse("T", "translation", allowed, "give T in mm", escaped(str(translation.tolist())))
-    right = None
+    right_size = None
     if "right_image_size" in keys:
-        across, down = _array(keys, "right_image_size", (2,)).astype(int).tolist()
-        right = across, down
-        if not same_shape((width, height), right):
+        width_right, height_right = _array(keys, "right_image_size", (2,)).astype(int).tolist()
+        right_size = width_right, height_right
+        if not same_shape((width, height), right_size):
             allowed = f"width and height in the proportion of {width} to {height} px"
             raise keys.refuse("right_image_size", "image-size", allowed, "calibrate at sizes of one proportion")
     covariance = _array(keys, "parameter_covariance", (24, 24))
@@ -331,7 +331,7 @@ def parse_stereo(data: bytes, file: str) -> Stereo:
         rms_px=keys.number("rms_px", 0.0, 1e4),
         assumed="assumed" in keys and keys.flag("assumed"),
         assumed_from=keys.text_value("assumed_from", _ORIGIN_CHARS_MAX) if "assumed_from" in keys else "",
-        right_image_size=right,
+        right_image_size=right_size,
     )
 
 
@@ -400,15 +400,15 @@ def fold_radius(distortion: np.ndarray) -> float:
 def _lens_doubts(
     matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[int, int], matrix_place: str, distortion_place: str
 ) -> list[str]:
-    """What no lens does."""
+    """Doubts about properties that no lens has."""
     doubts = []
-    widest = 2 * math.degrees(math.atan(size_px[0] / 2 / matrix[0, 0]))
-    if widest > VIEW_DEG_MAX:
+    view_deg = 2 * math.degrees(math.atan(size_px[0] / 2 / matrix[0, 0]))
+    if view_deg > VIEW_DEG_MAX:
         doubts.append(
-            f"fx in {matrix_place} is {matrix[0, 0]:.4g} px: a view of {widest:.0f} deg, which no such lens has"
+            f"fx in {matrix_place} is {matrix[0, 0]:.4g} px: a view of {view_deg:.0f} deg, which no such lens has"
         )
-    if widest < VIEW_DEG_MIN:
-        doubts.append(f"fx in {matrix_place} is {matrix[0, 0]:.4g} px: a view of {widest:.2g} deg: is it in px?")
+    if view_deg < VIEW_DEG_MIN:
+        doubts.append(f"fx in {matrix_place} is {matrix[0, 0]:.4g} px: a view of {view_deg:.2g} deg: is it in px?")
     corners = np.array([[x, y] for x in (0, size_px[0] - 1) for y in (0, size_px[1] - 1)], float)
     corner = float(np.linalg.norm((corners - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], axis=1).max())
     fold = fold_radius(distortion)
@@ -427,29 +427,29 @@ def _lens_doubts(
 
 
 def pair_doubts(stereo: Stereo, places: Mapping[str, str] | None = None) -> tuple[str, ...]:
-    """What contradicts two cameras beside each other that look at one scene, in words; empty where nothing does.
+    """What contradicts two cameras side by side with one scene, in words; empty where nothing does.
 
-    No refusal: mirrors, cropped images and lenses off their axes exist. Seen are cameras exchanged, an image size that
-    belongs to other pictures, pixels far from square, views near 180 deg, distortion that folds, T in another unit.
+    No refusal: mirrors, cropped images and lenses off their axes exist. Detected are exchanged cameras, the image size
+    of other pictures, pixels far from square, views near 180 deg, distortion that folds, T in another unit.
 
     Args:
         stereo: the pair.
-        places: which key of which file M1, D1, M2, D2, R, T came from, in words; those of `stereo.json` where absent.
+        places: file and key of M1, D1, M2, D2, R, T, in words; those of `stereo.json` where absent.
     """
     place = {name: f"{name} of stereo.json" for name in ("M1", "D1", "M2", "D2", "R", "T")} | dict(places or {})
     doubts = [text] if (text := baseline_doubt(stereo, place["T"])) is not None else []
-    turned = math.degrees(float(np.linalg.norm(rotation_vector(stereo.R))))
-    if turned > TURN_DEG_MAX:
-        doubts.append(f"{place['R']} turns by {turned:.0f} deg: do both cameras look at one scene?")
-    # Where the second camera stands, in axes of the first: x to the right, as columns of a picture grow.
+    turn_deg = math.degrees(float(np.linalg.norm(rotation_vector(stereo.R))))
+    if turn_deg > TURN_DEG_MAX:
+        doubts.append(f"{place['R']} turns by {turn_deg:.0f} deg: do both cameras look at one scene?")
+    # Position of the second camera in axes of the first: x to the right, as columns of a picture grow.
     right_mm = -float(stereo.R[:, 0] @ stereo.T)
     if right_mm < 0:
         doubts.append(
             f"the second camera stands {-right_mm:.4g} mm to the left of the first (x_right = R x_left + T with T_x = "
             f"{stereo.T[0]:+.4g} mm): are left and right swapped?"
         )
-    apart_mm = float(np.linalg.norm(stereo.T))
-    if abs(right_mm) < BESIDE_SHARE * apart_mm:
+    baseline_mm = float(np.linalg.norm(stereo.T))
+    if abs(right_mm) < BESIDE_SHARE * baseline_mm:
         below_mm, before_mm = (-float(stereo.R[:, k] @ stereo.T) for k in (1, 2))
         doubts.append(
             f"{place['T']} puts the second camera {below_mm:+.4g} mm below and {before_mm:+.4g} mm before the first, "

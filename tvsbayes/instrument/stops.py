@@ -1,7 +1,7 @@
-"""Where the moves came to rest: the one follower of the moves of an axis, and what its stops can tell before any fit.
+"""Rests of an axis between its moves, and what its stops can determine before any fit.
 
 Counters in steps; signs +1 left or up, -1 right or down. An axis rests until its own counter changes or a homing sets
-it anew; looks taken in between share its stop error, also when the other axis moves.
+it; looks in between share its stop error, also when the other axis moves.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class Rest(Stop):
-    """Where an axis stands after a move, and how it came there.
+    """The position of an axis after a move, and how it was reached.
 
     Attributes:
         move: number of the move that led there.
         homing: number of the homing from which its counter counts.
         distance: steps of that move with their sign, 0 after homing.
-        leg: steps since the sense of motion last changed, infinite after homing: what the play was taken up with.
+        leg: steps since the sense of motion last changed, infinite after homing: they have taken up the play.
     """
 
     move: int
@@ -47,7 +47,7 @@ class Rest(Stop):
 
 
 def rests_of(moves: Sequence[Move], axis: str) -> list[Rest]:
-    """The rest at which an axis stands after every move: a new one whenever its counter changed (formulation 3.1).
+    """The rest of an axis after every move: a new one whenever its counter changed (formulation 3.1).
 
     Args:
         moves: all moves in order, the first after a homing.
@@ -59,12 +59,12 @@ def rests_of(moves: Sequence[Move], axis: str) -> list[Rest]:
         if approach:
             rest = Rest(move.segment, steps, APPROACH_SIGN[approach], move.move, move.move, 0, math.inf)
         elif steps != rests[-1].steps:
-            before = rests[-1]
-            distance = steps - before.steps
+            previous = rests[-1]
+            distance = steps - previous.steps
             sign = 1 if distance > 0 else -1
-            # Moves on in the same sense keep the play taken up.
-            leg = abs(distance) + (before.leg if before.sign == sign else 0.0)
-            rest = Rest(move.segment, steps, sign, move.move, before.homing, distance, leg)
+            # Further moves in the same sense keep the play taken up.
+            leg = abs(distance) + (previous.leg if previous.sign == sign else 0.0)
+            rest = Rest(move.segment, steps, sign, move.move, previous.homing, distance, leg)
         else:
             rest = rests[-1]
         rests.append(rest)
@@ -82,7 +82,7 @@ def legs_of(moves: Sequence[Move]) -> dict[str, list[int]]:
 
 
 def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) -> tuple[Stop, ...]:
-    """Rests of one axis, in order, that the spots tell of.
+    """Rests of one axis, in order, at which a usable spot was seen.
 
     Args:
         moves: all moves in order.
@@ -95,24 +95,24 @@ def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) 
 
 
 FEW_STOPS = 12
-"""Fewer tell their own scatter so poorly that 1.96 standard deviations of it hold less than 93 % (Student's t)."""
+"""With fewer, their scatter is so uncertain that 1.96 standard deviations contain less than 93 % (Student's t)."""
 
 
 def too_few(stops: Mapping[str, int]) -> dict[str, int]:
-    """Of the numbers of stops by direction those below `FEW_STOPS`."""
+    """Numbers of stops by direction below `FEW_STOPS`."""
     return {direction: count for direction, count in stops.items() if count < FEW_STOPS}
 
 
 def few_stops(moves: Sequence[Move], observed: Collection[int]) -> dict[str, int]:
     """Directions moved in with too few observed stops, and their number; see `observed_stops`."""
     counts = Counter(direction_of(axis, stop.sign) for axis in AXES for stop in observed_stops(moves, observed, axis))
-    moved = legs_of(moves)
-    return too_few({direction: counts[direction] for direction in DIRECTIONS if direction in moved})
+    legs = legs_of(moves)
+    return too_few({direction: counts[direction] for direction in DIRECTIONS if direction in legs})
 
 
 INSEPARABLE = 0.5
-"""Correlation of an effective ratio and its backlash, in a fit or in what a plan is expected to tell, from which a
-quarter of the ratio's variance is exchange with the backlash."""
+"""Correlation of an effective ratio and its backlash, in a fit or expected of a plan, from which a quarter of the
+ratio's variance is exchange with the backlash."""
 ALONE, ALONE_ONE_LENGTH = 0.9, 0.7
 """The same in the moves alone, where neither cameras nor priors add to the ratio's variance and the correlation is
 larger: what is called inseparable here is so in the fit. Equal numbers of cleared and reversed legs of one length give
@@ -120,12 +120,12 @@ larger: what is called inseparable here is so in the fit. Equal numbers of clear
 
 
 def inseparable(correlation: float) -> bool:
-    """Whether a ratio and its backlash are hard to tell apart, by their correlation in a fit or expected of a plan."""
+    """Whether a ratio and its backlash are hard to separate, by their correlation in a fit or expected of a plan."""
     return abs(correlation) >= INSEPARABLE
 
 
 def one_sided(stops: Sequence[Stop], axis: str) -> str | None:
-    """What is missing of the stops without which no campaign tells a ratio from its backlash, None if nothing is."""
+    """Which stops are missing to separate a ratio from its backlash, in words; None if none are."""
     if len({stop.steps for stop in stops}) < 2:
         return f"the {axis} axis was seen at one counter only; look before and after moves of that axis"
     if not {1, -1} <= {stop.sign for stop in stops}:
@@ -134,17 +134,17 @@ def one_sided(stops: Sequence[Stop], axis: str) -> str | None:
 
 
 def separation(stops: Sequence[Stop], axis: str) -> str | None:
-    """Why a ratio and its backlash cannot be told apart well, and the smallest cure.
+    """Why a ratio and its backlash cannot be separated well, and the smallest remedy.
 
     With equal errors at every stop the angle is zero(segment) + k n - b sign / 2: the correlation of k and b in
     this straight line tells before any fit whether the stops separate them.
 
     Returns:
-        A sentence, or None if nothing stands in the way.
+        A sentence, or None if they can.
     """
-    missing = one_sided(stops, axis)
-    if missing is not None:
-        return missing
+    reason = one_sided(stops, axis)
+    if reason is not None:
+        return reason
     steps = np.array([stop.steps for stop in stops], dtype=float)
     signs = np.array([stop.sign for stop in stops], dtype=float)
     segments = np.array([stop.segment for stop in stops])
@@ -164,21 +164,21 @@ def separation(stops: Sequence[Stop], axis: str) -> str | None:
     if correlation < (ALONE_ONE_LENGTH if len(lengths) == 1 else ALONE):
         return None
     common = lengths.most_common(1)[0][0]
-    only = f"only one |N| = {common}" if len(lengths) == 1 else f"nearly every leg has |N| = {common} and reverses"
-    return f"{only}; add N = {max(common // 2, 1)} or a cleared approach"
+    text = f"only one |N| = {common}" if len(lengths) == 1 else f"nearly every leg has |N| = {common} and reverses"
+    return f"{text}; add N = {max(common // 2, 1)} or a cleared approach"
 
 
 @dataclass(frozen=True)
 class Redraws:
-    """Which errors are new at each look since the look before, arrays over looks; fields as in `SpotArrays`.
+    """Which errors are new at each look since the previous look, arrays over looks; fields as in `SpotArrays`.
 
     Attributes:
         redraw: the stop error of (pan, tilt), shape (n, 2).
-        redraw_mix: share of the variance of (negative, positive) direction in it, shape (n, 2, 2); half of both where
+        redraw_mix: share of the variance of (negative, positive) direction in it, shape (n, 2, 2); one half each where
             the direction is unknown.
         new_segment: there was a homing, shape (n,).
         homed: one whose home offset is unknown, shape (n,).
-        hours: since the look before, or since the homing where that came after it, shape (n,).
+        hours: since the previous look, or since a homing after it, shape (n,).
     """
 
     redraw: np.ndarray
@@ -196,15 +196,15 @@ def redraws(moves: Sequence[Move], looks: Sequence[int], homed_from: int = 1) ->
         looks: number of the move before each look, in order.
         homed_from: first segment with an unknown home offset.
     """
-    at = [[rests[move] for move in looks] for rests in (rests_of(moves, axis) for axis in AXES)]
-    came_by = np.array([[rest.move for rest in rests] for rests in at]).T.reshape(-1, 2)
-    redraw = np.diff(came_by, axis=0, prepend=-1) != 0
-    sign = np.array([[rest.sign for rest in rests] for rests in at]).T.reshape(-1, 2)
+    rests_at = [[rests[move] for move in looks] for rests in (rests_of(moves, axis) for axis in AXES)]
+    move_numbers = np.array([[rest.move for rest in rests] for rests in rests_at]).T.reshape(-1, 2)
+    redraw = np.diff(move_numbers, axis=0, prepend=-1) != 0
+    sign = np.array([[rest.sign for rest in rests] for rests in rests_at]).T.reshape(-1, 2)
     mix = (1 + sign[..., None] * np.array([-1, 1])) / 2
-    new_segment = np.diff([rest.homing for rest in at[0]], prepend=-1) != 0
-    segment = np.array([rest.segment for rest in at[0]], dtype=int)
+    new_segment = np.diff([rest.homing for rest in rests_at[0]], prepend=-1) != 0
+    segment = np.array([rest.segment for rest in rests_at[0]], dtype=int)
     seen_s = np.array([moves[move].time_s for move in looks], dtype=float)
-    homed_s = np.array([moves[rest.homing].time_s for rest in at[0]], dtype=float)
+    homed_s = np.array([moves[rest.homing].time_s for rest in rests_at[0]], dtype=float)
     since_s = seen_s - np.where(new_segment, homed_s, np.concatenate([homed_s[:1], seen_s[:-1]]))
     mixed, homed = np.where(redraw[..., None], mix, 0.0), new_segment & (segment >= homed_from)
     return Redraws(redraw, mixed, new_segment, homed, since_s / SECONDS_PER_HOUR)

@@ -10,7 +10,7 @@ import numpy as np
 
 from tvsbayes.assessment.causes import PLAY_VARIATION, TRANSMISSION_ERROR
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES
-from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, described
+from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT, describe_looks
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.planning.expectation import Knowledge
 from tvsbayes.planning.looks import covariance_of
@@ -173,7 +173,7 @@ def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:
                 continue
             best = problem.chosen(search, allowed, LOOKS_PER_EXPERIMENT)
             steps, minutes, gain = best.design.steps, best.design.minutes(rig), max(now - best.value, 0.0)
-            text = f"{'a full turn of pan away, ' if turned else ''}{described(rig, steps)}"
+            text = f"{'a full turn of pan away, ' if turned else ''}{describe_looks(rig, steps)}"
             batches.append(Batch(steps, minutes, gain, gain / max(minutes, 1e-9), text))
     unique = {batch.actions: batch for batch in batches}.values()
     return tuple(sorted(unique, key=lambda b: -b.gain_per_minute)[:NEXT_LISTED])

@@ -18,7 +18,7 @@ from tvsbayes.instrument.campaign import Move
 from tvsbayes.instrument.counter_limits import CounterLimits
 from tvsbayes.instrument.parameters import INDEX, TARGET_ROWS
 from tvsbayes.instrument.places import FEW_COUNTERS, LEAST_ERROR_RAD, too_few_counters
-from tvsbayes.instrument.plan import PlanStep, described, run_plan, step_json
+from tvsbayes.instrument.plan import PlanStep, describe_looks, run_plan, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import Stop, few_stops, inseparable, observed_stops, one_sided, separation
 from tvsbayes.planning.candidates import Candidates, candidates
@@ -226,7 +226,7 @@ def _fault(
     if cure is None:
         return PlanFault(axis, f"{text}; no {CURE_LOOKS} looks cure it on this rig", (), before, None)
     looks, after = sum(s.action == "look" for s in cure.addition), cure.after.u(axis)
-    more = f"{looks} more look{'s' * (looks != 1)}, {described(knowledge.rig, cure.addition, steps)}"
+    more = f"{looks} more look{'s' * (looks != 1)}, {describe_looks(knowledge.rig, cure.addition, steps)}"
     text += f"; smallest cure: {more}: u of the {axis} ratio {before:.2g} -> {after:.2g} deg/step"
     return PlanFault(axis, text, cure.addition, before, after)
 

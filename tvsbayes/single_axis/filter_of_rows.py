@@ -69,17 +69,17 @@ def whitened(
     variance, gain_zero, gain_held = np.array(blocks).reshape(count, 3, n).swapaxes(0, 1)[..., None]
     white = np.empty((count, n, width))
     zero, held = np.zeros((n, width)), np.zeros((n, width))
-    of_row = np.swapaxes(columns, 0, 1)
+    move_of_row = np.swapaxes(columns, 0, 1)
     kept = np.broadcast_to(carry, (n, count)).T[..., None]
     for k in range(count):
         if begins[k]:
             zero = np.zeros((n, width))
         if renewed[k]:
-            innovation = of_row[k] - zero
+            innovation = move_of_row[k] - zero
             held = gain_held[k] * innovation
         else:
             held = kept[k] * held
-            innovation = of_row[k] - zero - held
+            innovation = move_of_row[k] - zero - held
             held += gain_held[k] * innovation
         white[k] = innovation
         zero = zero + gain_zero[k] * innovation

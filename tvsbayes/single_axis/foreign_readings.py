@@ -19,9 +19,9 @@ from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.foreign_table import ForeignTable
 from tvsbayes.instrument.column_names import (
     READING_UNITS,
-    Understood,
+    ColumnMapping,
     field_by_word,
-    understand,
+    map_columns,
     unit_of_name,
     words_of,
 )
@@ -82,8 +82,8 @@ def axis_field_of(name: str) -> str | None:
     return field_by_word(words_of(name), _COLUMNS.values())
 
 
-def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = None) -> Understood:
-    """Guess what columns of an axis are, as `understand`; some names are clear only beside others.
+def map_axis_columns(columns: Iterable[str], stated: Mapping[str, str] | None = None) -> ColumnMapping:
+    """Guess what columns of an axis are, as `map_columns`; some names are clear only beside others.
 
     Beside "microsteps" a "position [um]" is what was read; where nothing else is, "mm" alone, or the one other column
     that names a unit of readings, as "dial gauge mm".
@@ -96,10 +96,10 @@ def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = N
         InputError: a field or column that does not exist.
     """
     names, given = list(columns), dict(stated or {})
-    known = understand(names, given, AXIS_FIELDS, axis_field_of)
-    if "value" in known.columns or "value" in known.claimed or "value" in given:
+    known = map_columns(names, given, AXIS_FIELDS, axis_field_of)
+    if "value" in known.columns or "value" in known.ambiguous or "value" in given:
         return known
-    claims = known.claimed.get("command", ())
+    claims = known.ambiguous.get("command", ())
     readings = [name for name in claims if _FOUND_BY_ENCODERS.intersection(words_of(name))]
     sure = [name for name in claims if name not in readings]
     units = [
@@ -108,14 +108,14 @@ def understand_axis(columns: Iterable[str], stated: Mapping[str, str] | None = N
         if (words := words_of(name)) and all(unit_of_name(word, READING_UNITS) for word in words)
     ]
     if len(sure) == len(readings) == 1 and not units and (unit_of_name(readings[0], READING_UNITS) or not known.unused):
-        return understand(names, {**given, "command": sure[0], "value": readings[0]}, AXIS_FIELDS, axis_field_of)
+        return map_columns(names, {**given, "command": sure[0], "value": readings[0]}, AXIS_FIELDS, axis_field_of)
     units = units or [
         name
         for name in known.unused
         if unit_of_name(name, READING_UNITS) and not _TEMPERATURE.intersection(words_of(name))
     ]
     if len(units) == 1 and not claims:
-        return understand(names, {**given, "value": units[0]}, AXIS_FIELDS, axis_field_of)
+        return map_columns(names, {**given, "value": units[0]}, AXIS_FIELDS, axis_field_of)
     return known
 
 

@@ -120,7 +120,7 @@ class Truth:
     def as_json(self, campaign: Campaign) -> TruthDocument:
         """The document of truth.json of a campaign of this rig, with the effective ratios where there are looks."""
         mechanism = campaign.rig.mechanism
-        constants = mechanism.held
+        constants = mechanism.fixed
         cameras = dict(zip(STEREO_PARAMETER_NAMES, map(float, self.stereo.vector), strict=True))
         document: TruthDocument = {
             "format": TRUTH_FORMAT,

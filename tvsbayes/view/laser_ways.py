@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from tvsbayes.errors import InputError
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.looks import WINDOW, in_frame_s, nearest_range, spot_angles
-from tvsbayes.instrument.mirrors import Optics, Ray, Vectors, laser_way
+from tvsbayes.instrument.mirrors import Optics, Ray, Vectors, beam_path
 from tvsbayes.model.compiled import compiled
 from tvsbayes.model.geometry import image, materialise, rotation_matrix, transform
 from tvsbayes.model.parameter_space import ParameterSpace
@@ -52,7 +52,7 @@ def _window(
     if not isinstance(model.optics, Optics):
         remedy = "`tvsbayes fit --details` has the terms of a head"
         raise InputError("usage", "view draws the mirrors of a scanner, and this is a pan-tilt head", remedy=remedy)
-    way = laser_way(model.optics, pan, tilt, jnp, materialise)
+    way = beam_path(model.optics, pan, tilt, jnp, materialise)
     rays = [Ray(*map(way.pan.forward, ray)) for ray in way.rays]
     ray = rays[-1]
     reach = nearest_range(model.extrinsics, ray, Vectors.of(arrays.spots.triangulated_mm.T))
