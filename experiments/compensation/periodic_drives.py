@@ -26,7 +26,7 @@ from tvsbayes.results.compensation_record import Compensation
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import results_for
-from tvsbayes.single_axis.waves import AskedPeriods
+from tvsbayes.single_axis.waves import WavePeriods
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_axis import SimulatedAxis, drive_of, simulate_axis
 
@@ -44,7 +44,7 @@ def template(seed: int) -> AxisCampaign:
         "transmission_error": AxisPrior(0.0, 5.0),
         "reading_scale": AxisPrior(1.0, 0.0),
     }
-    asked = AskedPeriods((), ((60.0, 600.0),), True)
+    asked = WavePeriods((), ((60.0, 600.0),), True)
     return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": RATE}, asked)
 
 

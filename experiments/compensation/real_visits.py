@@ -32,7 +32,7 @@ from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import results_for
 from tvsbayes.single_axis.axis_rows import legs_of, rows_of
-from tvsbayes.single_axis.predicted_stops import DRAWS, carried_scales
+from tvsbayes.single_axis.predicted_stops import DRAWS, transferred_scales
 
 COUNTS_PER_DEG = -22466.7
 """Of the encoder by the least-squares line through all stops: readings in degrees of the axis."""
@@ -113,7 +113,7 @@ def _followed(fit: AxisFit, campaign: AxisCampaign, moves: np.ndarray) -> np.nda
         replace(rows_of(campaign), line=fit.rows.line), fit.model.priors, None, fit.model.coordinates.waves
     )
     drawn = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
-    w = carried_scales(fit.model, drawn, model, np.random.default_rng(1))
+    w = transferred_scales(fit.model, drawn, model, np.random.default_rng(1))
     return model.left_out(w, np.flatnonzero(np.isin(model.rows.move, moves)))[0].mean(axis=0)
 
 

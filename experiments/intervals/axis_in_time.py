@@ -20,7 +20,7 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_periods import wave_samples
-from tvsbayes.single_axis.waves import AskedPeriods
+from tvsbayes.single_axis.waves import WavePeriods
 from tvsbayes.statistics.chances import binomial_bounds, rms_bounds
 from tvsbayes.twin.simulated_axis import simulate_axis
 
@@ -58,12 +58,12 @@ def template(protocol: str, seed: int) -> AxisCampaign:
             "transmission_error": AxisPrior(0.0, 5.0),
             "reading_scale": AxisPrior(1.0, 0.0),
         }
-        asked = AskedPeriods((), ((60.0, 600.0),), True)
+        asked = WavePeriods((), ((60.0, 600.0),), True)
         return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": 15.0}, asked)
     stated = {"per_command": AxisPrior(0.01, 0.002)}
     if protocol == "stops":
         places = np.sort(rng.choice(np.arange(-2000.0, 2001.0, 10.0), 24, replace=False))
-        asked = AskedPeriods((8.0,), ((2.5, 7.0),))
+        asked = WavePeriods((8.0,), ((2.5, 7.0),))
         return AxisCampaign("deg", _stops(places, seed), (), stated, periods=asked)
     moves = tuple(
         AxisMove(m.move, m.segment, m.time_s, m.command, m.approach) for m in _stops(np.linspace(-2000, 2000, 10), seed)

@@ -23,7 +23,7 @@ from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 from tvsbayes.single_axis.axis_record import summarise_axis
 from tvsbayes.single_axis.guide_log import GuideRun, is_guide_log, read_runs, readings_of_run
-from tvsbayes.single_axis.waves import AskedPeriods
+from tvsbayes.single_axis.waves import WavePeriods
 
 ROWS = output(__file__, "guide_logs.jsonl")
 FRAMES_MIN = 100
@@ -45,7 +45,7 @@ def campaign_of(run: GuideRun, file: str) -> AxisCampaign:
     if found.drive is None or found.drive.period_between is None:
         raise SystemExit(f"{file}: no drive at constant rate, or too short")
     stated = {name: AxisPrior(value, u) for name, (value, u) in found.drive.priors.items()}
-    asked = AskedPeriods((), (found.drive.period_between,), True)
+    asked = WavePeriods((), (found.drive.period_between,), True)
     return AxisCampaign("arcsec", found.moves, found.readings, stated, {"rate": found.drive.rate}, asked)
 
 

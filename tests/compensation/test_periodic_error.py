@@ -13,7 +13,7 @@ from tvsbayes.compensation.promise import compensation_of
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
-from tvsbayes.single_axis.waves import AskedPeriods
+from tvsbayes.single_axis.waves import WavePeriods
 
 RATE, WORM_S, U = 15.0, 200.0, 0.3
 PERIOD = RATE * WORM_S
@@ -33,7 +33,7 @@ def results() -> AxisResults:
     readings = tuple(
         Reading(k, 0, float(v), U, time_s=float(t)) for k, (v, t) in enumerate(zip(value, TIME_S, strict=True))
     )
-    asked = AskedPeriods(stated=(WORM_S, WORM_S / 3), in_seconds=True)
+    asked = WavePeriods(stated=(WORM_S, WORM_S / 3), in_seconds=True)
     moves = (AxisMove(0, 0, 0.0, 0.0, "forward"),)
     return results_for(AxisCampaign("arcsec", moves, readings, {}, {"rate": RATE}, asked))
 

@@ -36,7 +36,7 @@ def kept(tmp_path_factory):
 def test_what_was_kept_is_taken_up(kept):
     folder, fit = kept
     told = []
-    found = results_for(read_axis(folder), tell=told.append)
+    found = results_for(read_axis(folder), notify=told.append)
     assert not told and found.fit.seed == fit.seed
     np.testing.assert_array_equal(found.fit.w, fit.w)
 

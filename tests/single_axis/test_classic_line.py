@@ -36,7 +36,7 @@ def test_what_rows_of_one_side_cannot_tell_is_zero():
     rows = rows_with(2)
     forward = fit_line(rows, rows.side > 0)
     slope, offset = np.polyfit((rows.command - rows.command.mean())[rows.side > 0], rows.value[rows.side > 0], 1)
-    np.testing.assert_allclose(forward.solved, [offset, slope, 0.0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(forward.solution, [offset, slope, 0.0], rtol=1e-9, atol=1e-12)
     assert not forward.covariance[2].any() and np.all(np.diag(forward.covariance)[:2] > 0)
     moves = [AxisMove(k, 0, 0.0, c, "" if k else "forward") for k, c in enumerate((0.0, 1.0, 2.0, 4.0))]
     alone = classic_axis(rows_of(campaign(moves, [0.0, 1.1, 1.9, 4.0])))

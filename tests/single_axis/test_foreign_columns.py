@@ -8,7 +8,7 @@ from tvsbayes.errors import InputError
 from tvsbayes.files.foreign_table import table_of
 from tvsbayes.single_axis.foreign_columns import (
     deviation_columns,
-    one_reading_a_row,
+    long_table,
     refuse_small,
     run_columns,
 )
@@ -41,21 +41,21 @@ def test_runs_side_by_side_follow_each_other():
         **{"Forward 2 (mm)": ("3", "4")},
     )
     wide.columns["Backward 1 (mm)"] = ("5", "6")
-    rows = one_reading_a_row(wide, {})
+    rows = long_table(wide, {})
     found, (told,) = rows.table, rows.remarks
     assert found.columns["reading (mm)"] == ("2", "1", "5", "6", "4", "3")
     assert found.columns["Position"] == ("0", "10", "10", "0", "0", "10")
     assert found.columns["direction"] == ("forward",) * 2 + ("backward",) * 2 + ("forward",) * 2
     assert found.lines == (3, 2, 2, 3, 3, 2) and "3 columns" in told
     assert rows.stated == {"command": "Position"}
-    assert one_reading_a_row(wide, {"value": "Forward 1 (mm)"}).table is wide
+    assert long_table(wide, {"value": "Forward 1 (mm)"}).table is wide
 
 
 def test_runs_in_two_units_or_without_positions_are_refused():
     with pytest.raises(InputError, match="runs in mm, um"):
-        one_reading_a_row(table(**{"p": ("1",), "Forward 1 (mm)": ("1",), "Forward 2 (um)": ("1",)}), {})
+        long_table(table(**{"p": ("1",), "Forward 1 (mm)": ("1",), "Forward 2 (um)": ("1",)}), {})
     with pytest.raises(InputError, match="no column that is surely their position"):
-        one_reading_a_row(table(p=("1",), q=("2",), Forward_1=("1",), Backward_1=("1",)), {})
+        long_table(table(p=("1",), q=("2",), Forward_1=("1",), Backward_1=("1",)), {})
 
 
 COLUMNS = {"command": "target mm", "value": "actual mm"}

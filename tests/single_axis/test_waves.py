@@ -19,9 +19,9 @@ from tvsbayes.single_axis.period_search import APART_MIN, period_grid
 from tvsbayes.single_axis.waves import (
     SECOND,
     WANDER,
-    AskedPeriods,
-    Tabulated,
+    TabulatedDensity,
     Wave,
+    WavePeriods,
     WaveRecord,
     log_order,
     wave_columns,
@@ -31,7 +31,7 @@ from tvsbayes.single_axis.waves import (
 RATE, PERIOD, AMPLITUDE = 15.0, 240.0, 3.0
 
 
-def drive(seed: int, amplitude: float, asked: AskedPeriods, count: int = 160, span: float = 1600.0) -> AxisCampaign:
+def drive(seed: int, amplitude: float, asked: WavePeriods, count: int = 160, span: float = 1600.0) -> AxisCampaign:
     """A drive that was read for a while, with noise of sd 1 and a wave."""
     rng = np.random.default_rng(seed)
     times = np.sort(rng.uniform(0.0, span, count))
@@ -43,9 +43,9 @@ def drive(seed: int, amplitude: float, asked: AskedPeriods, count: int = 160, sp
     return AxisCampaign("arcsec", (AxisMove(0, 0, 0.0, 0.0, "forward"),), readings, stated, {"rate": RATE}, asked)
 
 
-def a_table(seed: int = 0) -> Tabulated:
+def a_table(seed: int = 0) -> TabulatedDensity:
     rng = np.random.default_rng(seed)
-    return Tabulated.of(np.sort(rng.uniform(0.0, 2.0, 30)), 3 * rng.standard_normal(30), 0.05)
+    return TabulatedDensity.of(np.sort(rng.uniform(0.0, 2.0, 30)), 3 * rng.standard_normal(30), 0.05)
 
 
 def test_quantiles_of_a_table_invert_its_integral():
@@ -63,8 +63,8 @@ def test_quantiles_of_a_table_invert_its_integral():
 def test_the_prior_of_a_wave_is_the_prior_whatever_its_tables():
     """Drawn by the tables and weighted: half have no wave, s is half-normal, the period log-uniform."""
     low, high = 2.0, 2.0 * np.exp(2.0)
-    table = Tabulated(a_table().at + np.log(low), a_table().density)
-    table = Tabulated.of(np.concatenate([[np.log(low)], table.at[1:-1], [np.log(high)]]), np.zeros(30), 0.3)
+    table = TabulatedDensity(a_table().at + np.log(low), a_table().density)
+    table = TabulatedDensity.of(np.concatenate([[np.log(low)], table.at[1:-1], [np.log(high)]]), np.zeros(30), 0.3)
     wave = replace(Wave.fixed("position", low, 0.4), high=high, log_period=table, absent=0.2)
     count = 200_000
     w = np.random.default_rng(1).standard_normal((2, count))
@@ -105,7 +105,7 @@ def test_columns_are_averaged_over_their_width():
 
 def test_a_drive_is_the_dense_gaussian():
     """Drift, seeing between readings, noise, offset, ratio, creep, one wave: term by term."""
-    made = drive(3, 2.0, AskedPeriods((PERIOD,), (), True), 40)
+    made = drive(3, 2.0, WavePeriods((PERIOD,), (), True), 40)
     model = model_of(made)
     rng = np.random.default_rng(5)
     w = 0.3 * rng.standard_normal((3, len(model.coordinates.names))) + 0.4
@@ -139,7 +139,7 @@ def test_a_drive_is_the_dense_gaussian():
 
 def test_readings_in_motion_are_averaged_without_losing_the_wave():
     """4000 readings become few rows, and say of period and amplitude what they should."""
-    made = drive(4, AMPLITUDE, AskedPeriods((), ((100.0, 800.0),), True), 4000, 4000.0)
+    made = drive(4, AMPLITUDE, WavePeriods((), ((100.0, 800.0),), True), 4000, 4000.0)
     summary = summarise_axis(fit_axis(made, tier="importance"))
     assert not summary.problems
     assert summary.readings == 4000 and summary.moves < 250
@@ -154,7 +154,7 @@ def test_readings_in_motion_are_averaged_without_losing_the_wave():
 
 @pytest.mark.thorough
 def test_no_wave_is_claimed_of_noise():
-    found = fit_axis(drive(6, 0.0, AskedPeriods((), ((100.0, 800.0),), True)), tier="importance")
+    found = fit_axis(drive(6, 0.0, WavePeriods((), ((100.0, 800.0),), True)), tier="importance")
     [estimate] = summarise_axis(found).periods
     assert not found.missing and estimate.probability < 0.5
 
@@ -162,7 +162,7 @@ def test_no_wave_is_claimed_of_noise():
 @pytest.mark.thorough
 def test_a_range_holds_more_waves_than_were_asked_for():
     """Three waves, two in one range: the strongest of every range first, in the order of the ranges, then the third."""
-    made, waves = drive(4, AMPLITUDE, AskedPeriods((), ((60.0, 120.0), (120.0, 700.0)), True), 400, 4000.0), {97.0: 1.0}
+    made, waves = drive(4, AMPLITUDE, WavePeriods((), ((60.0, 120.0), (120.0, 700.0)), True), 400, 4000.0), {97.0: 1.0}
     waves |= {PERIOD: AMPLITUDE, 410.0: 2.0}
     values = [
         r.value + sum(waves[period] * np.cos(2 * np.pi * r.time_s / period + 0.4) for period in (97.0, 410.0))
@@ -186,7 +186,7 @@ def test_a_stated_period_of_position():
     command = {m.move: m.command for m in made.moves}
     wave = {move: 0.12 * np.cos(2 * np.pi * 0.01 * c / 8.0 - 2.0) for move, c in command.items()}
     readings = tuple(replace(r, value=float(r.value or 0.0) + wave[r.move]) for r in made.readings)
-    found = fit_axis(replace(made, readings=readings, periods=AskedPeriods((8.0,))), tier="importance")
+    found = fit_axis(replace(made, readings=readings, periods=WavePeriods((8.0,))), tier="importance")
     [estimate] = summarise_axis(found).periods
     assert not found.missing and estimate.source == "stated" and estimate.probability > 0.95
     assert estimate.period.value == 8.0 and estimate.period.sd == 0.0
@@ -233,21 +233,21 @@ def test_a_second_harmonic_that_is_stronger_than_the_first_is_named():
 def test_a_period_at_the_end_of_its_range_is_doubted():
     """A wave of 240 s asked for below 228 s is given there, and said to lie at the end; one inside is not."""
     for high, doubted in ((0.95 * PERIOD, True), (700.0, False)):
-        asked = AskedPeriods(between=((60.0, high),), in_seconds=True)
+        asked = WavePeriods(between=((60.0, high),), in_seconds=True)
         found = summarise_axis(fit_axis(drive(4, 5.0, asked), tier="importance"))
         assert any("lies at the end of the range" in text for text in found.warnings) == doubted, (high, found.periods)
 
 
 def test_a_search_that_gets_lost_begins_anew_within_bounds(monkeypatch):
     """A long record with sharp waves sent it far out: there, and here by force, the bounded one finds the mode."""
-    model = model_of(drive(4, AMPLITUDE, AskedPeriods((PERIOD,), (), True)))
-    there, search = find_mode(model), axis_mode._searched
+    model = model_of(drive(4, AMPLITUDE, WavePeriods((PERIOD,), (), True)))
+    there, search = find_mode(model), axis_mode._search
 
     def lost(*arguments, bounded=False):
         found = search(*arguments, bounded=bounded)
         return found if bounded else replace(found, missing=("lost",), log_density=-1e9)
 
-    monkeypatch.setattr(axis_mode, "_searched", lost)
+    monkeypatch.setattr(axis_mode, "_search", lost)
     found = find_mode(model)
     # Both end where the slope is small: within a tenth of a sd.
     assert not there.missing and not found.missing and found.log_density == pytest.approx(there.log_density, abs=0.01)

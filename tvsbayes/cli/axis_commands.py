@@ -204,7 +204,7 @@ def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path |
     stages = {FITTING: 3.0, "drawing the page": 1.5, PRINTING: 3.0 if pdf else 0.0}
     with waiting() as progress, Job(stages, progress) as job:
         shown = curve_commands(float(read.min()), float(read.max()))
-        results = results_for(data, shown, job.part(FITTING), tell=report_line)
+        results = results_for(data, shown, job.part(FITTING), notify=report_line)
         job.begin("drawing the page")
         page = axis_document(results, issue)
         removed = replace_page(path, page_html(page), out)
@@ -233,7 +233,7 @@ def plan(
         raise InputError("target", message, column="--target", allowed=allowed, remedy=f"name one of {allowed}")
     data = read_axis(folder)
     with waiting() as progress, Job({FITTING: 1.0, PLANNING: 3.0}, progress) as job:
-        results = results_for(data, progress=job.part(FITTING), seed=seed, tell=report_line)
+        results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
         stops = plan_next(results.fit, wanted, minutes=minutes, progress=job.part(PLANNING))
     document, text = {**stops.as_json(), "unit": data.unit, "seed": seed}, axis_plan_text(stops, data.unit)
     document["u_unit"] = unit_of(stops.target, data.unit)

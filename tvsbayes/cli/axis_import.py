@@ -173,10 +173,10 @@ def _table_understood(table: ForeignTable, stated: Mapping[str, str], wish: Axis
     from tvsbayes.files.csv_table import NUMBER
     from tvsbayes.instrument.column_names import READING_UNITS, SECONDS, unit_of_name
     from tvsbayes.single_axis.axis_campaign import unit_of_folder
-    from tvsbayes.single_axis.foreign_columns import deviation_columns, one_reading_a_row, refuse_small
+    from tvsbayes.single_axis.foreign_columns import deviation_columns, long_table, refuse_small
     from tvsbayes.single_axis.foreign_readings import AXIS_FIELDS, map_axis_columns, readings_of, unwrapped
 
-    rows = one_reading_a_row(table, stated)
+    rows = long_table(table, stated)
     table, stated, remarks = rows.table, rows.stated, rows.remarks
     known = map_axis_columns(table.columns, stated)
     missing = [field for field in NEEDED if field not in known.columns]

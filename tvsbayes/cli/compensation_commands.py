@@ -104,7 +104,7 @@ def compensate(
     checked(wish)
     data = read_axis(campaign)
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
-        results = results_for(data, progress=job.part(FITTING), seed=seed, tell=report_line)
+        results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
         made = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
     document = {"format": COMPENSATION_FORMAT, **made.as_json(), **plain(provenance(axis_hashes(data), seed))}
     files: dict[str, str] = {}

@@ -1,6 +1,6 @@
 """One geared axis and its readings: `campaign.toml`, `moves.csv`, `readings.csv` of an axis folder.
 
-Readings in the unit that the folder states, commands in steps or in whatever the controller counts; s. Columns are
+Readings in the unit that the folder states, commands in steps or the controller's own unit; s. Columns are
 found by name. No JAX.
 """
 
@@ -33,21 +33,21 @@ from tvsbayes.instrument.campaign_header import header_values
 from tvsbayes.instrument.column_names import DEGREES, SPREAD
 from tvsbayes.instrument.conditions import check_power, powered_on_s
 from tvsbayes.single_axis.axis_parameters import AXIS_KEYS, AxisPrior
-from tvsbayes.single_axis.waves import AskedPeriods
+from tvsbayes.single_axis.waves import WavePeriods
 
 FORMAT = "tvsbayes-axis/1"
 Approach = Literal["forward", "backward", "unknown"]
 """Forward is a rising command, whatever the sign of the unit per command."""
 COMMAND_MAX = 1e12
-"""Of a command or a reading, either sign."""
+"""Largest absolute command or reading."""
 TURNS = {**{unit: 360.0 / in_deg for unit, in_deg in DEGREES.items()}, "turn": 1.0}
 """One turn in the units of angles."""
 _NEVER_ZERO = ("transmission_error_length", "reading_scale", "creep_minutes", "seeing_s")
-"""Log-normals that the model divides by: held at 0, every density is without a value."""
+"""Log-normals that the model divides by: no density exists where they are fixed at 0."""
 PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
-"""Keys of `[axis]` that ask for waves."""
+"""Keys of `[axis]` that define waves."""
 PERIODS_MAX, RANGES_MAX = 8, 4
-"""Stated periods, and unknown ones: each adds two coordinates to what is sampled."""
+"""Largest numbers of stated and of unknown periods: each adds two sampled coordinates."""
 TEMPERATURE_MAX = 1000.0
 _MOVE = replace(MOVES["move"], names="")
 
@@ -57,7 +57,7 @@ class AxisMove:
     """A row of `moves.csv`: the command AFTER the move; `approach` in the first row of a segment, else empty."""
 
     move: Annotated[int, _MOVE]
-    # Of a scanner a run is an experiment; of an axis, what lies between two homings.
+    # A run of a scanner is an experiment; of an axis, the moves between two homings.
     segment: Annotated[int, replace(MOVES["segment"], names=MOVES["segment"].names + " run lauf durchlauf")]
     time_s: Annotated[float, MOVES["time_s"]]
     command: Annotated[
@@ -153,8 +153,8 @@ class AxisCampaign(Shown):
         readings: in the order of the file.
         stated: entries of `[axis]`; names left out take the default, which scales with the travel.
         header: keys of `campaign.toml` outside `[axis]` but `format` and `unit`.
-        periods: waves that `[axis]` asks for.
-        path: the folder, None of one that was never written.
+        periods: waves that `[axis]` defines.
+        path: the folder, None where it was never written.
     """
 
     unit: str
@@ -162,26 +162,26 @@ class AxisCampaign(Shown):
     readings: tuple[Reading, ...]
     stated: dict[str, AxisPrior] = field(default_factory=dict)
     header: dict[str, object] = field(default_factory=dict)
-    periods: AskedPeriods = field(default_factory=AskedPeriods)
+    periods: WavePeriods = field(default_factory=WavePeriods)
     path: Path | None = None
 
     @property
     def rate(self) -> float | None:
-        """Commands per second of a drive that never stops; None of an axis that is read at stops."""
+        """Commands per second of a drive that never stops; None where the axis is read at stops."""
         rate = self.header.get("rate")
         return float(rate) if isinstance(rate, int | float) else None
 
     @property
     def powered_on_s(self) -> float | None:
-        """When the machine was switched on, on the clock of `time_s`; None where nothing says it."""
+        """When the machine was switched on, on the clock of `time_s`; None where unknown."""
         return powered_on_s(self.header)
 
     def shown(self) -> View:
         """Counts, and the readings with the commands behind them."""
-        at = {move.move: move.command for move in self.moves}
+        command_of = {move.move: move.command for move in self.moves}
         ok = sum(reading.status == "ok" for reading in self.readings)
         title = f"AxisCampaign in {self.unit}: {len(self.moves)} moves, {len(self.readings)} readings ({ok} ok)"
-        rows = [(r.reading, r.move, at.get(r.move), r.value, r.u, r.status) for r in self.readings]
+        rows = [(r.reading, r.move, command_of.get(r.move), r.value, r.u, r.status) for r in self.readings]
         return View(
             title, ("reading", "move", "command", f"value, {self.unit}", f"u, {self.unit}", "status"), rows, most=5
         )
@@ -189,7 +189,7 @@ class AxisCampaign(Shown):
 
 _TEXTS = {**dict.fromkeys(("name", "operator", "instrument", "serial", "method"), 200), "notes": 4000}
 _FILES = {"moves.csv": CSV_BYTES_MAX, "readings.csv": CSV_BYTES_MAX, "campaign.toml": TOML_BYTES_MAX}
-"""campaign.toml is written last: a folder without it is recognisably unfinished."""
+"""campaign.toml is written last: a folder without it is unfinished."""
 
 
 def parse_axis_moves(data: bytes, file: str = "moves.csv") -> tuple[AxisMove, ...]:
@@ -198,17 +198,17 @@ def parse_axis_moves(data: bytes, file: str = "moves.csv") -> tuple[AxisMove, ..
 
 
 def parse_readings(
-    data: bytes, moves: int, moved: tuple[AxisMove, ...] = (), in_motion: bool = False
+    data: bytes, moves: int, move_rows: tuple[AxisMove, ...] = (), in_motion: bool = False
 ) -> tuple[Reading, ...]:
     """The checked rows of `readings.csv`.
 
     Args:
         data: content of the file.
         moves: number of moves, which `move` must name.
-        moved: the moves, where readings were taken `in_motion`: then each that is ok has its time.
+        move_rows: the moves, where readings were taken `in_motion`: then each ok reading has its time.
         in_motion: whether the folder states a `rate`.
     """
-    return READINGS.parse(data, READINGS.file, follows_a_move(moves, "reading"), _times_in_motion(moved, in_motion))
+    return READINGS.parse(data, READINGS.file, follows_a_move(moves, "reading"), _times_in_motion(move_rows, in_motion))
 
 
 def _times_in_motion(moves: tuple[AxisMove, ...], in_motion: bool) -> Callable[[Table, Values], None]:
@@ -226,9 +226,9 @@ def _times_in_motion(moves: tuple[AxisMove, ...], in_motion: bool) -> Callable[[
                 place = "time_s" if "time_s" in table.columns else "reading"
                 raise table.refuse(row, place, "motion", allowed, "add time_s, or remove `rate`")
             if in_motion and time_s is not None:
-                until = moves[move + 1].time_s if move + 1 < len(moves) else COMMAND_MAX
-                if not moves[move].time_s <= time_s <= until:
-                    allowed = f"from {moves[move].time_s:g}, the time of move {move}, to {until:g}"
+                end_s = moves[move + 1].time_s if move + 1 < len(moves) else COMMAND_MAX
+                if not moves[move].time_s <= time_s <= end_s:
+                    allowed = f"from {moves[move].time_s:g}, the time of move {move}, to {end_s:g}"
                     raise table.refuse(row, "time_s", "order", allowed, "name the last move before the reading")
 
     return check
@@ -258,7 +258,7 @@ def _parse_header(keys: Keys) -> dict[str, object]:
 
 
 def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
-    """Priors of `[axis]`; a half-normal entry has value 0, or u = 0 and the value that it is fixed at."""
+    """Priors of `[axis]`; a half-normal entry has value 0, or u = 0 and its fixed value."""
     keys.only((*AXIS_KEYS, *PERIODS))
     stated: dict[str, AxisPrior] = {}
     for name in keys.values:
@@ -278,14 +278,14 @@ def _parse_axis_table(keys: Keys) -> dict[str, AxisPrior]:
     return stated
 
 
-def _parse_periods(keys: Keys) -> AskedPeriods:
-    """Waves that `[axis]` asks for."""
-    least = 1.0 / COMMAND_MAX
-    stated = keys.numbers("periods", least, COMMAND_MAX, PERIODS_MAX) if "periods" in keys else ()
-    encoder = keys.number("encoder_period", least, COMMAND_MAX) if "encoder_period" in keys else None
+def _parse_periods(keys: Keys) -> WavePeriods:
+    """Waves that `[axis]` defines."""
+    minimum = 1.0 / COMMAND_MAX
+    periods = keys.numbers("periods", minimum, COMMAND_MAX, PERIODS_MAX) if "periods" in keys else ()
+    encoder = keys.number("encoder_period", minimum, COMMAND_MAX) if "encoder_period" in keys else None
     in_seconds = "periods_in" in keys and keys.word("periods_in", ("unit", "seconds")) == "seconds"
     between = _parse_ranges(keys) if "period_between" in keys else ()
-    return AskedPeriods(stated, between, in_seconds, encoder)
+    return WavePeriods(periods, between, in_seconds, encoder)
 
 
 def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
@@ -305,8 +305,8 @@ def _parse_ranges(keys: Keys) -> tuple[tuple[float, float], ...]:
         ranges.append((low, high))
     for k, (low, high) in enumerate(ranges):
         if any((low, high) != other and low < other[1] and other[0] < high for other in ranges[:k]):
-            same = "ranges that are the same or do not overlap"
-            raise keys.refuse("period_between", "range", same, "write one range twice where both periods may be there")
+            rule = "ranges that are the same or do not overlap"
+            raise keys.refuse("period_between", "range", rule, "write one range twice where both periods may be there")
     if len(ranges) > RANGES_MAX:
         raise keys.refuse("period_between", "range", allowed, "ask for fewer unknown periods at once")
     return tuple(ranges)
@@ -341,7 +341,7 @@ def read_axis(folder: Path | str) -> AxisCampaign:
         place, found = escaped(str(folder), 200), "no such folder" if not folder.exists() else "a file"
         allowed, remedy = "an axis folder", "give the folder that holds campaign.toml"
         raise refusal("missing-file", file=place, found=found, allowed=allowed, remedy=remedy)
-    return _parse_files({name: read_bytes(folder / name, cap, folder) for name, cap in _FILES.items()}, folder)
+    return _parse_files({name: read_bytes(folder / name, limit, folder) for name, limit in _FILES.items()}, folder)
 
 
 def axis_templates() -> dict[str, bytes]:
@@ -362,13 +362,13 @@ def readings_bytes(readings: Iterable[Reading]) -> bytes:
 def _axis_table_lines(campaign: AxisCampaign) -> list[str]:
     priors = [toml_line(name, {"value": p.value, "u": p.u}) for name, p in sorted(campaign.stated.items())]
     periods = campaign.periods
-    given = {
+    entries = {
         "periods": list(periods.stated),
         "periods_in": "seconds" if periods.in_seconds else None,
         "period_between": [list(pair) for pair in periods.between],
         "encoder_period": periods.encoder,
     }
-    return [*priors, *(toml_line(name, value) for name, value in given.items() if value)]
+    return [*priors, *(toml_line(name, value) for name, value in entries.items() if value)]
 
 
 def axis_toml(campaign: AxisCampaign) -> bytes:
@@ -379,11 +379,11 @@ def axis_toml(campaign: AxisCampaign) -> bytes:
 
 
 def write_axis(campaign: AxisCampaign, folder: Path) -> None:
-    """Writes the three files into a new or empty folder; what is read back is the same.
+    """Writes the three files into a new or empty folder; reading them gives the same campaign.
 
     Raises:
-        InputError: the folder holds something, cannot be written, or `campaign` holds what `read_axis` would refuse
-            (then nothing is written).
+        InputError: the folder is not empty or cannot be written, or `read_axis` would refuse the files (then nothing is
+            written).
     """
     contents = axis_moves_bytes(campaign.moves), readings_bytes(campaign.readings), axis_toml(campaign)
     files = dict(zip(_FILES, contents, strict=True))
@@ -394,7 +394,7 @@ def write_axis(campaign: AxisCampaign, folder: Path) -> None:
 
 
 def axis_hashes(campaign: AxisCampaign) -> dict[str, str]:
-    """SHA-256 of what an estimate depends on, by "moves", "readings" and "axis", over values in canonical text."""
+    """SHA-256 of the inputs of an estimate, by "moves", "readings" and "axis", over values in canonical text."""
     readings = sorted(campaign.readings, key=lambda reading: reading.reading)
     timing = [toml_line(key, campaign.header[key]) for key in ("rate", "powered_on") if key in campaign.header]
     axis = "\n".join([campaign.unit, *timing, *_axis_table_lines(campaign)])
@@ -410,7 +410,7 @@ def stops_csv(stops: Iterable[tuple[float | None, float, str]]) -> bytes:
     """`plan.csv` of an axis: step, command, direction, read (1 or 0).
 
     Args:
-        stops: the command visited before, None where there is none; the command; the direction it is reached by.
+        stops: the command visited before, None where there is none; the command; its direction of approach.
     """
     rows: list[tuple[int, float, str, int]] = []
     for via, command, direction in stops:

@@ -1,4 +1,4 @@
-"""The posterior of an axis as samplers see it: its scales, with draws of the line that was integrated out."""
+"""The posterior of an axis for samplers: density of its scales, with draws of the line that was integrated out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 
 FUNCTIONALS: dict[str, Callable[[AxisModel], np.ndarray]] = {
-    # At command zero, where folders count from.
+    # At command zero.
     "offset": lambda model: model.head(offset=1.0, slope=-model.middle),
     "per_command": lambda model: model.head(slope=1.0),
     "ratio_contrast": lambda model: model.head(contrast=1.0),
@@ -21,19 +21,19 @@ FUNCTIONALS: dict[str, Callable[[AxisModel], np.ndarray]] = {
     "per_command.forward": lambda model: model.head(slope=1.0, contrast=0.5),
     "per_command.backward": lambda model: model.head(slope=1.0, contrast=-0.5),
 }
-"""Of the columns: quantities of `AXIS_QUANTITIES` that no draw changes."""
+"""Functionals of the columns by quantity of `AXIS_QUANTITIES`; the same for all draws."""
 HEADLINE_DRAWS = (*FUNCTIONALS, "effective_per_command")
 """Rows of `headline_functionals`."""
 
 
 def line_weights(model: AxisModel, w: np.ndarray) -> np.ndarray:
-    """Slope of the least-squares line of the error by position over the rows, each counting once.
+    """Slope of the least-squares line of the error by position over the rows, with equal weights.
 
     Shape (columns,), or (n, columns) at draws w (n, d) where a period is not known.
     """
     rows = model.rows
-    off = rows.command - rows.command.mean()
-    weights = off / (off @ off)
+    deviations = rows.command - rows.command.mean()
+    weights = deviations / (deviations @ deviations)
     if not model.repeats_by_draw:
         return weights @ model.functional(rows.command)
     return np.concatenate([weights @ model.functional(rows.command, part) for part in blocks_of(w)])
@@ -55,12 +55,12 @@ def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
 
 
 def line_functionals(model: AxisModel) -> np.ndarray:
-    """Those of `HEADLINE_DRAWS` but the last, which no draw changes."""
+    """Functionals of all but the last of `HEADLINE_DRAWS`; the same for all draws."""
     return np.array([functional(model) for functional in FUNCTIONALS.values()])
 
 
 class AxisDensity:
-    """A `Density`; the part `linear` (n, t) of its points is a draw of `HEADLINE_DRAWS` but the last."""
+    """A `Density`; the part `linear` (n, t) of its points is a draw of all but the last of `HEADLINE_DRAWS`."""
 
     headlines = tuple(name for name, quantity in AXIS_QUANTITIES.items() if quantity.headline)
     fixed: frozenset[str] = frozenset()
@@ -77,30 +77,30 @@ class AxisDensity:
 
     @property
     def log_constant(self) -> float:
-        """Of the normal priors of the coordinates, and the density at the mode."""
+        """Log density at the mode, with the constant of the normal priors of the coordinates."""
         return self.mode.log_density - 0.5 * self.dimension * float(np.log(2 * np.pi))
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
-        """Log density of w (n, d), relative to the mode; -inf where it has no value."""
+        """Log density of w (n, d), relative to the mode; -inf where it is undefined."""
         return self.model.log_density(w) - self.mode.log_density
 
     def valued(self, w: np.ndarray, generator: np.random.Generator) -> Points:
-        """The same, with draws of the line."""
+        """Points at w with their log density and draws of the line."""
         likelihood = self.model.posterior(w, self.functionals)
         linear = likelihood.linear.drawn(np.eye(len(self.functionals)), generator)
         return Points(w, likelihood.log_density - self.mode.log_density, {"linear": linear})
 
     def log_density(self, points: Points) -> np.ndarray:
-        """Of the sampled coordinates."""
+        """Log density of the sampled coordinates."""
         return points.log_target + self.mode.log_density
 
     def quantities(self, points: Points) -> dict[str, np.ndarray]:
-        """Sampled scales, and what is linear."""
+        """Draws of the sampled scales and of the linear quantities."""
         values, names = self.model.coordinates.values(points.w), self.model.coordinates.names
         linear = dict(zip(HEADLINE_DRAWS, points.parts["linear"].T, strict=False))
-        # A backlash that is sampled is in the linear one.
+        # A sampled backlash is part of the linear one.
         return {name: values[name] for name in names if name in values} | linear
 
     def first_proposal(self) -> StudentMixture:
-        """About the mode."""
+        """A mixture about the mode."""
         return StudentMixture.about(self.mode.w, self.mode.covariance)

@@ -1,4 +1,4 @@
-"""What is odd about the data of an axis before any fit: counts of other steps, a wrong ratio stated, wild readings."""
+"""Doubts about the data of an axis before any fit: miscounted steps, a wrong stated ratio, outliers."""
 
 from __future__ import annotations
 
@@ -15,33 +15,34 @@ from tvsbayes.single_axis.axis_rows import AxisRows
 from tvsbayes.single_axis.classic_line import LineFit, fit_line
 
 SLOPE_SHARE, SLOPE_ERRORS = 0.2, 6.0
-"""A segment's own slope is odd from this share of the others' on, and so many standard errors: errors by position make
-some per cent, steps miscounted a factor of 2 or more."""
+"""Least difference of a doubtful segment's slope from the others, as a share and in standard errors: errors by position
+change it by some per cent, miscounted steps by a factor of 2 or more."""
 PLAYS = 4.0
-"""Plays and scatters by which that must move an end of the segment: stops inside the play bend short segments."""
+"""Least shift of the segment's end by that difference, in plays and scatters: stops inside the play bend short
+segments."""
 WILD = 6.0
-"""Standard deviations of readings at one stop."""
+"""Least deviation of an outlier among readings at one stop, in standard deviations."""
 STOPS_MIN = 5
-"""With several readings, below which their scatter is not known well enough to call one wild."""
+"""Least number of stops with several readings: with fewer, the scatter is too uncertain to call one wild."""
 WILD_STOP, STOPS_JUDGED_MIN = 12.0, 8
-"""Typical distances from the line through the others by which a stop is wild, and stops from which on that is asked."""
+"""Least deviation of a wild stop from the line, in typical deviations, and least number of stops for this test."""
 WILD_SHARE = 0.1
-"""Of the travel, which a wild stop is off too: no gear errs and no stop scatters by so much."""
+"""Least deviation of a wild stop as a share of the travel: no gear error and no scatter of stops is so large."""
 LINE_SLOPE = float(np.sqrt(12.0))
-"""Largest sd of the slope that errors of sd 1, however they go with position, give a line over a range of 1."""
+"""Largest sd of a line's slope over a range of 1 from errors of sd 1, for any dependence on position."""
 
 
 def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """What is odd about the data, in sentences."""
+    """Doubts about the data, in sentences."""
     sentences = []
     if rows.in_motion:
         return _warnings_in_motion(campaign, rows)
     legs = rows.legs
-    idle = (legs.step == 0) & ~legs.first
-    again = [int(m) for m in rows.move if idle[m]]
-    if again:
+    zero_steps = (legs.step == 0) & ~legs.first
+    unmoved = [int(m) for m in rows.move if zero_steps[m]]
+    if unmoved:
         sentences.append(
-            f"same command as the move before: moves {listed(again, 5)}; nothing moved, so they are of one stop and "
+            f"same command as the move before: moves {listed(unmoved, 5)}; nothing moved, so they are of one stop and "
             "side; list the moves in between if the axis went on and came back"
         )
     if len({m.time_s for m in campaign.moves}) == 1:
@@ -55,7 +56,7 @@ def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
 
 
 def _warnings_in_motion(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """What is odd about a record of a drive that never stops."""
+    """Doubts about a record of a drive that never stops."""
     sentences = []
     if not any(r.u > 0 for r in campaign.readings):
         sentences.append(f"no reading has a stated u: {rows.reading_u:.2g} {rows.unit} by differences of neighbours")
@@ -66,31 +67,31 @@ def _warnings_in_motion(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
 
 
 def data_doubts(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """Of its numbers alone."""
+    """Doubts about commands, readings and the stated ratio."""
     wild = _wild_readings(campaign, rows)
     return [*_odd_segments(rows), *_odd_ratio(campaign, rows), *(wild or _wild_stops(campaign, rows))]
 
 
 def _odd_segments(rows: AxisRows) -> list[str]:
-    """Segments whose own line rises otherwise than those of the others."""
+    """Segments whose slope differs from that of the others."""
     lines: dict[int, LineFit] = {}
     for segment in np.unique(rows.segment):
-        mine = rows.segment == segment
-        # Offset, slope and play take three rows; a fourth tells their scatter.
-        if mine.sum() > 3 and np.ptp(rows.command[mine]) > 0:
-            lines[int(segment)] = fit_line(rows, mine)
+        of_segment = rows.segment == segment
+        # Three rows determine offset, slope and play; a fourth their scatter.
+        if of_segment.sum() > 3 and np.ptp(rows.command[of_segment]) > 0:
+            lines[int(segment)] = fit_line(rows, of_segment)
     sentences = []
     for segment, line in lines.items():
-        # Of two that differ the data cannot say which is wrong: both are named.
+        # If two segments differ, the data do not show which is wrong: both are named.
         others = [other for number, other in lines.items() if number != segment or len(lines) > 2]
         if not others:
             continue
-        typical = sorted(others, key=lambda other: float(other.solved[1]))[(len(others) - 1) // 2]
-        slope, reference = float(line.solved[1]), float(typical.solved[1])
+        typical = sorted(others, key=lambda other: float(other.solution[1]))[(len(others) - 1) // 2]
+        slope, reference = float(line.solution[1]), float(typical.solution[1])
         u = float(np.sqrt(line.covariance[1, 1] + typical.covariance[1, 1]))
-        off, reach = abs(slope - reference), float(np.ptp(rows.command[rows.segment == segment]))
-        loose = max(abs(float(one.solved[2])) + one.scatter for one in (line, typical))
-        if off > max(SLOPE_SHARE * min(abs(slope), abs(reference)), SLOPE_ERRORS * u) and off * reach > PLAYS * loose:
+        gap, span = abs(slope - reference), float(np.ptp(rows.command[rows.segment == segment]))
+        bound = max(abs(float(fit.solution[2])) + fit.scatter for fit in (line, typical))
+        if gap > max(SLOPE_SHARE * min(abs(slope), abs(reference)), SLOPE_ERRORS * u) and gap * span > PLAYS * bound:
             sentences.append(
                 f"segment {segment} reads {slope:.5g} {rows.unit} per command, {slope / reference:.3g} times what "
                 f"others read ({reference:.5g}): its commands were counted in other steps (full steps among "
@@ -119,61 +120,61 @@ def _odd_ratio(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
 
 
 def _wild_readings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """Readings far off the others at their stop; of two that differ, the one farther off the line."""
+    """Readings far from the others at their stop; if two differ, the one farther from the line."""
     stops: dict[int, list[Reading]] = defaultdict(list)
     for reading in campaign.readings:
         if reading.status == "ok" and reading.value is not None:
             stops[reading.move].append(reading)
     line = fit_line(rows)
     side = {int(move): int(s) for move, s in zip(rows.move, rows.side, strict=True)}
-    odd: list[tuple[Reading, float, float]] = []
-    for move, each in stops.items():
-        if len(each) < 2:
+    candidates: list[tuple[Reading, float, float]] = []
+    for move, readings in stops.items():
+        if len(readings) < 2:
             continue
-        values = np.array([float(r.value or 0.0) for r in each])
-        middle = float(np.median(values))
-        if len(each) == 2:
-            # Both are as far from their middle.
+        values = np.array([float(r.value or 0.0) for r in readings])
+        centre = float(np.median(values))
+        if len(readings) == 2:
+            # Both are at the same distance from their median.
             design = [1.0, rows.legs.command[move] - rows.command.mean(), -0.5 * np.sign(rows.line[1]) * side[move]]
-            middle = float(np.dot(design, line.solved))
-        k = int(np.argmax(np.abs(values - middle)))
+            centre = float(np.dot(design, line.solution))
+        k = int(np.argmax(np.abs(values - centre)))
         others = np.delete(values, k)
-        u = [r.u for r in each]
-        unit = float(np.hypot(u[k], np.linalg.norm(np.delete(u, k)) / len(others))) if all(u) else 0.0
-        odd.append((each[k], float(values[k] - np.median(others)), unit))
-    # Where no u is stated all are in one scale, that of their typical difference; a stated one may be too small.
-    known = bool(odd) and all(unit > 0 for _, _, unit in odd)
-    if len(odd) < STOPS_MIN:
+        u = [r.u for r in readings]
+        sd = float(np.hypot(u[k], np.linalg.norm(np.delete(u, k)) / len(others))) if all(u) else 0.0
+        candidates.append((readings[k], float(values[k] - np.median(others)), sd))
+    # Where no u is stated, the scale is their typical difference; a stated u may be too small.
+    known = bool(candidates) and all(sd > 0 for _, _, sd in candidates)
+    if len(candidates) < STOPS_MIN:
         return []
-    sizes = np.array([abs(off) / (unit if known else 1.0) for _, off, unit in odd])
+    sizes = np.array([abs(deviations) / (sd if known else 1.0) for _, deviations, sd in candidates])
     typical = float(np.median(sizes)) / 0.6745
     scale = max(typical, 1.0) if known else typical
     return [
         f"reading {reading.reading} (move {reading.move}, command {rows.legs.command[reading.move]:.10g}) lies "
-        f"{off:+.3g} {rows.unit}, {size / scale:.0f} sds, off what else was read at its stop: look at it in "
+        f"{deviations:+.3g} {rows.unit}, {size / scale:.0f} sds, off what else was read at its stop: look at it in "
         "readings.csv, and if it is wrong give it another status than ok, such as wild"
-        for (reading, off, _), size in zip(odd, sizes, strict=True)
+        for (reading, deviations, _), size in zip(candidates, sizes, strict=True)
         if size > WILD * scale > 0
     ]
 
 
 @dataclass(frozen=True)
-class _MostLine:
-    """A line with a reversal and a home of each segment that single rows do not bend.
+class _RobustLine:
+    """A robust line with a reversal and an offset of each segment.
 
     Attributes:
-        off: distance of every row from it, unit, shape (rows,).
-        lost: in the reversal, unit.
+        deviations: of every row from it, unit, shape (rows,).
+        reversal: unit.
     """
 
-    off: np.ndarray
-    lost: float
+    deviations: np.ndarray
+    reversal: float
 
 
-def _line_through_most(rows: AxisRows) -> _MostLine:
-    """Medians throughout: the slope of pairs half the rows apart on one side, then each side of each segment.
+def _robust_line(rows: AxisRows) -> _RobustLine:
+    """Medians: the slope of pairs half the rows apart on one side, then each side of each segment.
 
-    All pairs (Theil, Sen) would tell the slope somewhat better, in a time that grows with the square of the rows.
+    All pairs (Theil, Sen) would determine the slope somewhat better, in a time that grows with the square of the rows.
     """
     slopes = []
     for side in np.unique(rows.side):
@@ -181,35 +182,35 @@ def _line_through_most(rows: AxisRows) -> _MostLine:
         of_side = of_side[np.argsort(rows.command[of_side], kind="stable")]
         half = len(of_side) // 2
         near, far = of_side[: len(of_side) - half], of_side[half:]
-        apart = rows.command[far] - rows.command[near]
-        slopes += ((rows.value[far] - rows.value[near])[apart > 0] / apart[apart > 0]).tolist()
-    off = rows.value - float(np.median(slopes or [rows.line[1]])) * rows.command
-    lost = []
+        spacing = rows.command[far] - rows.command[near]
+        slopes += ((rows.value[far] - rows.value[near])[spacing > 0] / spacing[spacing > 0]).tolist()
+    deviations = rows.value - float(np.median(slopes or [rows.line[1]])) * rows.command
+    reversals = []
     for segment in np.unique(rows.segment):
         sides = [(rows.segment == segment) & (rows.side == side) for side in (-1, 0, 1)]
-        middles = [float(np.median(off[mine])) if mine.any() else None for mine in sides]
-        if middles[0] is not None and middles[2] is not None:
-            lost.append(abs(middles[2] - middles[0]))
-        for mine, middle in zip(sides, middles, strict=True):
-            off[mine] -= middle or 0.0
-    return _MostLine(off, float(np.median(lost or [0.0])))
+        centres = [float(np.median(deviations[of_rows])) if of_rows.any() else None for of_rows in sides]
+        if centres[0] is not None and centres[2] is not None:
+            reversals.append(abs(centres[2] - centres[0]))
+        for of_rows, centre in zip(sides, centres, strict=True):
+            deviations[of_rows] -= centre or 0.0
+    return _RobustLine(deviations, float(np.median(reversals or [0.0])))
 
 
 def _wild_stops(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """Single readings far off the line through all others, where stops were read once.
+    """Single readings far from the line through all others, where stops were read once.
 
-    A stop that a short leg reached may stand inside the play and is not judged.
+    A stop after a short leg may lie inside the play and is not judged.
     """
     if len(rows.value) < STOPS_JUDGED_MIN:
         return []
-    line = _line_through_most(rows)
-    typical = float(np.median(np.abs(line.off))) / 0.6745
-    wild = np.abs(line.off) > max(WILD_STOP * typical, WILD_SHARE * rows.travel)
-    way = np.abs(rows.legs.step[rows.move] * rows.line[1])
+    line = _robust_line(rows)
+    typical = float(np.median(np.abs(line.deviations))) / 0.6745
+    wild = np.abs(line.deviations) > max(WILD_STOP * typical, WILD_SHARE * rows.travel)
+    leg = np.abs(rows.legs.step[rows.move] * rows.line[1])
     reading = {r.move: r.reading for r in campaign.readings if r.status == "ok"}
     return [
         f"reading {reading[int(rows.move[k])]} (move {rows.move[k]}, command {rows.command[k]:.10g}) lies "
-        f"{line.off[k]:+.3g} {rows.unit} off the line through the others, typical is {typical:.2g}: look at it in "
-        "readings.csv, and if it is wrong give it another status than ok, such as wild"
-        for k in np.flatnonzero(wild & (way > PLAYS * line.lost))
+        f"{line.deviations[k]:+.3g} {rows.unit} off the line through the others, typical is {typical:.2g}: look at it "
+        "in readings.csv, and if it is wrong give it another status than ok, such as wild"
+        for k in np.flatnonzero(wild & (leg > PLAYS * line.reversal))
     ]

@@ -1,7 +1,7 @@
-"""The fit of one axis: mode, the sampled posterior, equal draws of everything that is said of it.
+"""The fit of one axis: mode, sampled posterior, equal draws of all reported quantities.
 
-And priors that its readings contradict: the error and the play by position stretch to bear a wrong ratio or play, so
-that the posterior stays at the prior and looks content. What the readings say is asked of a model without that prior.
+And priors that its readings contradict: the error and the play by position can absorb a wrong ratio or play, so that
+the posterior stays at the prior without a sign of conflict. The check fits a model without that prior.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.period_search import waves_of
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
-STRETCHED = {"per_command": "slope", "backlash": "backlash"}
-"""Keys of `[axis]` that processes of position can stand in for, with their functionals."""
+ABSORBED = {"per_command": "slope", "backlash": "backlash"}
+"""Keys of `[axis]` that processes of position can absorb, with their functionals."""
 REMEDY = (
     "check sign and unit of commands (steps or microsteps?) and readings, or state the prior wider or leave it out of "
     "[axis]"
 )
 DRAWS = 200
-"""Of the Laplace approximation, for a value and its sd."""
+"""Draws of the Laplace approximation for a value and its sd."""
 
 
 @dataclass(frozen=True)
 class PriorConflict:
-    """A prior and what the readings say against it.
+    """A prior that the readings contradict.
 
     Attributes:
         name: of the parameter.
-        value, sd: by the readings without that prior; of a scale, of its posterior. Folder's unit.
-        prior: what was stated, or the default.
+        value, sd: by the readings without that prior; for a scale, by its posterior. Folder's unit.
+        prior: stated or default.
         stated: whether the prior was stated.
-        distance: of the value from the prior's centre, in prior sds; infinite where the prior holds it exactly.
+        distance: of the value from the prior's centre, in prior sds; infinite where the prior fixes it.
     """
 
     name: str
@@ -66,65 +66,65 @@ def prior_conflicts(
     """Priors that the readings contradict.
 
     Args:
-        model: that was fitted.
+        model: the fitted model.
         w: coordinates of equal draws of its posterior, shape (n, d).
         stated: entries of `[axis]`.
         defaults: complete priors, as if nothing were stated.
     """
-    conflicts = [_of_stretched(model, name, defaults[name]) for name in STRETCHED if name in stated]
+    conflicts = [_absorbed_conflict(model, name, defaults[name]) for name in ABSORBED if name in stated]
     values = model.coordinates.values(w)
     for k, name in enumerate(model.coordinates.names):
         key = name.split(".")[0]
         if key.startswith("wave_"):
             continue
-        off = float(w[:, k].mean())
-        # That an axis is far better than the default is no fault of what was stated.
-        if key not in STRETCHED and (off if key not in stated else abs(off)) > CONFLICT_LIMIT:
-            drawn = values[name]
+        z = float(w[:, k].mean())
+        # An axis far better than the default does not contradict what was stated.
+        if key not in ABSORBED and (z if key not in stated else abs(z)) > CONFLICT_LIMIT:
+            draws = values[name]
             conflicts.append(
-                PriorConflict(name, float(drawn.mean()), float(drawn.std()), model.priors[key], key in stated, abs(off))
+                PriorConflict(name, float(draws.mean()), float(draws.std()), model.priors[key], key in stated, abs(z))
             )
     return tuple(conflict for conflict in conflicts if conflict is not None)
 
 
 def conflict_text(conflict: PriorConflict) -> str:
-    """In words: what the readings say, what the prior does, what to do."""
+    """A sentence with the readings' value, the prior and the remedy."""
     prior, key = conflict.prior, conflict.name.split(".")[0]
-    whose = "of [axis]" if conflict.stated else "by default"
-    entry = f"`{key} = {{ value = {prior.value:.10g}, u = {prior.u:.6g} }}` {whose}"
+    origin = "of [axis]" if conflict.stated else "by default"
+    entry = f"`{key} = {{ value = {prior.value:.10g}, u = {prior.u:.6g} }}` {origin}"
     # To the second digit of its u.
     digits = int(np.clip(2 + np.ceil(np.log10(max(abs(conflict.value), 1e-300) / conflict.sd)), 2, 12))
     quantity = f"{conflict.name} = {conflict.value:.{digits}g} (u = {conflict.sd:.2g})"
     return conflict_sentence(quantity, conflict.distance, entry, REMEDY)
 
 
-def _of_stretched(model: AxisModel, name: str, wide: AxisPrior) -> PriorConflict | None:
-    """Whether prior and readings, each with its own u, differ beyond reason; None where not, or where none tells."""
+def _absorbed_conflict(model: AxisModel, name: str, default: AxisPrior) -> PriorConflict | None:
+    """The conflict of prior and readings beyond both u; None where there is none or it cannot be judged."""
     prior = model.priors[name]
-    if prior.u >= wide.u or (name == "backlash" and not model.rows.both_sides):
+    if prior.u >= default.u or (name == "backlash" and not model.rows.both_sides):
         return None
-    alone = AxisModel.of(model.rows, {**model.priors, name: wide}, None, model.coordinates.waves)
-    mode = find_mode(alone)
+    without_prior = AxisModel.of(model.rows, {**model.priors, name: default}, None, model.coordinates.waves)
+    mode = find_mode(without_prior)
     if mode.missing:
         return None
     rng = np.random.default_rng(0)
     w = rng.multivariate_normal(mode.w, mode.covariance, DRAWS) if len(mode.w) else np.zeros((DRAWS, 0))
-    drawn = alone.linear(w).drawn(alone.head(**{STRETCHED[name]: 1.0})[None], rng)[:, 0]
-    value, sd = float(drawn.mean()), float(drawn.std())
-    off = abs(value - prior.value)
-    if off <= CONFLICT_LIMIT * float(np.hypot(prior.u, sd)):
+    draws = without_prior.linear(w).drawn(without_prior.head(**{ABSORBED[name]: 1.0})[None], rng)[:, 0]
+    value, sd = float(draws.mean()), float(draws.std())
+    difference = abs(value - prior.value)
+    if difference <= CONFLICT_LIMIT * float(np.hypot(prior.u, sd)):
         return None
-    return PriorConflict(name, value, sd, prior, True, off / prior.u if prior.u else np.inf)
+    return PriorConflict(name, value, sd, prior, True, difference / prior.u if prior.u else np.inf)
 
 
 MODE, WEIGHING, WALKING, TELLING = "mode", "weighted draws", "chain", "summarising"
 EQUAL_DRAWS = 2000
-"""Kept of a sample, of equal weight."""
+"""Number of equally weighted draws kept of a sample."""
 ROUNDS_MAX = 32
-"""Of weighted draws: ends of an interval that is thin there take more draws than are worth the time of a chain."""
+"""Largest number of rounds of weighted draws: an interval with thin tails takes more draws than a chain is worth."""
 PILOTS_MAX = 16
-"""Rounds from which its proposal is learnt: waves, creep and drifts bend what the Laplace approximation takes as
-straight."""
+"""Largest number of rounds that adapt the proposal: waves, creep and drifts are nonlinear, the Laplace approximation is
+not."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -132,10 +132,10 @@ class AxisFit(Shown):
     """A fitted axis.
 
     Attributes:
-        campaign, rows, model: what was fitted.
+        campaign, rows, model: data and model of the fit.
         mode: of the sampled parameters.
         sample: the sampled posterior; None where nothing was sampled.
-        w: coordinates of equal draws, (draws, d): of the Laplace approximation where no sample has an answer.
+        w: coordinates of equal draws, (draws, d): of the Laplace approximation where no sample converged.
         seed: of everything random.
     """
 
@@ -148,43 +148,43 @@ class AxisFit(Shown):
     seed: int
 
     def shown(self) -> View:
-        """What was fitted and how; `axis_record.summarise_axis` says what came out."""
-        rows, how = self.rows, self.tier or self.estimator
+        """Data, method and state of the fit; `axis_record.summarise_axis` has its results."""
+        rows, method = self.rows, self.tier or self.estimator
         state = "converged" if self.error is None else f"NOT CONVERGED: {self.error.message}"
-        return View(f"AxisFit of {len(rows.value)} rows at {len(rows.positions)} positions by {how}, {state}")
+        return View(f"AxisFit of {len(rows.value)} rows at {len(rows.positions)} positions by {method}, {state}")
 
     @classmethod
     def of_draws(cls, campaign: AxisCampaign, model: AxisModel, w: np.ndarray, seed: int) -> AxisFit:
-        """Of draws that were kept; how they were made is not."""
+        """A fit from stored draws, without their sample."""
         mode = AxisMode(w.mean(axis=0), np.atleast_2d(np.cov(w.T)), 0.0)
         return cls(campaign, model.rows, model, mode, None, w, seed)
 
     @property
     def answer(self) -> AnswerKind:
-        """What the intervals are."""
+        """Kind of the intervals."""
         return "laplace" if self.sample is None else self.sample.convergence.answer
 
     @property
     def estimator(self) -> EstimatorName:
-        """What made the intervals."""
+        """The estimator of the intervals."""
         return "laplace" if self.answer == "laplace" else "posterior"
 
     @property
     def tier(self) -> Tier | None:
-        """Of the posterior."""
+        """Tier of the posterior; None of a Laplace approximation."""
         return None if self.sample is None or self.answer == "laplace" else self.sample.tier
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What an accepted answer lacks, in sentences; without a sample why the mode must not be used."""
+        """Why the answer is not accepted, in sentences; without a sample, why the mode must not be used."""
         if self.sample is None:
             return self.mode.missing
-        lacks = {"accepted": "", "rough": "ROUGH", "laplace": "LAPLACE"}[self.answer]
-        return tuple(f"{lacks}: {sentence}" for sentence in self.sample.convergence.missing)
+        label = {"accepted": "", "rough": "ROUGH", "laplace": "LAPLACE"}[self.answer]
+        return tuple(f"{label}: {sentence}" for sentence in self.sample.convergence.missing)
 
     @property
     def error(self) -> TvsError | None:
-        """`NotConverged` where there is no mode: nothing was sampled then, or no sample has an answer."""
+        """`NotConverged` where there is no mode: then nothing was sampled, or the sample did not converge."""
         if self.estimator == "posterior" or not self.mode.missing:
             return None
         if not self.free:
@@ -203,24 +203,24 @@ class AxisFit(Shown):
 
     @cached_property
     def linear(self) -> LinearPosterior:
-        """What is linear, at every equal draw."""
+        """Posterior of the linear quantities at every equal draw."""
         return self.model.linear(self.w)
 
     @cached_property
     def draws(self) -> dict[str, np.ndarray]:
         """Equal draws (draws,) of every sampled parameter, of the linear ones, and of the line through the stops."""
         rng = random_stream(self.seed, AxisStream.LINEAR_TERMS)
-        by_name = {name: v for name, v in self.model.coordinates.values(self.w).items() if name in self.free}
+        draws = {name: v for name, v in self.model.coordinates.values(self.w).items() if name in self.free}
         linear = self.linear.drawn(headline_functionals(self.model, self.w), rng)
-        return by_name | dict(zip(HEADLINE_DRAWS, linear.T, strict=True)) | self._shift_draws(rng)
+        return draws | dict(zip(HEADLINE_DRAWS, linear.T, strict=True)) | self._shift_draws(rng)
 
     def _shift_draws(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Of the zero's shifts in time."""
+        """Draws of the zero's shifts in time."""
         names = self.model.shifts
         if not names:
             return {}
-        drawn = self.linear.drawn(np.array([self.model.shift(name) for name in names]), rng)
-        return dict(zip(names, drawn.T, strict=True))
+        draws = self.linear.drawn(np.array([self.model.shift(name) for name in names]), rng)
+        return dict(zip(names, draws.T, strict=True))
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -261,11 +261,11 @@ def fit_axis(
     Args:
         campaign: from `read_axis`.
         tier: "importance" for weighted draws alone, "emcee" for the chain that must agree with them.
-        sampled: sample; else the Laplace approximation stands alone.
+        sampled: sample the posterior; else the Laplace approximation alone.
         max_minutes: time for the chain.
         seed: of everything random.
-        progress: told how far it is.
-        more: further commands at which the error will be asked for, shape (n,).
+        progress: shows the progress.
+        more: further commands at which the error will be evaluated, shape (n,).
 
     Raises:
         NothingToEstimate: too few positions or moves, or readings that do not move.
@@ -279,13 +279,13 @@ def fit_axis(
         if sampled and len(mode.w) and np.isfinite(mode.log_density):
             job.begin(WEIGHING)
             run = weighted_run(AxisDensity(model, mode), seed, job.at, ROUNDS_MAX, pilots_max=PILOTS_MAX)
-            began = time.monotonic()
+            start_time = time.monotonic()
             sample = run.sample
             if tier == CHAIN:
                 from tvsbayes.inference.ensemble import Run, better
 
                 job.begin(WALKING)
-                sample = better(sample, Run(run, None, None, job.at, began).until_converged(60.0 * max_minutes))
+                sample = better(sample, Run(run, None, None, job.at, start_time).until_converged(60.0 * max_minutes))
         job.begin(TELLING)
         rng = random_stream(seed, AxisStream.RESAMPLING)
         if sample is not None and sample.convergence.converged:

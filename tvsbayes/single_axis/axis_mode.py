@@ -1,4 +1,4 @@
-"""Where the density of an axis' scales is highest, and how it is curved there."""
+"""Mode of the density of an axis' scales, and its curvature there."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import reversal_of
 from tvsbayes.single_axis.classic_line import fit_line
-from tvsbayes.single_axis.waves import start_of
+from tvsbayes.single_axis.waves import start_coordinate
 
 STEP, CURVATURE_STEP = 1e-2, 5e-2
-"""Of differences, in units of the coordinates' expected widths: a third derivative of 1 makes 2e-5 of a gradient."""
+"""Steps of differences, in expected widths of the coordinates: a third derivative of 1 changes a gradient by 2e-5."""
 CURVATURE_MIN = 0.3
-"""Least curvature taken, in units of the prior's: where a scale is not needed the density is bent the other way."""
+"""Least curvature, in units of the prior's: where a scale is not needed the density is convex."""
 
 BOUND = 5.0
-"""Standard normal coordinates beyond it are one in two million."""
-OFF_MAX = 1.0
-"""Standard deviations from where a search ended to where slope and curvature there place the mode. A search that got
-there ends within 0.01, at a kink of the play (8.1) within 0.7; one that got lost ends beyond 3, 2.8 or more in log
+"""Standard normal coordinates beyond it have a probability of one in two million."""
+SDS_MAX = 1.0
+"""Largest distance, in standard deviations, from the end of a search to the mode by slope and curvature there. A
+successful search ends within 0.01, at a kink of the play (8.1) within 0.7; a failed one beyond 3, 2.8 or more in log
 density too low."""
 
 
@@ -32,7 +32,7 @@ class AxisMode:
     Attributes:
         w: coordinates, shape (d,).
         covariance: shape (d, d).
-        log_density: there; minus infinity where it has no value.
+        log_density: there; minus infinity where it is undefined.
         missing: sentences on why the approximation may not be used by itself; empty where it may.
     """
 
@@ -48,15 +48,15 @@ def _repeat_sd(model: AxisModel) -> float:
     squares, freedom = 0.0, 0
     for command in () if rows.in_motion else rows.positions:
         for side in (-1, 0, 1):
-            mine = rows.value[(rows.command == command) & (rows.side == side)]
-            if len(mine) > 1:
-                squares += len(mine) * float(np.var(mine))
-                freedom += len(mine) - 1
+            values = rows.value[(rows.command == command) & (rows.side == side)]
+            if len(values) > 1:
+                squares += len(values) * float(np.var(values))
+                freedom += len(values) - 1
     return max(float(np.sqrt(squares / freedom)) if freedom else 0.0, 1e-4 * rows.travel)
 
 
 def _start(model: AxisModel, stop_sd: float) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates to begin at, with stops that scatter by so much, and their expected widths, each (d,)."""
+    """Start coordinates for stops with scatter `stop_sd`, and their expected widths, each (d,)."""
     names = model.coordinates.names
     w, width = np.zeros(len(names)), np.ones(len(names))
     for k, name in enumerate(names):
@@ -65,7 +65,7 @@ def _start(model: AxisModel, stop_sd: float) -> tuple[np.ndarray, np.ndarray]:
             w[k] = model.coordinates.coordinate(name, reversal)
             width[k] = min(max(error / model.priors[name].u, 1e-9), 1.0)
         elif name.startswith("wave_"):
-            w[k] = start_of(model.coordinates.waves[int(name.split(".")[1]) - 1], name)
+            w[k] = start_coordinate(model.coordinates.waves[int(name.split(".")[1]) - 1], name)
         elif name.startswith("stop_sd"):
             w[k] = np.clip(model.coordinates.coordinate(name, stop_sd), -4.0, 4.0)
     return w, width
@@ -76,47 +76,47 @@ def _gradients(model: AxisModel, w: np.ndarray, width: np.ndarray, step: float) 
     d = w.shape[1]
     shift = np.concatenate([np.diag(step * width), np.diag(-step * width)])
     value = model.log_density((w[:, None] + shift).reshape(-1, d)).reshape(len(w), 2, d)
-    # Where a density has no value neither has its slope.
+    # Where the density is undefined, so is its slope.
     with np.errstate(invalid="ignore"):
         slopes = (value[:, 0] - value[:, 1]) / (2 * step)
     return np.where(np.isfinite(slopes), slopes, 0.0)
 
 
-def _missing(log_density: float, off: float = 0.0) -> tuple[str, ...]:
-    """What a search did not reach, in sentences: a density with a value, and an end `off` few sds from the mode."""
+def _missing(log_density: float, distance: float = 0.0) -> tuple[str, ...]:
+    """Why a search failed, in sentences: an undefined density, or an end more than `SDS_MAX` sds from the mode."""
     if not np.isfinite(log_density):
         return ("the readings have no density under these priors",)
-    if not off <= OFF_MAX:
-        return (f"the search for the mode ended {off:.1f} standard deviations away from it, wanted {OFF_MAX:g}",)
+    if not distance <= SDS_MAX:
+        return (f"the search for the mode ended {distance:.1f} standard deviations away from it, wanted {SDS_MAX:g}",)
     return ()
 
 
-def find_mode(model: AxisModel, near: Mapping[str, float] | None = None) -> AxisMode:
+def find_mode(model: AxisModel, guess: Mapping[str, float] | None = None) -> AxisMode:
     """The mode by a quasi-Newton search from the least-squares line and the scatter of repeats.
 
-    A search that does not get there begins anew where stops scatter as widely as rows do about the line: a single wild
-    reading lies far outside what repeats tell, where the density is all slope.
+    A failed search restarts with the scatter of rows about the line as that of stops: a single wild reading lies far
+    outside the scatter of repeats, where the density is very steep.
 
     Args:
-        model: whose mode is looked for.
-        near: coordinates to begin at, by name: of a model with fewer waves.
+        model: the model.
+        guess: start coordinates by name, from a model with fewer waves.
     """
     start, width = _start(model, _repeat_sd(model))
-    start = np.array([(near or {}).get(name, at) for name, at in zip(model.coordinates.names, start, strict=True)])
-    nearest = _searched(model, start, width)
-    if nearest.missing and len(nearest.w):
-        bounded = _searched(model, *_start(model, _repeat_sd(model)), bounded=True)
+    start = np.array([(guess or {}).get(name, w) for name, w in zip(model.coordinates.names, start, strict=True)])
+    best = _search(model, start, width)
+    if best.missing and len(best.w):
+        bounded = _search(model, *_start(model, _repeat_sd(model)), bounded=True)
         if not bounded.missing:
             return bounded
-        again = _searched(model, *_start(model, max(fit_line(model.rows).scatter, 1e-4 * model.rows.travel)))
-        nearest = max(nearest, again, key=lambda mode: (not mode.missing, mode.log_density))
-    return nearest
+        restarted = _search(model, *_start(model, max(fit_line(model.rows).scatter, 1e-4 * model.rows.travel)))
+        best = max(best, restarted, key=lambda mode: (not mode.missing, mode.log_density))
+    return best
 
 
-def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray, bounded: bool = False) -> AxisMode:
-    """The mode that a search finds from coordinates (d,) whose expected widths are (d,).
+def _search(model: AxisModel, start: np.ndarray, width: np.ndarray, bounded: bool = False) -> AxisMode:
+    """The mode found by a search from coordinates (d,) with expected widths (d,).
 
-    A `bounded` one stays within `BOUND` of the priors' centres: a long step over a steep density ends far out.
+    A `bounded` search stays within `BOUND` of the priors' centres: a long step over a steep density ends far outside.
     """
     from scipy.optimize import minimize
 
@@ -131,11 +131,11 @@ def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray, bounded: b
     def slope(v: np.ndarray) -> np.ndarray:
         return -_gradients(model, (start + width * v)[None], width, STEP)[0]
 
-    how, bounds = "BFGS", None
+    method, bounds = "BFGS", None
     if bounded:
-        how, bounds = "L-BFGS-B", list(zip((-BOUND - start) / width, (BOUND - start) / width, strict=True))
+        method, bounds = "L-BFGS-B", list(zip((-BOUND - start) / width, (BOUND - start) / width, strict=True))
     options = {"gtol": 1e-2, "maxiter": 200}
-    best = minimize(value, np.zeros(len(start)), jac=slope, method=how, bounds=bounds, options=options)
+    best = minimize(value, np.zeros(len(start)), jac=slope, method=method, bounds=bounds, options=options)
     v = np.asarray(best.x)
     w = start + width * v
     shift = np.concatenate([np.diag(CURVATURE_STEP * width), np.diag(-CURVATURE_STEP * width)])
@@ -145,6 +145,6 @@ def _searched(model: AxisModel, start: np.ndarray, width: np.ndarray, bounded: b
     values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
     inverse = vectors @ np.diag(1 / np.maximum(values, CURVATURE_MIN)) @ vectors.T
     log_density = float(model.log_density(w[None])[0])
-    left = _gradients(model, w[None], width, STEP)[0]
-    off = float(np.sqrt(left @ inverse @ left))
-    return AxisMode(w, width[:, None] * inverse * width, log_density, _missing(log_density, off))
+    gradient = _gradients(model, w[None], width, STEP)[0]
+    distance = float(np.sqrt(gradient @ inverse @ gradient))
+    return AxisMode(w, width[:, None] * inverse * width, log_density, _missing(log_density, distance))

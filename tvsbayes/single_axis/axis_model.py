@@ -1,10 +1,10 @@
-"""The density of an axis' readings: everything linear integrated out exactly, many draws of the scales at once.
+"""The density of an axis' readings: linear quantities integrated out exactly, many draws of the scales at once.
 
 A reading = offset + unit per command x command + contrast + place in the play x (backlash + its variation) / 2
-+ error by position + waves + creep + thermal shift + drift + stop error + noise (formulation 8.1). Drift and held stop
-errors by a Kalman filter of two states over the rows, whose innovations whiten the columns of everything else; cost
-linear in the rows. Of a drive at constant rate time and position are one: no error by position, and seeing in the place
-of stop errors. NumPy.
++ error by position + waves + creep + thermal shift + drift + stop error + noise (formulation 8.1). A Kalman filter of
+two states (drift, held stop error) over the rows whitens the columns of all other terms; its cost is linear in the
+rows. For a drive at constant rate time and position are equivalent: no error by position, and seeing in place of stop
+errors. NumPy.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from tvsbayes.single_axis.waves import COLUMNS, SHARES, Wave, WaveRecord, wave_c
 from tvsbayes.statistics.gaussian_process import JITTER, matern52
 
 OFFSET_TRAVELS = 1.0
-"""sd of the offset's prior about the least-squares line, in travels: flat."""
+"""sd of the offset's prior about the least-squares line, in travels: nearly flat."""
 FLOOR = 1e-7
-"""Least scatter of a row, of the travel: a reading that repeats exactly was rounded."""
+"""Least scatter of a row as a share of the travel: a reading that repeats exactly was rounded."""
 FARTHEST = 12.0
-"""Coordinates beyond it are impossible: a standard normal number exceeds it once in 1e32."""
-NUMBERS_MAX = 8_000_000
-"""Of a block of draws held at once."""
+"""Coordinates beyond it have density 0: a standard normal number exceeds it once in 1e32."""
+BLOCK_NUMBERS_MAX = 8_000_000
+"""Largest number of values in a block of draws."""
 OFFSET, SLOPE, CONTRAST, BACKLASH = 0, 1, 2, 3
 """First columns."""
 HEAD = 4
@@ -37,7 +37,7 @@ HEAD = 4
 
 @dataclass(frozen=True)
 class LinearPosterior:
-    """What is linear, given the scales: normal, by column of the model.
+    """Posterior of the linear quantities given the scales: normal, by column of the model.
 
     Attributes:
         mean: shape (n, columns).
@@ -48,10 +48,10 @@ class LinearPosterior:
     covariance: np.ndarray
 
     def of(self, functionals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (n, t) and sd (n, t) of functionals (t, columns), or (n, t, columns) where each draw has its own."""
+        """Mean (n, t) and sd (n, t) of functionals (t, columns), or of (n, t, columns), one for each draw."""
         if functionals.ndim == 3:
-            across = functionals @ self.covariance
-            variance = np.einsum("nti,nti->nt", across, functionals)
+            product = functionals @ self.covariance
+            variance = np.einsum("nti,nti->nt", product, functionals)
             return np.einsum("ni,nti->nt", self.mean, functionals), np.sqrt(np.maximum(variance, 0.0))
         variance = np.einsum("ti,nij,tj->nt", functionals, self.covariance, functionals, optimize=True)
         return self.mean @ functionals.T, np.sqrt(np.maximum(variance, 0.0))
@@ -67,26 +67,24 @@ class LinearPosterior:
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Of the readings at many coordinates, what is linear integrated out.
+    """Likelihood of the readings at many coordinates, linear quantities integrated out.
 
     Attributes:
         log_density: shape (n,).
-        linear: of the functionals that were asked for, in the place of columns.
+        linear: posterior of the requested functionals, in place of columns.
     """
 
     log_density: np.ndarray
     linear: LinearPosterior
 
     @classmethod
-    def nowhere(cls, count: int, wanted: int) -> Likelihood:
-        """Without a value."""
-        return cls(
-            np.full(count, -np.inf), LinearPosterior(np.zeros((count, wanted)), np.zeros((count, wanted, wanted)))
-        )
+    def undefined(cls, count: int, size: int) -> Likelihood:
+        """At coordinates where the density is undefined."""
+        return cls(np.full(count, -np.inf), LinearPosterior(np.zeros((count, size)), np.zeros((count, size, size))))
 
     @classmethod
     def joined(cls, parts: Sequence[Likelihood]) -> Likelihood:
-        """One after the other."""
+        """Parts concatenated."""
         mean, covariance = ([getattr(part.linear, name) for part in parts] for name in ("mean", "covariance"))
         linear = LinearPosterior(np.concatenate(mean), np.concatenate(covariance))
         return cls(np.concatenate([part.log_density for part in parts]), linear)
@@ -94,7 +92,7 @@ class Likelihood:
 
 @dataclass(frozen=True)
 class _Block:
-    """Draws of a block made ready.
+    """Products of a block of draws.
 
     Attributes:
         products: of whitened columns, shape (n, 1 + columns, 1 + columns).
@@ -109,14 +107,14 @@ class _Block:
 
 @dataclass(frozen=True)
 class AxisModel:
-    """Rows with priors; coordinates of the sampled parameters as `AxisCoordinates` has them.
+    """Rows with priors and the coordinates of the sampled parameters.
 
     Attributes:
-        rows: what was read.
+        rows: averaged readings.
         priors: of every key of `[axis]`.
-        coordinates: of what is sampled, the waves with it.
+        coordinates: of the sampled parameters, with those of the waves.
         places: of the processes.
-        unknown_segments: numbers of segments whose rows do not all know where they stand in the play.
+        unknown_segments: numbers of segments with rows of unknown place in the play.
     """
 
     rows: AxisRows
@@ -133,20 +131,20 @@ class AxisModel:
         more: np.ndarray | None = None,
         waves: Sequence[Wave] = (),
     ) -> AxisModel:
-        """Of rows and complete priors.
+        """The model of rows and complete priors.
 
         Args:
-            rows: what was read.
+            rows: averaged readings.
             priors: from `axis_priors`.
-            more: further commands at which the processes will be asked for.
-            waves: periods that are asked for.
+            more: further commands at which the processes will be evaluated.
+            waves: waves of the model.
         """
         unused = set()
         if priors["creep"].u == 0 == priors["creep"].value or not _creeps(rows):
             unused.add("creep_minutes")
         unused |= {"stop_sd.forward", "stop_sd.backward"} if rows.in_motion else {"seeing_scale", "seeing_s"}
         if rows.in_motion:
-            # Averaged readings hardly part white noise from seeing: theirs is as stated, what is beyond it is seeing.
+            # Averaged readings hardly separate white noise from seeing: noise is as stated, the excess is seeing.
             unused |= {"transmission_error", "transmission_error_length", "play_variation", "reading_scale"}
         if not np.any(rows.variance > 0):
             unused.add("reading_scale")
@@ -161,20 +159,20 @@ class AxisModel:
         if priors["transmission_error"].u == 0 == priors["transmission_error"].value:
             if priors["play_variation"].u == 0 == priors["play_variation"].value:
                 unused.add("transmission_error_length")
-        firsts = np.flatnonzero(rows.legs.first)
-        unknown = tuple(int(k) for k in rows.legs.segment[firsts[rows.legs.side[firsts] == 0]])
-        lost = play_places(rows, np.array([rows.travel])).spread[0]
-        unknown = tuple(k for k in unknown if np.any(lost[rows.segment == k] > 0))
+        first_moves = np.flatnonzero(rows.legs.first)
+        unknown_segments = tuple(int(k) for k in rows.legs.segment[first_moves[rows.legs.side[first_moves] == 0]])
+        spread = play_places(rows, np.array([rows.travel])).spread[0]
+        unknown_segments = tuple(k for k in unknown_segments if np.any(spread[rows.segment == k] > 0))
         if legs_are_long(rows):
             unused.add("backlash")
-        # In motion at constant rate what goes with position goes with time: the drift has it.
+        # In motion at constant rate an error by position is a function of time: part of the drift.
         command = rows.command[:0] if rows.in_motion else rows.command
         places = process_places(command, np.zeros(0) if more is None else more)
-        return cls(rows, dict(priors), AxisCoordinates.of(priors, frozenset(unused), waves), places, unknown)
+        return cls(rows, dict(priors), AxisCoordinates.of(priors, frozenset(unused), waves), places, unknown_segments)
 
     @cached_property
     def homed(self) -> np.ndarray:
-        """Segments after the first that were read: each has a zero of its own."""
+        """Segments with readings after the first: each has its own zero."""
         return np.unique(self.rows.segment)[1:]
 
     @property
@@ -189,10 +187,10 @@ class AxisModel:
 
     @cached_property
     def shifts(self) -> tuple[str, ...]:
-        """Which shifts of the zero in time have a column: `creep`, `thermal_per_K`."""
+        """Shifts of the zero in time that have a column: `creep`, `thermal_per_K`."""
         there = {"creep": _creeps(self.rows), "thermal_per_K": self.rows.kelvin is not None}
-        named = [name for name, recorded in there.items() if recorded]
-        return tuple(name for name in named if not self.priors[name].u == 0 == self.priors[name].value)
+        names = [name for name, is_recorded in there.items() if is_recorded]
+        return tuple(name for name in names if not self.priors[name].u == 0 == self.priors[name].value)
 
     @property
     def waves_begin(self) -> int:
@@ -206,7 +204,7 @@ class AxisModel:
 
     @property
     def columns(self) -> int:
-        """How many quantities are linear."""
+        """Number of linear quantities."""
         return self.processes + 2 * len(self.places.command)
 
     @cached_property
@@ -215,17 +213,17 @@ class AxisModel:
 
     @cached_property
     def _unknown_spread(self) -> np.ndarray:
-        """Half of the distance (1, rows) between the sides that a stop may lie on, by the line's reversal."""
+        """Half of the distance (1, rows) between the possible sides of a stop, by the line's reversal."""
         reversal, error = reversal_of(self.rows)
         return play_places(self.rows, np.array([max(abs(reversal), min(error, self.rows.travel))])).spread
 
     def clock(self, wave: Wave, command: np.ndarray, time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
-        """What a wave's period is of, at rows with these commands, times and readings, each (t,)."""
+        """Position, time or reading that a wave is periodic in, for commands, times and readings, each (t,)."""
         clocks = {"position": abs(self.rows.line[1]) * command, "seconds": time_s, "encoder": value}
         return clocks[wave.clock]
 
     def record(self, wave: Wave) -> WaveRecord:
-        """Where the rows lie on the clock of a wave."""
+        """Range of the rows on the clock of a wave."""
         rows = self.rows
         return WaveRecord.of(self.clock(wave, rows.command, rows.time_s, rows.value))
 
@@ -250,14 +248,14 @@ class AxisModel:
         return columns
 
     def _columns(self, w: np.ndarray, values: Mapping[str, np.ndarray], extra: np.ndarray | None) -> np.ndarray:
-        """Readings less what the priors' means say, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
+        """Readings less the prior means, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
         rows, backlash = self.rows, values["backlash"]
         shifts, waves = self._shift_columns(values), list(self._wave_columns(w))
         play = play_places(rows, backlash if self.play_is_sampled else np.zeros(1))
         spread = play.spread if self.play_is_sampled else self._unknown_spread
-        # Draws that differ in nothing share their columns.
-        by_draw = self.play_is_sampled or any(len(each) > 1 for each in (*shifts.values(), *waves))
-        blocks = len(backlash) if by_draw else 1
+        # Equal columns are computed once for all draws.
+        differ = self.play_is_sampled or any(len(each) > 1 for each in (*shifts.values(), *waves))
+        blocks = len(backlash) if differ else 1
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
         filled = np.zeros((blocks, len(rows.move), width))
         level = rows.line[0] + rows.line[1] * self.middle
@@ -271,13 +269,13 @@ class AxisModel:
             filled[:, :, 1 + HEAD + k] = rows.segment == segment
         for k, segment in enumerate(self.unknown_segments):
             filled[:, :, 1 + HEAD + len(self.homed) + k] = spread * (rows.segment == segment)
-        at = 1 + HEAD + len(self.homed) + len(self.unknown_segments)
-        for k, (name, column) in enumerate(shifts.items(), start=at):
+        first_shift = 1 + HEAD + len(self.homed) + len(self.unknown_segments)
+        for k, (name, column) in enumerate(shifts.items(), start=first_shift):
             filled[:, :, 0] -= self.priors[name].value * column
             filled[:, :, k] = column
         for k, columns in enumerate(waves):
-            begins = 1 + self.waves_begin + COLUMNS * k
-            filled[:, :, begins : begins + COLUMNS] = columns
+            first = 1 + self.waves_begin + COLUMNS * k
+            filled[:, :, first : first + COLUMNS] = columns
         start, count = 1 + self.processes, len(self.places.command)
         filled[:, :, start : start + count] = self._weights
         filled[:, :, start + count : start + 2 * count] = 0.5 * play.share[:, :, None] * self._weights
@@ -301,39 +299,39 @@ class AxisModel:
         return stop, reading
 
     def _carry(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """How much of a row's stop error, in motion of the seeing, the next has: shape (n or 1, rows)."""
+        """Share of the previous row's stop error (in motion: seeing) in each row: shape (n or 1, rows)."""
         rows = self.rows
         if not rows.in_motion:
             return np.where(rows.redrawn, 0.0, 1.0)[None]
-        lasts = values["seeing_s"][:, None]
-        gap = np.maximum(HOUR_S * rows.hours - rows.width_s, 0.0)[None] / lasts
-        over = rows.width_s[None] / lasts
-        whole = np.where(over > 1e-3, -np.expm1(-over) / np.maximum(over, 1e-3), 1.0 - 0.5 * over)
-        carry = np.exp(-gap) * whole**2 / averaged_variance(over)
+        duration_s = values["seeing_s"][:, None]
+        gap = np.maximum(HOUR_S * rows.hours - rows.width_s, 0.0)[None] / duration_s
+        ratio = rows.width_s[None] / duration_s
+        mean_factor = np.where(ratio > 1e-3, -np.expm1(-ratio) / np.maximum(ratio, 1e-3), 1.0 - 0.5 * ratio)
+        carry = np.exp(-gap) * mean_factor**2 / averaged_variance(ratio)
         return np.where(rows.redrawn, 0.0, np.minimum(carry, 1.0))
 
     def _between_nodes(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Variance (n,) that both processes have midway between nodes and lines of third order do not carry."""
+        """Variance (n,) of both processes midway between nodes that cubic interpolation does not represent."""
         spacing = abs(self.rows.line[1]) * (self.places.command[1] - self.places.command[0])
         length = values["transmission_error_length"]
         weight = np.array([1.0, -0.0625, 0.5625, 0.5625, -0.0625])
-        at = np.array([1.5, 0.0, 1.0, 2.0, 3.0]) * spacing
+        positions = np.array([1.5, 0.0, 1.0, 2.0, 3.0]) * spacing
         weight[1:] *= -1
-        correlation = matern52((at[:, None] - at)[None], length[:, None, None])
-        missing = np.maximum(np.einsum("i,nij,j->n", weight, correlation, weight), 0.0)
-        return missing * (values["transmission_error"] ** 2 + 0.25 * values["play_variation"] ** 2)
+        correlation = matern52((positions[:, None] - positions)[None], length[:, None, None])
+        residual = np.maximum(np.einsum("i,nij,j->n", weight, correlation, weight), 0.0)
+        return residual * (values["transmission_error"] ** 2 + 0.25 * values["play_variation"] ** 2)
 
     @cached_property
     def informed(self) -> np.ndarray:
-        """Columns that any row depends on; the others are places where the processes are predicted."""
+        """Columns with influence on any row; the others are places of predictions."""
         weighted = np.any(self._weights != 0, axis=0)
         return np.flatnonzero(np.concatenate((np.ones(self.processes, bool), weighted, weighted)))
 
-    def _factor(self, values: Mapping[str, np.ndarray], scales: Sequence[np.ndarray], told_first: bool) -> np.ndarray:
+    def _factor(self, values: Mapping[str, np.ndarray], scales: Sequence[np.ndarray], reorder: bool) -> np.ndarray:
         """Factor of the prior covariance of the columns, shape (n, columns, columns); `scales` (n,) are of the waves.
 
-        Cholesky's, places in order; or with the places that rows depend on before the others: then these places depend
-        on no unit of the others.
+        Cholesky's, places in order; with `reorder` places with influence on rows come before the others and do not
+        depend on the coordinates of these.
         """
         count, n = len(self.places.command), len(values["backlash"])
         factor = np.zeros((n, self.columns, self.columns))
@@ -355,7 +353,7 @@ class AxisModel:
         distance = slope * (self.places.command[:, None] - self.places.command)
         length = values["transmission_error_length"][:, None, None]
         covariance = matern52(distance[None], length) + JITTER * np.eye(count)
-        if told_first:
+        if reorder:
             first = np.argsort(~np.any(self._weights != 0, axis=0), kind="stable")
             root = np.empty_like(covariance)
             root[:, first[:, None], first] = np.linalg.cholesky(covariance[:, first[:, None], first])
@@ -370,9 +368,9 @@ class AxisModel:
     def _blocks(
         self, w: np.ndarray, extra: np.ndarray | None = None, *, informed: bool = False
     ) -> Iterator[tuple[slice, _Block]]:
-        """The draws w (n, d) in blocks that fit into memory; products of those columns alone that rows depend on."""
+        """The draws w (n, d) in blocks that fit into memory; `informed`: products only of columns of `informed`."""
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
-        size = max(1, NUMBERS_MAX // (width * max(len(self.rows.move), width)))
+        size = max(1, BLOCK_NUMBERS_MAX // (width * max(len(self.rows.move), width)))
         for start in range(0, len(w), size):
             part = slice(start, start + size)
             values = self.coordinates.values(w[part])
@@ -380,7 +378,7 @@ class AxisModel:
             if informed:
                 columns = columns[:, :, np.concatenate(([0], 1 + self.informed))]
             white, log_scatter = self._whitened(values, columns)
-            scales = [each.scale for each in self.coordinates.wave_draws(w[part])]
+            scales = [draws.scale for draws in self.coordinates.wave_draws(w[part])]
             products = np.swapaxes(white, 1, 2) @ white
             spread = rows_log_density(self.rows, values["reading_scale"])
             yield part, _Block(products, log_scatter - 2 * spread, self._factor(values, scales, informed))
@@ -388,7 +386,7 @@ class AxisModel:
     def white(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whitened readings and columns (rows, 1 + columns) at one draw w (1, d), and the factor of their prior."""
         values = self.coordinates.values(w)
-        scales = [each.scale for each in self.coordinates.wave_draws(w)]
+        scales = [draws.scale for draws in self.coordinates.wave_draws(w)]
         return self._whitened(values, self._columns(w, values, None))[0][0], self._factor(values, scales, False)[0]
 
     def whitened_extra(self, w: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -404,25 +402,25 @@ class AxisModel:
         return self.likelihood(w, np.zeros((0, self.columns))).log_density
 
     def likelihood(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
-        """At coordinates (n, d), with what it says of functionals (t, columns) of what is linear."""
-        rows, wanted = len(self.rows.move), len(functionals)
-        log_density, mean, covariance = np.empty(len(w)), np.empty((len(w), wanted)), np.empty((len(w), wanted, wanted))
+        """At coordinates (n, d), with the posterior of functionals (t, columns) of the linear quantities."""
+        rows, count = len(self.rows.move), len(functionals)
+        log_density, mean, covariance = np.empty(len(w)), np.empty((len(w), count)), np.empty((len(w), count, count))
         for part, block in self._blocks(w):
-            information, towards = _information(block, 0)
+            information, right_side = _information(block, 0)
             root, scaled, scale = _equilibrated(information)
-            sides = np.concatenate([towards[:, None], functionals @ block.factor], axis=1) / scale[:, None]
+            sides = np.concatenate([right_side[:, None], functionals @ block.factor], axis=1) / scale[:, None]
             solved = np.linalg.solve(scaled, np.swapaxes(sides, 1, 2))
             products = sides @ solved
             log_det = 2 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)) + np.log(scale), axis=1)
-            left = block.products[:, 0, 0] - products[:, 0, 0]
-            log_density[part] = -0.5 * (block.log_scatter + log_det + left + rows * np.log(2 * np.pi))
+            residual = block.products[:, 0, 0] - products[:, 0, 0]
+            log_density[part] = -0.5 * (block.log_scatter + log_det + residual + rows * np.log(2 * np.pi))
             mean[part], covariance[part] = products[:, 0, 1:], products[:, 1:, 1:]
-        if wanted:
+        if count:
             mean += self._prior_means(w) @ functionals.T
         return Likelihood(log_density, LinearPosterior(mean, covariance))
 
     def _prior_means(self, w: np.ndarray) -> np.ndarray:
-        """Of the columns, (n, columns): what their deviations are from."""
+        """Prior means of the columns, (n, columns)."""
         means = np.zeros((len(w), self.columns))
         means[:, OFFSET] = self.rows.line[0] + self.rows.line[1] * self.middle
         means[:, SLOPE] = self.priors["per_command"].value
@@ -433,85 +431,85 @@ class AxisModel:
         return means
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
-        """Log posterior density at coordinates (n, d) up to a constant, shape (n,); -inf where it has no value."""
+        """Log posterior density at coordinates (n, d) up to a constant, shape (n,); -inf where it is undefined."""
         return self.posterior(w, np.zeros((0, self.columns))).log_density
 
     def posterior(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
-        """The same with the prior of the coordinates; zero where it has no value."""
-        wanted = len(functionals)
-        likelihood = Likelihood.nowhere(len(w), wanted)
+        """`likelihood` with the prior of the coordinates; zero density where it is undefined."""
+        count = len(functionals)
+        likelihood = Likelihood.undefined(len(w), count)
         usable = np.flatnonzero(np.all(np.abs(w) < FARTHEST, axis=1))
         if len(usable):
             prior = self.coordinates.log_prior(w[usable])
             usable, prior = usable[np.isfinite(prior)], prior[np.isfinite(prior)]
         if len(usable):
-            possible = self._possible(w[usable], functionals)
-            value = possible.log_density + prior
+            likelihood_there = self._possible(w[usable], functionals)
+            value = likelihood_there.log_density + prior
             likelihood.log_density[usable] = np.where(np.isfinite(value), value, -np.inf)
             likelihood.linear.mean[usable], likelihood.linear.covariance[usable] = (
-                possible.linear.mean,
-                possible.linear.covariance,
+                likelihood_there.linear.mean,
+                likelihood_there.linear.covariance,
             )
         return likelihood
 
     def _possible(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
-        """`likelihood`, -inf where rounding leaves a matrix no factor."""
+        """`likelihood`, -inf where a factorisation fails by rounding."""
         try:
             return self.likelihood(w, functionals)
         except np.linalg.LinAlgError:
             if len(w) == 1:
-                return Likelihood.nowhere(1, len(functionals))
+                return Likelihood.undefined(1, len(functionals))
             middle = len(w) // 2
             return Likelihood.joined([self._possible(half, functionals) for half in (w[:middle], w[middle:])])
 
     def linear(self, w: np.ndarray) -> LinearPosterior:
-        """What is linear, given coordinates (n, d); means are whole, not deviations from the priors'."""
+        """Posterior of the linear quantities given coordinates (n, d); means include the prior means."""
         means, covariances = np.empty((len(w), self.columns)), np.empty((len(w), self.columns, self.columns))
         informed, others = self.informed, np.setdiff1d(np.arange(self.columns), self.informed)
-        # Rows tell nothing of the units of places between them: a matrix of those that they depend on is inverted.
+        # Places without influence on rows have no information: only the matrix of the others is inverted.
         for part, block in self._blocks(w, informed=len(others) > 0):
-            small = replace(block, factor=block.factor[:, informed[:, None], informed]) if len(others) else block
-            information, towards = _information(small, 0)
+            reduced = replace(block, factor=block.factor[:, informed[:, None], informed]) if len(others) else block
+            information, right_side = _information(reduced, 0)
             _, scaled, scale = _equilibrated(information)
             inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
-            reach = block.factor[:, :, informed] if len(others) else block.factor
-            means[part] = np.einsum("nij,njk,nk->ni", reach, inverse, towards, optimize=True)
-            covariances[part] = reach @ inverse @ np.swapaxes(reach, 1, 2)
-            for halves in (others[: len(others) // 2], others[len(others) // 2 :]):
-                # Of the error by position, then of the play: independent beforehand.
-                free = block.factor[:, halves[:, None], halves]
-                covariances[part, halves[:, None], halves] += free @ np.swapaxes(free, 1, 2)
+            loading = block.factor[:, :, informed] if len(others) else block.factor
+            means[part] = np.einsum("nij,njk,nk->ni", loading, inverse, right_side, optimize=True)
+            covariances[part] = loading @ inverse @ np.swapaxes(loading, 1, 2)
+            for group in (others[: len(others) // 2], others[len(others) // 2 :]):
+                # Of the error by position, then of the play: independent in the prior.
+                factor = block.factor[:, group[:, None], group]
+                covariances[part, group[:, None], group] += factor @ np.swapaxes(factor, 1, 2)
         return LinearPosterior(means + self._prior_means(w), covariances)
 
     def left_out(self, w: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What is predicted of some rows by all others, given the scales.
+        """Prediction of some rows by all others, given the scales.
 
-        A row with an unknown of its own and a flat prior counts as not read; the unknown is the reading less what the
-        others predict.
+        Each left-out row gets an additional unknown with a flat prior, so that it has no influence; the unknown is the
+        reading less its prediction.
 
         Args:
             w: coordinates (n, d).
             rows: numbers of the rows left out.
 
         Returns:
-            Means (n, rows) and covariances (n, rows, rows) of their readings, noise and stop errors in them.
+            Means (n, rows) and covariances (n, rows, rows) of their readings, including noise and stop errors.
         """
         extra = np.zeros((len(self.rows.move), len(rows)))
         extra[rows, np.arange(len(rows))] = 1.0
         means, covariances = np.empty((len(w), len(rows))), np.empty((len(w), len(rows), len(rows)))
         for part, block in self._blocks(w, extra):
-            information, towards = _information(block, len(rows))
+            information, right_side = _information(block, len(rows))
             _, scaled, scale = _equilibrated(information)
             inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
-            expected = np.einsum("nij,nj->ni", inverse, towards)
+            expected = np.einsum("nij,nj->ni", inverse, right_side)
             means[part] = self.rows.value[rows] - expected[:, self.columns :]
             covariances[part] = inverse[:, self.columns :, self.columns :]
         return means, covariances
 
-    def head(self, **of: float) -> np.ndarray:
+    def head(self, **factors: float) -> np.ndarray:
         """A functional (columns,) of `offset`, `slope`, `contrast`, `backlash` by their factors."""
         functional = np.zeros(self.columns)
-        for name, factor in of.items():
+        for name, factor in factors.items():
             functional[_HEAD_COLUMNS[name]] = factor
         return functional
 
@@ -523,13 +521,13 @@ class AxisModel:
 
     @property
     def repeats_by_draw(self) -> bool:
-        """Whether what repeats by position has a period that is not known."""
+        """Whether the error by position has a wave of unknown period."""
         return any(wave.clock == "position" and not wave.is_fixed for wave in self.coordinates.waves)
 
     def functional(self, command: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
-        """What repeats by position at commands (t,): the error by position and the waves of position, the gear's.
+        """Error that repeats by position at commands (t,): the process and the waves of the gear.
 
-        Functionals (t, columns); where a period is not known, of each of the draws w (n, d): (n, t, columns).
+        Functionals (t, columns); where a period is not known, one for each draw w (n, d): (n, t, columns).
 
         Raises:
             ValueError: a period is not known, and no draws are given.
@@ -541,16 +539,16 @@ class AxisModel:
             raise ValueError("draws are needed where a period is not known")
         draws = self.coordinates.wave_draws(np.zeros((1, len(self.coordinates.names))) if w is None else w)
         functionals = np.repeat(functionals[None], 1 if w is None or not by_draw else len(w), axis=0)
-        for k, (wave, each) in enumerate(zip(self.coordinates.waves, draws, strict=True)):
+        for k, (wave, draw) in enumerate(zip(self.coordinates.waves, draws, strict=True)):
             if wave.clock == "position":
-                begins = self.waves_begin + COLUMNS * k
-                at = self.clock(wave, command, command, command)
-                functionals[:, :, begins : begins + COLUMNS] = wave_columns(at, each.period, self.record(wave))
+                first = self.waves_begin + COLUMNS * k
+                x = self.clock(wave, command, command, command)
+                functionals[:, :, first : first + COLUMNS] = wave_columns(x, draw.period, self.record(wave))
         return functionals if by_draw else functionals[0]
 
 
 def _creeps(rows: AxisRows) -> bool:
-    """Whether times are known, so that a creep can be asked for."""
+    """Whether times are known, so that a creep can be estimated."""
     return bool(np.ptp(rows.warm_s) > 0)
 
 
@@ -566,10 +564,10 @@ def _information(block: _Block, flat: int) -> tuple[np.ndarray, np.ndarray]:
         factor = np.zeros((len(block.factor), size, size))
         factor[:, :columns, :columns] = block.factor
         factor[:, range(columns, size), range(columns, size)] = 1.0
-    across = np.swapaxes(factor, 1, 2)
-    information = across @ products[:, 1:, 1:] @ factor
+    transposed = np.swapaxes(factor, 1, 2)
+    information = transposed @ products[:, 1:, 1:] @ factor
     information[:, range(columns), range(columns)] += 1.0
-    return information, np.einsum("nij,nj->ni", across, products[:, 1:, 0])
+    return information, np.einsum("nij,nj->ni", transposed, products[:, 1:, 0])
 
 
 def _equilibrated(information: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -580,7 +578,7 @@ def _equilibrated(information: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def rows_log_density(rows: AxisRows, reading_scale: np.ndarray) -> np.ndarray:
-    """Log density (n,) of the scatter of readings about the means of their rows; constants left out but of u."""
+    """Log density (n,) of the scatter of readings about the means of their rows; of constants only those of u."""
     known = rows.variance > 0
     freedom = float(np.sum(rows.count[known] - 1))
     return -freedom * np.log(reading_scale) - 0.5 * float(rows.within[known].sum()) / reading_scale**2

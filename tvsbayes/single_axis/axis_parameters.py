@@ -1,7 +1,7 @@
 """The parameters of one axis: names, priors, defaults that scale with its travel, coordinates.
 
-A coordinate w has a standard normal prior; a parameter is a monotone function of it. What is linear in the readings
-(offset, unit per command, its contrast, the processes) has no coordinate here: it is integrated out exactly.
+A coordinate w has a standard normal prior; a parameter is a monotone function of it. Linear quantities (offset, unit
+per command, its contrast, the processes) have no coordinate here: they are integrated out exactly.
 Formulation 8.
 """
 
@@ -33,7 +33,7 @@ class AxisKey(Quantity):
 
     Attributes:
         kind: of its prior.
-        share: what the default's value (log-normal) or u is of the travel; None where it does not scale.
+        share: of the travel, of the default's value (log-normal) or u; None where it does not scale.
         u: sd of the log of a log-normal default.
         median: of a log-normal default that does not scale.
     """
@@ -45,9 +45,9 @@ class AxisKey(Quantity):
 
 
 def _key(
-    name: str, kind: Kind, share: float | None, u: float, label: str, unit: str = "{unit}", **more: Any
+    name: str, kind: Kind, share: float | None, u: float, label: str, unit: str = "{unit}", **fields: Any
 ) -> AxisKey:
-    return AxisKey(name=name, block=name, kind=kind, share=share, u=u, label=label, unit=unit, **more)
+    return AxisKey(name=name, block=name, kind=kind, share=share, u=u, label=label, unit=unit, **fields)
 
 
 _SIDES, _PER_COMMAND = ("forward", "backward"), "{unit} per command"
@@ -72,15 +72,15 @@ AXIS_QUANTITIES: Quantities[Quantity] = Quantities(
     _key("seeing_s", "log-normal", None, 1.2, "seeing lasts, s", "s", median=10.0),
     *Quantity.many("offset", (), unit="{unit}", label="reading at command 0"),
 )
-"""What is said of an axis. How the linear ones follow from the model stands in `axis_density.FUNCTIONALS`."""
+"""Reported quantities of an axis. `axis_density.FUNCTIONALS` has the functionals of the linear ones."""
 AXIS_KEYS = {name: key for name, key in AXIS_QUANTITIES.items() if isinstance(key, AxisKey)}
-"""Shares of the travel: half-normals and stop scatter by eleven stepper axes that others measured, on which the scales
-integrated out give left-out positions that lie within 1.96 u in 95 % of cases. Backlash: cheap gears lose up to some
-per cent; any reversal measures it well, so a wide prior costs nothing. Seeing: what readings in motion share for
+"""Shares of the travel: half-normals and stop scatter by eleven stepper axes that others measured, where left-out
+positions, with the scales integrated out, lie within 1.96 u in 95 % of cases. Backlash: cheap gears lose up to some per
+cent; any reversal measures it well, so a wide prior is harmless. Seeing: errors of readings in motion that last for
 seconds, of air, of a guider's loop, of the reader; its sd in units of a reading's u."""
 CONTRAST_SHARE = 1e-4
-"""sd of the difference of both directions' ratios, of the ratio: gears and screws have one. Over a long path more would
-pass a warming frame off as two ratios."""
+"""sd of the difference of both directions' ratios over the ratio: gears and screws have one ratio. A larger sd would
+explain a warming frame on a long path by two ratios."""
 SAMPLED = (
     *("backlash", "transmission_error", "transmission_error_length", "play_variation", "drift_per_root_hour"),
     *("stop_sd.forward", "stop_sd.backward", "home_sd", "reading_scale"),
@@ -90,7 +90,7 @@ SAMPLED = (
 
 
 def kind_of(name: str) -> Kind:
-    """Of the prior of a name in `SAMPLED` or `AXIS_KEYS`."""
+    """Kind of the prior of a name in `SAMPLED` or `AXIS_KEYS`."""
     return AXIS_KEYS[name.split(".")[0]].kind
 
 
@@ -102,7 +102,7 @@ def axis_priors(
     Args:
         stated: entries of `[axis]`.
         travel: range of the readings' quantity, > 0: range of commands times |unit per command|.
-        per_command: of the least-squares line: centre of a prior as wide as itself, where nothing is stated.
+        per_command: of the least-squares line: centre and u of the default prior.
         u_per_command: its standard error, which widens that prior.
     """
     priors = {}
@@ -137,7 +137,7 @@ class AxisCoordinates:
     Attributes:
         names: free parameters, in the order of the coordinates; those of the waves last.
         priors: of every name in `SAMPLED`.
-        waves: whose scales and periods are sampled too, as `wave_scale.1`, `wave_period.1`, ...
+        waves: their scales and periods are sampled too, as `wave_scale.1`, `wave_period.1`, ...
     """
 
     names: tuple[str, ...]
@@ -146,17 +146,17 @@ class AxisCoordinates:
 
     @classmethod
     def of(cls, priors: Mapping[str, AxisPrior], unused: frozenset[str], waves: Sequence[Wave] = ()) -> AxisCoordinates:
-        """Of the priors of an axis; what is `unused` by the data, or has u = 0, is held at its value."""
-        of_each = {name: priors[name.split(".")[0]] for name in SAMPLED}
-        free = tuple(name for name in SAMPLED if of_each[name].u > 0 and name not in unused)
-        return cls((*free, *names_of(waves)), of_each, tuple(waves))
+        """Coordinates from the priors of an axis; parameters in `unused`, or with u = 0, are fixed at their value."""
+        prior_of = {name: priors[name.split(".")[0]] for name in SAMPLED}
+        free = tuple(name for name in SAMPLED if prior_of[name].u > 0 and name not in unused)
+        return cls((*free, *names_of(waves)), prior_of, tuple(waves))
 
     def wave_draws(self, w: np.ndarray) -> list[WaveDraws]:
         """Every wave at coordinates (n, d)."""
         draws = []
         for k, wave in enumerate(self.waves, start=1):
-            place = None if wave.is_fixed else w[:, self.names.index(f"wave_period.{k}")]
-            draws.append(wave_draws(wave, w[:, self.names.index(f"wave_scale.{k}")], place))
+            coordinate = None if wave.is_fixed else w[:, self.names.index(f"wave_period.{k}")]
+            draws.append(wave_draws(wave, w[:, self.names.index(f"wave_scale.{k}")], coordinate))
         return draws
 
     def log_prior(self, w: np.ndarray) -> np.ndarray:
@@ -164,29 +164,29 @@ class AxisCoordinates:
         density: np.ndarray = -0.5 * np.sum(w**2, axis=1)
         if self.waves:
             draws = self.wave_draws(w)
-            density = density + log_order(self.waves, draws) + sum(each.log_prior for each in draws)
+            density = density + log_order(self.waves, draws) + sum(wave.log_prior for wave in draws)
         return density
 
     def values(self, w: np.ndarray) -> dict[str, np.ndarray]:
         """Every name of `SAMPLED` at coordinates (n, d): arrays (n,)."""
         from scipy.special import log_ndtr, ndtri_exp
 
-        by_name = {}
+        values = {}
         for name, prior in self.priors.items():
             if name not in self.names:
-                by_name[name] = np.full(len(w), prior.value)
+                values[name] = np.full(len(w), prior.value)
                 continue
             z, kind = w[:, self.names.index(name)], kind_of(name)
             if kind == "half-normal":
                 # u Phi^-1((1 + Phi(z)) / 2) = -u Phi^-1(Phi(-z) / 2), exact in the far tail too.
-                by_name[name] = -prior.u * ndtri_exp(log_ndtr(-z) - np.log(2.0))
+                values[name] = -prior.u * ndtri_exp(log_ndtr(-z) - np.log(2.0))
             elif kind == "log-normal":
-                by_name[name] = prior.value * np.exp(prior.u * z)
+                values[name] = prior.value * np.exp(prior.u * z)
             else:
-                by_name[name] = prior.value + prior.u * z
-        return by_name
+                values[name] = prior.value + prior.u * z
+        return values
 
     def coordinate(self, name: str, value: float) -> float:
-        """Of a free parameter with a normal or log-normal prior."""
+        """Coordinate of a free parameter with a normal or log-normal prior."""
         prior = self.priors[name]
         return float(np.log(value / prior.value) if kind_of(name) == "log-normal" else value - prior.value) / prior.u

@@ -1,6 +1,7 @@
-"""What is said of an axis' waves: period, amplitude, phase, the probability that there is one, and its curve.
+"""Results for an axis' waves: period, amplitude, phase, the probability that there is one, and its curve.
 
-Numbers are given that there is a wave; `probability` says whether. Amplitude and phase are those of the first harmonic.
+Numbers are conditional on the existence of the wave; `probability` is that of its existence. Amplitude and phase are
+those of the first harmonic.
 """
 
 from __future__ import annotations
@@ -12,15 +13,15 @@ import numpy as np
 from tvsbayes.results.estimates import Measured, PeriodEstimate
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_model import LinearPosterior
-from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, absent_at, wave_columns
+from tvsbayes.single_axis.waves import COLUMNS, Wave, WaveRecord, absent_coord, wave_columns
 from tvsbayes.statistics.intervals import interval95, phases_deg
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
 WITH_WAVE_MIN, WITH_WAVE = 200, 1000
-"""Draws with a wave that its numbers come from; where the posterior has fewer, so many are drawn and weighted."""
-ALIKE = 0.02
-"""Draws of a period that lie farther apart than this share of it belong to different waves that explain the same."""
+"""Least number of draws with a wave for its results; where the posterior has fewer, number of weighted draws."""
+SAME_SHARE = 0.02
+"""Draws of a period farther apart than this share of it belong to different explanations."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +29,12 @@ class WaveSample:
     """Draws of one wave, given that there is one.
 
     Attributes:
-        wave: what was asked for.
+        wave: the wave of the model.
         period: on the model's clock, shape (n,).
         true_period: with the ratio's uncertainty, shape (n,).
         coefficients: of the wave's columns, shape (n, `COLUMNS`).
         probability: that there is one.
-        record: of the readings on the clock of the wave; its middle is where the phase is known best.
+        record: of the readings on the clock of the wave; the phase is known best at its middle.
     """
 
     wave: Wave
@@ -44,12 +45,12 @@ class WaveSample:
     record: WaveRecord
 
     def period_unit(self, unit: str) -> str:
-        """Of its period, in a folder whose readings have this unit."""
+        """Unit of its period, in a folder whose readings have this unit."""
         return "s" if self.wave.clock == "seconds" else unit
 
     @property
     def amplitude(self) -> np.ndarray:
-        """Of the first harmonic, shape (n,)."""
+        """Amplitude of the first harmonic, shape (n,)."""
         return np.hypot(self.coefficients[:, 0], self.coefficients[:, 1])
 
     def phase_deg(self) -> np.ndarray:
@@ -58,7 +59,7 @@ class WaveSample:
 
     @property
     def likeliest(self) -> np.ndarray:
-        """Which draws (n,) are of the period that explains the readings best, where several do."""
+        """Mask of draws (n,) in the most probable group of periods."""
         groups = separate_periods(self.period)
         low, high = groups[0].between if groups else (0.0, np.inf)
         return (self.period >= low) & (self.period <= high)
@@ -70,61 +71,61 @@ class WaveSample:
 
 
 def _with_wave(fit: AxisFit, k: int, rng: np.random.Generator) -> tuple[np.ndarray, LinearPosterior]:
-    """Draws (m, d) of the posterior given that wave k is there, and what is linear at them."""
+    """Draws (m, d) of the posterior given that wave k exists, and the linear quantities at them."""
     model, w = fit.model, fit.w
-    there = model.coordinates.wave_draws(w)[k].scale > 0
-    if there.sum() >= WITH_WAVE_MIN:
-        return w[there], LinearPosterior(fit.linear.mean[there], fit.linear.covariance[there])
+    present = model.coordinates.wave_draws(w)[k].scale > 0
+    if present.sum() >= WITH_WAVE_MIN:
+        return w[present], LinearPosterior(fit.linear.mean[present], fit.linear.covariance[present])
     from scipy.special import ndtri
 
-    # The wave is added to draws without it: all else follows what the readings say without it.
+    # The wave is added to draws without it: all other coordinates keep their posterior without it.
     names = model.coordinates.names
-    chosen = w[rng.choice(len(w), WITH_WAVE, replace=len(w) < WITH_WAVE)].copy()
-    before = chosen.copy()
+    draws = w[rng.choice(len(w), WITH_WAVE, replace=len(w) < WITH_WAVE)].copy()
+    without = draws.copy()
     wave = model.coordinates.waves[k]
-    column = names.index(f"wave_scale.{k + 1}")
-    before[:, column] = absent_at(wave)
-    chosen[:, column] = ndtri(wave.absent + (1 - wave.absent) * rng.uniform(1e-9, 1 - 1e-9, len(chosen)))
+    scale_column = names.index(f"wave_scale.{k + 1}")
+    without[:, scale_column] = absent_coord(wave)
+    draws[:, scale_column] = ndtri(wave.absent + (1 - wave.absent) * rng.uniform(1e-9, 1 - 1e-9, len(draws)))
     if not wave.is_fixed:
-        place = names.index(f"wave_period.{k + 1}")
-        chosen[:, place] = before[:, place] = rng.standard_normal(len(chosen))
-    gain = model.log_density(chosen) - model.log_density(before)
-    gain += 0.5 * (chosen[:, column] ** 2 - before[:, column] ** 2)
-    gain = np.where(np.isfinite(gain), gain, -np.inf)
-    if np.any(np.isfinite(gain)):
-        weights = np.exp(gain - gain.max())
-        chosen = chosen[systematic(weights / weights.sum(), WITH_WAVE, rng.random())]
-    return chosen, model.linear(chosen)
+        period_column = names.index(f"wave_period.{k + 1}")
+        draws[:, period_column] = without[:, period_column] = rng.standard_normal(len(draws))
+    log_ratio = model.log_density(draws) - model.log_density(without)
+    log_ratio += 0.5 * (draws[:, scale_column] ** 2 - without[:, scale_column] ** 2)
+    log_ratio = np.where(np.isfinite(log_ratio), log_ratio, -np.inf)
+    if np.any(np.isfinite(log_ratio)):
+        weights = np.exp(log_ratio - log_ratio.max())
+        draws = draws[systematic(weights / weights.sum(), WITH_WAVE, rng.random())]
+    return draws, model.linear(draws)
 
 
 def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
-    """Every wave of a fit, given that it is there.
+    """Every wave of a fit, given that it exists.
 
-    In order: stated ones, the strongest of every range that was asked for, further ones by strength, the encoder's.
+    In order: stated ones, the strongest of every stated range, further ones by strength, the encoder's.
     """
     model, rng = fit.model, random_stream(fit.seed, AxisStream.PERIODS)
     samples = []
     for k, wave in enumerate(model.coordinates.waves):
         probability = float(np.mean(model.coordinates.wave_draws(fit.w)[k].scale > 0))
         w, linear = _with_wave(fit, k, rng)
-        begins = model.waves_begin + COLUMNS * k
-        picked = np.concatenate([np.zeros((COLUMNS, model.columns)), model.head(slope=1.0)[None]])
-        picked[range(COLUMNS), range(begins, begins + COLUMNS)] = 1.0
-        drawn = linear.drawn(picked, rng)
-        coefficients, ratio = drawn[:, :COLUMNS], drawn[:, COLUMNS] / fit.rows.line[1]
+        first_column = model.waves_begin + COLUMNS * k
+        functionals = np.concatenate([np.zeros((COLUMNS, model.columns)), model.head(slope=1.0)[None]])
+        functionals[range(COLUMNS), range(first_column, first_column + COLUMNS)] = 1.0
+        draws = linear.drawn(functionals, rng)
+        coefficients, ratio = draws[:, :COLUMNS], draws[:, COLUMNS] / fit.rows.line[1]
         period = np.broadcast_to(model.coordinates.wave_draws(w)[k].period, len(w)).copy()
         # Positions of the model are by the line; the true ratio makes them longer or shorter.
         true_period = period * ratio if wave.clock == "position" else period
         samples.append(WaveSample(wave, period, true_period, coefficients, probability, model.record(wave)))
-    given = [each for each in samples if each.wave.known is not None]
-    inferred = [each for each in samples if each.wave.known is None]
-    further = sorted(inferred, key=lambda each: (each.probability > 0.5, each.amplitude.mean()), reverse=True)
-    first = []
+    stated_samples = [sample for sample in samples if sample.wave.known is not None]
+    inferred = [sample for sample in samples if sample.wave.known is None]
+    ordered = sorted(inferred, key=lambda sample: (sample.probability > 0.5, sample.amplitude.mean()), reverse=True)
+    range_samples = []
     for ends in fit.campaign.periods.between:
-        k = next(k for k, each in enumerate(further) if (each.wave.low, each.wave.high) == ends)
-        first.append(further.pop(k))
-    stated = [each for each in given if each.wave.clock != "encoder"]
-    return (*stated, *first, *further, *given[len(stated) :])
+        k = next(k for k, sample in enumerate(ordered) if (sample.wave.low, sample.wave.high) == ends)
+        range_samples.append(ordered.pop(k))
+    stated = [sample for sample in stated_samples if sample.wave.clock != "encoder"]
+    return (*stated, *range_samples, *ordered, *stated_samples[len(stated) :])
 
 
 def _measured(draws: np.ndarray, likeliest: np.ndarray) -> Measured:
@@ -133,7 +134,7 @@ def _measured(draws: np.ndarray, likeliest: np.ndarray) -> Measured:
 
 
 def period_estimate(sample: WaveSample) -> PeriodEstimate:
-    """One wave in numbers."""
+    """The estimate of one wave."""
     known, likeliest = sample.wave.known, sample.likeliest
     return PeriodEstimate(
         period=_measured(sample.true_period, likeliest) if known is None else Measured(known, 0.0, (known, known)),
@@ -146,7 +147,7 @@ def period_estimate(sample: WaveSample) -> PeriodEstimate:
 
 @dataclass(frozen=True)
 class PeriodGroup:
-    """Draws of a period that lie together: their mean, their least and greatest, their share of all."""
+    """Neighbouring draws of a period: their mean, minimum and maximum, and their share of all."""
 
     mean: float
     between: tuple[float, float]
@@ -154,16 +155,16 @@ class PeriodGroup:
 
 
 def separate_periods(period: np.ndarray) -> list[PeriodGroup]:
-    """Groups of draws (n,) of a period that lie apart, the likeliest first; the rarest are left out."""
+    """Separate groups of draws (n,) of a period, the most probable first; the rarest are omitted."""
     ordered = np.sort(period)
-    cut = np.flatnonzero(np.diff(ordered) > ALIKE * ordered[1:]) + 1
-    groups = [group for group in np.split(ordered, cut) if len(group) >= ALIKE * len(period)]
-    separate = [PeriodGroup(float(g.mean()), (float(g[0]), float(g[-1])), len(g) / len(period)) for g in groups]
-    return sorted(separate, key=lambda group: -group.share)
+    cut = np.flatnonzero(np.diff(ordered) > SAME_SHARE * ordered[1:]) + 1
+    groups = [group for group in np.split(ordered, cut) if len(group) >= SAME_SHARE * len(period)]
+    period_groups = [PeriodGroup(float(g.mean()), (float(g[0]), float(g[-1])), len(g) / len(period)) for g in groups]
+    return sorted(period_groups, key=lambda group: -group.share)
 
 
 def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
-    """What the readings leave open about waves, in words, with what would tell."""
+    """Weaknesses of the readings about waves, in words, with remedies."""
     sentences = []
     for sample in samples:
         unit = sample.period_unit(fit.campaign.unit)
@@ -178,13 +179,13 @@ def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
 
 
 def strong_harmonics(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
-    """Waves whose second harmonic is stronger than the first: half of the period is the wave that leads."""
+    """Waves whose second harmonic is stronger than the first: the leading wave has half of the period."""
     sentences = []
     for sample in samples:
-        mine = sample.likeliest
-        second = float(np.hypot(*sample.coefficients[mine, 2:4].T).mean())
-        if sample.probability > 0.5 and second > float(sample.amplitude[mine].mean()):
-            period, of = float(sample.true_period[mine].mean()), sample.period_unit(unit)
+        likeliest = sample.likeliest
+        second = float(np.hypot(*sample.coefficients[likeliest, 2:4].T).mean())
+        if sample.probability > 0.5 and second > float(sample.amplitude[likeliest].mean()):
+            period, of = float(sample.true_period[likeliest].mean()), sample.period_unit(unit)
             sentences.append(
                 f"the wave of {period:.4g} {of} is strongest by its second harmonic: {second:.2g} {unit} every "
                 f"{0.5 * period:.4g} {of}; ask for that period in a range of its own to part two wheels"
@@ -193,14 +194,14 @@ def strong_harmonics(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
 
 
 def waves_at_an_end(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
-    """Warnings of periods that lie where the range ends that was asked for: the true one may lie beyond it."""
+    """Warnings of periods at the end of the stated range: the true one may lie beyond it."""
     sentences = []
     for sample in samples:
         wave = sample.wave
         if wave.known is not None or not sample.probability > 0.5:
             continue
         low, high = interval95(sample.period)
-        if low < wave.low * (1 + ALIKE) or high > wave.high * (1 - ALIKE):
+        if low < wave.low * (1 + SAME_SHARE) or high > wave.high * (1 - SAME_SHARE):
             of = sample.period_unit(unit)
             sentences.append(
                 f"the period {np.mean(sample.period):.4g} {of} lies at the end of the range that was asked for "
@@ -210,7 +211,7 @@ def waves_at_an_end(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
 
 
 def _one_wave_twice(fit: AxisFit) -> list[str]:
-    """Gear and encoder with one period, which their readings hardly part."""
+    """Gear and encoder with one period, which their readings hardly separate."""
     sentences = []
     model, rows = fit.model, fit.rows
     gears = [wave for wave in model.coordinates.waves if wave.clock == "position"]

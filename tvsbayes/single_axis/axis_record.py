@@ -1,4 +1,4 @@
-"""What is said of a fitted axis, as `fit --json` and `results/fit.json` hold it; all lengths in the folder's unit."""
+"""Results of a fitted axis for `fit --json` and `results/fit.json`; all lengths in the folder's unit."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ AXIS_FIT_FORMAT = "tvsbayes-axis-fit/1"
 type PeriodClock = Literal["unit", "seconds"]
 type BothSides[T] = Annotated[dict[str, T], Meta(extra_json_schema={"required": ("forward", "backward")})]
 POSITIONS_FEW = 5
-"""Below it a process of position is mostly its prior."""
+"""With fewer positions a process of position is mostly its prior."""
 REVERSED = 0.975
-"""Probability of a negative backlash from which it is said."""
+"""Least probability of a negative backlash for a warning."""
 POSITIONS_LISTED = 400
 
 
 class PositionDeviation(Record, frozen=True):
-    """What the axis does at a position, off the line through the stops: the error that repeats, drift and play apart.
+    """Deviation of the axis at a position from the line through the stops: the repeated error without drift and play.
 
     Attributes:
         position: a command.
@@ -72,23 +72,23 @@ class AxisSummary(Shown, Record, frozen=True):
     Attributes:
         unit: of everything but commands, hours and shares.
         estimator: "laplace" or "posterior".
-        tier: what made a posterior's draws, weighted draws or a chain; None of a Laplace approximation.
-        converged: there is a mode, and an answer of the sampler, accepted or rough, where one was asked for.
-        problems: what an accepted answer lacks.
-        per_command: ratio by direction, "forward" and "backward"; it holds beyond the range read.
+        tier: method of the posterior's draws, weighted draws or a chain; None of a Laplace approximation.
+        converged: there is a mode, and an answer of the sampler, accepted or rough, where it ran.
+        problems: why the answer is not accepted.
+        per_command: ratio by direction, "forward" and "backward"; valid beyond the range read.
         effective_per_command: slope of the least-squares line through the positions read, by direction.
         range_command: least and largest command read; `effective_per_command` belongs to it.
         parameters: by name.
         periods: waves of the gear, stated ones first.
         encoder_periods: of the encoder.
-        periods_in: what those of the gear are in: "unit", that of the readings, or "seconds".
-        deviations: off that line, by position read.
-        classic: beside it.
-        moves, readings, positions: how many were used.
+        periods_in: unit of the gear's: "unit", that of the readings, or "seconds".
+        deviations: from that line, by position read.
+        classic: the classic estimate.
+        moves, readings, positions: numbers used.
         weak_directions, warnings: sentences.
         sampling: diagnosis of the draws.
         prior_conflicts: priors that the readings contradict, in words.
-        answer: what the intervals are: of a sample that was accepted, of a rough one, of the Laplace approximation.
+        answer: kind of the intervals: of an accepted sample, of a rough one, of the Laplace approximation.
         monte_carlo_error: of every headline, in its sd.
     """
 
@@ -118,17 +118,17 @@ class AxisSummary(Shown, Record, frozen=True):
 
     @property
     def explained(self) -> bool:
-        """There is a mode: only then is anything sampled."""
+        """Whether there is a mode: sampling needs one."""
         return self.converged or bool(self.sampling)
 
     def shown(self) -> View:
         """Ratios by direction, then every parameter."""
-        named = {f"per_command.{side}": e for side, e in self.per_command.items()}
-        named |= {f"effective_per_command.{side}": e for side, e in self.effective_per_command.items()}
-        named |= {name: e for name, e in self.parameters.items() if name != "per_command"}
+        estimates = {f"per_command.{side}": e for side, e in self.per_command.items()}
+        estimates |= {f"effective_per_command.{side}": e for side, e in self.effective_per_command.items()}
+        estimates |= {name: e for name, e in self.parameters.items() if name != "per_command"}
         rows = [
             (name, e.value, e.sd, *e.interval95, None if e.contraction is None else round(100 * e.contraction, 1))
-            for name, e in named.items()
+            for name, e in estimates.items()
         ]
         state = "converged" if self.converged else "NOT CONVERGED"
         title = f"AxisSummary in {self.unit}, {self.estimator}, {state}"
@@ -136,7 +136,7 @@ class AxisSummary(Shown, Record, frozen=True):
 
 
 class AxisInputs(Record, frozen=True):
-    """SHA-256 of what a fit depends on."""
+    """SHA-256 of the inputs of a fit."""
 
     moves: Sha256
     readings: Sha256
@@ -158,17 +158,17 @@ def _estimate(
 
 
 def _diagnoses(fit: AxisFit) -> dict[str, tuple[float | None, float | None, float | None]]:
-    """R-hat, bulk and tail effective draws by quantity; every other has those of the least known."""
+    """R-hat, bulk and tail effective draws by quantity; "" has the worst of all, for other quantities."""
     if fit.sample is None or fit.answer == "laplace":
         return {"": (None, None, None)}
     state = fit.sample.convergence
-    each = {name: (state.rhat.get(name), state.ess_bulk[name], state.ess_tail[name]) for name in state.ess_bulk}
-    worst = (
+    by_name = {name: (state.rhat.get(name), state.ess_bulk[name], state.ess_tail[name]) for name in state.ess_bulk}
+    lowest = (
         max(state.rhat.values(), default=None),
         min(state.ess_bulk.values()),
         min(state.ess_tail.values()),
     )
-    return {**each, "": worst}
+    return {**by_name, "": lowest}
 
 
 def _prior_sds(fit: AxisFit) -> dict[str, float]:
@@ -186,10 +186,10 @@ def _prior_sds(fit: AxisFit) -> dict[str, float]:
 
 
 def summarise_axis(fit: AxisFit) -> AxisSummary:
-    """Everything that is said of a fit."""
+    """The complete summary of a fit."""
     draws, sds, diagnoses = fit.draws, _prior_sds(fit), _diagnoses(fit)
 
-    def of(name: str, values: np.ndarray | None = None) -> Estimate:
+    def estimate(name: str, values: np.ndarray | None = None) -> Estimate:
         diagnosis = diagnoses.get(name, diagnoses[""])
         return _estimate(draws[name] if values is None else values, sds.get(name), diagnosis)
 
@@ -207,12 +207,12 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         monte_carlo_error={} if fit.sample is None else fit.sample.convergence.monte_carlo_error,
         converged=fit.error is None and (fit.sample is None or fit.answer != "laplace"),
         problems=fit.missing,
-        per_command={side: of(f"per_command.{side}") for side in sides},
+        per_command={side: estimate(f"per_command.{side}") for side in sides},
         effective_per_command={
             side: _estimate(effective + half * contrast, None, diagnoses[""]) for side, half in sides.items()
         },
         range_command=(float(fit.rows.command.min()), float(fit.rows.command.max())),
-        parameters={name: of(name) for name in dict.fromkeys(names)} | _untold(fit),
+        parameters={name: estimate(name) for name in dict.fromkeys(names)} | _prior_backlash(fit),
         deviations=_deviations(fit),
         classic=classic_axis(fit.rows),
         moves=len(fit.rows.move),
@@ -226,16 +226,16 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         ),
         sampling=_sampling(fit),
         prior_conflicts=tuple(conflict_text(conflict) for conflict in fit.conflicts),
-        periods=tuple(period_estimate(each) for each in samples if each.wave.clock != "encoder"),
-        encoder_periods=tuple(period_estimate(each) for each in samples if each.wave.clock == "encoder"),
+        periods=tuple(period_estimate(sample) for sample in samples if sample.wave.clock != "encoder"),
+        encoder_periods=tuple(period_estimate(sample) for sample in samples if sample.wave.clock == "encoder"),
         periods_in="seconds" if fit.campaign.periods.in_seconds else "unit",
     )
 
 
-def _untold(fit: AxisFit) -> dict[str, Estimate]:
-    """The backlash as its prior has it, where every stop was reached from one side.
+def _prior_backlash(fit: AxisFit) -> dict[str, Estimate]:
+    """The backlash by its prior, where every stop was reached from one side.
 
-    Draws of it then depend on how a start of unknown side was taken, which is no knowledge of the play.
+    Draws of it then depend on the treatment of a start of unknown side, which is no knowledge of the play.
     """
     prior = fit.model.priors["backlash"]
     if fit.rows.both_sides or not prior.u:
@@ -245,25 +245,25 @@ def _untold(fit: AxisFit) -> dict[str, Estimate]:
 
 
 def deviation_functionals(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
-    """What repeats by position at commands (t,), less the line that the rows put through it.
+    """Error that repeats by position at commands (t,), less its least-squares line over the rows.
 
-    Shape (t, columns); of `fit.w` (n, t, columns) where a period is not known.
+    Shape (t, columns); (n, t, columns) for `fit.w` where a period is not known.
     """
     model = fit.model
     level = model.functional(fit.rows.command, fit.w).mean(axis=-2)
     slope = line_weights(model, fit.w)
-    off = (commands - model.middle)[:, None]
-    return model.functional(commands, fit.w) - level[..., None, :] - off * slope[..., None, :]
+    offsets = (commands - model.middle)[:, None]
+    return model.functional(commands, fit.w) - level[..., None, :] - offsets * slope[..., None, :]
 
 
 CURVE_DRAWS = 400
-"""Of the error by position in a figure, and where its functionals are each draw's own."""
+"""Number of draws of the error by position in a figure, and where functionals differ by draw."""
 STRATA = 16
-"""Of the normal law of one draw in a figure: its band is then as smooth as that of thousands of draws."""
+"""Quantiles of the normal distribution of one draw in a figure: its band is as smooth as that of thousands of draws."""
 
 
 def drawn_deviations(fit: AxisFit, commands: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The error that repeats by position at commands (t,), off the line, drawn: (draws, t)."""
+    """Draws of the error that repeats by position at commands (t,), less its line: (draws, t)."""
     if not fit.model.repeats_by_draw:
         return fit.linear.drawn(deviation_functionals(fit, commands), rng)
     parts = _curve_parts(fit)
@@ -271,9 +271,9 @@ def drawn_deviations(fit: AxisFit, commands: np.ndarray, rng: np.random.Generato
 
 
 def deviation_strata(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
-    """Values that the error at each command takes equally often, for its band alone: (`CURVE_DRAWS` x `STRATA`, t).
+    """Equally probable values of the error at each command, for its band: (`CURVE_DRAWS` x `STRATA`, t).
 
-    What is linear is computed for so many draws only; values of two commands do not belong together.
+    Values at two commands are not joint draws.
     """
     from scipy.special import ndtri
 
@@ -303,24 +303,24 @@ def _deviations(fit: AxisFit) -> tuple[PositionDeviation, ...]:
 def _sampling(fit: AxisFit) -> dict[str, float | int | None]:
     if fit.sample is None:
         return {}
-    judged = fit.sample.convergence
-    first = judged.importance
+    convergence = fit.sample.convergence
+    importance = convergence.importance
     numbers: dict[str, float | int | None] = {
-        "draws": first.draws,
-        "rounds": first.rounds,
-        "effective": first.effective_share * first.draws,
-        "pareto_k": first.pareto_k,
+        "draws": importance.draws,
+        "rounds": importance.rounds,
+        "effective": importance.effective_share * importance.draws,
+        "pareto_k": importance.pareto_k,
     }
-    if isinstance(judged, Convergence):
-        numbers |= {"steps": judged.steps, "acceptance": float(judged.acceptance.mean())}
-        numbers["autocorrelation_times"] = (judged.steps - judged.discarded) / judged.tau_steps
-        if judged.agreement is not None:
-            numbers["agreement"] = judged.agreement.worst.value
+    if isinstance(convergence, Convergence):
+        numbers |= {"steps": convergence.steps, "acceptance": float(convergence.acceptance.mean())}
+        numbers["autocorrelation_times"] = (convergence.steps - convergence.discarded) / convergence.tau_steps
+        if convergence.agreement is not None:
+            numbers["agreement"] = convergence.agreement.worst.value
     return numbers
 
 
 def _reversed(fit: AxisFit) -> list[str]:
-    """Where the sign of the reversal is not that of lost motion."""
+    """A warning where the sign of the reversal is not that of lost motion."""
     if not fit.rows.both_sides or np.mean(fit.draws["backlash"] < 0) < REVERSED:
         return []
     return [
@@ -330,7 +330,7 @@ def _reversed(fit: AxisFit) -> list[str]:
 
 
 def _weak(fit: AxisFit) -> list[str]:
-    """What the data leave to the priors, and what would tell."""
+    """Quantities that the data do not determine, in words, with remedies."""
     rows, sentences = fit.rows, _weak_in_time(fit)
     if rows.in_motion:
         return [*sentences, "a drive at constant rate cannot tell error by position from drift: both are in the drift"]
@@ -349,15 +349,13 @@ def _weak(fit: AxisFit) -> list[str]:
 
 
 CREEP_SHARE = 0.5
-"""Correlation with the creep from which the contrast of the directions, or the play, is said to be weak."""
-
-
+"""Least correlation with the creep at which the contrast of the directions, or the play, counts as weak."""
 ORDER_SHARE = 0.9
-"""Correlation of commands and travel from which the places are said to have been read one after the other."""
+"""Least correlation of commands and travel at which the places count as read one after the other."""
 
 
 def _weak_in_time(fit: AxisFit) -> list[str]:
-    """What a shift of the zero in time cannot be told from."""
+    """Quantities that are hardly separable from a shift of the zero in time."""
     rows, sentences = fit.rows, []
     several = rows.both_sides and len(rows.positions) > 2
     in_turn = several and abs(np.corrcoef(rows.command, rows.path)[0, 1]) > ORDER_SHARE
@@ -367,24 +365,24 @@ def _weak_in_time(fit: AxisFit) -> list[str]:
             "directions are hardly separated: read them again in another order; of gears whose teeth keep step state "
             "`ratio_contrast = { value = 0, u = 0 }` in [axis], of a warm machine `creep` likewise"
         )
-    for shift, cure in {
+    for shift, remedy in {
         "creep": "alternate the directions, come back to the first stop, wait until it is warm",
         "thermal_per_K": "come back to the first stop at another temperature",
     }.items():
-        for name, what in {"backlash": "the play", "ratio_contrast": "the contrast of the directions"}.items():
+        for name, effect in {"backlash": "the play", "ratio_contrast": "the contrast of the directions"}.items():
             if shift not in fit.model.shifts or not fit.rows.both_sides:
                 continue
             a, b = fit.draws[shift], fit.draws[name]
             if a.std() and b.std() and abs(np.corrcoef(a, b)[0, 1]) > CREEP_SHARE:
                 words = "a creep of the zero" if shift == "creep" else "a shift with the temperature"
-                sentences.append(f"{what} and {words} are hardly separated: {cure}")
+                sentences.append(f"{effect} and {words} are hardly separated: {remedy}")
     return sentences
 
 
 def uninformed(summary: AxisSummary) -> TvsError | None:
-    """Nothing learned of the ratio."""
-    of = summary.per_command.values()
-    if any(e.contraction is None or e.contraction >= CONTRACTION_LIMIT for e in of):
+    """The error where the readings do not determine the ratio."""
+    ratios = summary.per_command.values()
+    if any(e.contraction is None or e.contraction >= CONTRACTION_LIMIT for e in ratios):
         return None
     return NothingToEstimate(
         "uninformed",
@@ -400,16 +398,16 @@ def keep_fit(fit: AxisFit, summary: AxisSummary, folder: Path) -> dict[str, str]
     Raises:
         InputError: the folder cannot be written.
     """
-    made = plain(provenance(axis_hashes(fit.campaign), fit.seed))
+    origin = plain(provenance(axis_hashes(fit.campaign), fit.seed))
     buffer = io.BytesIO()
     draws = np.stack(list(fit.draws.values()), axis=-1)
     np.savez(buffer, names=np.array(list(fit.draws)), w=fit.w, draws=draws)
-    return write_files(folder, buffer.getvalue(), {"format": AXIS_FIT_FORMAT, **summary.as_json(), **made})
+    return write_files(folder, buffer.getvalue(), {"format": AXIS_FIT_FORMAT, **summary.as_json(), **origin})
 
 
 @dataclass(frozen=True, repr=False)
 class AxisResults(Shown):
-    """A fit and what is said of it."""
+    """A fit and its summary."""
 
     summary: AxisSummary
     fit: AxisFit
@@ -420,7 +418,7 @@ class AxisResults(Shown):
 
 
 def _stored_w(folder: Path, names: int, again: str) -> np.ndarray:
-    """Coordinates (draws, names) in the `results/` of a folder; `again` is what to do where they are damaged.
+    """Coordinates (draws, names) in the `results/` of a folder; `again` is the remedy where they are damaged.
 
     Raises:
         InputError: no file, or one that is damaged.
@@ -446,16 +444,16 @@ def results_for(
     more: np.ndarray | None = None,
     progress: Show | None = None,
     seed: int = 0,
-    tell: Callable[[str], None] = lambda _: None,
+    notify: Callable[[str], None] = lambda _: None,
 ) -> AxisResults:
-    """Those in `results/` if they are of these data and converged; else of a fit by weighted draws.
+    """The results in `results/` if they are of these data and converged; else of a fit by weighted draws.
 
     Args:
         campaign: from `read_axis`.
-        more: further commands at which the error will be asked for, shape (n,).
-        progress: told how far the fit is.
+        more: further commands at which the error will be evaluated, shape (n,).
+        progress: shows the progress of the fit.
         seed: of that fit.
-        tell: shows that a fit is made first.
+        notify: reports that a fit runs first.
 
     Raises:
         InputError: stored results are damaged.
@@ -463,14 +461,14 @@ def results_for(
     """
     document = stored_document(campaign, "fit.json", (AXIS_FIT_FORMAT,), axis_hashes(campaign))
     if document is not None and document.values.get("converged") is True and campaign.path is not None:
-        again = "run `tvsbayes fit` again"
-        hold_to_schema(document, axis_fit_schema(), again)
-        summary = read_record(AxisSummary, document, again, held=True)
-        made = read_record(Provenance, document, again, held=True)
+        remedy = "run `tvsbayes fit` again"
+        hold_to_schema(document, axis_fit_schema(), remedy)
+        summary = read_record(AxisSummary, document, remedy, held=True)
+        origin = read_record(Provenance, document, remedy, held=True)
         model = model_of(campaign, more)
-        w = _stored_w(campaign.path, len(model.coordinates.names), again)
-        return AxisResults(summary, AxisFit.of_draws(campaign, model, w, made.seed))
-    tell(FITTING_FIRST)
+        w = _stored_w(campaign.path, len(model.coordinates.names), remedy)
+        return AxisResults(summary, AxisFit.of_draws(campaign, model, w, origin.seed))
+    notify(FITTING_FIRST)
     fit = fit_axis(campaign, tier="importance", seed=seed, more=more, progress=progress)
     if fit.error is not None:
         raise fit.error

@@ -1,7 +1,7 @@
-"""An axis campaign as arrays: where stops were read, from which side they were reached, where the play stood.
+"""An axis campaign as arrays: stops with readings, their sides of approach, the state of the play.
 
-A row is a move with readings, averaged; of a drive at constant rate the readings of a short while
-(`readings_in_motion`). Positions are commands; `unit` is that of the readings. Formulation 8.1.
+A row is a move with its readings averaged; for a drive at constant rate, the readings of a short time
+(`rows_in_motion`). Positions are commands; `unit` is that of the readings. Formulation 8.1.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ SIDES = {"forward": 1, "backward": -1, "unknown": 0}
 DIRECTIONS = {1: "forward", -1: "backward", 0: "unknown"}
 HOUR_S = 3600.0
 ROWS_MAX = 2000
-"""Moves with readings that a fit takes: at this many it takes minutes."""
+"""Largest number of moves with readings: a fit of so many takes minutes."""
 LONG_LEGS, LONG_ERRORS = 2.0, 10.0
-"""Where the shortest leg is so many reversals and standard errors of one long, no stop lies inside the play."""
+"""No stop lies inside the play where the shortest leg exceeds so many reversals and standard errors of the reversal."""
 WRAP_SHARE = 0.7
-"""Of a turn: a step of the readings that is off by more has jumped by whole turns."""
+"""Share of a turn: a step of the readings with a larger deviation has jumped by whole turns."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Legs:
         command: after the move.
         step: change of the command; 0 in the first row of a segment.
         first: whether a segment begins.
-        side: 1 arrived forward, -1 backward, 0 unknown; of a move that changes nothing that of the one before.
+        side: 1 arrived forward, -1 backward, 0 unknown; a move without motion has that of the previous one.
         segment: number.
     """
 
@@ -56,16 +56,16 @@ class AxisRows:
         legs: all moves.
         move: number of the move.
         command, side, segment: as in `Legs`.
-        hours: since the row before in the segment; since the segment's first move in its first row.
+        hours: since the previous row in the segment; since the segment's first move in its first row.
         path: commands travelled since the segment began.
-        redrawn: whether the stop's error is another than that of the row before.
+        redrawn: whether the stop's error is new since the previous row.
         value: mean of the readings, unit.
         variance: of that mean by the stated u, unit^2; 0 where no u is known.
         within: sum of squares of the readings about their mean, in units of their u.
         count: readings in the mean.
         line: offset and unit per command of the least-squares line with a reversal.
         time_s: clock of moves.csv.
-        warm_s: since it was switched on; since the first move where nothing says when that was.
+        warm_s: since it was switched on; since the first move where that is unknown.
         kelvin: temperature less that of the first move; None where none was recorded.
         width_s: over which the readings of a row in motion were averaged; 0 at a stop.
         rate: commands per second of a drive at constant rate; None of stops.
@@ -105,29 +105,29 @@ class AxisRows:
 
     @property
     def positions(self) -> np.ndarray:
-        """Commands at which something was read, ascending, each once."""
+        """Commands with readings, ascending, without repetition."""
         return np.unique(self.command)
 
     @property
     def both_sides(self) -> bool:
-        """Whether stops were reached forward and backward: a stop of unknown side tells no play."""
+        """Whether stops were reached forward and backward; stops of unknown side do not count."""
         return {-1, 1} <= set(self.side.tolist())
 
     def without(self, left_out: np.ndarray) -> AxisRows:
-        """The rows where `left_out` is false; times and redrawing follow, the line stays."""
-        kept = np.flatnonzero(~left_out)
-        hours, redrawn = np.zeros(len(kept)), np.ones(len(kept), dtype=bool)
-        since = np.cumsum(self.hours)
-        for row, at in enumerate(kept):
-            before = kept[row - 1] if row else -1
-            begins = np.flatnonzero(self.segment == self.segment[at])[0]
-            same = before >= begins
-            hours[row] = since[at] - since[before] if same else since[at] - since[begins] + self.hours[begins]
-            redrawn[row] = not same or bool(self.redrawn[before + 1 : at + 1].any())
+        """The rows where `left_out` is false; `hours` and `redrawn` are adapted, the line stays."""
+        rows_kept = np.flatnonzero(~left_out)
+        hours, redrawn = np.zeros(len(rows_kept)), np.ones(len(rows_kept), dtype=bool)
+        time_h = np.cumsum(self.hours)
+        for k, row in enumerate(rows_kept):
+            previous = rows_kept[k - 1] if k else -1
+            first = np.flatnonzero(self.segment == self.segment[row])[0]
+            same = previous >= first
+            hours[k] = time_h[row] - time_h[previous] if same else time_h[row] - time_h[first] + self.hours[first]
+            redrawn[k] = not same or bool(self.redrawn[previous + 1 : row + 1].any())
         arrays = ("move", "command", "side", "segment", "path", "value", "variance", "within", "count")
-        picked = {name: getattr(self, name)[kept] for name in (*arrays, "time_s", "warm_s", "width_s")}
-        picked["kelvin"] = None if self.kelvin is None else self.kelvin[kept]
-        return replace(self, hours=hours, redrawn=redrawn, **picked)
+        columns = {name: getattr(self, name)[rows_kept] for name in (*arrays, "time_s", "warm_s", "width_s")}
+        columns["kelvin"] = None if self.kelvin is None else self.kelvin[rows_kept]
+        return replace(self, hours=hours, redrawn=redrawn, **columns)
 
 
 def legs_of(moves: Sequence[AxisMove]) -> Legs:
@@ -148,31 +148,31 @@ def legs_of(moves: Sequence[AxisMove]) -> Legs:
 def _means(used: Sequence[Reading]) -> dict[int, tuple[float, float, float, int]]:
     """Mean, variance, scatter within and number of the readings of every move.
 
-    Where no u is stated, readings of one move that were repeated tell it; else it stays unknown, 0.
+    Where no u is stated, it comes from repeated readings of one move; without these it is unknown, 0.
     """
     by_move: dict[int, list[Reading]] = defaultdict(list)
     for reading in used:
         by_move[reading.move].append(reading)
-    unknown = [[float(r.value or 0.0) for r in each if r.u == 0] for each in by_move.values()]
+    unknown = [[float(r.value or 0.0) for r in of_move if r.u == 0] for of_move in by_move.values()]
     repeated = [values for values in unknown if len(values) > 1]
     squares = sum(len(values) * float(np.var(values)) for values in repeated)
     freedom = sum(len(values) - 1 for values in repeated)
     pooled = float(np.sqrt(squares / freedom)) if freedom else 0.0
     means = {}
-    for move, each in by_move.items():
-        values = np.array([r.value for r in each], dtype=float)
-        u = np.array([r.u or pooled for r in each])
+    for move, of_move in by_move.items():
+        values = np.array([r.value for r in of_move], dtype=float)
+        u = np.array([r.u or pooled for r in of_move])
         if np.all(u > 0):
             weight = 1 / u**2
             mean = float(weight @ values / weight.sum())
-            means[move] = mean, float(1 / weight.sum()), float(weight @ (values - mean) ** 2), len(each)
+            means[move] = mean, float(1 / weight.sum()), float(weight @ (values - mean) ** 2), len(of_move)
         else:
-            means[move] = float(values.mean()), 0.0, 0.0, len(each)
+            means[move] = float(values.mean()), 0.0, 0.0, len(of_move)
     return means
 
 
 def turn_jumps(command: np.ndarray, value: np.ndarray, turn: float) -> dict[int, float]:
-    """By row how far readings jump there, turns; empty where none do.
+    """Jumps of the readings by row, turns; empty where there are none.
 
     Args:
         command: of the readings in order of time, shape (rows,).
@@ -180,15 +180,15 @@ def turn_jumps(command: np.ndarray, value: np.ndarray, turn: float) -> dict[int,
         turn: in their unit.
     """
     step = np.diff(command)
-    moved = step != 0
-    if moved.sum() < 3:
+    moving = step != 0
+    if moving.sum() < 3:
         return {}
     rise = np.diff(value)
-    slope = float(np.median(rise[moved] / step[moved]))
-    off = rise - slope * step
-    jumps = np.flatnonzero(np.abs(off) > WRAP_SHARE * turn)
-    # A slope that is itself wrong by a turn per step makes every step jump, or none; only rare jumps are wraps.
-    return {int(k) + 1: float(off[k] / turn) for k in jumps} if 2 * len(jumps) < len(step) else {}
+    slope = float(np.median(rise[moving] / step[moving]))
+    deviation = rise - slope * step
+    jumps = np.flatnonzero(np.abs(deviation) > WRAP_SHARE * turn)
+    # With a slope wrong by a turn per step, every step jumps, or none; only rare jumps are wraps.
+    return {int(k) + 1: float(deviation[k] / turn) for k in jumps} if 2 * len(jumps) < len(step) else {}
 
 
 def _check_turns(campaign: AxisCampaign, command: np.ndarray, value: np.ndarray, moves: np.ndarray) -> None:
@@ -200,10 +200,10 @@ def _check_turns(campaign: AxisCampaign, command: np.ndarray, value: np.ndarray,
     turn = TURNS.get(campaign.unit)
     jumps = turn_jumps(command, value, turn) if turn is not None else {}
     if jumps:
-        named = listed([int(moves[row]) for row in jumps], 5)
+        moves_text = listed([int(moves[row]) for row in jumps], 5)
         raise InputError(
             "wrapped",
-            f"readings.csv: the angle jumps by whole turns at move {named}; allowed: a continuous angle",
+            f"readings.csv: the angle jumps by whole turns at move {moves_text}; allowed: a continuous angle",
             file="readings.csv",
             column="value",
             remedy=f"unwrap them: add or subtract {turn:g} {campaign.unit}; or are command and value exchanged?",
@@ -250,8 +250,8 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
             remedy="check the columns move and value, and that the reading follows this axis",
         )
     times_s = np.array([m.time_s for m in campaign.moves])
-    stated = [r.u for r in used if r.u > 0]
-    rows_found = AxisRows(
+    stated_u = [r.u for r in used if r.u > 0]
+    rows = AxisRows(
         unit=campaign.unit,
         legs=legs,
         move=moves,
@@ -271,22 +271,22 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
         kelvin=_kelvin(campaign, times_s[moves]),
         width_s=np.zeros(len(moves)),
         rate=None,
-        reading_u=float(np.median(stated)) if stated else 0.0,
+        reading_u=float(np.median(stated_u)) if stated_u else 0.0,
     )
-    return rows_found if legs_are_long(rows_found) else _line_with_play(rows_found)
+    return rows if legs_are_long(rows) else _line_with_play(rows)
 
 
 ROWS_IN_MOTION, PER_PERIOD, READINGS_IN_MOTION = 2000, 5.0, 100_000
-"""Rows of a drive, readings' groups in the shortest period that is asked for, readings that are taken."""
+"""Largest number of rows of a drive, rows in the shortest stated period, largest number of readings."""
 WIDE_ROWS = 400
-"""Rows of a drive of which no period is asked, and below which readings stay single."""
+"""Rows of a drive without stated periods; fewer readings are not averaged."""
 
 
 def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
     """The rows of a drive at constant rate: means of the readings of equal short times.
 
-    A wave is averaged over them too, so that nothing but detail shorter than a fifth of the shortest period is lost.
-    Where no u is stated, second differences of neighbouring readings tell it.
+    The model averages a wave over the same times, so that only detail shorter than a fifth of the shortest period is
+    lost. Where no u is stated, it comes from second differences of neighbouring readings.
 
     Raises:
         NothingToEstimate, InputError: as `rows_of`.
@@ -311,8 +311,8 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
         )
     move = np.array([r.move for r in used])
     time_s, value = np.array([r.time_s for r in used], dtype=float), np.array([r.value for r in used], dtype=float)
-    at = {name: np.array([getattr(m, name) for m in campaign.moves]) for name in ("segment", "time_s", "command")}
-    command = at["command"][move] + rate * (time_s - at["time_s"][move])
+    by_move = {name: np.array([getattr(m, name) for m in campaign.moves]) for name in ("segment", "time_s", "command")}
+    command = by_move["command"][move] + rate * (time_s - by_move["time_s"][move])
     _check_turns(campaign, command, value, move)
     slope = float(np.polyfit(command - command.mean(), value, 1)[0])
     if not abs(slope) * np.ptp(command) > 1e-9 * max(float(np.max(np.abs(value))), 1e-300):
@@ -326,25 +326,25 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
     u = np.where(u > 0, u, _neighbours_sd(value - slope * command, move))
     weight = 1.0 / np.maximum(u, FLOOR_SHARE * abs(slope) * np.ptp(command)) ** 2
     width = _width_s(campaign, abs(slope * rate), time_s, move)
-    begins = np.r_[True, np.diff(move) > 0]
-    since = time_s - time_s[begins][np.cumsum(begins) - 1]
-    bin_of = np.floor(since / width).astype(int) if width else np.arange(len(used))
-    starts = np.flatnonzero(np.r_[True, (np.diff(move) > 0) | (np.diff(bin_of) != 0)])
-    total = np.add.reduceat(weight, starts)
+    is_first = np.r_[True, np.diff(move) > 0]
+    since_move_s = time_s - time_s[is_first][np.cumsum(is_first) - 1]
+    bin_of = np.floor(since_move_s / width).astype(int) if width else np.arange(len(used))
+    first_readings = np.flatnonzero(np.r_[True, (np.diff(move) > 0) | (np.diff(bin_of) != 0)])
+    weight_sum = np.add.reduceat(weight, first_readings)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return np.add.reduceat(weight * values, starts) / total
+        return np.add.reduceat(weight * values, first_readings) / weight_sum
 
-    count = np.diff(np.r_[starts, len(used)])
-    rows_move, rows_time, rows_command, rows_value = move[starts], mean(time_s), mean(command), mean(value)
+    count = np.diff(np.r_[first_readings, len(used)])
+    rows_move, rows_time, rows_command, rows_value = move[first_readings], mean(time_s), mean(command), mean(value)
     spread = np.sqrt(mean((time_s - np.repeat(rows_time, count)) ** 2))
-    segment = at["segment"][rows_move]
+    segment = by_move["segment"][rows_move]
     first = np.r_[True, np.diff(segment) > 0]
-    starts_s = np.array([at["time_s"][np.flatnonzero(at["segment"] == s)[0]] for s in segment])
+    starts_s = np.array([by_move["time_s"][np.flatnonzero(by_move["segment"] == s)[0]] for s in segment])
     gaps = np.where(first, rows_time - starts_s, np.r_[0.0, np.diff(rows_time)])
     design = np.column_stack([np.ones(len(rows_command)), rows_command - rows_command.mean()])
     line = np.linalg.lstsq(design, rows_value, rcond=None)[0]
-    starts_command = np.array([at["command"][np.flatnonzero(at["segment"] == s)[0]] for s in segment])
+    starts_command = np.array([by_move["command"][np.flatnonzero(by_move["segment"] == s)[0]] for s in segment])
     return AxisRows(
         unit=campaign.unit,
         legs=legs_of(campaign.moves),
@@ -356,7 +356,7 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
         path=np.abs(rows_command - starts_command),
         redrawn=first,
         value=rows_value,
-        variance=1.0 / total,
+        variance=1.0 / weight_sum,
         within=np.zeros(len(count)),
         count=count,
         line=(float(line[0] - line[1] * rows_command.mean()), float(line[1])),
@@ -370,7 +370,7 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
 
 
 FLOOR_SHARE = 1e-9
-"""Of the way: least u of a reading in motion."""
+"""Least u of a reading in motion, as a share of the travel."""
 
 
 def _neighbours_sd(off: np.ndarray, move: np.ndarray) -> float:
@@ -381,17 +381,17 @@ def _neighbours_sd(off: np.ndarray, move: np.ndarray) -> float:
 
 
 def _width_s(campaign: AxisCampaign, speed: float, time_s: np.ndarray, move: np.ndarray) -> float:
-    """Time over which readings are averaged, s; 0 where they stay single.
+    """Time over which readings are averaged, s; 0 where they are not averaged.
 
     Args:
-        campaign: what is asked for.
+        campaign: with the stated periods.
         speed: unit per second.
         time_s: of the readings, s.
         move: of the readings.
     """
     if len(time_s) <= WIDE_ROWS:
         return 0.0
-    span = sum(float(np.ptp(time_s[move == each])) for each in np.unique(move))
+    span = sum(float(np.ptp(time_s[move == number])) for number in np.unique(move))
     shortest = campaign.periods.shortest
     if shortest is None:
         return span / WIDE_ROWS
@@ -400,7 +400,7 @@ def _width_s(campaign: AxisCampaign, speed: float, time_s: np.ndarray, move: np.
 
 
 def warm_from(campaign: AxisCampaign) -> float:
-    """Time from which the machine warms up, clock of moves.csv, s."""
+    """Time at which the machine began to warm up, clock of moves.csv, s."""
     return campaign.moves[0].time_s if campaign.powered_on_s is None else campaign.powered_on_s
 
 
@@ -411,9 +411,9 @@ def _kelvin(campaign: AxisCampaign, times_s: np.ndarray) -> np.ndarray | None:
 def _hours(times_h: np.ndarray, legs: Legs, moves: np.ndarray) -> np.ndarray:
     hours = np.zeros(len(moves))
     for row, move in enumerate(moves):
-        begins = int(np.flatnonzero(legs.segment == legs.segment[move])[0])
-        before = int(moves[row - 1]) if row and legs.segment[moves[row - 1]] == legs.segment[move] else begins
-        hours[row] = times_h[move] - times_h[before]
+        first = int(np.flatnonzero(legs.segment == legs.segment[move])[0])
+        previous = int(moves[row - 1]) if row and legs.segment[moves[row - 1]] == legs.segment[move] else first
+        hours[row] = times_h[move] - times_h[previous]
     return hours
 
 
@@ -424,23 +424,23 @@ def _path(legs: Legs) -> np.ndarray:
 
 
 def _redrawn(legs: Legs, moves: np.ndarray) -> np.ndarray:
-    """Whether something moved, or homed, since the row before."""
+    """Whether the axis moved, or homed, since the previous row."""
     changes = np.cumsum(legs.first | (legs.step != 0))
     return np.array([True, *(changes[after] > changes[before] for before, after in pairwise(moves))])
 
 
 @dataclass(frozen=True)
 class PlayPlaces:
-    """Where the output stands in the play; shapes (n or 1, rows).
+    """Position of the output in the play; shapes (n or 1, rows).
 
     While a leg is lost in the play the output stays where an earlier move left it: `anchor` is the command of that
-    move, `path` the commands travelled up to it, `side` where in the play it stood then, in halves of the play. Where
-    nobody knows from which side a segment began, all are means of the two ends that are possible.
+    move, `path` the commands travelled up to it, `side` its position in the play then, in halves of the play. Where
+    the side at the start of a segment is unknown, all are means of the two possible ends.
 
     Attributes:
         anchor, path, side: of the move that last moved the output.
-        share: where the output stands in the play now, in halves of it, -1 to 1.
-        spread: half of the distance between the ends that are possible, unit.
+        share: present position of the output in the play, in halves of it, -1 to 1.
+        spread: half of the distance between the possible ends, unit.
     """
 
     anchor: np.ndarray
@@ -450,8 +450,8 @@ class PlayPlaces:
     spread: np.ndarray
 
 
-class _End:
-    """One possible place of the output, for every draw of the backlash; arrays (n,)."""
+class _PlayEnd:
+    """One possible position of the output, for every draw of the backlash; arrays (n,)."""
 
     def __init__(self, command: float, path: float, side: float, n: int):
         self.anchor, self.path, self.side = np.full(n, command), np.full(n, path), np.full(n, side)
@@ -460,57 +460,57 @@ class _End:
         return slope * self.anchor + self.side * half
 
     def follow(self, command: float, path: float, slope: float, half: np.ndarray) -> None:
-        """What a move does: the wheel takes the output along where the play is used up."""
-        stands, wheel = self.place(slope, half), slope * command
+        """Applies a move: the wheel moves the output where the play is taken up."""
+        output, wheel = self.place(slope, half), slope * command
         # Where there is no play the side is that of the leg, and both sides are one place.
-        for side, taken in ((-1.0, stands < wheel - half), (1.0, stands > wheel + half)):
-            self.anchor = np.where(taken, command, self.anchor)
-            self.path = np.where(taken, path, self.path)
-            self.side = np.where(taken, side, self.side)
+        for side, is_moved in ((-1.0, output < wheel - half), (1.0, output > wheel + half)):
+            self.anchor = np.where(is_moved, command, self.anchor)
+            self.path = np.where(is_moved, path, self.path)
+            self.side = np.where(is_moved, side, self.side)
 
 
 def _places_in_motion(rows: AxisRows) -> PlayPlaces:
-    """A drive that never turns has taken up the play on one side."""
+    """Places of a drive that never reverses: the play is taken up on one side."""
     side = (-float(np.sign(rows.line[1])) * rows.side)[None].astype(float)
     return PlayPlaces(rows.command[None], rows.path[None], side, side, np.zeros_like(side))
 
 
 def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
-    """The play operator for backlash (n,), unit; which legs it swallows is judged at the least-squares line's slope.
+    """The play operator for backlash (n,), unit; the least-squares line's slope decides which legs are lost in it.
 
-    A negative backlash is no play but a reversal that overshoots: every stop lies on its own side at once.
+    A negative backlash is no play but an overshooting reversal: every stop lies on its own side at once.
     """
     if rows.in_motion:
         return _places_in_motion(rows)
     legs, slope = rows.legs, rows.line[1]
     motion = legs.step * slope
-    least = np.min(np.abs(motion[motion != 0]), initial=np.inf)
-    if np.all(backlash < least) and not np.any(legs.first & (legs.side == 0)):
-        # Every leg takes the output along, whatever the play is.
+    shortest = np.min(np.abs(motion[motion != 0]), initial=np.inf)
+    if np.all(backlash < shortest) and not np.any(legs.first & (legs.side == 0)):
+        # Every leg moves the output, for all values of the play.
         backlash = backlash[:1]
     half = 0.5 * np.maximum(backlash, 0.0)
-    n, count, turned = len(half), len(rows.move), float(np.sign(slope))
+    n, count, slope_sign = len(half), len(rows.move), float(np.sign(slope))
     arrays = [np.empty((n, count)) for _ in range(5)]
     path = _path(legs)
-    ends: list[_End] = []
+    ends: list[_PlayEnd] = []
     row = 0
     for move in range(len(legs.command)):
         command, travelled = float(legs.command[move]), float(path[move])
         if legs.first[move]:
-            side = -float(legs.side[move]) * turned
-            ends = [_End(command, travelled, s, n) for s in ((side,) if side else (-1.0, 1.0))]
+            side = -float(legs.side[move]) * slope_sign
+            ends = [_PlayEnd(command, travelled, s, n) for s in ((side,) if side else (-1.0, 1.0))]
         elif motion[move]:
             for end in ends:
                 end.follow(command, travelled, slope, half)
         if row < count and rows.move[row] == move:
             low, high = ends[0], ends[-1]
             places = low.place(slope, half), high.place(slope, half)
-            off = 0.5 * (places[0] + places[1]) - slope * command
+            offset = 0.5 * (places[0] + places[1]) - slope * command
             middle_side = 0.5 * (low.side + high.side)
             arrays[0][:, row] = 0.5 * (low.anchor + high.anchor)
             arrays[1][:, row] = 0.5 * (low.path + high.path)
             arrays[2][:, row] = middle_side
-            arrays[3][:, row] = np.where(half > 0, off / np.where(half > 0, half, 1.0), middle_side)
+            arrays[3][:, row] = np.where(half > 0, offset / np.where(half > 0, half, 1.0), middle_side)
             arrays[4][:, row] = 0.5 * (places[1] - places[0])
             row += 1
     return PlayPlaces(*arrays)
@@ -518,12 +518,12 @@ def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
 
 def line_design(rows: AxisRows) -> np.ndarray:
     """Columns of offset (at the mean command), unit per command and backlash, shape (rows, 3)."""
-    turned = np.sign(rows.line[1])
-    return np.column_stack([np.ones(len(rows.value)), rows.command - rows.command.mean(), -0.5 * turned * rows.side])
+    sign = np.sign(rows.line[1])
+    return np.column_stack([np.ones(len(rows.value)), rows.command - rows.command.mean(), -0.5 * sign * rows.side])
 
 
 def reversal_of(rows: AxisRows) -> tuple[float, float]:
-    """Backlash of the least-squares line with one reversal, unit, and its standard error: infinite where none tells."""
+    """Backlash of the least-squares line with one reversal, unit, and its standard error: infinite if undetermined."""
     design = line_design(rows)
     solved, _, rank, _ = np.linalg.lstsq(design, rows.value, rcond=None)
     if rank < 3:
@@ -533,22 +533,22 @@ def reversal_of(rows: AxisRows) -> tuple[float, float]:
 
 
 def legs_are_long(rows: AxisRows) -> bool:
-    """Whether every leg takes up the play for certain, so that the backlash too is linear."""
+    """Whether every leg surely takes up the play, so that the backlash too is linear."""
     reversal, error = reversal_of(rows)
     motion = np.abs(rows.legs.step * rows.line[1])
-    least = np.min(motion[motion > 0], initial=np.inf)
+    shortest = np.min(motion[motion > 0], initial=np.inf)
     if np.all(rows.side >= 0) or np.all(rows.side <= 0):
-        # Arrived from one side alone: the backlash stays at its prior, and the offset takes it.
+        # With approaches from one side only, the backlash stays at its prior, and the offset absorbs it.
         return True
-    return bool(least > LONG_LEGS * abs(reversal) + LONG_ERRORS * error)
+    return bool(shortest > LONG_LEGS * abs(reversal) + LONG_ERRORS * error)
 
 
 LINE_ROUNDS, LINE_PLAYS, LINE_PLAY_MAX = 3, 61, 0.5
-"""Rounds, and plays tried up to a share of the travel, for the line where stops may lie inside the play."""
+"""Rounds, and number of trial plays up to a share of the travel, for the line where stops may lie inside the play."""
 
 
 def _line_with_play(rows: AxisRows) -> AxisRows:
-    """The rows with the least-squares line that knows the play: which legs are lost is judged by its slope."""
+    """The rows with a least-squares line that includes the play; its slope decides which legs are lost."""
     slope = rows.line[1]
     for _ in range(LINE_ROUNDS):
         play = play_places(rows, np.linspace(0.0, LINE_PLAY_MAX * rows.travel, LINE_PLAYS))
@@ -556,9 +556,9 @@ def _line_with_play(rows: AxisRows) -> AxisRows:
         for anchor, side in zip(play.anchor, play.side, strict=True):
             design = np.column_stack([np.ones(len(anchor)), anchor, side])
             solved = np.linalg.lstsq(design, rows.value, rcond=None)[0]
-            square = float(np.sum((rows.value - design @ solved) ** 2))
-            if best is None or square < best[0]:
-                best = square, solved
+            sum_of_squares = float(np.sum((rows.value - design @ solved) ** 2))
+            if best is None or sum_of_squares < best[0]:
+                best = sum_of_squares, solved
         if best is None or not 0.5 < best[1][1] / slope < 2.0:
             break
         rows = replace(rows, line=(float(best[1][0]), float(best[1][1])))

@@ -1,4 +1,4 @@
-"""The classic of an axis: the least-squares line with one reversal and independent stops, and the ISO 230-2 table."""
+"""The classic estimate of an axis: least-squares line with one reversal and independent stops, ISO 230-2 table."""
 
 from __future__ import annotations
 
@@ -47,27 +47,27 @@ class LineFit:
     """The line through some rows.
 
     Attributes:
-        solved: offset, unit per command, backlash; those that cannot be told are 0.
-        covariance: shape (3, 3); of what cannot be told 0.
+        solution: offset, unit per command, backlash; undetermined ones are 0.
+        covariance: shape (3, 3); 0 for undetermined ones.
         scatter: of the rows about it, unit.
     """
 
-    solved: np.ndarray
+    solution: np.ndarray
     covariance: np.ndarray
     scatter: float
 
 
-def fit_line(rows: AxisRows, kept: np.ndarray | None = None) -> LineFit:
-    """Least squares over the rows that are `kept` (None: all)."""
-    used = np.ones(len(rows.value), dtype=bool) if kept is None else kept
+def fit_line(rows: AxisRows, included: np.ndarray | None = None) -> LineFit:
+    """Least squares over the `included` rows (None: all)."""
+    used = np.ones(len(rows.value), dtype=bool) if included is None else included
     determined = np.array([True, np.ptp(rows.command[used]) > 0, np.ptp(rows.side[used]) > 0])
     design = line_design(rows)[used][:, determined]
-    solved, covariance = np.zeros(3), np.zeros((3, 3))
-    solved[determined] = np.linalg.lstsq(design, rows.value[used], rcond=None)[0]
+    solution, covariance = np.zeros(3), np.zeros((3, 3))
+    solution[determined] = np.linalg.lstsq(design, rows.value[used], rcond=None)[0]
     freedom = max(int(used.sum()) - int(determined.sum()), 1)
-    scatter = float(np.sqrt(np.sum((rows.value[used] - design @ solved[determined]) ** 2) / freedom))
+    scatter = float(np.sqrt(np.sum((rows.value[used] - design @ solution[determined]) ** 2) / freedom))
     covariance[np.ix_(determined, determined)] = scatter**2 * np.linalg.pinv(design.T @ design)
-    return LineFit(solved, covariance, scatter)
+    return LineFit(solution, covariance, scatter)
 
 
 def classic_axis(rows: AxisRows) -> ClassicAxis:
@@ -76,9 +76,9 @@ def classic_axis(rows: AxisRows) -> ClassicAxis:
     u = np.sqrt(np.maximum(np.diag(line.covariance), 0.0))
     both = rows.both_sides
     return ClassicAxis(
-        per_command=float(line.solved[1]),
+        per_command=float(line.solution[1]),
         u_per_command=float(u[1]),
-        backlash=float(line.solved[2]) if both else None,
+        backlash=float(line.solution[2]) if both else None,
         u_backlash=float(u[2]) if both else None,
         residual_sd=line.scatter,
         iso230=iso230_figures(rows),
@@ -87,9 +87,9 @@ def classic_axis(rows: AxisRows) -> ClassicAxis:
 
 @dataclass(frozen=True)
 class PositionRuns:
-    """Positions (m,) that were read twice from both sides, and what was read there, off the least-squares line.
+    """Positions (m,) read twice from both sides, and the deviations of their readings from the least-squares line.
 
-    `forward` and `backward` have shape (m, runs), not a number where there are fewer runs.
+    `forward` and `backward` have shape (m, runs), NaN where there are fewer runs.
     """
 
     position: np.ndarray
@@ -99,31 +99,31 @@ class PositionRuns:
 
 def position_runs(rows: AxisRows) -> PositionRuns:
     """The runs of ISO 230-2."""
-    off = rows.value - rows.command * rows.line[1] - rows.line[0]
-    by_side = [[off[(rows.command == p) & (rows.side == side)] for p in rows.positions] for side in (1, -1)]
-    kept = [k for k in range(len(rows.positions)) if min(len(by_side[0][k]), len(by_side[1][k])) >= RUNS_MIN]
+    deviations = rows.value - rows.command * rows.line[1] - rows.line[0]
+    by_side = [[deviations[(rows.command == p) & (rows.side == side)] for p in rows.positions] for side in (1, -1)]
+    complete = [k for k in range(len(rows.positions)) if min(len(by_side[0][k]), len(by_side[1][k])) >= RUNS_MIN]
     tables = []
     for runs in by_side:
-        table = np.full((len(kept), max((len(runs[k]) for k in kept), default=0)), np.nan)
-        for row, k in enumerate(kept):
+        table = np.full((len(complete), max((len(runs[k]) for k in complete), default=0)), np.nan)
+        for row, k in enumerate(complete):
             table[row, : len(runs[k])] = runs[k]
         tables.append(table)
-    return PositionRuns(rows.positions[kept], *tables)
+    return PositionRuns(rows.positions[complete], *tables)
 
 
 def positioning_of(rows: AxisRows) -> Positioning | None:
-    """ISO 230-2 figures of the deviations from the line; None where nothing was read twice from both sides.
+    """ISO 230-2 figures of the deviations from the line; None where no position was read twice from both sides.
 
-    Its fields say degrees and are in the folder's unit; "up" is forward.
+    Fields named `_deg` are in the folder's unit; "up" is forward.
     """
     runs = position_runs(rows)
     return figures_of(runs.forward, runs.backward) if len(runs.position) else None
 
 
 def iso230_figures(rows: AxisRows) -> dict[str, float] | None:
-    """Those of the whole axis, by name, in the folder's unit."""
+    """ISO 230-2 figures of the axis, by name, in the folder's unit."""
     positioning = positioning_of(rows)
     if positioning is None:
         return None
-    of_axis = {name.replace("_up", "_forward").replace("_down", "_backward"): name for name in FIGURES}
-    return {name.removesuffix("_deg"): float(getattr(positioning, kept_as)) for name, kept_as in of_axis.items()}
+    field_of = {name.replace("_up", "_forward").replace("_down", "_backward"): name for name in FIGURES}
+    return {name.removesuffix("_deg"): float(getattr(positioning, field)) for name, field in field_of.items()}

@@ -1,8 +1,8 @@
-"""Moves and readings of somebody's table of an axis: one row is a move, a reading, or both; unit of the folder.
+"""Moves and readings of a foreign table of an axis: one row is a move, a reading, or both; unit of the folder.
 
-Rows that follow each other at the same command are readings of one stop; rows without a value are moves that nobody
-read. A column of directions says from which side a stop was reached; where the rows before do not lead there, the move
-that did is put in. What a table does not say is assumed and listed in words.
+Successive rows at the same command are readings of one stop; rows without a value are moves without a reading. A column
+of directions gives the side from which a stop was reached; where the previous rows lead to another side, the missing
+move is inserted. Assumptions about what the table does not state are listed in words.
 """
 
 from __future__ import annotations
@@ -39,58 +39,58 @@ from tvsbayes.single_axis.axis_campaign import AXIS_MOVES, READINGS, TURNS, Appr
 from tvsbayes.single_axis.axis_rows import turn_jumps
 from tvsbayes.single_axis.foreign_columns import positions_of_deviations
 
-WHOLE = 0.1
-"""Of a turn, by which play and errors of gears may make a jump differ from whole turns."""
+TURN_TOLERANCE = 0.1
+"""Largest deviation of a jump from whole turns by play and errors of gears, turns."""
 JUMP_SDS = 6.0
-"""Typical distances of steps from the line, beside two counts, by which a jump may miss a power of two."""
+"""Largest deviation of a jump from a power of two, in typical deviations of steps from the line, plus two counts."""
 BITS = range(8, 33)
-"""Of encoders that count modulo a power of two."""
-BEYOND = 0.05
-"""Of the range of commands, by which a move that no row lists is taken to have gone past a stop: more than any play."""
+"""Exponents of encoders that count modulo a power of two."""
+OVERSHOOT_SHARE = 0.05
+"""Assumed overshoot of an inserted move beyond a stop, as a share of the range of commands: more than any play."""
 CONTRARY_MIN = 4
-"""Rows whose direction is the opposite of their command's, all of them, from which on the sign is another."""
+"""Least number of rows with a direction opposite to their commands', for all of them, to refuse the sign."""
 FORWARD = {
     *("forward", "forwards", "fwd", "f", "+", "+1", "1", "up", "rising", "increasing", "positive", "pos", "below"),
     *("from below", "vorwarts", "vor", "hin", "aufwarts", "adelante", "subida", "avant", "aller", "\u2191", "\u2192"),
 }
-"""Words of a direction that is that of rising commands, without accents."""
+"""Words of the direction of rising commands, without accents."""
 BACKWARD = {
     *("backward", "backwards", "back", "bwd", "b", "rev", "reverse", "-", "-1", "down", "falling", "decreasing"),
     *("negative", "neg", "above", "from above", "ruckwarts", "zuruck", "ruck", "abwarts", "atras", "bajada"),
     *("arriere", "retour", "\u2193", "\u2190", "\u2212"),
 }
-_AGAIN = {"repeat", "repetition", "cycle", "zyklus", "wiederholung", "ciclo", "repeticion", "cycles", "rep"}
+_REPEAT_WORDS = {"repeat", "repetition", "cycle", "zyklus", "wiederholung", "ciclo", "repeticion", "cycles", "rep"}
 """Words of columns that count approaches to one stop."""
 
 _COLUMNS = {c.name: c for kind in (READINGS, AXIS_MOVES) for c in kind.columns.values() if c.names}
 AXIS_FIELDS = tuple(dict.fromkeys(("command", "value", *_COLUMNS)))
-"""All that a table of an axis can give."""
-_FOUND_BY_ENCODERS = {"position", "pos", "posicion", "counts", "zahler", "contador"}
-"""Words of commands that name what was read where another column is the command for certain."""
+"""All fields of a table of an axis."""
+_READING_WORDS = {"position", "pos", "posicion", "counts", "zahler", "contador"}
+"""Words of commands that mean readings where another column is surely the command."""
 _PERCENT = {"percent", "prozent", "pct"}
 _COVERAGE = re.compile(r"\bk\s*=?\s*([0-9]+(?:\.[0-9]+)?)\b")
-"""Of an expanded uncertainty, in the name of its column: the factor over the standard one (GUM, 6.2)."""
+"""Coverage factor in the name of a column of expanded uncertainties (GUM, 6.2)."""
 COVERAGE_USUAL = 2.0
 _TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura", "humidity"}
-"""Degrees of these are no angle."""
+"""Words of quantities whose degrees are no angle."""
 
 
 def axis_field_of(name: str) -> str | None:
-    """The field of an axis that a column's name tells of: by its first word that is known; shares of 100 are none."""
+    """The field of an axis that a column's name means: by its first known word; percentages are none."""
     if "%" in name or _PERCENT.intersection(words_of(name)):
         return None
     return field_by_word(words_of(name), _COLUMNS.values())
 
 
 def map_axis_columns(columns: Iterable[str], stated: Mapping[str, str] | None = None) -> ColumnMapping:
-    """Guess what columns of an axis are, as `map_columns`; some names are clear only beside others.
+    """Assigns columns of an axis to fields, as `map_columns`; some names depend on the other columns.
 
-    Beside "microsteps" a "position [um]" is what was read; where nothing else is, "mm" alone, or the one other column
-    that names a unit of readings, as "dial gauge mm".
+    With a column "microsteps" a "position [um]" is a reading; without any other reading, so is "mm" alone, or the only
+    other column with a unit of readings, as "dial gauge mm".
 
     Args:
         columns: their names.
-        stated: column by field of `AXIS_FIELDS`, where somebody has said it; an empty column: the table has none.
+        stated: column by field of `AXIS_FIELDS`, as the user states it; an empty column: the table has none.
 
     Raises:
         InputError: a field or column that does not exist.
@@ -99,22 +99,22 @@ def map_axis_columns(columns: Iterable[str], stated: Mapping[str, str] | None = 
     known = map_columns(names, given, AXIS_FIELDS, axis_field_of)
     if "value" in known.columns or "value" in known.ambiguous or "value" in given:
         return known
-    claims = known.ambiguous.get("command", ())
-    readings = [name for name in claims if _FOUND_BY_ENCODERS.intersection(words_of(name))]
-    sure = [name for name in claims if name not in readings]
+    ambiguous = known.ambiguous.get("command", ())
+    readings = [name for name in ambiguous if _READING_WORDS.intersection(words_of(name))]
+    rest = [name for name in ambiguous if name not in readings]
     units = [
         name
         for name in known.unused
         if (words := words_of(name)) and all(unit_of_name(word, READING_UNITS) for word in words)
     ]
-    if len(sure) == len(readings) == 1 and not units and (unit_of_name(readings[0], READING_UNITS) or not known.unused):
-        return map_columns(names, {**given, "command": sure[0], "value": readings[0]}, AXIS_FIELDS, axis_field_of)
+    if len(rest) == len(readings) == 1 and not units and (unit_of_name(readings[0], READING_UNITS) or not known.unused):
+        return map_columns(names, {**given, "command": rest[0], "value": readings[0]}, AXIS_FIELDS, axis_field_of)
     units = units or [
         name
         for name in known.unused
         if unit_of_name(name, READING_UNITS) and not _TEMPERATURE.intersection(words_of(name))
     ]
-    if len(units) == 1 and not claims:
+    if len(units) == 1 and not ambiguous:
         return map_columns(names, {**given, "value": units[0]}, AXIS_FIELDS, axis_field_of)
     return known
 
@@ -126,7 +126,7 @@ class LoggedDrive:
     Attributes:
         rate: commands per second.
         header: keys of `campaign.toml` that the log states.
-        period_between: seconds among which a period is looked for; None where the log is too short.
+        period_between: range of an unknown period, s; None where the log is too short.
         priors: entries of `[axis]`, value and u.
     """
 
@@ -138,15 +138,15 @@ class LoggedDrive:
 
 @dataclass(frozen=True)
 class ForeignReadings:
-    """Rows of `moves.csv` and `readings.csv`, and what the table does not say.
+    """Rows of `moves.csv` and `readings.csv`, and the assumptions about the table.
 
     Attributes:
         moves: rows.
         readings: rows.
-        assumed: in words, each with the option that overrules it where there is one.
-        unit: of readings where cells or the log say it.
+        assumed: in words, with the option that overrides the assumption, if any.
+        unit: of readings where cells or the log state it.
         drive: of a log of readings in motion.
-        notes: what was counted and left out.
+        notes: on rows used and left out.
     """
 
     moves: tuple[AxisMove, ...]
@@ -161,8 +161,8 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: boo
     """Moves and readings of a table.
 
     Args:
-        table: as it was read.
-        columns: its columns by field, of `AXIS_FIELDS`; "command" and "value" among them.
+        table: the foreign table.
+        columns: its columns by field of `AXIS_FIELDS`, with "command" and "value".
         deviations: whether the readings are actual less commanded position.
 
     Raises:
@@ -207,19 +207,19 @@ def _coverage_of(name: str) -> float | None:
 
 
 def _plain(table: ForeignTable, columns: Mapping[str, str], assumed: list[str]) -> tuple[ForeignTable, str | None]:
-    """A table with plain numbers for commands, readings and their u, and the unit that cells of readings state."""
+    """A table with plain numbers for commands, readings and their u, and the unit in the cells of readings."""
     units: dict[str, str | None] = {}
-    plain = dict(table.columns)
+    plain_columns = dict(table.columns)
     for field in ("command", "value", "u"):
         if field in columns:
             column = plain_column(columns[field], table.columns[columns[field]])
-            plain[columns[field]], units[field] = column.cells, column.unit
+            plain_columns[columns[field]], units[field] = column.cells, column.unit
             assumed += [column.remark] * bool(column.remark)
-    return replace(table, columns=plain), units.get("value")
+    return replace(table, columns=plain_columns), units.get("value")
 
 
 class _Stops:
-    """Moves of a table, row by row, with those that its column of directions implies.
+    """Moves of a table, row by row, including those implied by its column of directions.
 
     Attributes:
         moves: so far.
@@ -236,36 +236,36 @@ class _Stops:
         self._cells, self._commands, self._values, self._homings = cells, commands, values, homings
         self._sides = _sides(cells, commands, homings, assumed)
         self._temperatures = temperatures_of(cells, assumed)
-        again = [name for name in cells.table.columns if _AGAIN.intersection(words_of(name))]
-        self._counts = cells.table.columns[again[0]] if again else None
-        self._reach = BEYOND * (max(commands) - min(commands)) or 1.0
+        count_columns = [name for name in cells.table.columns if _REPEAT_WORDS.intersection(words_of(name))]
+        self._counts = cells.table.columns[count_columns[0]] if count_columns else None
+        self._reach = OVERSHOOT_SHARE * (max(commands) - min(commands)) or 1.0
         self._overshoots = self._went_past()
         self.moves: list[AxisMove] = []
-        self._put_in = self._again = 0
+        self._inserted = self._repeats = 0
         self._refuse_contrary()
 
     def _went_past(self) -> bool:
-        """Whether the axis went past an end and came back, where the side changes at one command.
+        """Whether the axis overshot and came back where the side changes at one command.
 
-        Either that or it was read again where it stood: readings that change there as they differ between the two sides
-        elsewhere say the first, in most such rows.
+        The alternative is a second reading at standstill. The axis overshot if in most such rows the readings change as
+        they differ between the two sides elsewhere.
         """
-        read: dict[float, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+        values_at: dict[float, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
         for command, side, value in zip(self._commands, self._sides, self._values, strict=True):
             if side and value is not None:
-                read[command][side].append(value)
-        gaps = [median(by_side[-1]) - median(by_side[1]) for by_side in read.values() if len(by_side) == 2]
+                values_at[command][side].append(value)
+        gaps = [median(by_side[-1]) - median(by_side[1]) for by_side in values_at.values() if len(by_side) == 2]
         gap = median(gaps) if gaps else 0.0
-        votes = []
+        is_overshoot = []
         for row in range(1, len(self._commands)):
-            value, before, side = self._values[row], self._values[row - 1], self._sides[row]
-            turned = self._commands[row] == self._commands[row - 1] and side * self._sides[row - 1] < 0
-            if turned and value is not None and before is not None:
-                votes.append(abs(value - before + side * gap) <= abs(value - before))
-        return 2 * sum(votes) >= len(votes)
+            value, previous, side = self._values[row], self._values[row - 1], self._sides[row]
+            reversed_here = self._commands[row] == self._commands[row - 1] and side * self._sides[row - 1] < 0
+            if reversed_here and value is not None and previous is not None:
+                is_overshoot.append(abs(value - previous + side * gap) <= abs(value - previous))
+        return 2 * sum(is_overshoot) >= len(is_overshoot)
 
     def _refuse_contrary(self) -> None:
-        """Refuse directions that say the opposite of what commands do, all of them."""
+        """Refuses directions that are all opposite to the commands."""
         steps = [b - a for a, b in zip(self._commands, self._commands[1:], strict=False)]
         moved = [row for row, step in enumerate(steps, start=1) if step and self._sides[row] and not self._homings[row]]
         contrary = [row for row in moved if self._sides[row] * steps[row - 1] < 0]
@@ -275,25 +275,25 @@ class _Stops:
             raise self._cells.refuse(contrary[0], "approach", allowed, remedy)
 
     def go(self, row: int, command: float, at_s: float | None) -> None:
-        """What a row says of where the axis went, at a time of the table or at the number of the move."""
+        """Adds the moves of a row, at a time of the table or at the number of the move."""
         homed = self._homings[row] or not self.moves
         side = self._sides[row]
         step = 0.0 if homed else command - self.moves[-1].command
         if not homed and side and side * step <= 0 and (step or self._turned(row, side)):
-            before = self.moves[-1].time_s
+            previous_s = self.moves[-1].time_s
             via = min(command, self.moves[-1].command) - self._reach
             if side < 0:
                 via = max(command, self.moves[-1].command) + self._reach
-            self._add(via, None if at_s is None else 0.5 * (before + at_s), homed=False)
-            self._put_in += 1
+            self._add(via, None if at_s is None else 0.5 * (previous_s + at_s), homed=False)
+            self._inserted += 1
             step = command - via
         if homed or step:
             self._add(command, at_s, homed=homed, side=side, temperature_degC=self._temperatures[row])
         else:
-            self._again += 1
+            self._repeats += 1
 
     def _turned(self, row: int, side: int) -> bool:
-        """Whether a stop at the command before was reached anew: from the other side, or as another repetition."""
+        """Whether a stop at the previous command was approached again: from the other side, or as a repetition."""
         if side == self._sides[row - 1] or not self._sides[row - 1]:
             return (
                 self._counts is not None and self._counts[row] != self._counts[row - 1] and bool(self._sides[row - 1])
@@ -316,11 +316,11 @@ class _Stops:
         self.moves.append(AxisMove(len(self.moves), segment, time_s, command, approach, temperature_degC))
 
     def remarks(self) -> list[str]:
-        """What was assumed of moves."""
+        """Assumptions about moves, in words."""
         sentences = []
-        if n := self._again:
+        if n := self._repeats:
             sentences.append(f"{n} row{'s' * (n > 1)} at the command before: read at that stop again, without a move")
-        if n := self._put_in:
+        if n := self._inserted:
             name = escaped(self._cells.columns["approach"])
             sentences.append(
                 f"{n} move{'s' * (n > 1)} put in, {self._reach:.6g} past the stop, where column {name} says another "
@@ -332,23 +332,23 @@ class _Stops:
 
 
 def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool], assumed: list[str]) -> list[int]:
-    """1 where a row's column of directions says forward, -1 backward, 0 where it says nothing.
+    """Direction of each row: 1 forward, -1 backward, 0 unstated.
 
-    Of two words that are not known the order of the commands tells which is which.
+    The order of the commands decides the meaning of two unknown words.
     """
     words = [word_of(text) for text in cells.text("approach")]
     sides = {**dict.fromkeys(("", "unknown"), 0), **dict.fromkeys(FORWARD, 1), **dict.fromkeys(BACKWARD, -1)}
-    listed = sorted(set(words) - {"", "unknown"})
-    if not set(listed) <= set(sides) and len(listed) == 2:
-        moved: dict[str, set[int]] = {word: set() for word in listed}
+    unknown_words = sorted(set(words) - {"", "unknown"})
+    if not set(unknown_words) <= set(sides) and len(unknown_words) == 2:
+        signs_of: dict[str, set[int]] = {word: set() for word in unknown_words}
         for row in range(1, len(words)):
             step = commands[row] - commands[row - 1]
-            if step and words[row] in moved and not homings[row]:
-                moved[words[row]].add(1 if step > 0 else -1)
-        signs = [next(iter(moved[word])) if len(moved[word]) == 1 else 0 for word in listed]
+            if step and words[row] in signs_of and not homings[row]:
+                signs_of[words[row]].add(1 if step > 0 else -1)
+        signs = [next(iter(signs_of[word])) if len(signs_of[word]) == 1 else 0 for word in unknown_words]
         if signs[0] * signs[1] < 0:
-            sides |= dict(zip(listed, signs, strict=True))
-            forward, backward = (escaped(listed[signs.index(side)], 24) for side in (1, -1))
+            sides |= dict(zip(unknown_words, signs, strict=True))
+            forward, backward = (escaped(unknown_words[signs.index(side)], 24) for side in (1, -1))
             assumed.append(f"approach: {forward} is forward and {backward} backward, as the commands rise and fall")
     for row, word in enumerate(words):
         if word not in sides:
@@ -359,28 +359,28 @@ def _sides(cells: FieldCells, commands: Sequence[float], homings: Sequence[bool]
 
 
 def unwrapped(wrapped: ForeignReadings, unit: str, counts_per_turn: float | None = None) -> ForeignReadings:
-    """The same with the whole turns added that an encoder or autocollimator which begins anew leaves out.
+    """The readings with whole turns added, where an encoder or autocollimator wraps.
 
     Args:
         wrapped: moves and readings.
-        unit: of the readings; those of no angle stay as they are unless they count to a power of two.
-        counts_per_turn: where readings begin anew, in their unit; 0: nowhere.
+        unit: of the readings; other units than of angles are unchanged unless the readings count to a power of two.
+        counts_per_turn: period of the wrapping, in their unit; 0: no wrapping.
 
     Raises:
-        InputError: readings jump by one number again and again, and nobody said that they begin anew there.
+        InputError: readings jump repeatedly by one number that is not stated as their period.
     """
     if counts_per_turn == 0:
         return wrapped
-    rows = [k for k, reading in enumerate(wrapped.readings) if reading.status == "ok" and reading.value is not None]
-    command = np.array([wrapped.moves[wrapped.readings[k].move].command for k in rows])
-    value = np.array([wrapped.readings[k].value for k in rows], dtype=float)
+    usable = [k for k, reading in enumerate(wrapped.readings) if reading.status == "ok" and reading.value is not None]
+    command = np.array([wrapped.moves[wrapped.readings[k].move].command for k in usable])
+    value = np.array([wrapped.readings[k].value for k in usable], dtype=float)
     turn = counts_per_turn or TURNS.get(unit) or _counts_of(command, value)
     jumps = turn_jumps(command, value, turn) if turn is not None else {}
-    # A wild reading jumps too, and back: by no whole turns.
-    if turn is None or not jumps or any(abs(far - round(far)) > WHOLE for far in jumps.values()):
+    # A wild reading jumps too, and back, but not by whole turns.
+    if turn is None or not jumps or any(abs(jump - round(jump)) > TURN_TOLERANCE for jump in jumps.values()):
         return wrapped
     readings, turns = list(wrapped.readings), 0
-    for row, k in enumerate(rows):
+    for row, k in enumerate(usable):
         turns -= round(jumps.get(row, 0.0))
         readings[k] = replace(readings[k], value=float(value[row]) + turn * turns)
     times = "once" if len(jumps) == 1 else f"{len(jumps)} times"
@@ -390,7 +390,7 @@ def unwrapped(wrapped: ForeignReadings, unit: str, counts_per_turn: float | None
 
 
 def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
-    """Where whole numbers begin anew: at the power of two that holds them all, if they jump by it.
+    """Period of wrapped whole numbers: the power of two that contains them all, if they jump by it.
 
     Raises:
         InputError: they jump by another number.
@@ -403,11 +403,11 @@ def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
     if turn is None or not jumps:
         return None
     typical = span * float(np.median(np.abs(list(jumps.values()))))
-    if any(abs(abs(far) * span / typical - 1.0) > WHOLE for far in jumps.values()):
+    if any(abs(abs(jump) * span / typical - 1.0) > TURN_TOLERANCE for jump in jumps.values()):
         return None
     rise, step = np.diff(value), np.diff(command)
-    rest = np.delete(rise - np.median(rise[step != 0] / step[step != 0]) * step, [row - 1 for row in jumps])
-    if abs(typical - turn) <= JUMP_SDS * float(np.median(np.abs(rest))) + 2.0:
+    residuals = np.delete(rise - np.median(rise[step != 0] / step[step != 0]) * step, [row - 1 for row in jumps])
+    if abs(typical - turn) <= JUMP_SDS * float(np.median(np.abs(residuals))) + 2.0:
         return turn
     found, allowed = f"readings that jump by about {typical:.0f} counts, {len(jumps)} times", "a continuous count"
     remedy = "say where the encoder begins anew, --counts-per-turn N; or that these are motions, --counts-per-turn 0"

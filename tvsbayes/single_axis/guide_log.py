@@ -1,8 +1,8 @@
 """Guide logs of PHD2: the motion of a mount's RA axis while it tracks a star, run by run.
 
 A run lies between "Guiding Begins" and "Guiding Ends". Distances are pixels on the sky, durations ms, times s since the
-run's begin. A pulse acts after its frame: the star's uncorrected motion is the raw distance plus the pulses of all
-frames before. Angles of the axis, arcsec: what is on the sky over cos(declination). No JAX.
+beginning of the run. A pulse acts after its frame: the star's uncorrected motion is the raw distance plus the pulses of
+all previous frames. Angles of the axis, arcsec: those on the sky over cos(declination). No JAX.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ SIDEREAL_ARCSEC_PER_S = 1296000.0 / 86164.0905
 BEGINS, ENDS = "Guiding Begins at ", "Guiding Ends"
 NEEDED = ("Time", "RARawDistance", "RADuration", "RADirection")
 DECLINATION_MAX_DEG = 85.0
-"""Above which 1 / cos(declination) makes more of the seeing than of the axis."""
+"""Largest declination: above it 1 / cos(declination) magnifies the seeing over the errors of the axis."""
 RATES_DIFFER = 0.1
-"""Of two rates of a pulse, a share from which on it is said that they differ."""
+"""Least relative difference of two rates of a pulse for a remark."""
 PRIORS = {"per_command": (1.0, 1e-3), "transmission_error": (0.0, 10.0)}
-"""Of `[axis]`, arcsec: refraction and polar alignment change the apparent rate by parts in 1000; periodic errors of
-worms are some arcsec to some tens of arcsec."""
+"""Priors of `[axis]`, arcsec: refraction and polar alignment change the apparent rate by parts in 1000; periodic errors
+of worms are some arcsec to some tens of arcsec."""
 ASSUMED = (
     "a pulse acts after its frame: motion = raw distance + W - E pulses of the frames before",
     "sign: positive where the star runs ahead of the mount, so that the axis lags and W pulses answer",
@@ -42,7 +42,7 @@ ASSUMPTIONS = {
     "pixel_arcsec": "scale of the guide camera, arcsec per pixel",
     "drive_arcsec_per_s": "rate of the drive: sidereal",
 }
-"""What `--assume` may state of a log."""
+"""Values that `--assume` may state, with their meaning."""
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _HEADER = {
     "pixel_arcsec": re.compile(rf"^Pixel scale = {_NUMBER} arc-sec/px"),
@@ -59,7 +59,7 @@ _MOUNT, _PIER = re.compile(r"^Mount = ([^,]*)"), re.compile(r"\bPier side = (\w+
 
 @dataclass
 class GuideRun:
-    """A run as the log has it.
+    """A run of the log.
 
     Attributes:
         number: from 1.
@@ -70,9 +70,9 @@ class GuideRun:
         header: numbers of the header by the names of `_HEADER`.
         frames: (line, time_s, raw distance px, pulse ms with W positive, settling) of frames with a star.
         dropped: (line, time_s) of frames without one.
-        breaks: places among `frames` before which the zero is another: dithers, new lock positions, settling, pauses.
-        counts: of what happened, in words.
-        ended: whether the log says that it ended.
+        breaks: indices of `frames` with a new zero: after dithers, new lock positions, settling, pauses.
+        counts: of events by name.
+        ended: whether the log has its end.
     """
 
     number: int
@@ -89,12 +89,12 @@ class GuideRun:
 
     @property
     def minutes(self) -> float:
-        """From the first frame to the last."""
+        """Time from the first frame to the last."""
         return (self.frames[-1][1] - self.frames[0][1]) / 60.0 if self.frames else 0.0
 
     @property
     def settling(self) -> int:
-        """Frames while the mount settled."""
+        """Number of frames while the mount settled."""
         return sum(frame[4] for frame in self.frames)
 
 
@@ -104,17 +104,17 @@ def is_guide_log(text: str) -> bool:
 
 
 def read_runs(text: str, file: str) -> list[GuideRun]:
-    """The runs of a log, those without a frame left out.
+    """The runs of a log, without those that have no frame.
 
     Raises:
-        InputError: no run, or a table of frames without a column that is needed.
+        InputError: no run, or a table of frames without a required column.
     """
     runs: list[GuideRun] = []
     run: GuideRun | None = None
     columns: list[str] | None = None
     settling, calibrating, calibration_steps = False, False, 0
-    for number, raw in enumerate(text.splitlines(), start=1):
-        line = raw.strip()
+    for number, text_line in enumerate(text.splitlines(), start=1):
+        line = text_line.strip()
         if line.startswith(BEGINS):
             run, columns, settling, calibrating = (
                 GuideRun(len(runs) + 1, number, line[len(BEGINS) :]),
@@ -136,20 +136,20 @@ def read_runs(text: str, file: str) -> list[GuideRun]:
             settling = _event(run, line, settling)
         elif line.startswith("Frame,"):
             columns = line.split(",")
-            if lacking := [name for name in NEEDED if name not in columns]:
-                found, remedy = f"no column {', '.join(lacking)}", "export the log of the guider as it was written"
+            if missing := [name for name in NEEDED if name not in columns]:
+                found, remedy = f"no column {', '.join(missing)}", "export the log of the guider as it was written"
                 raise refusal("csv", file=file, line=number, found=found, allowed=", ".join(NEEDED), remedy=remedy)
         elif columns is None:
             _header(run, line)
         else:
             _frame(run, number, line, columns, settling)
-    kept = [one for one in runs if one.frames]
-    for k, one in enumerate(kept, start=1):
-        one.number = k
-    if not kept:
+    runs_kept = [run for run in runs if run.frames]
+    for k, run in enumerate(runs_kept, start=1):
+        run.number = k
+    if not runs_kept:
         found, remedy = "no run with frames", "give a log that holds guiding, not calibration alone"
         raise refusal("empty", file=file, found=found, allowed=f'frames after "{BEGINS.strip()}"', remedy=remedy)
-    return kept
+    return runs_kept
 
 
 def _header(run: GuideRun, line: str) -> None:
@@ -163,7 +163,7 @@ def _header(run: GuideRun, line: str) -> None:
 
 
 def _event(run: GuideRun, line: str, settling: bool) -> bool:
-    """What an INFO line says of the frames that follow; whether the mount settles from here on."""
+    """Applies an INFO line to the run; returns whether the mount settles from here on."""
     if "Settling started" in line:
         run.breaks.add(len(run.frames))
         return True
@@ -182,28 +182,28 @@ def _event(run: GuideRun, line: str, settling: bool) -> bool:
 
 
 def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settling: bool) -> None:
-    """A row of the table; one that is cut off or of no frame of the mount is counted."""
+    """Adds a row of the table to the run; a truncated row, or one of another device, is only counted."""
     try:
         cells = dict(zip(columns, next(csv.reader([line])), strict=False))
-        time_s, kind = float(cells["Time"]), cells.get("mount", "Mount")
+        time_s, device = float(cells["Time"]), cells.get("mount", "Mount")
         last = max((run.frames[-1][1] if run.frames else 0.0, run.dropped[-1][1] if run.dropped else 0.0))
         if time_s < last or not math.isfinite(time_s):
             run.counts["damaged row"] += 1
-        elif kind == "DROP" or cells["RARawDistance"] == "":
+        elif device == "DROP" or cells["RARawDistance"] == "":
             run.dropped.append((number, time_s))
-        elif kind != "Mount":
-            run.counts[f"rows of {escaped(kind, 12)}"] += 1
+        elif device != "Mount":
+            run.counts[f"rows of {escaped(device, 12)}"] += 1
         else:
             raw, pulse_ms = float(cells["RARawDistance"]), float(cells["RADuration"] or 0)
-            way = {"W": 1.0, "E": -1.0, "": 0.0}[cells["RADirection"].strip()[:1].upper()]
-            run.frames.append((number, time_s, raw, way * pulse_ms, settling))
+            sign = {"W": 1.0, "E": -1.0, "": 0.0}[cells["RADirection"].strip()[:1].upper()]
+            run.frames.append((number, time_s, raw, sign * pulse_ms, settling))
             run.counts["frame with a saturated star"] += cells.get("ErrorCode") == "1"
     except (KeyError, ValueError, csv.Error, StopIteration):
         run.counts["damaged row"] += 1
 
 
 def run_rows(runs: Sequence[GuideRun]) -> list[dict[str, object]]:
-    """A row a run, for the list that is printed where a log holds several."""
+    """A row for each run, for the printed list of a log with several."""
     return [
         {
             "run": run.number,
@@ -223,7 +223,7 @@ def run_rows(runs: Sequence[GuideRun]) -> list[dict[str, object]]:
 
 @dataclass(frozen=True)
 class _Scale:
-    """Numbers that turn a log into angles of the axis, and their sources in words."""
+    """Conversion of a log to angles of the axis, and its sources in words."""
 
     pixel_arcsec: float
     cos_declination: float
@@ -233,10 +233,10 @@ class _Scale:
 
 
 def _scale(run: GuideRun, stated: Mapping[str, float], file: str) -> _Scale:
-    """Of a run.
+    """The conversion of a run.
 
     Raises:
-        InputError: what the log does not state, with the option that does.
+        InputError: a number that the log does not state, with the option that does.
     """
     known = {**run.header, **stated}
 
@@ -266,25 +266,25 @@ def _scale(run: GuideRun, stated: Mapping[str, float], file: str) -> _Scale:
     return _Scale(pixel, cosine, pulse, drive, tuple(assumed))
 
 
-def _logged_pulse(run: GuideRun, known: Mapping[str, float], sky: float, cosine: float, assumed: list[str]) -> float:
-    """What a pulse turns the axis by, arcsec/s: xRate is that of the run's declination or of the calibration's.
+def _logged_pulse(run: GuideRun, known: Mapping[str, float], x_rate: float, cosine: float, assumed: list[str]) -> float:
+    """Rate of the axis during a pulse, arcsec/s: xRate is that at the run's declination or at the calibration's.
 
     Args:
         run: for its pulses.
         known: numbers of the header.
-        sky: xRate times pixel scale, arcsec/s.
+        x_rate: xRate times pixel scale, arcsec/s.
         cosine: of the declination.
         assumed: sentences, to which the source is added.
     """
     calibration = known.get("calibration_deg")
-    of_run, where = sky / cosine, "at the run's declination"
-    pulse = of_run
+    rate_of_run, source = x_rate / cosine, "at the run's declination"
+    pulse = rate_of_run
     if calibration is not None and abs(calibration) < 90:
-        of_calibration = sky / math.cos(math.radians(calibration))
-        norm = known.get("at_equator")
-        if norm is None or abs(of_calibration - norm) < abs(of_run - norm):
-            pulse, where = of_calibration, f"at the calibration's declination of {calibration:g} deg"
-    text = f"pulses turn the axis by {pulse:.4g} arcsec/s: xRate {sky:.4g} arcsec/s on the sky, taken {where}"
+        rate_of_calibration = x_rate / math.cos(math.radians(calibration))
+        rate_at_equator = known.get("at_equator")
+        if rate_at_equator is None or abs(rate_of_calibration - rate_at_equator) < abs(rate_of_run - rate_at_equator):
+            pulse, source = rate_of_calibration, f"at the calibration's declination of {calibration:g} deg"
+    text = f"pulses turn the axis by {pulse:.4g} arcsec/s: xRate {x_rate:.4g} arcsec/s on the sky, taken {source}"
     if (speed := known.get("guide_speed")) and abs(pulse / speed - 1) > RATES_DIFFER:
         text += f"; the mount's guide speed is {speed:g}, {100 * (speed / pulse - 1):+.0f} %"
     assumed.append(f"{text}; --assume pulse_arcsec_per_s=")
@@ -297,45 +297,45 @@ def readings_of_run(run: GuideRun, file: str, stated: Mapping[str, float]) -> Fo
     Args:
         run: of the log.
         file: its name.
-        stated: numbers by the names of `ASSUMPTIONS`, which count before those of the log.
+        stated: numbers by the names of `ASSUMPTIONS`, which override those of the log.
 
     Raises:
-        InputError: a number that neither says, or fewer than three frames that can be used.
+        InputError: a number that neither states, or fewer than three usable frames.
     """
     scale = _scale(run, stated, file)
     moves: list[AxisMove] = []
-    taken: list[tuple[float, int, float | None, str]] = []
-    pulsed, waiting = 0.0, True
+    frames: list[tuple[float, int, float | None, str]] = []
+    pulse_sum, needs_move = 0.0, True
     for k, (_, time_s, raw, pulse_ms, settling) in enumerate(run.frames):
-        waiting = waiting or k in run.breaks
+        needs_move = needs_move or k in run.breaks
         status, value = "settling" if settling else "ok", None
         if not settling:
-            if waiting:
+            if needs_move:
                 command = round(scale.drive_arcsec_per_s * time_s, 6)
                 moves.append(AxisMove(len(moves), len(moves), time_s, command, "forward"))
-                pulsed, waiting = 0.0, False
-            motion = raw * scale.pixel_arcsec / scale.cos_declination + pulsed
+                pulse_sum, needs_move = 0.0, False
+            motion = raw * scale.pixel_arcsec / scale.cos_declination + pulse_sum
             value = scale.drive_arcsec_per_s * time_s + motion
-        taken.append((time_s, len(moves) - 1, value, status))
-        pulsed += pulse_ms / 1000.0 * scale.pulse_arcsec_per_s
-    used = sum(value is not None for _, _, value, _ in taken)
+        frames.append((time_s, len(moves) - 1, value, status))
+        pulse_sum += pulse_ms / 1000.0 * scale.pulse_arcsec_per_s
+    used = sum(value is not None for _, _, value, _ in frames)
     if used < 3:
         remedy = "name another run with --run"
         raise refusal("empty", file=file, line=run.line, found=f"{used} frames", allowed="three or more", remedy=remedy)
     # A frame before the first stretch belongs to no move.
-    taken += [(time_s, -1, None, "dropped") for _, time_s in run.dropped]
-    begins = [move.time_s for move in moves]
+    frames += [(time_s, -1, None, "dropped") for _, time_s in run.dropped]
+    starts_s = [move.time_s for move in moves]
     rows = [
-        (time_s, max(0, sum(at <= time_s for at in begins) - 1) if move < 0 else move, value, status)
-        for time_s, move, value, status in sorted(taken, key=lambda row: row[0])
-        if time_s >= begins[0]
+        (time_s, max(0, sum(start_s <= time_s for start_s in starts_s) - 1) if move < 0 else move, value, status)
+        for time_s, move, value, status in sorted(frames, key=lambda row: row[0])
+        if time_s >= starts_s[0]
     ]
     readings = tuple(
         Reading(k, move, None if value is None else round(value, 4), 0.0, status, time_s)
         for k, (time_s, move, value, status) in enumerate(rows)
     )
     drive = LoggedDrive(scale.drive_arcsec_per_s, _header_of(run, file), _between(rows), PRIORS)
-    notes = (_counted(run, used, len(moves)), *_remarks(run))
+    notes = (_frames_text(run, used, len(moves)), *_remarks(run))
     return ForeignReadings(tuple(moves), readings, (*scale.assumed, *ASSUMED), "arcsec", drive, notes)
 
 
@@ -343,29 +343,29 @@ def _several(count: int, name: str) -> str:
     return f"{count} {name}{'s' * (count != 1)}"
 
 
-def _counted(run: GuideRun, used: int, stretches: int) -> str:
-    """What is used and what is left out."""
+def _frames_text(run: GuideRun, used: int, stretches: int) -> str:
+    """Numbers of frames used and left out, in words."""
     events = [f"{run.settling} while settling", f"{len(run.dropped)} dropped"]
     events += [_several(n, name) for name in ("damaged row", "calibration step") if (n := run.counts[name])]
     events += [f"{n} {name}" for name, n in run.counts.items() if name.startswith("rows of") and n]
     text = f"frames: {used} used of {len(run.frames) + len(run.dropped)} ({', '.join(events)} left out)"
-    broken = [_several(run.counts["dither"], "dither"), *([_several(n, "pause")] if (n := run.counts["pause"]) else [])]
+    breaks = [_several(run.counts["dither"], "dither"), *([_several(n, "pause")] if (n := run.counts["pause"]) else [])]
     words = "of its own each" if stretches > 1 else "of its own"
-    return f"{text}; {stretches} stretch{'es' * (stretches != 1)} with a zero {words} ({', '.join(broken)})"
+    return f"{text}; {stretches} stretch{'es' * (stretches != 1)} with a zero {words} ({', '.join(breaks)})"
 
 
 def _remarks(run: GuideRun) -> list[str]:
-    """What else a reader should know of a run."""
+    """Further remarks on a run."""
     remarks = [f"pier side {run.pier}"]
     if not run.ended:
         remarks.append("the log does not say that the run ended: it may be cut off")
     times = [frame[1] for frame in run.frames]
     step = median([b - a for a, b in pairwise(times)] or [0.0])
     pulses = [abs(frame[3]) for frame in run.frames]
-    if late := sum(p > 1000.0 * step for p in pulses):
-        remarks.append(f"{late} pulses last longer than the {step:.2g} s between frames and act in part later")
-    if (most := run.header.get("pulse_max_ms")) and (capped := sum(p >= most for p in pulses)):
-        remarks.append(f"{capped} pulses at their limit of {most:g} ms")
+    if long_pulses := sum(p > 1000.0 * step for p in pulses):
+        remarks.append(f"{long_pulses} pulses last longer than the {step:.2g} s between frames and act in part later")
+    if (limit_ms := run.header.get("pulse_max_ms")) and (at_limit := sum(p >= limit_ms for p in pulses)):
+        remarks.append(f"{at_limit} pulses at their limit of {limit_ms:g} ms")
     if n := run.counts["frame with a saturated star"]:
         remarks.append(f"{n} frame{'s' * (n > 1)} with a saturated star, used")
     if n := run.counts["change of the RA algorithm"]:
@@ -383,6 +383,6 @@ def _header_of(run: GuideRun, file: str) -> dict[str, object]:
 
 
 def _between(rows: Sequence[tuple[float, int, float | None, str]]) -> tuple[float, float] | None:
-    """Periods, s, among which a search makes sense: from a minute to a third of the run; None of a short run."""
+    """Range of periods, s, for a search: from a minute to a third of the run; None of a short run."""
     span_s = rows[-1][0] - rows[0][0]
     return (60.0, round(span_s / 3.0, 0)) if span_s > 360.0 else None

@@ -1,4 +1,4 @@
-"""Hold-out of one axis: every commanded position left out in turn, fitted without it, predicted."""
+"""Hold-out of one axis: every commanded position is left out in turn and predicted by a fit of the others."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.classic_line import fit_line
-from tvsbayes.single_axis.predicted_stops import PredictedStops, carried_scales
+from tvsbayes.single_axis.predicted_stops import PredictedStops, transferred_scales
 from tvsbayes.statistics.intervals import NORMAL_95, rms
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
-DRAWS, HELD_ROUNDS = 300, 2
-"""Draws that predict, of every fit without a position, and its rounds of importance sampling at least."""
+DRAWS, ROUNDS_MIN = 300, 2
+"""Number of draws of a prediction by a fit without the position, and least number of rounds of importance sampling."""
 POSITIONS_MIN, POSITIONS_MAX = 3, 200
-REFITTED_MAX, WEIGHED, WEIGHED_MIN = 30, 400, 80
-"""Positions up to which each has a fit of its own; beyond, draws of one fit are weighted, as long as so many of them
-count. `POSITIONS_MAX` are predicted at most."""
+REFITTED_MAX, DRAWS_WEIGHTED, EFFECTIVE_MIN = 30, 400, 80
+"""Largest number of positions with a fit for each; for more, draws of one fit are weighted, if so many of them are
+effective. At most `POSITIONS_MAX` are predicted."""
 
 
 def _means_of(rows: AxisRows, members: np.ndarray) -> tuple[np.ndarray, int]:
-    """Weights (rows,) of the mean of all readings in these rows, and how many there are."""
+    """Weights (rows,) of the mean of all readings in these rows, and the number of readings."""
     count = rows.count[members]
     return count / count.sum(), int(count.sum())
 
@@ -40,40 +40,40 @@ def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray
     """Mean of rows `members` by offset, scale and play fitted to the rows that are not left out, and its u."""
     line = fit_line(rows, ~left_out)
     weights, _ = _means_of(rows, members)
-    at = weights @ line_design(rows)[members]
-    variance = float(at @ line.covariance @ at + line.scatter**2 * weights @ weights)
-    return float(at @ line.solved), float(np.sqrt(variance))
+    design_row = weights @ line_design(rows)[members]
+    variance = float(design_row @ line.covariance @ design_row + line.scatter**2 * weights @ weights)
+    return float(design_row @ line.solution), float(np.sqrt(variance))
 
 
 @dataclass(frozen=True)
 class _Prediction:
-    """Of the rows left out: mean (rows,), covariance (rows, rows), and what is wrong with them, or ""."""
+    """Prediction of the rows left out: mean (rows,), covariance (rows, rows), and its fault in words, or ""."""
 
     mean: np.ndarray
     covariance: np.ndarray
     fault: str = ""
 
 
-def _reweighted(model: AxisModel, w: np.ndarray, left: np.ndarray) -> _Prediction | None:
-    """By draws (n, d) of the posterior of all rows, weighted by what each makes of those left out.
+def _reweighted(model: AxisModel, w: np.ndarray, rows: np.ndarray) -> _Prediction | None:
+    """Prediction by draws (n, d) of the posterior of all rows, weighted for those left out.
 
     None where the weights cannot be trusted. Leave-one-out by importance (Vehtari, Gelman and Gabry, Stat. Comput. 27
     (2017) 1413), whole positions left out.
     """
-    stops = PredictedStops(*model.left_out(w, left), {})
-    smooth = smoothed_weights(-stops.log_densities(model.rows.value[left]))
-    if not smooth.pareto_k < K_MAX or effective_draws(smooth.weights) < WEIGHED_MIN:
+    stops = PredictedStops(*model.left_out(w, rows), {})
+    smoothed = smoothed_weights(-stops.log_densities(model.rows.value[rows]))
+    if not smoothed.pareto_k < K_MAX or effective_draws(smoothed.weights) < EFFECTIVE_MIN:
         return None
-    return _Prediction(*stops.pooled(smooth.weights))
+    return _Prediction(*stops.pooled(smoothed.weights))
 
 
-def _refitted(model: AxisModel, out: np.ndarray, seed: int) -> _Prediction:
-    """By a fit of the rows that are not left out."""
-    without = AxisModel.of(model.rows.without(out), model.priors, None, model.coordinates.waves)
+def _refitted(model: AxisModel, left_out: np.ndarray, seed: int) -> _Prediction:
+    """Prediction by a fit of the other rows."""
+    reduced = AxisModel.of(model.rows.without(left_out), model.priors, None, model.coordinates.waves)
     rng = random_stream(seed, AxisStream.HELD_OUT)
-    drawn = _drawn(without, DRAWS, seed, rng)
-    w = carried_scales(without, drawn.w, model, rng)
-    return _Prediction(*PredictedStops(*model.left_out(w, np.flatnonzero(out)), {}).pooled(), drawn.fault)
+    sample = _equal_draws(reduced, DRAWS, seed, rng)
+    w = transferred_scales(reduced, sample.w, model, rng)
+    return _Prediction(*PredictedStops(*model.left_out(w, np.flatnonzero(left_out)), {}).pooled(), sample.fault)
 
 
 def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | None = None) -> AxisHoldOut:
@@ -82,7 +82,7 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
     Args:
         campaign: from `read_axis`.
         seed: of everything random.
-        progress: told how far it is.
+        progress: shows the progress.
 
     Raises:
         NothingToEstimate: fewer than three positions, or what `fit_axis` refuses.
@@ -103,22 +103,22 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
     if len(positions) > POSITIONS_MAX:
         warnings.append(f"of {len(positions)} positions {POSITIONS_MAX} are left out in turn, evenly chosen")
         positions = positions[np.linspace(0, len(positions) - 1, POSITIONS_MAX).astype(int)]
-    drawn = None
+    draws = None
     with Job({"hold-out": 1.0}, progress) as job:
         for number, position in enumerate(positions):
             job.at(number / len(positions), f"position {position:.10g}")
-            out = rows.command == position
-            if len(np.unique(rows.command[~out])) < 2 or (~out).sum() < 3:
+            left_out = rows.command == position
+            if len(np.unique(rows.command[~left_out])) < 2 or (~left_out).sum() < 3:
                 warnings.append(f"position {position:.10g}: too few readings elsewhere to predict it")
                 continue
-            left, predicted = np.flatnonzero(out), None
+            rows_left_out, prediction = np.flatnonzero(left_out), None
             if len(positions) > REFITTED_MAX:
-                drawn = _whole_draws(model, seed) if drawn is None else drawn
-                predicted = _reweighted(model, drawn, left)
-            predicted = predicted or _refitted(model, out, seed + number)
-            if predicted.fault:
-                warnings.append(f"position {position:.10g}: {predicted.fault}")
-            predictions += _scored(rows, position, left, predicted.mean, predicted.covariance)
+                draws = _draws_of_all_rows(model, seed) if draws is None else draws
+                prediction = _reweighted(model, draws, rows_left_out)
+            prediction = prediction or _refitted(model, left_out, seed + number)
+            if prediction.fault:
+                warnings.append(f"position {position:.10g}: {prediction.fault}")
+            predictions += _scores(rows, position, rows_left_out, prediction.mean, prediction.covariance)
     return AxisHoldOut(
         positions=tuple(predictions),
         rms_z=rms([p.z for p in predictions]),
@@ -128,45 +128,45 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
     )
 
 
-def _whole_draws(model: AxisModel, seed: int) -> np.ndarray:
-    """Coordinates (`WEIGHED`, d) of the scales by all rows."""
+def _draws_of_all_rows(model: AxisModel, seed: int) -> np.ndarray:
+    """Coordinates (`DRAWS_WEIGHTED`, d) of the scales by all rows."""
     rng = random_stream(seed, AxisStream.HELD_OUT_BY_WEIGHTS)
-    return _drawn(model, WEIGHED, seed, rng).w
+    return _equal_draws(model, DRAWS_WEIGHTED, seed, rng).w
 
 
 @dataclass(frozen=True)
-class _Drawn:
-    """Coordinates (n, d) of equal draws, and what their sample lacks, or ""."""
+class _EqualDraws:
+    """Coordinates (n, d) of equal draws, and the fault of their sample in words, or ""."""
 
     w: np.ndarray
     fault: str
 
 
-def _drawn(model: AxisModel, count: int, seed: int, rng: np.random.Generator) -> _Drawn:
-    """By importance sampling."""
+def _equal_draws(model: AxisModel, count: int, seed: int, rng: np.random.Generator) -> _EqualDraws:
+    """Equal draws by importance sampling."""
     mode = find_mode(model)
     if not len(mode.w):
-        return _Drawn(np.zeros((count, 0)), "; ".join(mode.missing))
-    sample = weighted_run(AxisDensity(model, mode), seed, rounds_least=HELD_ROUNDS, pilots_max=PILOT_ROUNDS).sample
-    return _Drawn(sample.equal(count, rng), "; ".join(sample.convergence.missing))
+        return _EqualDraws(np.zeros((count, 0)), "; ".join(mode.missing))
+    sample = weighted_run(AxisDensity(model, mode), seed, rounds_least=ROUNDS_MIN, pilots_max=PILOT_ROUNDS).sample
+    return _EqualDraws(sample.equal(count, rng), "; ".join(sample.convergence.missing))
 
 
-def _scored(
-    rows: AxisRows, position: float, left: np.ndarray, mean: np.ndarray, covariance: np.ndarray
+def _scores(
+    rows: AxisRows, position: float, rows_left_out: np.ndarray, mean: np.ndarray, covariance: np.ndarray
 ) -> list[HeldOutReadings]:
-    """The position from each side it was reached from."""
+    """Scores of the position by side of approach."""
     predictions = []
-    out = rows.command == position
+    left_out = rows.command == position
     for side in (1, -1, 0):
-        mine = np.flatnonzero(rows.side[left] == side)
-        if not len(mine):
+        of_side = np.flatnonzero(rows.side[rows_left_out] == side)
+        if not len(of_side):
             continue
-        members = left[mine]
+        members = rows_left_out[of_side]
         weights, n = _means_of(rows, members)
-        predicted = float(weights @ mean[mine])
-        u = float(np.sqrt(weights @ covariance[np.ix_(mine, mine)] @ weights))
-        z = (rows.value[members] - mean[mine]) / np.sqrt(np.diag(covariance)[mine])
-        classic, classic_u = classic_prediction(rows, out, members)
+        predicted = float(weights @ mean[of_side])
+        u = float(np.sqrt(weights @ covariance[np.ix_(of_side, of_side)] @ weights))
+        z = (rows.value[members] - mean[of_side]) / np.sqrt(np.diag(covariance)[of_side])
+        classic_mean, classic_u = classic_prediction(rows, left_out, members)
         predictions.append(
             HeldOutReadings(
                 position=float(position),
@@ -177,7 +177,7 @@ def _scored(
                 u=u,
                 rows=len(members),
                 inside=int(np.sum(np.abs(z) <= NORMAL_95)),
-                classic_predicted=classic,
+                classic_predicted=classic_mean,
                 classic_u=classic_u,
                 end=position in (rows.positions[0], rows.positions[-1]),
             )

@@ -1,7 +1,7 @@
-"""Logs that hold the command and the reading of an axis as two series, each with its own times: EPICS, Klipper.
+"""Logs with the command and the reading of an axis as two series, each with its own times: EPICS, Klipper.
 
-A value is logged when it changes. A reading gets the command of its time: interpolated while the command changes,
-held where it stands. The result is a table, as `read_foreign` gives one.
+A value is logged when it changes. A reading gets the command of its time: interpolated while the command changes, else
+the last one. The result is a table, as that of `read_foreign`.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.files.foreign_table import ForeignTable, table_of
 from tvsbayes.instrument.column_names import words_of
 
-STANDS = 5.0
-"""Typical intervals of a series from which on nothing changed in between: its value stood still."""
-SAME_S = 1e-6
-"""Times closer than this are one."""
+STANDSTILL_INTERVALS = 5.0
+"""An interval of so many typical ones means a standstill: the value did not change in between."""
+EQUAL_S = 1e-6
+"""Times closer than this are equal."""
 ROWS_KEPT = 2000
-"""Joined rows, as many as a fit takes; of more every n-th is kept."""
+"""Largest number of joined rows, as many as a fit takes; of more rows, every n-th is used."""
 INFLATED_BYTES_MAX = 256 * 2**20
 KLIPPER_TURN = 65536
-"""Of an angle sensor in Klipper (klippy/extras/angle.py, ANGLE_BITS)."""
+"""Counts per turn of an angle sensor in Klipper (klippy/extras/angle.py, ANGLE_BITS)."""
 STEPS_MAX = 20_000_000
 _CAMONITOR = re.compile(
     r"(?P<name>\S+)\s+(?:\(\S+\)\s*)?(?P<time>\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(?:\.\d+)?)\s+"
     r"(?P<value>\S+)(?:\s+(?P<rest>\S.*))?"
 )
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_READ = ("encoder", "enc", "ssi", "biss", "endat", "absolute", "reading", "measured", "interferometer")
-_COMMANDED = ("axis", "motor", "setpoint", "sp", "val", "command", "cmd", "steps", "step", "counter", "demand")
+_READING_WORDS = ("encoder", "enc", "ssi", "biss", "endat", "absolute", "reading", "measured", "interferometer")
+_COMMAND_WORDS = ("axis", "motor", "setpoint", "sp", "val", "command", "cmd", "steps", "step", "counter", "demand")
 
 
 @dataclass(frozen=True)
 class Series:
-    """Values as they changed.
+    """Values by time, logged at changes.
 
     Attributes:
-        times_s: rising, shape (n,).
+        times_s: ascending, shape (n,).
         values: shape (n,).
     """
 
@@ -53,7 +53,7 @@ class Series:
 
     @property
     def changes(self) -> bool:
-        """Whether it holds more than one value."""
+        """Whether it has more than one value."""
         return len(np.unique(self.values)) > 1
 
 
@@ -64,7 +64,7 @@ def is_camonitor(text: str) -> bool:
 
 
 def is_klipper(data: bytes) -> bool:
-    """Whether a file is a log of Klipper's data logger, packed or not, or a configuration with an angle sensor."""
+    """Whether a file is a log of Klipper's data logger, compressed or not, or a configuration with an angle sensor."""
     head = data[:100000]
     return (
         data.startswith(b"\x1f\x8b")
@@ -80,13 +80,13 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
     Args:
         text: of the log.
         file: its name, for messages.
-        stated: name of a series by `command` or `value`, where somebody has said it.
+        stated: name of a series by `command` or `value`, as the user states it.
 
     Raises:
-        InputError: no pair that is surely command and reading, or no time at which both are known.
+        InputError: no unique pair of command and reading, or no time at which both are known.
     """
     by_name: dict[str, list[tuple[float, float]]] = {}
-    left_out, begin = 0, None
+    left_out, start = 0, None
     for line in text.splitlines():
         match = _CAMONITOR.fullmatch(line.strip())
         if match is None:
@@ -97,9 +97,9 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
             by_name.setdefault(match["name"], [])
             left_out += 1
             continue
-        when = datetime.datetime.fromisoformat(match["time"])
-        begin = begin or when
-        by_name.setdefault(match["name"], []).append(((when - begin).total_seconds(), float(match["value"])))
+        date_time = datetime.datetime.fromisoformat(match["time"])
+        start = start or date_time
+        by_name.setdefault(match["name"], []).append(((date_time - start).total_seconds(), float(match["value"])))
     series = {name: _series(rows) for name, rows in by_name.items() if rows}
     command, value = _pair(series, file, stated)
     kind = f"EPICS camonitor, {len(by_name)} series, {left_out} lines without a number left out"
@@ -107,40 +107,40 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
 
 
 def _series(rows: Sequence[tuple[float, float]]) -> Series:
-    """Rows in order of time; of several at one time the last."""
+    """Rows in order of time; the last of several at one time."""
     ordered = sorted(enumerate(rows), key=lambda row: (row[1][0], row[0]))
     times = np.array([row[0] for _, row in ordered])
-    kept = np.r_[np.diff(times) > SAME_S, True]
-    return Series(times[kept], np.array([row[1] for _, row in ordered])[kept])
+    is_last = np.r_[np.diff(times) > EQUAL_S, True]
+    return Series(times[is_last], np.array([row[1] for _, row in ordered])[is_last])
 
 
 def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) -> tuple[str, str]:
     """Names of the command and of the reading: as stated, else by words in their names.
 
     Raises:
-        InputError: nobody can tell.
+        InputError: the names do not determine the pair.
     """
-    changing = [name for name, one in series.items() if one.changes]
+    changing = [name for name, values in series.items() if values.changes]
     listed = ", ".join(f"{escaped(name)} ({len(series[name].times_s)} values)" for name in changing) or "none"
     for field in ("command", "value"):
         if (name := stated.get(field)) and name not in series:
             message = f"--column {field}={escaped(name)}: no such series; allowed: {listed}"
             raise InputError("usage", message, allowed=listed, remedy="name one of them")
     free = [name for name in changing if name not in stated.values()]
-    known = {field: name for field in ("command", "value") if (name := stated.get(field))}
-    for field, words in (("value", _READ), ("command", _COMMANDED)):
+    names = {field: name for field in ("command", "value") if (name := stated.get(field))}
+    for field, words in (("value", _READING_WORDS), ("command", _COMMAND_WORDS)):
         matching = [name for name in free if set(words_of(name)).intersection(words)]
-        if field not in known and len(matching) == 1:
-            known[field] = matching[0]
+        if field not in names and len(matching) == 1:
+            names[field] = matching[0]
             free.remove(matching[0])
-    lacking = [field for field in ("command", "value") if field not in known]
-    if len(lacking) == 1 and len(free) == 1:
-        known[lacking[0]] = free[0]
-    elif lacking:
+    missing = [field for field in ("command", "value") if field not in names]
+    if len(missing) == 1 and len(free) == 1:
+        names[missing[0]] = free[0]
+    elif missing:
         found, allowed = f"series that change: {listed}", "one that is commanded and one that is read"
         remedy = "say which: --column command=NAME --column value=NAME"
         raise refusal("missing-column", file=file, found=found, allowed=allowed, remedy=remedy)
-    return known["command"], known["value"]
+    return names["command"], names["value"]
 
 
 def _joined(series: Mapping[str, Series], command: str, value: str, file: str, kind: str) -> ForeignTable:
@@ -149,52 +149,52 @@ def _joined(series: Mapping[str, Series], command: str, value: str, file: str, k
     Raises:
         InputError: the series do not overlap in time.
     """
-    ordered, read = series[command], series[value]
-    inside = (read.times_s >= ordered.times_s[0] - SAME_S) & (read.times_s <= ordered.times_s[-1] + SAME_S)
+    log, read = series[command], series[value]
+    inside = (read.times_s >= log.times_s[0] - EQUAL_S) & (read.times_s <= log.times_s[-1] + EQUAL_S)
     if not inside.any():
         found, remedy = f"no value of {escaped(value)} between the first and the last of {escaped(command)}", ""
         remedy = "name two series of one time with --column command=NAME --column value=NAME"
         raise refusal("empty", file=file, found=found, allowed="series that overlap in time", remedy=remedy)
-    commands, interpolated = command_at(ordered, read.times_s[inside])
-    words = [kind, f"command {escaped(command)}, reading {escaped(value)}"]
-    words.append(f"{interpolated} commands interpolated in time, {int((~inside).sum())} readings outside left out")
-    return _pairs_table(file, words, Series(read.times_s[inside], commands), read.values[inside], (command, value))
+    commands, interpolated = command_at(log, read.times_s[inside])
+    notes = [kind, f"command {escaped(command)}, reading {escaped(value)}"]
+    notes.append(f"{interpolated} commands interpolated in time, {int((~inside).sum())} readings outside left out")
+    return _pairs_table(file, notes, Series(read.times_s[inside], commands), read.values[inside], (command, value))
 
 
 def _pairs_table(
-    file: str, words: Sequence[str], commands: Series, values: np.ndarray, names: tuple[str, str]
+    file: str, notes: Sequence[str], commands: Series, values: np.ndarray, names: tuple[str, str]
 ) -> ForeignTable:
-    """Commands and readings of the same times as a table, of many every n-th; `names` are those of both."""
-    every = -(-len(values) // ROWS_KEPT)
-    times = commands.times_s[::every] - commands.times_s[0]
+    """Commands and readings at the same times as a table, every n-th of many; `names` are those of both."""
+    step = -(-len(values) // ROWS_KEPT)
+    times = commands.times_s[::step] - commands.times_s[0]
     columns: dict[str, Sequence[object]] = {
         "time_s": [f"{t:.6f}" for t in times],
-        names[0]: [repr(float(f"{c:.10g}")) for c in commands.values[::every]],
-        names[1]: [f"{v:.12g}" for v in values[::every]],
+        names[0]: [repr(float(f"{c:.10g}")) for c in commands.values[::step]],
+        names[1]: [f"{v:.12g}" for v in values[::step]],
     }
-    kept = [f"every {every}th reading kept"] * (every > 1)
-    return table_of(file, "; ".join([*words, *kept]), columns, range(1, len(times) + 1))
+    thinned = [f"every {step}th reading kept"] * (step > 1)
+    return table_of(file, "; ".join([*notes, *thinned]), columns, range(1, len(times) + 1))
 
 
-POLLED_S = 2.0
-"""Longest time between two values of an axis in motion: a command that is logged once a move stands until the next."""
+INTERVAL_MAX_S = 2.0
+"""Longest time between two values of an axis in motion: a command logged once per move is valid until the next."""
 
 
 def command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]:
     """Commands at times between the first and the last of a series, and how many had to be interpolated.
 
     Args:
-        commands: as they changed.
+        commands: logged at changes.
         times_s: shape (n,).
     """
-    at = np.clip(np.searchsorted(commands.times_s, times_s + SAME_S, side="right") - 1, 0, len(commands.times_s) - 1)
-    after = np.minimum(at + 1, len(commands.times_s) - 1)
-    gap = commands.times_s[after] - commands.times_s[at]
+    k = np.clip(np.searchsorted(commands.times_s, times_s + EQUAL_S, side="right") - 1, 0, len(commands.times_s) - 1)
+    after = np.minimum(k + 1, len(commands.times_s) - 1)
+    gap = commands.times_s[after] - commands.times_s[k]
     typical = float(np.median(np.diff(commands.times_s))) if len(commands.times_s) > 1 else 0.0
-    share = np.where(gap > 0, (times_s - commands.times_s[at]) / np.where(gap > 0, gap, 1.0), 0.0)
-    moving = (gap <= min(STANDS * typical, POLLED_S)) & (share * gap > SAME_S)
-    rise = commands.values[after] - commands.values[at]
-    return commands.values[at] + np.where(moving, share * rise, 0.0), int(moving.sum())
+    fraction = np.where(gap > 0, (times_s - commands.times_s[k]) / np.where(gap > 0, gap, 1.0), 0.0)
+    moving = (gap <= min(STANDSTILL_INTERVALS * typical, INTERVAL_MAX_S)) & (fraction * gap > EQUAL_S)
+    rise = commands.values[after] - commands.values[k]
+    return commands.values[k] + np.where(moving, fraction * rise, 0.0), int(moving.sum())
 
 
 def _saved_angles(data: bytes) -> tuple[str, list[float]] | None:
@@ -210,7 +210,7 @@ def _saved_angles(data: bytes) -> tuple[str, list[float]] | None:
     tables = {name: parser[name].get("calibrate") or "" for name in parser.sections() if name.startswith("angle ")}
     if not tables:
         return None
-    name = max(tables, key=lambda one: len(tables[one]))
+    name = max(tables, key=lambda section: len(tables[section]))
     return name.removeprefix("angle "), [float(number) for number in _NUMBER.findall(tables[name])]
 
 
@@ -218,11 +218,11 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
     """Angles of a motor's shaft by Klipper: a log of its data logger, or the table that ANGLE_CALIBRATE saves.
 
     Args:
-        data: of the file; a log of the data logger may be packed.
+        data: of the file; a log of the data logger may be compressed.
         file: its name, for messages.
 
     Raises:
-        InputError: no angles in it, or no steps beside them.
+        InputError: no angles, or no steps.
     """
     if (saved := _saved_angles(data)) is not None:
         sensor, numbers = saved
@@ -254,32 +254,32 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
         raise refusal("missing-column", file=file, found=found, allowed=allowed, remedy=remedy)
     times, positions = (np.concatenate(part) for part in zip(*steps, strict=True))
     order = np.argsort(times, kind="stable")
-    read, held = _series(angles_s), Series(times[order], positions[order])
-    # Steps are commands at once; nothing is interpolated between them.
-    at = np.searchsorted(held.times_s, read.times_s, side="right") - 1
-    inside = at >= 0
+    readings, counters = _series(angles_s), Series(times[order], positions[order])
+    # Steps are instantaneous commands, without interpolation.
+    before = np.searchsorted(counters.times_s, readings.times_s, side="right") - 1
+    inside = before >= 0
     if not inside.any():
         remedy = "log both at once, while the stepper moves"
         raise refusal("empty", file=file, found="no angle after a step", allowed="steps and angles", remedy=remedy)
-    words = [f"Klipper, {', '.join(map(escaped, names))}"]
-    words.append(f"{int((~inside).sum())} angles before the first step left out")
-    commands = Series(read.times_s[inside], held.values[at[inside]])
-    return _pairs_table(file, words, commands, read.values[inside], ("steps", "angle (deg)"))
+    notes = [f"Klipper, {', '.join(map(escaped, names))}"]
+    notes.append(f"{int((~inside).sum())} angles before the first step left out")
+    commands = Series(readings.times_s[inside], counters.values[before[inside]])
+    return _pairs_table(file, notes, commands, readings.values[inside], ("steps", "angle (deg)"))
 
 
 def _messages(data: bytes, file: str) -> Iterator[dict]:
-    """JSON objects of a log, packed or not, each ended by the byte 3 or by a line end."""
+    """JSON objects of a log, compressed or not, each ended by the byte 3 or by a line end."""
     if data.startswith(b"\x1f\x8b"):
         try:
             data = zlib.decompressobj(31).decompress(data, INFLATED_BYTES_MAX)
         except zlib.error as error:
             found, remedy = "a damaged gzip file", "copy it again, or cut it where it ends"
             raise refusal("kind", file=file, found=found, allowed="a log of data_logger.py", remedy=remedy) from error
-    for part in re.split(rb"[\x03\n]", data):
+    for text in re.split(rb"[\x03\n]", data):
         try:
-            message = json.loads(part) if part.strip() else None
+            message = json.loads(text) if text.strip() else None
         except ValueError:
-            # A log that is cut off ends inside a message.
+            # A truncated log ends inside a message.
             continue
         if isinstance(message, dict):
             yield message

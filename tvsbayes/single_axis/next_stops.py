@@ -1,7 +1,7 @@
-"""What to read next on an axis: stops that lower the uncertainty of its ratio, or of positions, most per move.
+"""The next stops to read on an axis: those that reduce the uncertainty of its ratio, or of positions, most per move.
 
-Linear and normal given the scales, averaged over their posterior: a stop that is yet to be read changes covariances
-alone. What is left open because the scales are not known is kept as it is: the plan begins at the u of the fit.
+The model is linear and normal given the scales, averaged over their posterior: a future reading changes covariances
+only. The variance by unknown scales stays constant: the plan begins at the u of the fit.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from tvsbayes.single_axis.axis_record import deviation_functionals
 from tvsbayes.single_axis.axis_rows import AxisRows, reversal_of, rows_of
 
 TARGETS = (*(name for name, quantity in AXIS_QUANTITIES.items() if quantity.target), "position")
-"""What may be made surer; "position" is the mean uncertainty of the error by position over the range."""
-CANDIDATES, AT_ONCE, DRAWS = 17, 8, 24
-"""Places tried along the range, moves proposed, draws of the scales."""
+"""Targets of a plan; "position" is the mean uncertainty of the error by position over the range."""
+CANDIDATES, STOPS_DEFAULT, DRAWS = 17, 8, 24
+"""Candidate places along the range, default number of stops, draws of the scales."""
 MOVE_S = 60.0
-"""Time of a move where the campaign does not tell."""
+"""Time of a move where the campaign has no times."""
 OVERRUN = 0.05
-"""Of the range: how far beyond a place a move goes that will come back to it."""
+"""Overrun beyond a place before the move back to it, as a share of the range."""
 
 
 def unit_of(target: str, unit: str) -> str:
-    """Of a target's uncertainty, in a folder of this unit."""
+    """Unit of a target's uncertainty, in a folder of this unit."""
     return AXIS_QUANTITIES[target].unit.format(unit=unit) if target in AXIS_QUANTITIES else unit
 
 
@@ -43,10 +43,10 @@ class NextStop:
     """A stop to be read.
 
     Attributes:
-        command: where.
-        direction: from which side, "forward" or "backward".
-        via: command to visit first, without reading, so that the side is right; None where it is.
-        u: of the target after it, unit; `gain`: what it takes off; `gain_per_minute`.
+        command: of the stop.
+        direction: of approach, "forward" or "backward".
+        via: command to visit first, without reading, for this direction; None where not needed.
+        u: of the target after it, unit; `gain`: its reduction; `gain_per_minute`.
     """
 
     command: float
@@ -58,7 +58,7 @@ class NextStop:
 
     @property
     def actions(self) -> list[str]:
-        """What to do, in order."""
+        """Actions in order, in words."""
         first = [] if self.via is None else [f"move {self.via:.10g}"]
         return [*first, f"move {self.command:.10g}", "read"]
 
@@ -68,9 +68,9 @@ class AxisPlan(Shown):
     """Stops to be read next, each given those before it.
 
     Attributes:
-        target: what they lower.
+        target: name in `TARGETS`.
         u_now: of the target, unit (`unit_of` it).
-        next: stops, first things first.
+        next: stops in order.
         minutes: of all of them.
     """
 
@@ -102,11 +102,11 @@ def _move_seconds(campaign: AxisCampaign) -> float:
 
 
 def _with_stop(
-    campaign: AxisCampaign, read: AxisRows, command: float, direction: str, seconds: float
+    campaign: AxisCampaign, rows: AxisRows, command: float, direction: str, seconds: float
 ) -> tuple[AxisCampaign, float | None]:
-    """The campaign with one more stop, reached from that side, and the command visited before it, None if none was.
+    """The campaign with one more stop, reached in this direction, and the command visited before it, None without one.
 
-    Its reading lies on the line with a reversal through what was `read`: so neither is moved by it.
+    Its reading lies on the line with a reversal through the `rows`: so it changes neither.
     """
     moves, last = list(campaign.moves), campaign.moves[-1]
     commands = [m.command for m in campaign.moves]
@@ -117,8 +117,8 @@ def _with_stop(
         via = float(np.round(via)) if np.all(np.array(commands) == np.round(commands)) else via
         moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, via))
     moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, command))
-    offset, slope = read.line
-    value = offset + slope * command - 0.5 * float(np.sign(slope)) * sign * reversal_of(read)[0]
+    offset, slope = rows.line
+    value = offset + slope * command - 0.5 * float(np.sign(slope)) * sign * reversal_of(rows)[0]
     u = float(np.median([r.u for r in campaign.readings if r.status == "ok"]))
     number = max(r.reading for r in campaign.readings) + 1
     reading = Reading(number, len(moves) - 1, value, u)
@@ -126,15 +126,15 @@ def _with_stop(
 
 
 def _functionals(fit: AxisFit, target: str, places: np.ndarray) -> np.ndarray:
-    """What is to be made surer, as functionals (t, columns) of the fit's model."""
+    """Functionals (t, columns) of the target in the fit's model."""
     if target == "position":
         return deviation_functionals(fit, places)
     return headline_functionals(fit.model, fit.w)[..., [HEADLINE_DRAWS.index(target)], :]
 
 
 @dataclass(frozen=True)
-class _Known:
-    """What is known of a target, unit^2, by the law of total variance over draws of the scales.
+class _Variance:
+    """Variance of a target, unit^2, by the law of total variance over draws of the scales.
 
     Attributes:
         given: mean of its variances given the scales.
@@ -145,20 +145,20 @@ class _Known:
     between: float
 
 
-def _known(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray, w: np.ndarray) -> _Known:
-    """With the rows of a campaign, at draws w (n, d)."""
+def _variance(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndarray, w: np.ndarray) -> _Variance:
+    """The variance with the rows of a campaign, at draws w (n, d)."""
     rows = replace(rows_of(campaign), line=fit.rows.line)
     model = AxisModel.of(rows, fit.model.priors, places, fit.model.coordinates.waves)
     model = replace(model, coordinates=fit.model.coordinates)
     mean, sd = model.linear(w).of(_functionals(replace(fit, rows=rows, model=model, w=w), target, places))
-    return _Known(float(np.mean(sd**2)), float(np.mean(np.var(mean, axis=0))))
+    return _Variance(float(np.mean(sd**2)), float(np.mean(np.var(mean, axis=0))))
 
 
 def _with_linear_play(fit: AxisFit) -> AxisFit:
-    """The fit as if every reversal were longer than the play, which then is linear in the readings."""
+    """The fit as if every reversal were longer than the play, which is then linear in the readings."""
     names = fit.model.coordinates.names
-    left = tuple(name for name in names if name != "backlash")
-    model = replace(fit.model, coordinates=replace(fit.model.coordinates, names=left))
+    remaining = tuple(name for name in names if name != "backlash")
+    model = replace(fit.model, coordinates=replace(fit.model.coordinates, names=remaining))
     return replace(fit, model=model, w=np.delete(fit.w, names.index("backlash"), axis=1))
 
 
@@ -167,17 +167,17 @@ def plan_next(
     target: str = "per_command",
     *,
     minutes: float | None = None,
-    count: int = AT_ONCE,
+    count: int = STOPS_DEFAULT,
     progress: Show | None = None,
 ) -> AxisPlan:
     """Greedy choice of the next stops to be read.
 
     Args:
-        fit: of what was read so far.
+        fit: of the present readings.
         target: one of `TARGETS`.
-        minutes: for all moves at most; None for `count` stops.
-        count: stops at most.
-        progress: told how far it is.
+        minutes: largest time of all moves; None for `count` stops.
+        count: largest number of stops.
+        progress: shows the progress.
 
     Raises:
         InputError: an unknown target.
@@ -200,43 +200,43 @@ def plan_next(
         grid = np.unique(np.round(grid))
     w = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
     seconds = _move_seconds(fit.campaign)
-    campaign, chosen, spent = fit.campaign, [], 0.0
-    known = _known(fit, campaign, target, grid, fit.w)
+    campaign, chosen, minutes_used = fit.campaign, [], 0.0
+    start = _variance(fit, campaign, target, grid, fit.w)
     if target == "backlash" and fit.model.play_is_sampled:
-        # Given the scales there is no uncertainty of a play that is one of them: that of a linear play shrinks alike.
-        known, fit = _Known(known.given + known.between, 0.0), _with_linear_play(fit)
+        # A sampled play has no variance given the scales: that of a linear play takes its place.
+        start, fit = _Variance(start.given + start.between, 0.0), _with_linear_play(fit)
         w = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
-    few = _known(fit, campaign, target, grid, w)
+    few = _variance(fit, campaign, target, grid, w)
     if not few.given:
         remedy = f"state {target} in [axis] with u above 0, or name another target"
         raise NothingToEstimate("held", f"{target} is held at its value: no reading changes it", remedy=remedy)
 
-    def u_of(read: AxisCampaign) -> float:
-        # Of a few draws the ratio is surer than the value.
-        return float(np.sqrt(known.between + known.given * _known(fit, read, target, grid, w).given / few.given))
+    def u_of(after: AxisCampaign) -> float:
+        # With few draws the ratio is more accurate than the value.
+        return float(np.sqrt(start.between + start.given * _variance(fit, after, target, grid, w).given / few.given))
 
-    u_now = now = float(np.sqrt(known.between + known.given))
+    u_now = now = float(np.sqrt(start.between + start.given))
     with Job({"choosing stops": 1.0}, progress) as job:
         for number in range(count):
             best: tuple[float, NextStop, AxisCampaign] | None = None
             for k, command in enumerate(grid):
                 job.at((number + k / len(grid)) / count)
                 for direction in ("forward", "backward"):
-                    longer, via = _with_stop(campaign, fit.rows, float(command), direction, seconds)
+                    after, via = _with_stop(campaign, fit.rows, float(command), direction, seconds)
                     if via is not None and not low <= via <= high:
                         continue
-                    took = (1 + (via is not None)) * seconds / 60.0
-                    if minutes is not None and spent + took > minutes:
+                    stop_minutes = (1 + (via is not None)) * seconds / 60.0
+                    if minutes is not None and minutes_used + stop_minutes > minutes:
                         continue
-                    u = u_of(longer)
-                    rate = (now - u) / took
+                    u = u_of(after)
+                    rate = (now - u) / stop_minutes
                     if best is None or rate > best[0]:
                         stop = NextStop(float(command), direction, via, u, now - u, rate)
-                        best = rate, stop, longer
+                        best = rate, stop, after
             if best is None:
                 break
             _, stop, campaign = best
             chosen.append(stop)
-            spent += (1 + (stop.via is not None)) * seconds / 60.0
+            minutes_used += (1 + (stop.via is not None)) * seconds / 60.0
             now = stop.u
-    return AxisPlan(target, u_now, tuple(chosen), spent)
+    return AxisPlan(target, u_now, tuple(chosen), minutes_used)

@@ -1,8 +1,8 @@
-"""Where the evidence of a wave lies: over a grid fine against 1 / span, then between its points where it is sharp.
+"""Evidence of a wave by period: on a grid fine against 1 / span, refined where the evidence is sharp.
 
-Everything is linear and normal given the scales of noise and errors: these are held at the mode, the readings and all
-columns are whitened once, and every period costs products with its own few columns. What is found makes the tables of
-`waves.Wave`, from which the sampler starts; it weighs against the density without any of these approximations.
+The model is linear and normal given the scales of noise and errors: these are fixed at the mode, the readings and all
+columns are whitened once, and every period costs products with its own few columns. The result gives the tables of
+`waves.Wave`, from which the sampler starts; its weights use the density without these approximations.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from tvsbayes.single_axis.waves import (
     COLUMNS,
     SCALE_RANGE,
     SHARES,
-    AskedPeriods,
     Clock,
-    Tabulated,
+    TabulatedDensity,
     Wave,
+    WavePeriods,
     WaveRecord,
-    absent_at,
+    absent_coord,
     log_scale_prior,
     wave_columns,
 )
@@ -35,32 +35,32 @@ from tvsbayes.single_axis.waves import (
 PER_RESOLUTION = 8
 """Points of the grid in 1 / span of frequency."""
 GRID_MAX = 30_000
-"""Points; beyond it the range is refused."""
+"""Largest number of points; a range that needs more is refused."""
 APART_MIN = 1e-9
-"""Distance of logs of periods in the grid before it is refined: `REFINEMENTS` halvings stay above rounding."""
+"""Least distance of log periods in the grid before its refinement: `REFINEMENTS` halvings stay above rounding."""
 AT_ONCE = 400
-"""Periods whose columns are held at once."""
+"""Periods in a block of columns."""
 SCALES = 60
-"""Of the grid of log s."""
+"""Points of the grid of log s."""
 STEEP, NEAR, REFINEMENTS = 0.5, 14.0, 12
-"""Log evidence that may lie between neighbours, where it is within `NEAR` of the best; rounds of halving."""
+"""Largest step of log evidence between neighbours, where it is within `NEAR` of the best; rounds of halving."""
 TEMPER, FLOOR = 0.6, 0.05
 """Power of the evidence in a table, and its uniform share: tables are wider than the posterior."""
 ABSENT_MIN, ABSENT_MAX = 0.03, 0.9
-"""Of a table's share without a wave."""
+"""Limits of a table's share without a wave."""
 WAVES_MAX, FURTHER = 6, 3.0
-"""Inferred waves while more are added than were asked for, and the log Bayes factor that another one needs."""
+"""Largest number of inferred waves, with those beyond the stated ranges, and the least log Bayes factor of one more."""
 RESOLVED, UNRESOLVED = 0.5, 1e3
-"""Periods in the record by which two waves differ at least, P / (2 N) of a period of which N fit in; log evidence of
-one that does not is lowered by so much: it would be what the other changes by."""
+"""Least difference of two waves in periods of the record, P / (2 N) of a period with N in it; reduction of the log
+evidence of an unresolved one, which would represent changes of the other."""
 
 
 @dataclass(frozen=True)
-class _Prepared:
+class _WhitenedModel:
     """Whitened readings and columns at the mode.
 
     Attributes:
-        model: with all other waves; the one that is looked for is not in it, or has no size at `w`.
+        model: with all other waves; the one of the search is not in it, or is absent at `w`.
         w: coordinates, shape (1, d).
         base: whitened readings and columns in units of their priors, shape (rows, 1 + columns).
         inverse: of the columns' information, shape (columns, columns).
@@ -74,51 +74,51 @@ class _Prepared:
     towards: np.ndarray
 
 
-def _prepared(model: AxisModel, w: np.ndarray) -> _Prepared:
+def _whitened_model(model: AxisModel, w: np.ndarray) -> _WhitenedModel:
     white, factor = model.white(w)
     base = np.column_stack([white[:, :1], white[:, 1:] @ factor])
     information = base[:, 1:].T @ base[:, 1:] + np.eye(factor.shape[1])
-    return _Prepared(model, w, base, np.linalg.inv(information), base[:, 1:].T @ base[:, 0])
+    return _WhitenedModel(model, w, base, np.linalg.inv(information), base[:, 1:].T @ base[:, 0])
 
 
-def _log_evidence(ready: _Prepared, wave: Wave, log_period: np.ndarray, scales: np.ndarray) -> np.ndarray:
+def _log_evidence(state: _WhitenedModel, wave: Wave, log_period: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Log Bayes factors (p, scales) of a wave against none, at logs of periods (p,) and scales (scales,)."""
-    model, rows = ready.model, ready.model.rows
+    model, rows = state.model, state.model.rows
     x = model.clock(wave, rows.command, rows.time_s, rows.value)
     width = rows.width_s * (1.0 if wave.clock == "seconds" else abs(rows.line[1] * (rows.rate or 0.0)))
     evidence = np.empty((len(log_period), len(scales)))
-    for begins in range(0, len(log_period), AT_ONCE):
-        part = slice(begins, begins + AT_ONCE)
-        columns = wave_columns(x, np.exp(log_period[part]), WaveRecord.of(x), width) * np.array(SHARES)
+    for start in range(0, len(log_period), AT_ONCE):
+        block = slice(start, start + AT_ONCE)
+        columns = wave_columns(x, np.exp(log_period[block]), WaveRecord.of(x), width) * np.array(SHARES)
         count = len(columns)
         flat = np.moveaxis(columns, 0, 1).reshape(len(x), -1)
-        white = model.whitened_extra(ready.w, flat)
-        across = white.T @ ready.base[:, 1:]
-        towards = (white.T @ ready.base[:, 0] - across @ ready.inverse @ ready.towards).reshape(count, COLUMNS)
-        of_columns = white.reshape(len(x), count, COLUMNS)
-        across = across.reshape(count, COLUMNS, -1)
-        information = np.einsum("rpi,rpj->pij", of_columns, of_columns, optimize=True)
-        information -= across @ ready.inverse @ np.swapaxes(across, 1, 2)
+        white = model.whitened_extra(state.w, flat)
+        cross = white.T @ state.base[:, 1:]
+        right_side = (white.T @ state.base[:, 0] - cross @ state.inverse @ state.towards).reshape(count, COLUMNS)
+        wave_block = white.reshape(len(x), count, COLUMNS)
+        cross = cross.reshape(count, COLUMNS, -1)
+        information = np.einsum("rpi,rpj->pij", wave_block, wave_block, optimize=True)
+        information -= cross @ state.inverse @ np.swapaxes(cross, 1, 2)
         values, vectors = np.linalg.eigh(information)
         values = np.maximum(values, 0.0)[:, None, :]
-        along = np.einsum("pij,pi->pj", vectors, towards)[:, None, :] ** 2
+        power = np.einsum("pij,pi->pj", vectors, right_side)[:, None, :] ** 2
         variance = scales[None, :, None] ** 2
-        evidence[part] = 0.5 * np.sum(variance * along / (1 + variance * values) - np.log1p(variance * values), axis=2)
+        evidence[block] = 0.5 * np.sum(variance * power / (1 + variance * values) - np.log1p(variance * values), axis=2)
     return evidence
 
 
 @dataclass(frozen=True)
-class _Searched:
-    """A wave with tables by what the readings say, and its log Bayes factor against none."""
+class _SearchResult:
+    """A wave with tables from its evidence, and its log Bayes factor against none."""
 
     wave: Wave
     log_evidence: float
 
 
-def _searched(ready: _Prepared, wave: Wave, apart: Sequence[Wave] = ()) -> _Searched:
-    """The wave, all others as in `ready`; its period resolved from those of `apart`, which the record hardly parts."""
-    rows = ready.model.rows
-    span = float(np.ptp(ready.model.clock(wave, rows.command, rows.time_s, rows.value)))
+def _search(state: _WhitenedModel, wave: Wave, others: Sequence[Wave] = ()) -> _SearchResult:
+    """The wave, all others as in `state`; its period must be resolved from those of `others`."""
+    rows = state.model.rows
+    span = float(np.ptp(state.model.clock(wave, rows.command, rows.time_s, rows.value)))
     low, high = (np.log(end * wave.unit) for end in SCALE_RANGE)
     log_scale = np.linspace(low, high, SCALES)
     prior = log_scale_prior(log_scale, wave.unit)
@@ -126,8 +126,8 @@ def _searched(ready: _Prepared, wave: Wave, apart: Sequence[Wave] = ()) -> _Sear
     scales = np.exp(log_scale)
 
     def evidence_at(log_period: np.ndarray) -> np.ndarray:
-        evidence = _log_evidence(ready, wave, log_period, scales)
-        for other in apart:
+        evidence = _log_evidence(state, wave, log_period, scales)
+        for other in others:
             evidence[np.abs(np.exp(-log_period) - 1 / other.peak) * span < RESOLVED] -= UNRESOLVED
         return evidence
 
@@ -137,31 +137,31 @@ def _searched(ready: _Prepared, wave: Wave, apart: Sequence[Wave] = ()) -> _Sear
         by_period = np.logaddexp.reduce(evidence + weights, axis=1)
         best = np.maximum(by_period[1:], by_period[:-1])
         steep = (np.abs(np.diff(by_period)) > STEEP) & (best > by_period.max() - NEAR)
-        # A peak between two points is seen by the curvature of its neighbours alone.
+        # A peak between two points shows only in the curvature of its neighbours.
         peak = int(np.argmax(by_period))
         steep[max(peak - 1, 0) : peak + 1] |= bool(np.diff(grid)[max(peak - 1, 0)] > _sharp(evidence, grid))
         if not steep.any() or len(grid) > 2 * GRID_MAX:
             break
-        more = 0.5 * (grid[1:] + grid[:-1])[steep]
-        order = np.argsort(np.concatenate([grid, more]), kind="stable")
-        grid = np.concatenate([grid, more])[order]
-        evidence = np.concatenate([evidence, evidence_at(more)])[order]
+        midpoints = 0.5 * (grid[1:] + grid[:-1])[steep]
+        order = np.argsort(np.concatenate([grid, midpoints]), kind="stable")
+        grid = np.concatenate([grid, midpoints])[order]
+        evidence = np.concatenate([evidence, evidence_at(midpoints)])[order]
     by_period = np.logaddexp.reduce(evidence + weights, axis=1)
     if wave.is_fixed:
-        total, table, over = float(by_period[0]), None, np.zeros(1)
+        total, table, log_weights = float(by_period[0]), None, np.zeros(1)
     else:
-        over = np.log(np.gradient(grid) / np.ptp(grid))
-        total = float(np.logaddexp.reduce(by_period + over))
-        table = Tabulated.of(grid, TEMPER * by_period, FLOOR)
-    by_scale = np.logaddexp.reduce(evidence + over[:, None], axis=0) + prior
+        log_weights = np.log(np.gradient(grid) / np.ptp(grid))
+        total = float(np.logaddexp.reduce(by_period + log_weights))
+        table = TabulatedDensity.of(grid, TEMPER * by_period, FLOOR)
+    by_scale = np.logaddexp.reduce(evidence + log_weights[:, None], axis=0) + prior
     absent = float(np.clip(1 / (1 + np.exp(np.clip(total, -50, 50))), ABSENT_MIN, ABSENT_MAX))
-    scale_table = Tabulated.of(log_scale, TEMPER * by_scale, FLOOR)
-    peak_at = float(np.exp(grid[int(np.argmax(by_period))]))
-    return _Searched(replace(wave, log_scale=scale_table, log_period=table, absent=absent, peak=peak_at), total)
+    scale_table = TabulatedDensity.of(log_scale, TEMPER * by_scale, FLOOR)
+    peak_period = float(np.exp(grid[int(np.argmax(by_period))]))
+    return _SearchResult(replace(wave, log_scale=scale_table, log_period=table, absent=absent, peak=peak_period), total)
 
 
 def _sharp(evidence: np.ndarray, grid: np.ndarray) -> float:
-    """Spacing of log periods that the best peak is resolved with: half a sd of its curvature."""
+    """Spacing of log periods that resolves the best peak: half a sd by its curvature."""
     best = evidence.max(axis=1)
     k = int(np.clip(np.argmax(best), 1, len(grid) - 2)) if len(grid) > 2 else 0
     if not k:
@@ -188,20 +188,20 @@ def period_grid(wave: Wave, span: float) -> np.ndarray:
             remedy="raise the lower end of the range, or fit a part of the record",
         )
     even = np.linspace(1 / wave.high, 1 / wave.low, max(count, 40))[1:-1]
-    # A slow wave, of which few fit in, needs points by its log. The ends come from one list alone: apart by rounding
-    # they would have one point half-way.
+    # A slow wave, with few periods in the record, needs points by its log. The ends come from one list only: ends that
+    # differ by rounding would get a point between them.
     by_log = np.linspace(np.log(wave.low), np.log(wave.high), 60)
     grid = np.sort(np.concatenate([-np.log(even), by_log[1:-1]]))
     return np.concatenate([by_log[:1], grid[np.diff(grid, append=np.inf) > APART_MIN], by_log[-1:]])
 
 
-def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], periods: AskedPeriods) -> tuple[Wave, ...]:
-    """The waves that a folder asks for, with tables by what its readings say; stated ones first, the encoder's last.
+def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], periods: WavePeriods) -> tuple[Wave, ...]:
+    """The waves that a folder defines, with tables from its readings; stated ones first, the encoder's last.
 
     Args:
-        rows: what was read.
+        rows: averaged readings.
         priors: complete; the scale of `transmission_error` is that of the waves.
-        periods: periods.
+        periods: settings of the folder.
 
     Raises:
         InputError: a range that is too wide for the record.
@@ -211,20 +211,20 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], periods: AskedPeri
     error = priors["transmission_error"]
     unit = error.u or error.value or (AXIS_KEYS["transmission_error"].share or 0.0) * rows.travel
     clock: Clock = "seconds" if periods.in_seconds else "position"
-    stated = [_of_stated(clock, period, unit, rows, priors) for period in periods.stated]
+    stated = [_stated_wave(clock, period, unit, rows, priors) for period in periods.stated]
     unknown = [replace(Wave.fixed(clock, low, unit), high=high) for low, high in periods.between]
-    encoder = [] if periods.encoder is None else [_of_stated("encoder", periods.encoder, unit, rows, priors)]
+    encoder = [] if periods.encoder is None else [_stated_wave("encoder", periods.encoder, unit, rows, priors)]
     known = [Wave.fixed(wave.clock, wave.peak, unit) for wave in (*stated, *encoder)]
-    near: dict[str, float] = {}
-    unknown, peaks = _inferred(rows, priors, known, unknown, near)
-    every = [*known[: len(stated)], *peaks, *known[len(stated) :]]
-    model = AxisModel.of(rows, priors, None, every)
-    mode, names, final = find_mode(model, near).w, model.coordinates.names, []
+    start: dict[str, float] = {}
+    unknown, peaks = _inferred(rows, priors, known, unknown, start)
+    all_waves = [*known[: len(stated)], *peaks, *known[len(stated) :]]
+    model = AxisModel.of(rows, priors, None, all_waves)
+    mode, names, results = find_mode(model, start).w, model.coordinates.names, []
     for k, wave in enumerate([*stated, *unknown, *encoder]):
         without = mode[None].copy()
-        without[0, names.index(f"wave_scale.{k + 1}")] = absent_at(every[k])
-        final.append(_searched(_prepared(model, without), wave).wave)
-    return tuple(final)
+        without[0, names.index(f"wave_scale.{k + 1}")] = absent_coord(all_waves[k])
+        results.append(_search(_whitened_model(model, without), wave).wave)
+    return tuple(results)
 
 
 def _inferred(
@@ -232,25 +232,24 @@ def _inferred(
     priors: Mapping[str, AxisPrior],
     known: Sequence[Wave],
     waves: Sequence[Wave],
-    near: dict[str, float],
+    start: dict[str, float],
 ) -> tuple[list[Wave], list[Wave]]:
     """The waves of unknown period, and each at its peak: one after the other, the strongest evidence first.
 
-    Every range gets the waves that it was asked for, and further ones while the evidence for another is `FURTHER`: a
-    gear train has more periods than its owner knows of, and the one that is asked for may not be the strongest. `near`
-    holds the coordinates of the last mode by name.
+    Every range gets the stated number of waves, and further ones while the evidence for another exceeds `FURTHER`: a
+    gear train may have unexpected periods that are stronger. `start` has the coordinates of the last mode by name.
     """
     inferred: list[Wave] = []
     peaks: list[Wave] = []
 
-    def strongest(ranges: Sequence[Wave]) -> _Searched:
+    def strongest(ranges: Sequence[Wave]) -> _SearchResult:
         model = AxisModel.of(rows, priors, None, [*known, *peaks])
-        mode = find_mode(model, near).w
-        near.update(zip(model.coordinates.names, mode.tolist(), strict=True))
-        ready = _prepared(model, mode[None])
-        return max((_searched(ready, wave, peaks) for wave in ranges), key=lambda each: each.log_evidence)
+        mode = find_mode(model, start).w
+        start.update(zip(model.coordinates.names, mode.tolist(), strict=True))
+        state = _whitened_model(model, mode[None])
+        return max((_search(state, wave, peaks) for wave in ranges), key=lambda result: result.log_evidence)
 
-    def take(best: _Searched) -> None:
+    def take(best: _SearchResult) -> None:
         inferred.append(next(wave for wave in waves if (wave.low, wave.high) == (best.wave.low, best.wave.high)))
         peaks.append(replace(Wave.fixed(best.wave.clock, best.wave.peak, best.wave.unit), absent=best.wave.absent))
 
@@ -264,25 +263,25 @@ def _inferred(
 
 
 RATIO_SDS = 3.0
-"""sds of the ratio that a stated period of position may be off by on the line's."""
+"""Range of a stated period of position, in sds of the ratio on the line's clock."""
 ERROR_SLOPE = 1.7
-"""Slope that an error by position of sd 1 typically gives a line over a range of 1: half of the largest, root 12."""
+"""Typical slope of a line over a range of 1 by an error by position of sd 1: half of the largest, root 12."""
 
 
-def _of_stated(clock: Clock, period: float, unit: float, rows: AxisRows, priors: Mapping[str, AxisPrior]) -> Wave:
-    """The wave of a stated period: on a clock of position the line's ratio stands for the true one, which is not known.
+def _stated_wave(clock: Clock, period: float, unit: float, rows: AxisRows, priors: Mapping[str, AxisPrior]) -> Wave:
+    """The wave of a stated period: a clock of position uses the line's ratio in place of the unknown true one.
 
-    What that may be off by is a narrow range of the period; where `per_command` is stated better, by that.
+    So the period has a narrow range by the uncertainty of the ratio; where `per_command` is stated better, by that.
     """
     if clock != "position":
         return replace(Wave.fixed(clock, period, unit), known=period)
     ratio, prior = abs(rows.line[1]), priors["per_command"]
     error = max(priors["transmission_error"].u, priors["transmission_error"].value)
-    spread = float(np.hypot(np.sqrt(fit_line(rows).covariance[1, 1]) / ratio, ERROR_SLOPE * error / rows.travel))
+    relative_sd = float(np.hypot(np.sqrt(fit_line(rows).covariance[1, 1]) / ratio, ERROR_SLOPE * error / rows.travel))
     middle = period
-    if prior.u < spread * abs(prior.value):
-        spread, middle = prior.u / abs(prior.value), period * ratio / abs(prior.value)
-    if spread * RATIO_SDS < 1e-9:
+    if prior.u < relative_sd * abs(prior.value):
+        relative_sd, middle = prior.u / abs(prior.value), period * ratio / abs(prior.value)
+    if relative_sd * RATIO_SDS < 1e-9:
         return replace(Wave.fixed(clock, middle, unit), known=period)
-    factor = float(np.exp(RATIO_SDS * spread))
+    factor = float(np.exp(RATIO_SDS * relative_sd))
     return replace(Wave.fixed(clock, middle, unit), low=middle / factor, high=middle * factor, known=period)

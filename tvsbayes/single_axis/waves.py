@@ -1,15 +1,15 @@
-"""Waves of known or unknown period beside the error by position: what is asked for, and their coordinates.
+"""Waves of known or unknown period in addition to the error by position: their settings and coordinates.
 
 A wave is A cos(2 pi x / P - phase) with a second harmonic. x is the position |unit per command| x command, the time in
 seconds, or the reading itself (a wave of the encoder). Cosines and sines are linear and have a normal prior of sd s,
 those of the second harmonic of `SECOND` times s; s is half-normal, and with probability 1/2 there is no wave at all.
-No turn of a gear is quite like the one before: cosine and sine of the first harmonic change over the record, linearly,
-by a normal share of sd `WANDER` of s at its ends, without which a period would be surer than gears are regular.
+Turns of a gear differ slightly: cosine and sine of the first harmonic change over the record, linearly, by a normal
+share of sd `WANDER` of s at its ends. Without this the uncertainty of a period would be too small for real gears.
 
-Coordinates with a standard normal density are needed where the posterior has many peaks: s and P are quantiles of
-tables close to their posterior (`period_search`), and the prior over the table is part of the density. So the draws are
-weighted exactly, whatever the tables are. While there is no wave its period follows its table (pseudo-prior: Carlin and
-Chib, J. R. Stat. Soc. B 57 (1995) 473). Periods in the unit of their clock. NumPy.
+The posterior has many peaks in s and P: their coordinates with a standard normal prior are quantiles of tables close to
+their posterior (`period_search`), and the ratio of prior to table is part of the density. So the draws have exact
+weights for any tables. Without a wave its period follows its table (pseudo-prior: Carlin and Chib, J. R. Stat. Soc. B
+57 (1995) 473). Periods in the unit of their clock. NumPy.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ import numpy as np
 
 Clock = Literal["position", "seconds", "encoder"]
 SECOND = 0.25
-"""sd of the second harmonic's cosine and sine, of the first's: with more, twice the period would explain a wave nearly
-as well, by its second harmonic alone."""
+"""sd of the second harmonic's cosine and sine over that of the first: with a larger one, twice the period would explain
+a wave nearly as well, by its second harmonic alone."""
 WAVE_PRIOR = 0.5
-"""Probability beforehand that there is a wave."""
+"""Prior probability of a wave."""
 WANDER = 0.1
-"""sd of what the first harmonic's cosine and sine have changed by at an end of the record, of s."""
+"""sd of the change of the first harmonic's cosine and sine at an end of the record, over s."""
 SHARES = (1.0, 1.0, SECOND, SECOND, WANDER, WANDER)
-"""sds of a wave's columns, of s."""
+"""sds of a wave's columns over s."""
 COLUMNS = len(SHARES)
-"""Cosine and sine of both harmonics, then of what the first changes by."""
+"""Number of columns: cosine and sine of both harmonics, then of the change of the first."""
 SCALE_RANGE = (1e-4, 4.0)
-"""Of s, over the scale of its half-normal prior, which has 1e-4 of its probability outside."""
+"""Range of s over the scale of its half-normal prior, which has 1e-4 of its probability outside."""
 
 
 @dataclass(frozen=True)
-class AskedPeriods:
+class WavePeriods:
     """Periods of `[axis]`.
 
     Attributes:
         stated: periods that are known.
         between: ranges of unknown periods, each low and high; ranges are the same or do not overlap.
         in_seconds: whether both are of time; else of position, unit of the readings.
-        encoder: period of the encoder's own wave, unit of the readings; None where none is asked for.
+        encoder: period of the encoder's own wave, unit of the readings; None without it.
     """
 
     stated: tuple[float, ...] = ()
@@ -58,12 +58,12 @@ class AskedPeriods:
 
     @property
     def shortest(self) -> float | None:
-        """Of the gear's periods; None where none is asked for."""
+        """Shortest of the gear's periods; None without any."""
         return min((*self.stated, *(low for low, _ in self.between)), default=None)
 
 
 @dataclass(frozen=True)
-class Tabulated:
+class TabulatedDensity:
     """A density that is linear between nodes.
 
     Attributes:
@@ -75,8 +75,8 @@ class Tabulated:
     density: np.ndarray
 
     @classmethod
-    def of(cls, at: np.ndarray, log_density: np.ndarray, floor: float) -> Tabulated:
-        """Proportional to exp(log_density), with a uniform part that has the probability `floor`."""
+    def of(cls, at: np.ndarray, log_density: np.ndarray, floor: float) -> TabulatedDensity:
+        """A density proportional to exp(log_density), plus a uniform part with the probability `floor`."""
         density = np.exp(log_density - log_density.max())
         density = (1 - floor) * density / np.trapezoid(density, at) + floor / np.ptp(at)
         return cls(at, density / np.trapezoid(density, at))
@@ -88,24 +88,24 @@ class Tabulated:
         return np.concatenate(([0.0], np.cumsum(parts)))
 
     def quantile(self, share: np.ndarray) -> np.ndarray:
-        """Where the probability below is `share`, any shape."""
+        """Quantiles at probabilities `share`, any shape."""
         below = self._below
         k = np.clip(np.searchsorted(below, share, side="right") - 1, 0, len(self.at) - 2)
         rest = np.clip(share, 0.0, below[-1]) - below[k]
         start = self.density[k]
         slope = (self.density[k + 1] - start) / (self.at[k + 1] - self.at[k])
-        # Of start t + slope t^2 / 2 = rest the root that holds where the slope is 0 too.
+        # The root of start t + slope t^2 / 2 = rest in the form that is valid for slope 0 too.
         step = 2 * rest / (start + np.sqrt(np.maximum(start**2 + 2 * slope * rest, 0.0)))
         return self.at[k] + np.clip(step, 0.0, self.at[k + 1] - self.at[k])
 
     def share(self, x: float) -> float:
         """Probability below x."""
         k = int(np.clip(np.searchsorted(self.at, x, side="right") - 1, 0, len(self.at) - 2))
-        there = np.interp(x, self.at, self.density)
-        return float(self._below[k] + 0.5 * (self.density[k] + there) * (x - self.at[k]))
+        density_at = np.interp(x, self.at, self.density)
+        return float(self._below[k] + 0.5 * (self.density[k] + density_at) * (x - self.at[k]))
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
-        """At x, any shape, inside the nodes."""
+        """Log density at x, any shape, inside the nodes."""
         return np.log(np.interp(x, self.at, self.density))
 
 
@@ -116,7 +116,7 @@ def log_scale_prior(log_scale: np.ndarray, unit: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Wave:
-    """One wave that is asked for.
+    """One wave of the model.
 
     Attributes:
         clock: of its period.
@@ -124,27 +124,27 @@ class Wave:
         unit: scale of the half-normal prior of s, in the unit of the readings, > 0.
         log_scale: table of log s, given that there is a wave.
         log_period: table of the log of the period; None where it is fixed.
-        absent: share of the coordinate's probability that is given to no wave at all.
-        peak: period of most evidence.
-        known: the period that was stated; None of one that is looked for.
+        absent: share of the coordinate's probability for no wave at all.
+        peak: period with the largest evidence.
+        known: the stated period; None of an unknown one.
     """
 
     clock: Clock
     low: float
     high: float
     unit: float
-    log_scale: Tabulated
-    log_period: Tabulated | None
+    log_scale: TabulatedDensity
+    log_period: TabulatedDensity | None
     absent: float
     peak: float
     known: float | None = None
 
     @classmethod
     def fixed(cls, clock: Clock, period: float, unit: float) -> Wave:
-        """Of one period, before anything was searched."""
+        """A wave of one period, before any search."""
         low, high = (log(end * unit) for end in SCALE_RANGE)
         at = np.linspace(low, high, 200)
-        table = Tabulated.of(at, 0.3 * np.maximum(log_scale_prior(at, unit), -20.0), 0.5)
+        table = TabulatedDensity.of(at, 0.3 * np.maximum(log_scale_prior(at, unit), -20.0), 0.5)
         return cls(clock, period, period, unit, table, None, 0.05, period)
 
     @property
@@ -160,7 +160,7 @@ class WaveDraws:
     Attributes:
         scale: s; 0 where there is no wave.
         period: in the unit of its clock; shape (1,) where it is stated.
-        log_prior: what its coordinates' density has beside the standard normal.
+        log_prior: log density of its coordinates relative to the standard normal.
     """
 
     scale: np.ndarray
@@ -168,25 +168,25 @@ class WaveDraws:
     log_prior: np.ndarray
 
 
-def wave_draws(wave: Wave, strength: np.ndarray, place: np.ndarray | None) -> WaveDraws:
+def wave_draws(wave: Wave, scale_coordinate: np.ndarray, period_coordinate: np.ndarray | None) -> WaveDraws:
     """One wave at coordinates of its scale (n,) and of its period (n,), None where it is stated."""
     from scipy.special import ndtr
 
-    share = ndtr(strength)
-    there = share > wave.absent
+    share = ndtr(scale_coordinate)
+    present = share > wave.absent
     log_scale = wave.log_scale.quantile(np.clip((share - wave.absent) / (1 - wave.absent), 0.0, 1.0))
-    prior = np.where(there, log(WAVE_PRIOR / (1 - wave.absent)), log((1 - WAVE_PRIOR) / max(wave.absent, 1e-300)))
+    prior = np.where(present, log(WAVE_PRIOR / (1 - wave.absent)), log((1 - WAVE_PRIOR) / max(wave.absent, 1e-300)))
     correction = log_scale_prior(log_scale, wave.unit) - wave.log_scale.log_density(log_scale)
     period = np.array([wave.low])
-    if place is not None and wave.log_period is not None:
-        log_period = wave.log_period.quantile(ndtr(place))
+    if period_coordinate is not None and wave.log_period is not None:
+        log_period = wave.log_period.quantile(ndtr(period_coordinate))
         period = np.exp(log_period)
         correction = correction - log(log(wave.high / wave.low)) - wave.log_period.log_density(log_period)
-    return WaveDraws(np.where(there, np.exp(log_scale), 0.0), period, prior + np.where(there, correction, 0.0))
+    return WaveDraws(np.where(present, np.exp(log_scale), 0.0), period, prior + np.where(present, correction, 0.0))
 
 
-def absent_at(wave: Wave) -> float:
-    """Coordinate of a wave's scale at which there is none."""
+def absent_coord(wave: Wave) -> float:
+    """Coordinate of a wave's scale at which the wave is absent."""
     from scipy.special import ndtri
 
     return float(ndtri(0.5 * wave.absent))
@@ -200,8 +200,8 @@ def names_of(waves: Sequence[Wave]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def start_of(wave: Wave, name: str) -> float:
-    """Coordinate at which a search for the mode begins."""
+def start_coordinate(wave: Wave, name: str) -> float:
+    """Start coordinate of a search for the mode."""
     from scipy.special import ndtri
 
     if name.startswith("wave_scale") or wave.log_period is None:
@@ -210,42 +210,42 @@ def start_of(wave: Wave, name: str) -> float:
 
 
 def log_order(waves: Sequence[Wave], draws: Sequence[WaveDraws]) -> np.ndarray:
-    """Log prior (n or 1,) of the order of waves that share one range: which is called the first is a convention.
+    """Log prior (n or 1,) of the order of waves that share one range: their numbering is a convention.
 
-    With m waves of K there, the first m are, each the one of the rest that is nearest to its own peak; such an order
-    stands for K! / (K - m)! others. -inf for all others.
+    If m of K waves are present, these are the first m, each the nearest to its own peak among the rest; such an order
+    represents K! / (K - m)! equivalent ones. -inf for all others.
     """
     order = np.zeros(1)
-    alike: dict[tuple[float, float, Clock], list[int]] = {}
+    by_range: dict[tuple[float, float, Clock], list[int]] = {}
     for k, wave in enumerate(waves):
         if wave.known is None and not wave.is_fixed:
-            alike.setdefault((wave.low, wave.high, wave.clock), []).append(k)
-    for group in alike.values():
+            by_range.setdefault((wave.low, wave.high, wave.clock), []).append(k)
+    for group in by_range.values():
         if len(group) < 2:
             continue
-        there = np.array([draws[k].scale > 0 for k in group])
-        count = there.sum(axis=0)
-        allowed = np.all(there[:-1] | ~there[1:], axis=0)
+        present = np.array([draws[k].scale > 0 for k in group])
+        count = present.sum(axis=0)
+        allowed = np.all(present[:-1] | ~present[1:], axis=0)
         for row, k in enumerate(group):
             distance = np.abs(np.log(draws[k].period / waves[k].peak))
             for other, j in enumerate(group[row + 1 :], start=row + 1):
                 nearer = distance <= np.abs(np.log(draws[j].period / waves[k].peak))
-                allowed &= nearer | ~there[other] | ~there[row]
-        each = np.array([log(factorial(len(group)) / factorial(len(group) - m)) for m in range(len(group) + 1)])
-        order = order + np.where(allowed, each[count], -np.inf)
+                allowed &= nearer | ~present[other] | ~present[row]
+        log_orders = np.array([log(factorial(len(group)) / factorial(len(group) - m)) for m in range(len(group) + 1)])
+        order = order + np.where(allowed, log_orders[count], -np.inf)
     return order
 
 
 @dataclass(frozen=True)
 class WaveRecord:
-    """Where on the clock of a wave the readings lie: the middle, and half of the way from the first to the last."""
+    """Range of the readings on the clock of a wave: its middle and half-width."""
 
     middle: float
     half: float
 
     @classmethod
     def of(cls, x: np.ndarray) -> WaveRecord:
-        """Of the readings' places (rows,)."""
+        """The range of clock values (rows,)."""
         return cls(0.5 * float(np.min(x) + np.max(x)), 0.5 * float(np.ptp(x)) or 1.0)
 
 
@@ -255,8 +255,8 @@ def wave_columns(x: np.ndarray, period: np.ndarray, record: WaveRecord, width: n
     Args:
         x: shape (rows,).
         period: shape (n,).
-        record: that the wave changes over.
-        width: over which every row was averaged, shape (rows,).
+        record: range over which the wave changes.
+        width: averaging width of every row, shape (rows,).
     """
     turn = x[None] / period[:, None]
     turn = 2 * pi * (turn - np.round(turn))
@@ -264,10 +264,10 @@ def wave_columns(x: np.ndarray, period: np.ndarray, record: WaveRecord, width: n
     second = [cosine**2 - sine**2, 2 * sine * cosine]
     if np.any(width):
         half = np.maximum(pi * np.asarray(width)[None] / period[:, None], 1e-9)
-        kept = np.sin(half) / half
-        cosine, sine = cosine * kept, sine * kept
+        factor = np.sin(half) / half
+        cosine, sine = cosine * factor, sine * factor
         # sin 2x / 2x = cos x sin x / x.
-        kept = kept * np.cos(half)
-        second = [each * kept for each in second]
-    along = ((x - record.middle) / record.half)[None]
-    return np.stack([cosine, sine, *second, along * cosine, along * sine], axis=-1)
+        factor = factor * np.cos(half)
+        second = [column * factor for column in second]
+    position = ((x - record.middle) / record.half)[None]
+    return np.stack([cosine, sine, *second, position * cosine, position * sine], axis=-1)

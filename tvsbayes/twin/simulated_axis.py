@@ -19,7 +19,7 @@ from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import write_atomically
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading, write_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior, axis_priors, kind_of
-from tvsbayes.single_axis.waves import SECOND, WANDER, AskedPeriods
+from tvsbayes.single_axis.waves import SECOND, WANDER, WavePeriods
 from tvsbayes.twin.gear_errors import kelvin_of, zero_shift
 
 READING_SHARE = 5e-5
@@ -129,7 +129,7 @@ def draw_axis(
     per_command: float,
     travel: float,
     rng: np.random.Generator,
-    periods: AskedPeriods | None = None,
+    periods: WavePeriods | None = None,
     between_s: tuple[float, float] = (0.0, 1.0),
 ) -> AxisTruth:
     """A true axis for a list of commands.
@@ -169,7 +169,7 @@ def draw_axis(
 
 
 def _drawn_waves(
-    stated: AskedPeriods,
+    stated: WavePeriods,
     priors: Mapping[str, AxisPrior],
     travel: float,
     record: Mapping[str, tuple[float, float]],
