@@ -14,7 +14,7 @@ import sys
 from experiments.common.command_line import print_only
 from experiments.common.rows import ROOT
 from tvsbayes.instrument.axes import SENSES
-from tvsbayes.report.drawing import BLACK, OF_ESTIMATOR, drawing, svg
+from tvsbayes.report.drawing import BLACK, ESTIMATOR_STYLE, drawing, svg
 
 OUT = ROOT / "data" / "tutorial" / "demo.svg"
 
@@ -31,7 +31,7 @@ def draw(demo: dict) -> bytes:
                     ("joint", joint[direction]["value"], joint[direction]["interval95"]),
                 )
                 for offset, (name, value, (low, high)) in zip((-0.13, 0.13), shown, strict=True):
-                    colour, marker = OF_ESTIMATOR[name]
+                    colour, marker = ESTIMATOR_STYLE[name]
                     bars, label = [[value - low], [high - value]], None if row else name
                     panel.errorbar(
                         value, row + offset, xerr=bars, fmt=marker, color=colour, capsize=3, markersize=4, label=label

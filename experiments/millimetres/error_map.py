@@ -24,7 +24,7 @@ from tvsbayes.estimators.four_point import classic
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.metrology.look_budget import budget
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.report.drawing import OF_ESTIMATOR, SEQUENTIAL, colour_map
+from tvsbayes.report.drawing import ESTIMATOR_STYLE, SEQUENTIAL, colour_map
 
 RANGES_MM = (200.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1400.0)
 PICTURE = Path(__file__).with_suffix(".png")
@@ -53,7 +53,7 @@ def main() -> None:
     for k, reach in enumerate(RANGES_MM):
         valid = found.valid[..., k]
         cells = []
-        for name in OF_ESTIMATOR:
+        for name in ESTIMATOR_STYLE:
             errors = found.rms_mm[name][..., k][valid]
             cells.append(f"{np.sqrt(np.mean(errors**2)):.1f}" if errors.size else "-")
         print(f"| {reach:.0f} | {' | '.join(cells)} | {valid.sum()} of {valid.size} |")
@@ -72,7 +72,7 @@ def draw(found: ErrorMap) -> None:
     """RMS error against range, and over the counters at 500 mm."""
     with page_figure(PICTURE, 3.2, width_in=10.0) as figure:
         axes = figure.subplots(1, 3)
-        for name, (colour, marker) in OF_ESTIMATOR.items():
+        for name, (colour, marker) in ESTIMATOR_STYLE.items():
             curve = [np.sqrt(np.nanmean(found.rms_mm[name][..., k] ** 2)) for k in range(len(RANGES_MM))]
             axes[0].semilogy(RANGES_MM, curve, color=colour, marker=marker, markersize=4, label=name)
         axes[0].set(xlabel="range, mm", ylabel="RMS error, mm", title="against range")

@@ -31,7 +31,7 @@ from tvsbayes.assessment.fitted_calibration import calibration_of
 from tvsbayes.coordinates.location import locate_linear, settings_of
 from tvsbayes.estimators.joint_fit import fit
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.report.drawing import BLACK, OF_ESTIMATOR
+from tvsbayes.report.drawing import BLACK, ESTIMATOR_STYLE
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
 
@@ -164,7 +164,7 @@ def draw(rows) -> None:
             chosen = [r for r in rows if r["name"] == protocol]
             if not chosen:
                 continue
-            for name, (colour, marker) in OF_ESTIMATOR.items():
+            for name, (colour, marker) in ESTIMATOR_STYLE.items():
                 per_rig = np.array(
                     [[_rms(_flat([r], "error_mm", k, name)) for k in range(len(metres))] for r in chosen]
                 )

@@ -28,7 +28,7 @@ from tvsbayes.estimators.four_point import classic
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.model.compilation_cache import use_compilation_cache
-from tvsbayes.report.drawing import OF_ESTIMATOR
+from tvsbayes.report.drawing import ESTIMATOR_STYLE
 from tvsbayes.twin.simulated_campaign import simulate
 
 ROWS, FIGURE = output(__file__, "bias.jsonl"), Path(__file__).with_suffix(".png")
@@ -181,7 +181,7 @@ def figure(shown: dict[tuple[str, str, str], list[tuple[float, dict[str, float]]
         axes = fig.subplots(2, len(LEVELS), sharey="row")
         for column, factor in enumerate(LEVELS):
             for name, (inside, label) in styles.items():
-                colour = OF_ESTIMATOR[name][0]
+                colour = ESTIMATOR_STYLE[name][0]
                 for axis, mark in (("pan", "o-"), ("tilt", "s--")):
                     cells = shown.get((factor, axis, name), [])
                     if not cells:

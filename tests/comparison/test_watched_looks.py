@@ -29,7 +29,7 @@ from tvsbayes.errors import NothingToEstimate
 from tvsbayes.instrument.campaign import Campaign, write_campaign
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 from tvsbayes.instrument.protocols import four_point_protocol
-from tvsbayes.report.watch_text import HELPS, MISSED
+from tvsbayes.report.watch_text import HELPS, REMEDIES
 from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, OK
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import simulate
@@ -169,4 +169,4 @@ def test_the_command_keeps_a_table(mounted_rig, mixed_fit, truth, tmp_path, monk
     assert (document["verdict"], document["error"]["code"]) == ("CANNOT TELL", "header")
     assert (tmp_path / "other.csv").read_text() == "night,what\n"
     assert set(HELPS) == {change.what for change in (*CHANGES, *SIGHTED_CHANGES)}
-    assert set(MISSED) == {what.split(":")[0] for what in HELPS}
+    assert set(REMEDIES) == {what.split(":")[0] for what in HELPS}

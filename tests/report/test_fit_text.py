@@ -9,7 +9,7 @@ from support.small_results import small_summary
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult
 from tvsbayes.head.foreign_sightings import STEP_DEG
-from tvsbayes.report.advice import steps_ahead
+from tvsbayes.report.advice import next_steps
 from tvsbayes.report.evidence import Criterion
 from tvsbayes.report.fit_text import FINE_DEG, classic_text, demo_text, fit_text
 from tvsbayes.report.result_tables import KEY_PARAMETERS
@@ -27,8 +27,8 @@ def test_a_fit_astray_shows_no_results():
     assert "19 and 10 more" in text and "cause" not in text
     causes = [Finding("counter-sign", "spots move right", "flip it", True)]
     assert fit_text(astray, causes=causes).splitlines()[-1] == "cause: spots move right"
-    assert steps_ahead(astray, "mine", causes) == ["Use none of the numbers: spots move right; flip it."]
-    assert "tvsbayes check" in steps_ahead(astray, "mine")[0]
+    assert next_steps(astray, "mine", causes) == ["Use none of the numbers: spots move right; flip it."]
+    assert "tvsbayes check" in next_steps(astray, "mine")[0]
 
 
 @pytest.mark.parametrize(("estimator", "word"), [("laplace", "too short; sample"), ("posterior", "intervals hold it")])

@@ -139,12 +139,12 @@ def _fitted(data: AxisCampaign, place: Path, quick: bool, no_sample: bool, max_m
 def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool, as_json: bool) -> None:
     """Check, classic, fit and report of an axis in one go."""
     from tvsbayes.report.axis_document import axis_fit_text
-    from tvsbayes.report.command_text import held_text
+    from tvsbayes.report.command_text import check_text
     from tvsbayes.single_axis.axis_campaign import read_axis
 
     data = read_axis(folder)
     documents: dict[str, Any] = {"check": held(folder)}
-    tell_part(held_text(documents["check"]), as_json)
+    tell_part(check_text(documents["check"]), as_json)
     documents["classic"], text = _classic(data)
     tell_part(text, as_json)
     kept = _fitted(data, output_place(folder, "results"), quick, no_sample, MAX_MINUTES, seed)

@@ -210,12 +210,12 @@ def check(
         finish(repaired, "\n".join([*lines, f"{escaped(str(repair_to), 200)}: written"]), as_json)
         return
     from tvsbayes.instrument.sightings import SIGHTINGS
-    from tvsbayes.report.command_text import held_text
+    from tvsbayes.report.command_text import check_text
 
     document = _held(path, plan_file)
     warnings, is_sighted = document["warnings"], (path / SIGHTINGS.file).is_file()
     end = f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}"
-    finish(document, f"{held_text(document, is_sighted)}\n{end}", as_json)
+    finish(document, f"{check_text(document, is_sighted)}\n{end}", as_json)
 
 
 def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:

@@ -279,12 +279,12 @@ def calibrate(
     from tvsbayes.estimators.findings import stop_at
     from tvsbayes.estimators.plausibility import implausible
     from tvsbayes.instrument.campaign import read_campaign
-    from tvsbayes.report.command_text import held_text
+    from tvsbayes.report.command_text import check_text
     from tvsbayes.report.fit_text import fit_text
 
     data = read_campaign(campaign)
     documents: dict[str, Any] = {"check": campaign_held(campaign, data)}
-    tell_part(held_text(documents["check"]), as_json)
+    tell_part(check_text(documents["check"]), as_json)
     if not anyway:
         stop_at(implausible(data), GO_ON)
     documents["classic"], printed = _classic(data)

@@ -63,10 +63,10 @@ def _append(table: Path, result: Watch) -> InputError | None:
     import datetime
 
     from tvsbayes.files.csv_table import append_line
-    from tvsbayes.report.watch_text import moved_words
+    from tvsbayes.report.watch_text import moved_text
 
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    moved = "; ".join(map(moved_words, result.moved))
+    moved = "; ".join(map(moved_text, result.moved))
     try:
         append_line(table, TABLE_COLUMNS, (now, result.verdict, float(f"{result.p:.3g}"), result.looks, moved))
     except InputError as error:

@@ -1,6 +1,6 @@
-"""What a fit amounts to in one line, why a validation may fail and what helps, and what to do next.
+"""Advice on a fit: its verdict in one line, causes and remedies of a failed validation, next steps.
 
-Shared by the terminal and the page. Sentences for people; ratios in deg/step.
+Shared by the terminal and the page; ratios in deg/step.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
 from tvsbayes.results.metrology_tables import BudgetTable
 
 SPOTS_REMEDY = "look at those spots, or fit with --robust"
-"""Where single spots disagree; a factor on u covers nothing of that."""
+"""Remedy for single spots that disagree; no factor on u covers these."""
 REMEDIES = {
     "the cameras moved": "fix the cameras and measure again, or fit the looks before and after as two campaigns",
     "the cameras drifted": "let cameras and mount warm up for half an hour and measure again in less time",
@@ -30,24 +30,24 @@ REMEDIES = {
     "the sheets disagree": "check that every sheet is flat, stands still and bears the right name in spots.csv",
     "single spots disagree": f"{SPOTS_REMEDY}, which leaves them out by name",
 }
-"""What helps, by how the name of the failed test begins."""
+"""Remedies by the beginning of the failed test's name."""
 ANY_REMEDY = "find the cause in the section Validation of the report, mend it and measure again"
 SPOTS_LISTED = 20
-"""Of those that disagree, by their ids."""
-SHARE_TOLD = 0.05
-"""Of a variance, from which on its cause is named."""
+"""Largest number of listed ids of spots that disagree."""
+SHARE_NAMED = 0.05
+"""Least share of a variance for naming its cause."""
 USUAL_SCALE = (0.5, 2.0)
-"""Pixel noise over the stated one that needs no word."""
+"""Pixel noise over the stated one without a remark."""
 
 
 def remedy(validation: Validation) -> str:
-    """What helps against the defect that explains the residuals best."""
+    """The remedy of the defect that explains the residuals best."""
     cause = validation.tests[0].name if validation.tests else ""
-    return next((cure for begin, cure in REMEDIES.items() if cause.startswith(begin)), ANY_REMEDY)
+    return next((text for test_name, text in REMEDIES.items() if cause.startswith(test_name)), ANY_REMEDY)
 
 
-def factor_told(validation: Validation) -> str:
-    """What a failed validation does to every u; its factor is 1 where it saw no move of a result."""
+def factor_text(validation: Validation) -> str:
+    """The effect of a failed validation on every u; its factor is 1 where no result would move."""
     if validation.widens:
         return f"multiply every u and half-width by {validation.inflation:.2f}"
     return "no factor on u covers it"
@@ -57,12 +57,12 @@ LAPLACE_SHORT = "Intervals are those of the Laplace approximation: too short for
 LAPLACE_WORTH = "the table is the Laplace approximation, whose intervals are up to a quarter too short"
 UNSAMPLED = f"usable with care: the posterior could not be sampled; {LAPLACE_WORTH}"
 ROUGH = "usable, but rough: see the Monte Carlo error"
-"""On 900 simulated campaigns its 95 % intervals of play hold the truth in 89 %, all others in 92 to 96 %
+"""On 900 simulated campaigns its 95 % intervals of play contain the truth in 89 %, all others in 92 to 96 %
 (experiments/intervals): a normal interval of 89 % is 1.6 sd wide instead of 1.96."""
 
 
 def failed(summary: FitSummary) -> Validation | None:
-    """The validation where it failed."""
+    """The validation if it failed, else None."""
     validation = summary.validation
     return None if validation is None or validation.passed else validation
 
@@ -72,9 +72,9 @@ def verdict_line(summary: FitSummary) -> str:
     if not summary.explained:
         return "verdict: NOT CONVERGED, use none of these numbers"
     if (validation := failed(summary)) is not None:
-        by_spots = not validation.widens and validation.cause.startswith("single spots disagree")
-        return f"verdict: VALIDATION FAILED, {factor_told(validation)}" + f": {SPOTS_REMEDY}" * by_spots
-    unseen = [d for d in DIRECTIONS if (e := summary.effective[d]) is not None and not e.informed]
+        only_spots = not validation.widens and validation.cause.startswith("single spots disagree")
+        return f"verdict: VALIDATION FAILED, {factor_text(validation)}" + f": {SPOTS_REMEDY}" * only_spots
+    unmoved = [d for d in DIRECTIONS if (e := summary.effective[d]) is not None and not e.informed]
     validation = summary.validation
     if not summary.converged:
         verdict = UNSAMPLED
@@ -86,13 +86,13 @@ def verdict_line(summary: FitSummary) -> str:
         verdict = (
             f"usable; no sign of a model error in {len(validation.tests)} tests (least p {validation.tests[0].p:.2g})"
         )
-    if unseen:
-        verdict += f"; the data say nothing of {', '.join(unseen)}"
+    if unmoved:
+        verdict += f"; the data say nothing of {', '.join(unmoved)}"
     return f"verdict: {verdict}"
 
 
 def noise_line(summary: FitSummary) -> str | None:
-    """What pixel noise far from the stated one means; None where it is as stated."""
+    """A remark on pixel noise far from the stated one; None where it is close."""
     scale = summary.parameters["pixel_scale"].value
     if USUAL_SCALE[0] <= scale <= USUAL_SCALE[1]:
         return None
@@ -107,7 +107,7 @@ def noise_line(summary: FitSummary) -> str | None:
 
 
 def assumed_stereo(stereo: Stereo, budgets: Sequence[BudgetTable]) -> str | None:
-    """How much of each result's variance an assumed stereo covariance makes, and what lowers it; None of a real one."""
+    """Shares of an assumed stereo covariance in the results' variances, and its remedy; None for an estimated one."""
     if not stereo.assumed:
         return None
     cause = REGISTRY[STEREO_PARAMETER_NAMES[0]].cause
@@ -115,21 +115,21 @@ def assumed_stereo(stereo: Stereo, budgets: Sequence[BudgetTable]) -> str | None
         f"{100 * row.share:.0f} % of the variance of {table.quantity}"
         for table in budgets
         for row in table.rows
-        if row.quantity == cause and row.share >= SHARE_TOLD
+        if row.quantity == cause and row.share >= SHARE_NAMED
     ]
-    begin = "the stereo covariance is assumed, not estimated"
+    text = "the stereo covariance is assumed, not estimated"
     origin = f" (from {stereo.assumed_from})" if stereo.assumed_from else ""
     if not budgets:
-        return f"{begin}{origin}"
+        return f"{text}{origin}"
     if not shares:
-        return f"{begin}{origin}: less than {100 * SHARE_TOLD:.0f} % of the variance of every result comes from it"
-    return f"{begin}{origin}: it makes {', '.join(shares)}; what lowers it: {ASSUMED_REMEDY}"
+        return f"{text}{origin}: less than {100 * SHARE_NAMED:.0f} % of the variance of every result comes from it"
+    return f"{text}{origin}: it makes {', '.join(shares)}; what lowers it: {ASSUMED_REMEDY}"
 
 
-def steps_ahead(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()) -> list[str]:
-    """What to do next, most urgent first, in words for the page of the campaign in a folder of that name.
+def next_steps(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()) -> list[str]:
+    """The next steps, most urgent first, for the page of the campaign in `folder`.
 
-    `causes` explain a fit that failed.
+    `causes` explain a failed fit.
     """
     steps = []
     if not summary.explained and causes:
@@ -140,16 +140,16 @@ def steps_ahead(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()
             "and pictures of another size, then fit again.",
         ]
     if (validation := failed(summary)) is not None:
-        help_ = remedy(validation)
-        steps.append(f"{validation.cause}: {help_}.")
+        action = remedy(validation)
+        steps.append(f"{validation.cause}: {action}.")
     if summary.suspect_spots and (validation is None or "single spots" not in validation.cause):
         ids = listed(summary.suspect_spots, SPOTS_LISTED)
         steps.append(
             f"Look at spots {ids}, which disagree with all others, or fit with --robust, which leaves them out."
         )
     if summary.few_stops:
-        named = ", ".join(f"{direction} ({count})" for direction, count in summary.few_stops.items())
-        steps.append(f"Add stops reached by moving {named}: so few hardly tell their own scatter.")
+        directions = ", ".join(f"{direction} ({count})" for direction, count in summary.few_stops.items())
+        steps.append(f"Add stops reached by moving {directions}: so few hardly tell their own scatter.")
     if summary.estimator == "laplace":
         steps.append(f"Sample the posterior, which takes minutes: `tvsbayes fit {folder}`, then make the report again.")
     texts = [weak.text for weak in summary.weak_directions if asks_for_looks(weak)]
@@ -157,5 +157,5 @@ def steps_ahead(summary: FitSummary, folder: str, causes: Sequence[Finding] = ()
 
 
 def asks_for_looks(weak: WeakDirection) -> bool:
-    """Whether a weak direction says which looks would cure it: those stand under what to do next."""
+    """Whether a weak direction recommends looks: these are among the next steps."""
     return "looks at" in weak.text

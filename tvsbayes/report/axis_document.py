@@ -1,6 +1,6 @@
-"""What is said of an axis: its tables, what commands print of them, and the document of its page.
+"""Results of an axis: tables, texts of commands, the document of its page.
 
-Commands and values in the axis' own units, `escaped` where a campaign names them.
+Commands and values in the axis' own units, `escaped` where they come from a campaign.
 """
 
 from __future__ import annotations
@@ -53,19 +53,19 @@ from tvsbayes.single_axis.next_stops import AxisPlan, unit_of
 
 DEVIATIONS_SHOWN = 40
 TABLE_ROWS = 60
-"""Positions on a terminal, and on the page."""
+"""Largest numbers of positions on a terminal, and on the page."""
 LIKELY = 0.5
-"""Probability of a wave from which on its curve is drawn."""
-HARDLY = 0.95
-"""Stops that leave more than this share of an uncertainty are not worth their time."""
+"""Least probability of a wave for a figure."""
+HELPLESS_SHARE = 0.95
+"""Largest useful remaining share of an uncertainty after further stops."""
 MORE_HELPS = "many more stops (--minutes) help, or readings of smaller u"
 HELPS = {
     "per_command": "a longer travel helps, over which errors by position count less; the line over the commands read "
     "is known better: --target effective_per_command"
 }
-"""By target, instead of stops that hardly help."""
-CONFLICTING = "the numbers hold only if the readings, not the priors, are wrong"
-"""Of a fit whose priors the readings contradict."""
+"""Alternatives by target where further stops hardly help."""
+CONFLICT_TEXT = "the numbers hold only if the readings, not the priors, are wrong"
+"""Part of the verdict where the readings contradict priors."""
 METHOD = (
     "Readings = offset + unit per command x command, play taken up on the side of arrival, an error and a play "
     "that repeat by position (Matern processes), waves where periods are asked for, a zero that creeps and drifts, "
@@ -74,26 +74,26 @@ METHOD = (
 )
 
 
-def _row(name: str, of: Estimate) -> list[str]:
-    return [name, concise(of.value, of.sd), interval_text(*of.interval95, of.sd)]
+def _row(name: str, estimate: Estimate) -> list[str]:
+    return [name, concise(estimate.value, estimate.sd), interval_text(*estimate.interval95, estimate.sd)]
 
 
 def period_table(summary: AxisSummary) -> TableView | None:
-    """Every wave with amplitude and period, given that it is there; None where none was asked for."""
+    """Every wave with amplitude and period, given that it exists; None where the model has none."""
     unit, rows = escaped(summary.unit), []
-    for what, waves in (("gear", summary.periods), ("encoder", summary.encoder_periods)):
-        of = "s" if what == "gear" and summary.periods_in == "seconds" else unit
-        rows += [wave_row(what, wave, unit, of) for wave in waves]
+    for source, periods in (("gear", summary.periods), ("encoder", summary.encoder_periods)):
+        period_unit = "s" if source == "gear" and summary.periods_in == "seconds" else unit
+        rows += [wave_row(source, wave, unit, period_unit) for wave in periods]
     return TableView(f"{WAVES}; phase at position or time 0", WAVE_COLUMNS, rows) if rows else None
 
 
 def ratio_table(summary: AxisSummary) -> TableView:
-    """Unit per command by direction: of the gears, of the line through what was read, and the classic."""
+    """Unit per command by direction: of the gears, of the line through the readings, and the classic."""
     unit = escaped(summary.unit)
     low, high = summary.range_command
-    rows = [_row(f"gears, {side}", of) for side, of in summary.per_command.items()]
+    rows = [_row(f"gears, {side}", e) for side, e in summary.per_command.items()]
     rows += [
-        _row(f"line from {low:.10g} to {high:.10g}, {side}", of) for side, of in summary.effective_per_command.items()
+        _row(f"line from {low:.10g} to {high:.10g}, {side}", e) for side, e in summary.effective_per_command.items()
     ]
     classic = summary.classic
     rows.append(["classic: least-squares line", concise(classic.per_command, classic.u_per_command), ""])
@@ -103,33 +103,33 @@ def ratio_table(summary: AxisSummary) -> TableView:
 def parameter_table(summary: AxisSummary) -> TableView:
     """All parameters but the ratio."""
     rows, labels = [], {name: quantity.label for name, quantity in AXIS_QUANTITIES.items()}
-    for name, of in summary.parameters.items():
+    for name, estimate in summary.parameters.items():
         if name != "per_command":
-            said = "" if of.contraction is None else f"{100 * max(of.contraction, 0.0):.0f} %"
-            rows.append([labels.get(name, name), *_row(name, of)[1:], said])
+            share = "" if estimate.contraction is None else f"{100 * max(estimate.contraction, 0.0):.0f} %"
+            rows.append([labels.get(name, name), *_row(name, estimate)[1:], share])
     caption = f"parameters, {escaped(summary.unit)}; 100 %: the readings tell it, 0 %: the prior does"
     return TableView(caption, ["", "value(u)", "95 % interval", "data"], rows)
 
 
 def for_firmware(summary: AxisSummary) -> str:
-    """What goes into a motion controller: commands per unit on the line read, play in commands."""
+    """Values for a motion controller: commands per unit on the line read, play in commands."""
     sides = tuple(summary.effective_per_command.values())
-    ratio, u_ratio = sum(of.value for of in sides) / len(sides), max(of.sd for of in sides)
+    ratio, u_ratio = sum(estimate.value for estimate in sides) / len(sides), max(estimate.sd for estimate in sides)
     low, high = summary.range_command
-    said = f"for your firmware, from {low:.10g} to {high:.10g}: {concise(1 / ratio, u_ratio / ratio**2)} commands per "
-    said += f"{escaped(summary.unit)}, "
+    text = f"for your firmware, from {low:.10g} to {high:.10g}: {concise(1 / ratio, u_ratio / ratio**2)} commands per "
+    text += f"{escaped(summary.unit)}, "
     play = summary.parameters["backlash"]
     in_commands = concise(play.value / abs(ratio), play.sd / abs(ratio))
     if play.interval95[0] <= 0 <= play.interval95[1]:
-        return f"{said}play of {in_commands} commands is not proved: its 95 % interval holds 0"
+        return f"{text}play of {in_commands} commands is not proved: its 95 % interval holds 0"
     if play.value < 0:
         overshoot = concise(-play.value / abs(ratio), play.sd / abs(ratio))
-        return f"{said}no play: a reversal overshoots by {overshoot} commands"
-    return f"{said}play of {in_commands} commands"
+        return f"{text}no play: a reversal overshoots by {overshoot} commands"
+    return f"{text}play of {in_commands} commands"
 
 
-def offered(summary: AxisSummary) -> list[str]:
-    """What an owner takes from a converged fit: numbers for firmware, the worst place, waves. Of a drive the last."""
+def result_lines(summary: AxisSummary) -> list[str]:
+    """Main results of a converged fit: numbers for firmware, the worst place, waves; only waves for a drive."""
     waves = [*_waves(summary.periods, summary, summary.periods_in), *_waves(summary.encoder_periods, summary, "")]
     if "seeing_s" in summary.parameters:
         return waves
@@ -137,35 +137,35 @@ def offered(summary: AxisSummary) -> list[str]:
 
 
 def _waves(estimates: Sequence[PeriodEstimate], summary: AxisSummary, periods_in: str) -> list[str]:
-    """Waves that are likely, in words."""
+    """Probable waves, in words."""
     unit = escaped(summary.unit)
-    said = []
-    for one in estimates:
-        if one.probability >= LIKELY:
-            period = f"{one.period.value:.10g}" if one.source == "stated" else concise(one.period.value, one.period.sd)
-            amplitude = concise(one.amplitude.value, one.amplitude.sd)
-            of = "s" if periods_in == "seconds" else unit
-            said.append(f"a wave of {amplitude} {unit} every {period} {of}, probability {percent(one.probability)}")
-    return said
+    texts = []
+    for e in estimates:
+        if e.probability >= LIKELY:
+            period = f"{e.period.value:.10g}" if e.source == "stated" else concise(e.period.value, e.period.sd)
+            amplitude = concise(e.amplitude.value, e.amplitude.sd)
+            x_unit = "s" if periods_in == "seconds" else unit
+            texts.append(f"a wave of {amplitude} {unit} every {period} {x_unit}, probability {percent(e.probability)}")
+    return texts
 
 
 def worst_place(summary: AxisSummary) -> str:
-    """Where the error by position is largest, and whose it may be."""
+    """The largest error by position and its possible source."""
     worst = max(summary.deviations, key=lambda d: abs(d.value))
-    said = f"the error by position is largest at command {worst.position:.10g}: {concise(worst.value, worst.sd)} "
-    said += f"{escaped(summary.unit)} off the line"
+    text = f"the error by position is largest at command {worst.position:.10g}: {concise(worst.value, worst.sd)} "
+    text += f"{escaped(summary.unit)} off the line"
     if worst.interval95[0] <= 0 <= worst.interval95[1]:
-        said += ", whose 95 % interval holds 0"
-    return f"{said}; it is that of gears and encoder together, which one encoder alone cannot tell apart"
+        text += ", whose 95 % interval holds 0"
+    return f"{text}; it is that of gears and encoder together, which one encoder alone cannot tell apart"
 
 
-def deviation_table(deviations: Sequence[PositionDeviation], unit: str, most: int) -> TableView:
-    """What repeats by position, off the line; of more positions than `most`, so many spread evenly."""
+def deviation_table(deviations: Sequence[PositionDeviation], unit: str, limit: int) -> TableView:
+    """Errors that repeat by position, less the line; at most `limit` positions, evenly spread."""
     rows = [[f"{d.position:.10g}", concise(d.value, d.sd), interval_text(*d.interval95, d.sd)] for d in deviations]
     caption = f"error that repeats by position, off the line through the stops, {escaped(unit)}"
-    if len(rows) > most:
-        caption += f"; {most} of {len(rows)} positions, fit.json has all"
-        rows = [rows[round(k * (len(rows) - 1) / (most - 1))] for k in range(most)]
+    if len(rows) > limit:
+        caption += f"; {limit} of {len(rows)} positions, fit.json has all"
+        rows = [rows[round(k * (len(rows) - 1) / (limit - 1))] for k in range(limit)]
     return TableView(caption, ["command", "value(u)", "95 % interval"], rows)
 
 
@@ -182,16 +182,16 @@ def iso230_table(classic: ClassicAxis, unit: str) -> TableView | None:
 
 
 def classic_text(classic: ClassicAxis, unit: str) -> str:
-    """The classic of an axis in words."""
-    named = escaped(unit)
+    """The classic estimate of an axis as text."""
+    unit_text = escaped(unit)
     play = None
     if classic.backlash is not None and classic.u_backlash is not None:
-        play = f"backlash {concise(classic.backlash, classic.u_backlash)} {named}"
+        play = f"backlash {concise(classic.backlash, classic.u_backlash)} {unit_text}"
     table = iso230_table(classic, unit)
     return terminal(
-        f"{concise(classic.per_command, classic.u_per_command)} {named} per command",
+        f"{concise(classic.per_command, classic.u_per_command)} {unit_text} per command",
         play,
-        f"scatter about the line {two_digits(classic.residual_sd)} {named}; stops taken as independent",
+        f"scatter about the line {two_digits(classic.residual_sd)} {unit_text}; stops taken as independent",
         None if table is None else "",
         table,
     )
@@ -201,40 +201,40 @@ def _lines(title: str, texts: Sequence[str]) -> list[str]:
     return [f"{title}: {text}" for text in texts]
 
 
-def reserved(summary: AxisSummary) -> str:
-    """What a reader of a verdict alone would miss: that warnings stand beside it."""
+def warnings_note(summary: AxisSummary) -> str:
+    """A reference to the warnings, at the end of a verdict."""
     count = len(summary.warnings)
     return f"; mind the {count} warnings" if count > 1 else "; mind the warning" * count
 
 
 def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence[str] = ()) -> str:
-    """The answer, what the reader must know, then the tables, then one line of verdict.
+    """Main results, remarks, tables, and one line of verdict at the end.
 
     Args:
         summary: the fit.
-        details: also the error by position, ISO 230-2 and what the readings leave to the priors.
-        written: files that hold all of it.
+        details: also the error by position, ISO 230-2 and weak directions.
+        written: files with all results.
     """
     words = {None: "Laplace approximation", IMPORTANCE: "weighted draws"}
-    how = words.get(summary.tier, f"chain of {summary.tier}")
-    more: list[Part] = []
+    method = words.get(summary.tier, f"chain of {summary.tier}")
+    parts: list[Part] = []
     if details:
         deviations = deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN)
-        more = [deviations if summary.deviations else None, iso230_table(summary.classic, summary.unit)]
-        more += _lines("weak (the readings leave it to the priors)", summary.weak_directions)
+        parts = [deviations if summary.deviations else None, iso230_table(summary.classic, summary.unit)]
+        parts += _lines("weak (the readings leave it to the priors)", summary.weak_directions)
     elif count := len(summary.weak_directions):
-        more = [f"--details and the report say more: {count} weak direction{'s' * (count > 1)}"]
+        parts = [f"--details and the report say more: {count} weak direction{'s' * (count > 1)}"]
     title = "not accepted" if summary.explained else "NOT CONVERGED"
-    more += [*_lines(title, summary.problems), *_lines("warning", summary.warnings)]
-    more += _lines("prior conflict", summary.prior_conflicts)
-    more += [f"written: {', '.join(written)}"] if written else []
-    counted = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {how}"
-    answer = offered(summary) if summary.explained else []
+    parts += [*_lines(title, summary.problems), *_lines("warning", summary.warnings)]
+    parts += _lines("prior conflict", summary.prior_conflicts)
+    parts += [f"written: {', '.join(written)}"] if written else []
+    data = f"{summary.readings} readings of {summary.moves} moves at {summary.positions} positions; {method}"
+    answer = result_lines(summary) if summary.explained else []
     return terminal(
         *answer,
-        *more,
-        "" if answer or any(part is not None for part in more) else None,
-        counted,
+        *parts,
+        "" if answer or any(part is not None for part in parts) else None,
+        data,
         *(period_table(summary), parameter_table(summary), ratio_table(summary)),
         f"verdict: {axis_verdict(summary)}",
     )
@@ -245,14 +245,14 @@ def axis_verdict(summary: AxisSummary) -> str:
     if not summary.explained:
         return "NOT CONVERGED, use none of these numbers"
     if summary.prior_conflicts:
-        return f"PRIOR CONFLICT, {CONFLICTING}"
+        return f"PRIOR CONFLICT, {CONFLICT_TEXT}"
     if not summary.converged:
-        return f"{UNSAMPLED}{reserved(summary)}"
-    return f"{ROUGH if summary.answer == 'rough' else 'usable'}{reserved(summary)}"
+        return f"{UNSAMPLED}{warnings_note(summary)}"
+    return f"{ROUGH if summary.answer == 'rough' else 'usable'}{warnings_note(summary)}"
 
 
 def hold_out_table(hold_out: AxisHoldOut, unit: str) -> TableView:
-    """Positions left out, beside what was predicted of them."""
+    """Positions left out, with their predictions."""
     rows = []
     for p in hold_out.positions:
         row = [f"{p.position:.10g}", p.direction, str(p.n), f"{p.mean:.6g}", concise(p.predicted, p.u), f"{p.z:+.1f}"]
@@ -262,7 +262,7 @@ def hold_out_table(hold_out: AxisHoldOut, unit: str) -> TableView:
 
 
 def axis_hold_out_text(hold_out: AxisHoldOut, unit: str) -> str:
-    """A hold-out in words."""
+    """A hold-out as text."""
     errors = f"RMS z {hold_out.rms_z:.2f}, classic {hold_out.classic_rms_z:.2f}; "
     errors += f"{100 * hold_out.inside_share:.0f} % of the left-out readings in their 95 % intervals"
     return terminal(hold_out_table(hold_out, unit), errors, *_lines("warning", hold_out.warnings))
@@ -281,17 +281,17 @@ def next_table(plan: AxisPlan, unit: str) -> TableView:
 
 
 def axis_plan_text(plan: AxisPlan, unit: str) -> str:
-    """What next, in words."""
+    """A plan as text."""
     if not plan.next:
         return "there is no time for a single stop"
-    left = plan.next[-1].u / plan.u_now
-    hardly = f"these stops hardly help: u falls by {100 * (1 - left):.1f} %; {HELPS.get(plan.target, MORE_HELPS)}"
+    share = plan.next[-1].u / plan.u_now
+    warning = f"these stops hardly help: u falls by {100 * (1 - share):.1f} %; {HELPS.get(plan.target, MORE_HELPS)}"
     minutes = f"{plan.minutes:.1f} minutes in all"
-    return terminal(next_table(plan, unit), minutes, hardly if left > HARDLY else None)
+    return terminal(next_table(plan, unit), minutes, warning if share > HELPLESS_SHARE else None)
 
 
 def _wave_figures(fit: AxisFit) -> list[FigureView]:
-    """Every wave that is there more likely than not."""
+    """Figures of probable waves."""
     alt, end = "A wave over one period as a curve with a band.", "over one period, both harmonics, with its 95 % band."
     return [
         FigureView(
@@ -305,7 +305,7 @@ def _wave_figures(fit: AxisFit) -> list[FigureView]:
 
 
 def curve_commands(low: float, high: float) -> np.ndarray:
-    """Where the figure's curve is wanted; `results_for` needs them beforehand."""
+    """Commands of the figure's curve; `results_for` needs them as `more`."""
     return np.linspace(low, high, CURVE_POINTS)
 
 
@@ -320,23 +320,23 @@ def _error_figures(fit: AxisFit) -> list[FigureView]:
 
 
 def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[Section]:
-    """In the order of the page; `figures` are those that the first page has no room for."""
+    """Sections in the order of the page; `figures` are those after the first page."""
     summary, campaign = results.summary, results.fit.campaign
     unit, classic, waves = summary.unit, summary.classic, period_table(summary)
     line = f"Least-squares line: {concise(classic.per_command, classic.u_per_command)} {unit} per command, stops "
     line += f"independent, residual scatter {two_digits(classic.residual_sd)} {unit}."
     parameters = [ratio_table(summary) if waves else None, parameter_table(summary)]
-    in_words = [sentence(text) for text in (offered(summary) if summary.explained else ())]
-    repeated = [deviation_table(summary.deviations, unit, TABLE_ROWS) if summary.deviations else None]
-    made = compensation_in(campaign)
-    applied = []
-    if made is not None:
-        fresh = stored_verification(campaign, axis_hashes(campaign), made.digest, made.unit)
-        applied = [compensation_section(made, fresh)]
+    result_texts = [sentence(text) for text in (result_lines(summary) if summary.explained else ())]
+    deviations = [deviation_table(summary.deviations, unit, TABLE_ROWS) if summary.deviations else None]
+    compensation = compensation_in(campaign)
+    compensation_sections = []
+    if compensation is not None:
+        verification = stored_verification(campaign, axis_hashes(campaign), compensation.digest, compensation.unit)
+        compensation_sections = [compensation_section(compensation, verification)]
     return [
-        Section("Result", in_words, tables=parameters, figures=figures, opened=True),
-        Section("What repeats by position", tables=repeated),
-        *applied,
+        Section("Result", result_texts, tables=parameters, figures=figures, opened=True),
+        Section("What repeats by position", tables=deviations),
+        *compensation_sections,
         Section("What the readings cannot tell", items=summary.weak_directions or ["Nothing of note."]),
         Section("Classic", [line], tables=[iso230_table(classic, unit)]),
         Section("Method", METHOD),
@@ -344,17 +344,17 @@ def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[S
 
 
 def axis_document(results: AxisResults, issue: Issue) -> Document:
-    """The report of an axis with its number; `results.fit` holds `curve_commands` of its range."""
+    """The report of an axis with its number; `results.fit` must include `curve_commands` of its range."""
     summary, fit = results.summary, results.fit
-    made = plain(provenance(axis_hashes(fit.campaign), fit.seed))
-    said = json.dumps([summary.as_json(), made["inputs"]], sort_keys=True)
+    origin = plain(provenance(axis_hashes(fit.campaign), fit.seed))
+    content = json.dumps([summary.as_json(), origin["inputs"]], sort_keys=True)
     header, play = fit.campaign.header, summary.parameters["backlash"]
     verdict = sentence(axis_verdict(summary)) + " No limit was stated." * summary.explained
     figures = [*_error_figures(fit), *_wave_figures(fit)]
     folder = "AXIS" if fit.campaign.path is None else typed(fit.campaign.path.resolve().name)
     return numbered(
         Document(
-            results=digest_number(said.encode()),
+            results=digest_number(content.encode()),
             name=title_of(header, fit.campaign.path),
             about=about_table(header, str(header.get("created") or ""), issue),
             verdict=Verdict(verdict, "cannot-tell" if summary.explained else "not-met"),
@@ -364,7 +364,7 @@ def axis_document(results: AxisResults, issue: Issue) -> Document:
             steps=[f"`tvsbayes plan --given {folder}` says which stops to read next."],
             traceable="The readings are taken as stated.",
             warnings=[*summary.problems, *summary.warnings, *_lines("Prior conflict", summary.prior_conflicts)],
-            versions=made["versions"],
+            versions=origin["versions"],
             sections=axis_sections(results, figures[1:]),
             title="Calibration of an axis",
             issue=issue,

@@ -1,4 +1,4 @@
-"""What commands print besides a fit: cameras, coordinates, comparisons, plans, studies; units in heads and words."""
+"""Texts of commands other than `fit`: cameras, coordinates, comparisons, plans, studies; units in heads and words."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 
 
 def extrapolated_text(unseen: str) -> str:
-    """What counters that no look reached mean for a result; `unseen` names them."""
+    """The warning of a result at counters without looks; `unseen` names them."""
     return f"EXTRAPOLATED: {unseen}, where looks were; errors of the gears are predicted there by their size alone"
 
 
-HELD_WORDS = {
+KEY_WORDS = {
     "ok_spots": "usable spots",
     "refused": "refused spots, by reason",
     "aperture_readings": "spots with aperture reading",
@@ -51,64 +51,64 @@ HELD_WORDS = {
     "seen": "looks in view",
     "range_command": "commands, from and to",
 }
-"""What `check` calls its keys."""
-SIGHTED_WORDS = {
+"""Words of keys in the text of `check`."""
+SIGHTING_WORDS = {
     "spots": "sightings",
     "ok_spots": "usable sightings",
     "refused": "refused sightings, by reason",
     **dict.fromkeys(("aperture_readings", "experiments"), ""),
 }
-"""The same of a head that says where it points; "" of what it does not have."""
+"""The same for a head with sightings; "" omits a key."""
 UNSEEN_SHOWN = 5
-"""Counters that no look reached, of a file of points."""
+"""Largest number of notes on counters without looks, for a file of points."""
 PLAN_UNIT = {"contrast": "deg/step", "backlash": "deg", "mirror_offset": "mm"}
-"""Units of what a plan will tell, by how their names begin; the ratios' is deg/step."""
+"""Units of results in a plan, by the beginning of their names; deg/step for ratios."""
 
 
-def held_text(document: Mapping[str, Any], sightings: bool = False) -> str:
-    """What `check` found in a campaign, rig, plan, axis or journal: a table, and warnings.
+def check_text(document: Mapping[str, Any], sightings: bool = False) -> str:
+    """The text of `check` for a campaign, rig, plan, axis or journal: a table, and warnings.
 
     Args:
         document: of `check --json`.
-        sightings: whether the campaign is of a head that says where it points.
+        sightings: whether the campaign is of a head with sightings.
     """
-    left_out = ("kind", "findings", "warnings", "faults", "expected", "contraction", "journal")
-    words = HELD_WORDS | (SIGHTED_WORDS if sightings else {})
+    omitted = ("kind", "findings", "warnings", "faults", "expected", "contraction", "journal")
+    words = KEY_WORDS | (SIGHTING_WORDS if sightings else {})
     rows = [
-        [words.get(key, key), _held_value(value)]
+        [words.get(key, key), _value_text(value)]
         for key, value in document.items()
-        if key not in left_out and words.get(key) != ""
+        if key not in omitted and words.get(key) != ""
     ]
     parts: list[Part] = [TableView(document["kind"], [], rows)]
     if "expected" in document:
         parts.append(_expected_table(document["expected"], document["contraction"]))
     if (journal := document.get("journal")) is not None:
-        rows = [[key, _held_value(value)] for key, value in journal.items() if key != "kind"]
+        rows = [[key, _value_text(value)] for key, value in journal.items() if key != "kind"]
         parts.append(TableView("journal of the run", [], rows))
     parts += [f"warning: {warning}" for warning in document["warnings"]]
-    certain = sum(finding["certain"] for finding in document.get("findings", ()))
-    parts += [f"certain: {certain} of them; `fit` and `calibrate` stop there, --anyway goes on"] * bool(certain)
+    count = sum(finding["certain"] for finding in document.get("findings", ()))
+    parts += [f"certain: {count} of them; `fit` and `calibrate` stop there, --anyway goes on"] * bool(count)
     return terminal(*parts)
 
 
-def _held_value(value: Any) -> str:
-    """One entry of `check`: numbers as they are, tables and lists in words."""
+def _value_text(value: Any) -> str:
+    """One value of `check`: numbers, tables and lists as text."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{escaped(str(key), 80)} {_held_value(each)}" for key, each in value.items()) or "none"
+        return ", ".join(f"{escaped(str(key), 80)} {_value_text(entry)}" for key, entry in value.items()) or "none"
     if isinstance(value, list | tuple):
-        return ", ".join(map(_held_value, value)) or "none"
+        return ", ".join(map(_value_text, value)) or "none"
     if isinstance(value, float):
         return f"{value:.10g}" if value == round(value) else f"{value:.4g}"
     return "not known" if value is None else escaped(str(value), 400)
 
 
 def _expected_table(expected: Mapping[str, float], contraction: Mapping[str, float | None]) -> TableView:
-    """What a plan will tell: u of every result, and how much of the prior variance it takes away."""
+    """Expected results of a plan: u, and the reduction of the prior variance."""
     rows = []
     for name, u in expected.items():
-        unit = next((unit for begin, unit in PLAN_UNIT.items() if name.startswith(begin)), "deg/step")
+        unit = next((unit for prefix, unit in PLAN_UNIT.items() if name.startswith(prefix)), "deg/step")
         share = contraction.get(name)
-        # What an instrument does not have is exactly known.
+        # Parameters that the instrument lacks are fixed.
         if u > 0 or share is not None:
             rows.append([name, two_digits(u), unit, "fixed" if share is None else f"{round(100 * share)} %"])
     columns = ["result", "u expected", "unit", "set by the data"]
@@ -119,11 +119,11 @@ LAW = (
     "values are those of the draws; law: digits of u to which the law of propagation (GUM) agrees, else by how much "
     "an end of its 95 % interval differs"
 )
-"""Below a table of points."""
+"""Note below a table of points."""
 
 
 def plan_text(result: PlanResult) -> str:
-    """A result for people."""
+    """A plan as text."""
     unit = result.target.unit
     lines = [f"target: {result.target.text}; now {result.now:.3g} {unit}", ""]
     lines.append("looks  minutes     classic       joint  chance of success")
@@ -136,9 +136,9 @@ def plan_text(result: PlanResult) -> str:
     symbol = result.target.text.partition("(")[0]
     lines.append(f"{symbol} in {unit}, medians over {result.draws} drawn instruments;")
     lines.append("chance of success (assurance): that the fit of such a campaign reports the target as met")
-    most = LOOKS_PER_EXPERIMENT * result.curve[-1].experiments
+    looks_max = LOOKS_PER_EXPERIMENT * result.curve[-1].experiments
     for level, n in zip(ASSURED, (result.n80, result.n95), strict=True):
-        count = f"not reached with up to {most} looks" if n is None else f"{LOOKS_PER_EXPERIMENT * n} looks"
+        count = f"not reached with up to {looks_max} looks" if n is None else f"{LOOKS_PER_EXPERIMENT * n} looks"
         lines.append(f"for a chance of {100 * level:.0f} %: {count}")
     if result.assurance is None or result.assurance_se is None:
         lines.append("the target is met already: nothing is left to do")
@@ -173,13 +173,13 @@ def plan_text(result: PlanResult) -> str:
 
 
 def _curve_shown(result: PlanResult) -> list[CurvePoint]:
-    """Points of the curve up to the first with the higher assurance, one beyond it, and the last."""
+    """Points of the curve up to the first with the higher assurance, the next one, and the last."""
     enough = next((k for k, p in enumerate(result.curve) if p.assurance >= ASSURED[1]), len(result.curve))
     return [p for k, p in enumerate(result.curve) if k <= enough + 1 or k == len(result.curve) - 1]
 
 
 def stereo_text(stereo: Stereo) -> str:
-    """The 24 parameters of a pair with their standard uncertainties, both cameras beside each other."""
+    """The 24 parameters of a pair with their standard uncertainties, both cameras side by side."""
     sds = np.sqrt(np.diag(stereo.parameter_covariance))
     cells = [concise(float(value), float(sd)) for value, sd in zip(stereo.vector, sds, strict=True)]
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -194,7 +194,7 @@ def stereo_text(stereo: Stereo) -> str:
 
 
 def stereo_calibration_text(result: StereoCalibration) -> str:
-    """A calibration from checkerboards: parameters, views, and everything the reader must know about it."""
+    """A calibration from checkerboards as text: parameters, views, remarks."""
 
     def px(value: float | None) -> str:
         return "-" if value is None else f"{value:.3f}"
@@ -204,7 +204,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
         cells = [px(view.left_rms_px), px(view.right_rms_px), f"{view.distance_mm:.0f}", f"{view.tilt_deg:.0f}"]
         rows.append([escaped(view.name) or "-", *cells, "OUTLIER" if view.outlier else ""])
     columns = ["view", "left rms px", "right rms px", "distance mm", "tilt deg", ""]
-    board, mean_sd = result.board, result.triangulated_pitch_mm
+    board, pitch_mm = result.board, result.triangulated_pitch_mm
     lines: list[Part] = [
         stereo_text(result.stereo),
         TableView(f"{result.pairs} pairs, {len(result.views) - result.pairs} single views", columns, rows),
@@ -214,19 +214,19 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
         f"{result.correlation_factor:.1f} times those of independent corners",
         f"and for a board whose corners are {result.board_error_mm:.2g} mm off a grid, as the residuals show",
         f"baseline {concise(float(np.linalg.norm(result.stereo.T)), result.baseline_sd_mm)} mm; squares, triangulated: "
-        f"{mean_sd[0]:.3f} mm on average, sd {mean_sd[1]:.3f}, stated {board.pitch_mm:g}",
+        f"{pitch_mm[0]:.3f} mm on average, sd {pitch_mm[1]:.3f}, stated {board.pitch_mm:g}",
         "boards cover "
         + ", ".join(f"{100 * share:.0f} % of the {side} image" for side, share in result.coverage.items()),
     ]
     if (pictures := result.pictures) is not None:
-        lists = {
+        names_by_note = {
             "without their counterpart": pictures.unpaired,
             "names tell no camera, not used": pictures.unnamed,
             "no board found": pictures.without_board,
             "another size, not used": pictures.other_size,
             "found by the other finder": pictures.by_fallback,
         }
-        lines += [f"{what}: {escaped(', '.join(names), 400)}" for what, names in lists.items() if names]
+        lines += [f"{note}: {escaped(', '.join(names), 400)}" for note, names in names_by_note.items() if names]
     if result.reordered:
         lines.append(f"right corners turned to agree: {escaped(', '.join(result.reordered), 400)}")
     if result.excluded:
@@ -236,7 +236,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
 
 
 def detection_text(detection: Detection) -> str:
-    """What `detect` found, as a table of statuses."""
+    """Results of `detect` as a table of statuses."""
     from tvsbayes.cameras.detection import REASONS
 
     rows = [[status, str(count), REASONS.get(status.split(" ")[0], "")] for status, count in detection.statuses.items()]
@@ -274,24 +274,24 @@ def locations_text(locations: Locations) -> str:
         sd = np.sqrt(np.diag(locations.covariance_mm2[index]))
         cells = [concise(float(x), float(u)) for x, u in zip(locations.xyz_mm[index], sd, strict=True)]
         half = " ".join(map(two_digits, locations.u95_mm[index]))
-        held = int(locations.digits_held[index].min())
-        off = two_digits(float(locations.law_off_mm[index]))
-        verdict = f"same to {held} digit{'s' * (held > 1)}" if held else f"off by {off} mm"
-        # What is only known to be far off needs no second opinion on its u.
+        digits = int(locations.digits_held[index].min())
+        difference = two_digits(float(locations.law_off_mm[index]))
+        verdict = f"same to {digits} digit{'s' * (digits > 1)}" if digits else f"off by {difference} mm"
+        # For an extrapolated point the comparison with the law is irrelevant.
         rows.append([str(index), *cells, half, "EXTRAPOLATED" if locations.extrapolated[index] else verdict])
     columns = ["point", "x(u) mm", "y(u) mm", "z(u) mm", "U95 mm", "law"]
     table = TableView(f"frame T, {locations.draws} draws ({locations.estimator})", columns, rows)
-    # Every point of a file may be far off for a reason of its own.
+    # The points of a file may be extrapolated for different reasons.
     missing = zip(locations.unseen, locations.refused, strict=True)
-    beyond = dict.fromkeys(words for words, error in missing if words and not error)
-    notes = [extrapolated_text(words) for words in list(beyond)[:UNSEEN_SHOWN]]
-    if len(beyond) > UNSEEN_SHOWN:
-        notes.append(f"and {len(beyond) - UNSEEN_SHOWN} more counters that no look reached")
+    counters = dict.fromkeys(words for words, error in missing if words and not error)
+    notes = [extrapolated_text(words) for words in list(counters)[:UNSEEN_SHOWN]]
+    if len(counters) > UNSEEN_SHOWN:
+        notes.append(f"and {len(counters) - UNSEEN_SHOWN} more counters that no look reached")
     return terminal(table, *textwrap.wrap(LAW, COLUMNS), *notes)
 
 
 LAW_SHARE = 0.95
-"""Of the points tried, at which the law of propagation must hold for its sds to be relied on."""
+"""Least share of tested points where the law of propagation must hold for reliable sds."""
 
 
 def _points(count: int) -> str:
@@ -299,7 +299,7 @@ def _points(count: int) -> str:
 
 
 def cloud_text(cloud: CloudFile, law: LawChecked, calibration: Calibration) -> str:
-    """What was written, what was not, and how far its uncertainties hold."""
+    """A written cloud as text: files, refused points, validity of its uncertainties."""
     lines = [f"written: {escaped(str(cloud.path), 200)}, {_points(cloud.points)}, frame T, mm"]
     lines.append(f"properties: {', '.join(cloud.columns)}")
     agreement = (
@@ -324,18 +324,18 @@ def cloud_text(cloud: CloudFile, law: LawChecked, calibration: Calibration) -> s
         name = escaped(str(cloud.refused_path), 200)
         count = cloud.refused.total()
         reasons = ", ".join(f"{code} {number}" for code, number in sorted(cloud.refused.items()))
-        have = "look has" if count == 1 else "looks have"
-        lines.append(f"{count} {have} no point ({reasons}): lines and reasons in {name}")
+        verb = "look has" if count == 1 else "looks have"
+        lines.append(f"{count} {verb} no point ({reasons}): lines and reasons in {name}")
     return "\n".join(lines)
 
 
 def budget_text(budget: Budget) -> str:
     """Uncertainty budget of a point: causes by share, then the parameters that contribute most."""
-    size = np.linalg.norm(budget.contribution_mm, axis=1)
+    length = np.linalg.norm(budget.contribution_mm, axis=1)
     rows = [
         [name_in_words(budget.parameters[k]), *(f"{v:+.3g}" for v in budget.contribution_mm[k])]
-        for k in np.argsort(-size)[:10]
-        if size[k] > 0
+        for k in np.argsort(-length)[:10]
+        if length[k] > 0
     ]
     title = "by parameter, one standard uncertainty each (correlated: they do not add up)"
     parts = TableView(title, ["parameter", "x mm", "y mm", "z mm"], rows)
@@ -343,7 +343,7 @@ def budget_text(budget: Budget) -> str:
 
 
 def steps_text(steps: Steps) -> str:
-    """Counters, the way there, and what remains."""
+    """Counters, the approach, and the remaining error."""
     pan, tilt = steps.approach
     lines = [
         f"go to      pan {steps.via_pan_steps}, tilt {steps.via_tilt_steps} steps (takes up the backlash)",
@@ -362,22 +362,22 @@ def steps_text(steps: Steps) -> str:
 
 
 def gap_text(gaps: Mapping[str, Gap | None]) -> str:
-    """The gap between both estimators by its terms."""
+    """The gap between both estimators by its terms, as text."""
     return terminal(gap_table(gaps))
 
 
-def hold_out_text(held: HoldOut) -> str:
-    """Who predicts left-out angles better, and what no hold-out can see."""
-    common = ", ".join(f"{d} {u:.1e}" for d, u in held.unseen.items())
+def hold_out_text(hold_out: HoldOut) -> str:
+    """Both estimators' predictions of left-out angles, and the uncertainty that no hold-out shows."""
+    u_text = ", ".join(f"{d} {u:.1e}" for d, u in hold_out.unseen.items())
     return terminal(
-        hold_out_table(held),
-        f"held-out angles: {held.verdict}: {held.reason}",
-        f"not seen by any hold-out, common to all spots: u by stereo and focal scale, deg/step: {common}",
+        hold_out_table(hold_out),
+        f"held-out angles: {hold_out.verdict}: {hold_out.reason}",
+        f"not seen by any hold-out, common to all spots: u by stereo and focal scale, deg/step: {u_text}",
     )
 
 
 def positions_text(hold_out: PositionHoldOut) -> str:
-    """Counters left out, beside what was predicted of them."""
+    """Counters left out, with their predictions."""
     rows = []
     for p in hold_out.positions:
         predicted = concise(p.predicted, p.u), f"{p.z:+.1f}"
@@ -389,7 +389,7 @@ def positions_text(hold_out: PositionHoldOut) -> str:
 
 
 def changes_text(comparison: Comparison) -> str:
-    """Two calibrations of one instrument."""
+    """Changes between two calibrations of one instrument as text."""
     rows = []
     for c in comparison.changes:
         cells = [c.told, f"{c.first:.6f}", f"{c.second:.6f}", concise(c.difference, c.u), c.unit]
@@ -403,16 +403,16 @@ def changes_text(comparison: Comparison) -> str:
     verdict = f"{comparison.verdict}{days} (limit {comparison.limit:.2f} u for all together; {cameras})"
     ratios = [c for c in comparison.changes if c.unit == "deg/step" and c.u > 0]
     if ratios and not any(c.significant for c in comparison.changes):
-        hidden = max(comparison.limit * c.u / abs(c.first) for c in ratios)
+        share = max(comparison.limit * c.u / abs(c.first) for c in ratios)
         verdict += (
-            f"\nthat is no proof of none: a ratio may have changed by {100 * hidden:.2g} % unseen; "
+            f"\nthat is no proof of none: a ratio may have changed by {100 * share:.2g} % unseen; "
             "`tvsbayes watch A B` holds the looks of B against A and sees smaller changes"
         )
     return terminal(table, verdict)
 
 
 def study_text(result: StudyResult) -> str:
-    """A study for people."""
+    """A study as text."""
     n, t = result.converged, result.target
     low, high = rms_bounds(n)
     bounds = [f"{100 * low:.0f}-{100 * high:.0f}" for low, high in (binomial_bounds(n, x) for x in LEVELS)]

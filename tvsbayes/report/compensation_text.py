@@ -1,4 +1,4 @@
-"""What `compensate` and `verify` print: promise or verdict first, then what stands behind it, then what to do."""
+"""Texts of `compensate` and `verify`: promise or verdict first, then its basis, then the remedy."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ REMEDIES = {
     OTHER_MACHINE: "the table is of another machine, or this one changed: measure it again and compensate anew",
     APPLIED: "readings lie farther off than the table allows: measure again, and compensate anew if that stays",
 }
-"""By the world that fits best, where the promise is broken."""
+"""Remedies by the most probable world, where the promise is broken."""
 SCANNER_REMEDIES = {
     NOT_APPLIED: "counters follow the nominal degrees per step, or come without the run-up that takes up the play: use "
     "those of `tvsbayes steps-for` with `via_pan_steps` and `via_tilt_steps`, or the header's",
@@ -44,7 +44,7 @@ SCANNER_REMEDIES = {
     "`tvsbayes check FRESH` and `tvsbayes watch CAMPAIGN FRESH` tell",
     APPLIED: "looks lie farther off than the calibration allows: `tvsbayes watch CAMPAIGN FRESH` says what moved",
 }
-"""The same of a scanner."""
+"""The same for a scanner."""
 HELPS = {
     "homing": "the scatter of homings; read after several homings, or verify without homing in between",
     "stops": "the scatter of single stops; no table takes that out",
@@ -53,16 +53,16 @@ HELPS = {
     "drift": "the walk of the zero; home more often, or guide",
     "readings": "the readings themselves; a better reference",
 }
-"""What the largest cause of what is left is, and what takes it down."""
+"""The largest cause of the remaining error, with its remedy."""
 
 
-def promise_table(made: Compensation) -> TableView:
-    """What is left by side, and what each cause alone would leave."""
+def promise_table(result: Compensation) -> TableView:
+    """Remaining error by side, and the part of each cause alone."""
     rows = []
-    for side, left in made.promise.items():
-        causes = [two_digits(left.causes[cause]) for cause in CAUSES]
-        rows.append([side, two_digits(left.without95), two_digits(left.error95), *causes])
-    caption = f"95 % of errors are at most, {escaped(made.unit)}; each cause alone"
+    for side, remainder in result.promise.items():
+        causes = [two_digits(remainder.causes[cause]) for cause in CAUSES]
+        rows.append([side, two_digits(remainder.without95), two_digits(remainder.error95), *causes])
+    caption = f"95 % of errors are at most, {escaped(result.unit)}; each cause alone"
     return TableView(caption, ["arriving", "without", "after applying", *CAUSES], rows)
 
 
@@ -77,88 +77,88 @@ def sizes_table(verification: Verification) -> TableView:
         ["after (read)", two_digits(verification.after.rms), two_digits(verification.after.worst)],
     ]
     columns = ["", "RMS", "worst"]
-    if (at := verification.millimetres) is not None:
-        columns += [f"RMS at {at.distance_mm:.10g} mm, mm", "worst, mm"]
-        for row, size in zip(rows, (at.before, at.after), strict=True):
+    if (points := verification.millimetres) is not None:
+        columns += [f"RMS at {points.distance_mm:.10g} mm, mm", "worst, mm"]
+        for row, size in zip(rows, (points.before, points.after), strict=True):
             row += [two_digits(size.rms), two_digits(size.worst)]
-    of = " of both axes" * verification.looks + ", and of points" * (at is not None)
-    return TableView(f"errors, {escaped(verification.unit)}{of}", columns, rows)
+    scope = " of both axes" * verification.looks + ", and of points" * (points is not None)
+    return TableView(f"errors, {escaped(verification.unit)}{scope}", columns, rows)
 
 
-def _promised(verification: Verification) -> str:
-    at = verification.millimetres
-    points = "" if at is None else f", of points at {at.distance_mm:.10g} mm {two_digits(at.promised95)} mm"
+def _promise_text(verification: Verification) -> str:
+    mm = verification.millimetres
+    points = "" if mm is None else f", of points at {mm.distance_mm:.10g} mm {two_digits(mm.promised95)} mm"
     return (
         f"promised: 95 % of errors at most {two_digits(verification.promised95)} {escaped(verification.unit)}{points}"
     )
 
 
-def compensation_text(made: Compensation, written: Sequence[str] = ()) -> str:
-    """A compensation for people."""
-    unit, (low, high) = escaped(made.unit), made.range_command
-    largest = max(CAUSES, key=lambda cause: max(left.causes[cause] for left in made.promise.values()))
-    shift = ", but for one shift common to all" if made.zero_free else ""
+def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
+    """A compensation as text."""
+    unit, (low, high) = escaped(result.unit), result.range_command
+    largest = max(CAUSES, key=lambda cause: max(bounds.causes[cause] for bounds in result.promise.values()))
+    shift = ", but for one shift common to all" if result.zero_free else ""
     lines: list[Part] = [
-        f"compensation for {made.target}: {len(made.table)} commands from {low:.10g} to {high:.10g}, in {unit}",
-        f"aim: reading = {made.offset:.6g} + {made.per_command:.9g} x command{shift}",
+        f"compensation for {result.target}: {len(result.table)} commands from {low:.10g} to {high:.10g}, in {unit}",
+        f"aim: reading = {result.offset:.6g} + {result.per_command:.9g} x command{shift}",
         "",
-        promise_table(made),
+        promise_table(result),
         "",
-        *_where(made),
+        *_validity(result),
         f"most of what is left: {HELPS[largest]}",
-        *(f"the format: {text}" for text in made.unsaid),
+        *(f"the format: {text}" for text in result.unsaid),
     ]
-    if made.homings == 1 and not made.in_motion:
+    if result.homings == 1 and not result.in_motion:
         lines.append("one homing alone was read: how far the next one is off is known by its prior; home_sd in [axis]")
-        left = [
-            f"{side} {two_digits(p.shift_free95)}" for side, p in made.promise.items() if p.shift_free95 is not None
+        bounds = [
+            f"{side} {two_digits(p.shift_free95)}" for side, p in result.promise.items() if p.shift_free95 is not None
         ]
-        if left and not made.zero_free:
-            lines.append(f"but for one shift common to all, as within one homing, at most: {', '.join(left)} {unit}")
-    lines.append(f"nothing is applied yet; apply it once, in one place, then {made.shown_by}")
+        if bounds and not result.zero_free:
+            lines.append(f"but for one shift common to all, as within one homing, at most: {', '.join(bounds)} {unit}")
+    lines.append(f"nothing is applied yet; apply it once, in one place, then {result.shown_by}")
     return terminal(*lines, *(f"written: {escaped(path, 200)}" for path in written))
 
 
-def _where(made: Compensation) -> list[str]:
-    """For which errors the promise is."""
-    if made.in_motion:
-        travel = f"{made.travel_command:.6g}"
+def _validity(result: Compensation) -> list[str]:
+    """Validity of the promise, in words."""
+    if result.in_motion:
+        travel = f"{result.travel_command:.6g}"
         return [f"the promise holds within {travel} commands, off the drive's own line, but for one shift"]
     return [
-        f"the promise holds between these commands, within {two_digits(made.hours)} h and {made.travel_command:.4g} "
-        "commands of travel since homing",
-        f"arrive with at least {made.reversal_command:.4g} commands of travel on a side",
+        f"the promise holds between these commands, within {two_digits(result.hours)} h and "
+        f"{result.travel_command:.4g} commands of travel since homing",
+        f"arrive with at least {result.reversal_command:.4g} commands of travel on a side",
     ]
 
 
 def verification_text(verification: Verification) -> str:
-    """A verification for people."""
+    """A verification as text."""
     p = "< 0.0003" if verification.p < 3e-4 else f"= {verification.p:.2g}"
     rows = [[name, f"{100 * chance:.1f} %"] for name, chance in verification.worlds.items()]
-    axis = not verification.looks
-    what = (
+    is_axis = not verification.looks
+    caption = (
         f"{verification.readings} readings under the table"
-        if axis
+        if is_axis
         else f"{verification.readings} looks that the calibration aimed"
     )
     lines: list[Part] = [
         f"{verification.verdict}: {verification.world} (p {p})",
         "",
-        TableView(what, [f"the {'table' if axis else 'calibration'} was", "probability"], rows),
+        TableView(caption, [f"the {'table' if is_axis else 'calibration'} was", "probability"], rows),
         "",
         sizes_table(verification),
-        _promised(verification),
+        _promise_text(verification),
         *verification.remarks,
     ]
     if verification.verdict == BROKEN:
-        remedies = REMEDIES if axis else REMEDIES | SCANNER_REMEDIES
+        remedies = REMEDIES if is_axis else REMEDIES | SCANNER_REMEDIES
         lines.append(f"what to do: {remedies[verification.world]}")
     elif verification.verdict == CANNOT_TELL and verification.needed is None:
         lines.append(
             "no number of such readings tells: what the table corrects is lost in what homing and fit leave open"
         )
     elif verification.verdict == CANNOT_TELL:
-        kind = "readings" if axis else "looks"
+        kind = "readings" if is_axis else "looks"
         more = f"about {verification.needed} {kind} of this kind" if verification.needed else f"some more {kind}"
         lines.append(f"what to do: {more} would tell; `tvsbayes plan --verify FOLDER` names those that tell soonest")
     return terminal(*lines)
@@ -167,54 +167,54 @@ def verification_text(verification: Verification) -> str:
 APPLIED_TITLE = "Applied, and what is left"
 
 
-def compensation_section(made: Compensation, verification: Verification | None) -> Section:
-    """Report: what was made to be applied, what is left by the promise, and what fresh readings say of it."""
-    low, high = made.range_command
+def compensation_section(result: Compensation, verification: Verification | None) -> Section:
+    """Section of the report: the compensation, its promise, and its verification by fresh readings."""
+    low, high = result.range_command
     text = [
-        f"Made for {made.target}, to be applied by the {made.applied_by}, for commands from {low:.10g} to {high:.10g}; "
-        f"{_where(made)[0]}.",
+        f"Made for {result.target}, to be applied by the {result.applied_by}, for commands from {low:.10g} to "
+        f"{high:.10g}; {_validity(result)[0]}.",
         "No fresh readings have verified it." if verification is None else _verdict(verification),
     ]
-    tables = [promise_table(made), *([] if verification is None else [sizes_table(verification)])]
-    return Section(APPLIED_TITLE, text, made.unsaid, tables)
+    tables = [promise_table(result), *([] if verification is None else [sizes_table(verification)])]
+    return Section(APPLIED_TITLE, text, result.unsaid, tables)
 
 
 def verified_section(verification: Verification) -> Section:
-    """Report of a scanner: what fresh looks say that its calibration aimed, with points in mm."""
+    """Section of a scanner's report: verification by fresh looks aimed with its calibration, points in mm."""
     text = "Counters by `tvsbayes steps-for` or the header, held against fresh looks. " + _verdict(verification)
     return Section(APPLIED_TITLE, [text], tables=[sizes_table(verification)])
 
 
 def _verdict(verification: Verification) -> str:
     kind = "readings" if verification.millimetres is None else "looks"
-    said = f"{verification.verdict}: {verification.readings} fresh {kind}, "
-    said += f"most probable: {verification.world}, p = {verification.p:.2g}."
-    promised = _promised(verification)
-    return f"{said} {promised[0].upper()}{promised[1:]}."
+    text = f"{verification.verdict}: {verification.readings} fresh {kind}, "
+    text += f"most probable: {verification.world}, p = {verification.p:.2g}."
+    promised = _promise_text(verification)
+    return f"{text} {promised[0].upper()}{promised[1:]}."
 
 
 def verify_plan_text(plan: VerifyPlan) -> str:
-    """Readings that tell soonest what became of a table."""
+    """A plan of readings that verify a table, as text."""
     words = {1: "forward", -1: "backward"}
     rows = [[f"{command:.10g}", words[side]] for command, side in plan.stops]
     table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
-    return terminal(table, f"to arrive on a side, come from at least {plan.overrun:.4g} commands away", _how_far(plan))
+    return terminal(table, f"to arrive on a side, come from at least {plan.overrun:.4g} commands away", _power(plan))
 
 
 def aim_plan_text(plan: AimPlan) -> str:
-    """Looks that tell soonest what became of a calibration."""
+    """A plan of looks that verify a calibration, as text."""
     rows = [[str(p), str(t), SIDES["pan"][ps > 0], SIDES["tilt"][ts > 0]] for p, t, ps, ts in plan.stops]
     columns = ["pan", "tilt", "arriving", ""]
     table = TableView(
         f"{len(rows)} looks with the calibration in force, in this order, from a homing on", columns, rows
     )
     pan, tilt = plan.run_up
-    come = f"to arrive on a side, come from at least {pan} steps of pan and {tilt} of tilt away"
-    return terminal(table, come, _how_far(plan))
+    run_up = f"to arrive on a side, come from at least {pan} steps of pan and {tilt} of tilt away"
+    return terminal(table, run_up, _power(plan))
 
 
-def _how_far(plan: VerifyPlan | AimPlan) -> str:
-    """Whether a plan tells."""
+def _power(plan: VerifyPlan | AimPlan) -> str:
+    """Whether a plan separates the worlds, in words."""
     if plan.enough:
         return f"they tell the worlds apart in 95 of 100: {plan.distance:.1f} standard deviations"
     return f"they hardly tell: the nearest two worlds are {plan.distance:.1f} standard deviations apart"

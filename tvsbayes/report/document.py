@@ -1,6 +1,6 @@
-"""A document: what is said of results, gathered once as sentences, tables and figures, in the order of its reader.
+"""A document: results as sentences, tables and figures in reading order.
 
-A terminal shows it by `terminal`, a browser and paper by `page`.
+`terminal` prints it as text, `page` as HTML and PDF.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 NOT_RECORDED = "not recorded"
-"""Of what `campaign.toml` may say and does not."""
+"""Text of an optional key that `campaign.toml` lacks."""
 RECORDED = (("instrument", "instrument"), ("serial", "serial number"), ("operator", "operator"))
-"""Keys of `campaign.toml` on the first page, and what they are called there."""
+"""Keys of `campaign.toml` on the first page, with their labels."""
 
 
 @dataclass(frozen=True)
 class FigureView:
-    """A figure with what it says in words."""
+    """A figure with its texts."""
 
     figure: Figure
     alt: str
@@ -48,7 +48,7 @@ class FigureView:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a document; `opened` ones are not folded on a screen, `None` among the tables is left out."""
+    """A part of a document; `opened` sections are not folded on a screen, `None` among the tables is omitted."""
 
     title: str
     text: Sequence[str] = ()
@@ -60,7 +60,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Number:
-    """One of the numbers at the top."""
+    """One of the numbers at the top of the page."""
 
     label: str
     value: str
@@ -69,7 +69,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Verdict:
-    """One line, and the class that colours it: "met", "not-met" or "cannot-tell"."""
+    """One line, and its class for the colour: "met", "not-met" or "cannot-tell"."""
 
     text: str
     kind: str
@@ -77,7 +77,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Issue:
-    """Who issues a report, for whom, and on which day (UTC); "" where nobody is stated."""
+    """Laboratory, customer and day (UTC) of a report; "" where unstated."""
 
     day: datetime.date
     laboratory: str = ""
@@ -85,7 +85,7 @@ class Issue:
 
     @classmethod
     def today(cls) -> Issue:
-        """Of today, by nobody for nobody."""
+        """An issue of today without laboratory and customer."""
         return cls(datetime.datetime.now(datetime.UTC).date())
 
 
@@ -94,16 +94,16 @@ class Document:
     """A report of any instrument.
 
     Attributes:
-        results: number of the results behind it; `number` is the document's own.
-        name: of what was measured.
-        about: what was measured, when and by whom.
+        results: number of its results; `number` is the document's own.
+        name: of the measured object.
+        about: object, dates and operator of the measurement.
         verdict: whether the numbers may be used.
-        answer: the first table, beside `picture`; `numbers` and `why` stand below it.
-        steps: what to do next.
-        criteria: limits judged.
-        traceable: what is said of traceability.
-        warnings: what to keep in mind.
-        versions: of the programs that made it.
+        answer: the first table, beside `picture`; `numbers` and `why` are below it.
+        steps: next steps.
+        criteria: limits with their verdicts.
+        traceable: statement on traceability.
+        warnings: for the user of the numbers.
+        versions: of the programs that computed it.
     """
 
     results: str
@@ -126,7 +126,7 @@ class Document:
 
 
 def about_table(header: Mapping[str, object], measured: str, issue: Issue) -> TableView:
-    """What was measured, when, by whom and for whom; `measured` is a date or "" where nobody wrote it down."""
+    """Object, dates, operator and customer of a measurement; `measured` is a date or "" where not recorded."""
     recorded = [("measured", measured)]
     recorded += [(label, str(header.get(key) or "")) for key, label in RECORDED]
     stated = [("laboratory", issue.laboratory), ("customer", issue.customer)]
@@ -140,9 +140,9 @@ def sentence(text: str) -> str:
 
 
 type Part = str | TableView | None
-"""Of what a terminal shows; None is left out."""
+"""A part of a terminal's text; None is omitted."""
 
 
 def terminal(*parts: Part) -> str:
-    """Sentences and tables below each other, as a terminal shows them."""
+    """Sentences and tables one below the other, as text for a terminal."""
     return "\n".join(part.text() if isinstance(part, TableView) else part for part in parts if part is not None)

@@ -1,8 +1,8 @@
-"""The house style of all figures: size, colours, text, and a figure as an SVG document.
+"""The common style of all figures: size, colours, text, and a figure as an SVG document.
 
 Figures are one phone's width (4.6 inch) with text of 9 points. Colours are Okabe and Ito's (safe for colour-blind
-readers, jfly.uni-koeln.de/color); wherever a colour means something, a marker or a label says the same. Importing the
-module loads no matplotlib.
+readers, jfly.uni-koeln.de/color); a colour with a meaning always has a marker or a label too. Importing the module
+loads no matplotlib.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE, GREY = (
     *("#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7"),
     "#767676",
 )
-OF_ESTIMATOR = {"nominal": (GREY, "s"), "classic": (RED, "^"), "joint": (BLUE, "o")}
+ESTIMATOR_STYLE = {"nominal": (GREY, "s"), "classic": (RED, "^"), "joint": (BLUE, "o")}
 """Colour and marker of each estimator in every figure."""
-OF_DIRECTION = {
+DIRECTION_STYLE = {
     **{"left": ("<", BLUE), "right": (">", RED), "up": ("^", GREEN), "down": ("v", ORANGE)},
     **{"forward": (">", BLUE), "backward": ("<", RED), "": ("x", GREY)},
 }
-"""Marker and colour of each direction of a scanner and of an axis in every figure; "" where nobody knows it."""
+"""Marker and colour of each direction of a scanner and of an axis in every figure; "" for an unknown direction."""
 SMALLEST_SHARE = 0.005
-"""Of a variance, that has a bar or a row of its own; what is below stands in fit.json alone."""
+"""Least share of a variance with its own bar or row; smaller ones are only in fit.json."""
 DIVERGING, SEQUENTIAL = (BLUE, "#FFFFFF", RED), ("#FFFFFF", SKY, BLUE, "#00263E")
 """Colours of maps, from the lowest to the highest value."""
 RASTER_DPI = 150
-"""Of the parts of a figure with hundreds of points."""
+"""Resolution of parts of a figure with hundreds of points."""
 STYLE: dict[Any, object] = {
     "font.size": 9.0,
     "axes.titlesize": 9.0,
@@ -54,7 +54,7 @@ STYLE: dict[Any, object] = {
 
 @contextmanager
 def drawing(height_in: float) -> Iterator[Figure]:
-    """A figure in the house style, one phone wide, filled by the caller."""
+    """A figure in the common style, one phone wide, filled by the caller."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -62,13 +62,13 @@ def drawing(height_in: float) -> Iterator[Figure]:
         yield Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
 
 
-def legend(figure: Figure, columns: int, of: Axes | None = None) -> None:
-    """What the marks mean, below the panels: of one of them, else of all, each name once."""
-    named: dict[object, Artist] = {}
-    for axes in figure.axes if of is None else [of]:
+def legend(figure: Figure, columns: int, panel: Axes | None = None) -> None:
+    """A legend below the panels: of one of them, else of all, without repetition."""
+    handles: dict[object, Artist] = {}
+    for axes in figure.axes if panel is None else [panel]:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            named.setdefault(label, handle)
-    figure.legend(list(named.values()), list(map(str, named)), loc="outside lower center", ncols=columns)
+            handles.setdefault(label, handle)
+    figure.legend(list(handles.values()), list(map(str, handles)), loc="outside lower center", ncols=columns)
 
 
 def colour_map(stops: Sequence[str]) -> Colormap:
@@ -84,8 +84,7 @@ def svg(figure: Figure) -> bytes:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer, dpi = io.BytesIO(), figure.dpi
-    # The identifiers in the file are drawn when it is written. The canvas draws once, where `savefig` draws a first
-    # time for the layout alone.
+    # Writing creates the identifiers in the file. The canvas draws only once; `savefig` would draw the layout before.
     with rc_context(STYLE):
         figure.dpi = RASTER_DPI
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})

@@ -1,4 +1,4 @@
-"""What a report shows, gathered: results as they are stored, the classic beside them, errors in 3D, limits judged.
+"""All inputs of a report: stored results, the classic estimate, errors in 3D, judged limits.
 
 Ratios in deg/step, points and their errors in mm, frame T.
 """
@@ -50,25 +50,25 @@ class Criterion:
 
 
 def criterion(quantity: str, errors: np.ndarray, limit: float, unit: str) -> Criterion:
-    """Judge draws of an error (n,) by a limit (decision rule stated beforehand, ISO/IEC 17025 7.8.6)."""
+    """Judges draws of an error (n,) by a limit (decision rule agreed in advance, ISO/IEC 17025 7.8.6)."""
     probability = float(np.mean(np.abs(errors) <= limit))
     verdict = MET if probability >= MET_PROBABILITY else NOT_MET if probability <= 1 - MET_PROBABILITY else CANNOT_TELL
     return Criterion(quantity, limit, unit, probability, verdict)
 
 
 MAP_CELLS = 5
-"""Per axis; odd, so that one lies in the middle."""
+"""Cells of a map per axis; odd, so that one is in the middle."""
 MAP_DRAWS = 1000
-"""Rigs of the maps: a probability near 0.95 is then known to 0.007."""
+"""Draws of the maps: a probability near 0.95 is then known to 0.007."""
 BAND_POINTS = 161
-"""Counters of the curves of the gears' errors."""
+"""Number of counters of the curves of the gears' errors."""
 MAP_RANGES_MM = (300.0, 2000.0)
-"""Ranges mapped besides the stated one: the scanner's near and far ends."""
+"""Ranges of maps in addition to the stated one: the scanner's near and far ends."""
 
 
 @dataclass(frozen=True)
 class GearBand:
-    """What is known of one axis' gears over its counters.
+    """Errors of one axis' gears over its counters.
 
     Attributes:
         axis: pan or tilt.
@@ -85,15 +85,15 @@ class GearBand:
 
 
 def gear_bands(calibration: Calibration) -> tuple[GearBand, ...]:
-    """Of both axes; none where gears do not vary."""
+    """Bands of both axes; none where gears do not vary."""
     curves, columns = [], calibration.inputs[:, len(INPUT_NAMES) :]
     for index, axis in enumerate(AXES if calibration.gears.size else ()):
         nodes = calibration.gears.steps[index]
         steps = np.linspace(nodes[0], nodes[-1], BAND_POINTS)
-        drawn = calibration.gears.at(columns, (steps, steps))
+        values_at = calibration.gears.at(columns, (steps, steps))
         bands = []
         for kind in (ERROR_AT, PLAY_AT):
-            values = drawn[f"{kind}.{axis}"]
+            values = values_at[f"{kind}.{axis}"]
             low, high = np.quantile(values, (0.025, 0.975), axis=0)
             bands.append(np.stack([low, values.mean(axis=0), high]))
         low_seen, high_seen = calibration.range_steps[index].tolist()
@@ -103,25 +103,25 @@ def gear_bands(calibration: Calibration) -> tuple[GearBand, ...]:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Everything a report shows.
+    """All data of a report.
 
     Attributes:
-        campaign: what was measured.
+        campaign: the data.
         fit: the content of `results/fit.json`.
         classic: the paper's estimator; None without complete experiments.
         held_out: of `results/compare.json`, None where `compare` was not run on these data.
         planned: of `results/plan.json`, None where `plan --given` was not run on these data.
-        criteria: what was asked of the calibration, judged.
+        criteria: limits of the calibration, judged.
         distances_mm: draws of the 3D error by estimator at `range_mm` and the middle of the counters.
         range_mm: stated range.
-        simple_errors: why simple calibrations are off there, by their name.
+        simple_errors: errors of simple calibrations there, by their name.
         maps: error maps.
         budget: of a point at that range.
         point: the same for its least certain coordinate, by parameter.
-        gears: what they repeat over the counters, by axis; none where they do not vary.
+        gears: repeated errors over the counters, by axis; none where they do not vary.
         crops: of a few spots, where there are frames.
-        doubts: what `check` warns of.
-        verified: what `verify` said last of this calibration; None where it has not.
+        doubts: warnings of `check`.
+        verified: the last result of `verify` for this calibration; None without one.
     """
 
     campaign: Campaign
@@ -143,7 +143,7 @@ class Evidence:
 
     @property
     def shown(self) -> FitEvidence:
-        """What the fit lends reports besides its estimates."""
+        """Evidence of the fit besides its estimates."""
         return self.fit.evidence or FitEvidence()
 
 
@@ -157,20 +157,20 @@ def gather(
     limit_mm: float | None = None,
     doubts: Sequence[str] = (),
 ) -> Evidence:
-    """Ask the library for everything a report shows.
+    """Computes all data of a report.
 
     Args:
-        campaign: what was measured.
+        campaign: the data.
         fit: its `fit.json`.
         calibration: its draws.
         range_mm: at which millimetres are stated.
         limit_deg_per_step: largest error allowed of every effective ratio.
         limit_mm: largest 3D error allowed at that range, pan and tilt in the middle of the counters seen.
-        doubts: what `check` warns of.
+        doubts: warnings of `check`.
     """
     classic_result = classic_of(campaign)
     maps = _maps(campaign, classic_result, calibration, range_mm)
-    # The middle cell of an odd number is the middle of the counters.
+    # With an odd number of cells the middle one is at the middle of the counters.
     cell = MAP_CELLS // 2, MAP_CELLS // 2, maps.range_mm.tolist().index(range_mm)
     distances = {name: distance[:, *cell] for name, distance in maps.distance_mm.items()}
     criteria = []
@@ -183,7 +183,7 @@ def gather(
     ray = calibration.ray(pan, tilt, HOME_APPROACH)
     point = np.asarray(ray.origin_mm) + range_mm * np.asarray(ray.direction)
     table = budget(calibration, pan, tilt, calibration.reading(point))
-    least = "xyz"[int(np.argmax(np.diag(table.covariance_mm2)))]
+    coordinate = "xyz"[int(np.argmax(np.diag(table.covariance_mm2)))]
     return Evidence(
         campaign=campaign,
         fit=fit,
@@ -194,12 +194,12 @@ def gather(
         distances_mm=distances,
         range_mm=range_mm,
         simple_errors={
-            name: simple_error(calibration, one, (pan, tilt), range_mm)
-            for name, one in simple_calibrations(campaign.rig.priors, classic_result).items()
+            name: simple_error(calibration, simple, (pan, tilt), range_mm)
+            for name, simple in simple_calibrations(campaign.rig.priors, classic_result).items()
         },
         maps=maps,
         budget=table,
-        point=coordinate_budget(table, calibration, point.tolist(), least),
+        point=coordinate_budget(table, calibration, point.tolist(), coordinate),
         gears=gear_bands(calibration),
         crops=spot_crops(campaign, fit.summary.suspect_spots),
         doubts=tuple(doubts),
@@ -218,7 +218,7 @@ def _maps(campaign: Campaign, result: ClassicResult | None, calibration: Calibra
 
 
 def _inflation(fit: FitRecord) -> float:
-    """Limits are judged with the uncertainty that a failed validation leaves."""
+    """Factor on uncertainties of limits after a failed validation."""
     return 1.0 if fit.summary.validation is None else fit.summary.validation.inflation
 
 

@@ -1,10 +1,8 @@
 """The paper's figures for any campaign, and the pictures of a calibration report, as matplotlib figures.
 
-Every function takes results and returns a `matplotlib.figure.Figure` that no window owns: nothing is shown, and no
-global setting of matplotlib is touched; importing the module loads none of it. Frame S (X depth, Y left, Z up) in mm;
-ratios in deg/step; angles in deg. Figures are one phone's width (4.6 inch) with text of 9 points. Colours are Okabe
-and Ito's (safe for colour-blind readers, jfly.uni-koeln.de/color); wherever a colour means something, a marker or a
-label says the same.
+Every function takes results and returns a `matplotlib.figure.Figure` without a window; no global setting of matplotlib
+changes, and importing the module does not load it. Frame S (X depth, Y left, Z up) in mm; ratios in deg/step; angles in
+deg. `drawing` has the common style.
 """
 
 from __future__ import annotations
@@ -20,11 +18,11 @@ from tvsbayes.instrument.axes import DIRECTIONS, SENSES, Axis
 from tvsbayes.report.drawing import (
     BLACK,
     BLUE,
+    DIRECTION_STYLE,
     DIVERGING,
+    ESTIMATOR_STYLE,
     GREEN,
     GREY,
-    OF_DIRECTION,
-    OF_ESTIMATOR,
     ORANGE,
     RED,
     SEQUENTIAL,
@@ -57,7 +55,7 @@ EXPERIMENT = "experiment of this direction"
 
 
 def __dir__() -> list[str]:
-    """The figures: what a prompt completes after `tvsbayes.plots.`."""
+    """The figures: completions of a prompt after `tvsbayes.plots.`."""
     return __all__
 
 
@@ -79,22 +77,22 @@ def trajectories(campaign: Campaign, experiment: int) -> Figure:
         ValueError: the experiment is not complete.
     """
     points, axis, steps = _experiment(campaign, experiment)
-    across = 1 if axis == "pan" else 2
+    coordinate = 1 if axis == "pan" else 2
     before, after = points[[0, 1]], points[[3, 2]]
     with drawing(3.6) as figure:
         axes = figure.add_subplot()
         for pair, name, colour, marker in ((before, "before", BLUE, "o"), (after, "after", RED, "^")):
-            run = pair[1] - pair[0]
-            start, end = pair[0] - 0.6 * run, pair[1] + 0.2 * run
-            axes.plot([start[0], end[0]], [start[across], end[across]], color=colour, linewidth=1)
-            angle = np.degrees(np.arctan2(run[across], run[0]))
+            direction = pair[1] - pair[0]
+            start, end = pair[0] - 0.6 * direction, pair[1] + 0.2 * direction
+            axes.plot([start[0], end[0]], [start[coordinate], end[coordinate]], color=colour, linewidth=1)
+            angle = np.degrees(np.arctan2(direction[coordinate], direction[0]))
             label = f"{name}: {angle:.2f} deg".replace("-", "\u2212")
-            axes.plot(pair[:, 0], pair[:, across], marker, color=colour, label=label, linestyle="none")
+            axes.plot(pair[:, 0], pair[:, coordinate], marker, color=colour, label=label, linestyle="none")
         for number, point in enumerate(points, start=1):
-            axes.annotate(f"P{number}", (point[0], point[across]), (4, 5), textcoords="offset points")
+            axes.annotate(f"P{number}", (point[0], point[coordinate]), (4, 5), textcoords="offset points")
         title = f"experiment {experiment}: {axis} by {steps:+d} steps".replace("-", "\u2212")
-        axes.set(xlabel="X (depth), mm", ylabel=f"{'Y (left)' if across == 1 else 'Z (up)'}, mm", title=title)
-        # Angles are those of the picture.
+        axes.set(xlabel="X (depth), mm", ylabel=f"{'Y (left)' if coordinate == 1 else 'Z (up)'}, mm", title=title)
+        # Equal scales: angles are true.
         axes.set_aspect("equal", adjustable="datalim")
         legend(figure, 2)
     return figure
@@ -129,7 +127,7 @@ def direction_scatter(result: ClassicResult, direction: str, joint: Estimate | N
     Args:
         result: of the classic estimator.
         direction: left, right, up or down.
-        joint: of the joint estimator, drawn beside.
+        joint: of the joint estimator, for comparison.
 
     Raises:
         ValueError: there is no such direction, or it has no experiment.
@@ -156,7 +154,7 @@ def direction_scatters(result: ClassicResult, joint: FitSummary | None = None) -
                 axes.set(title=f"{direction}: no experiment")
                 continue
             _scatter(axes, result, direction, None if joint is None else joint.effective[direction])
-        # Once for all: below one of two panels side by side there is no room for it.
+        # One label for all: there is no room below each panel.
         figure.supxlabel(EXPERIMENT, fontsize=STYLE["font.size"])
     return figure
 
@@ -165,16 +163,16 @@ def _scatter(axes: Axes, result: ClassicResult, direction: str, joint: Estimate 
     """One direction's experiments into a panel."""
     summary = result.directions[direction]
     assert summary is not None
-    mine = [e for e in result.experiments if e.direction == direction]
+    experiments = [e for e in result.experiments if e.direction == direction]
     mean, sd = summary.mean_deg_per_step, summary.sd_deg_per_step
     if sd is not None:
-        for k, shade in ((3, "#F0F0F0"), (2, "#E0E0E0"), (1, "#CCCCCC")):
-            axes.axhspan(mean - k * sd, mean + k * sd, color=shade, label=f"{k} sigma", zorder=0)
+        for k, grey in ((3, "#F0F0F0"), (2, "#E0E0E0"), (1, "#CCCCCC")):
+            axes.axhspan(mean - k * sd, mean + k * sd, color=grey, label=f"{k} sigma", zorder=0)
     axes.axhline(mean, color=RED, label=f"mean {mean:.6f}")
     if joint is not None:
         label = f"joint {joint.value:.6f}, 2 u"
-        axes.errorbar(len(mine) + 1.5, joint.value, 2 * joint.sd, fmt="o", color=BLUE, capsize=3, label=label)
-    axes.plot(range(1, len(mine) + 1), [e.deg_per_step for e in mine], "^", color=BLACK, markersize=4)
+        axes.errorbar(len(experiments) + 1.5, joint.value, 2 * joint.sd, fmt="o", color=BLUE, capsize=3, label=label)
+    axes.plot(range(1, len(experiments) + 1), [e.deg_per_step for e in experiments], "^", color=BLACK, markersize=4)
     axes.set(ylabel="deg/step", title=f"{direction}, n = {summary.n}")
 
 
@@ -185,7 +183,7 @@ def setup(
 
     Args:
         campaign: for spots and cameras.
-        translation_mm: origin of the positioner's frame P in S, (3,), as estimated; None leaves it out.
+        translation_mm: origin of the positioner's frame P in S, (3,), as estimated; None omits it.
         baseline_mm: of the TVS, for the caption of the positioner.
     """
     points = campaign.usable_points_mm
@@ -193,18 +191,16 @@ def setup(
     right_s = np.array([right[2], -right[0], -right[1]])
     with drawing(5.4) as figure:
         panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-        for axes, across, name in ((panels[0], 1, "Y (left), mm"), (panels[1], 2, "Z (up), mm")):
-            axes.plot(points[:, 0], points[:, across], ".", color=RED, markersize=3, label="spots", rasterized=True)
+        for axes, index, name in ((panels[0], 1, "Y (left), mm"), (panels[1], 2, "Z (up), mm")):
+            axes.plot(points[:, 0], points[:, index], ".", color=RED, markersize=3, label="spots", rasterized=True)
             for centre, label in ((np.zeros(3), "left camera"), (right_s, "right camera")):
                 marker = "s" if label.startswith("left") else "D"
-                axes.plot(centre[0], centre[across], marker, color=GREEN, label=label, linestyle="none")
+                axes.plot(centre[0], centre[index], marker, color=GREEN, label=label, linestyle="none")
             if translation_mm is not None:
                 origin = np.asarray(translation_mm, dtype=float)
-                axes.plot(
-                    origin[0], origin[across], "^", color=BLUE, markersize=8, label="positioner", linestyle="none"
-                )
+                axes.plot(origin[0], origin[index], "^", color=BLUE, markersize=8, label="positioner", linestyle="none")
                 for point in points[np.unique(np.round(points, -1), axis=0, return_index=True)[1][:24]]:
-                    axes.plot([origin[0], point[0]], [origin[across], point[across]], color=ORANGE, linewidth=0.5)
+                    axes.plot([origin[0], point[0]], [origin[index], point[index]], color=ORANGE, linewidth=0.5)
             axes.set_ylabel(name)
             axes.set_aspect("equal", adjustable="datalim")
         panels[0].set_title("from above" + ("" if baseline_mm is None else f"; TVS baseline {baseline_mm:.4g} mm"))
@@ -244,24 +240,24 @@ def intervals(
     """Ratios of both estimators with their 95 % intervals by direction, deg/step.
 
     Args:
-        joint: what a fit says (`results.record.summary`, `read_fit(path).summary`), or estimates by direction.
+        joint: summary of a fit (`results.record.summary`, `read_fit(path).summary`), or estimates by direction.
         classic: of the classic estimator; None draws the joint one alone.
     """
     ratios: object = getattr(joint, "effective", joint)
     if not isinstance(ratios, Mapping):
-        takes = "takes what a fit says: tvsbayes.calibrate(campaign, sampled=False).record.summary"
-        raise TypeError(f"intervals {takes}, or read_fit(path).summary; not a {type(joint).__name__}")
+        usage = "takes what a fit says: tvsbayes.calibrate(campaign, sampled=False).record.summary"
+        raise TypeError(f"intervals {usage}, or read_fit(path).summary; not a {type(joint).__name__}")
     classic = {} if classic is None else classic if isinstance(classic, Mapping) else classic.directions
     fitted = {d: (x.value, x.interval95) for d, x in ratios.items() if x is not None}
     four_point = {
         d: (x.mean_deg_per_step, x.interval95_gum or (x.mean_deg_per_step,) * 2) for d, x in classic.items() if x
     }
     with drawing(3.2) as figure:
-        apart = 0.12 if four_point and fitted else 0.0
-        # Gears of pan and tilt differ by more than any interval is long: each has its scale.
+        distance = 0.12 if four_point and fitted else 0.0
+        # Ratios of pan and tilt differ by more than the length of their intervals: each has its scale.
         for axes, pair in zip(figure.subplots(len(SENSES), 1), SENSES.values(), strict=True):
-            for offset, name, results in ((-apart, "classic", four_point), (apart, "joint", fitted)):
-                colour, marker = OF_ESTIMATOR[name]
+            for offset, name, results in ((-distance, "classic", four_point), (distance, "joint", fitted)):
+                colour, marker = ESTIMATOR_STYLE[name]
                 for row, direction in enumerate(pair):
                     if direction not in results:
                         continue
@@ -282,18 +278,18 @@ def gap_terms(gaps: ComparisonRecord | Mapping[str, Gap | None]) -> Figure:
         ValueError: no direction has a gap.
     """
     gaps = gaps if isinstance(gaps, Mapping) else gaps.directions
-    stated = {direction: each for direction, each in gaps.items() if each is not None}
-    if not stated:
+    present = {direction: gap for direction, gap in gaps.items() if gap is not None}
+    if not present:
         raise ValueError("no direction has a gap: the campaign has no complete experiment")
-    names = [term.name for term in next(iter(stated.values())).terms]
+    names = [term.name for term in next(iter(present.values())).terms]
     with drawing(3.6) as figure:
         axes = figure.add_subplot()
-        for shift, (direction, each) in zip(np.linspace(-0.24, 0.24, len(stated)), stated.items(), strict=True):
-            values = np.array([term.value for term in each.terms])
-            ends = np.array([term.interval95 for term in each.terms])
-            marker, colour = OF_DIRECTION[direction]
-            place, bars = np.arange(len(names)) + shift, np.abs(ends.T - values)
-            axes.errorbar(values, place, xerr=bars, fmt=marker, color=colour, capsize=2, label=direction, markersize=4)
+        for shift, (direction, gap) in zip(np.linspace(-0.24, 0.24, len(present)), present.items(), strict=True):
+            values = np.array([term.value for term in gap.terms])
+            ends = np.array([term.interval95 for term in gap.terms])
+            marker, colour = DIRECTION_STYLE[direction]
+            y, bars = np.arange(len(names)) + shift, np.abs(ends.T - values)
+            axes.errorbar(values, y, xerr=bars, fmt=marker, color=colour, capsize=2, label=direction, markersize=4)
         axes.axvline(0.0, color=BLACK, linewidth=0.8)
         wrapped = [name.replace(" and ", "\nand ", 1).replace(" over", "\nover") for name in names]
         axes.set(yticks=range(len(names)), yticklabels=wrapped, xlabel="classic - joint, deg/step, 95 % intervals")
@@ -311,9 +307,9 @@ def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
         axes.imshow(matrix, cmap=colour_map(DIVERGING), vmin=-1, vmax=1)
         for row in range(count):
             for column in range(count):
-                shade = "white" if abs(matrix[row, column]) > 0.8 else "black"
+                text_colour = "white" if abs(matrix[row, column]) > 0.8 else "black"
                 text = f"{round(100 * matrix[row, column])}".replace("-", "\u2212")
-                axes.text(column, row, text, ha="center", va="center", color=shade)
+                axes.text(column, row, text, ha="center", va="center", color=text_colour)
         axes.set(xticks=range(count), yticks=range(count), yticklabels=names, title="correlation, %")
         axes.set_xticklabels(names, rotation=60, ha="right", rotation_mode="anchor")
         axes.grid(False)
@@ -322,44 +318,42 @@ def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
 
 def residuals(stops: Sequence[StopResidual], axis: Axis) -> Figure:
     """Deviations of one axis' stops over time and against their counters."""
-    mine = [stop for stop in stops if stop.axis == axis]
+    axis_stops = [stop for stop in stops if stop.axis == axis]
     directions = SENSES[axis]
     with drawing(4.6) as figure:
         panels = figure.subplots(2, 1, sharey=True)
         for direction in (*directions, ""):
-            marker, colour = OF_DIRECTION[direction]
-            part = [stop for stop in mine if stop.direction == direction]
-            if not part:
+            marker, colour = DIRECTION_STYLE[direction]
+            group = [stop for stop in axis_stops if stop.direction == direction]
+            if not group:
                 continue
-            scaled = [stop.deviation_deg / stop.u_deg for stop in part]
+            scaled = [stop.deviation_deg / stop.u_deg for stop in group]
             label = f"moving {direction}" if direction else "unknown approach"
-            for axes, place in zip(
-                panels, ([stop.time_s for stop in part], [stop.steps for stop in part]), strict=True
-            ):
+            for axes, x in zip(panels, ([stop.time_s for stop in group], [stop.steps for stop in group]), strict=True):
                 axes.plot(
-                    place, scaled, marker, color=colour, markersize=3.5, linestyle="none", rasterized=True, label=label
+                    x, scaled, marker, color=colour, markersize=3.5, linestyle="none", rasterized=True, label=label
                 )
         for axes, name in zip(panels, ("time, s", f"{axis} counter, steps"), strict=True):
             axes.axhspan(-2, 2, color="#EEEEEE", zorder=0)
             axes.axhline(0.0, color=BLACK, linewidth=0.8)
             axes.set(xlabel=name, ylabel="deviation / u")
-        panels[0].set_title(f"stops of the {axis} axis, {len(mine)}; band: 2 standard deviations")
+        panels[0].set_title(f"stops of the {axis} axis, {len(axis_stops)}; band: 2 standard deviations")
         legend(figure, 3)
     return figure
 
 
 def causes(shares: Sequence[Cause], axis: str) -> Figure:
     """Mean deviation by group of each cause, with two standard errors."""
-    mine = [cause for cause in shares if cause.axis == axis and len(cause.groups) > 1]
-    rows = sum(len(cause.groups) for cause in mine)
+    axis_causes = [cause for cause in shares if cause.axis == axis and len(cause.groups) > 1]
+    rows = sum(len(cause.groups) for cause in axis_causes)
     with drawing(1.2 + 0.22 * max(rows, 2)) as figure:
         axes = figure.add_subplot()
         labels: list[str] = []
-        for cause in mine:
+        for cause in axis_causes:
             colour, marker = (RED, "D") if cause.suspicious else (BLUE, "o")
             for group in cause.groups:
-                reach = 2 * group.standard_error
-                axes.errorbar(group.mean, len(labels), xerr=reach, fmt=marker, color=colour, markersize=4)
+                bar = 2 * group.standard_error
+                axes.errorbar(group.mean, len(labels), xerr=bar, fmt=marker, color=colour, markersize=4)
                 labels.append(f"{cause.name}: {group.label}")
             axes.axhline(len(labels) - 0.5, color="#CCCCCC", linewidth=0.6)
         axes.axvline(0.0, color=BLACK, linewidth=0.8)
@@ -371,12 +365,12 @@ def causes(shares: Sequence[Cause], axis: str) -> Figure:
 
 def error_maps(maps: ErrorMap, range_index: int) -> Figure:
     """Root mean square 3D error of each estimator over pan and tilt at one range, mm."""
-    names = [name for name in OF_ESTIMATOR if name in maps.rms_mm]
+    names = [name for name in ESTIMATOR_STYLE if name in maps.rms_mm]
     with drawing(0.5 + 1.75 * len(names)) as figure:
         panels = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
         # One scale for all: equal colours are equal errors.
-        every = np.concatenate([maps.rms_mm[name][:, :, range_index].ravel() for name in names])
-        finite = every[np.isfinite(every)]
+        values_all = np.concatenate([maps.rms_mm[name][:, :, range_index].ravel() for name in names])
+        finite = values_all[np.isfinite(values_all)]
         low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
         for axes, name in zip(panels, names, strict=True):
             values = maps.rms_mm[name][:, :, range_index].T
@@ -393,7 +387,7 @@ def error_maps(maps: ErrorMap, range_index: int) -> Figure:
 
 
 def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, dark_above: float) -> None:
-    """Values written into a map of few cells, white on dark ones."""
+    """Writes values into the cells of a map, white on dark ones."""
     for row, yy in enumerate(y):
         for column, xx in enumerate(x):
             value = values[row, column]
@@ -403,15 +397,15 @@ def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, dark_ab
 
 
 def shares(budget: Budget) -> Figure:
-    """Shares of a point's variance by cause, largest first; what is below `SMALLEST_SHARE` is one bar."""
+    """Shares of a point's variance by cause, largest first; those below `SMALLEST_SHARE` are one bar."""
     order = np.argsort(-budget.share)
-    kept = [k for k in order if budget.share[k] >= SMALLEST_SHARE]
-    names = [share_in_words(budget.causes[k]) for k in kept]
-    values = [100 * budget.share[k] for k in kept]
-    rest = 100 - sum(values)
-    if rest > 0.05:
+    shown = [k for k in order if budget.share[k] >= SMALLEST_SHARE]
+    names = [share_in_words(budget.causes[k]) for k in shown]
+    values = [100 * budget.share[k] for k in shown]
+    remainder = 100 - sum(values)
+    if remainder > 0.05:
         names.append("all others")
-        values.append(rest)
+        values.append(remainder)
     with drawing(0.9 + 0.26 * len(names)) as figure:
         axes = figure.add_subplot()
         bars = axes.barh(range(len(names)), values, color=SKY, edgecolor=BLACK, linewidth=0.5)
@@ -426,18 +420,18 @@ def ratio_curves(curves: Curves) -> Figure:
     """Local ratios along both axes with 95 % intervals."""
     with drawing(5.4) as figure:
         panels = figure.subplots(2, 1)
-        for axes, axis, shown in zip(panels, SENSES, SENSES.values(), strict=True):
+        for axes, axis, directions in zip(panels, SENSES, SENSES.values(), strict=True):
             points = curves.ratios[axis]
             angle = np.array([point.pan_deg if axis == "pan" else point.tilt_deg for point in points])
-            for shift, direction in zip((-0.02, 0.02), shown, strict=True):
+            for shift, direction in zip((-0.02, 0.02), directions, strict=True):
                 if any(direction not in point.ratios for point in points):
                     continue
                 value = np.array([point.ratios[direction].value for point in points])
                 ends = np.array([point.ratios[direction].interval95 for point in points])
-                marker, colour = OF_DIRECTION[direction]
-                place, bars = angle + shift * np.ptp(angle), np.abs(ends.T - value)
+                marker, colour = DIRECTION_STYLE[direction]
+                x, bars = angle + shift * np.ptp(angle), np.abs(ends.T - value)
                 axes.errorbar(
-                    place, value, yerr=bars, label=direction, fmt=f"{marker}-", color=colour, capsize=2, markersize=4
+                    x, value, yerr=bars, label=direction, fmt=f"{marker}-", color=colour, capsize=2, markersize=4
                 )
             axes.set(xlabel=f"{axis} angle, deg", ylabel="deg/step")
         legend(figure, 4)

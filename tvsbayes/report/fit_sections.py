@@ -1,4 +1,4 @@
-"""Sections of the page on a fit: setting, headlines, parameters, what the data tell apart, residuals, tests.
+"""Sections of the page on a fit: set-up, headlines, parameters, identifiability, residuals, tests.
 
 Ratios in deg/step, other values in the unit of their name; frame S in mm for the picture of the rig.
 """
@@ -40,25 +40,25 @@ CORRELATED = (
     *("degrees_per_step.pan", "degrees_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
     *("mirror_offset_mm", "tilt_zero_deg", "laser_tilt_deg.x", "laser_tilt_deg.y", "focal_scale"),
 )
-"""Parameters of the correlation matrix, in order; those that were not estimated are left out."""
+"""Parameters of the correlation matrix, in order; those that are not estimated are omitted."""
 
 
 LEAST_P = 0.001
-"""Printed of a probability; smaller ones are said to be below it."""
+"""Least printed probability; smaller ones print as "below" it."""
 PRIORS_SHOWN = 8
-"""Of those that a result is sensitive to, the strongest first; fit.json has all."""
+"""Largest number of priors in the table of sensitivities, the strongest first; fit.json has all."""
 HEADER_SHOWN = ("method", "notes")
-"""Keys of a campaign's header that the first page does not have."""
+"""Keys of a campaign's header that are not on the first page."""
 
 
 def fit_sections(e: Evidence) -> list[Section]:
-    """In the order of the page."""
+    """The sections in the order of the page."""
     parts = (results_section, setup_section, gear_section, identifiability_section, residuals_section)
     return [part(e) for part in (*parts, validation_section) if part is not gear_section or e.gears]
 
 
 def setup_section(e: Evidence) -> Section:
-    """The rig, and what was measured where."""
+    """The rig, and the coverage of the data."""
     campaign, header, summary = e.campaign, e.campaign.header, e.fit.summary
     ok = sum(spot.status == "ok" for spot in campaign.spots)
     targets = sorted({spot.target for spot in campaign.spots if spot.target})
@@ -71,11 +71,11 @@ def setup_section(e: Evidence) -> Section:
     rows += [[*stated_text(campaign, "environment", key)] for key in header_table(campaign, "environment")]
     names = [f"extrinsics.translation_mm.{a}" for a in "xyz"]
     known = all(name in summary.parameters for name in names)
-    where = [summary.parameters[name].value for name in names] if known else None
+    position = [summary.parameters[name].value for name in names] if known else None
     baseline = campaign.rig.priors["baseline_mm"].value
     views = [
         FigureView(
-            figures.setup(campaign, where, baseline),
+            figures.setup(campaign, position, baseline),
             "Positions of cameras, positioner and spots from above and from the side; the coordinates are in spots.csv "
             "and in the table of results",
             "The rig as estimated, frame S: left camera at the origin, X depth, Y left, Z up.",
@@ -87,10 +87,10 @@ def setup_section(e: Evidence) -> Section:
         ),
     ]
     if e.crops:
-        listed = ", ".join(dict.fromkeys(str(crop.spot) for crop in e.crops))
+        ids = ", ".join(dict.fromkeys(str(crop.spot) for crop in e.crops))
         view = FigureView(
             spot_gallery(e.crops),
-            f"Cut-outs of the pictures of spots {listed}, a cross at each centre",
+            f"Cut-outs of the pictures of spots {ids}, a cross at each centre",
             "Spots as the cameras saw them, by number; suspect ones first. Red cross: the centre that was used.",
         )
         views.append(view)
@@ -98,7 +98,7 @@ def setup_section(e: Evidence) -> Section:
 
 
 def results_section(e: Evidence) -> Section:
-    """Why both estimators differ, what their experiments say, and every parameter."""
+    """Gap between both estimators, their experiments, and every parameter."""
     text = [
         "value(u): the digits in brackets are the standard uncertainty in units of the last place, or with their "
         "decimal point the uncertainty itself."
@@ -126,7 +126,7 @@ def results_section(e: Evidence) -> Section:
 
 
 def _one_experiment(e: Evidence) -> list[FigureView]:
-    """The first complete experiment as the paper draws one: its beams and its points."""
+    """The first complete experiment as in the paper: its beams and its points."""
     if e.classic is None or not e.classic.experiments:
         return []
     number = e.classic.experiments[0].experiment
@@ -139,11 +139,11 @@ def _one_experiment(e: Evidence) -> list[FigureView]:
 
 
 def _scatters(e: Evidence) -> list[FigureView]:
-    """The experiments of all directions that have some, in one figure."""
+    """The experiments of all directions in one figure."""
     if e.classic is None:
         return []
-    estimated = {d: r for d, r in e.classic.directions.items() if r is not None}
-    means = ", ".join(f"{d} {r.mean_deg_per_step:.6f} deg/step of {r.n}" for d, r in estimated.items())
+    results = {d: r for d, r in e.classic.directions.items() if r is not None}
+    means = ", ".join(f"{d} {r.mean_deg_per_step:.6f} deg/step of {r.n}" for d, r in results.items())
     figure = figures.direction_scatters(e.classic, e.fit.summary)
     return [
         FigureView(
@@ -155,7 +155,7 @@ def _scatters(e: Evidence) -> list[FigureView]:
 
 
 def _parameters(e: Evidence) -> TableView:
-    """Everything that was estimated, but for the cameras' parameters; ratios by direction are results of their own."""
+    """All estimated parameters except those of the cameras and ratios by direction, which have their own table."""
     rows = []
     by_direction = {f"degrees_per_step.{direction}" for direction in DIRECTIONS}
     for name, x in e.fit.summary.parameters.items():
@@ -177,7 +177,7 @@ def _parameters(e: Evidence) -> TableView:
 
 
 def gear_section(e: Evidence) -> Section:
-    """What the gears repeat; of gears that are taken as perfect there is none."""
+    """Errors of the gears that repeat by position."""
     summary = e.fit.summary
     rows = []
     for direction in DIRECTIONS:
@@ -204,22 +204,22 @@ def _view(band: GearBand, stops: Sequence[StopResidual]) -> FigureView:
 
 
 def identifiability_section(e: Evidence) -> Section:
-    """What the campaign cannot separate, which stops and priors it depends on."""
+    """Correlated parameters, and the stops and priors that matter."""
     names, matrix = e.fit.covariance.names, e.fit.covariance.matrix
-    kept = [n for n in CORRELATED if n in names and matrix[names.index(n), names.index(n)] > 0]
+    shown = [n for n in CORRELATED if n in names and matrix[names.index(n), names.index(n)] > 0]
     views, rows = [], []
-    if len(kept) > 1:
-        index = [names.index(n) for n in kept]
-        part = matrix[np.ix_(index, index)]
-        sd = np.sqrt(np.diag(part))
-        correlation = part / np.outer(sd, sd)
-        for i in range(len(kept)):
+    if len(shown) > 1:
+        index = [names.index(n) for n in shown]
+        block = matrix[np.ix_(index, index)]
+        sd = np.sqrt(np.diag(block))
+        correlation = block / np.outer(sd, sd)
+        for i in range(len(shown)):
             for j in range(i):
                 if abs(correlation[i, j]) > 0.8:
-                    rows.append([f"{name_in_words(kept[j])}; {name_in_words(kept[i])}", f"{correlation[i, j]:+.3f}"])
+                    rows.append([f"{name_in_words(shown[j])}; {name_in_words(shown[i])}", f"{correlation[i, j]:+.3f}"])
         views.append(
             FigureView(
-                figures.correlations(kept, correlation),
+                figures.correlations(shown, correlation),
                 "Correlation matrix; every cell holds its value in per cent",
                 "Correlations of the posterior.",
             )
@@ -255,7 +255,7 @@ def residuals_section(e: Evidence) -> Section:
     ]
     views = []
     for axis in AXES:
-        # One group alone has nothing to be compared with, and no bar in the figure.
+        # A single group cannot be compared, and has no bar in the figure.
         if any(c.axis == axis and len(c.groups) > 1 for c in causes):
             alt = f"Mean deviation by group, {axis} axis; values in fit.json"
             views.append(FigureView(figures.causes(causes, axis), alt, f"{axis} axis: mean deviation by group."))
@@ -286,7 +286,7 @@ def _causes(causes: tuple[Cause, ...]) -> TableView:
 
 
 def validation_section(e: Evidence) -> Section:
-    """Signs of model errors, the sampler's diagnosis, and what was predicted of the classic and of left-out angles."""
+    """Tests for model errors, diagnosis of the sampler, predictions of the classic and of left-out angles."""
     text, items, validation, sampling = [], [], e.fit.summary.validation, e.fit.summary.sampling
     tables: list[TableView | None] = []
     if validation is None:
@@ -320,7 +320,7 @@ def validation_section(e: Evidence) -> Section:
 
 
 def _predicted(e: Evidence) -> TableView | None:
-    """What the model says of the classic estimator beside what that says."""
+    """The classic estimates predicted by the model, and as reported."""
     rows = []
     for direction, predicted in e.fit.summary.classic_predicted.items():
         result = None if e.classic is None else e.classic.directions[direction]

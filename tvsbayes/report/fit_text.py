@@ -1,4 +1,4 @@
-"""A fit in words, for a terminal: its table, and every sentence that its reader must know, shared with the page."""
+"""A fit as text for a terminal: its table and all remarks, shared with the page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tvsbayes.errors import NotConverged, listed
 from tvsbayes.estimators.findings import Finding
 from tvsbayes.estimators.four_point import ClassicResult
 from tvsbayes.instrument.axes import AXES, DIRECTIONS
-from tvsbayes.report.advice import SPOTS_LISTED, factor_told, failed, noise_line, remedy, verdict_line
+from tvsbayes.report.advice import SPOTS_LISTED, factor_text, failed, noise_line, remedy, verdict_line
 from tvsbayes.report.document import Part, terminal
 from tvsbayes.report.result_tables import (
     KEY_PARAMETERS,
@@ -28,12 +28,12 @@ from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
 from tvsbayes.results.tiers import CHAIN
 
 FINE_DEG = 1e-5
-"""Of a step of an encoder's angles, as `head.foreign_sightings` counts them; motors turn by far more."""
+"""Step of an encoder's angles in `head.foreign_sightings`; steps of motors are much larger."""
 PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 
 
 def classic_text(result: ClassicResult) -> str:
-    """The classic estimator's table, and which experiments it had to leave out."""
+    """The classic estimator's table, and the experiments it left out."""
     skipped = [f"experiment {s.experiment} skipped: {s.reason}" for s in result.skipped]
     return terminal(classic_table(result), *skipped)
 
@@ -41,20 +41,20 @@ def classic_text(result: ClassicResult) -> str:
 def fit_text(
     summary: FitSummary, details: bool = False, written: Sequence[str] = (), causes: Sequence[Finding] = ()
 ) -> str:
-    """What the reader must know, then the table, then one line of verdict: the end is what a terminal shows.
+    """Remarks, the table, and one line of verdict at the end, where a terminal shows it.
 
     Args:
         summary: the fit.
-        details: also what else it says: the positioner, the gears, priors that matter, weak directions, single stops.
-        written: files that hold all of it.
-        causes: what explains that a fit failed.
+        details: also the positioner, the gears, priors that matter, weak directions, single stops.
+        written: files with all results.
+        causes: explanations of a failed fit.
     """
     if not summary.explained:
-        return astray_text(summary, causes)
+        return unconverged_text(summary, causes)
     lines: list[Part] = detail_lines(summary) if details else []
     validation = failed(summary)
     if validation is not None:
-        # Above and below the table: who reads either end of the text must meet it.
+        # Above and below the table: visible at both ends of the text.
         tests = validation_lines(validation)
         lines = [tests[0], *lines, *tests[1:], f"what helps: {remedy(validation)}"]
     lines += answer_lines(summary)
@@ -66,7 +66,7 @@ def fit_text(
         lines.append(f"excluded spots: {', '.join(map(str, summary.excluded_spots))}")
     if summary.suspect_spots:
         lines.append(f"{suspect_line(summary.suspect_spots)}; look at them, or fit with --robust")
-    # Where the model fails, its scatter is no noise.
+    # Where the model fails, the residual scatter is not noise.
     if failed(summary) is None and (noise := noise_line(summary)) is not None:
         lines.append(noise)
     if (encoder := encoder_line(summary)) is not None:
@@ -79,20 +79,20 @@ def fit_text(
 
 
 def encoder_line(summary: FitSummary) -> str | None:
-    """What a degree of an encoder does, whose steps are too small to say it; None of motors."""
+    """Ratio per degree of an encoder, whose steps are too small for the table; None for motors."""
     ratios = {axis: summary.parameters.get(f"degrees_per_step.{axis}") for axis in AXES}
-    shown = [
+    texts = [
         f"{axis} by {concise(ratio.value / FINE_DEG, ratio.sd / FINE_DEG)} deg"
         for axis, ratio in ratios.items()
         if ratio is not None and 0 < abs(ratio.value) < 10 * FINE_DEG
     ]
     counts = f"{1 / FINE_DEG:.0f} counts, 1 deg of angles as `import` takes them,"
-    return f"{counts} turn {' and '.join(shown)}" if shown else None
+    return f"{counts} turn {' and '.join(texts)}" if texts else None
 
 
 def more_line(summary: FitSummary) -> str:
-    """What --details and the report say besides; "" where that is nothing."""
-    counted = {
+    """Further contents of --details and the report; "" where there are none."""
+    counts = {
         "weak direction": len(summary.weak_directions),
         "stop on which a result hangs": len(summary.leverage),
         "prior that matters": len({entry.parameter for entry in summary.prior_sensitivity}),
@@ -101,15 +101,15 @@ def more_line(summary: FitSummary) -> str:
         "stop on which a result hangs": "stops on which a result hangs",
         "prior that matters": "priors that matter",
     }
-    named = [f"{n} {name if n == 1 else plural.get(name, name + 's')}" for name, n in counted.items() if n]
-    return f"--details and the report say more: {', '.join(named)}" if named else ""
+    phrases = [f"{n} {name if n == 1 else plural.get(name, name + 's')}" for name, n in counts.items() if n]
+    return f"--details and the report say more: {', '.join(phrases)}" if phrases else ""
 
 
 def detail_lines(summary: FitSummary) -> list[Part]:
-    """What else a fit says: the positioner, the gears, what was tested, priors that matter, what stays unknown."""
-    where = details_table(summary)
-    # A head that says where it points stands in no camera's frame.
-    lines: list[Part] = [where] if where.rows else []
+    """Details of a fit: the positioner, the gears, tests, priors that matter, weak directions."""
+    details = details_table(summary)
+    # A head with sightings has no camera frame.
+    lines: list[Part] = [details] if details.rows else []
     if (waves := waves_table(summary)) is not None:
         lines.append(waves)
     if (gears := gears_table(summary)) is not None:
@@ -117,12 +117,12 @@ def detail_lines(summary: FitSummary) -> list[Part]:
     lines.append(f"chi2 {summary.noise.chi2:.1f} for {summary.noise.dof:.1f} degrees of freedom")
     if summary.validation is not None and summary.validation.passed:
         lines += validation_lines(summary.validation)
-    predicted = [f"{d} {concise(e.value, e.sd)}" for d, e in summary.classic_predicted.items() if e is not None]
-    if predicted:
-        lines.append(f"the classic estimator should report, deg/step: {', '.join(predicted)}")
+    classic_texts = [f"{d} {concise(e.value, e.sd)}" for d, e in summary.classic_predicted.items() if e is not None]
+    if classic_texts:
+        lines.append(f"the classic estimator should report, deg/step: {', '.join(classic_texts)}")
     if summary.sampling is not None and summary.sampling.converged:
-        agreed = agreement_line(summary.sampling)
-        lines += [sampling_line(summary.sampling), *([] if agreed is None else [agreed])]
+        agreement = agreement_line(summary.sampling)
+        lines += [sampling_line(summary.sampling), *([] if agreement is None else [agreement])]
     if summary.curves is not None:
         lines += lost_motion_lines(summary.curves.lost_motion)
     for entry in summary.prior_sensitivity:
@@ -137,41 +137,41 @@ def detail_lines(summary: FitSummary) -> list[Part]:
 
 
 def homing_lines(summary: FitSummary) -> list[str]:
-    """How the axes came home whose sides nobody recorded."""
+    """Probabilities of unrecorded homing sides."""
     lines = []
     for axis, chances in summary.homing_side.items():
-        ordered = sorted(chances.items(), key=lambda each: -each[1])
+        ordered = sorted(chances.items(), key=lambda item: -item[1])
         ways = ", ".join(f"{side} {100 * chance:.1f} %" for side, chance in ordered)
         lines.append(f"{axis} homing side, not recorded: {ways}")
     return lines
 
 
 def gear_lines(summary: FitSummary) -> list[str]:
-    """Where effective ratios hold that have errors of the gears in them, and what they are without."""
+    """Range of effective ratios, which include errors of the gears, and the local ratios without them."""
     lines = [f"effective ratios are slopes of lines through the looks, {range_text(summary)}; elsewhere errors differ"]
     local = [f"{d} {concise(e.value, e.sd)}" for d, e in summary.local.items() if e is not None]
     return lines + [f"local ratios, without errors of the gears, deg/step: {', '.join(local)}"] * bool(local)
 
 
-def astray_text(summary: FitSummary, causes: Sequence[Finding] = ()) -> str:
-    """Where a fit that did not converge stopped, values without uncertainty, and what explains it."""
-    there = (row for row in PARAMETERS if row[0] in summary.parameters)
-    rows = [[label, f"{summary.parameters[name].value:.4g}", unit] for name, label, unit in there]
+def unconverged_text(summary: FitSummary, causes: Sequence[Finding] = ()) -> str:
+    """A fit that did not converge: its last values without uncertainty, and the causes."""
+    parameters = (row for row in PARAMETERS if row[0] in summary.parameters)
+    rows = [[label, f"{summary.parameters[name].value:.4g}", unit] for name, label, unit in parameters]
     table = TableView("where the fit stopped: NOT results", ["quantity", "value", "unit"], rows)
     suspects = suspect_line(summary.suspect_spots) if summary.suspect_spots else None
-    said = NotConverged.of(summary.problems, "").message
-    return terminal(said, table, suspects, *(f"cause: {finding.message}" for finding in causes))
+    message = NotConverged.of(summary.problems, "").message
+    return terminal(message, table, suspects, *(f"cause: {finding.message}" for finding in causes))
 
 
 def suspect_line(spots: Sequence[int]) -> str:
-    """Spots that others predict badly, at most `SPOTS_LISTED` by their ids."""
+    """Spots that disagree with the others, at most `SPOTS_LISTED` ids."""
     return f"spots that disagree with all others: {listed(spots, SPOTS_LISTED)}"
 
 
-def few_stops_line(few: Mapping[str, int], estimator: str) -> str:
-    """What few stops of a direction do to its intervals."""
-    named = ", ".join(f"{direction} {count}" for direction, count in few.items())
-    sentence = f"few stops ({named}): they hardly tell their own scatter"
+def few_stops_line(counts: Mapping[str, int], estimator: str) -> str:
+    """The effect of few stops of a direction on its intervals."""
+    counts_text = ", ".join(f"{direction} {count}" for direction, count in counts.items())
+    sentence = f"few stops ({counts_text}): they hardly tell their own scatter"
     if estimator == "posterior":
         return f"{sentence}; the intervals hold it, more stops would shorten them"
     sentence += ", and the Laplace intervals of ratio and backlash are too short"
@@ -179,7 +179,7 @@ def few_stops_line(few: Mapping[str, int], estimator: str) -> str:
 
 
 def validation_lines(validation: Validation) -> list[str]:
-    """What the residuals say of the model: one line where they agree, else the warning and every test that failed."""
+    """Result of the validation: one line where it passed, else the warning and every failed test."""
     tests = validation.tests
     if validation.passed:
         if not tests:
@@ -190,7 +190,7 @@ def validation_lines(validation: Validation) -> list[str]:
             "play can take themselves are not seen"
         ]
     warning = f"VALIDATION FAILED: {validation.cause} (p {tests[0].p:.1e}); the table is as fitted, "
-    warning += factor_told(validation)
+    warning += factor_text(validation)
     return [
         warning,
         *(
@@ -203,7 +203,7 @@ def validation_lines(validation: Validation) -> list[str]:
 
 
 def sampling_line(sampling: Sampling) -> str:
-    """What stands behind a posterior, in one line."""
+    """Diagnosis of a posterior's draws, in one line."""
     rhat, ess, tail = sampling.worst_rhat, sampling.least_ess_bulk, sampling.least_ess_tail
     if rhat is None:
         text = "" if sampling.importance is None else importance_line(sampling.importance)
@@ -215,22 +215,22 @@ def sampling_line(sampling: Sampling) -> str:
 
 
 def answer_lines(summary: FitSummary) -> list[str]:
-    """What an answer that is not accepted lacks, and what more time would do; none of an accepted one."""
+    """Why an answer is not accepted, and the remedy; none for an accepted one."""
     if summary.sampling is None or not summary.sampling.missing:
         return []
-    quick = summary.sampling.steps is None
+    is_quick = summary.sampling.steps is None
     lines = [f"{'rough' if summary.converged else 'not sampled'}: {text}" for text in summary.sampling.missing]
     lines.append(sampling_line(summary.sampling))
     if summary.converged and summary.monte_carlo_error:
-        worst = max(summary.monte_carlo_error.items(), key=lambda each: each[1].rounds_factor)
-        ends = " and ".join(f"{each:.2f}" for each in worst[1].interval95)
+        worst = max(summary.monte_carlo_error.items(), key=lambda error: error[1].rounds_factor)
+        ends = " and ".join(f"{error:.2f}" for error in worst[1].interval95)
         largest = f"{worst[1].mean:.2f} sd of the mean, {ends} sd of the interval's ends ({worst[0]})"
         lines.append(f"Monte Carlo error, largest: {largest}")
-    return [*lines, f"what helps: {'fit without --quick' if quick else 'fit with --resume and more --max-minutes'}"]
+    return [*lines, f"what helps: {'fit without --quick' if is_quick else 'fit with --resume and more --max-minutes'}"]
 
 
 def importance_line(importance: Importance) -> str:
-    """What importance sampling is worth, in one line."""
+    """Diagnosis of importance sampling, in one line."""
     least, worst = importance.least_ess, importance.worst_pareto_k
     text = f"importance sampling: {importance.draws} draws, {100 * importance.effective_share:.0f} % effective, "
     text += f"at least {least.value:.0f} for a result ({least.quantity}); "
@@ -238,19 +238,19 @@ def importance_line(importance: Importance) -> str:
 
 
 def agreement_line(sampling: Sampling) -> str | None:
-    """Whether the chain says what importance sampling said; None without a chain."""
+    """Whether chain and importance sampling agree; None without a chain."""
     if sampling.steps is None or sampling.importance is None:
         return None
     if sampling.agreement is None:
         return "importance sampling was not accepted: the chain stands alone"
-    said = "agree on every result" if sampling.agreement.agrees else "DISAGREE"
+    words = "agree on every result" if sampling.agreement.agrees else "DISAGREE"
     worst = sampling.agreement.worst
-    text = f"{CHAIN} and importance sampling {said}: the largest difference is {worst.value:.1f} Monte Carlo errors"
+    text = f"{CHAIN} and importance sampling {words}: the largest difference is {worst.value:.1f} Monte Carlo errors"
     return f"{text} ({worst.quantity})"
 
 
 def first_text(summary: FitSummary) -> str:
-    """What importance sampling says while a chain is still to come."""
+    """Results of importance sampling while the chain runs."""
     sampling = summary.sampling
     if sampling is None or sampling.importance is None:
         return ""
@@ -259,10 +259,10 @@ def first_text(summary: FitSummary) -> str:
     return terminal(headline_table(summary), f"{importance_line(sampling.importance)}; {CHAIN} goes on ...")
 
 
-def lost_motion_lines(lost: Mapping[str, Sequence[LostMotion]]) -> list[str]:
-    """Lost motion after a reversal, for the step counts that were used."""
+def lost_motion_lines(motions: Mapping[str, Sequence[LostMotion]]) -> list[str]:
+    """Lost motion after a reversal, for the step counts of the campaign."""
     lines = []
-    for direction, entries in lost.items():
+    for direction, entries in motions.items():
         parts = []
         for text, group in groupby(entries, lambda e: concise(e.value_deg, e.sd_deg)):
             steps = [e.steps for e in group]
@@ -272,7 +272,7 @@ def lost_motion_lines(lost: Mapping[str, Sequence[LostMotion]]) -> list[str]:
 
 
 def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[str, float]) -> str:
-    """Both estimators beside the truth of a simulated campaign."""
+    """Both estimators compared with the truth of a simulated campaign."""
 
     def holds(interval: tuple[float, float] | None, true: float) -> str:
         return "-" if interval is None else ("yes" if interval[0] <= true <= interval[1] else "NO")
@@ -283,8 +283,8 @@ def demo_text(classic_result: ClassicResult, summary: FitSummary, truth: dict[st
         if c is None or j is None:
             continue
         true = truth[direction]
-        shown = concise(c.mean_deg_per_step, c.u_type_a_deg_per_step or 0.0)
-        cells = [direction, shown, holds(c.interval95_type_a, true), concise(j.value, j.sd)]
+        classic_cell = concise(c.mean_deg_per_step, c.u_type_a_deg_per_step or 0.0)
+        cells = [direction, classic_cell, holds(c.interval95_type_a, true), concise(j.value, j.sd)]
         rows.append([*cells, holds(j.interval95, true), f"{true:.6f}"])
     columns = ["deg/step", "classic, type A", "holds truth", "joint", "holds truth", "truth"]
     ratios = TableView("degrees of beam per motor step, value(u)", columns, rows)

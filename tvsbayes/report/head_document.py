@@ -1,6 +1,6 @@
-"""The document of a head that says where it points: ratios, terms, stops, what is left open.
+"""The document of a head with sightings: ratios, terms, stops, weaknesses.
 
-Nothing is computed here but the pointing model beside the fit. deg, deg/step.
+Only the pointing model is computed here, for comparison with the fit. deg, deg/step.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
         campaign: of a head, with sightings.
         record: its `fit.json`.
         issue: who issues it, for whom and when.
-        doubts: what `check` warns of.
+        doubts: warnings of `check`.
     """
     summary = record.summary
-    open_ends = [weak.text for weak in summary.weak_directions] + [entry.text for entry in summary.leverage]
+    weaknesses = [weak.text for weak in summary.weak_directions] + [entry.text for entry in summary.leverage]
     warnings = [*summary.problems, *(f"Prior conflict: {sentence_in_words(text)}" for text in summary.prior_conflicts)]
     warnings += [f"`check` warns: {sentence_in_words(text)}" for text in doubts]
     if summary.estimator == "laplace":
@@ -62,7 +62,7 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
         Section("Stops", text=_noise_text(record), figures=[view for axis in AXES for view in stop_views(stops, axis)]),
         Section(
             "What the sightings cannot tell",
-            items=[sentence_in_words(text) for text in open_ends] or ["Nothing of note."],
+            items=[sentence_in_words(text) for text in weaknesses] or ["Nothing of note."],
         ),
         Section("Signs of model errors", items=validation or ["Not asked."]),
         Section("Method", text=METHOD),

@@ -1,7 +1,7 @@
 """A document as one page: verdict, numbers and warnings at its top, the sections below; HTML and PDF.
 
-No script, nothing fetched. Text of a campaign reaches it through jinja2's autoescape only; pictures are SVG inside
-`data:` images, which browsers open without scripts and without network. Its policy (CSP) allows exactly its own style
+No script, no network access. Text of a campaign reaches it through jinja2's autoescape only; pictures are SVG inside
+`data:` images, which browsers open without scripts and without network. Its policy (CSP) allows only its own style
 sheet, by hash, and such images.
 """
 
@@ -31,11 +31,11 @@ PDF_SECONDS = 120
 NUMBER_DIGITS = 12
 PAGE_BYTES_MAX = 64 * 1024 * 1024
 GENERATOR = b'<meta name="generator" content="tvsbayes '
-"""In the head of every page of ours."""
+"""Marker in the head of every page of this program."""
 
 
 def find_browser() -> str:
-    """The program that prints pages.
+    """The browser that prints pages.
 
     Raises:
         InputError: none is installed.
@@ -48,7 +48,7 @@ def find_browser() -> str:
 
 
 def print_to_pdf(page: Path) -> Path:
-    """Print a report with an installed Chromium or Chrome; the PDF lies beside it.
+    """Prints a report with an installed Chromium or Chrome; the PDF is beside it.
 
     Raises:
         InputError: none is installed, or it failed.
@@ -56,49 +56,49 @@ def print_to_pdf(page: Path) -> Path:
     browser = find_browser()
     target = page.with_suffix(".pdf")
     remedy = f"open {page} in any browser and print it to PDF (A4)"
-    with tempfile.TemporaryDirectory(prefix="tvsbayes-") as scratch:
-        printed = Path(scratch) / "report.pdf"
+    with tempfile.TemporaryDirectory(prefix="tvsbayes-") as folder:
+        pdf = Path(folder) / "report.pdf"
         flags = ["--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-sync"]
         if hasattr(os, "geteuid") and os.geteuid() == 0:
-            # Chromium's own walls cannot be built by root; the page is ours and holds no script.
+            # Chromium's sandbox does not work as root; the page is ours and has no script.
             flags.append("--no-sandbox")
-        flags += ["--no-pdf-header-footer", "--generate-pdf-document-outline", f"--user-data-dir={scratch}/profile"]
-        command = [browser, *flags, f"--print-to-pdf={printed}", page.resolve().as_uri()]
+        flags += ["--no-pdf-header-footer", "--generate-pdf-document-outline", f"--user-data-dir={folder}/profile"]
+        command = [browser, *flags, f"--print-to-pdf={pdf}", page.resolve().as_uri()]
         try:
-            done = subprocess.run(command, capture_output=True, timeout=PDF_SECONDS, check=False)
+            process = subprocess.run(command, capture_output=True, timeout=PDF_SECONDS, check=False)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise InputError("pdf", f"{Path(browser).name} did not print the report", remedy=remedy) from error
-        if done.returncode or not printed.exists():
-            raise InputError("pdf", f"{Path(browser).name} ended with code {done.returncode}", remedy=remedy)
-        write_atomically(target, printed.read_bytes())
+        if process.returncode or not pdf.exists():
+            raise InputError("pdf", f"{Path(browser).name} ended with code {process.returncode}", remedy=remedy)
+        write_atomically(target, pdf.read_bytes())
     return target
 
 
 def certificate_place(page: Path, out: Path | None) -> Path:
-    """Where the certificate of a page lies: `dcc.xml` in `results/`, beside a page elsewhere by its name."""
+    """Path of a page's certificate: `dcc.xml` in `results/`; for a page elsewhere, beside it with its name."""
     return page.with_name("dcc.xml" if out is None else f"{page.stem}.dcc.xml")
 
 
 def replace_page(page: Path, html: bytes, out: Path | None) -> list[str]:
-    """Write a page, and remove what was made of another one that stood there: its PDF and its certificate.
+    """Writes a page, and removes PDF and certificate of a different previous page.
 
     Args:
-        page: where to; `results/` is made where it is missing.
-        html: its bytes; of the very page that stands there already nothing is removed.
-        out: as the user named it; there only what lies beside a page of ours is ours.
+        page: its path; `results/` is made where it is missing.
+        html: its bytes; nothing is removed where they equal the previous page.
+        out: path stated by the user; files beside it are removed only if the previous page is of this program.
 
     Returns:
-        Names of what was removed.
+        Names of removed files.
 
     Raises:
         InputError: the folder cannot be written.
     """
     try:
-        before = read_bytes(page, PAGE_BYTES_MAX)
+        previous = read_bytes(page, PAGE_BYTES_MAX)
     except InputError:
-        before = b""
+        previous = b""
     removed = []
-    if before != html and (out is None or GENERATOR in before):
+    if previous != html and (out is None or GENERATOR in previous):
         for follower in (page.with_suffix(".pdf"), certificate_place(page, out)):
             if follower.is_file():
                 follower.unlink()
@@ -110,12 +110,12 @@ def replace_page(page: Path, html: bytes, out: Path | None) -> list[str]:
 
 
 def numbered(document: Document) -> Document:
-    """The document with its number: digits of a digest of all that its page says, so that no other has it."""
+    """The document with its number: digits of a digest of its page, unique to its content."""
     return replace(document, number=digest_number(page_html(replace(document, number=""))))
 
 
 def digest_number(content: bytes) -> str:
-    """What tells results or reports apart: hexadecimal digits of a SHA-256."""
+    """Number of results or of a report: hexadecimal digits of a SHA-256."""
     return hashlib.sha256(content).hexdigest()[:NUMBER_DIGITS].upper()
 
 
@@ -124,14 +124,14 @@ SIGNS = (("+-", "\u00b1"), ("<=", "\u2264"), (">=", "\u2265"))
 
 
 def typeset(text: str) -> str:
-    """Text with true signs: minus before numbers, plus-minus, not more than, and no minus before zero."""
+    """Text with typographic signs: minus before numbers, plus-minus, less or equal, and no minus before zero."""
     for plain, sign in SIGNS:
         text = text.replace(plain, sign)
     return MINUS.sub("\u2212", MINUS_ZERO.sub(r"\1", text))
 
 
 def prose(text: str) -> Markup:
-    """A sentence as `typeset`, escaped; what stands between backticks, a command to be typed, as it is and as code."""
+    """A sentence as `typeset`, escaped; commands between backticks unchanged, as code."""
     parts = str(text).split("`")
     if len(parts) % 2 == 0:
         return escape(typeset(text))
@@ -142,37 +142,37 @@ def prose(text: str) -> Markup:
 
 
 def page_html(document: Document) -> bytes:
-    """A document by the template, UTF-8; its policy allows its own style sheet and pictures alone."""
+    """A document by the template, UTF-8; its policy allows only its own style sheet and pictures."""
     return rendered("report", "report.html", "report.css", document.number, r=document)
 
 
 def rendered(
-    folder: str, template: str, style: str, number: str = "", scripts: Sequence[str] = (), **held: object
+    folder: str, template: str, style: str, number: str = "", scripts: Sequence[str] = (), **content: object
 ) -> bytes:
-    """A shipped template with its style and scripts in it, UTF-8; its policy (CSP) names exactly those, by hash.
+    """A shipped template with its style and scripts in it, UTF-8; its policy (CSP) allows only those, by hash.
 
     Args:
         folder: of the shipped data.
         template: a file in it.
         style: its style sheet.
-        scripts: in the order in which they run.
+        scripts: in the order of execution.
         number: of the report, for the foot of its printed pages.
-        held: what the template shows.
+        content: values for the template.
     """
-    place = shipped_data() / folder
-    css = (place / style).read_text(encoding="utf-8").replace("@ID@", number)
-    script = "\n".join((place / name).read_text(encoding="utf-8") for name in scripts)
+    directory = shipped_data() / folder
+    css = (directory / style).read_text(encoding="utf-8").replace("@ID@", number)
+    script = "\n".join((directory / name).read_text(encoding="utf-8") for name in scripts)
     policy = f"default-src 'none'; img-src data:; style-src {_source(css)}; base-uri 'none'; form-action 'none'"
     policy += f"; script-src {_source(script)}" if scripts else ""
     environment = Environment(
-        loader=FileSystemLoader(str(place)), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+        loader=FileSystemLoader(str(directory)), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     environment.filters |= {"typeset": typeset, "prose": prose}
     # Style sheet and scripts are ours; escaped quotes would change their hashes.
-    shown = environment.get_template(template).render(css=Markup(css), script=Markup(script), policy=policy, **held)
-    return shown.encode()
+    page = environment.get_template(template).render(css=Markup(css), script=Markup(script), policy=policy, **content)
+    return page.encode()
 
 
 def _source(text: str) -> str:
-    """How a policy names a text (Content Security Policy 3, 2.3.1)."""
+    """The hash of a text in a policy (Content Security Policy 3, 2.3.1)."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

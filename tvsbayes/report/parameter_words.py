@@ -1,4 +1,4 @@
-"""What reports call parameters, causes of uncertainty and tiers: words for readers, beside the names in files."""
+"""Words of reports for parameters, causes of uncertainty and tiers, in place of the names in files."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ _MADE_BY = {
     "posterior": f"posterior sampled by {CHAIN}",
 }
 IN_WORDS = {**QUANTITIES.words, "extrinsics": "the positioner's pose"}
-"""By block of quantities; those of the positioner's pose also as one."""
+"""Words by block of quantities; also of the positioner's pose as a whole."""
 
 
 def made_by(tier: str) -> str:
-    """What made the numbers, by tier, or by estimator where results name no tier."""
+    """The method of the numbers in words, by tier, or by estimator where results have no tier."""
     return _MADE_BY.get(tier, f"posterior sampled by {tier}")
 
 
 def name_in_words(name: str) -> str:
-    """A quantity for readers, with its part and unit: "laser's direction, x, deg"; other names stay."""
+    """A quantity in words, with its part and unit: "laser's direction, x, deg"; other names are unchanged."""
     quantity = QUANTITIES.get(name)
     return name if quantity is None or not quantity.words else quantity.in_words
 
 
 def source_in_words(source: str) -> str:
-    """A row of a budget for readers, with part and unit: a parameter, the prior of one; others stay."""
-    for begin, article in (("prior of ln ", ""), ("prior of ", "the ")):
-        if source.startswith(begin):
-            name = source.removeprefix(begin)
+    """A row of a budget in words, with part and unit: a parameter, the prior of one; others are unchanged."""
+    for prefix, article in (("prior of ln ", ""), ("prior of ", "the ")):
+        if source.startswith(prefix):
+            name = source.removeprefix(prefix)
             words = name_in_words(name)
-            return begin + article * (words != name) + words
+            return prefix + article * (words != name) + words
     return name_in_words(source)
 
 
 def share_in_words(cause: str) -> str:
-    """A cause of uncertainty in a table of shares: priors of a group of parameters as one; others stay."""
+    """A cause of uncertainty in a table of shares: priors of a group of parameters as one; others are unchanged."""
     name = cause.removeprefix("prior of ")
     return f"prior of {IN_WORDS[name]}" if cause != name and name in IN_WORDS else cause
 
@@ -53,7 +53,7 @@ _NAMES = re.compile(r"\b(?:" + "|".join(sorted(map(re.escape, IN_WORDS), key=len
 
 
 def sentence_in_words(text: str) -> str:
-    """A sentence with parameters by their words; commands between backticks stay."""
+    """A sentence with words in place of names of parameters; commands between backticks are unchanged."""
     parts = text.split("`")
 
     def words(match: re.Match[str]) -> str:

@@ -1,6 +1,6 @@
-"""Tables that texts and the page print alike: both estimators, their gap, what they predict, budgets of a point.
+"""Tables shared by texts and the page: both estimators, their gap, predictions, budgets of a point.
 
-Units stand in captions and heads; numbers carry two digits of their uncertainty (GUM 7.2.6).
+Units are in captions and heads; numbers have two digits of their uncertainty (GUM 7.2.6).
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ if TYPE_CHECKING:
 
 def _rows(*names: str) -> tuple[tuple[str, str, str], ...]:
     rows = (QUANTITIES[name] for name in names)
-    return tuple((of.name, of.label, "" if of.unit == "1" else of.unit) for of in rows)
+    return tuple((quantity.name, quantity.label, "" if quantity.unit == "1" else quantity.unit) for quantity in rows)
 
 
 KEY_PARAMETERS = _rows(
-    *(of.name for of in HEADLINES if of.label and not of.ratio),
+    *(quantity.name for quantity in HEADLINES if quantity.label and not quantity.ratio),
     *names_of("stop_sd_deg", "look_scatter_deg", "pixel_scale"),
 )
 """Parameters of the table that ends a fit: name, label, unit."""
 HEAD_PARAMETERS = _rows(*(term.name for term in HEAD_TERMS.values()))
-"""The terms of a head, behind them."""
+"""The terms of a head, after them."""
 MORE_PARAMETERS = _rows(*names_of("mirror_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm"))
-"""Those of its details."""
+"""Parameters of the table of details."""
 SHARE_SHOWN = 5e-4
-"""Of a variance: smaller ones print as 0.0 %."""
+"""Least share of a variance in a table: smaller ones print as 0.0 %."""
 
 
 def classic_table(result: ClassicResult) -> TableView:
@@ -52,7 +52,7 @@ def classic_table(result: ClassicResult) -> TableView:
             continue
         optional = (r.sd_deg_per_step, r.u_type_a_deg_per_step)
         sd, u = ("-" if x is None else f"{x:.6f}" for x in optional)
-        # An interval has its u beside it.
+        # Digits of the interval follow its own u.
         gum = "-" if r.interval95_gum is None else interval_text(*r.interval95_gum, r.u_gum_deg_per_step or 0.0)
         rows.append([direction, str(r.n), f"{r.mean_deg_per_step:.6f}", sd, u, gum])
     columns = ["direction", "n", "mean deg/step", "sd", "u type A", "95 % interval (GUM)"]
@@ -60,7 +60,7 @@ def classic_table(result: ClassicResult) -> TableView:
 
 
 ESTIMATE_COLUMNS = ("quantity", "value(u)", "95 % interval", "set by")
-"""Of `estimate_row`."""
+"""Columns of `estimate_row`."""
 
 
 def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
@@ -74,29 +74,29 @@ def estimate_row(label: str, estimate: Estimate | None, unit: str) -> list[str]:
 
 
 def headline_table(summary: FitSummary) -> TableView:
-    """Ratios, contrasts and key parameters of the joint estimator: what ends a fit."""
+    """Ratios, contrasts and key parameters of the joint estimator: the last table of a fit."""
     pose = summary.reference_pose_deg
     estimates = {f"effective_deg_per_step.{part}": e for part, e in summary.effective.items()}
     estimates |= {
         f"effective_contrast_deg_per_step.{part}": e for part, e in summary.contrasts.items() if e is not None
     }
     rows = [estimate_row(label, estimates[name], unit) for name, label, unit in _rows(*estimates)]
-    there = (row for row in (*KEY_PARAMETERS, *HEAD_PARAMETERS) if row[0] in summary.parameters)
-    rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in there]
+    parameters = (row for row in (*KEY_PARAMETERS, *HEAD_PARAMETERS) if row[0] in summary.parameters)
+    rows += [estimate_row(label, summary.parameters[name], unit) for name, label, unit in parameters]
     kind = {"laplace": "Laplace", "posterior": "posterior"}[summary.estimator]
     title = f"joint estimator ({kind}) at pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
     return TableView(title, ESTIMATE_COLUMNS, rows)
 
 
 def details_table(summary: FitSummary) -> TableView:
-    """Where the positioner stands, and L."""
-    there = (row for row in MORE_PARAMETERS if row[0] in summary.parameters)
-    rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in there]
+    """Pose of the positioner, and L."""
+    parameters = (row for row in MORE_PARAMETERS if row[0] in summary.parameters)
+    rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in parameters]
     return TableView("the positioner in frame S (the left camera's)", ESTIMATE_COLUMNS, rows)
 
 
 def range_text(summary: FitSummary) -> str:
-    """Counters over which the effective ratios hold."""
+    """Range of counters of the effective ratios."""
     return ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in summary.range_steps.items()) + " steps"
 
 
@@ -104,15 +104,15 @@ GEAR_SCALES = names_of(
     *("transmission_error_deg", "transmission_error_length_deg", "play_variation_deg", "drift_deg_per_root_hour"),
     *("creep_deg", "thermal_deg_per_K", "harmonic_amplitude_deg"),
 )
-"""Scales of what gears repeat and how zeros drift."""
+"""Scales of repeated errors of the gears and of drifts of the zeros."""
 
 
 def gears_table(summary: FitSummary) -> TableView | None:
-    """Scales of the gears' errors of both axes; None where they are taken as perfect."""
-    there = [name for name in GEAR_SCALES if name in summary.parameters]
-    if not any(name.startswith(("transmission", "play", "harmonic")) for name in there):
+    """Scales of the gears' errors of both axes; None for perfect gears."""
+    names = [name for name in GEAR_SCALES if name in summary.parameters]
+    if not any(name.startswith(("transmission", "play", "harmonic")) for name in names):
         return None
-    rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in _rows(*there)]
+    rows = [estimate_row(label, summary.parameters[name], unit) for name, label, unit in _rows(*names)]
     return TableView("gears: what repeats by position", ESTIMATE_COLUMNS, rows)
 
 
@@ -123,19 +123,19 @@ WAVE_COLUMNS = [
 ]
 
 
-def wave_row(what: str, wave: PeriodEstimate, unit: str, of: str) -> list[str]:
-    """A row of `WAVE_COLUMNS`; `unit` of the amplitude, `of` the period."""
+def wave_row(name: str, wave: PeriodEstimate, unit: str, period_unit: str) -> list[str]:
+    """A row of `WAVE_COLUMNS`; `unit` is that of the amplitude."""
     stated = wave.source == "stated"
     period = f"{wave.period.value:.10g}" if stated else concise(wave.period.value, wave.period.sd)
-    amplitude = concise(wave.amplitude.value, wave.amplitude.sd)
-    across = interval_text(*wave.amplitude.interval95, wave.amplitude.sd)
-    between = "stated" if stated else interval_text(*wave.period.interval95, wave.period.sd)
+    amplitude = f"{concise(wave.amplitude.value, wave.amplitude.sd)} {unit}"
+    amplitude95 = interval_text(*wave.amplitude.interval95, wave.amplitude.sd)
+    period95 = "stated" if stated else interval_text(*wave.period.interval95, wave.period.sd)
     phase = concise(wave.phase_deg.value, wave.phase_deg.sd)
-    return [what, f"{amplitude} {unit} every {period} {of}", across, between, phase, percent(wave.probability)]
+    return [name, f"{amplitude} every {period} {period_unit}", amplitude95, period95, phase, percent(wave.probability)]
 
 
 def percent(probability: float) -> str:
-    """Of draws, so that neither 0 nor 100 % is claimed."""
+    """A probability from draws, never as 0 or 100 %."""
     return "> 99.9 %" if probability > 0.999 else "< 0.1 %" if probability < 0.001 else f"{100 * probability:.1f} %"
 
 
@@ -162,9 +162,9 @@ def gap_table(gaps: Mapping[str, Gap | None]) -> TableView:
     return TableView("why the classic differs from the joint, deg/step, value(u)", ["", *stated], rows)
 
 
-def hold_out_table(held: HoldOut) -> TableView | None:
-    """How well both estimators predict angles that were left out; None where nothing could be judged."""
-    if held.classic is None or held.joint is None:
+def hold_out_table(hold_out: HoldOut) -> TableView | None:
+    """Predictions of left-out angles by both estimators; None where there are none."""
+    if hold_out.classic is None or hold_out.joint is None:
         return None
     rows = [
         [
@@ -174,14 +174,14 @@ def hold_out_table(held: HoldOut) -> TableView | None:
             f"{100 * score.coverage:.0f} %",
             f"{score.log_density:+.2f}",
         ]
-        for name, score in (("classic", held.classic), ("joint", held.joint))
+        for name, score in (("classic", hold_out.classic), ("joint", hold_out.joint))
     ]
     columns = ["", "rms error", "rms of block means", "inside 95 %", "log density"]
-    return TableView(f"angles of {len(held.predictions)} experiments left out by {held.by}, deg", columns, rows)
+    return TableView(f"angles of {len(hold_out.predictions)} experiments left out by {hold_out.by}, deg", columns, rows)
 
 
 def point_budget_table(budget: Budget, caption: str = "uncertainty by cause") -> TableView:
-    """What the uncertainty of a located point consists of, the largest share first."""
+    """Uncertainty of a located point by cause, the largest share first."""
     order = np.argsort(-budget.share)
     rows = [
         [
@@ -195,7 +195,7 @@ def point_budget_table(budget: Budget, caption: str = "uncertainty by cause") ->
 
 
 def pointing_table(model: PointingModel, joint: Mapping[str, tuple[float, float]] | None = None) -> TableView:
-    """The terms of a head by least squares, beside those of a fit, value and sd, where there is one."""
+    """The terms of a head by least squares, and those of a fit, value and sd, where there is one."""
     rows = []
     for name, value, error in zip(model.names, model.value.tolist(), model.standard_error.tolist(), strict=True):
         row = [name_in_words(name), concise(value, error)]

@@ -1,4 +1,4 @@
-"""The document of a scanner: verdict, the answer of both estimators, millimetres, warnings, what next; its sections.
+"""The document of a scanner: verdict, results of both estimators, errors in mm, warnings, next steps; its sections.
 
 Ratios in deg/step, lost motion in deg, distances in mm.
 """
@@ -18,10 +18,10 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS, SENSES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.metrology.traceability import performed, traceability
 from tvsbayes.report import figures
-from tvsbayes.report.advice import LAPLACE_SHORT, assumed_stereo, steps_ahead, verdict_line
+from tvsbayes.report.advice import LAPLACE_SHORT, assumed_stereo, next_steps, verdict_line
 from tvsbayes.report.compensation_text import verified_section
 from tvsbayes.report.document import Document, FigureView, Issue, Number, Verdict, about_table, sentence
-from tvsbayes.report.drawing import OF_ESTIMATOR
+from tvsbayes.report.drawing import ESTIMATOR_STYLE
 from tvsbayes.report.evidence import MET, NOT_MET, Criterion, Evidence
 from tvsbayes.report.fit_sections import fit_sections
 from tvsbayes.report.fit_text import validation_lines
@@ -32,30 +32,30 @@ from tvsbayes.report.uncertainty_sections import uncertainty_sections
 from tvsbayes.results.comparison_record import CANNOT_TELL
 from tvsbayes.results.estimates import Estimate, FitSummary
 
-CLASSIC_BLIND = "cannot see it"
-SYMMETRICAL = 1.5
-"""Of the distances of an interval's ends from its value, up to which half of it stands for both."""
-CAUSES_TOLD = 3
-"""Of the uncertainty of a point; the section on budgets has all."""
+NO_CLASSIC = "cannot see it"
+ASYMMETRY_MAX = 1.5
+"""Largest ratio of the distances of an interval's ends from its value for stating half of it as U."""
+CAUSES_LISTED = 3
+"""Number of listed causes of a point's uncertainty; the section on budgets has all."""
 
 
 def report_document(e: Evidence, issue: Issue | None = None) -> Document:
     """The report of a scanner with its number.
 
     Args:
-        e: gathered beforehand; nothing is computed here.
-        issue: who issues it, for whom and when; None is today, by nobody.
+        e: all data; nothing is computed here.
+        issue: laboratory, customer and day; None: today, without names.
     """
     issue = issue or Issue.today()
-    applied = [] if e.verified is None else [verified_section(e.verified)]
+    verification = [] if e.verified is None else [verified_section(e.verified)]
     return numbered(
         Document(
             results=e.fit.results_id,
             name=e.campaign.title,
             about=about_table(e.campaign.header, measured_days(e.campaign, issue), issue),
             verdict=verdict_of(e.fit.summary, e.criteria, e.doubts),
-            numbers=distances(e),
-            why=why_far(e),
+            numbers=point_errors(e),
+            why=error_sources(e),
             answer=answer_table(e.fit.summary, e.classic),
             picture=both_estimators(e),
             steps=_steps(e),
@@ -63,16 +63,16 @@ def report_document(e: Evidence, issue: Issue | None = None) -> Document:
             traceable=traceability(e.campaign).statement,
             warnings=warnings_of(e),
             versions=e.fit.provenance.versions,
-            sections=[*fit_sections(e), *applied, *uncertainty_sections(e)],
+            sections=[*fit_sections(e), *verification, *uncertainty_sections(e)],
             issue=issue,
         )
     )
 
 
 def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Sequence[str] = ()) -> Verdict:
-    """What the page says first: whether its numbers may be used, and whether the limits are met.
+    """The verdict of the page: whether its numbers may be used, and whether the limits are met.
 
-    `doubts` are what `check` warns of.
+    `doubts` are warnings of `check`.
     """
     if not summary.explained:
         return Verdict("NOT CONVERGED: the numbers below must not be used", "not-met")
@@ -85,20 +85,20 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Seque
         return Verdict(f"{sentence(usable)} No limit was stated", "cannot-tell")
     judgements = []
     for verdict in (NOT_MET, CANNOT_TELL, MET):
-        mine = [c for c in criteria if c.verdict == verdict]
-        limits = dict.fromkeys((c.limit, c.unit) for c in mine)
+        criteria_of_verdict = [c for c in criteria if c.verdict == verdict]
+        limits = dict.fromkeys((c.limit, c.unit) for c in criteria_of_verdict)
         for limit, unit in limits:
-            part = [c for c in mine if (c.limit, c.unit) == (limit, unit)]
-            chances = [c.probability for c in part]
-            bound = "" if len(part) == 1 else "at most " if verdict == NOT_MET else "at least "
+            same_limit = [c for c in criteria_of_verdict if (c.limit, c.unit) == (limit, unit)]
+            chances = [c.probability for c in same_limit]
+            bound = "" if len(same_limit) == 1 else "at most " if verdict == NOT_MET else "at least "
             worst = chance_text(max(chances) if verdict == NOT_MET else min(chances), bound)
-            names = ", ".join(c.quantity for c in part)
+            names = ", ".join(c.quantity for c in same_limit)
             judgements.append((verdict, f"{verdict}: {names} within {limit:.3g} {unit} (probability {worst})"))
     text = "; ".join(sentence for _, sentence in judgements)
-    judged = ""
+    prefix = ""
     if failed and validation is not None:
-        judged = "With that factor: " if validation.widens else "As fitted: "
-    return Verdict(failed + judged + text[0].upper() + text[1:], judgements[0][0].replace(" ", "-"))
+        prefix = "With that factor: " if validation.widens else "As fitted: "
+    return Verdict(failed + prefix + text[0].upper() + text[1:], judgements[0][0].replace(" ", "-"))
 
 
 def criteria_table(criteria: Sequence[Criterion]) -> TableView | None:
@@ -111,22 +111,22 @@ def criteria_table(criteria: Sequence[Criterion]) -> TableView | None:
 
 
 def _chance(c: Criterion) -> str:
-    """The probability; where it decides nothing, also how many of a hundred would be off by more."""
+    """The probability; where it is undecided, also the number of a hundred beyond the limit."""
     text = chance_text(c.probability)
     return text if c.verdict != CANNOT_TELL else f"{text}: {100 - round(100 * c.probability)} of 100 are off by more"
 
 
 def measured_days(campaign: Campaign, issue: Issue) -> str:
-    """The first and last day of a campaign; "" where it does not say."""
+    """The first and last day of a campaign; "" where unstated."""
     when = performed(campaign, issue.day)
     days = dict.fromkeys((when.begin.isoformat(), when.end.isoformat()))
     return " to ".join(days) if when.recorded else ""
 
 
-def answer_table(summary: FitSummary, classic: ClassicResult | None, what: str = "the beam") -> TableView:
-    """Ratios of `what`, their contrasts and both backlashes, classic beside joint where there are experiments for it.
+def answer_table(summary: FitSummary, classic: ClassicResult | None, object_name: str = "the beam") -> TableView:
+    """Ratios of the beam or sight, contrasts and both backlashes, with the classic where there are experiments.
 
-    Ratios of both directions that are one number at their uncertainty share a row.
+    Ratios of both directions that print equal share a row.
     """
     rows, applicable = [], classic is not None
     for direction in DIRECTIONS:
@@ -137,20 +137,20 @@ def answer_table(summary: FitSummary, classic: ClassicResult | None, what: str =
                 rows.append([f"{' and '.join(pair)}, deg/step", *cells])
             continue
         four_point = None if classic is None else classic.directions[direction]
-        measured = "no experiment"
+        classic_cell = "no experiment"
         if four_point is not None:
             mean = concise(four_point.mean_deg_per_step, four_point.u_gum_deg_per_step or 0.0)
-            measured = f"{mean}, n = {four_point.n}"
-        rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), *[measured] * applicable])
+            classic_cell = f"{mean}, n = {four_point.n}"
+        rows.append([f"{direction}, deg/step", *_cells(summary.effective[direction]), *[classic_cell] * applicable])
     for axis, pair in SENSES.items():
         if (contrast := summary.contrasts[axis]) is not None:
             rows.append([f"{' - '.join(pair)}, \u00b5deg/step", *_cells(scaled(contrast, 1e6)), *[""] * applicable])
     for axis in AXES:
         play = _cells(summary.parameters[f"backlash_deg.{axis}"])
-        rows.append([f"backlash {axis}, deg", *play, *[CLASSIC_BLIND] * applicable])
+        rows.append([f"backlash {axis}, deg", *play, *[NO_CLASSIC] * applicable])
     pose = summary.reference_pose_deg
-    where = f"pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
-    caption = f"Degrees of {what} per motor step at {where}, and play; U: half the 95 % interval"
+    pose_text = f"pan {pose['pan']:.2f} deg, tilt {pose['tilt']:.2f} deg"
+    caption = f"Degrees of {object_name} per motor step at {pose_text}, and play; U: half the 95 % interval"
     columns = ["", "joint value(u)", "95 % interval", "U, 95 %", *["classic value(u)"] * applicable]
     return TableView(caption, columns, rows)
 
@@ -164,18 +164,18 @@ def scaled(estimate: Estimate, factor: float) -> Estimate:
 
 
 def _cells(estimate: Estimate | None) -> list[str]:
-    """Value, interval and its half; no half where the ends lie unlike far from the value: value - U may be none."""
+    """Value, interval and half of it; no half where the interval is asymmetric about the value."""
     if estimate is None:
         return ["never moved", "", ""]
     low, high = estimate.interval95
     interval = interval_text(low, high, estimate.sd)
     near, far = sorted((estimate.value - low, high - estimate.value))
-    half = two_digits(0.5 * (high - low)) if far <= SYMMETRICAL * near or far == near else ""
+    half = two_digits(0.5 * (high - low)) if far <= ASYMMETRY_MAX * near or far == near else ""
     return [concise(estimate.value, estimate.sd), interval, half]
 
 
 def both_estimators(e: Evidence) -> FigureView:
-    """Ratios of both estimators with their intervals; of the joint one alone where the other has no experiments."""
+    """Ratios of both estimators with their intervals; only the joint ones without experiments."""
     picture = figures.intervals(e.fit.summary, e.classic)
     if e.classic is None:
         caption = "Effective ratios. The classic method needs four-point experiments: the campaign has none."
@@ -187,24 +187,24 @@ def both_estimators(e: Evidence) -> FigureView:
     )
 
 
-def distances(e: Evidence) -> list[Number]:
-    """How far 3D points are off at the stated range, by estimator."""
-    below = {name: float(np.quantile(v, 0.95)) for name, v in e.distances_mm.items()}
+def point_errors(e: Evidence) -> list[Number]:
+    """Errors of 3D points at the stated range, by estimator."""
+    limits = {name: float(np.quantile(v, 0.95)) for name, v in e.distances_mm.items()}
     note = f"95 % of 3D errors {e.range_mm:g} mm away stay below this"
-    return [Number(f"{name} calibration", _mm(below[name]), note) for name in OF_ESTIMATOR if name in below]
+    return [Number(f"{name} calibration", _mm(limits[name]), note) for name in ESTIMATOR_STYLE if name in limits]
 
 
-def why_far(e: Evidence) -> list[str]:
-    """What the error of the joint calibration consists of, and why the last of the simple ones is farther off."""
-    order = np.argsort(-e.budget.share)[:CAUSES_TOLD]
+def error_sources(e: Evidence) -> list[str]:
+    """Causes of the joint calibration's error, and of the larger error of the last simple one."""
+    order = np.argsort(-e.budget.share)[:CAUSES_LISTED]
     causes = ", ".join(f"{cause_in_words(e.budget.causes[k])} {100 * e.budget.share[k]:.0f} %" for k in order)
     sentences = [f"What the joint one leaves comes from, as shares of the variance: {causes}."]
-    for name, off in list(e.simple_errors.items())[-1:]:
+    for name, error in list(e.simple_errors.items())[-1:]:
         sentences.append(
-            f"Why {name} is off there: its beam points {off.azimuth_deg:+.2f} deg in azimuth and "
-            f"{off.elevation_deg:+.2f} deg in elevation from the joint one (ratios, lost motion, mirrors), which alone "
-            f"makes {_mm(off.by_direction_mm)}; where it takes beam and aperture to stand, and the aperture's zero, "
-            f"alone make {_mm(off.by_place_mm)}."
+            f"Why {name} is off there: its beam points {error.azimuth_deg:+.2f} deg in azimuth and "
+            f"{error.elevation_deg:+.2f} deg in elevation from the joint one (ratios, lost motion, mirrors), which "
+            f"alone makes {_mm(error.by_direction_mm)}; where it takes beam and aperture to stand, and the aperture's "
+            f"zero, alone make {_mm(error.by_place_mm)}."
         )
     return sentences
 
@@ -216,7 +216,7 @@ def _mm(value: float) -> str:
 
 
 def warnings_of(e: Evidence) -> list[str]:
-    """What must be known before the numbers are used; the verdict and what to do next say the rest."""
+    """Warnings for the user of the numbers, besides the verdict and the next steps."""
     summary = e.fit.summary
     warnings = list(summary.problems)
     if summary.estimator == "laplace":
@@ -231,22 +231,22 @@ def warnings_of(e: Evidence) -> list[str]:
 
 
 def _steps(e: Evidence) -> list[str]:
-    """What to do next: what the fit asks for, then the best of a plan; the plan's own section has all of it."""
+    """Next steps: those of the fit, then the best of a plan; the plan's own section has all."""
     folder = "CAMPAIGN" if e.campaign.path is None else typed(e.campaign.path.resolve().name)
     summary = e.fit.summary
     failed = not summary.explained
     causes = misfit_causes(e.campaign, summary.parameters["pixel_scale"].value) if failed else ()
-    steps = steps_ahead(summary, folder, causes)
+    steps = next_steps(summary, folder, causes)
     if e.planned is not None and not e.planned.stop.now and e.planned.next:
         best = e.planned.next[0]
         steps.append(f"Look at {best.text} ({best.minutes:.1f} min): the best next four looks of the plan.")
     unmet = next((c for c in e.criteria if c.verdict != MET), None)
     if unmet is not None and e.planned is None and summary.explained:
         limit = f"{unmet.limit:g} {unmet.unit}"
-        aim = f"U95(worst) <= {limit}" if unmet.unit != "mm" else f"U95(x) at {e.range_mm:g},0,0 mm <= {limit}"
-        known = e.campaign.path is not None and (e.campaign.path / "rig.toml").is_file()
-        given = f"`tvsbayes plan {f'{folder}/rig.toml' if known else 'RIG'} --given {folder} --target '{aim}'`"
-        steps.append(f"Add looks until the limit is met; the fewest: {given}.")
+        goal = f"U95(worst) <= {limit}" if unmet.unit != "mm" else f"U95(x) at {e.range_mm:g},0,0 mm <= {limit}"
+        has_rig = e.campaign.path is not None and (e.campaign.path / "rig.toml").is_file()
+        command = f"`tvsbayes plan {f'{folder}/rig.toml' if has_rig else 'RIG'} --given {folder} --target '{goal}'`"
+        steps.append(f"Add looks until the limit is met; the fewest: {command}.")
     if not steps:
         steps.append("Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped.")
     if not e.criteria and e.fit.summary.converged:

@@ -1,4 +1,4 @@
-"""What the cameras saw: cut-outs of a few spots with their centres, where a campaign has its frames.
+"""Cut-outs of a few spots with their centres, where a campaign has its frames.
 
 Grey values of the raw pictures; px of the sensor with the integer at the centre of a pixel.
 """
@@ -45,15 +45,15 @@ class SpotCrop:
 
 
 def spot_crops(campaign: Campaign, suspects: Sequence[int]) -> tuple[SpotCrop, ...]:
-    """Cut-outs of suspect spots first, then of others evenly chosen; none without frames, or where they are damaged."""
+    """Cut-outs of suspect spots first, then of others evenly chosen; none for missing or damaged frames."""
     if campaign.path is None or not (campaign.path / "frames").is_dir():
         return ()
     usable = [spot for spot in campaign.spots if spot.status == "ok"]
-    doubted = [spot for spot in usable if spot.spot in set(suspects)][:LOOKS_SHOWN]
-    others = [spot for spot in usable if spot not in doubted]
-    wanted = min(LOOKS_SHOWN - len(doubted), len(others))
-    places = np.linspace(0, len(others) - 1, wanted).round().astype(int).tolist()
-    return tuple(crop for spot in [*doubted, *(others[k] for k in places)] for crop in _crops(campaign.path, spot))
+    suspected = [spot for spot in usable if spot.spot in set(suspects)][:LOOKS_SHOWN]
+    others = [spot for spot in usable if spot not in suspected]
+    count = min(LOOKS_SHOWN - len(suspected), len(others))
+    indices = np.linspace(0, len(others) - 1, count).round().astype(int).tolist()
+    return tuple(crop for spot in [*suspected, *(others[k] for k in indices)] for crop in _crops(campaign.path, spot))
 
 
 def _crops(folder: Path, spot: Spot) -> Iterator[SpotCrop]:
@@ -62,15 +62,15 @@ def _crops(folder: Path, spot: Spot) -> Iterator[SpotCrop]:
         try:
             picture = read_image(folder / frame_name(spot.spot, camera), folder)
         except InputError:
-            # The report of good centroids does not depend on a picture that was moved away since.
+            # A missing picture must not stop the report.
             continue
         u, v = float(getattr(spot, f"u_{camera}_px")), float(getattr(spot, f"v_{camera}_px"))
         left, top = max(round(u) - HALF_PX, 0), max(round(v) - HALF_PX, 0)
-        # Half a spot at the edge has its centre outside; a negative end would count from the other edge.
+        # A spot cut by the edge may have its centre outside; a negative index would count from the other edge.
         right, bottom = max(round(u) + HALF_PX + 1, 0), max(round(v) + HALF_PX + 1, 0)
-        part = picture[top:bottom, left:right].mean(axis=2)
-        if part.size:
-            yield SpotCrop(spot.spot, camera, part, (left, top), (u, v))
+        grey = picture[top:bottom, left:right].mean(axis=2)
+        if grey.size:
+            yield SpotCrop(spot.spot, camera, grey, (left, top), (u, v))
 
 
 def spot_gallery(crops: Sequence[SpotCrop]) -> Figure:

@@ -1,4 +1,4 @@
-"""Numbers with their uncertainty, and tables of ready text: made once, printed on a terminal and on a page alike."""
+"""Numbers with their uncertainty, and tables of formatted text for terminal and page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rich.text import Text
 from tvsbayes.display import concise
 
 COLUMNS, GAP = 80, 2
-"""Of a terminal; between two columns of a table."""
+"""Width of a terminal; gap between two columns of a table."""
 
 
 def two_digits(value: float) -> str:
@@ -31,15 +31,15 @@ def three_digits(value: float) -> str:
 
 
 def signed(value: float, sd: float) -> str:
-    """A difference with its sign, as `concise`."""
+    """A difference as `concise`, always with its sign."""
     text = concise(value, sd)
     return text if text.startswith("-") else f"+{text}"
 
 
 def interval_text(low: float, high: float, sd: float) -> str:
-    """Interval ends to the digits of the standard uncertainty, as `concise` has them (GUM 7.2.6).
+    """Interval ends to the digits of the standard uncertainty, as `concise` (GUM 7.2.6).
 
-    Empty where both ends are the same: what is held has no interval.
+    Empty where both ends are the same: a fixed quantity has no interval.
     """
     if low == high:
         return ""
@@ -48,11 +48,11 @@ def interval_text(low: float, high: float, sd: float) -> str:
 
 
 def chance_text(probability: float, bound: str = "") -> str:
-    """A probability from draws to three decimals, after the word of a bound; none is said to be 0 or 1.
+    """A probability from draws to three decimals, after the words of a bound; never as 0 or 1.
 
     Args:
         probability: share of draws.
-        bound: "at least " or "at most ", where the number is one; "" where it is the probability.
+        bound: "at least " or "at most " where the number is a bound; "" where it is the probability.
     """
     text = f"{probability:.3f}"
     return {"1.000": "above 0.999", "0.000": "below 0.001"}.get(text, bound + text)
@@ -60,7 +60,7 @@ def chance_text(probability: float, bound: str = "") -> str:
 
 @dataclass(frozen=True)
 class TableView:
-    """A table of ready text; the first cell of a row is its header, and `pairs` have no other."""
+    """A table of formatted text; the first cell of a row is its header; `pairs` have no header of columns."""
 
     caption: str
     columns: Sequence[str]
@@ -68,16 +68,16 @@ class TableView:
 
     @property
     def pairs(self) -> bool:
-        """Names with their values."""
+        """Whether rows are names with their values."""
         return not self.columns
 
     def text(self) -> str:
-        """The table without lines, for terminals and files alike; in parts below each other where it is too wide."""
+        """The table without lines, for terminals and files; in parts one below the other where it is too wide."""
         title = textwrap.wrap(self.caption, COLUMNS, break_long_words=False, break_on_hyphens=False)
-        return "\n".join([*title, *(self._part(chosen) for chosen in self._parts())])
+        return "\n".join([*title, *(self._part(columns) for columns in self._parts())])
 
     def _parts(self) -> list[list[int]]:
-        """Columns of every part: the first one, and as many others as fit beside it, about equally many in each."""
+        """Columns of every part: the first one and as many others as fit, about equally many in each part."""
         cells = [self.columns, *self.rows]
         others = max(1, *map(len, cells)) - 1
         width = [max((cell_len(row[k]) for row in cells if k < len(row)), default=0) + GAP for k in range(others + 1)]
@@ -88,19 +88,19 @@ class TableView:
         def fits(size: int) -> bool:
             return all(sum(width[k] for k in part) - GAP <= COLUMNS for part in parts(size))
 
-        most = next((size for size in range(others, 1, -1) if fits(size)), 1)
-        even = math.ceil(others / len(parts(most))) or 1
-        return parts(even if fits(even) else most)
+        widest = next((size for size in range(others, 1, -1) if fits(size)), 1)
+        balanced = math.ceil(others / len(parts(widest))) or 1
+        return parts(balanced if fits(balanced) else widest)
 
-    def _part(self, chosen: Sequence[int]) -> str:
+    def _part(self, columns: Sequence[int]) -> str:
         """Some columns as text."""
         table = Table(box=None, pad_edge=False, show_header=not self.pairs)
-        for number in chosen:
-            head = "" if self.pairs else self.columns[number]
-            table.add_column(head, justify="left" if number == 0 else "right", no_wrap=True)
+        for number in columns:
+            header = "" if self.pairs else self.columns[number]
+            table.add_column(header, justify="left" if number == 0 else "right", no_wrap=True)
         for row in self.rows:
-            table.add_row(*(Text(row[number] if number < len(row) else "") for number in chosen))
+            table.add_row(*(Text(row[number] if number < len(row) else "") for number in columns))
         stream = io.StringIO()
-        # Plain text whatever FORCE_COLOR and the like say: it also goes into files. Nothing is folded here.
+        # Plain text regardless of FORCE_COLOR and the like: it also goes into files. No folding.
         Console(file=stream, width=1000, highlight=False, color_system=None, force_terminal=False).print(table)
         return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())

@@ -29,34 +29,34 @@ if TYPE_CHECKING:
     from tvsbayes.results.estimates import Estimate
 
 OTHERS = f"others, each below {100 * SMALLEST_SHARE:g} %"
-"""All inputs of a budget that have no row of their own."""
+"""Row of all inputs of a budget without their own row."""
 END_SHIFT = 0.1
-"""Of U: an end of the linear interval farther off is told; a quantile of a thousand draws scatters by half of it."""
+"""Least difference of an end of the linear interval for a note, over U; a quantile of 1000 draws scatters by half."""
 
 
 def uncertainty_sections(e: Evidence) -> list[Section]:
-    """In the order of the page."""
+    """The sections in the order of the page."""
     parts = (maps_section, budgets_section, axes_section, plan_section, method_section, limits_section)
     return [part(e) for part in parts]
 
 
 def maps_section(e: Evidence) -> Section:
-    """Where which estimator errs by how many millimetres."""
+    """3D errors of each estimator, mm."""
     pan, tilt = len(e.maps.pan_steps) // 2, len(e.maps.tilt_steps) // 2
     at_middle = {name: values[pan, tilt] for name, values in e.maps.rms_mm.items()}
     rows, views = [], []
-    for k, reach in enumerate(e.maps.range_mm):
-        rows.append([f"{reach:g}", *(_cell(values[k]) for values in at_middle.values())])
-        if reach == e.range_mm:
+    for k, range_mm in enumerate(e.maps.range_mm):
+        rows.append([f"{range_mm:g}", *(_cell(values[k]) for values in at_middle.values())])
+        if range_mm == e.range_mm:
             views.append(
                 FigureView(
                     figures.error_maps(e.maps, k),
-                    f"Root mean square error over pan and tilt at {reach:g} mm; every cell holds its value in mm",
-                    f"3D error at {reach:g} mm, root mean square over the rigs that the data allow.",
+                    f"Root mean square error over pan and tilt at {range_mm:g} mm; every cell holds its value in mm",
+                    f"3D error at {range_mm:g} mm, root mean square over the rigs that the data allow.",
                 )
             )
-    at = f"pan {e.maps.pan_steps[pan]:.0f}, tilt {e.maps.tilt_steps[tilt]:.0f} steps"
-    table = TableView(f"Root mean square 3D error in mm at {at}, by range in mm", ["range", *e.maps.rms_mm], rows)
+    middle = f"pan {e.maps.pan_steps[pan]:.0f}, tilt {e.maps.tilt_steps[tilt]:.0f} steps"
+    table = TableView(f"Root mean square 3D error in mm at {middle}, by range in mm", ["range", *e.maps.rms_mm], rows)
     text = [
         "Nominal and classic users are given a baseline shortened by the mirror offset and moved by half of it; noise "
         "of one look is included for all."
@@ -68,7 +68,7 @@ def maps_section(e: Evidence) -> Section:
 
 
 def _no_better(e: Evidence, ranges_mm: Sequence[str]) -> str:
-    """Why a calibration may place points no better than the nominal rig: what the campaign could not tell."""
+    """Why a calibration may locate points no better than the nominal rig."""
     text = f"At {', '.join(ranges_mm)} mm the joint calibration places points no better than the nominal one"
     largest = int(np.argmax(e.budget.share))
     text += (
@@ -85,15 +85,15 @@ def _cell(value: float) -> str:
 
 
 def budgets_section(e: Evidence) -> Section:
-    """What the uncertainty of results and of a point consists of."""
-    summary, away = e.fit.summary, f"{e.range_mm:g} mm away"
+    """Uncertainty budgets of results and of a point."""
+    summary, distance_text = e.fit.summary, f"{e.range_mm:g} mm away"
     totals = {
-        table.quantity: _total(table) + _apart(table, summary.named.get(table.quantity)) for table in e.shown.budgets
+        table.quantity: _total(table) + _gap_note(table, summary.named.get(table.quantity)) for table in e.shown.budgets
     }
     tables = [_gum_table(some, "; ".join(totals[one.quantity] for one in some)) for some in _pairs(e.shown.budgets)]
     tables += [
-        point_budget_table(e.budget, f"Budget of a point {away}, by cause"),
-        _gum_table([e.point], f"{away}: {_total(e.point)}"),
+        point_budget_table(e.budget, f"Budget of a point {distance_text}, by cause"),
+        _gum_table([e.point], f"{distance_text}: {_total(e.point)}"),
     ]
     view = FigureView(
         figures.shares(e.budget),
@@ -110,29 +110,29 @@ def budgets_section(e: Evidence) -> Section:
 
 
 def _notes(e: Evidence) -> list[str]:
-    """What the reader of a budget must know, each once."""
+    """Notes on the budgets, without repetition."""
     notes = list(dict.fromkeys(note for table in e.shown.budgets for note in table.notes))
     notes += [f"a point {e.range_mm:g} mm away: {note}" for note in e.point.notes if note not in notes]
     return [sentence(note) for note in notes]
 
 
 def _pairs(tables: Sequence[BudgetTable]) -> list[list[BudgetTable]]:
-    """Budgets of both directions, or of both axes, together where the same kind of result has two; others alone."""
+    """Budgets grouped: both directions, or both axes, of one kind of result together; others alone."""
     kinds: dict[str, list[BudgetTable]] = {}
     for table in tables:
         kind, _, part = table.quantity.rpartition(".")
         axis = next((axis for axis, pair in SENSES.items() if part in pair), "")
         kinds.setdefault(f"{kind}.{axis}", []).append(table)
-    return [some for each in kinds.values() for some in ([each] if len(each) == 2 else [[one] for one in each])]
+    return [some for group in kinds.values() for some in ([group] if len(group) == 2 else [[one] for one in group])]
 
 
-def _mattering(table: BudgetTable) -> list[BudgetRow]:
-    """Single inputs that have a row of their own; the last row, of correlations, is no input."""
+def _important_rows(table: BudgetTable) -> list[BudgetRow]:
+    """Single inputs with their own row; the last row, of correlations, is no input."""
     return [row for row in table.rows[:-1] if row.u is not None and row.share >= SMALLEST_SHARE]
 
 
-def _named(row: BudgetRow) -> str:
-    """The source of a row in words, with the unit of its u; standardised effects count in their sds."""
+def _source_text(row: BudgetRow) -> str:
+    """The source of a row in words, with the unit of its u; standardised effects are in sds."""
     words = source_in_words(row.quantity)
     standardised = row.unit == "1" and parameter_of(row.quantity.removeprefix("prior of ")) is None
     unit = "in sds" if standardised else row.unit.removesuffix("1")
@@ -140,40 +140,40 @@ def _named(row: BudgetRow) -> str:
 
 
 def _others(table: BudgetTable, named: Collection[str]) -> tuple[str, str]:
-    """Contribution and share of all inputs without a row of their own: with it a column of shares makes 100 %."""
+    """Contribution and share of all inputs without their own row; with them the shares add up to 100 %."""
     share = sum(row.share for row in table.rows[:-1] if row.quantity not in named)
     return two_digits(table.u * math.sqrt(share)), f"{100 * share:.1f}"
 
 
 def _gum_table(tables: Sequence[BudgetTable], caption: str) -> TableView:
-    """Budgets beside each other, every input that matters to any of them; one alone in all columns of GUM 7.2.7."""
-    alone = len(tables) == 1
-    of_name = [{row.quantity: row for row in table.rows} for table in tables]
-    by_name = {name: [rows[name] for rows in of_name if name in rows] for rows in of_name for name in rows}
-    names = list(dict.fromkeys(row.quantity for table in tables for row in _mattering(table)))
-    names.sort(key=lambda name: -max(row.share for row in by_name[name]))
+    """Budgets side by side, with every important input of any of them; a single one in all columns of GUM 7.2.7."""
+    is_single = len(tables) == 1
+    row_maps = [{row.quantity: row for row in table.rows} for table in tables]
+    rows_by_name = {name: [rows[name] for rows in row_maps if name in rows] for rows in row_maps for name in rows}
+    names = list(dict.fromkeys(row.quantity for table in tables for row in _important_rows(table)))
+    names.sort(key=lambda name: -max(row.share for row in rows_by_name[name]))
     rows = []
     for name in (*names, tables[0].rows[-1].quantity):
-        first, stated = by_name[name][0], [row for row in by_name[name] if row.u is not None]
-        # One number for all where all have it.
-        cells = ["; ".join(dict.fromkeys(two_digits(row.u) for row in stated if row.u is not None))]
-        cells.append("; ".join(dict.fromkeys(_freedom(row.dof) for row in stated)))
-        if alone:
+        first, stated_rows = rows_by_name[name][0], [row for row in rows_by_name[name] if row.u is not None]
+        # Equal numbers appear once.
+        cells = ["; ".join(dict.fromkeys(two_digits(row.u) for row in stated_rows if row.u is not None))]
+        cells.append("; ".join(dict.fromkeys(_freedom(row.dof) for row in stated_rows)))
+        if is_single:
             cells = [first.distribution, *cells, "" if first.sensitivity is None else three_digits(first.sensitivity)]
-        parts = [cell for of_source in of_name for cell in _contributed(of_source.get(name))]
-        rows.append([_named(first), first.kind, *cells, *parts])
-    columns = ["source", "type", *(["distribution", "u", "dof", "sensitivity"] if alone else ["u", "dof"])]
+        contributions = [cell for of_source in row_maps for cell in _contribution_cells(of_source.get(name))]
+        rows.append([_source_text(first), first.kind, *cells, *contributions])
+    columns = ["source", "type", *(["distribution", "u", "dof", "sensitivity"] if is_single else ["u", "dof"])]
     rows.insert(-1, [OTHERS, *[""] * (len(columns) - 1), *(c for table in tables for c in _others(table, names))])
-    if alone and any(row.share > 1 for each in by_name.values() for row in each):
-        # GUM 5.2.2: with correlated inputs the cross terms are as real as the squares.
+    if is_single and any(row.share > 1 for each in rows_by_name.values() for row in each):
+        # GUM 5.2.2: correlated inputs have cross terms.
         caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations takes them back"
-    parts_of = [""] if alone else [f", {table.quantity.rpartition('.')[2]}" for table in tables]
-    columns += [f"{word}{part}" for part in parts_of for word in ("contribution", "share %")]
+    suffixes = [""] if is_single else [f", {table.quantity.rpartition('.')[2]}" for table in tables]
+    columns += [f"{word}{part}" for part in suffixes for word in ("contribution", "share %")]
     return TableView(caption, columns, rows)
 
 
-def _contributed(row: BudgetRow | None) -> tuple[str, str]:
-    """Contribution and share; empty where the input stands among others."""
+def _contribution_cells(row: BudgetRow | None) -> tuple[str, str]:
+    """Contribution and share; empty where the input is not in the budget."""
     if row is None:
         return "", ""
     return "" if row.contribution is None else two_digits(row.contribution), f"{100 * row.share:.1f}"
@@ -189,18 +189,18 @@ def _total(table: BudgetTable) -> str:
     )
 
 
-def _apart(table: BudgetTable, result: Estimate | None) -> str:
-    """The result that counts, where the interval of a budget is another; "" where both agree to their digits."""
+def _gap_note(table: BudgetTable, result: Estimate | None) -> str:
+    """A note with the valid result, where the interval of a budget differs; "" where both agree to their digits."""
     if result is None:
         return ""
     low, high = result.interval95
     half = 0.5 * (high - low)
-    ends = table.estimate - table.expanded, table.estimate + table.expanded
+    linear_ends = table.estimate - table.expanded, table.estimate + table.expanded
     parameter = parameter_of(table.quantity)
     never_below = parameter is not None and parameter.prior.distribution == "half-normal"
-    note = ", which reaches below 0, where no value can be" * (never_below and ends[0] < 0 <= low)
+    note = ", which reaches below 0, where no value can be" * (never_below and linear_ends[0] < 0 <= low)
     rounding = 10.0 ** (math.floor(math.log10(half)) - 1) if half > 0 else 0.0
-    shift = max(abs(ends[0] - low), abs(ends[1] - high))
+    shift = max(abs(linear_ends[0] - low), abs(linear_ends[1] - high))
     if note or abs(table.expanded - half) > rounding or shift > END_SHIFT * half:
         note += f" (the first page, which counts: {interval_text(low, high, result.sd)}, U = {two_digits(half)} "
         note += f"{table.unit})"
@@ -218,14 +218,14 @@ def axes_section(e: Evidence) -> Section:
         return Section("ISO 230-2-style figures", ["Not computed: the fit has not converged."])
     items: list[str] = []
     for axis in axes:
-        # Notes on the campaign's own stops belong to figures that mean something else: fit.json has both.
+        # Notes on the campaign's own stops belong to other figures: fit.json has both.
         items += [note for note in axis.notes if note not in items and "plug-in" not in note]
     rows = []
     for name, (symbol, term) in FIGURES.items():
         predictions = [(axis.predicted or {}).get(name) for axis in axes]
         if any(figure is not None for figure in predictions):
             cells = [cell for figure in predictions for cell in _figure_cells(figure)]
-            rows.append([f"{_growing(term)} {_arrow(symbol)}", *cells])
+            rows.append([f"{_in_counters(term)} {_arrow(symbol)}", *cells])
     columns = ["figure", *(cell for axis in axes for cell in (f"{axis.axis}, median", f"{axis.axis}, 95 % interval"))]
     first = axes[0]
     caption = f"deg, predicted for {first.runs} runs per side at {len(first.target_steps)} targets"
@@ -233,7 +233,7 @@ def axes_section(e: Evidence) -> Section:
 
 
 def _figure_cells(figure: Predicted | None) -> tuple[str, str]:
-    """Median and interval to the digits of the uncertainty that the interval has; empty where there is no figure."""
+    """Median and interval to the digits of the interval's uncertainty; empty where there is no figure."""
     if figure is None:
         return "", ""
     low, high = figure.interval95
@@ -241,7 +241,7 @@ def _figure_cells(figure: Predicted | None) -> tuple[str, str]:
     return concise(figure.median, sd).partition("(")[0], interval_text(low, high, sd)
 
 
-def _growing(term: str) -> str:
+def _in_counters(term: str) -> str:
     """The standard's up and down are directions of approach, not those of the tilt axis."""
     return term.replace(", up", ", counters growing").replace(", down", ", counters falling")
 
@@ -251,7 +251,7 @@ def _arrow(symbol: str) -> str:
 
 
 def plan_section(e: Evidence) -> Section:
-    """What further experiments would bring."""
+    """Gain of further experiments."""
     plan = e.planned
     if plan is None:
         text = [
@@ -274,8 +274,8 @@ def plan_section(e: Evidence) -> Section:
 
 
 def method_section(e: Evidence) -> Section:
-    """How it was computed, from what and by what."""
-    made = e.fit.provenance
+    """Method, inputs and versions of the results."""
+    origin = e.fit.provenance
     text = [
         "Joint model: two-mirror positioner with per-direction ratios, backlash, mirror offset and misalignments, seen "
         "by a calibrated stereo pair; all spots at once; stop errors integrated out; stereo calibration and focal "
@@ -283,20 +283,20 @@ def method_section(e: Evidence) -> Section:
         "doi 10.3390/metrology5040058.",
         f"Estimator: {made_by(e.fit.summary.tier or e.fit.summary.estimator)}. Intervals are equal-tailed "
         "(JCGM 101:2008, 5.3.3), coverage probability 95 %.",
-        f"Command: {made.command}. Seed {made.seed}.",
+        f"Command: {origin.command}. Seed {origin.seed}.",
     ]
     rows = [
         ["traceability", *stated_text(e.campaign, "traceability", key)]
         for key in header_table(e.campaign, "traceability")
     ]
-    rows += [["sha256", name, value] for name, value in made.inputs.items()]
-    rows.append(["versions", "", ", ".join(f"{name} {value}" for name, value in made.versions.items())])
+    rows += [["sha256", name, value] for name, value in origin.inputs.items()]
+    rows.append(["versions", "", ", ".join(f"{name} {value}" for name, value in origin.versions.items())])
     table = TableView("Traceability as declared, inputs, versions", ["", "name", "value"], rows)
     return Section("Method, traceability, provenance", text, tables=[table])
 
 
 def limits_section(e: Evidence) -> Section:
-    """What no number above can tell."""
+    """Limitations of the results."""
     items = [
         "The scale of all angles is that of the stereo calibration; an error of its board or of the focal length at "
         "the laser's wavelength beyond the stated uncertainty is in no residual.",

@@ -1,4 +1,4 @@
-"""What `watch` prints: the verdict first, then what moved, what the looks can see, and what to do."""
+"""Texts of `watch`: the verdict first, then the moved parts, the power of the looks, and the remedy."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ HELPS = {
     "play: pan": "each pan counter from both sides, several times",
     "play: tilt": "each tilt counter from both sides, several times",
 }
-"""Which looks see a change better, by change."""
+"""Looks that reveal a change better, by change."""
 LINEAR = {"deg": 1.0, "mm": 10.0}
-"""Sizes up to which a change is seen in its true size."""
-MISSED = {
+"""Largest change whose size is estimated correctly, by unit."""
+REMEDIES = {
     "cameras": "calibrate the cameras anew, then the rig",
     "positioner": "fasten it and calibrate anew; until then coordinates are off by the amount above",
     "zero": "look for a homing switch or a coupling that slipped, then calibrate anew",
@@ -35,20 +35,20 @@ MISSED = {
     "ratio": "look for a slipping gear or lost steps, then calibrate anew",
     "play": "look for wear or a loose grub screw, then calibrate anew",
 }
-"""What to do where something moved, by the first word of its name."""
+"""Remedies by the first word of the moved part."""
 
 
-def moved_words(part: MovedPart) -> str:
+def moved_text(part: MovedPart) -> str:
     """`cameras: rotation about y 0.052(6) deg`."""
     return f"{part.what} {concise(part.value, part.u)} {part.unit}"
 
 
 def watch_text(watch: Watch, power_min: float) -> str:
-    """A watched calibration for people.
+    """A watched calibration as text.
 
     Args:
         watch: the result.
-        power_min: below which a change counts as unseen.
+        power_min: with less power a change counts as unseen.
     """
     rows = [
         [c.what, f"{c.size:g} {c.unit}", f"{100 * c.power:.0f} %", "< 1e-9" if c.p < 1e-9 else f"{c.p:.2g}"]
@@ -59,17 +59,17 @@ def watch_text(watch: Watch, power_min: float) -> str:
     )
     p = "< 1e-9" if watch.p < 1e-9 else f"= {watch.p:.2g}"
     lines = [f"{watch.verdict} (p {p}; false alarms {100 * watch.false_alarm_rate:g} %)"]
-    lines += [f"moved: {moved_words(part)}" for part in watch.moved]
+    lines += [f"moved: {moved_text(part)}" for part in watch.moved]
     if any(abs(part.value) > LINEAR.get(part.unit, math.inf) for part in watch.moved):
         lines.append(
             "sizes are linear about the calibration: such large ones are rough, beyond the u that stands there"
         )
     if watch.verdict == MOVED:
         causes = list(dict.fromkeys(part.what.split(":")[0] for part in watch.moved))
-        lines.append(f"what to do: {MISSED[causes[0]]}")
+        lines.append(f"what to do: {REMEDIES[causes[0]]}")
         if len(causes) > 1:
-            left = ", ".join(causes[1:])
-            lines.append(f"then watch again: {left} takes up what the first leaves, and may not have moved itself")
+            others = ", ".join(causes[1:])
+            lines.append(f"then watch again: {others} takes up what the first leaves, and may not have moved itself")
     unseen = watch.unseen(power_min)
     if watch.verdict == CANNOT_TELL:
         lines += [f"cannot see {c.size:g} {c.unit} of {c.what}: {HELPS[c.what]}" for c in unseen]
@@ -85,30 +85,30 @@ def _need(change: PlannedChange) -> str:
 
 
 def watch_plan_text(plan: WatchPlan) -> str:
-    """A plan for watching a calibration, for people."""
+    """A plan for watching a calibration, as text."""
     rows = [[c.what, f"{c.size:g} {c.unit}", f"{100 * c.power:.0f} %", _need(c)] for c in plan.changes]
     wanted = f"{100 * plan.power_wanted:.0f} %"
-    head = (
+    summary = (
         f"{plan.looks} looks after {plan.homings} homings, {plan.minutes:.1f} of {plan.minutes_allowed:g} minutes; "
         f"false alarms {100 * plan.false_alarm_rate:g} %"
     )
     table = TableView(
         "What `watch` will notice", ["change", "of", "noticed by this plan", f"looks for {wanted} of it alone"], rows
     )
-    lines = [head]
+    lines = [summary]
     for c in plan.changes:
         if c.power >= plan.power_wanted:
             continue
-        missed = f"{c.size:g} {c.unit} of {c.what} is noticed in {100 * c.power:.0f} % of the cases"
+        text = f"{c.size:g} {c.unit} of {c.what} is noticed in {100 * c.power:.0f} % of the cases"
         if c.looks_needed is not None:
-            more = f"{c.looks_needed} looks after {c.homings_needed} homings ({c.minutes_needed:.0f} minutes) would do"
+            need = f"{c.looks_needed} looks after {c.homings_needed} homings ({c.minutes_needed:.0f} minutes) would do"
             if c.looks_needed > LOOKS_MAX:
-                more += f", more than the {LOOKS_MAX} that are planned at most"
-            lines.append(f"{missed}: {more}; {HELPS[c.what]}")
+                need += f", more than the {LOOKS_MAX} that are planned at most"
+            lines.append(f"{text}: {need}; {HELPS[c.what]}")
         else:
-            enough = "; what would do was not found"
+            remedy = "; what would do was not found"
             if c.looks_to_add is not None:
-                enough = f": add about {c.looks_to_add} looks to it like those of this plan, homed as often (others, "
-                enough += "after one homing, tell less), and take as many at every watch"
-            lines.append(f"{missed}, and no number of looks does better: the campaign knows too little of it{enough}")
+                remedy = f": add about {c.looks_to_add} looks to it like those of this plan, homed as often (others, "
+                remedy += "after one homing, tell less), and take as many at every watch"
+            lines.append(f"{text}, and no number of looks does better: the campaign knows too little of it{remedy}")
     return terminal(*lines, "", table)
