@@ -1,7 +1,6 @@
-"""From a campaign to everything said of it: fit, posterior, calibration, evidence, made whole, kept in `results/`.
+"""From a campaign to its results: fit, posterior, calibration and evidence, stored in `results/`.
 
-What the commands call, for anyone who calls from Python. Units are those of the contract names; JAX is loaded by what
-fits.
+The interface of the commands and of Python callers. Units are those of the contract names; only fits load JAX.
 """
 
 from __future__ import annotations
@@ -39,26 +38,26 @@ if TYPE_CHECKING:
 
 Tell = Callable[[str], None]
 """Shows a line to the user."""
-FITTING, SAMPLING, FILING, SUMMARISING = "fit", "posterior", "writing posterior.nc", "summarising"
+FITTING, SAMPLING, WRITING, SUMMARISING = "fit", "posterior", "writing posterior.nc", "summarising"
 MAX_MINUTES = 10.0
-"""For sampling, where nobody says otherwise."""
-FILED_SECONDS, SUMMARISED_SECONDS = 3.0, 1.5
-"""For posterior.nc and for the results: what progress predicts with."""
+"""Default time for sampling."""
+WRITING_SECONDS, SUMMARISING_SECONDS = 3.0, 1.5
+"""Expected durations of posterior.nc and of the results, for the progress."""
 RESIDUALS_LISTED = 4096
-"""Stops in `fit.json`, evenly chosen: a long campaign's file stays readable within its cap."""
+"""Largest number of stops in `fit.json`, evenly chosen: limits the file of a long campaign."""
 FITTING_FIRST = "fitting first (Laplace approximation) ..."
-_TOLD: set[str] = set()
-"""What `compile_for` has said in this process: several steps of one command ask it for the cache."""
-HASHED = {"moves": "moves.csv", "spots": "spots.csv", "stereo": "stereo.json", "rig": "[rig]"}
-"""What an estimate depends on, as its owner knows it."""
+_SHOWN_LINES: set[str] = set()
+"""Lines that `compile_for` has shown in this process: a command may call it several times."""
+INPUT_NAMES = {"moves": "moves.csv", "spots": "spots.csv", "stereo": "stereo.json", "rig": "[rig]"}
+"""Names of the inputs of an estimate for the user."""
 
 
-def untold(line: str) -> None:
-    """For callers that show nothing."""
+def no_output(line: str) -> None:
+    """Ignores a line: for callers without output."""
 
 
 def compile_for(tell: Tell) -> None:
-    """Use the compilation cache; say once a process that the first compilation takes time."""
+    """Enables the compilation cache; shows once per process that the first compilation takes time."""
     from tvsbayes.model.compilation_cache import own_cache_folder, use_compilation_cache
 
     empty, folder = use_compilation_cache(), own_cache_folder()
@@ -69,15 +68,15 @@ def compile_for(tell: Tell) -> None:
         line = "first run: the model is compiled, half a minute to two minutes; later runs take it from the cache"
     else:
         return
-    if line not in _TOLD:
-        _TOLD.add(line)
+    if line not in _SHOWN_LINES:
+        _SHOWN_LINES.add(line)
         tell(line)
 
 
 def unusable(summary: FitSummary, causes: Sequence[Finding] = ()) -> TvsError | None:
-    """Why a fit that ran to its end must not be used: not converged (4) or nothing learned (3).
+    """Why a finished fit must not be used: not converged (4) or nothing learned (3).
 
-    `causes` are what explains a fit that explains nothing, as `misfit_causes` finds them.
+    `causes` explain a fit that did not converge, see `misfit_causes`.
     """
     if not summary.explained:
         return NotConverged.of(summary.problems, "; ".join(c.sentence for c in causes) or MISFIT_REMEDY)
@@ -93,17 +92,17 @@ def unusable(summary: FitSummary, causes: Sequence[Finding] = ()) -> TvsError | 
 
 @dataclass(frozen=True, repr=False)
 class CampaignResults(Shown):
-    """Everything that is said of a campaign, and what it was taken from.
+    """The results of a campaign.
 
     Attributes:
         record: the content of `fit.json`.
         fit: mode and Laplace approximation.
-        posterior: its sample, None where nothing was sampled; one that has not converged lends the record no number.
-        calibration: what `locate` needs; None of a fit that did not converge.
-        draws: behind the record.
+        posterior: its sample, None without sampling; the record ignores one that has not converged.
+        calibration: input of `locate`; None of a fit that did not converge.
+        draws: of the record.
         error: why the results must not be used, None where they may.
-        causes: what explains a fit without a mode that explains the data; empty of all others.
-        files: paths of what was written, by kind: "draws", "fit", "posterior", "chain".
+        causes: explanations of a fit that did not converge; else empty.
+        files: paths of written files, by kind: "draws", "fit", "posterior", "chain".
     """
 
     record: FitRecord
@@ -116,7 +115,7 @@ class CampaignResults(Shown):
     causes: tuple[Finding, ...] = ()
 
     def shown(self) -> View:
-        """What its record says, and whether that may be used."""
+        """The summary of its record, and whether it may be used."""
         view = self.record.summary.shown()
         usable = "" if self.error is None else f"; DO NOT USE: {self.error.message}"
         return replace(view, title=f"CampaignResults: {view.title}{usable}")
@@ -132,80 +131,80 @@ def calibrate(
     max_minutes: float = MAX_MINUTES,
     resume: bool = False,
     seed: int = 0,
-    tell: Tell = untold,
+    tell: Tell = no_output,
     progress: Show | None = None,
     first: Callable[[FitSummary], None] | None = None,
 ) -> CampaignResults:
-    """Fit a campaign, sample its posterior, and make complete results of both, as the command `fit` does.
+    """Fits a campaign, samples its posterior, and summarises both, as the command `fit`.
 
     Args:
         campaign: from `read_campaign`.
         folder: for `fit.json`, `draws.npz`, `posterior.nc` and `chain.npz`; None writes nothing. For `locate` and the
             commands this is `results` in the campaign's folder.
-        model: what is asked for beyond the rig's priors.
-        sampled: sample the posterior; else the Laplace approximation stands alone.
-        tier: "importance" for weighted draws alone, seconds, which write no `posterior.nc` and no `chain.npz`; "emcee"
-            for the chain that must agree with them.
+        model: options beyond the rig's priors.
+        sampled: sample the posterior; else the Laplace approximation alone.
+        tier: "importance" for weighted draws alone, seconds, without `posterior.nc` and `chain.npz`; "emcee" for a
+            chain that must agree with them.
         max_minutes: time for sampling.
-        resume: go on with the chain in the folder.
+        resume: continue the chain in the folder.
         seed: of everything random.
-        tell: shows what takes long.
-        progress: told how far it is.
-        first: shows what importance sampling says before a chain starts.
+        tell: shows lines to the user.
+        progress: shows the progress.
+        first: shows the results of importance sampling before a chain starts.
 
     Raises:
         InputError: as `fit` and `sample`, or the folder cannot be written.
-        NothingToEstimate: too few spots, or nothing is free.
-        NotConverged: the fit diverged. One that ended badly is in the results, with their `error`.
+        NothingToEstimate: too few spots, or no free parameter.
+        NotConverged: the fit diverged. One that ended without a mode is in the results, with their `error`.
     """
     from tvsbayes.assessment.summary import summarise, worth_sampling
     from tvsbayes.estimators.joint_fit import fit as fit_joint
     from tvsbayes.estimators.joint_fit import fit_stages
 
-    place = None if folder is None else Path(folder)
-    if place is not None:
-        require_writable(place)
+    directory = None if folder is None else Path(folder)
+    if directory is not None:
+        require_writable(directory)
     fitting = {FITTING: sum(fit_stages(model.robust, campaign.moves).values())}
-    with Job(fitting | _later_stages(sampled, tier, place), progress) as job:
+    with Job(fitting | _later_stages(sampled, tier, directory), progress) as job:
         joint = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))
         posterior, files = None, {}
-        # A sample of what must not be used anyway would only take time.
+        # No sampling of a fit that must not be used.
         if sampled and worth_sampling(joint):
             from tvsbayes.posterior.sampling import sample
 
-            if place is not None:
-                make_folder(place)
-            shown = job.part(SAMPLING)
+            if directory is not None:
+                make_folder(directory)
+            sampling_progress = job.part(SAMPLING)
             if tier == IMPORTANCE:
-                posterior = sample(joint, tier, seed=seed, progress=shown)
+                posterior = sample(joint, tier, seed=seed, progress=sampling_progress)
             else:
                 posterior = sample(
                     joint,
                     tier,
                     max_minutes=max_minutes,
                     seed=seed,
-                    checkpoint=None if place is None else place / "chain.npz",
+                    checkpoint=None if directory is None else directory / "chain.npz",
                     resume=resume,
-                    progress=shown,
+                    progress=sampling_progress,
                     first=None if first is None else lambda early: first(summarise(joint, early)),
                 )
-                job.begin(FILING)
-                files = _posterior_files(posterior, place, tell)
+                job.begin(WRITING)
+                files = _posterior_files(posterior, directory, tell)
         job.begin(SUMMARISING)
-        return _results(joint, posterior, seed, place, files, tell)
+        return _results(joint, posterior, seed, directory, files, tell)
 
 
 def _later_stages(sampled: bool, tier: Tier, folder: Path | None) -> dict[str, float]:
-    """What `calibrate` does after its fit, with seconds; what is not done has none."""
+    """Stages of `calibrate` after its fit, with expected seconds; 0 for omitted ones."""
     from tvsbayes.posterior.sampling import sampling_stages
 
     sampling = sum(sampling_stages(tier).values()) if sampled else 0.0
-    filing = FILED_SECONDS if sampled and tier == CHAIN and folder is not None else 0.0
-    return {SAMPLING: sampling, FILING: filing, SUMMARISING: SUMMARISED_SECONDS}
+    filing = WRITING_SECONDS if sampled and tier == CHAIN and folder is not None else 0.0
+    return {SAMPLING: sampling, WRITING: filing, SUMMARISING: SUMMARISING_SECONDS}
 
 
 def _posterior_files(posterior: Posterior, folder: Path | None, tell: Tell) -> dict[str, str]:
-    """Write a posterior that has converged for ArviZ; the chain is kept already."""
+    """Writes a converged posterior for ArviZ; the chain is stored already."""
     if folder is None:
         return {}
     files = {}
@@ -219,11 +218,11 @@ def _posterior_files(posterior: Posterior, folder: Path | None, tell: Tell) -> d
 
 
 def _results(
-    found: JointFit, posterior: Posterior | None, seed: int, folder: Path | None, files: dict[str, str], tell: Tell
+    fit: JointFit, posterior: Posterior | None, seed: int, folder: Path | None, files: dict[str, str], tell: Tell
 ) -> CampaignResults:
-    """Summary, calibration and evidence of a fit and its sample, written where a folder is named.
+    """Summary, calibration and evidence of a fit and its sample, written where a folder is given.
 
-    A `posterior.nc` there that is not among `files` is another fit's: it goes.
+    A `posterior.nc` there that is not among `files` belongs to another fit and is removed.
     """
     import numpy as np
 
@@ -235,29 +234,29 @@ def _results(
     from tvsbayes.results.fit_record import FitRecord, covariance_of_draws, provenance
     from tvsbayes.results.stored_draws import ResultDraws, write_results
 
-    summary = summarise(found, posterior)
-    usable = posterior if summary.estimator == "posterior" else None
-    calibration = calibration_of(found, posterior, seed=seed) if found.converged else None
-    behind = equal_laplace_draws(found) if usable is None else usable.thinned(DRAWS_KEPT)
-    physical, effective = np.asarray(behind.physical), np.asarray(behind.effective_deg_per_step)
-    mechanism = found.space.mechanism
-    derived = {name: values for name, values in Draws(behind, mechanism).items() if name not in found.names}
+    summary = summarise(fit, posterior)
+    sampled_posterior = posterior if summary.estimator == "posterior" else None
+    calibration = calibration_of(fit, posterior, seed=seed) if fit.converged else None
+    equal_draws = equal_laplace_draws(fit) if sampled_posterior is None else sampled_posterior.thinned(DRAWS_KEPT)
+    physical, effective = np.asarray(equal_draws.physical), np.asarray(equal_draws.effective_deg_per_step)
+    mechanism = fit.space.mechanism
+    derived = {name: values for name, values in Draws(equal_draws, mechanism).items() if name not in fit.names}
     columns = np.stack(list(derived.values()), axis=1)
-    draws = ResultDraws(found.names, physical, effective, found.reference_pose_rad, tuple(derived), columns)
+    draws = ResultDraws(fit.names, physical, effective, fit.reference_pose_rad, tuple(derived), columns)
     record = FitRecord(
         summary,
         covariance_of_draws(draws.names, draws.physical, summary.parameters),
-        evidence_of(found, summary, usable, calibration, draws.physical),
-        provenance(input_hashes(found.campaign), seed),
+        evidence_of(fit, summary, sampled_posterior, calibration, draws.physical),
+        provenance(input_hashes(fit.campaign), seed),
     )
     if folder is not None:
-        if "posterior" not in files and (stale := folder / "posterior.nc").exists():
-            stale.unlink()
+        if "posterior" not in files and (old_file := folder / "posterior.nc").exists():
+            old_file.unlink()
             tell("posterior.nc of an earlier fit is removed: it would not be that of fit.json")
-        mode = None if calibration is None else found.stored
+        mode = None if calibration is None else fit.stored
         files = {**write_results(folder, record, draws, calibration, mode), **files}
-    causes = () if found.converged else misfit_causes(found.campaign, summary.parameters["pixel_scale"].value)
-    return CampaignResults(record, found, posterior, calibration, draws, unusable(summary, causes), files, causes)
+    causes = () if fit.converged else misfit_causes(fit.campaign, summary.parameters["pixel_scale"].value)
+    return CampaignResults(record, fit, posterior, calibration, draws, unusable(summary, causes), files, causes)
 
 
 def evidence_of(
@@ -267,9 +266,9 @@ def evidence_of(
     calibration: Calibration | None,
     physical: np.ndarray,
 ) -> FitEvidence:
-    """What reports show besides the estimates; without a calibration residuals alone.
+    """Evidence for reports besides the estimates; without a calibration only residuals.
 
-    `physical` are the draws, in the units of the names, that the calibration's inputs were taken from, row by row.
+    `physical` are the draws, in the units of the names, of the calibration's inputs, row by row.
     """
     from tvsbayes.assessment.causes import headline_budget, headline_causes
     from tvsbayes.assessment.residuals import residual_causes, stop_readings, stop_residuals
@@ -278,49 +277,49 @@ def evidence_of(
     from tvsbayes.results.fit_record import FitEvidence
 
     stops = stop_residuals(fit)
-    listed, causes = stops[:: -(-len(stops) // RESIDUALS_LISTED) or 1], residual_causes(stops)
+    stops_listed, causes = stops[:: -(-len(stops) // RESIDUALS_LISTED) or 1], residual_causes(stops)
     if calibration is None:
-        return FitEvidence(listed, causes)
+        return FitEvidence(stops_listed, causes)
     gaps = explain_gap(fit, posterior)
-    parts = headline_causes(fit)
-    # What a model holds fixed has no uncertainty to split.
-    known = {q: e for q in parts.quantities if (e := summary.named[q]).sd > 0}
-    budgets = tuple(headline_budget(parts, q, e) for q, e in known.items())
+    causes_by_quantity = headline_causes(fit)
+    # Fixed quantities have no uncertainty to split.
+    estimates = {q: e for q in causes_by_quantity.quantities if (e := summary.named[q]).sd > 0}
+    budgets = tuple(headline_budget(causes_by_quantity, q, e) for q, e in estimates.items())
     axes = []
     for axis in AXES:
         contrast = physical[:, fit.names.index(f"ratio_contrast_deg_per_step.{axis}")]
         readings = stop_readings(fit, axis)
         axes.append(positioning(calibration, axis, readings=readings, contrast_deg_per_step=contrast))
-    return FitEvidence(listed, causes, gaps if any(gaps.values()) else None, budgets, tuple(axes))
+    return FitEvidence(stops_listed, causes, gaps if any(gaps.values()) else None, budgets, tuple(axes))
 
 
 @dataclass(frozen=True)
 class StoredOrFitted:
-    """Results of a campaign: those in `results/` that are of exactly its data and priors; else of a fit made first.
+    """Results of a campaign: stored ones in `results/` for the same data and priors; else those of a new fit.
 
-    Each part is looked up by itself, since results of an older version may lack one; all that `results/` lack comes
-    from one fit (Laplace approximation), made when the first of them is needed.
+    Each part is looked up separately, since results of an older version may lack one; missing parts come from one fit
+    (Laplace approximation), made when the first of them is needed.
 
     Attributes:
         campaign: from `read_campaign`.
-        tell: shows why a fit is made first.
-        progress: told how far it is.
+        tell: shows why a fit runs first.
+        progress: shows the progress.
     """
 
     campaign: Campaign
-    tell: Tell = untold
+    tell: Tell = no_output
     progress: Show | None = None
 
     @cached_property
     def stored_calibration(self) -> Calibration | None:
-        """What `locate` needs, None where `results/` lack it."""
+        """The stored calibration, None where `results/` lack it."""
         from tvsbayes.calibration.calibration_file import stored_calibration
 
         return stored_calibration(self.campaign)
 
     @cached_property
     def stored_fit(self) -> JointFit | None:
-        """Where the fit in `results/` ended, None where they do not say so or another version named its parameters."""
+        """The stored fit at its mode, None where `results/` lack it or another version named its parameters."""
         from tvsbayes.results.stored_draws import stored_mode
 
         if (mode := stored_mode(self.campaign)) is None:
@@ -331,7 +330,7 @@ class StoredOrFitted:
 
     @cached_property
     def stored_record(self) -> FitRecord | None:
-        """`fit.json`, None where it is not of these data: an old one beside new draws would be that of other data."""
+        """The stored `fit.json`, None where it is not of these data."""
         from tvsbayes.instrument.campaign import input_hashes
         from tvsbayes.results.fit_record import read_fit
 
@@ -343,7 +342,7 @@ class StoredOrFitted:
 
     @cached_property
     def fitted(self) -> JointFit:
-        """A fit for a command that needs one in passing.
+        """A new fit for a command without stored results.
 
         Raises:
             NotConverged: it did not converge.
@@ -352,7 +351,7 @@ class StoredOrFitted:
 
     @cached_property
     def calibration(self) -> Calibration:
-        """What `locate` needs."""
+        """The calibration, stored or of a new fit."""
         if self.stored_calibration is not None:
             return self.stored_calibration
         fit = self.fitted
@@ -368,10 +367,10 @@ class StoredOrFitted:
 
     @cached_property
     def record(self) -> FitRecord:
-        """`fit.json` with all that a report shows; a fit that is made first is kept in the campaign's folder.
+        """`fit.json` with the evidence for reports; a new fit is stored in the campaign's folder.
 
         Raises:
-            InputError: the folder takes no results.
+            InputError: the folder cannot be written.
         """
         if self.stored_record is not None and self.stored_record.evidence is not None:
             return self.stored_record
@@ -408,20 +407,20 @@ def verify(
     made: Compensation | None = None,
     distance_mm: float = 1000.0,
     seed: int = 0,
-    tell: Tell = untold,
+    tell: Tell = no_output,
     progress: Show | None = None,
 ) -> Verification:
     """Whether an axis keeps the promise of its table, or a scanner that of its calibration.
 
     Args:
-        folder: with the results that the table or the calibration in force is of.
-        fresh: of an axis readings with the table in force, commands as asked for, before the correction; of a scanner
-            looks whose moves have the counters that `steps_for` or the header gave.
+        folder: with the results of the table or the calibration in force.
+        fresh: of an axis readings with the table in force, commands before the correction; of a scanner looks whose
+            moves have the counters of `steps_for` or of the header.
         made: table of an axis; None for the one in `results/compensation.json`.
-        distance_mm: along the beam of a scanner, at which errors of points are said.
-        seed: of what is drawn.
-        tell: shows what takes long.
-        progress: told how far it is.
+        distance_mm: along the beam of a scanner, for errors of points.
+        seed: of everything random.
+        tell: shows lines to the user.
+        progress: shows the progress.
 
     Raises:
         InputError: a folder cannot be used, or there is no table or calibration of these data.
@@ -449,33 +448,33 @@ def verify(
 
 
 def _why_not_stored(campaign: Campaign) -> str:
-    """What keeps `results/` from being used: nobody should wait for a fit without knowing why."""
+    """Why `results/` cannot be used, in words: the user should know why a fit runs."""
     from tvsbayes.instrument.campaign import input_hashes
     from tvsbayes.results.fit_record import provenance, read_fit
 
     path = None if campaign.path is None else campaign.path / "results" / "fit.json"
     if path is None or not path.exists():
-        begun = path is not None and path.with_name("chain.npz").exists()
+        is_interrupted = path is not None and path.with_name("chain.npz").exists()
         return (
             "results/ hold an interrupted chain alone (`tvsbayes fit --resume`)"
-            if begun
+            if is_interrupted
             else "there are no results/ yet"
         )
     record = read_fit(path)
-    now, stored = input_hashes(campaign), record.provenance
-    others = [HASHED[name] for name in HASHED if stored.inputs.get(name) != now[name]]
-    made_by = stored.versions["tvsbayes"]
-    if others == [HASHED["rig"]] and made_by != provenance(now, 0).versions["tvsbayes"]:
-        return f"results/ are of tvsbayes {escaped(made_by, 40)}, which modelled less of the rig, or of another [rig]"
-    if others:
-        return f"results/ are of other {', '.join(others)}"
+    hashes, stored = input_hashes(campaign), record.provenance
+    changed_inputs = [INPUT_NAMES[name] for name in INPUT_NAMES if stored.inputs.get(name) != hashes[name]]
+    version = stored.versions["tvsbayes"]
+    if changed_inputs == [INPUT_NAMES["rig"]] and version != provenance(hashes, 0).versions["tvsbayes"]:
+        return f"results/ are of tvsbayes {escaped(version, 40)}, which modelled less of the rig, or of another [rig]"
+    if changed_inputs:
+        return f"results/ are of other {', '.join(changed_inputs)}"
     if not record.summary.converged:
         return "results/ are of a fit that did not converge"
     return "results/ lack what this command needs"
 
 
 def _converged_fit(campaign: Campaign, tell: Tell, progress: Show | None) -> JointFit:
-    """A fit for a command that needs one in passing."""
+    """A new fit for a command without stored results."""
     tell(f"{_why_not_stored(campaign)}: {FITTING_FIRST}")
     from tvsbayes.estimators.joint_fit import fit as fit_joint
 

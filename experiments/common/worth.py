@@ -16,7 +16,7 @@ from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
 from tvsbayes.planning.assurance import Family
 from tvsbayes.planning.candidates import Candidates, candidates
 from tvsbayes.planning.expectation import Knowledge, information_of
-from tvsbayes.planning.limits import MANY, split_of
+from tvsbayes.planning.limits import MANY_TIMES, split_of
 from tvsbayes.planning.looks import LookArrays, covariance_of
 from tvsbayes.planning.search import DesignProblem, Scope, design_family
 from tvsbayes.planning.target import DEFAULT_TARGET, parse_target, sensitivity
@@ -72,7 +72,7 @@ def worth_of(
     parts = split_of(knowledge, fisher, None, at)
     cameras = parts.get("stereo calibration", 0.0) + parts.get("focal scale", 0.0)
     looks = parts.get("looks", 0.0)
-    floor = at.value(covariance_of(knowledge.precision + MANY * fisher))
+    floor = at.value(covariance_of(knowledge.precision + MANY_TIMES * fisher))
     return Worth(spots, u, dict(zip(CAUSES, (looks, cameras, 1 - looks - cameras), strict=True)), floor)
 
 

@@ -28,7 +28,7 @@ from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.planning.assurance import Family
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.expectation import Knowledge, PlanInformation, information_of, prior_knowledge
-from tvsbayes.planning.limits import MANY, limit_of, split_of
+from tvsbayes.planning.limits import MANY_TIMES, limit_of, split_of
 from tvsbayes.planning.looks import LookArrays, covariance_of
 from tvsbayes.planning.search import LADDER, DesignProblem, Scope, design_family
 from tvsbayes.planning.target import DEFAULT_TARGET, Sensitivity, parse_target, sensitivity
@@ -135,7 +135,7 @@ def second_session(first: Session) -> None:
         for n in (2, 4, 8, 16):
             after = information_of(more.arranged(n).steps, sharp)
             covariance = covariance_of(sharp.precision + after.fisher)
-            floor = first.at.value(covariance_of(sharp.precision + MANY * after.fisher))
+            floor = first.at.value(covariance_of(sharp.precision + MANY_TIMES * after.fisher))
             picked = int(away[more.picks[: 4 * n]].sum())
             minutes = first.information.minutes + after.minutes
             ratio = covariance[0, 0] ** 0.5 * rig.table.priors["degrees_per_step.pan"].u

@@ -94,7 +94,7 @@ def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monke
     monkeypatch.setenv("TVSBAYES_CACHE", str(tmp_path))
     monkeypatch.setattr(Traces, "used", None)
     monkeypatch.setattr(jax.config, "update", lambda *_: None)
-    monkeypatch.setattr("tvsbayes.pipeline._TOLD", set())
+    monkeypatch.setattr("tvsbayes.pipeline._SHOWN_LINES", set())
     compile_for(report_line)
     assert capsys.readouterr().err == "", "progress is for terminals"
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
@@ -102,7 +102,7 @@ def test_whoever_waits_for_the_first_compilation_is_told(tmp_path, capsys, monke
     assert "first run" in capsys.readouterr().err
     compile_for(report_line)
     assert capsys.readouterr().err == "", "several steps of a command ask for the cache"
-    monkeypatch.setattr("tvsbayes.pipeline._TOLD", set())
+    monkeypatch.setattr("tvsbayes.pipeline._SHOWN_LINES", set())
     (tmp_path / "jit_fit-cache").touch()
     compile_for(report_line)
     assert capsys.readouterr().err == ""

@@ -11,7 +11,7 @@ from support.coarse_planning import ROUNDING
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import CREEP_NAMES, INDEX, RIG_NAMES
 from tvsbayes.model.parameter_space import STOP_COLUMNS
-from tvsbayes.planning.assurance import SCALES, Assurance, Family, believed
+from tvsbayes.planning.assurance import SCALES, Assurance, Family, judged_z
 from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
 from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, information_of
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of
@@ -33,7 +33,7 @@ def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge,
     In parts of any size, and a design asked for later than others.
     """
     monkeypatch.setattr(Assurance, "PAIRS", together)
-    monkeypatch.setattr(Assurance, "KEPT", kept)
+    monkeypatch.setattr(Assurance, "CACHED", kept)
     picks = np.random.default_rng(4).integers(0, len(found.looks), 12)
     family = Family(knowledge, found, np.concatenate([picks, picks]), False)
     target = parse_target(DEFAULT_TARGET)
@@ -53,7 +53,7 @@ def test_what_is_reported_is_the_whole_plan_judged_at_each_instrument(knowledge,
             exact = information_of(steps, knowledge, z=z, space=space).fisher
             noise = assurance.noise[None, row]
             covariance = covariance_of(knowledge.precision + exact)[None]
-            at = believed(here, seen[None], assurance.looks.side, chosen, covariance, knowledge, noise)[0]
+            at = judged_z(here, seen[None], assurance.looks.side, chosen, covariance, knowledge, noise)[0]
             pose = seen.mirror_angles_rad[assurance.index].mean(axis=0)
             judged = information_of(steps, knowledge, z=at, space=space).fisher
             expected = sensitivity(target, z, space, knowledge.rig.table, pose).value(
@@ -116,7 +116,7 @@ def test_a_noise_scale_is_believed_by_the_weight_of_the_stops(knowledge, found, 
 
     def scales(chosen, noise):
         noise = np.full((1, 5), noise)
-        return believed(truth, seen[None], found.looks.side, chosen, exact, knowledge, noise)[0, columns]
+        return judged_z(truth, seen[None], found.looks.side, chosen, exact, knowledge, noise)[0, columns]
 
     assert scales(many, 0.0) == pytest.approx(1.5, abs=0.01)
     one = scales(many[:1], 0.0)
@@ -139,7 +139,7 @@ def test_what_the_geometry_takes_from_the_stops_is_not_left_for_their_scatter(kn
 
     def scatter(covariance):
         low, high = (
-            believed(truth, seen[None], found.looks.side, chosen, covariance[None], knowledge, np.full((1, 5), x))
+            judged_z(truth, seen[None], found.looks.side, chosen, covariance[None], knowledge, np.full((1, 5), x))
             for x in (0.0, 1.0)
         )
         return (high - low)[0, columns]

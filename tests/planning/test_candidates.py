@@ -12,7 +12,7 @@ from support.coarse_planning import with_priors
 from tvsbayes.errors import InputError
 from tvsbayes.instrument.parameters import INDEX, NAMES, Prior
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.planning.candidates import Positions, candidates, run_up_steps, sided
+from tvsbayes.planning.candidates import Positions, candidates, from_all_sides, run_up_steps
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
 from tvsbayes.planning.looks import Looks, arrange, covariance_of
 from tvsbayes.planning.plan_check import check_plan
@@ -115,6 +115,6 @@ OVERSHOOT = np.array([10, 20])
     ],
 )
 def test_a_side_is_offered_where_its_run_up_stays_inside(position, sides):
-    looks = sided(Positions(np.array([position]), np.array([3])), LIMITS, OVERSHOOT)
+    looks = from_all_sides(Positions(np.array([position]), np.array([3])), LIMITS, OVERSHOOT)
     assert {tuple(side) for side in looks.side.tolist()} == sides and len(looks) == len(sides)
     assert all(tuple(steps) == position for steps in looks.steps.tolist()) and set(looks.sheet.tolist()) <= {3}

@@ -20,14 +20,14 @@ from tvsbayes.model.gear_kriging import scales_at
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.headlines import SeenLine, line_deg_per_step
 from tvsbayes.model.laser_path import beam_angles
-from tvsbayes.planning.assurance import Assurance, Family, believed, own_gears
+from tvsbayes.planning.assurance import Assurance, Family, instrument_gears, judged_z
 from tvsbayes.planning.candidates import candidates
 from tvsbayes.planning.drawn_rigs import Instruments, draw_instruments
 from tvsbayes.planning.expectation import PARAMETERS, information_of, prior_knowledge
-from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces, TaughtErrors, regular_places, windows_of
+from tvsbayes.planning.gear_places import NO_PLACES, FittedErrors, GearPlaces, regular_places, windows_of
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookArrays, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.plan_check import check_plan
-from tvsbayes.planning.planner import judged
+from tvsbayes.planning.planner import baseline_of
 from tvsbayes.planning.search import DesignProblem
 from tvsbayes.planning.target import AT_POINT, GEARS_AT_POINT, parse_target, sensitivity
 from tvsbayes.statistics.gaussian_process import matern52
@@ -165,16 +165,16 @@ def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_ow
     reported, steps = assurance.values([6])[6], family.arranged(6).steps
     for row in range(3):
         here, z, space = assurance.instruments[np.array([row])], drawn.z[row], drawn.space_of(row)
-        mine = own_gears(known, here.physical[0])
+        mine = instrument_gears(known, here.physical[0])
         own = known.with_places(mine)
         assert own.gears.scales.error_rad == pytest.approx(np.radians(here.physical[0][ERRORS]))
         seen = LookArrays(assurance.looks, own, False).at(z, space)
         exact = information_of(steps, own, z=z, space=space)
         first = covariance_of(own.precision + exact.fisher)[None]
-        at = believed(here, seen[None], assurance.looks.side, assurance.index, first, own, assurance.noise[None, row])[
+        at = judged_z(here, seen[None], assurance.looks.side, assurance.index, first, own, assurance.noise[None, row])[
             0
         ]
-        judged = covariance_of(own.precision + information_of(steps, own, z=at, space=space).fisher)
+        baseline_of = covariance_of(own.precision + information_of(steps, own, z=at, space=space).fisher)
         pose = seen.mirror_angles_rad[assurance.index].mean(axis=0)
         planned = np.bincount(assurance.index)
         assert (planned * seen.seen).sum() < planned.sum() if row == 2 else seen.seen.all()
@@ -183,11 +183,11 @@ def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_ow
             return sensitivity(WORST, z, space, known.rig.table, pose, gears).value(covariance)
 
         lined = replace(mine, share=mine.line_through(assurance.looks.steps, planned * seen.seen))
-        assert reported[row] == pytest.approx(u(lined, judged), rel=ROUNDING)
-        assert abs(u(mine, judged) / reported[row] - 1) > 1e-3, "the line over all candidates is another"
+        assert reported[row] == pytest.approx(u(lined, baseline_of), rel=ROUNDING)
+        assert abs(u(mine, baseline_of) / reported[row] - 1) > 1e-3, "the line over all candidates is another"
         if row == 2:
             every = replace(mine, share=mine.line_through(assurance.looks.steps, planned))
-            assert abs(u(every, judged) / reported[row] - 1) > 1e-3, "so is that over looks which are missed"
+            assert abs(u(every, baseline_of) / reported[row] - 1) > 1e-3, "so is that over looks which are missed"
         prior = covariance_of(known.precision + information_of(steps, known, z=at, space=space).fisher)
         common = replace(known.gears, share=lined.share)
         assert abs(u(common, prior) / reported[row] - 1) > 1e-3, "so are the scales believed beforehand"
@@ -198,15 +198,15 @@ def test_what_a_fit_says_at_its_places_is_carried_to_others():
     gears = some_places(play_deg=0.0)
     own = replace(gears, steps=gears.steps * 0.9, share=gears.share / 0.9)
     nothing = np.eye(PARAMETERS + own.size)
-    assert TaughtErrors(own, nothing).carried(gears) == pytest.approx(np.eye(PARAMETERS + gears.size), abs=1e-6)
+    assert FittedErrors(own, nothing).covariance_at(gears) == pytest.approx(np.eye(PARAMETERS + gears.size), abs=1e-6)
     known = nothing.copy()
     known[PARAMETERS:, PARAMETERS:] *= 1e-6
     known[0, PARAMETERS] = known[PARAMETERS, 0] = 1e-4
-    left = gears.root @ TaughtErrors(own, known).carried(gears)[PARAMETERS:, PARAMETERS:] @ gears.root.T
+    left = gears.root @ FittedErrors(own, known).covariance_at(gears)[PARAMETERS:, PARAMETERS:] @ gears.root.T
     inside = np.abs(gears.steps) < 80
     count = len(gears.steps)
     assert np.sqrt(np.diag(left)[:count][inside]).max() < 0.1 * np.radians(0.04)
-    follows = TaughtErrors(own, known).carried(gears)[0, PARAMETERS:]
+    follows = FittedErrors(own, known).covariance_at(gears)[0, PARAMETERS:]
     assert follows[:count] @ gears.root[:count, :count].T @ np.ones(count) != 0
 
 
@@ -272,9 +272,9 @@ def test_a_plan_for_real_gears_looks_from_more_counters(mounted_rig, monkeypatch
 
 def test_the_papers_two_counters_are_worse_off_elsewhere_and_named(real, real_rig):
     known, _ = real
-    paper = judged("paper", information_of(paper_protocol(12), known), known, WORST)
+    paper = baseline_of("paper", information_of(paper_protocol(12), known), known, WORST)
     grid = grid_protocol(pan_steps=(0, 60, 120, 180, 240), tilt_steps=(-90, -45, 0, 45, 90))
-    assert judged("grid", information_of(grid, known), known, WORST).joint < 0.8 * paper.joint
+    assert baseline_of("grid", information_of(grid, known), known, WORST).joint < 0.8 * paper.joint
     warnings = check_plan(real_rig, paper_protocol(12)).warnings
     named = [text for text in warnings if "cannot tell gear error from ratio" in text]
     assert [text.split()[0] for text in named] == ["pan", "tilt"]

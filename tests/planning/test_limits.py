@@ -50,7 +50,7 @@ def test_next_looks_are_worth_what_they_say_here_and_a_full_turn_away(wide):
         assert min(pan) > 3000 or batch not in turned
         # The text names the looks' own counters.
         assert all(f"({steps}, " in batch.text for steps in pan)
-        judged = planner.judged("", information_of(batch.actions, known), known, target, pose)
+        judged = planner.baseline_of("", information_of(batch.actions, known), known, target, pose)
         assert batch.gain == pytest.approx(now - judged.joint, rel=1e-6)
         assert batch.minutes == judged.minutes and batch.gain_per_minute == batch.gain / batch.minutes
 

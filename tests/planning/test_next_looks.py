@@ -15,7 +15,7 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.plan import PlanStep, run_plan
 from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.stops import rests_of
-from tvsbayes.planning.candidates import UNSTATED_STEPS, allowed, overshoot_steps
+from tvsbayes.planning.candidates import UNSTATED_STEPS, counter_range, overshoot_steps
 from tvsbayes.planning.expectation import Knowledge, information_of, knowledge_of
 from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.next_looks import Confirmation, next_looks
@@ -72,7 +72,7 @@ def test_what_is_promised_is_the_information_of_the_whole_run(found, mounted_rig
 
 
 def test_every_look_is_reached_with_a_run_up_inside_the_limits(found, mounted_rig, begun_fit):
-    limits = allowed(mounted_rig.limits, UNSTATED_STEPS).limits
+    limits = counter_range(mounted_rig.limits, UNSTATED_STEPS).limits
     overshoot = overshoot_steps(knowledge_of(begun_fit, mounted_rig))
     assert found.steps[0].action == "place" and sum(step.action == "look" for step in found.steps) == 12
     log = run_plan(whole_plan(mounted_rig, found), mounted_rig)

@@ -18,7 +18,7 @@ from tvsbayes.instrument.protocols import four_point_protocol, grid_protocol, pa
 from tvsbayes.instrument.stops import INSEPARABLE, inseparable, separation
 from tvsbayes.planning.expectation import prior_knowledge
 from tvsbayes.planning.looks import Looks
-from tvsbayes.planning.plan_check import CURING, JUDGING, beyond_limits, check_plan, extended, judge
+from tvsbayes.planning.plan_check import CURING, JUDGING, appended, beyond_limits, check_plan, judge
 
 pytestmark = pytest.mark.usefixtures("small_searches")
 
@@ -31,7 +31,7 @@ def test_where_a_plan_stands_follows_the_twin(mounted_rig):
     )
     assert describe_looks(mounted_rig, steps) == "d1: (0, 0) by left, up; (50, 40) by right, up"
     looks = Looks(np.array([[50, 60]]), np.array([[1, 1]]), np.array([0]))
-    addition = extended(steps, looks, prior_knowledge(mounted_rig), np.array([30, 10]))
+    addition = appended(steps, looks, prior_knowledge(mounted_rig), np.array([30, 10]))
     # Tilt stands at 40: 20 steps up take up its play without a run-up; pan stands at its goal and needs one.
     assert [(s.action, s.pan_steps, s.tilt_steps) for s in addition[:-1]] == [("move", 20, 40), ("move", 50, 60)]
     assert describe_looks(mounted_rig, addition, steps) == "d1: (50, 60) by left, up"

@@ -16,8 +16,8 @@ from tvsbayes.planning.drawn_rigs import draw_instruments
 from tvsbayes.planning.expectation import PARAMETERS
 from tvsbayes.planning.looks import CONTRAST_COLUMNS, covariance_of, information_of_looks
 from tvsbayes.planning.search import (
+    CONTRAST_PRECISION,
     CRITERIA,
-    KNOWN,
     MEAN_WEIGHT,
     DesignProblem,
     Scope,
@@ -100,7 +100,7 @@ def test_a_search_after_data_knows_no_home_offset(knowledge, found, seen):
     whole = covariance_of(precision + np.einsum("mij,mik->jk", wide[picks], wide[picks]))[:PARAMETERS, :PARAMETERS]
     exact = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, True)
     contrasts = np.isin(np.arange(PARAMETERS), CONTRAST_COLUMNS)
-    expected = covariance_of(known.precision + exact + KNOWN * np.diag(contrasts))
+    expected = covariance_of(known.precision + exact + CONTRAST_PRECISION * np.diag(contrasts))
     assert whole == pytest.approx(expected, rel=ROUNDING, abs=ROUNDING * expected.max())
     without = information_of_looks(shown, picks, np.zeros((6, 2)), knowledge.space, False)
     assert np.abs(without - exact).max() > 1e-3 * np.abs(exact).max(), "offsets count, or they could be left out"

@@ -158,9 +158,9 @@ def fitted(folder: Path, looks: int) -> Estimate:
     from tvsbayes.assessment.summary import summarise
     from tvsbayes.estimators.joint_fit import fit
     from tvsbayes.instrument.campaign import read_campaign
-    from tvsbayes.pipeline import compile_for, untold, unusable
+    from tvsbayes.pipeline import compile_for, no_output, unusable
 
-    compile_for(untold)
+    compile_for(no_output)
     summary = summarise(fit(read_campaign(folder)))
     error = unusable(summary)
     if error is not None:
@@ -178,11 +178,11 @@ def proposed(rig: Path, folder: Path, looks: int, target_u: float, count: int, c
     from tvsbayes.estimators.joint_fit import fit
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.instrument.rig import read_rig
-    from tvsbayes.pipeline import compile_for, untold
+    from tvsbayes.pipeline import compile_for, no_output
     from tvsbayes.planning.next_looks import next_looks
     from tvsbayes.planning.target import parse_target
 
-    compile_for(untold)
+    compile_for(no_output)
     target = parse_target(f"u(worst) <= {target_u:g} deg/step")
     ahead = next_looks(fit(read_campaign(folder)), read_rig(rig), target, count, confirm_below=confirm_below)
     return ahead_of(ahead, looks)

@@ -1,4 +1,4 @@
-"""What fits of a design will report, over drawn instruments: the chance that they meet the target.
+"""Assurance of a design: the probability that its fit, over drawn instruments, reports the target as met.
 
 An instrument is drawn from `[truth]` of the rig file, or from the posterior of a campaign. Values in the target's unit.
 """
@@ -21,7 +21,7 @@ from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.drawn_rigs import Instruments
 from tvsbayes.planning.expectation import NOISE_COLUMNS, PARAMETERS, Knowledge
 from tvsbayes.planning.gear_places import GearPlaces
-from tvsbayes.planning.looks import Arranged, LookArrays, Looks, Seen, arrange, covariance_of, information_of_looks
+from tvsbayes.planning.looks import LookArrays, LookPlan, Looks, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target, sensitivity
 from tvsbayes.progress import Advance, unshown
 from tvsbayes.statistics.streams import Stream, random_stream
@@ -31,27 +31,27 @@ SCALES = [*STOP_COLUMNS.ravel(), PIXEL_COLUMN]
 """Columns of the noise scales: stops by direction (right, left, down, up), pixels."""
 
 
-def believed(
+def judged_z(
     instruments: Instruments,
     seen: Seen,
     side: np.ndarray,
-    chosen: np.ndarray,
+    picks: np.ndarray,
     covariance: np.ndarray,
     knowledge: Knowledge,
     noise: np.ndarray,
 ) -> np.ndarray:
-    """Coordinates at which fits will judge their uncertainty: the true ones, noise scales as they will estimate them.
+    """Coordinates at which fits evaluate their uncertainty: the true ones, with estimated noise scales.
 
     A standard deviation is known from n stops to 1 / sqrt(2 n): the log of each scale has the expected information
-    2 sum (s^2 m / (1 + s^2 m))^2 over the stops of its direction, m what the pixels know of one stop, less what the
-    geometry takes from them; its estimate lies between prior and truth by the weights of both, and scatters. A sampled
-    fit takes its variance over all that the scale may be: E s^2 of a log-normal, not s^2 of its middle.
+    2 sum (s^2 m / (1 + s^2 m))^2 over the stops of its direction, m the information of the pixels on one stop, less the
+    share used by the geometry; its estimate is the weighted mean of prior and truth, with scatter. A sampled fit
+    averages its variance over the scale: E s^2 of a log-normal, not s^2 of its median.
 
     Args:
         instruments: the true ones, n of them.
-        seen: what they see of m looks, shapes (n, m, ...).
+        seen: expectation of m looks for each, shapes (n, m, ...).
         side: sides of these, shape (m, 2).
-        chosen: numbers of those taken, repeats allowed, shape (k,).
+        picks: numbers of the looks taken, repeats allowed, shape (k,).
         covariance: of coordinates and errors of gears after the looks, shape (n, p + e, p + e).
         knowledge: before the looks.
         noise: standard normal numbers in the order of `SCALES`, shape (n, 5).
@@ -60,39 +60,39 @@ def believed(
         Shape (n, p).
     """
     z, u = instruments.z.copy(), np.asarray(knowledge.space.u)
-    taken = seen.seen * np.bincount(chosen, minlength=len(side))
-    looks = np.maximum(taken.sum(axis=1), 1)
+    times_seen = seen.seen * np.bincount(picks, minlength=len(side))
+    looks = np.maximum(times_seen.sum(axis=1), 1)
     rig_columns = np.ones(knowledge.size, dtype=bool)
     rig_columns[:PARAMETERS] = ~NOISE_COLUMNS & (np.arange(PARAMETERS) < len(RIG_NAMES))
     precision = np.diag(knowledge.precision)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     determined = np.sum(1 - variance[:, rig_columns] * precision[rig_columns], axis=1)
-    left_over = np.maximum(0.0, 1 - determined / (2 * looks))
+    residual_share = np.maximum(0.0, 1 - determined / (2 * looks))
 
     def estimate(column: int, information: np.ndarray, normal: np.ndarray) -> None:
-        information = information * u[column] ** 2 * left_over
-        before = precision[column]
-        mean = before * knowledge.z[column] + information * z[:, column] + np.sqrt(information) * normal
-        # ln s = u z: the root of E s^2 lies u^2 times the variance of z above the middle.
-        z[:, column] = (mean + u[column]) / (before + information)
+        information = information * u[column] ** 2 * residual_share
+        prior_precision = precision[column]
+        mean = prior_precision * knowledge.z[column] + information * z[:, column] + np.sqrt(information) * normal
+        # ln s = u z: the root of E s^2 lies u^2 times the variance of z above the median.
+        z[:, column] = (mean + u[column]) / (prior_precision + information)
 
     for axis in range(2):
         known = np.sum(seen.slope[..., axis] ** 2, axis=2)
-        for which, sign in enumerate((-1, 1)):
-            column = STOP_COLUMNS[axis, which]
+        for index, sign in enumerate((-1, 1)):
+            column = STOP_COLUMNS[axis, index]
             share = known * np.radians(instruments.physical[:, column, None]) ** 2
             share = share / (1 + share)
-            stops = taken * (side[:, axis] == sign)
-            estimate(column, 2 * np.sum(stops * share**2, axis=1), noise[:, 2 * axis + which])
+            stops = times_seen * (side[:, axis] == sign)
+            estimate(column, 2 * np.sum(stops * share**2, axis=1), noise[:, 2 * axis + index])
     estimate(PIXEL_COLUMN, 2.0 * looks, noise[:, 4])
     return z
 
 
-def own_gears(knowledge: Knowledge, physical: np.ndarray) -> GearPlaces:
-    """The places of the gears of an instrument: before any data it repeats errors of its own scales.
+def instrument_gears(knowledge: Knowledge, physical: np.ndarray) -> GearPlaces:
+    """The places of the gears of an instrument: before any data with its own scales of errors.
 
-    On the average over instruments a fit, which takes its variance over all that the scales may be, reports what it
-    would if it knew them. After data they are as good as known.
+    A fit averages its variance over the scales; on average over instruments it reports the same as with known scales.
+    After data the scales count as known.
 
     Args:
         knowledge: before the looks.
@@ -109,7 +109,7 @@ def own_gears(knowledge: Knowledge, physical: np.ndarray) -> GearPlaces:
 
 @dataclass(frozen=True)
 class Family:
-    """Designs that grow by one look at a time: the first 4 n of `picks` are n experiments."""
+    """Designs of increasing size: the first 4 n of `picks` are n experiments."""
 
     knowledge: Knowledge
     candidates: Candidates
@@ -120,7 +120,7 @@ class Family:
         """Looks of n experiments."""
         return self.candidates.looks[self.picks[: LOOKS_PER_EXPERIMENT * experiments]]
 
-    def arranged(self, experiments: int) -> Arranged:
+    def arranged(self, experiments: int) -> LookPlan:
         """Their plan."""
         return arrange(self.looks(experiments), self.knowledge.sheets, self.candidates.overshoot)
 
@@ -131,15 +131,15 @@ class Family:
 
 
 @dataclass(frozen=True)
-class _Scene:
-    """Some of the instruments, what they see of a family's looks, and the target there.
+class _VisibleInstruments:
+    """Instruments of a block that can make the looks of a family, their expectations, and the target's sensitivity.
 
     Attributes:
         rows: numbers of those that see any look and reach the target's point, n of them.
         instruments: these.
-        seen: shapes (n, looks, ...).
-        gradient: of the target, shape (n, q, p + e); of lines by each place, which designs sum, (n, c + 1, q, p + e).
-        own_variance: of the target beside it, shape (n, q).
+        seen: expectations, shapes (n, looks, ...).
+        gradient: of the target, shape (n, q, p + e); for lines by place, summed for each design, (n, c + 1, q, p + e).
+        own_variance: of the target in addition, shape (n, q).
     """
 
     rows: np.ndarray
@@ -150,37 +150,37 @@ class _Scene:
 
 
 class Assurance:
-    """What fits of the designs of a family will report, over drawn truths."""
+    """Uncertainties that fits of the designs of a family will report, over drawn truths."""
 
-    PAIRS, KEPT = 4096, 16
-    """Looks of all instruments that are evaluated together, and how often so many are kept: 10 MB each."""
+    PAIRS, CACHED = 4096, 16
+    """Pairs of instrument and look in a block, and number of cached blocks: 10 MB each."""
 
     def __init__(self, family: Family, target: Target, instruments: Instruments, seed: int):
         self.family, self.target, self.instruments, self.seed = family, target, instruments, seed
-        # After data a fit's line goes through the looks of both, of which the places know the sum alone.
-        before = not family.knowledge.after_data
-        self._of_lines = before and target.point_mm is None and family.knowledge.gears.size > 0
+        # After data a fit's line goes through earlier and new looks; the places only know the sum.
+        before_data = not family.knowledge.after_data
+        self._of_lines = before_data and target.point_mm is None and family.knowledge.gears.size > 0
         self.noise = random_stream(seed, Stream.INSTRUMENT_SCALES).standard_normal((len(instruments), len(SCALES)))
         self.distinct, self.index = np.unique(family.picks, return_inverse=True)
         self.looks = family.candidates.looks[self.distinct]
         self.arrays = LookArrays(self.looks, family.knowledge, family.aperture)
-        self._scene = lru_cache(maxsize=self.KEPT)(self._evaluated)
+        self._scene = lru_cache(maxsize=self.CACHED)(self._evaluate)
         self._values: dict[int, np.ndarray] = {}
 
     def of(self, family: Family) -> Assurance:
-        """The same instruments before other designs."""
+        """The same instruments with other designs."""
         return Assurance(family, self.target, self.instruments, self.seed)
 
     def values(self, sizes: Sequence[int], advance: Advance = unshown) -> dict[int, np.ndarray]:
         """Reported uncertainty of the target at each truth, shape (draws,), by number of experiments."""
-        draws, together = len(self.instruments), max(1, self.PAIRS // len(self.looks))
-        wanted = {n: self.family.arranged(n) for n in sizes if n not in self._values}
-        values_by_size = {n: np.full(draws, np.inf) for n in wanted}
-        for first in range(0, draws, together) if wanted else ():
-            scene = self._scene(first, min(first + together, draws))
-            for n, design in wanted.items():
-                values_by_size[n][scene.rows] = self._reported(scene, n, design)
-            advance((first + together) / draws)
+        draws, block_size = len(self.instruments), max(1, self.PAIRS // len(self.looks))
+        designs = {n: self.family.arranged(n) for n in sizes if n not in self._values}
+        values_by_size = {n: np.full(draws, np.inf) for n in designs}
+        for first in range(0, draws, block_size) if designs else ():
+            scene = self._scene(first, min(first + block_size, draws))
+            for n, design in designs.items():
+                values_by_size[n][scene.rows] = self._reported_values(scene, n, design)
+            advance((first + block_size) / draws)
         self._values |= values_by_size
         return {n: self._values[n] for n in sizes}
 
@@ -188,27 +188,27 @@ class Assurance:
         """Share of the truths whose fit of n experiments reports the target as met."""
         return float(np.mean(self.values([experiments])[experiments] <= self.target.limit))
 
-    def _evaluated(self, first: int, end: int) -> _Scene:
-        every, knowledge = self.instruments[np.arange(first, end)], self.family.knowledge
-        gears = [own_gears(knowledge, physical) for physical in every.physical]
+    def _evaluate(self, first: int, end: int) -> _VisibleInstruments:
+        block, knowledge = self.instruments[np.arange(first, end)], self.family.knowledge
+        gears = [instrument_gears(knowledge, physical) for physical in block.physical]
         turning = np.array([places.turning(self.looks.steps, self.looks.side) for places in gears])
-        shown = self.arrays.at_all(every.z, every.value, turning)
-        poses = shown.mirror_angles_rad[:, self.index].mean(axis=1)
-        rows, aimed = [], []
-        for row in np.flatnonzero(shown.seen.any(axis=1)).tolist():
+        expectation = self.arrays.at_all(block.z, block.value, turning)
+        poses = expectation.mirror_angles_rad[:, self.index].mean(axis=1)
+        rows, sensitivities = [], []
+        for row in np.flatnonzero(expectation.seen.any(axis=1)).tolist():
             try:
-                aimed.append(self._aimed(every.z[row], every.space_of(row), poses[row], gears[row]))
+                sensitivities.append(self._target_at(block.z[row], block.space_of(row), poses[row], gears[row]))
             except InputError:
                 continue
             rows.append(row)
-        chosen, wanted = np.array(rows, dtype=int), len(self.target.indices)
+        visible, count = np.array(rows, dtype=int), len(self.target.indices)
         parts = (knowledge.gears.size // 2 + 1,) if self._of_lines else ()
-        gradient = np.array([one.gradient for one in aimed]).reshape(len(rows), *parts, wanted, knowledge.size)
-        own_variance = np.array([one.own_variance for one in aimed]).reshape(len(rows), *parts, wanted)
-        return _Scene(first + chosen, every[chosen], shown[chosen], gradient, own_variance)
+        gradient = np.array([s.gradient for s in sensitivities]).reshape(len(rows), *parts, count, knowledge.size)
+        own_variance = np.array([s.own_variance for s in sensitivities]).reshape(len(rows), *parts, count)
+        return _VisibleInstruments(first + visible, block[visible], expectation[visible], gradient, own_variance)
 
-    def _aimed(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray, gears: GearPlaces) -> Sensitivity:
-        """How the target depends on the coordinates of an instrument; of lines, by place (leading axis c + 1).
+    def _target_at(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray, gears: GearPlaces) -> Sensitivity:
+        """Sensitivity of the target at an instrument; for lines by place (leading axis c + 1).
 
         Raises:
             InputError: no beam reaches the target's point.
@@ -217,51 +217,51 @@ class Assurance:
             return Sensitivity(np.asarray(gears.parts(z, space, pose_rad).gradient)[:, list(self.target.indices)])
         return sensitivity(self.target, z, space, self.family.knowledge.rig.table, pose_rad, gears)
 
-    def _reported(self, scene: _Scene, experiments: int, design: Arranged) -> np.ndarray:
-        """Of the instruments of a scene, shape (n,)."""
-        knowledge, chosen = self.family.knowledge, self.index[: LOOKS_PER_EXPERIMENT * experiments]
-        way = design.path, knowledge.space, knowledge.after_data, design.warm_minutes(knowledge.rig)
+    def _reported_values(self, scene: _VisibleInstruments, experiments: int, design: LookPlan) -> np.ndarray:
+        """Reported uncertainty for the instruments of a block, shape (n,)."""
+        knowledge, picks = self.family.knowledge, self.index[: LOOKS_PER_EXPERIMENT * experiments]
+        context = design.path, knowledge.space, knowledge.after_data, design.warm_minutes(knowledge.rig)
 
         def covariance(seen: Seen) -> np.ndarray:
-            information = information_of_looks(seen, chosen, *way)
+            information = information_of_looks(seen, picks, *context)
             return covariance_of(knowledge.precision + information)
 
         first = covariance(scene.seen)
         noise = self.noise[scene.rows]
-        z = believed(scene.instruments, scene.seen, self.looks.side, chosen, first, knowledge, noise)
-        judged = covariance(self.rescaled(scene.seen, scene.instruments, z))
-        return self._hangs(scene, chosen).values(judged, self.target.factor)
+        z = judged_z(scene.instruments, scene.seen, self.looks.side, picks, first, knowledge, noise)
+        covariance_judged = covariance(self.rescaled(scene.seen, scene.instruments, z))
+        return self._sensitivity_of(scene, picks).values(covariance_judged, self.target.factor)
 
-    def _hangs(self, scene: _Scene, chosen: np.ndarray) -> Sensitivity:
-        """How what is wanted depends on the coordinates: ratios along the lines through the looks that are seen."""
+    def _sensitivity_of(self, scene: _VisibleInstruments, picks: np.ndarray) -> Sensitivity:
+        """Sensitivity of the target for a design: ratios along the lines through the visible looks."""
         if not self._of_lines:
             return Sensitivity(scene.gradient, {"at the point": scene.own_variance})
         gears, rows = self.family.knowledge.gears, list(self.target.indices)
-        taken = scene.seen.seen * np.bincount(chosen, minlength=len(self.looks))
-        weights = gears.weights(gears.line_through(self.looks.steps, taken))[:, rows]
+        times_seen = scene.seen.seen * np.bincount(picks, minlength=len(self.looks))
+        weights = gears.weights(gears.line_through(self.looks.steps, times_seen))[:, rows]
         return Sensitivity(np.einsum("nqi,niqp->nqp", weights, scene.gradient))
 
     def rescaled(self, seen: Seen, instruments: Instruments, z: np.ndarray) -> Seen:
-        """The same looks (n, m) whitened with noise scales of other coordinates (n, p), the scatter of looks as it is.
+        """The looks (n, m) whitened with noise scales of other coordinates (n, p) and the same scatter of looks.
 
-        Rows and slope J are in units of pixels and scatter of looks D together: J D J^T of I is the scatter's, the rest
-        goes with the pixel scale s. With stop errors S the covariance is s^2 (I - J D J^T) + J (D + S) J^T.
+        Rows and slope J are in units of pixels and scatter of looks D together: J D J^T of I is the scatter's part, the
+        rest scales with the pixel scale s. With stop errors S the covariance is s^2 (I - J D J^T) + J (D + S) J^T.
         """
         u, true = np.asarray(self.family.knowledge.space.u)[SCALES], instruments.value[:, SCALES]
-        before, after = (true * np.exp(u * point[:, SCALES]) for point in (instruments.z, z))
-        pixel = after[:, 4] / before[:, 4]
+        old_sd, new_sd = (true * np.exp(u * point[:, SCALES]) for point in (instruments.z, z))
+        pixel = new_sd[:, 4] / old_sd[:, 4]
         sides = (self.looks.side > 0).astype(int)
 
         def of_angles(sd_deg: np.ndarray) -> np.ndarray:
             return (seen.slope * np.radians(sd_deg)[:, :, None] ** 2) @ np.swapaxes(seen.slope, -1, -2)
 
-        by_looks = of_angles(instruments.physical[:, None, SCATTER_COLUMNS])
-        # Both roots are taken in the three dimensions that the residual has; rows are turned, not only scaled.
-        old, new = (
-            p[:, None, None, None] ** 2 * (np.eye(4) - by_looks)
-            + by_looks
+        scatter = of_angles(instruments.physical[:, None, SCATTER_COLUMNS])
+        # The transform rotates the rows too, not only their scale.
+        old_root, new_root = (
+            p[:, None, None, None] ** 2 * (np.eye(4) - scatter)
+            + scatter
             + of_angles(scale[:, :4].reshape(-1, 2, 2)[:, [0, 1], sides])
-            for p, scale in ((np.ones(len(pixel)), before), (pixel, after))
+            for p, scale in ((np.ones(len(pixel)), old_sd), (pixel, new_sd))
         )
-        turn = np.linalg.solve(np.linalg.cholesky(new), np.linalg.cholesky(old))
-        return replace(seen, rows=turn @ seen.rows)
+        transform = np.linalg.solve(np.linalg.cholesky(new_root), np.linalg.cholesky(old_root))
+        return replace(seen, rows=transform @ seen.rows)

@@ -31,14 +31,14 @@ REACH_DEG = 60.0
 
 @dataclass(frozen=True)
 class Candidates:
-    """Everything that a search may choose from.
+    """All looks that a search may choose from.
 
     Attributes:
         looks: candidates.
         overshoot: run-up (pan, tilt), steps.
         limits: lowest and highest counter of (pan, tilt), shape (2, 2).
-        turned: whether each of them lies a full turn of pan away, shape (m,).
-        notes: sentences on what was left out and why.
+        turned: whether a look lies a full turn of pan away, shape (m,).
+        notes: sentences on excluded looks and the reasons.
     """
 
     looks: Looks
@@ -50,32 +50,32 @@ class Candidates:
 
 BACKLASH_COLUMNS = [INDEX[f"backlash_deg.{axis}"] for axis in AXES]
 RUN_UP_STOPS = 4.0
-"""Sds of a stop on top of the play: what the stop before the run-up may be off by, but for one in 30 000."""
+"""Sds of a stop in addition to the play: the stop before the run-up deviates by more once in 30 000."""
 RUN_UP_MARGIN = 1.5
-"""What is known of play and scatter before measuring is rough; half again costs seconds, play left over a look."""
+"""Factor for the uncertainty of play and scatter: a longer run-up costs seconds, remaining play a look."""
 
 
-def run_up_steps(physical: np.ndarray, lost_deg: np.ndarray) -> np.ndarray:
+def run_up_steps(physical: np.ndarray, play_axes_deg: np.ndarray) -> np.ndarray:
     """Run-up (pan, tilt) that takes up a play and a few stop errors, with a margin.
 
     Args:
         physical: parameters in the units of their names, shape (p,): ratios and scatter of stops.
-        lost_deg: the play of (pan, tilt) that is to be taken up.
+        play_axes_deg: the play of (pan, tilt) that is to be taken up.
     """
     result = []
-    for (axis, sides), lost in zip(SENSES.items(), lost_deg, strict=True):
+    for (axis, sides), play_deg in zip(SENSES.items(), play_axes_deg, strict=True):
         scatter = max(physical[INDEX[f"stop_sd_deg.{side}"]] for side in sides)
         ratio = abs(physical[INDEX[f"degrees_per_step.{axis}"]])
-        result.append(math.ceil(RUN_UP_MARGIN * (lost + RUN_UP_STOPS * scatter) / ratio))
+        result.append(math.ceil(RUN_UP_MARGIN * (play_deg + RUN_UP_STOPS * scatter) / ratio))
     return np.array(result)
 
 
 def overshoot_steps(knowledge: Knowledge) -> np.ndarray:
-    """Run-up (pan, tilt) that takes up the play in 99 % of instruments that are expected."""
+    """Run-up (pan, tilt) that takes up the play in 99 % of expected instruments."""
     draws = draws_of(knowledge, 200, np.random.default_rng(17))
     physical = np.stack([physical_at(z, knowledge.space).value for z in draws])
-    lost = np.quantile(physical[:, BACKLASH_COLUMNS], 0.99, axis=0)
-    return run_up_steps(np.median(physical, axis=0), lost)
+    play_deg = np.quantile(physical[:, BACKLASH_COLUMNS], 0.99, axis=0)
+    return run_up_steps(np.median(physical, axis=0), play_deg)
 
 
 @dataclass(frozen=True)
@@ -95,10 +95,10 @@ class Positions:
     def __getitem__(self, chosen: np.ndarray) -> Positions:
         return Positions(self.steps[chosen], self.sheet[chosen])
 
-    def also(self, pan_turns: Sequence[int]) -> Positions:
-        """These, and the same so many steps of pan away."""
-        moved = [self.steps, *(self.steps + np.array([turn, 0]) for turn in pan_turns)]
-        return Positions(np.concatenate(moved), np.tile(self.sheet, len(moved)))
+    def with_turns(self, pan_turns: Sequence[int]) -> Positions:
+        """The positions, and the same shifted by turns of pan, steps."""
+        shifted = [self.steps, *(self.steps + np.array([turn, 0]) for turn in pan_turns)]
+        return Positions(np.concatenate(shifted), np.tile(self.sheet, len(shifted)))
 
     def visible(self, knowledge: Knowledge, points: np.ndarray) -> np.ndarray:
         """Share of instruments at points (n, p) whose images both show the spot, shape (m,)."""
@@ -106,42 +106,42 @@ class Positions:
         return arrays.in_images(points).mean(axis=0)
 
 
-def sided(positions: Positions, limits: np.ndarray, overshoot: np.ndarray) -> Looks:
+def from_all_sides(positions: Positions, limits: np.ndarray, overshoot: np.ndarray) -> Looks:
     """Positions from all four sides whose run-up stays inside the limits (2, 2)."""
     parts = []
     for side in itertools.product((1, -1), repeat=2):
         start = positions.steps - np.array(side) * overshoot
-        both = np.stack([positions.steps, start])
-        good = np.all((both >= limits[:, 0]) & (both <= limits[:, 1]), axis=(0, 2))
-        sides = np.tile(np.array(side), (int(good.sum()), 1))
-        parts.append(Looks(positions.steps[good], sides, positions.sheet[good]))
+        end_points = np.stack([positions.steps, start])
+        inside = np.all((end_points >= limits[:, 0]) & (end_points <= limits[:, 1]), axis=(0, 2))
+        sides = np.tile(np.array(side), (int(inside.sum()), 1))
+        parts.append(Looks(positions.steps[inside], sides, positions.sheet[inside]))
     return Looks(*(np.concatenate([getattr(some, part.name) for some in parts]) for part in fields(Looks)))
 
 
 @dataclass(frozen=True)
-class Allowed:
+class CounterRange:
     """Lowest and highest counter of (pan, tilt), shape (2, 2), and notes where the rig file states none."""
 
     limits: np.ndarray
     notes: tuple[str, ...]
 
 
-def allowed(stated: CounterLimits, widest: Mapping[str, tuple[int, int]]) -> Allowed:
-    """What the rig file states, else `widest`."""
-    limits = stated.within(widest)
-    steps = np.array([limits[axis] for axis in AXES])
+def counter_range(stated: CounterLimits, widest: Mapping[str, tuple[int, int]]) -> CounterRange:
+    """The limits of the rig file, else `widest`."""
+    by_axis = stated.within(widest)
+    steps = np.array([by_axis[axis] for axis in AXES])
     if not stated.unstated:
-        return Allowed(steps, ())
-    ranges = ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in limits.items())
+        return CounterRange(steps, ())
+    ranges = ", ".join(f"{axis} {low} to {high}" for axis, (low, high) in by_axis.items())
     note = (
         f"[positioner] does not state {', '.join(stated.unstated)}: counters stay within {ranges}; wider limits would "
         "allow longer travel, and full turns"
     )
-    return Allowed(steps, (note,))
+    return CounterRange(steps, (note,))
 
 
 def _box_in_view(knowledge: Knowledge, limits: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """Lowest and highest counter of (pan, tilt) that both cameras see at the most probable instrument, shape (2, 2)."""
+    """Lowest and highest counter of (pan, tilt) in view of both cameras at the most probable instrument, (2, 2)."""
     reach = REACH_DEG / np.abs(ratio)
     window = np.stack([np.maximum(limits[:, 0], -reach), np.minimum(limits[:, 1], reach)], axis=1)
     coarse = Positions.grid(window, (COARSE_PAN, COARSE_TILT), len(knowledge.sheets))
@@ -159,42 +159,42 @@ def _box_in_view(knowledge: Knowledge, limits: np.ndarray, ratio: np.ndarray) ->
 
 @dataclass(frozen=True)
 class _InView:
-    """Positions that drawn instruments see, and notes on those that were left out."""
+    """Positions that drawn instruments see, and notes on excluded ones."""
 
     positions: Positions
     notes: tuple[str, ...]
 
 
-def _in_view(knowledge: Knowledge, box: np.ndarray, turns: Sequence[int], half_turn: float) -> _InView:
+def _visible_positions(knowledge: Knowledge, box: np.ndarray, turns: Sequence[int], half_turn: float) -> _InView:
     """Positions of a box (2, 2) and full turns away from it that `VISIBLE_SHARE` of drawn instruments see."""
-    positions = Positions.grid(box, (PAN_LEVELS, TILT_LEVELS), len(knowledge.sheets)).also(turns)
+    positions = Positions.grid(box, (PAN_LEVELS, TILT_LEVELS), len(knowledge.sheets)).with_turns(turns)
     share = positions.visible(knowledge, draws_of(knowledge, VISIBILITY_DRAWS, np.random.default_rng(23)))
-    good = share >= VISIBLE_SHARE
-    near = np.abs(positions.steps[:, 0] - box[0].mean()) < half_turn
+    visible = share >= VISIBLE_SHARE
+    in_box = np.abs(positions.steps[:, 0] - box[0].mean()) < half_turn
     notes = []
-    if turns and not (good & ~near).any():
+    if turns and not (visible & ~in_box).any():
         notes.append(
             "a full turn is allowed, but the ratio is not yet known well enough to find the spot after it: measure "
             "first, then plan with --given"
         )
-    if (good & near).sum() < 2 * LOOKS_PER_EXPERIMENT:
-        good = near & (positions.visible(knowledge, knowledge.z[None]) > 0)
+    if (visible & in_box).sum() < 2 * LOOKS_PER_EXPERIMENT:
+        visible = in_box & (positions.visible(knowledge, knowledge.z[None]) > 0)
         notes.append(
             "where the positioner stands is stated so loosely that looks may miss the images (as few as "
-            f"{100 * share[good].min(initial=1.0):.0f} % of drawn instruments see one): state all six extrinsics in "
+            f"{100 * share[visible].min(initial=1.0):.0f} % of drawn instruments see one): state all six extrinsics in "
             "[rig.prior], to some 0.03 rad and 5 mm, or measure little and plan with --given"
         )
-    return _InView(positions[good], tuple(notes))
+    return _InView(positions[visible], tuple(notes))
 
 
 def candidates(knowledge: Knowledge) -> Candidates:
-    """Looks on a grid over what images and motor limits allow, on every sheet, from both sides of both axes.
+    """Looks on a grid within images and motor limits, on every sheet, from both sides of both axes.
 
-    Where the limits allow, the same beams a full turn of pan away are candidates as well; counters never wrap. A
-    candidate must be in both images in `VISIBLE_SHARE` of drawn instruments: a full turn only once the ratio is known.
+    Where the limits allow, the same beams a full turn of pan away are candidates too; counters never wrap. A candidate
+    must be in both images in `VISIBLE_SHARE` of drawn instruments: a full turn only once the ratio is known.
 
     Raises:
-        InputError: no sheets, nothing that both cameras see, or limits too narrow for a run-up.
+        InputError: no sheets, nothing in view of both cameras, or limits too narrow for a run-up.
     """
     rig = knowledge.rig
     if not rig.depths_mm:
@@ -206,17 +206,17 @@ def candidates(knowledge: Knowledge) -> Candidates:
     ratio = physical[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
     widest: Mapping[str, tuple[int, int]] = UNSTATED_STEPS
     if rig.table.mechanism.sightings:
-        # What no picture bounds goes as far as candidates do.
+        # Without pictures the range is that of candidates.
         reach = {axis: int(REACH_DEG / abs(r)) for axis, r in zip(AXES, ratio.tolist(), strict=True)}
         widest = {axis: (-steps, steps) for axis, steps in reach.items()}
-    counters = allowed(rig.limits, widest)
-    limits = counters.limits
+    stated_range = counter_range(rig.limits, widest)
+    limits = stated_range.limits
     overshoot = overshoot_steps(knowledge)
     box = _box_in_view(knowledge, limits, ratio)
     turn = round(FULL_TURN_DEG / abs(float(ratio[0])))
     turns = [n for n in (turn, -turn) if limits[0, 0] <= box[0, 1] + n and box[0, 0] + n <= limits[0, 1]]
-    view = _in_view(knowledge, box, turns, 0.5 * turn)
-    looks = sided(view.positions, limits, overshoot)
+    view = _visible_positions(knowledge, box, turns, 0.5 * turn)
+    looks = from_all_sides(view.positions, limits, overshoot)
     if not len(looks):
         raise InputError(
             "limits",
@@ -226,5 +226,5 @@ def candidates(knowledge: Knowledge) -> Candidates:
             column="positioner",
             remedy="widen the limits in [positioner], or state backlash and ratio more closely in [rig.prior]",
         )
-    away = np.abs(looks.steps[:, 0] - box[0].mean()) >= 0.5 * turn
-    return Candidates(looks, overshoot, limits, away, (*counters.notes, *view.notes))
+    turned = np.abs(looks.steps[:, 0] - box[0].mean()) >= 0.5 * turn
+    return Candidates(looks, overshoot, limits, turned, (*stated_range.notes, *view.notes))

@@ -1,4 +1,4 @@
-"""Instruments that may stand there: drawn from `[truth]` of the rig file, or from the posterior of a campaign."""
+"""Possible instruments: drawn from `[truth]` of the rig file, or from the posterior of a campaign."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from tvsbayes.twin.true_rig import Truth, draw_truth
 
 @dataclass(frozen=True)
 class Instruments:
-    """Points of parameter space that may be true, n of them.
+    """Possible points of parameter space, n of them.
 
     Attributes:
         z: coordinates, shape (n, p).
-        value: of their spaces, shape (n, rig): what the priors hold fixed is held at its true value.
+        value: of their spaces, shape (n, rig): parameters fixed by the priors are at their true values.
         physical: values in the units of `NAMES`, shape (n, p).
         common: the rest of their spaces.
     """
@@ -33,9 +33,9 @@ class Instruments:
     @classmethod
     def at(cls, z: np.ndarray, value: np.ndarray, common: ParameterSpace) -> Instruments:
         """Points with coordinates (n, p) in spaces that differ by `value` (n, rig)."""
-        bare = cls(z, value, np.empty_like(z), common)
-        physical = [physical_at(point, bare.space_of(row)).value for row, point in enumerate(z)]
-        return replace(bare, physical=np.array(physical).reshape(z.shape))
+        instruments = cls(z, value, np.empty_like(z), common)
+        physical = [physical_at(point, instruments.space_of(row)).value for row, point in enumerate(z)]
+        return replace(instruments, physical=np.array(physical).reshape(z.shape))
 
     def __len__(self) -> int:
         return len(self.z)
@@ -44,23 +44,23 @@ class Instruments:
         return Instruments(self.z[chosen], self.value[chosen], self.physical[chosen], self.common)
 
     def space_of(self, row: int) -> ParameterSpace:
-        """The space in which one of them has its coordinates."""
+        """The space of one instrument's coordinates."""
         return replace(self.common, value=placed(self.value[row]))
 
 
 def instruments_in(knowledge: Knowledge, truths: Sequence[Truth]) -> Instruments:
-    """Coordinates of rigs under the ANALYSIS priors; what these hold fixed is held at its true value."""
+    """Coordinates of rigs under the ANALYSIS priors; parameters fixed by these are at their true values."""
     space = knowledge.space
     names = knowledge.rig.table.mechanism.rig_names
-    true = np.array([[truth.parameters[name] for name in names] for truth in truths]).reshape(-1, len(names))
-    cameras = np.array([truth.stereo.vector for truth in truths]).reshape(len(true), -1)
-    # A half-normal with u = 0 is 0 whatever its value; nothing else can be stated for it.
-    held = np.where(np.asarray(space.u) > 0, np.asarray(space.value), true)
-    return Instruments.at(coordinates_of(space, np.concatenate([true, cameras], axis=1)), held, space)
+    truth_values = np.array([[truth.parameters[name] for name in names] for truth in truths]).reshape(-1, len(names))
+    cameras = np.array([truth.stereo.vector for truth in truths]).reshape(len(truth_values), -1)
+    # A half-normal with u = 0 is 0 for any value.
+    value = np.where(np.asarray(space.u) > 0, np.asarray(space.value), truth_values)
+    return Instruments.at(coordinates_of(space, np.concatenate([truth_values, cameras], axis=1)), value, space)
 
 
 def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Coordinates of instruments that may stand there, shape (count, p)."""
+    """Coordinates of possible instruments, shape (count, p)."""
     root = np.linalg.cholesky(knowledge.covariance[:PARAMETERS, :PARAMETERS])
     return knowledge.z + generator.standard_normal((count, PARAMETERS)) @ root.T
 

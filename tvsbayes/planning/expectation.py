@@ -1,9 +1,9 @@
-"""What a plan will tell before it is run: the expected Fisher information of its looks.
+"""The expected Fisher information of a plan's looks.
 
-The model says what the looks would show; the information of the priors (or of a fit) plus J^T C^-1 J of all looks gives
-the covariance that a fit will report. `information_of` judges any plan move by move, through the filter of the
-likelihood: shared stops, home offsets and unknown play as in a fit. Counters in steps, mm, rad; coordinates z have
-prior N(0, 1) each, and so have what the gears repeat at regular counters, further coordinates behind them.
+The model predicts the looks; the information of the priors (or of a fit) plus J^T C^-1 J of all looks gives the
+covariance that a fit will report. `information_of` evaluates any plan move by move, by the filter of the likelihood:
+shared stops, home offsets and unknown play as in a fit. Counters in steps, mm, rad; coordinates z have the prior
+N(0, 1) each, and so have the further coordinates after them, repeated errors of the gears at regular counters.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from tvsbayes.model.laser_path import MoveArrays, mirror_angles, trace
 from tvsbayes.model.parameter_space import Model, ParameterSpace, parameter_space, physical_at
 from tvsbayes.planning.gear_places import (
     NO_PLACES,
+    FittedErrors,
     GearPlaces,
-    TaughtErrors,
-    believed_scales,
+    expected_scales,
     regular_places,
 )
 
@@ -61,7 +61,7 @@ SMALLEST_DESIGN, DESIGN_GROWTH = 512, 4
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known of an instrument when a plan is judged.
+    """Knowledge of an instrument before the looks of a plan.
 
     Attributes:
         rig: limits, sheets, costs; its table and stereo calibration are those of the data where there are any.
@@ -69,9 +69,9 @@ class Knowledge:
         z: most probable coordinates, shape (p,).
         precision: inverse covariance of the coordinates and of the errors at `gears`, shape (p + e, p + e).
         after_data: there is a campaign already: a new session begins with an unknown home offset.
-        gears: counters at which the gears' repeating errors are told apart, see `with_gears`.
-        warm_minutes: how long the machine has been on when looks are taken that go on where a campaign ended.
-        taught: what a fit says of those errors at its own places.
+        gears: counters with coordinates for repeated errors of the gears, see `with_gears`.
+        warm_minutes: time since power-on of looks that continue a campaign.
+        errors_of_fit: estimate of those errors by a fit at its own places.
     """
 
     rig: Rig
@@ -80,7 +80,7 @@ class Knowledge:
     precision: np.ndarray
     after_data: bool = False
     gears: GearPlaces = field(default=NO_PLACES)
-    taught: TaughtErrors | None = None
+    errors_of_fit: FittedErrors | None = None
     warm_minutes: float = 0.0
 
     @property
@@ -104,7 +104,7 @@ class Knowledge:
         return gears_vary(self.rig.table)
 
     def with_gears(self, reached: np.ndarray) -> Knowledge:
-        """The same with the errors of gears at regular places over counters (m, 2); as it is where none repeats.
+        """The knowledge with errors of gears at regular places over counters (m, 2); unchanged for perfect gears.
 
         Ratios are then the slopes of lines over these counters.
         """
@@ -112,56 +112,56 @@ class Knowledge:
             return self
         physical = np.asarray(physical_at(self.z, self.space).value)
         ratio = physical[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
-        return self.with_places(regular_places(reached, ratio, believed_scales(self.z, self.space, self.after_data)))
+        return self.with_places(regular_places(reached, ratio, expected_scales(self.z, self.space, self.after_data)))
 
     def with_places(self, gears: GearPlaces) -> Knowledge:
-        """The same with the errors of gears at given places."""
-        if self.taught is not None:
-            return replace(self, precision=np.linalg.inv(self.taught.carried(gears)), gears=gears)
+        """The knowledge with errors of gears at given places."""
+        if self.errors_of_fit is not None:
+            return replace(self, precision=np.linalg.inv(self.errors_of_fit.covariance_at(gears)), gears=gears)
         precision = np.eye(PARAMETERS + gears.size)
         precision[:PARAMETERS, :PARAMETERS] = self.precision[:PARAMETERS, :PARAMETERS]
         return replace(self, precision=precision, gears=gears)
 
 
 def prior_knowledge(rig: Rig) -> Knowledge:
-    """Before any data: the priors of the rig file."""
+    """Knowledge before any data: the priors of the rig file."""
     return Knowledge(rig, parameter_space(rig.table, rig.stereo), np.zeros(PARAMETERS), np.eye(PARAMETERS))
 
 
 def knowledge_of(result: JointFit, rig: Rig) -> Knowledge:
-    """After a fit: its mode, looks linearised without creep, and Laplace covariance; the rest is the rig file's."""
-    of_data = replace(rig, table=result.campaign.rig, stereo=result.campaign.stereo)
+    """Knowledge after a fit: its mode without creep and its Laplace covariance; the rest is the rig file's."""
+    data_rig = replace(rig, table=result.campaign.rig, stereo=result.campaign.stereo)
     precision = np.linalg.inv(result.covariance)
     z = np.where(np.isin(NAMES, CREEP_NAMES), 0.0, result.z)
-    return Knowledge(of_data, result.space, z, precision, True, taught=taught_errors(result, result.covariance))
+    return Knowledge(data_rig, result.space, z, precision, True, errors_of_fit=fitted_errors(result, result.covariance))
 
 
-def taught_errors(result: JointFit, covariance: np.ndarray) -> TaughtErrors | None:
-    """What a fit says of the errors at the places of its looks, padding left out; None of perfect gears.
+def fitted_errors(result: JointFit, covariance: np.ndarray) -> FittedErrors | None:
+    """Estimate of the errors at the places of a fit's looks, without padding; None for perfect gears.
 
     Args:
         result: the fit.
-        covariance: of the coordinates, shape (p, p), which the errors follow.
+        covariance: of the coordinates, shape (p, p), on which the errors depend.
     """
     if not len(result.information.place_mean):
         return None
-    both = with_places(result.z, covariance, result.information)
+    joint = with_places(result.z, covariance, result.information)
     valid = result.arrays.gears.without_padding().places.valid
     rows = np.concatenate([np.ones(PARAMETERS, dtype=bool), valid, valid])
-    return TaughtErrors(fit_places(result), both.covariance[np.ix_(rows, rows)])
+    return FittedErrors(fit_places(result), joint.covariance[np.ix_(rows, rows)])
 
 
 def fit_places(result: JointFit) -> GearPlaces:
-    """The places of a fit's looks, with the scales of its mode; ratios are its own, lines over its looks."""
+    """The places of a fit's looks, with the scales of its mode and its ratios along lines over its looks."""
     places = result.seen_line.places
     valid = np.asarray(places.valid)
-    steps, on_tilt, share = (np.asarray(part)[valid] for part in (places.steps, places.on_tilt, result.seen_line.share))
+    steps, on_tilt, share = (np.asarray(a)[valid] for a in (places.steps, places.on_tilt, result.seen_line.share))
     ratio = np.asarray(result.mode.physical)[[INDEX[f"degrees_per_step.{axis}"] for axis in AXES]]
-    return GearPlaces(steps, on_tilt, np.radians(ratio), believed_scales(result.z, result.space, True), share)
+    return GearPlaces(steps, on_tilt, np.radians(ratio), expected_scales(result.z, result.space, True), share)
 
 
 class Expectation(eqx.Module):
-    """The looks of a plan as the model expects them at one point of parameter space; first axis: looks.
+    """Expected looks of a plan at one point of parameter space; first axis: looks.
 
     `rows` = d(standardised innovations)/d(coordinates, errors of gears, common offset of pan, of tilt in rad): over all
     looks rows^T rows is the Fisher information. `jacobian` is that of the predictions by coordinates and errors. The
@@ -182,36 +182,36 @@ class Expectation(eqx.Module):
 NOISE_COLUMNS = np.isin(NAMES, NOISE_NAMES)
 
 
-class _MetSheet(eqx.Module):
-    """Where beams meet sheets of given depths X in frame S, and whether the points are in both images."""
+class _SheetPoints(eqx.Module):
+    """Points of beams on sheets of given depths X in frame S, and whether they are in both images."""
 
     points_mm: Float[Array, "3 looks"]
     inside: Bool[Array, " looks"]
 
 
-def met_sheet(
+def sheet_points(
     model: Model,
     moves: MoveArrays,
     depth_mm: Float[Array, " looks"],
     image_px: Float[Array, "4"] | None,
     look_moves: Int[Array, " looks"] | slice = slice(None),
-) -> _MetSheet:
-    """Looks after some of the moves, by default after each, at sheets across X without an error of their own.
+) -> _SheetPoints:
+    """Looks after some of the moves, by default after each, at sheets normal to X, without errors.
 
-    Without images a head says where it points: its points are directions, and every one is seen.
+    Without images (head with sightings) points are directions, and all are visible.
     """
     pan, tilt = mirror_angles(model.transmission, model.tilt_zero_rad, moves).angle_rad[look_moves].T
     ray = trace(model.optics, pan, tilt)
     if image_px is None:
         points = materialise(ray.direction).stacked()
-        return _MetSheet(points, jnp.all(jnp.isfinite(points), axis=0))
+        return _SheetPoints(points, jnp.all(jnp.isfinite(points), axis=0))
     turn = rotation_matrix(model.extrinsics.rotation_rad)
     ray = materialise(Ray(in_frame_s(model.extrinsics, ray.origin_mm), transform(turn, ray.direction)))
-    reach = (depth_mm - ray.origin_mm.x) / ray.direction.x
-    points = materialise(ray.at(jnp.where(jnp.isfinite(reach), reach, 0.0)))
+    distance = (depth_mm - ray.origin_mm.x) / ray.direction.x
+    points = materialise(ray.at(jnp.where(jnp.isfinite(distance), distance, 0.0)))
     pixels = jnp.stack(image(model.cameras, points))
     inside = jnp.all((pixels >= 0) & (pixels <= image_px[:, None]), axis=0)
-    return _MetSheet(points.stacked(), (reach > 0) & inside)
+    return _SheetPoints(points.stacked(), (distance > 0) & inside)
 
 
 @compiled(Expectation)
@@ -230,20 +230,20 @@ def expect(
         space: priors.
         arrays: moves and looks; pixels and points are not read.
         depth_mm: X of each look's sheet in frame S.
-        image_px: largest (u, v, u, v) inside the images; None of a head that says where it points.
-        turning: how errors of the gears turn (pan, tilt), see `GearPlaces.turning`.
+        image_px: largest (u, v, u, v) inside the images; None of a head with sightings.
+        turning: derivative of (pan, tilt) by errors of the gears, see `GearPlaces.turning`.
 
     Returns:
         Expectation of every look, padding included.
     """
     spots = arrays.spots
-    met = met_sheet(space.model(z), arrays.moves, depth_mm, image_px, spots.move_index)
-    seen = met.inside & (spots.valid > 0)
-    harmless = jnp.array(NOWHERE_MM)[:, None]
+    on_sheet = sheet_points(space.model(z), arrays.moves, depth_mm, image_px, spots.move_index)
+    seen = on_sheet.inside & (spots.valid > 0)
+    placeholder = jnp.array(NOWHERE_MM)[:, None]
     arrays = eqx.tree_at(
         lambda a: (a.spots.valid, a.spots.triangulated_mm),
         arrays,
-        (jnp.where(seen, 1.0, 0.0), jnp.where(seen, met.points_mm, harmless).T),
+        (jnp.where(seen, 1.0, 0.0), jnp.where(seen, on_sheet.points_mm, placeholder).T),
     )
     if image_px is None:
         arrays = eqx.tree_at(lambda a: a.spots.tangents, arrays, tangents_at(arrays.spots.triangulated_mm))
@@ -252,33 +252,34 @@ def expect(
     jacobian = jnp.where(NOISE_COLUMNS, 0.0, -lin.residual_jacobian)
     jacobian = jnp.concatenate([jacobian, lin.slope @ turning], axis=2)
     columns = jnp.concatenate([jacobian, lin.slope], axis=2)
-    given = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, spots)
+    inputs = filter_rows(columns, lin.slope, lin.play_sd_rad, lin.stop_variance, lin.drift_variance, spots)
 
     def step(belief, row):
         updated = kalman_update(belief.renewed(row), row)
         return updated.belief, updated.standardised
 
-    _, rows = jax.lax.scan(step, no_belief(columns.shape[2]), given)
+    _, rows = jax.lax.scan(step, no_belief(columns.shape[2]), inputs)
     rows = jnp.where(seen[:, None, None], rows, 0.0)
-    return Expectation(rows, jacobian, lin.slope, given.load, given.keep, given.variance, seen, lin.mirror_angles_rad)
+    noise = inputs.load, inputs.keep, inputs.variance
+    return Expectation(rows, jacobian, lin.slope, *noise, seen, lin.mirror_angles_rad)
 
 
 def tangents_at(direction: Float[Array, "looks 3"]) -> Float[Array, "looks 2 3"]:
-    """Unit vectors along azimuth and elevation at directions, as `sightings.tangent_frames` has them of angles."""
+    """Unit vectors along azimuth and elevation at directions, as `sightings.tangent_frames` for angles."""
     x, y, _ = direction.T
-    level = jnp.maximum(jnp.hypot(x, y), 1e-9)
-    across = jnp.stack([-y / level, x / level, jnp.zeros_like(x)], axis=1)
-    return jnp.stack([across, jnp.cross(direction, across)], axis=1)
+    horizontal = jnp.maximum(jnp.hypot(x, y), 1e-9)
+    azimuth_tangent = jnp.stack([-y / horizontal, x / horizontal, jnp.zeros_like(x)], axis=1)
+    return jnp.stack([azimuth_tangent, jnp.cross(direction, azimuth_tangent)], axis=1)
 
 
 def design_arrays(
     moves: Sequence[Move], look_moves: Sequence[int], rig: Rig, *, homed_from: int, aperture: bool
 ) -> CampaignArrays:
     """Moves and looks without pixels; segments from `homed_from` on have an unknown home offset."""
-    # Half the moves rounded up: there are twice as many places for them as for looks.
+    # Half the moves rounded up: their arrays have twice the size of those of looks.
     count = len(look_moves)
     size = bucket(max(count, (len(moves) + 1) // 2), SMALLEST_DESIGN, DESIGN_GROWTH)
-    new = redraws(moves, look_moves, homed_from)
+    redraw_arrays = redraws(moves, look_moves, homed_from)
     return CampaignArrays(
         move_arrays(moves, 2 * size),
         SpotArrays(
@@ -290,11 +291,11 @@ def design_arrays(
             triangulated_mm=padded(np.zeros((count, 3)), size),
             valid=padded([1.0] * count, size),
             weight=padded([1.0] * count, size, 1.0),
-            redraw=padded(new.redraw, size, False, bool),
-            redraw_mix=padded(new.redraw_mix, size),
-            new_segment=padded(new.new_segment, size, False, bool),
-            homed=padded(new.homed, size, False, bool),
-            hours=padded(new.hours, size),
+            redraw=padded(redraw_arrays.redraw, size, False, bool),
+            redraw_mix=padded(redraw_arrays.redraw_mix, size),
+            new_segment=padded(redraw_arrays.new_segment, size, False, bool),
+            homed=padded(redraw_arrays.homed, size, False, bool),
+            hours=padded(redraw_arrays.hours, size),
             tangents=padded(np.zeros((count, 2, 3)), size) if rig.table.mechanism.sightings else None,
         ),
         no_gears(size),
@@ -304,7 +305,7 @@ def design_arrays(
 
 
 def largest_px(rig: Rig) -> np.ndarray | None:
-    """Largest (u, v, u, v) inside the images of a rig, shape (4,); None of a head that says where it points."""
+    """Largest (u, v, u, v) inside the images of a rig, shape (4,); None of a head with sightings."""
     if rig.table.mechanism.sightings:
         return None
     return np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
@@ -328,7 +329,7 @@ def expected_information(
 
 @dataclass(frozen=True)
 class PlanInformation:
-    """What a plan will tell.
+    """Expected information of a plan.
 
     Attributes:
         fisher: J^T C^-1 J of all its looks, shape (p + e, p + e), without that of priors or earlier data.
@@ -336,7 +337,7 @@ class PlanInformation:
         moves: its moves.
         look_moves: move of each look.
         minutes: duration by the rig's costs.
-        pose_rad: mean mirror angles (pan, tilt) over the looks seen, at which the headlines hold, shape (2,).
+        pose_rad: mean mirror angles (pan, tilt) over the visible looks, the pose of the headlines, shape (2,).
     """
 
     fisher: np.ndarray
@@ -357,7 +358,7 @@ def plan_minutes(steps: Sequence[PlanStep], rig: Rig) -> float:
     return plan_seconds(rig, steps) / 60
 
 
-def _logged(steps: Sequence[PlanStep], rig: Rig) -> PlanLog:
+def _logged_plan(steps: Sequence[PlanStep], rig: Rig) -> PlanLog:
     log = run_plan(steps, rig)
     if not log.looks:
         remedy = "add `look` steps to the plan"
@@ -377,16 +378,16 @@ def information_of(
 
     Args:
         steps: the plan; every target is a sheet of the rig.
-        knowledge: where the instrument is believed to be.
+        knowledge: of the instrument before the plan.
         aperture: looks also read the aperture.
-        z: another point to look from (a drawn truth), shape (p,).
+        z: another point of evaluation (a drawn truth), shape (p,).
         space: its priors, where they differ.
 
     Raises:
         InputError: a plan that looks at nothing or places an unknown sheet.
     """
     rig = knowledge.rig
-    log = _logged(steps, rig)
+    log = _logged_plan(steps, rig)
     look_moves = tuple(look.move for look in log.looks)
     depth = np.array([rig.depths_mm[log.targets[look.placement]] for look in log.looks])
     arrays = design_arrays(log.moves, look_moves, rig, homed_from=0 if knowledge.after_data else 1, aperture=aperture)

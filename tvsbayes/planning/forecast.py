@@ -1,4 +1,4 @@
-"""What the paper's four-point estimator would do on drawn rigs, and its own number of experiments; deg/step."""
+"""Forecast of the paper's four-point estimator on drawn rigs, and its own number of experiments; deg/step."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tvsbayes.twin.true_rig import Truth, with_derived
 
 @dataclass(frozen=True)
 class ClassicForecast:
-    """What the four-point estimator will do, arrays over draws of the instrument and `DIRECTIONS`, deg/step.
+    """Forecast of the four-point estimator, arrays over draws of the instrument and `DIRECTIONS`, deg/step.
 
     Attributes:
         sd: standard deviation of one experiment, shape (draws, 4).
@@ -42,7 +42,7 @@ CLASSIC_DRAWS = 100
 
 
 def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicForecast | None:
-    """Run the paper's experiments on drawn instruments without noise; None where the rig has no two sheets.
+    """Simulates the paper's experiments on drawn instruments without noise; None where the rig has no two sheets.
 
     Pixels by the twin; noise by first-order propagation of pixel noise, of the two stops of an experiment and of the
     scatter of its looks.
@@ -52,40 +52,40 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         return None
     near, far = knowledge.sheets[0], knowledge.sheets[1]
     plan = four_point_protocol(2, targets=(near, far))
-    close_mm, away_mm = rig.sheets_mm[near], rig.sheets_mm[far]
+    near_mm, far_mm = rig.sheets_mm[near], rig.sheets_mm[far]
     # A beam through two spots that its angle scatters at, e each: (away e2 - close e1) / (away - close).
-    beam = (close_mm**2 + away_mm**2) / (away_mm - close_mm) ** 2
+    factor = (near_mm**2 + far_mm**2) / (far_mm - near_mm) ** 2
     pixels, steps, axes, local, stops, looks, spot_sds = [], [], [], [], [], [], []
-    first = None
+    campaign = None
     for physical in instruments.physical[:CLASSIC_DRAWS]:
         parameters = dict(zip(rig.table.mechanism.names, map(float, physical), strict=True))
-        quiet = dict.fromkeys([*names_of("stop_sd_deg", "look_scatter_deg"), "pixel_scale"], 0.0)
+        noise_free = dict.fromkeys([*names_of("stop_sd_deg", "look_scatter_deg"), "pixel_scale"], 0.0)
         stereo = rig.stereo.with_vector(physical[len(RIG_NAMES) :])
-        run = simulate(rig, plan, 0, Truth(with_derived({**parameters, **quiet}), stereo))
-        selection = select_experiments(run.campaign)
-        # The second of each direction: its start is reached as all later ones are.
-        later = np.flatnonzero(selection.experiments % 2 == 1)
-        pose = run.truth.reference_pose_deg
-        if len(later) < len(DIRECTIONS) or pose is None:
+        simulated = simulate(rig, plan, 0, Truth(with_derived({**parameters, **noise_free}), stereo))
+        selection = select_experiments(simulated.campaign)
+        # The second experiment of each direction: its start is reached like those of all later ones.
+        second_experiments = np.flatnonzero(selection.experiments % 2 == 1)
+        pose = simulated.truth.reference_pose_deg
+        if len(second_experiments) < len(DIRECTIONS) or pose is None:
             continue
-        pixels.append(selection.pixels[later])
-        steps.append(selection.steps[later])
-        axes.append(selection.axis[later])
-        true = local_deg_per_step(with_derived(parameters), pose)
-        local.append([true[d] for d in DIRECTIONS])
+        pixels.append(selection.pixels[second_experiments])
+        steps.append(selection.steps[second_experiments])
+        axes.append(selection.axis[second_experiments])
+        true_ratio = local_deg_per_step(with_derived(parameters), pose)
+        local.append([true_ratio[d] for d in DIRECTIONS])
         stops.append([parameters[f"stop_sd_deg.{d}"] ** 2 for d in DIRECTIONS])
         looks.append(np.repeat([parameters[name] ** 2 for name in LOOK_SCATTER_NAMES], 2))
         spot_sds.append([rig.spot_sd_px * parameters["pixel_scale"]])
-        first = run.campaign if first is None else first
-    if first is None:
+        campaign = simulated.campaign if campaign is None else campaign
+    if campaign is None:
         return None
     slopes = ratio_slopes(np.concatenate(pixels), np.concatenate(steps), np.concatenate(axes), rig.stereo)
     ratio = slopes.ratio.reshape(-1, len(DIRECTIONS))
     by_pixel = np.sum(slopes.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
-    pair = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]] + 2 * beam * np.array(looks)
-    variance = by_pixel * np.array(spot_sds) ** 2 + pair * (ratio / np.array(local) / np.array(steps)) ** 2
-    # Every direction has its experiments, else the draw was left out.
-    stereo_u = np.array([r.u_stereo_deg_per_step for r in classic(first).directions.values() if r is not None])
+    stop_variance = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]] + 2 * factor * np.array(looks)
+    variance = by_pixel * np.array(spot_sds) ** 2 + stop_variance * (ratio / np.array(local) / np.array(steps)) ** 2
+    # Every direction has experiments: other draws are skipped.
+    stereo_u = np.array([r.u_stereo_deg_per_step for r in classic(campaign).directions.values() if r is not None])
     return ClassicForecast(np.sqrt(variance), ratio - np.array(local), stereo_u)
 
 
@@ -93,13 +93,13 @@ def classic_count(sd: float, half_width: float) -> int:
     """Experiments of one direction for a 95 % half width: n = (t s / E)^2, t with n - 1 degrees of freedom."""
     n = 2
     for _ in range(200):
-        wanted = max(2, math.ceil((coverage_factor(n - 1) * sd / half_width) ** 2))
-        if wanted <= n:
-            # t falls with n: from above the first n that suffices is the answer.
+        needed = max(2, math.ceil((coverage_factor(n - 1) * sd / half_width) ** 2))
+        if needed <= n:
+            # t decreases with n: from above, the first sufficient n is the answer.
             while n > 2 and (coverage_factor(n - 2) * sd / half_width) ** 2 <= n - 1:
                 n -= 1
             return n
-        n = min(wanted, 2 * n)
+        n = min(needed, 2 * n)
     return n
 
 
@@ -108,11 +108,11 @@ class ClassicAnswer:
     """The four-point method's own number of experiments: n = (t s / E)^2 in every direction.
 
     Attributes:
-        direction: the one that needs most, or the one asked for.
+        direction: the one that needs most, or that of the target.
         sd, sd_interval95: s, deg/step: median and 95 % range, over instruments or (with data) by chi-square.
         half_width: E, deg/step.
         experiments, experiments_interval95: n of one direction, for s and for its interval.
-        stereo_u: what is common to all experiments, deg/step; no n lowers it.
+        stereo_u: uncertainty common to all experiments, deg/step; no n lowers it.
         systematic, systematic_interval95: its error for the median instrument and in 95 % of them, deg/step.
         from_data: s was measured.
     """
@@ -134,7 +134,7 @@ def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: C
     if forecast is None or not target.of_ratios:
         return None
     half_width = target.limit * NORMAL_95 / target.factor
-    measured = None if campaign is None else _measured(campaign)
+    measured = None if campaign is None else _measured_sds(campaign)
     answers = []
     for index in target.indices:
         direction = DIRECTIONS[index]
@@ -161,8 +161,8 @@ def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: C
     return max(answers, key=lambda a: a.experiments)
 
 
-def _measured(campaign: Campaign) -> dict[str, tuple[float, int]] | None:
-    """S and n of each direction of a campaign with complete experiments."""
+def _measured_sds(campaign: Campaign) -> dict[str, tuple[float, int]] | None:
+    """The sd s and n of each direction of a campaign with complete experiments."""
     try:
         results = classic(campaign).directions
     except TvsError:
@@ -171,10 +171,10 @@ def _measured(campaign: Campaign) -> dict[str, tuple[float, int]] | None:
 
 
 def value_of_classic(forecast: ClassicForecast | None, target: Target, experiments: int) -> float | None:
-    """Median over instruments of what the classic estimator should report: type A and stereo, as GUM adds them."""
-    each = experiments / len(DIRECTIONS)
-    if forecast is None or each < 2 or not target.of_ratios:
+    """Median over instruments of the expected classic uncertainty: type A and stereo, combined as in the GUM."""
+    per_direction = experiments / len(DIRECTIONS)
+    if forecast is None or per_direction < 2 or not target.of_ratios:
         return None
     rows = list(target.indices)
-    u = np.sqrt(forecast.sd[:, rows] ** 2 / each + forecast.stereo_u[rows] ** 2)
+    u = np.sqrt(forecast.sd[:, rows] ** 2 / per_direction + forecast.stereo_u[rows] ** 2)
     return float(target.factor * np.median(u.max(axis=1)))

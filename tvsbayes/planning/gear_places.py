@@ -1,8 +1,8 @@
-"""What gears repeat, as further coordinates of a plan: their errors at regular counters that plans may use.
+"""Repeated errors of the gears as further coordinates of a plan, at regular counters that plans may use.
 
-In a fit these errors are integrated out at the counters seen; before one nobody knows which those will be. Of the
-regular places each is N(0, 1) in units of the factor of their covariance at the believed scales (formulation 3.1, 6),
-transmission errors first, then plays; what lies between follows from them (kriging). Counters in steps, angles in rad.
+A fit integrates these errors out at its counters; before a plan these are unknown. The errors at the regular places are
+N(0, 1) each in units of the factor of their covariance at the expected scales (formulation 3.1, 6), transmission errors
+first, then plays; errors in between follow by kriging. Counters in steps, angles in rad.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from tvsbayes.model.laser_path import beam_angles
 from tvsbayes.model.parameter_space import ParameterSpace, physical_at
 
 PLACES_MAX = 12
-"""Of one axis in one window."""
+"""Largest number of places of one axis in one window."""
 GAP_DEG = 60.0
-"""Counters of an axis that lie farther apart are windows of their own: a full turn away, for instance."""
+"""Counters of an axis with a larger gap belong to different windows: a full turn away, for instance."""
 
 
 @dataclass(frozen=True)
 class GearPlaces(KnownPlaces):
-    """Places of both axes, and the lines that ratios are.
+    """Places of both axes, and the lines whose slopes are the ratios.
 
     Attributes:
         share: of the value at each place in the slope of the line of its axis, steps^-1, shape (c,).
@@ -46,41 +46,41 @@ class GearPlaces(KnownPlaces):
     share: np.ndarray
 
     def turning(self, steps: np.ndarray, side: np.ndarray) -> np.ndarray:
-        """How the errors turn (pan, tilt) of looks, d(angle)/d(errors), rad, shape (m, 2, 2 c).
+        """Derivative of the angles (pan, tilt) of looks by the errors, rad, shape (m, 2, 2 c).
 
         Args:
             steps: counters, shape (m, 2).
             side: +1 reached left or up, -1 right or down, 0 unknown, shape (m, 2).
         """
-        turns = np.zeros((len(steps), 2, self.size))
+        derivative = np.zeros((len(steps), 2, self.size))
         if self.size:
             for axis in range(2):
-                at = self.between(steps[:, axis], axis)
-                turns[:, axis] = np.concatenate([at.error, -0.5 * side[:, axis, None] * at.play], axis=1)
-        return turns
+                shares = self.between(steps[:, axis], axis)
+                derivative[:, axis] = np.concatenate([shares.error, -0.5 * side[:, axis, None] * shares.play], axis=1)
+        return derivative
 
     def line_through(self, steps: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Share of each place in the slope of the line of its axis through looks, as a fit of these looks has it.
+        """Share of each place in the slope of the line of its axis through looks, as in a fit of these looks.
 
         Args:
             steps: counters of the looks, shape (m, 2).
-            weight: how often each is taken, shape (..., m).
+            weight: number of times each is taken, shape (..., m).
 
         Returns:
-            Shape (..., c); zero for an axis that is seen at one counter alone.
+            Shape (..., c); zero for an axis with looks at a single counter.
         """
         shares = np.zeros((*weight.shape[:-1], len(self.steps)))
         for axis in range(2):
             counters = steps[:, axis].astype(float)
             total = np.maximum(weight.sum(axis=-1, keepdims=True), 1)
-            off = counters - (weight @ counters)[..., None] / total
-            square = np.sum(weight * off**2, axis=-1, keepdims=True)
-            slope = np.divide(weight * off, square, out=np.zeros_like(off), where=square > 0)
+            deviations = counters - (weight @ counters)[..., None] / total
+            squares = np.sum(weight * deviations**2, axis=-1, keepdims=True)
+            slope = np.divide(weight * deviations, squares, out=np.zeros_like(deviations), where=squares > 0)
             shares += slope @ self._interpolation(counters, axis)
         return shares
 
     def _interpolation(self, counters: np.ndarray, axis: int) -> np.ndarray:
-        """Share of the places in the counters (m,) of an axis, each from those of its window, shape (m, c)."""
+        """Share of the places in the counters (m,) of an axis, within their window, shape (m, c)."""
         weights = np.zeros((len(counters), len(self.steps)))
         of_axis = self.on_tilt == (axis == 1)
         windows = windows_of(self.steps[of_axis], abs(float(np.degrees(self.ratio_rad_per_step[axis]))))
@@ -102,7 +102,7 @@ class GearPlaces(KnownPlaces):
     def headlines(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray) -> Headlines:
         """Headlines at coordinates, with derivatives by coordinates and errors, shape (9, p + 2 c).
 
-        Ratios are slopes of the lines over the places, at a pose where gears repeat no error.
+        Ratios are slopes of the lines over the places, at the pose without errors of the gears.
         """
         if not self.size:
             return headlines(z, space, pose_rad)
@@ -113,26 +113,26 @@ class GearPlaces(KnownPlaces):
         )
 
     def parts(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray) -> Headlines:
-        """Headlines by each place alone, and last by none, which `weights` sum: arrays with a leading axis c + 1."""
+        """Headlines for each single place, and last for none; `weights` sum them: arrays with a leading axis c + 1."""
         places = Places(placed(self.steps), placed(self.on_tilt), placed(np.ones(len(self.steps), dtype=bool)))
-        alone = np.eye(len(self.steps) + 1, len(self.steps))
-        return place_headlines(z, space, placed(pose_rad), places, placed(alone), placed(self.root))
+        single_places = np.eye(len(self.steps) + 1, len(self.steps))
+        return place_headlines(z, space, placed(pose_rad), places, placed(single_places), placed(self.root))
 
     def weights(self, share: np.ndarray) -> np.ndarray:
-        """How lines sum `parts`, shape (..., 9, c + 1): a slope over places is the sum of what each has in it.
+        """Weights of `parts` for lines, shape (..., 9, c + 1): a slope over places is the sum of their contributions.
 
         Args:
             share: of each place in the slope of the line of its axis, steps^-1, shape (..., c).
         """
-        of_places = np.where(LINED_AXIS[:, None] == self.on_tilt, share[..., None, :], 0.0)
+        of_places = np.where(LINE_AXES[:, None] == self.on_tilt, share[..., None, :], 0.0)
         of_none = ~(of_places != 0).any(axis=-1, keepdims=True)
         return np.concatenate([of_places, of_none], axis=-1)
 
 
 NO_PLACES = GearPlaces(np.zeros(0), np.zeros(0, dtype=bool), np.zeros(2), None, np.zeros(0))
-"""Of gears that repeat no error."""
-LINED_AXIS = np.array([AXES.index(of.axis) if of.ratio and of.axis else -1 for of in TARGETS.values()])
-"""The axis over whose places each of `TARGETS` is a line, -1 for none."""
+"""Places of perfect gears."""
+LINE_AXES = np.array([AXES.index(q.axis) if q.ratio and q.axis else -1 for q in TARGETS.values()])
+"""Axis of the line of each of `TARGETS`, -1 for none."""
 
 
 @compiled(Headlines)
@@ -149,7 +149,7 @@ def place_headlines(
     Derivatives are by coordinates and errors at the places.
     """
 
-    def along(share):
+    def headlines_of(share):
         line = SeenLine(pose_rad, places, share)
 
         def values(point):
@@ -161,13 +161,13 @@ def place_headlines(
         point = jnp.concatenate([z, jnp.zeros(len(root))])
         return Headlines(values(point), jax.jacfwd(values)(point))
 
-    return jax.vmap(along)(shares)
+    return jax.vmap(headlines_of)(shares)
 
 
-def believed_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> GearScales:
-    """Scales of the gears' errors at coordinates; before any data root mean squares of those that may be zero.
+def expected_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> GearScales:
+    """Scales of the gears' errors at coordinates; before any data root mean squares of half-normal ones.
 
-    What sampling reports is a variance over all that a scale may be, E s^2: of a half-normal u^2.
+    Sampling averages the variance over a scale, E s^2: u^2 for a half-normal.
     """
     physical = np.array(physical_at(z, space).value)
     if not after_data:
@@ -177,38 +177,38 @@ def believed_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> G
 
 
 def windows_of(counters: np.ndarray, deg_per_step: float) -> list[np.ndarray]:
-    """Different counters (n,) of an axis, apart where nothing lies within `GAP_DEG`; best filled, nearest 0 first."""
-    different = np.unique(counters).astype(float)
-    apart = np.flatnonzero(np.diff(different) * deg_per_step > GAP_DEG) + 1
-    return sorted(np.split(different, apart), key=lambda window: (-len(window), abs(window.mean())))
+    """Distinct counters (n,) of an axis, split at gaps above `GAP_DEG`; the largest windows, nearest to 0, first."""
+    distinct = np.unique(counters).astype(float)
+    gaps = np.flatnonzero(np.diff(distinct) * deg_per_step > GAP_DEG) + 1
+    return sorted(np.split(distinct, gaps), key=lambda window: (-len(window), abs(window.mean())))
 
 
 def regular_places(reached: np.ndarray, ratio_deg_per_step: np.ndarray, scales: GearScales) -> GearPlaces:
-    """Places over the counters that plans may use; a ratio is the line over those of its axis' first window.
+    """Places over the counters that plans may use; a ratio is the slope of the line over its axis' first window.
 
     Args:
         reached: counters (pan, tilt), shape (m, 2).
         ratio_deg_per_step: mean ratios, shape (2,).
-        scales: believed.
+        scales: expected.
     """
     steps, on_tilt, share = [], [], []
     for axis in range(2):
         deg_per_step = abs(float(ratio_deg_per_step[axis]))
-        for number, chain in enumerate(windows_of(reached[:, axis], deg_per_step)):
-            wanted = math.ceil(np.ptp(chain) * deg_per_step / SPACING_DEG) + 1
-            nodes = np.linspace(chain[0], chain[-1], min(max(wanted, 2), PLACES_MAX)) if len(chain) > 1 else chain
-            off = nodes - nodes.mean()
-            lined = number == 0 and len(nodes) > 1
+        for number, window in enumerate(windows_of(reached[:, axis], deg_per_step)):
+            count = math.ceil(np.ptp(window) * deg_per_step / SPACING_DEG) + 1
+            nodes = np.linspace(window[0], window[-1], min(max(count, 2), PLACES_MAX)) if len(window) > 1 else window
+            deviations = nodes - nodes.mean()
+            has_line = number == 0 and len(nodes) > 1
             steps.append(nodes)
             on_tilt.append(np.full(len(nodes), axis == 1))
-            share.append(off / (off @ off) if lined else np.zeros(len(nodes)))
-    at, axis_of, line = (np.concatenate(part) for part in (steps, on_tilt, share))
-    return GearPlaces(at, axis_of, np.radians(ratio_deg_per_step), scales, line)
+            share.append(deviations / (deviations @ deviations) if has_line else np.zeros(len(nodes)))
+    all_steps, all_on_tilt, all_shares = (np.concatenate(part) for part in (steps, on_tilt, share))
+    return GearPlaces(all_steps, all_on_tilt, np.radians(ratio_deg_per_step), scales, all_shares)
 
 
 @dataclass(frozen=True)
-class TaughtErrors:
-    """What a fit says of the errors at its own places.
+class FittedErrors:
+    """Estimate of the errors by a fit at its own places.
 
     Attributes:
         places: its places.
@@ -218,21 +218,21 @@ class TaughtErrors:
     places: GearPlaces
     covariance: np.ndarray
 
-    def carried(self, places: GearPlaces) -> np.ndarray:
-        """The same covariance of the coordinates and of the errors at other places."""
+    def covariance_at(self, places: GearPlaces) -> np.ndarray:
+        """The covariance of the coordinates and of the errors at other places."""
         size, count = len(self.places.steps), len(NAMES)
         scales = self.places.scales
         assert scales is not None, "a fit with places has scales"
-        # In their units errors hang together whatever their size; no play would leave nothing to divide by.
-        sized = replace(scales, play_rad=np.where(scales.play_rad > 0, scales.play_rad, 1.0))
-        taught, wanted = replace(self.places, scales=sized), replace(places, scales=sized)
-        roots = np.split(wanted.root, 2)
-        factors = taught.factors_with(wanted.steps, wanted.on_tilt)
-        follows, rest = [], []
+        # Correlations do not depend on the size of the errors; a zero size of play would divide by zero.
+        scaled = replace(scales, play_rad=np.where(scales.play_rad > 0, scales.play_rad, 1.0))
+        fitted, target = replace(self.places, scales=scaled), replace(places, scales=scaled)
+        roots = np.split(target.root, 2)
+        factors = fitted.factors_with(target.steps, target.on_tilt)
+        loadings, residual_roots = [], []
         for part, factor in zip((roots[0][:, : len(roots[0])], roots[1][:, len(roots[0]) :]), factors, strict=True):
-            turned = linalg.solve_triangular(part, factor[size:], lower=True)
-            follows.append(turned[:, :size])
-            rest.append(turned[:, size:])
-        move = linalg.block_diag(np.eye(count), *follows)
-        left = linalg.block_diag(np.zeros((count, count)), *(part @ part.T for part in rest))
-        return move @ self.covariance @ move.T + left
+            loading = linalg.solve_triangular(part, factor[size:], lower=True)
+            loadings.append(loading[:, :size])
+            residual_roots.append(loading[:, size:])
+        transfer = linalg.block_diag(np.eye(count), *loadings)
+        residual = linalg.block_diag(np.zeros((count, count)), *(part @ part.T for part in residual_roots))
+        return transfer @ self.covariance @ transfer.T + residual

@@ -1,4 +1,4 @@
-"""What no further look improves, what input would, the next looks, and when to stop. Values in the target's unit."""
+"""The floor of a target, the inputs that set it, the next looks, and the stopping rule. Values in the target's unit."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from tvsbayes.results.plan_record import Advice, Batch
 
 @dataclass(frozen=True)
 class Limit:
-    """What is left of the target's variance when looks no longer matter.
+    """The remaining variance of the target after very many looks.
 
     Attributes:
-        floor: value that no number of looks goes below, in the target's unit.
+        floor: lowest value for any number of looks, in the target's unit.
         cause: the largest share of the floor.
         shares: share of every cause of the floor's variance; they add up to 1.
         reachable: the target lies above the floor.
-        needed: in words, the input uncertainty that would do, None where no input is in the way.
+        needed: the sufficient input uncertainty, in words; None where no input prevents the target.
     """
 
     floor: float
@@ -38,12 +38,12 @@ class Limit:
     needed: str | None
 
 
-MANY = 100.0
-"""So many times the largest design stand for "no matter how many": a week of looks. Beyond that the spots would be
-calibrating the cameras, and a model would be believed to a thousandth of a pixel."""
+MANY_TIMES = 100.0
+"""Multiple of the largest design that represents any number of looks: a week. With more, the spots would calibrate the
+cameras, with trust in the model to a thousandth of a pixel."""
 NEXT_LISTED = 5
 STOP_SHARE_PER_MINUTE = 1e-3
-"""Measuring is no longer worth while when the best next looks lower the target by less than this share a minute."""
+"""Measuring stops when the best next looks lower the target by less than this share a minute."""
 
 
 def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, aim: Sensitivity) -> dict[str, float]:
@@ -52,68 +52,68 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, a
     Args:
         knowledge: before the looks.
         data: information of the looks, shape (p + e, p + e).
-        noise: its part that pixel noise alone stands for, or None to leave the looks whole.
+        noise: its part by pixel noise alone, or None not to split the looks.
         aim: the target.
     """
     covariance = covariance_of(knowledge.precision + data)
     worst = int(np.argmax(np.einsum("qi,ij,qj->q", aim.gradient, covariance, aim.gradient) + aim.own_variance))
-    pull = covariance @ aim.gradient[worst]
+    loading = covariance @ aim.gradient[worst]
     parts = {}
     if noise is None:
-        parts["looks"] = float(pull @ data @ pull)
+        parts["looks"] = float(loading @ data @ loading)
     else:
-        parts["pixel noise"] = float(pull @ noise @ pull)
-        parts["stop errors of the looks"] = float(pull @ (data - noise) @ pull)
+        parts["pixel noise"] = float(loading @ noise @ loading)
+        parts["stop errors of the looks"] = float(loading @ (data - noise) @ loading)
     if knowledge.after_data:
-        # What the campaign taught and its priors cannot be told apart here: `locate --budget` and `fit` do.
-        parts["the campaign and its priors"] = float(pull @ knowledge.precision @ pull)
+        # Campaign and priors are not separated here: `locate --budget` and `fit` do it.
+        parts["the campaign and its priors"] = float(loading @ knowledge.precision @ loading)
     else:
         for name, columns in knowledge.rig.table.mechanism.prior_groups.items():
-            parts[name] = float(np.sum(pull[columns] ** 2))
-        errors = np.split(pull[len(NAMES) :], 2)
+            parts[name] = float(np.sum(loading[columns] ** 2))
+        errors = np.split(loading[len(NAMES) :], 2)
         parts |= {
             name: float(error @ error) for name, error in zip((TRANSMISSION_ERROR, PLAY_VARIATION), errors, strict=True)
         }
     parts |= {name: float(value[worst]) for name, value in aim.own.items()}
     total = sum(parts.values())
-    kept = {name: value / total for name, value in parts.items() if value > 1e-12 * total}
-    return dict(sorted(kept.items(), key=lambda item: -item[1]))
+    shares = {name: value / total for name, value in parts.items() if value > 1e-12 * total}
+    return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-def _at_most(value: float) -> str:
-    """A positive number to two digits, rounded down: an uncertainty that is enough, stated so that it stays enough."""
-    last = 10.0 ** (math.floor(math.log10(value)) - 1)
-    # A number that has two digits already may stand an ulp below them.
-    return f"{last * math.floor(value / last + 1e-9):.2g}"
+def _rounded_down(value: float) -> str:
+    """A positive number to two digits, rounded down: a sufficient uncertainty stays sufficient."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    # A number with two digits may be an ulp below them.
+    return f"{unit * math.floor(value / unit + 1e-9):.2g}"
 
 
-def _state(table: RigTable, columns: Sequence[int], share: float) -> str:
-    """The stated u of a prior, and what it would have to be."""
+def _requirement(table: RigTable, columns: Sequence[int], share: float) -> str:
+    """The stated u of a prior, and the required one, in words."""
     if len(columns) == len(NAMES) - len(RIG_NAMES):
-        return f"the stereo calibration to {_at_most(100 * share)} % of its present uncertainty"
-    stated = {NAMES[c]: table.priors[NAMES[c]].u for c in columns if table.priors[NAMES[c]].u > 0}
-    return " and ".join(f"u({name}) = {_at_most(share * u)} instead of {u:.2g}" for name, u in stated.items())
+        return f"the stereo calibration to {_rounded_down(100 * share)} % of its present uncertainty"
+    prior_u = {NAMES[c]: table.priors[NAMES[c]].u for c in columns if table.priors[NAMES[c]].u > 0}
+    return " and ".join(f"u({name}) = {_rounded_down(share * u)} instead of {u:.2g}" for name, u in prior_u.items())
 
 
 def _needed_at_point(aim: Sensitivity, target: Target) -> str | None:
-    """What would have to be better at the target's point itself, in words; None where no calibration is in its way."""
+    """The required improvement at the target's point itself, in words; None where its variance permits the target."""
     total = aim.own_variance
     gears = aim.own.get(GEARS_AT_POINT, np.zeros_like(total))
     # The worst of the quantities, each with its own parts.
-    stop, geared, whole = (target.factor * math.sqrt(max(variance)) for variance in (total - gears, gears, total))
+    stop, gear, worst = (target.factor * math.sqrt(max(variance)) for variance in (total - gears, gears, total))
     unit = target.unit
     if stop > target.limit:
-        short = f"{stop:.3g} {unit} come from the stop and the reading at the point itself"
-        return f"{short}: only a smaller stop error or aperture noise would do"
-    if whole > target.limit:
-        short = f"{whole:.3g} {unit} come from the point itself: {stop:.3g} from the stop and the reading there, "
-        short += f"{geared:.3g} from errors of the gears, of which looks elsewhere do not tell"
-        return f"{short}; widen the limits in [positioner] until looks reach the point's counters"
+        reason = f"{stop:.3g} {unit} come from the stop and the reading at the point itself"
+        return f"{reason}: only a smaller stop error or aperture noise would do"
+    if worst > target.limit:
+        reason = f"{worst:.3g} {unit} come from the point itself: {stop:.3g} from the stop and the reading there, "
+        reason += f"{gear:.3g} from errors of the gears, of which looks elsewhere do not tell"
+        return f"{reason}; widen the limits in [positioner] until looks reach the point's counters"
     return None
 
 
 def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: Target) -> Limit:
-    """What no number of looks of this kind removes, and what would.
+    """The floor of the target for looks of this kind, and the input that would lower it.
 
     Args:
         knowledge: before the looks.
@@ -121,9 +121,9 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: T
         aim: the target's sensitivities.
         target: the target.
     """
-    many = MANY * data
-    floor = aim.value(covariance_of(knowledge.precision + many), target.factor)
-    shares = split_of(knowledge, many, None, aim)
+    many_looks = MANY_TIMES * data
+    floor = aim.value(covariance_of(knowledge.precision + many_looks), target.factor)
+    shares = split_of(knowledge, many_looks, None, aim)
     cause = next(iter(shares))
     if floor <= target.limit:
         return Limit(floor, cause, shares, True, None)
@@ -135,9 +135,9 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: T
         precision = knowledge.precision.copy()
         for name, share in scaled.items():
             columns = groups[name]
-            # The prior's own precision is 1 in its coordinates, whatever the campaign added.
+            # The precision of the prior is 1 in its coordinates; the campaign adds to it.
             precision[columns, columns] += share**-2 - 1
-        return aim.value(covariance_of(precision + many), target.factor)
+        return aim.value(covariance_of(precision + many_looks), target.factor)
 
     scaled: dict[str, float] = {}
     names = [name for name in shares if name in groups]
@@ -152,18 +152,18 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: T
             middle = math.sqrt(low * high)
             low, high = (middle, high) if with_inputs({**scaled, name: middle}) <= target.limit else (low, middle)
         scaled[name] = low
-        # Earlier ones that turn out not to matter are left as they are.
+        # Earlier inputs that are not needed keep their uncertainty.
         for other in [n for n in scaled if n != name]:
-            kept = {n: s for n, s in scaled.items() if n != other}
-            if with_inputs(kept) <= target.limit:
-                scaled = kept
-        stated = "; ".join(_state(knowledge.rig.table, groups[n], s) for n, s in scaled.items())
+            others = {n: s for n, s in scaled.items() if n != other}
+            if with_inputs(others) <= target.limit:
+                scaled = others
+        stated = "; ".join(_requirement(knowledge.rig.table, groups[n], s) for n, s in scaled.items())
         return Limit(floor, cause, shares, False, f"it would do to know {stated}")
     return Limit(floor, cause, shares, False, "no single input stands in the way: widen the limits or add sheets")
 
 
 def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:
-    """Four looks at every sheet, chosen from all candidates and from those a full turn away, by gain per minute."""
+    """Four looks on every sheet, chosen from all candidates and from those a full turn away, by gain per minute."""
     search, candidates, rig, now = problem.search(), problem.candidates, problem.knowledge.rig, problem.now
     batches = []
     for number in range(len(problem.knowledge.sheets)):
@@ -171,7 +171,7 @@ def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:
             allowed = (candidates.looks.sheet == number) & (candidates.turned | (not turned))
             if not allowed.any():
                 continue
-            best = problem.chosen(search, allowed, LOOKS_PER_EXPERIMENT)
+            best = problem.choose(search, allowed, LOOKS_PER_EXPERIMENT)
             steps, minutes, gain = best.design.steps, best.design.minutes(rig), max(now - best.value, 0.0)
             text = f"{'a full turn of pan away, ' if turned else ''}{describe_looks(rig, steps)}"
             batches.append(Batch(steps, minutes, gain, gain / max(minutes, 1e-9), text))
@@ -180,7 +180,7 @@ def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:
 
 
 def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch], after_data: bool) -> Advice:
-    """The stopping rule: enough, or no use.
+    """The stopping rule: target met, or no useful looks.
 
     Args:
         now: the target's value before further looks.
@@ -190,17 +190,17 @@ def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch],
         after_data: there is a campaign to stop.
     """
     best = batches[0].gain_per_minute if batches else 0.0
-    worth = STOP_SHARE_PER_MINUTE * now
+    least_gain = STOP_SHARE_PER_MINUTE * now
     rule = (
         f"stop when {target.text} holds for a fit of all data, or when the best next four looks lower it by less than "
         f"{100 * STOP_SHARE_PER_MINUTE:g} % a minute"
     )
-    shown = f"{now:.3g} {target.unit}"
+    value = f"{now:.3g} {target.unit}"
     if after_data and now <= target.limit:
-        return Advice(True, f"the target is met: {shown}", rule)
+        return Advice(True, f"the target is met: {value}", rule)
     if not limit.reachable:
         reason = f"no number of looks meets the target: the floor is {limit.floor:.3g} {target.unit}"
         return Advice(after_data, reason if after_data else f"{reason}; measure if that will do", rule)
-    if best < worth:
-        return Advice(True, f"the best next four looks lower {shown} by only {best:.2g} {target.unit} a minute", rule)
-    return Advice(False, f"{shown} now; the best next four looks lower it by {best:.2g} {target.unit} a minute", rule)
+    if best < least_gain:
+        return Advice(True, f"the best next four looks lower {value} by only {best:.2g} {target.unit} a minute", rule)
+    return Advice(False, f"{value} now; the best next four looks lower it by {best:.2g} {target.unit} a minute", rule)

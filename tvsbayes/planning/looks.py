@@ -1,8 +1,8 @@
-"""Looks that stand for themselves: what each shows, and what a design of them tells.
+"""Independent looks: the expectation of each, and the information of a design.
 
-Every look is reached anew on both axes from a known side: their stop errors are independent and information adds up
-look by look; of the history only the length of the path remains (it carries the contrast of the two directions), and
-thousands of candidates are scored by low-rank updates. Counters in steps, angles in rad.
+Every look is approached anew on both axes from a known side: stop errors are independent and information adds up look
+by look. Only the length of the path remains of the history (for the contrast of the two directions), and low-rank
+updates score thousands of candidates. Counters in steps, angles in rad.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from tvsbayes.model.compiled import compiled, placed
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.laser_path import MoveArrays
 from tvsbayes.model.parameter_space import ParameterSpace
-from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge, expect, largest_px, met_sheet
+from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge, expect, largest_px, sheet_points
 
 
 @dataclass(frozen=True)
 class Looks:
-    """Looks that are each reached anew on both axes, arrays over looks.
+    """Looks with a new approach on both axes each, arrays over looks.
 
     Attributes:
         steps: counters (pan, tilt), shape (m, 2).
@@ -50,14 +50,14 @@ class Looks:
 
 
 @dataclass(frozen=True)
-class Arranged:
-    """Looks in the order of a plan: each sheet placed once, side by side, every look with a run-up where it needs one.
+class LookPlan:
+    """Looks in the order of a plan: each sheet placed once, every look with a run-up where needed.
 
     Attributes:
-        order: look at each place of the plan, shape (m,).
-        sheet: name of the sheet at each place.
-        via: counters from which each place is reached: where its run-up begins, or where the one before ended; (m, 2).
-        goal: counters of each place, shape (m, 2).
+        order: number of the look at each position of the plan, shape (m,).
+        sheet: name of the sheet at each position.
+        via: counters before the last move: the start of the run-up, or the end of the previous look; (m, 2).
+        goal: counters of each position, shape (m, 2).
         home: counters of the homing.
     """
 
@@ -70,8 +70,8 @@ class Arranged:
     @cached_property
     def _legs(self) -> np.ndarray:
         """Steps to the start of every run-up and from there to the look, shape (m, 2, 2)."""
-        ends = np.stack([self.via, self.goal], axis=1).reshape(-1, 2)
-        return np.diff(ends, axis=0, prepend=[self.home]).reshape(-1, 2, 2)
+        waypoints = np.stack([self.via, self.goal], axis=1).reshape(-1, 2)
+        return np.diff(waypoints, axis=0, prepend=[self.home]).reshape(-1, 2, 2)
 
     @property
     def path(self) -> np.ndarray:
@@ -81,13 +81,13 @@ class Arranged:
         return path
 
     def warm_minutes(self, rig: Rig) -> np.ndarray:
-        """From the homing to the last move before each look (in the caller's order) by `[costs]`, shape (m,)."""
+        """Minutes from the homing to the last move before each look (in the caller's order), by `[costs]`, (m,)."""
         cost = {name: action_seconds(rig, {name: 1}) for name in ("home", "place", "move", "look")}
         moves = self._legs.any(axis=2).sum(axis=1)
         placed = np.array([now != before for now, before in zip(self.sheet, ("", *self.sheet[:-1]), strict=True)])
         taken = placed * cost["place"] + moves * cost["move"] + cost["look"]
         ends = cost["home"] + np.cumsum(taken)
-        # The time of a row is that at which its move begins; without a move the row before holds on.
+        # The time of a row is the start of its move; without a move that of the previous row.
         last = np.where(moves > 0, ends - cost["look"] - cost["move"], 0.0)
         minutes = np.empty(len(self.order))
         minutes[self.order] = np.maximum.accumulate(last) / 60
@@ -95,7 +95,7 @@ class Arranged:
 
     @property
     def actions(self) -> dict[str, int]:
-        """How many of each kind the plan has."""
+        """Number of actions of each kind."""
         moves, looks = int(self._legs.any(axis=2).sum()), len(self.order)
         places = sum(now != before for now, before in zip(self.sheet, ("", *self.sheet[:-1]), strict=True))
         return {"home": 1, "place": places, "move": moves, "look": looks}
@@ -109,14 +109,14 @@ class Arranged:
         """The plan, from its homing on."""
         plan = PlanBuilder()
         plan.home(*self.home)
-        return self._taken(plan)
+        return self._plan(plan)
 
     @cached_property
     def steps_onwards(self) -> tuple[PlanStep, ...]:
-        """The plan where the axes stand at `home` already."""
-        return self._taken(PlanBuilder(at=self.home))
+        """The plan without homing, where the axes are at `home` already."""
+        return self._plan(PlanBuilder(at=self.home))
 
-    def _taken(self, plan: PlanBuilder) -> tuple[PlanStep, ...]:
+    def _plan(self, plan: PlanBuilder) -> tuple[PlanStep, ...]:
         placed = ""
         for sheet, via, goal in zip(self.sheet, self.via.tolist(), self.goal.tolist(), strict=True):
             if sheet != placed:
@@ -128,30 +128,30 @@ class Arranged:
         return tuple(plan.steps)
 
 
-def arrange(looks: Looks, sheets: Sequence[str], overshoot: np.ndarray, home: tuple[int, int] = (0, 0)) -> Arranged:
+def arrange(looks: Looks, sheets: Sequence[str], overshoot: np.ndarray, home: tuple[int, int] = (0, 0)) -> LookPlan:
     """Order looks into a plan.
 
     Args:
-        looks: what is to be seen.
-        sheets: names, as `Looks.sheet` counts them.
+        looks: to be arranged.
+        sheets: names, in the order of `Looks.sheet`.
         overshoot: run-up (pan, tilt) in steps that takes up all play, shape (2,).
         home: counters of the homing.
     """
     order = np.lexsort((looks.steps[:, 0] * looks.side[:, 0], looks.side[:, 0], looks.side[:, 1], looks.sheet))
     goal, side = looks.steps[order], looks.side[order]
-    before = np.concatenate([np.array([home]), goal])[:-1]
-    via = np.where((goal - before) * side < overshoot, goal - side * overshoot, before)
-    return Arranged(order, tuple(sheets[number] for number in looks.sheet[order]), via, goal, home)
+    previous = np.concatenate([np.array([home]), goal])[:-1]
+    via = np.where((goal - previous) * side < overshoot, goal - side * overshoot, previous)
+    return LookPlan(order, tuple(sheets[number] for number in looks.sheet[order]), via, goal, home)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What m looks show, at one point of parameter space or, with a leading axis, at several.
+    """Expectation of m looks, at one point of parameter space or, with a leading axis, at several.
 
     Attributes:
         rows: shape (m, 4, p + e + 2), see `expectation.Expectation`.
         slope: shape (m, 4, 2).
-        seen: whether they are in both images, shape (m,).
+        seen: whether a look is in both images, shape (m,).
         mirror_angles_rad: (pan, tilt), shape (m, 2).
     """
 
@@ -164,8 +164,8 @@ class Seen:
         return Seen(*(getattr(self, part.name)[chosen] for part in fields(Seen)))
 
 
-class _Shown(eqx.Module):
-    """`Seen` of pairs of an instrument and a look."""
+class _PairExpectation(eqx.Module):
+    """`Seen` for pairs of an instrument and a look."""
 
     rows: Float[Array, "pairs 4 columns"]
     slope: Float[Array, "pairs 4 2"]
@@ -174,7 +174,7 @@ class _Shown(eqx.Module):
 
 
 class _Pairs(eqx.Module):
-    """Instruments, each in front of one look: coordinates, the `value` of its space, and the look."""
+    """Pairs of an instrument and a look: coordinates, the `value` of its space, and the look."""
 
     z: Float[Array, "pairs parameters"]
     value: Float[Array, "pairs rig"]
@@ -183,17 +183,17 @@ class _Pairs(eqx.Module):
     depth_mm: Float[Array, " pairs"]
 
     def space(self, common: ParameterSpace) -> ParameterSpace:
-        """Of one pair."""
+        """The space of one pair."""
         return eqx.tree_at(lambda s: s.value, common, self.value)
 
     def moves(self, warm_minutes: Float[Array, ""]) -> MoveArrays:
-        """Of one pair: the look's counters, reached from its side as if homed there."""
+        """The move of one pair: the look's counters, approached from its side as if homed there."""
         steps, side = self.steps[None], self.side[None]
         return MoveArrays(steps, jnp.ones(1, dtype=bool), side, warm_minutes[None], jnp.zeros(1))
 
 
-class _Eyes(eqx.Module):
-    """What takes the looks: largest (u, v, u, v) inside the images, noise of a look, and the aperture; and when."""
+class _Observer(eqx.Module):
+    """Settings of the observation: largest (u, v, u, v) inside the images, noise of a look, aperture, time."""
 
     image_px: Float[Array, "4"] | None
     look_sd: Float[Array, ""]
@@ -202,17 +202,17 @@ class _Eyes(eqx.Module):
     warm_minutes: Float[Array, ""]
 
 
-@compiled(_Shown)
-def _shown(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> _Shown:
-    """What every pair's look shows: `expect` of a plan of one look."""
+@compiled(_PairExpectation)
+def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer) -> _PairExpectation:
+    """Expectation of every pair's look: `expect` of a plan of one look."""
 
-    def one(pair: _Pairs) -> _Shown:
+    def expectation_of(pair: _Pairs) -> _PairExpectation:
         spot = SpotArrays(
             move_index=jnp.zeros(1, dtype=jnp.int32),
             pixels=jnp.zeros((1, 4)),
-            whitening=jnp.eye(4)[None] / eyes.look_sd,
+            whitening=jnp.eye(4)[None] / observer.look_sd,
             aperture_rad=jnp.zeros(1),
-            has_aperture=eyes.has_aperture[None],
+            has_aperture=observer.has_aperture[None],
             triangulated_mm=jnp.zeros((1, 3)),
             valid=jnp.ones(1),
             weight=jnp.ones(1),
@@ -221,61 +221,61 @@ def _shown(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> _Shown:
             new_segment=jnp.ones(1, dtype=bool),
             homed=jnp.zeros(1, dtype=bool),
             hours=jnp.zeros(1),
-            tangents=jnp.zeros((1, 2, 3)) if eyes.image_px is None else None,
+            tangents=jnp.zeros((1, 2, 3)) if observer.image_px is None else None,
         )
-        none = jnp.zeros(0, dtype=bool)
-        gears = GearArrays(Places(jnp.zeros(0), none, none), jnp.zeros((1, 0)), jnp.zeros((1, 0)))
-        alone = jnp.ones((), dtype=jnp.int32)
-        arrays = CampaignArrays(pair.moves(eyes.warm_minutes), spot, gears, eyes.azimuth_convention, alone)
-        # Errors of the gears turn the mirrors as an offset does: their columns follow from its, outside.
-        still = jnp.zeros((1, 2, 0))
-        expectation = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], eyes.image_px, still)
-        return _Shown(*(getattr(expectation, part.name)[0] for part in fields(_Shown)))
+        no_places = jnp.zeros(0, dtype=bool)
+        gears = GearArrays(Places(jnp.zeros(0), no_places, no_places), jnp.zeros((1, 0)), jnp.zeros((1, 0)))
+        count = jnp.ones((), dtype=jnp.int32)
+        arrays = CampaignArrays(pair.moves(observer.warm_minutes), spot, gears, observer.azimuth_convention, count)
+        # Errors of the gears act as an offset: their columns follow from the offset's, see `at_all`.
+        no_turning = jnp.zeros((1, 2, 0))
+        expectation = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], observer.image_px, no_turning)
+        return _PairExpectation(*(getattr(expectation, part.name)[0] for part in fields(_PairExpectation)))
 
-    return jax.vmap(one)(pairs)
+    return jax.vmap(expectation_of)(pairs)
 
 
 LOOKS_COMPILED_SECONDS = 20.0
 
 
 def looks_wait() -> float:
-    """Seconds to expect of the first looks of a process, beyond their work."""
-    return _shown.wait(LOOKS_COMPILED_SECONDS)
+    """Expected compilation time of the first looks of a process, s."""
+    return _pair_expectation.wait(LOOKS_COMPILED_SECONDS)
 
 
 @compiled(jax.Array)
-def _in_images(pairs: _Pairs, space: ParameterSpace, eyes: _Eyes) -> Bool[Array, " pairs"]:
+def _in_images(pairs: _Pairs, space: ParameterSpace, observer: _Observer) -> Bool[Array, " pairs"]:
     """Whether every pair's look puts its spot into both images."""
 
-    def one(pair: _Pairs) -> Bool[Array, ""]:
-        return met_sheet(
-            pair.space(space).model(pair.z), pair.moves(eyes.warm_minutes), pair.depth_mm[None], eyes.image_px
+    def is_visible(pair: _Pairs) -> Bool[Array, ""]:
+        return sheet_points(
+            pair.space(space).model(pair.z), pair.moves(observer.warm_minutes), pair.depth_mm[None], observer.image_px
         ).inside[0]
 
-    return jax.vmap(one)(pairs)
+    return jax.vmap(is_visible)(pairs)
 
 
 class LookArrays:
-    """Looks in front of the compiled functions: pairs with instruments, in blocks of one size."""
+    """Looks as input of the compiled functions: pairs with instruments, in blocks of one size."""
 
     SHOWN, IN_IMAGES = 128, 1024
-    """Pairs in one call: enough to hide the call, few enough for a processor's cache."""
+    """Pairs in one call: enough to hide its overhead, few enough for a processor's cache."""
 
     def __init__(self, looks: Looks, knowledge: Knowledge, aperture: bool):
         rig, self.looks, self.space = knowledge.rig, looks, knowledge.space
         self.depth_mm = np.array([rig.depths_mm[name] for name in knowledge.sheets])[looks.sheet]
         azimuth = rig.table.aperture_convention == "azimuth"
         self.turning = knowledge.gears.turning(looks.steps, looks.side)
-        of_look = placed(rig.look_sd), placed(float(aperture)), placed(azimuth), placed(knowledge.warm_minutes)
+        settings = placed(rig.look_sd), placed(float(aperture)), placed(azimuth), placed(knowledge.warm_minutes)
         image_px = largest_px(rig)
-        self.eyes = _Eyes(None if image_px is None else placed(image_px), *of_look)
+        self.observer = _Observer(None if image_px is None else placed(image_px), *settings)
 
     def _blocks(self, z: np.ndarray, value: np.ndarray, size: int) -> list[_Pairs]:
-        """Every instrument (n,) with every look (m,), the last block filled up with its last pair."""
+        """Every instrument (n,) with every look (m,), the last block padded with its last pair."""
         m, total = len(self.looks), len(z) * len(self.looks)
         blocks = []
-        for begin in range(0, total, size):
-            pair = np.minimum(np.arange(begin, begin + size), total - 1)
+        for start in range(0, total, size):
+            pair = np.minimum(np.arange(start, start + size), total - 1)
             instrument, look = pair // m, pair % m
             steps, side = self.looks.steps[look].astype(float), self.looks.side[look].astype(float)
             parts = z[instrument], value[instrument], steps, side, self.depth_mm[look]
@@ -283,35 +283,35 @@ class LookArrays:
         return blocks
 
     def at_all(self, z: np.ndarray, value: np.ndarray, turning: np.ndarray | None = None) -> Seen:
-        """At several instruments: a leading axis n.
+        """The expectation at several instruments, with a leading axis n.
 
         Args:
             z: coordinates, shape (n, p).
             value: of their spaces, shape (n, rig).
-            turning: how errors of their own gears turn the looks, shape (n, m, 2, e); by default as of the knowledge's.
+            turning: derivatives by errors of their own gears, shape (n, m, 2, e); by default those of the knowledge.
         """
         turning = self.turning if turning is None else turning
         blocks = [
-            [np.asarray(part) for part in jax.tree.leaves(_shown(block, self.space, self.eyes))]
+            [np.asarray(part) for part in jax.tree.leaves(_pair_expectation(block, self.space, self.observer))]
             for block in self._blocks(z, value, self.SHOWN)
         ]
         shape = len(z), len(self.looks)
-        whole = (np.concatenate(parts)[: shape[0] * shape[1]] for parts in zip(*blocks, strict=True))
-        shown = Seen(*(part.reshape(*shape, *part.shape[1:]) for part in whole))
+        joined = (np.concatenate(parts)[: shape[0] * shape[1]] for parts in zip(*blocks, strict=True))
+        seen = Seen(*(part.reshape(*shape, *part.shape[1:]) for part in joined))
         if not turning.shape[-1]:
-            return shown
-        own, offset = shown.rows[..., :-2], shown.rows[..., -2:]
-        return replace(shown, rows=np.concatenate([own, offset @ turning, offset], axis=-1))
+            return seen
+        columns, offset = seen.rows[..., :-2], seen.rows[..., -2:]
+        return replace(seen, rows=np.concatenate([columns, offset @ turning, offset], axis=-1))
 
     def at(self, z: np.ndarray, space: ParameterSpace) -> Seen:
-        """At one instrument: coordinates (p,) in a space that differs from the knowledge's by `value` at most."""
+        """The expectation at one instrument: coordinates (p,), a space that differs from the knowledge's in `value`."""
         return self.at_all(z[None], np.asarray(space.value)[None])[0]
 
     def in_images(self, z: np.ndarray) -> np.ndarray:
         """Whether instruments at points (n, p) see the looks in both images, shape (n, m)."""
         value = np.broadcast_to(np.asarray(self.space.value), (len(z), len(self.space.value)))
         blocks = [
-            np.asarray(_in_images(block, self.space, self.eyes)) for block in self._blocks(z, value, self.IN_IMAGES)
+            np.asarray(_in_images(block, self.space, self.observer)) for block in self._blocks(z, value, self.IN_IMAGES)
         ]
         return np.concatenate(blocks)[: len(z) * len(self.looks)].reshape(len(z), -1)
 
@@ -322,7 +322,7 @@ CREEP_COLUMNS = [INDEX["creep_deg.pan"], INDEX["creep_deg.tilt"]]
 
 def information_of_looks(
     seen: Seen,
-    chosen: np.ndarray,
+    picks: np.ndarray,
     path: np.ndarray,
     space: ParameterSpace,
     homed: bool,
@@ -330,40 +330,39 @@ def information_of_looks(
 ) -> np.ndarray:
     """Fisher information of chosen looks, shape (..., p + e, p + e); equal to `information_of` of the arranged plan.
 
-    A look that is taken again differs by its path alone: each is multiplied out once, whatever its repeats.
+    Repeats of a look differ only in their path: the product of each look is computed once.
 
     Args:
         seen: all looks, at one point or with leading axes at several.
-        chosen: numbers of those taken, repeats allowed, shape (k,).
-        path: steps travelled when each is taken, shape (k, 2).
+        picks: numbers of the looks taken, repeats allowed, shape (k,).
+        path: steps travelled at each look, shape (k, 2).
         space: priors, for the scale of the contrast.
         homed: the session begins with an unknown home offset.
-        warm_minutes: since it began when each is taken, shape (k,); None where the zeros' creep stands still meanwhile,
-            as `seen` has it.
+        warm_minutes: since the start of the session at each look, shape (k,); None for the constant creep of `seen`.
     """
-    looks, place, count = np.unique(chosen, return_inverse=True, return_counts=True)
+    looks, index, count = np.unique(picks, return_inverse=True, return_counts=True)
     # q = sum of k_dir dn = k n + (contrast / 2) x path: the contrast's column is the offset's, times the path.
-    far, moved, of_axis = path * (np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 360), CONTRAST_COLUMNS, [0, 1]
+    factors, linked, axes = path * (np.asarray(space.u)[CONTRAST_COLUMNS] * np.pi / 360), CONTRAST_COLUMNS, [0, 1]
     if warm_minutes is not None:
-        # Likewise the creep's: the offset's times how much of it is over.
-        crept = -np.expm1(-warm_minutes / np.asarray(space.value)[INDEX["creep_minutes"]])
-        creep = crept[:, None] * (np.asarray(space.u)[CREEP_COLUMNS] * np.pi / 180)
-        far, moved, of_axis = np.hstack([far, creep]), [*CONTRAST_COLUMNS, *CREEP_COLUMNS], [0, 1, 0, 1]
-    once, twice = np.zeros((len(looks), len(moved))), np.zeros((len(looks), len(moved), len(moved)))
-    np.add.at(once, place, far)
-    np.add.at(twice, place, far[:, :, None] * far[:, None, :])
+        # Likewise the creep's column: the offset's times the completed share of the creep.
+        creep_share = -np.expm1(-warm_minutes / np.asarray(space.value)[INDEX["creep_minutes"]])
+        creep = creep_share[:, None] * (np.asarray(space.u)[CREEP_COLUMNS] * np.pi / 180)
+        factors, linked, axes = np.hstack([factors, creep]), [*CONTRAST_COLUMNS, *CREEP_COLUMNS], [0, 1, 0, 1]
+    sums, squares = np.zeros((len(looks), len(linked))), np.zeros((len(looks), len(linked), len(linked)))
+    np.add.at(sums, index, factors)
+    np.add.at(squares, index, factors[:, :, None] * factors[:, None, :])
     rows = seen.rows[..., looks, :, :]
-    rows[..., moved] = 0.0
+    rows[..., linked] = 0.0
     *lead, m, components, columns = rows.shape
     flat, offset = rows.reshape(*lead, m * components, columns), rows[..., -2:]
-    turned_by = offset[..., of_axis]
-    turned = np.swapaxes(flat, -1, -2)
-    information = turned @ (flat * np.repeat(count, components)[:, None])
-    across = turned @ (turned_by * once[:, None, :]).reshape(*lead, m * components, len(moved))
-    information[..., moved] = across
-    information[..., moved, :] = np.swapaxes(across, -1, -2)
-    information[..., np.array(moved)[:, None], moved] = np.einsum(
-        "...mia,...mib,mab->...ab", turned_by, turned_by, twice
+    offsets_of = offset[..., axes]
+    transposed = np.swapaxes(flat, -1, -2)
+    information = transposed @ (flat * np.repeat(count, components)[:, None])
+    cross = transposed @ (offsets_of * sums[:, None, :]).reshape(*lead, m * components, len(linked))
+    information[..., linked] = cross
+    information[..., linked, :] = np.swapaxes(cross, -1, -2)
+    information[..., np.array(linked)[:, None], linked] = np.einsum(
+        "...mia,...mib,mab->...ab", offsets_of, offsets_of, squares
     )
     if not homed:
         return information[..., :-2, :-2]

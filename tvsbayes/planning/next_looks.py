@@ -1,4 +1,4 @@
-"""The next best looks of a run that goes on: from where the axes stand, on the sheet that stands there, no homing.
+"""The next best looks of a running session: from the present counters, first on the present sheet, without homing.
 
 What `plan --given --next` prints and `acquire --adapt` follows. Counters in steps, values in the target's unit.
 """
@@ -20,7 +20,7 @@ from tvsbayes.instrument.plan import PlanStep, plan_seconds, step_json
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.planning.expectation import knowledge_of
 from tvsbayes.planning.planner import design_problem
-from tvsbayes.planning.search import Chosen, DesignProblem
+from tvsbayes.planning.search import Choice, DesignProblem
 from tvsbayes.planning.target import Target
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.results.tiers import IMPORTANCE
@@ -28,7 +28,7 @@ from tvsbayes.results.tiers import IMPORTANCE
 
 @dataclass(frozen=True)
 class Confirmation:
-    """What importance sampling says of the effective ratios by direction, deg/step.
+    """Effective ratios by importance sampling, by direction, deg/step.
 
     Attributes:
         accepted: whether its weights may be used.
@@ -52,17 +52,17 @@ class Confirmation:
 
 @dataclass(frozen=True)
 class NextLooks:
-    """A few looks that go on where a campaign ended.
+    """A few looks that continue a campaign.
 
     Attributes:
-        target: what is wanted.
-        steps: placements, moves and looks; they begin with a placement.
-        minutes: by `[costs]`, without that placement where its sheet stands there.
+        target: of the looks.
+        steps: placements, moves and looks; the first is a placement.
+        minutes: by `[costs]`, without that placement where its sheet is placed already.
         now: the target's value by the campaign; `expected` after the looks.
         after_each: the target's value after each look, in their order.
         deg_per_step, u_deg_per_step: effective ratios of the fit by direction, and their Laplace sds.
-        why: in words.
-        confirmed: what the sampled posterior says of them, where that was asked for.
+        why: reason of the choice, in words.
+        confirmed: the ratios by the sampled posterior, where requested.
     """
 
     target: Target
@@ -93,22 +93,22 @@ class NextLooks:
 
 
 def confirmation(fit: JointFit) -> Confirmation:
-    """The effective ratios of a converged fit by importance sampling: with rough scales Laplace's sds are short."""
-    drawn = sample(fit, IMPORTANCE)
-    stats = drawn.propagate(lambda p: np.stack([p[f"effective_deg_per_step.{d}"] for d in DIRECTIONS], axis=1))
+    """The effective ratios of a converged fit by importance sampling: Laplace sds are too small for rough scales."""
+    posterior = sample(fit, IMPORTANCE)
+    stats = posterior.propagate(lambda p: np.stack([p[f"effective_deg_per_step.{d}"] for d in DIRECTIONS], axis=1))
     ends = [(low, high) for low, high in stats.interval95.T.tolist()]
-    by_direction = (dict(zip(DIRECTIONS, of, strict=True)) for of in (stats.mean.tolist(), stats.sd.tolist(), ends))
-    return Confirmation(drawn.converged, *by_direction)
+    by_direction = (dict(zip(DIRECTIONS, row, strict=True)) for row in (stats.mean.tolist(), stats.sd.tolist(), ends))
+    return Confirmation(posterior.converged, *by_direction)
 
 
 def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_below: float | None = None) -> NextLooks:
-    """The looks that lower a target most per minute, by the fit of what was seen so far.
+    """The looks that lower a target most per minute, by the fit of the present data.
 
     Args:
-        fit: of the campaign so far; its last homing holds on.
+        fit: of the campaign so far; its last segment continues.
         rig: sheets, limits, costs.
-        target: what is wanted.
-        count: looks.
+        target: to be lowered.
+        count: number of looks.
         confirm_below: sample the posterior where the Laplace sd of every effective ratio is at most this, deg/step.
 
     Raises:
@@ -117,22 +117,22 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
     """
     if not fit.converged:
         raise NotConverged.of(fit.problems, "see `tvsbayes fit`")
-    on_s = powered_on_s(fit.campaign.header)
-    warm = replace(knowledge_of(fit, rig), warm_minutes=float(warm_minutes(fit.campaign.moves, on_s)[-1]))
-    problem = design_problem(warm, target, fit.reference_pose_rad, False)
-    # The segment goes on: no home offset is drawn anew, and the creep so far is in what the looks show.
+    power_s = powered_on_s(fit.campaign.header)
+    knowledge = replace(knowledge_of(fit, rig), warm_minutes=float(warm_minutes(fit.campaign.moves, power_s)[-1]))
+    problem = design_problem(knowledge, target, fit.reference_pose_rad, False)
+    # The segment continues: no new home offset, and the expectation of the looks includes the creep so far.
     problem = replace(problem, knowledge=replace(problem.knowledge, after_data=False), warming=False)
     last, sheet = fit.campaign.moves[-1], ordered_spots(fit.campaign)[-1].target
 
-    def minutes(choice: Chosen) -> float:
+    def minutes(choice: Choice) -> float:
         steps = choice.design.steps_onwards
         return plan_seconds(rig, steps[1:] if choice.design.sheet[0] == sheet else steps) / 60
 
     choices = _choices(problem, count, (last.pan_steps, last.tilt_steps))
     best = max(choices, key=lambda choice: (problem.now - choice.value) / max(minutes(choice), 1e-9))
     sds = np.asarray(fit.draws.effective_deg_per_step).std(axis=0)
-    confirmed = confirmation(fit) if confirm_below is not None and sds.max() <= confirm_below else None
-    places, wanted = ", ".join(dict.fromkeys(best.design.sheet)), target.text.split("<=")[0].strip()
+    confirmation_result = confirmation(fit) if confirm_below is not None and sds.max() <= confirm_below else None
+    places, quantity = ", ".join(dict.fromkeys(best.design.sheet)), target.text.split("<=")[0].strip()
     return NextLooks(
         target=target,
         steps=best.design.steps_onwards,
@@ -143,21 +143,21 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
         deg_per_step=dict(zip(DIRECTIONS, map(float, np.asarray(fit.mode.effective_deg_per_step)), strict=True)),
         u_deg_per_step=dict(zip(DIRECTIONS, map(float, sds), strict=True)),
         why=(
-            f"{count} looks at {places} lower {wanted} most per minute: from {problem.now:.3g} to {best.value:.3g} "
+            f"{count} looks at {places} lower {quantity} most per minute: from {problem.now:.3g} to {best.value:.3g} "
             f"{target.unit} in {minutes(best):.1f} minutes"
         ),
-        confirmed=confirmed,
+        confirmed=confirmation_result,
     )
 
 
-def _choices(problem: DesignProblem, count: int, at: tuple[int, int]) -> list[Chosen]:
+def _choices(problem: DesignProblem, count: int, at: tuple[int, int]) -> list[Choice]:
     """The best looks on every sheet and on every pair of sheets."""
-    search, of_look = problem.search(), problem.candidates.looks.sheet
+    search, sheet_of_look = problem.search(), problem.candidates.looks.sheet
     subsets = [s for size in (1, 2) for s in combinations(range(len(problem.knowledge.sheets)), size)]
-    candidates = (np.isin(of_look, subset) for subset in subsets)
-    return [problem.chosen(search, allowed, count, at) for allowed in candidates if allowed.any()]
+    masks = (np.isin(sheet_of_look, subset) for subset in subsets)
+    return [problem.choose(search, allowed, count, at) for allowed in masks if allowed.any()]
 
 
-def _after_each(problem: DesignProblem, best: Chosen) -> tuple[float, ...]:
+def _after_each(problem: DesignProblem, best: Choice) -> tuple[float, ...]:
     order = best.design.order
     return tuple(problem.value(best.picks, best.design, order[:done]) for done in range(1, len(order) + 1))

@@ -1,4 +1,4 @@
-"""How many looks, which ones, and when to stop: the cheapest plan that meets a target, and how sure it is to.
+"""Planning: the cheapest plan that meets a target, its assurance, and the stopping rule.
 
 Values in the target's unit, minutes by the rig's `[costs]`; an experiment is four looks.
 """
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """What up to n experiments give: medians over draws of the instrument, in the target's unit.
+    """Results of up to n experiments: medians over draws of the instrument, in the target's unit.
 
     `classic` is None where the four-point method does not estimate the quantity or n is too small for it.
     """
@@ -69,7 +69,7 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class Baseline:
-    """A known protocol, or the planned one, judged by the same yardstick at the most probable instrument."""
+    """A known protocol, or the planned one, judged in the same way at the most probable instrument."""
 
     name: str
     spots: int
@@ -80,25 +80,25 @@ class Baseline:
 
 @dataclass(frozen=True, repr=False)
 class PlanResult(Shown):
-    """How many, which ones, and when to stop.
+    """A plan with its curve and advice.
 
     Attributes:
-        target: what is wanted.
-        steps: the recommended plan; empty where there is nothing left to do.
+        target: of the plan.
+        steps: the recommended plan; empty where the target is met already.
         experiments, looks, minutes: its size.
         expected: the target's value after it at the most probable instrument; `now`: before it.
         assurance, assurance_se: probability that its fit reports the target as met, and Monte Carlo error; None where
-            there is nothing left to do.
+            the target is met already.
         curve: by number of experiments.
         n80, n95: experiments for which the assurance is 80 % and 95 %, None if none.
-        limit: what no number of looks removes.
-        shares: what the variance of the target consists of after the plan.
-        baselines: other protocols beside it.
+        limit: floor of the target.
+        shares: of the variance of the target after the plan, by cause.
+        baselines: the plan and other protocols.
         next: possible next experiments, best first.
         stop: the stopping rule applied now.
-        classic: the four-point method's own answer, None for quantities that it does not estimate.
+        classic: the four-point method's own number of experiments, None for quantities that it does not estimate.
         met: the target is met already, or the plan meets it with an assurance of 80 %.
-        notes: what was left out and why.
+        notes: on excluded looks and the reasons.
         draws, seed, criterion: of the computation.
     """
 
@@ -127,7 +127,7 @@ class PlanResult(Shown):
     criterion: str
 
     def shown(self) -> View:
-        """The curve: what so many looks bring."""
+        """The curve by number of looks."""
         size = "met already" if self.assurance is None else f"{self.looks} looks in {self.minutes:.1f} minutes"
         columns = ("looks", "minutes", "classic", "joint", "chance of success")
         rows = [(LOOKS_PER_EXPERIMENT * p.experiments, p.minutes, p.classic, p.joint, p.assurance) for p in self.curve]
@@ -167,15 +167,15 @@ def _baselines(knowledge: Knowledge, target: Target, aperture: bool, pose_rad: n
         plans = {"paper": paper_protocol(targets=pair), "mixed": mixed_protocol(targets=pair)}
     plans["grid"] = grid_protocol(targets=sheets[:3])
     return [
-        judged(name, information_of(steps, knowledge, aperture=aperture), knowledge, target, pose_rad)
+        baseline_of(name, information_of(steps, knowledge, aperture=aperture), knowledge, target, pose_rad)
         for name, steps in plans.items()
     ]
 
 
-def judged(
+def baseline_of(
     name: str, information: PlanInformation, knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None = None
 ) -> Baseline:
-    """One plan at the most probable instrument; ratios hold at `pose_rad`, by default the plan's own, as in a fit."""
+    """One plan at the most probable instrument; ratios are at `pose_rad`, by default the plan's own, as in a fit."""
     pose = information.pose_rad if pose_rad is None else pose_rad
     at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
     value = at.value(covariance_of(knowledge.precision + information.fisher), target.factor)
@@ -196,19 +196,19 @@ def plan(
     seed: int = 0,
     progress: Show | None = None,
 ) -> PlanResult:
-    """Find the cheapest plan that meets a target, and say what it will give, or why none can (formulation 6).
+    """Finds the cheapest plan that meets a target, with expected results, or the reason why none can (formulation 6).
 
     Args:
         rig: sheets, limits, costs; its priors where there is no campaign.
-        target: what is wanted.
-        given: a fit of what was measured already.
+        target: of the plan.
+        given: a fit of earlier data.
         minutes: the plan must not take longer.
-        criterion: what the search lowers: "c" the target, "D" or "A" ratios and backlashes together.
+        criterion: of the search: "c" the target, "D" or "A" ratios and backlashes together.
         aperture: looks also read the aperture.
-        draws: instruments over which the assurance is taken.
-        largest: experiments (of four looks) beyond which no plan is sought.
+        draws: number of instruments for the assurance.
+        largest: largest number of experiments (of four looks) of a plan.
         seed: of the draws.
-        progress: told how far it is.
+        progress: shows the progress.
 
     Returns:
         The plan, its curve and the advice.
@@ -228,26 +228,26 @@ def plan(
 def _curve(
     assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float], sizes: Sequence[int]
 ) -> tuple[CurvePoint, ...]:
-    """What up to n experiments give, for each size.
+    """Results of up to n experiments, for each size.
 
     Noise scales estimated from few stops make single draws jump; a row states the best of all sizes up to its own,
-    so that more experiments never look worse. A best of estimates leans towards the hopeful side.
+    so that more experiments never appear worse. The best of several estimates is biased towards optimism.
     """
     target, draws = assurance.target, len(assurance.instruments)
-    rows, best, surest = [], math.inf, 0.0
+    rows, best_value, best_share = [], math.inf, 0.0
     for n in sorted(set(sizes)):
         reported = assurance.values([n])[n]
-        best = min(best, float(np.median(reported)))
-        surest = max(surest, float(np.mean(reported <= target.limit)))
+        best_value = min(best_value, float(np.median(reported)))
+        best_share = max(best_share, float(np.mean(reported <= target.limit)))
         classic_value = value_of_classic(forecast, target, n)
-        rows.append(CurvePoint(n, durations[n], classic_value, best, surest, share_error(surest, draws)))
+        rows.append(CurvePoint(n, durations[n], classic_value, best_value, best_share, share_error(best_share, draws)))
     return tuple(rows)
 
 
 def few_looks(looks: Looks, target: Target) -> list[str]:
-    """Directions that a design reaches so rarely that a fit can say little about them, as notes.
+    """Notes on directions with too few stops in a design for reliable intervals.
 
-    Every look of a design is a stop of its own.
+    Every look of a design is a separate stop.
     """
     notes = []
     sides = {d: looks.side[:, AXES.index(axis)] == sign for d, (axis, sign) in DIRECTION_SIGNS.items()}
@@ -261,17 +261,17 @@ def few_looks(looks: Looks, target: Target) -> list[str]:
 
 
 def design_problem(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, aperture: bool) -> DesignProblem:
-    """The candidates of an instrument as it is known, and a target there.
+    """The candidates for an instrument, and a target there.
 
     Raises:
-        InputError: nothing to look at or in view; a target that is held fixed.
+        InputError: nothing to look at or in view; a fixed target.
     """
     possible = candidates(knowledge)
     knowledge = knowledge.with_gears(possible.looks.steps)
-    shown = LookArrays(possible.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
-    pose = shown.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
+    expectation = LookArrays(possible.looks, knowledge, aperture).at(knowledge.z, knowledge.space)
+    pose = expectation.mirror_angles_rad.mean(axis=0) if pose_rad is None else pose_rad
     at_centre = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
-    problem = DesignProblem(knowledge, possible, shown, target, at_centre)
+    problem = DesignProblem(knowledge, possible, expectation, target, at_centre)
     if problem.now == 0:
         raise InputError(
             "target",
@@ -285,7 +285,7 @@ def design_problem(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | 
 
 
 def _durations(family: Family, scope: Scope) -> dict[int, float]:
-    """Minutes of every number of experiments that the time allows."""
+    """Minutes by number of experiments, for those that the time allows."""
     durations = {n: family.arranged(n).minutes(family.knowledge.rig) for n in range(1, scope.largest + 1)}
     allowed = {n: minutes for n, minutes in durations.items() if scope.minutes is None or minutes <= scope.minutes}
     if not allowed:
@@ -301,7 +301,7 @@ def _durations(family: Family, scope: Scope) -> dict[int, float]:
 
 @dataclass(frozen=True)
 class _Size:
-    """How many experiments: those of the curve, and the smallest numbers with an assurance of 80 % and 95 %."""
+    """Number of experiments: the curve, and the smallest numbers with an assurance of 80 % and 95 %."""
 
     curve: tuple[CurvePoint, ...]
     n80: int | None
@@ -329,7 +329,7 @@ COUNTING, EXCHANGING = "counting experiments", "exchanging looks"
 
 
 def _stages(draws: int) -> dict[str, float]:
-    """Stages of planning, with seconds."""
+    """Stages of planning, with expected seconds."""
     return {
         LOOKING: 0.1 + looks_wait(),
         CHOOSING: 2.5,
@@ -350,12 +350,12 @@ def plan_from(
     seed: int,
     progress: Show | None = None,
 ) -> PlanResult:
-    """`plan` from what is known; effective ratios hold at `pose_rad`, by default in the middle of the candidates."""
+    """`plan` from knowledge; effective ratios are at `pose_rad`, by default in the middle of the candidates."""
     with Job(_stages(draws), progress) as job:
-        return _planned(knowledge, target, campaign, pose_rad, scope, draws, seed, job)
+        return _plan_in_stages(knowledge, target, campaign, pose_rad, scope, draws, seed, job)
 
 
-def _planned(
+def _plan_in_stages(
     knowledge: Knowledge,
     target: Target,
     campaign: Campaign | None,
@@ -379,37 +379,37 @@ def _planned(
     refined = refine(family, problem, size.experiments, scope, assurance, job.at)
     job.begin(JUDGING)
     steps = refined.family.arranged(size.experiments).steps
-    exact = judge(steps, knowledge, aperture=scope.aperture)
-    chosen = judged("planned", exact.information, knowledge, target, pose_rad)
+    judgement = judge(steps, knowledge, aperture=scope.aperture)
+    planned = baseline_of("planned", judgement.information, knowledge, target, pose_rad)
     share = float(np.mean(refined.reported <= target.limit))
-    most = problem.information(family.picks, family.arranged(family.largest))
-    limit = limit_of(knowledge, most, problem.at_centre, target)
-    pixels = _pixel_part(exact.information.expectation)
+    largest_information = problem.information(family.picks, family.arranged(family.largest))
+    limit = limit_of(knowledge, largest_information, problem.at_centre, target)
+    pixel_information = _pixel_part(judgement.information.expectation)
     batches = next_experiments(problem)
-    done = knowledge.after_data and problem.now <= target.limit
+    met_already = knowledge.after_data and problem.now <= target.limit
     notes = few_looks(refined.family.looks(size.experiments), target)
-    notes += [exact.together(axis) for axis in AXES if inseparable(exact.exchange(axis))]
+    notes += [judgement.inseparable_text(axis) for axis in AXES if inseparable(judgement.exchange(axis))]
     return PlanResult(
         target=target,
-        steps=() if done else steps,
-        experiments=0 if done else size.experiments,
-        looks=0 if done else len(refined.family.picks),
-        minutes=0.0 if done else exact.information.minutes,
+        steps=() if met_already else steps,
+        experiments=0 if met_already else size.experiments,
+        looks=0 if met_already else len(refined.family.picks),
+        minutes=0.0 if met_already else judgement.information.minutes,
         now=problem.now,
-        expected=problem.now if done else chosen.joint,
-        assurance=None if done else share,
-        assurance_se=None if done else share_error(share, draws),
+        expected=problem.now if met_already else planned.joint,
+        assurance=None if met_already else share,
+        assurance_se=None if met_already else share_error(share, draws),
         curve=size.curve,
         n80=size.n80,
         n95=size.n95,
         limit=limit,
-        shares=split_of(knowledge, exact.information.fisher, pixels, problem.at_centre),
-        baselines=(chosen, *_baselines(knowledge, target, scope.aperture, pose_rad)),
+        shares=split_of(knowledge, judgement.information.fisher, pixel_information, problem.at_centre),
+        baselines=(planned, *_baselines(knowledge, target, scope.aperture, pose_rad)),
         next=batches,
         stop=stop_now(problem.now, target, limit, batches, knowledge.after_data),
         classic=classic_answer(target, forecast, campaign),
-        met=done or share >= ASSURED[0],
-        notes=(*problem.candidates.notes, *([] if done else notes)),
+        met=met_already or share >= ASSURED[0],
+        notes=(*problem.candidates.notes, *([] if met_already else notes)),
         draws=draws,
         seed=seed,
         criterion=scope.criterion,
@@ -417,7 +417,7 @@ def _planned(
 
 
 def _pixel_part(expectation: Expectation) -> np.ndarray:
-    """What pixel noise alone contributes to the information, (C^-1 J)^T (C^-1 J), shape (p + e, p + e)."""
+    """Contribution of pixel noise alone to the information, (C^-1 J)^T (C^-1 J), shape (p + e, p + e)."""
     spots = LinearSpots(
         residual=np.zeros(expectation.jacobian.shape[:2]),
         load=np.asarray(expectation.load),

@@ -1,7 +1,7 @@
-"""The smallest plan that is enough: greedy choice of looks, and their exchange, over choices of sheets.
+"""The smallest sufficient plan: greedy choice of looks, and their exchange, over choices of sheets.
 
-Scores are variances of the quantities wanted; rows and precisions are in the coordinates, with two more columns (rad)
-for the home offset of (pan, tilt) where a campaign went before.
+Scores are variances of the target's quantities; rows and precisions are in the coordinates, with two more columns (rad)
+for the home offset of (pan, tilt) after an earlier campaign.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from tvsbayes.instrument.plan import LOOKS_PER_EXPERIMENT
 from tvsbayes.planning.assurance import Assurance, Family
 from tvsbayes.planning.candidates import Candidates
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge
-from tvsbayes.planning.looks import CONTRAST_COLUMNS, Arranged, Seen, arrange, covariance_of, information_of_looks
+from tvsbayes.planning.looks import CONTRAST_COLUMNS, LookPlan, Seen, arrange, covariance_of, information_of_looks
 from tvsbayes.planning.target import Sensitivity, Target
 from tvsbayes.progress import Advance, unshown
 
 CRITERIA = ("c", "D", "A")
 EXCHANGED_SHARE = 0.6
-"""Of the time of `refine`, for the exchanges themselves: what progress predicts with."""
+"""Share of the exchanges in the expected time of `refine`, for the progress."""
 MEAN_WEIGHT = 0.05
-"""Of the mean variance beside the worst: looks that help only the others still count a little."""
+"""Weight of the mean variance in addition to the worst: looks that improve only other quantities count a little."""
 
 
 def scores(variances: np.ndarray, reference: np.ndarray, criterion: str) -> np.ndarray:
-    """What a search lowers, from covariances (..., q, q) of the quantities; shape (...).
+    """Scores that a search lowers, from covariances (..., q, q) of the quantities; shape (...).
 
     "c": the worst variance and `MEAN_WEIGHT` of the mean; "D": log-determinant; "A": mean variance in units of
     `reference` (q,).
@@ -46,12 +46,12 @@ def scores(variances: np.ndarray, reference: np.ndarray, criterion: str) -> np.n
 
 @dataclass(frozen=True)
 class _Prospects:
-    """What every candidate would tell if it were the next look; the last axis counts the candidates.
+    """Covariances of every candidate as the next look; the last axis counts the candidates.
 
     Attributes:
         covariance: of the columns, before it, shape (P, P).
-        inner: of what it shows, its noise included, shape (4, 4, m).
-        moved: of that with the quantities, shape (4, q, m).
+        inner: of its residuals, noise included, shape (4, 4, m).
+        moved: of its residuals with the quantities, shape (4, q, m).
     """
 
     covariance: np.ndarray
@@ -59,9 +59,9 @@ class _Prospects:
     moved: np.ndarray
 
     def gain(self) -> np.ndarray:
-        """What it takes from the covariance of the quantities, moved^T inner^-1 moved, shape (q, q, m).
+        """Reduction of the covariance of the quantities, moved^T inner^-1 moved, shape (q, q, m).
 
-        By elimination of all candidates at once: LAPACK takes longer to be called for each.
+        By elimination for all candidates at once: calls of LAPACK for each would be slower.
         """
         inner, moved = self.inner.copy(), self.moved.copy()
         gain = np.zeros((moved.shape[1], *moved.shape[1:]))
@@ -73,8 +73,8 @@ class _Prospects:
         return gain
 
 
-REFRESHED = 16
-"""Looks added before prospects are computed anew: what differences lose adds up."""
+RECOMPUTED_AFTER = 16
+"""Number of added looks before prospects are recomputed: rounding of differences accumulates."""
 
 
 @dataclass
@@ -82,14 +82,14 @@ class Search:
     """Greedy choice and exchange of looks by low-rank updates of one covariance.
 
     Attributes:
-        rows: of all candidates, shape (m, 4, P); a candidate that is not to be chosen has zero rows.
+        rows: of all candidates, shape (m, 4, P); an excluded candidate has zero rows.
         precision: before any look, shape (P, P).
         gradient: d(quantity)/d(column), shape (q, P).
-        variance: beside it, shape (q,).
+        variance: of the quantities in addition, shape (q,).
         criterion: see `scores`.
-        numbers: by which candidates are called, ascending, shape (m,); by default their places in `rows`.
+        numbers: of the candidates, ascending, shape (m,); by default their indices in `rows`.
 
-    A quantity that the priors hold fixed has no variance to lower and is left out.
+    A quantity fixed by the priors has no variance and is omitted.
     """
 
     rows: np.ndarray
@@ -105,7 +105,7 @@ class Search:
         self.gradient, self.variance = self.gradient[uncertain], self.variance[uncertain]
         self.reference = np.diag(self._quantities(self.covariance)).copy()
         self.numbers = np.arange(len(self.rows)) if self.numbers is None else self.numbers
-        # Candidates last, as prospects have them: the wide products then need no copy.
+        # Candidates last, as in prospects: large products need no copy.
         self.columns = np.ascontiguousarray(self.rows.transpose(2, 1, 0)).reshape(self.rows.shape[2], -1)
 
     def _quantities(self, covariance: np.ndarray) -> np.ndarray:
@@ -119,43 +119,43 @@ class Search:
         return _Prospects(covariance, inner, moved.swapaxes(0, 1))
 
     def _scores(self, prospects: _Prospects) -> np.ndarray:
-        left = self._quantities(prospects.covariance)[:, :, None] - prospects.gain()
-        return scores(np.moveaxis(left, -1, 0), self.reference, self.criterion)
+        remaining = self._quantities(prospects.covariance)[:, :, None] - prospects.gain()
+        return scores(np.moveaxis(remaining, -1, 0), self.reference, self.criterion)
 
     def after_one_more(self, covariance: np.ndarray) -> np.ndarray:
-        """Score of every candidate if it were added, shape (m,): C - B^T K^-1 B, K of four components."""
+        """Score after adding each candidate, shape (m,): C - B^T K^-1 B, K of four components."""
         return self._scores(self._prospects(covariance))
 
-    def _with(self, prospects: _Prospects, place: int) -> _Prospects:
-        """Prospects after one look more: every covariance loses the product of its parts along the look."""
-        row, (components, _, count) = self.rows[place], prospects.inner.shape
+    def _with(self, prospects: _Prospects, index: int) -> _Prospects:
+        """Prospects after one more look: a low-rank update of every covariance."""
+        row, (components, _, count) = self.rows[index], prospects.inner.shape
         root = np.linalg.cholesky(np.eye(components) + row @ prospects.covariance @ row.T)
-        along = np.linalg.solve(root, row @ prospects.covariance)
-        cross = (along @ self.columns).reshape(components, components, count)
+        update = np.linalg.solve(root, row @ prospects.covariance)
+        cross = (update @ self.columns).reshape(components, components, count)
         inner = prospects.inner - sum(part[:, None] * part for part in cross)
-        slope = along @ self.gradient.T
-        moved = prospects.moved - sum(part[:, None] * one[:, None] for part, one in zip(cross, slope, strict=True))
-        covariance = prospects.covariance - along.T @ along
+        slope = update @ self.gradient.T
+        moved = prospects.moved - sum(part[:, None] * row[:, None] for part, row in zip(cross, slope, strict=True))
+        covariance = prospects.covariance - update.T @ update
         return _Prospects(0.5 * (covariance + covariance.T), inner, moved)
 
     def greedy(self, count: int) -> list[int]:
-        """The best look, then the best beside it, and so on; nothing where there is no candidate."""
+        """The best look, then the best in addition, and so on; empty where there is no candidate."""
         prospects, places = self._prospects(self.covariance), []
-        for chosen in range(1, count + 1 if len(self.rows) else 1):
+        for count_added in range(1, count + 1 if len(self.rows) else 1):
             places.append(int(np.argmin(self._scores(prospects))))
             prospects = self._with(prospects, places[-1])
-            if chosen % REFRESHED == 0:
+            if count_added % RECOMPUTED_AFTER == 0:
                 prospects = self._prospects(prospects.covariance)
-        return self._called(places)
+        return self._candidate_numbers(places)
 
-    def _called(self, places: Sequence[int]) -> list[int]:
+    def _candidate_numbers(self, places: Sequence[int]) -> list[int]:
         return np.asarray(self.numbers)[list(places)].tolist()
 
     def _places(self, picks: Sequence[int]) -> list[int]:
         return np.searchsorted(np.asarray(self.numbers), list(picks)).tolist()
 
     def among(self, allowed: np.ndarray) -> Search:
-        """The same search with only some candidates to choose from, shape (m,)."""
+        """The same search among some candidates, mask of shape (m,)."""
         return replace(self, rows=self.rows[allowed], numbers=np.asarray(self.numbers)[allowed])
 
     def _after(self, places: Sequence[int]) -> np.ndarray:
@@ -168,7 +168,7 @@ class Search:
         return float(scores(self._quantities(self._after(self._places(picks))), self.reference, self.criterion))
 
     def exchange(self, picks: Sequence[int], passes: int = 2, worth: float = 1e-3) -> list[int]:
-        """Replace looks one by one while that lowers the score by more than `worth` of it (Fedorov's exchange)."""
+        """Replaces looks one by one while this lowers the score by more than a share `worth` (Fedorov's exchange)."""
         places = self._places(picks)
         for _ in range(passes):
             changed = False
@@ -179,19 +179,19 @@ class Search:
                     places[number], changed = best, True
             if not changed:
                 break
-        return self._called(places)
+        return self._candidate_numbers(places)
 
 
 LADDER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
-"""Experiments at which the curve is drawn; 96 is the paper's."""
-KNOWN = 1e8
-"""Precision of the contrasts during a search: their part in a design is a matter of its path, which comes later."""
+"""Numbers of experiments of the curve; 96 is the paper's."""
+CONTRAST_PRECISION = 1e8
+"""Precision of the contrasts during a search: their information depends on the path, which is unknown then."""
 
 
 def search_rows(seen: Seen, knowledge: Knowledge) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and precision with the contrasts taken as known; home offsets are two more columns after data."""
+    """Rows and precision with known contrasts; home offsets are two more columns after data."""
     precision = knowledge.precision.copy()
-    precision[CONTRAST_COLUMNS, CONTRAST_COLUMNS] += KNOWN
+    precision[CONTRAST_COLUMNS, CONTRAST_COLUMNS] += CONTRAST_PRECISION
     if not knowledge.after_data:
         return seen.rows[..., :-2], precision
     size = len(precision)
@@ -203,12 +203,12 @@ def search_rows(seen: Seen, knowledge: Knowledge) -> tuple[np.ndarray, np.ndarra
 
 @dataclass(frozen=True)
 class Scope:
-    """How a design is sought.
+    """Scope of the search for a design.
 
     Attributes:
-        criterion: what the search lowers, one of `CRITERIA`: "c" the target, "D" or "A" ratios and backlashes together.
+        criterion: one of `CRITERIA`: "c" the target, "D" or "A" ratios and backlashes together.
         aperture: looks also read the aperture.
-        largest: experiments beyond which none is sought.
+        largest: largest number of experiments.
         minutes: the plan must not take longer.
     """
 
@@ -222,14 +222,14 @@ SUBSETS_MAX = 40
 
 
 def _sheet_subsets(count: int) -> list[tuple[int, ...]]:
-    """Which sheets to place: all choices of one to three, the farthest apart first."""
+    """Choices of sheets: all subsets of one to three, the farthest apart first."""
     subsets = [s for size in (1, 2, 3) for s in combinations(range(count), size)]
     return sorted(subsets, key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """Looks that a search chose.
+class Choice:
+    """The looks chosen by a search.
 
     Attributes:
         picks: numbers of the candidates, shape (k,).
@@ -238,21 +238,21 @@ class Chosen:
     """
 
     picks: np.ndarray
-    design: Arranged
+    design: LookPlan
     value: float
 
 
 @dataclass(frozen=True)
 class DesignProblem:
-    """The candidates, what they show at the most probable instrument, and the target there.
+    """The candidates, their expectation at the most probable instrument, and the target there.
 
     Attributes:
         knowledge: with the errors of the gears at places over all candidates.
         candidates: looks to choose from.
-        seen: what they show.
-        target: what is wanted.
-        at_centre: how the target depends on the coordinates.
-        warming: the zeros creep while the looks are taken; False where `seen` has the creep of the whole session.
+        seen: their expectation.
+        target: of the design.
+        at_centre: sensitivity of the target.
+        warming: the zeros creep during the looks; False where `seen` includes the creep of the whole session.
     """
 
     knowledge: Knowledge
@@ -267,47 +267,47 @@ class DesignProblem:
         """The target's value before any further look."""
         return self.at_centre.value(self.knowledge.covariance, self.target.factor)
 
-    def search(self, sought: Sensitivity | None = None, criterion: str = "c") -> Search:
-        """A search among the looks, for the target or what is `sought` instead; contrasts count as known (`KNOWN`)."""
+    def search(self, sensitivity_sought: Sensitivity | None = None, criterion: str = "c") -> Search:
+        """A search among the looks, for the target or for other quantities; contrasts count as known."""
         rows, precision = search_rows(self.seen, self.knowledge)
-        aim = self.at_centre if sought is None else sought
-        wide = np.zeros((len(aim.gradient), rows.shape[2]))
-        wide[:, : self.knowledge.size] = aim.gradient
-        return Search(rows, precision, wide, aim.own_variance, criterion)
+        aim = self.at_centre if sensitivity_sought is None else sensitivity_sought
+        gradient = np.zeros((len(aim.gradient), rows.shape[2]))
+        gradient[:, : self.knowledge.size] = aim.gradient
+        return Search(rows, precision, gradient, aim.own_variance, criterion)
 
-    def information(self, picks: np.ndarray, design: Arranged, taken: np.ndarray | None = None) -> np.ndarray:
-        """Of the looks `picks` (k,) of a design, or of those `taken`, by places in `picks`; shape (p + e, p + e)."""
+    def information(self, picks: np.ndarray, design: LookPlan, taken: np.ndarray | None = None) -> np.ndarray:
+        """Information of the looks `picks` (k,) of a design, or of those `taken` (indices in `picks`)."""
         rows = np.arange(len(picks)) if taken is None else taken
-        warm = design.warm_minutes(self.knowledge.rig)[rows] if self.warming else None
-        way = self.knowledge.space, self.knowledge.after_data, warm
-        return information_of_looks(self.seen, picks[rows], design.path[rows], *way)
+        minutes = design.warm_minutes(self.knowledge.rig)[rows] if self.warming else None
+        context = self.knowledge.space, self.knowledge.after_data, minutes
+        return information_of_looks(self.seen, picks[rows], design.path[rows], *context)
 
-    def value(self, picks: np.ndarray, design: Arranged, taken: np.ndarray | None = None) -> float:
-        """Of the target after looks, see `information`; in its unit."""
+    def value(self, picks: np.ndarray, design: LookPlan, taken: np.ndarray | None = None) -> float:
+        """Value of the target after looks, see `information`; in its unit."""
         precision = self.knowledge.precision + self.information(picks, design, taken)
         return self.at_centre.value(covariance_of(precision), self.target.factor)
 
-    def chosen(self, search: Search, allowed: np.ndarray, count: int, at: tuple[int, int] | None = None) -> Chosen:
+    def choose(self, search: Search, allowed: np.ndarray, count: int, start: tuple[int, int] | None = None) -> Choice:
         """The best looks among some candidates.
 
         Args:
             search: for the target.
-            allowed: candidates to choose from, shape (m,); one at least.
-            count: looks.
-            at: where the axes stand; None for a plan that begins with a homing.
+            allowed: mask of candidates, shape (m,); at least one.
+            count: number of looks.
+            start: present counters; None for a plan that begins with a homing.
         """
         picks = np.array(search.among(allowed).greedy(count))
         looks = self.candidates.looks[picks]
-        design = arrange(looks, self.knowledge.sheets, self.candidates.overshoot, at or (0, 0))
-        if at is not None:
-            # A run-up of its own for the first look: nobody knows where the axes stand when the looks begin.
+        design = arrange(looks, self.knowledge.sheets, self.candidates.overshoot, start or (0, 0))
+        if start is not None:
+            # The first look gets a run-up: the counters at the start of the looks are unknown.
             via = design.via.copy()
             via[0] = design.goal[0] - looks.side[design.order[0]] * self.candidates.overshoot
             design = replace(design, via=via)
-        return Chosen(picks, design, self.value(picks, design))
+        return Choice(picks, design, self.value(picks, design))
 
 
-def _of_all_gears(knowledge: Knowledge, seen: Seen) -> Sensitivity:
+def _of_gears(knowledge: Knowledge, seen: Seen) -> Sensitivity:
     """Ratios and backlashes of both axes, in the middle of the looks."""
     pose_rad = seen.mirror_angles_rad.mean(axis=0)
     everything = np.asarray(knowledge.gears.headlines(knowledge.z, knowledge.space, pose_rad).gradient)
@@ -315,33 +315,33 @@ def _of_all_gears(knowledge: Knowledge, seen: Seen) -> Sensitivity:
 
 
 @dataclass(frozen=True, order=True)
-class _Reached:
-    """How soon a family meets the target: minutes, infinite where it never does, and then the target's value."""
+class _FamilyScore:
+    """Minutes until a family meets the target, infinite where it never does, then the target's value."""
 
     minutes: float = math.inf
     value: float = math.inf
 
 
-def _reached(family: Family, problem: DesignProblem, scope: Scope) -> _Reached:
-    best = _Reached()
+def _family_score(family: Family, problem: DesignProblem, scope: Scope) -> _FamilyScore:
+    best = _FamilyScore()
     for n in (n for n in LADDER if n <= scope.largest):
         design = family.arranged(n)
         duration = design.minutes(problem.knowledge.rig)
         if scope.minutes is not None and duration > scope.minutes:
             break
         value = problem.value(family.picks[: LOOKS_PER_EXPERIMENT * n], design)
-        best = min(best, _Reached(duration if value <= problem.target.limit else math.inf, value))
+        best = min(best, _FamilyScore(duration if value <= problem.target.limit else math.inf, value))
     return best
 
 
 def design_family(problem: DesignProblem, scope: Scope | None = None, advance: Advance = unshown) -> Family:
     """The choice of sheets and the order of looks that reach the target soonest.
 
-    For every choice of sheets looks are added greedily; the choice that first meets the target, counted in minutes,
-    is kept, or the best after the largest number of experiments (or minutes) if none does.
+    For every choice of sheets looks are added greedily. The result is the choice that first meets the target, in
+    minutes, or the best after the largest number of experiments (or minutes) if none does.
     """
     scope, knowledge, candidates = scope or Scope(), problem.knowledge, problem.candidates
-    search = problem.search(None if scope.criterion == "c" else _of_all_gears(knowledge, problem.seen), scope.criterion)
+    search = problem.search(None if scope.criterion == "c" else _of_gears(knowledge, problem.seen), scope.criterion)
     families = []
     subsets = list(_sheet_subsets(len(knowledge.sheets)))
     for number, subset in enumerate(subsets):
@@ -350,11 +350,11 @@ def design_family(problem: DesignProblem, scope: Scope | None = None, advance: A
         if allowed.any():
             picks = search.among(allowed).greedy(LOOKS_PER_EXPERIMENT * scope.largest)
             families.append(Family(knowledge, candidates, np.array(picks), scope.aperture))
-    return min(families, key=lambda family: _reached(family, problem, scope))
+    return min(families, key=lambda family: _family_score(family, problem, scope))
 
 
 def smallest_design(meets: Callable[[int], bool], sizes: Sequence[int]) -> int | None:
-    """Smallest whole number that meets a monotone condition, bracketed by a ladder first."""
+    """Smallest whole number that meets a monotone condition, bracketed by `sizes` first."""
     above = next((n for n in sizes if meets(n)), None)
     if above is None:
         return None
@@ -367,7 +367,7 @@ def smallest_design(meets: Callable[[int], bool], sizes: Sequence[int]) -> int |
 
 @dataclass(frozen=True)
 class Refined:
-    """A design, and the uncertainty of the target that its fits report over the truths, shape (draws,)."""
+    """A design, and the reported uncertainty of the target over the truths, shape (draws,)."""
 
     family: Family
     reported: np.ndarray
@@ -383,22 +383,22 @@ def refine(
 ) -> Refined:
     """The design of n experiments after exchanges.
 
-    Exchanges suit the most probable instrument; they are kept only where they do not cost assurance or time.
+    Exchanges are optimal for the most probable instrument; they are kept only where assurance and time permit.
     """
     knowledge, candidates = family.knowledge, family.candidates
     picks = family.picks[: LOOKS_PER_EXPERIMENT * experiments]
-    plain = Refined(replace(family, picks=picks), assurance.values([experiments])[experiments])
+    unchanged = Refined(replace(family, picks=picks), assurance.values([experiments])[experiments])
     if scope.criterion != "c":
-        return plain
+        return unchanged
     allowed = np.isin(candidates.looks.sheet, candidates.looks.sheet[picks])
     exchanged = replace(family, picks=np.array(problem.search().among(allowed).exchange(picks.tolist())))
     duration = exchanged.arranged(experiments).minutes(knowledge.rig)
     if scope.minutes is not None and duration > scope.minutes:
-        return plain
+        return unchanged
     advance(EXCHANGED_SHARE)
-    other = Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])
+    exchanged_result = Refined(exchanged, assurance.of(exchanged).values([experiments])[experiments])
 
-    def merit(of: Refined) -> tuple[float, float]:
-        return float(np.mean(of.reported <= problem.target.limit)), -float(np.median(of.reported))
+    def merit(result: Refined) -> tuple[float, float]:
+        return float(np.mean(result.reported <= problem.target.limit)), -float(np.median(result.reported))
 
-    return other if merit(other) > merit(plain) else plain
+    return exchanged_result if merit(exchanged_result) > merit(unchanged) else unchanged

@@ -1,4 +1,4 @@
-"""What a measurement is for: its target in words, and how that quantity depends on the coordinates.
+"""The target of a measurement in words, and its sensitivity to the coordinates.
 
 Ratios in deg/step, backlashes in deg, mirror offset and coordinates of a point (frame T) in mm.
 """
@@ -24,17 +24,17 @@ from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces
 from tvsbayes.statistics.intervals import NORMAL_95
 
 UNITS = {
-    **{name: of.unit for name, of in TARGETS.items()},
+    **{name: quantity.unit for name, quantity in TARGETS.items()},
     **{"worst": "deg/step", "x": "mm", "y": "mm", "z": "mm", "xyz": "mm"},
 }
 COORDINATES = {"x": (0,), "y": (1,), "z": (2,), "xyz": (0, 1, 2)}
 DEFAULT_TARGET = "u(worst) <= 2e-4 deg/step"
-"""0.3 % of the paper's ratios: above the floor that stereo and a focal scale known to 0.2 % leave."""
+"""0.3 % of the paper's ratios: above the floor by stereo and a focal scale known to 0.2 %."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """What the measurement is for: an uncertainty that shall not exceed a limit.
+    """The target of a measurement: an uncertainty with a limit.
 
     Attributes:
         text: as written.
@@ -42,7 +42,7 @@ class Target:
         factor: 1 for u, 1.96 for U95.
         limit: in the unit.
         unit: deg/step, deg or mm.
-        point_mm: where a coordinate is wanted, frame T.
+        point_mm: of a target coordinate, frame T.
     """
 
     text: str
@@ -54,14 +54,14 @@ class Target:
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Rows of the headlines, or of x, y, z, whose worst is meant."""
+        """Rows of the headlines, or of x, y, z; the target is the worst of them."""
         if self.quantity in COORDINATES:
             return COORDINATES[self.quantity]
         return tuple(range(len(DIRECTIONS))) if self.quantity == "worst" else (TARGET_ROWS[self.quantity],)
 
     @property
     def of_ratios(self) -> bool:
-        """Effective ratios are wanted, which the four-point estimator estimates too."""
+        """Whether the target is effective ratios, which the four-point estimator estimates too."""
         return self.quantity == "worst" or self.quantity in DIRECTIONS
 
     def as_json(self) -> dict[str, object]:
@@ -85,7 +85,7 @@ _TARGET = re.compile(
     re.ASCII,
 )
 SMALLEST_LIMIT, LARGEST_NUMBER = 1e-12, 1e9
-"""Limits and coordinates of a target: beyond these a number is a slip of the pen, and squares of it overflow."""
+"""Limits and coordinates of a target: numbers beyond these are typing errors, and their squares overflow."""
 _NAMED = {
     unit: ", ".join(name for name in dict.fromkeys((*DIRECTIONS, "worst", *TARGETS)) if UNITS[name] == unit)
     for unit in UNITS.values()
@@ -98,10 +98,10 @@ TARGET_FORMS = (
 
 
 def parse_target(text: str) -> Target:
-    """Read a target such as `u(left) <= 2e-4 deg/step` or `U95(x) at 1000,0,0 mm <= 60 mm`.
+    """Reads a target such as `u(left) <= 2e-4 deg/step` or `U95(x) at 1000,0,0 mm <= 60 mm`.
 
     Raises:
-        InputError: anything else, with what is allowed.
+        InputError: anything else, with the allowed forms.
     """
 
     def refuse(found: str, remedy: str) -> InputError:
@@ -133,12 +133,12 @@ def parse_target(text: str) -> Target:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """How a target depends on the coordinates, at one point of parameter space or with a leading axis at several.
+    """Sensitivity of a target to the coordinates, at one point of parameter space or with a leading axis at several.
 
     Attributes:
-        gradient: d(quantity)/d(coordinates, errors of gears) of each quantity whose worst is meant, shape (q, p + e).
+        gradient: d(quantity)/d(coordinates, errors of gears) of each quantity of the target, shape (q, p + e).
         own: variance that no calibration lowers, by cause, shapes (q,): the stop and the reading at the point itself,
-            and what its counters have of the gears' errors that those at the places do not tell.
+            and the gears' errors at its counters that are independent of those at the places.
     """
 
     gradient: np.ndarray
@@ -171,15 +171,15 @@ def sensitivity(
     pose_rad: np.ndarray,
     gears: GearPlaces = NO_PLACES,
 ) -> Sensitivity:
-    """Linearise a target at a point of parameter space.
+    """Linearises a target at a point of parameter space.
 
     Args:
-        target: what is wanted.
+        target: the target.
         z: coordinates, shape (p,).
         space: priors.
         table: gives the aperture's convention and the periods.
-        pose_rad: where effective ratios hold, shape (2,).
-        gears: where errors of the gears are further coordinates; ratios are then lines over these places.
+        pose_rad: pose of effective ratios, shape (2,).
+        gears: places of the gears' errors, further coordinates; ratios are then lines over these places.
 
     Raises:
         InputError: no beam reaches the target's point.
@@ -187,12 +187,12 @@ def sensitivity(
     rows = list(target.indices)
     if target.point_mm is None:
         return Sensitivity(np.asarray(gears.headlines(z, space, pose_rad).gradient)[rows])
-    at = physical_at(z, space)
-    physical, slope = np.asarray(at.value), np.asarray(at.slope)
+    physical_point = physical_at(z, space)
+    physical, slope = np.asarray(physical_point.value), np.asarray(physical_point.slope)
     inputs = [INDEX[name] for name in INPUT_NAMES]
     stop_sd = noise_of_a_look(dict(zip(NAMES, physical, strict=True)))
     azimuth = table.aperture_convention == "azimuth"
-    machine = Calibration(
+    calibration = Calibration(
         mean=physical[inputs],
         covariance=slope[inputs] @ slope[inputs].T,
         noise_variance=dict(zip(CALIBRATION_NOISE, stop_sd**2, strict=True)),
@@ -200,21 +200,21 @@ def sensitivity(
         azimuth=azimuth,
         period_deg=table.first_period_deg,
     )
-    goal = machine.steps_for(target.point_mm)
+    goal = calibration.steps_for(target.point_mm)
     assert goal.aperture_deg is not None, "a point has a reading"
     count = len(inputs)
-    jacobian = machine.derivatives(goal.pan_steps, goal.tilt_steps, goal.aperture_deg, goal.approach)[rows]
+    jacobian = calibration.derivatives(goal.pan_steps, goal.tilt_steps, goal.aperture_deg, goal.approach)[rows]
     variances = jacobian[:, count:] ** 2
     by_source = {AT_POINT[0]: variances[:, :2].sum(axis=1), AT_POINT[1]: variances[:, 4]}
     gradient = jacobian[:, :count] @ slope[inputs]
     if not gears.size:
         return Sensitivity(gradient, by_source)
-    # Per rad of both mirrors: what a stop error of sd 1 does.
-    reached = [CALIBRATION_NOISE.index(f"stop_sd_deg.{name}") for name in goal.approach]
-    by_angle = jacobian[:, count : count + 2] / np.radians(stop_sd[reached])
-    between = [gears.between(np.array([steps]), axis) for axis, steps in enumerate((goal.pan_steps, goal.tilt_steps))]
-    side = [APPROACH_SIGN[name] for name in goal.approach]
-    turning = np.stack([np.append(one.error[0], -0.5 * s * one.play[0]) for one, s in zip(between, side, strict=True)])
-    rest = np.array([one.error_rest[0] ** 2 + 0.25 * one.play_rest[0] ** 2 for one in between])
-    by_source[GEARS_AT_POINT] = by_angle**2 @ rest
+    # Derivatives per rad of both mirrors, from those by stop errors of sd 1.
+    stop_columns = [CALIBRATION_NOISE.index(f"stop_sd_deg.{name}") for name in goal.approach]
+    by_angle = jacobian[:, count : count + 2] / np.radians(stop_sd[stop_columns])
+    kriged = [gears.between(np.array([steps]), axis) for axis, steps in enumerate((goal.pan_steps, goal.tilt_steps))]
+    signs = [APPROACH_SIGN[name] for name in goal.approach]
+    turning = np.stack([np.append(one.error[0], -0.5 * s * one.play[0]) for one, s in zip(kriged, signs, strict=True)])
+    residual_variance = np.array([one.error_rest[0] ** 2 + 0.25 * one.play_rest[0] ** 2 for one in kriged])
+    by_source[GEARS_AT_POINT] = by_angle**2 @ residual_variance
     return Sensitivity(np.concatenate([gradient, by_angle @ turning], axis=1), by_source)

@@ -1,9 +1,9 @@
-"""`plan --watch`: the fewest looks that notice every stated change, within a budget, and what is out of reach.
+"""`plan --watch`: the fewest looks that detect every stated change, within a budget, and undetectable changes.
 
-Candidates are the looks of the campaign itself: within the limits, in both images, at counters whose gear errors are
-known. A pattern of them on every sheet is repeated after further homings, since a homing hides the same part of a
-turned positioner from all looks that follow it. Patterns are searched with independent stops, so that information
-adds up; what is said of the plan is computed from its own moves. Counters in steps, minutes by `[costs]`.
+Candidates are the looks of the campaign itself: within the limits, in both images, at counters with known gear errors.
+A pattern of them on every sheet is repeated after further homings, since the error of a homing hides the same part of a
+positioner's rotation from all looks after it. The search assumes independent stops, so that information adds up; the
+final powers follow from the plan's own moves. Counters in steps, minutes by `[costs]`.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ from tvsbayes.results.watch_record import LOOKS_MAX, PlannedChange, WatchPlan
 from tvsbayes.statistics.streams import Stream, random_stream
 
 PATTERN_MAX = 12
-"""Looks after one homing at most."""
+"""Largest number of looks after one homing."""
 CANDIDATES_MAX = 32
-DIRECTIONS = 24
-"""Of a change, over which patterns are judged."""
-ENOUGH = 20.0
+CHANGE_DIRECTIONS = 24
+"""Number of directions of a change for judging patterns."""
+NONCENTRALITY_ENOUGH = 20.0
 """Noncentrality at which a test of three components at 1 % shared by eight has a power of 80 %."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A look of the campaign that may be taken again: counters, the sides that they are reached from, its spot."""
+    """A look of the campaign that may be repeated: counters, their sides of approach, its spot."""
 
     steps: tuple[int, int]
     side: tuple[int, int]
@@ -64,56 +64,56 @@ class Candidate:
 
 
 def _candidates(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> list[Candidate]:
-    """One look of every kind; at most `CANDIDATES_MAX` on a sheet, outermost counters first."""
+    """One look of each kind; at most `CANDIDATES_MAX` on a sheet, outermost counters first."""
     rests = [rests_of(campaign.moves, axis) for axis in AXES]
     by_place: dict[tuple, Candidate] = {}
     for row, spot in enumerate(spots):
-        at = [rests[axis][spot.move] for axis in range(2)]
-        side = at[0].sign, at[1].sign
+        rests_here = [rests[axis][spot.move] for axis in range(2)]
+        side = rests_here[0].sign, rests_here[1].sign
         if used[row] and all(side):
-            steps = at[0].steps, at[1].steps
+            steps = rests_here[0].steps, rests_here[1].steps
             by_place.setdefault((steps, side, spot.target), Candidate(steps, side, spot.target, spot))
     if not by_place:
         return []
-    every = np.array([one.steps for one in by_place.values()], dtype=float)
-    middle, width = every.mean(axis=0), np.maximum(np.ptp(every, axis=0), 1.0)
-    outer = sorted(by_place.values(), key=lambda one: -float(np.max(np.abs((one.steps - middle) / width))))
+    all_steps = np.array([candidate.steps for candidate in by_place.values()], dtype=float)
+    middle, width = all_steps.mean(axis=0), np.maximum(np.ptp(all_steps, axis=0), 1.0)
+    outer = sorted(by_place.values(), key=lambda candidate: -float(np.max(np.abs((candidate.steps - middle) / width))))
     sheets: dict[str, list[Candidate]] = {}
-    for one in outer:
-        of_sheet = sheets.setdefault(one.target, [])
-        if len(of_sheet) < CANDIDATES_MAX:
-            of_sheet.append(one)
-    return [one for of_sheet in sheets.values() for one in of_sheet]
+    for candidate in outer:
+        sheet_candidates = sheets.setdefault(candidate.target, [])
+        if len(sheet_candidates) < CANDIDATES_MAX:
+            sheet_candidates.append(candidate)
+    return [candidate for sheet_candidates in sheets.values() for candidate in sheet_candidates]
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Numbers of the candidates that are looked at after a homing, by sheet."""
+    """Numbers of the candidates after a homing, by sheet."""
 
     looks: dict[str, tuple[int, ...]]
 
     @property
     def size(self) -> int:
-        """Looks of one homing on every sheet."""
+        """Number of looks with one homing on every sheet."""
         return sum(map(len, self.looks.values()))
 
 
 def _rig_of(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> Rig:
-    """What a campaign says of its rig: sheets where its spots lie, the usual costs."""
+    """A rig from a campaign: sheets at the depths of its spots, default costs."""
     sheets: dict[str, float] = {}
     for name in () if campaign.rig.mechanism.sightings else dict.fromkeys(spot.target for spot in spots):
-        of_sheet = [spot for spot, use in zip(spots, used, strict=True) if use and spot.target == name]
-        if of_sheet:
-            sheets[name] = float(np.median(triangulate(campaign.stereo, pixels_of(of_sheet))[:, 0]))
+        sheet_spots = [spot for spot, use in zip(spots, used, strict=True) if use and spot.target == name]
+        if sheet_spots:
+            sheets[name] = float(np.median(triangulate(campaign.stereo, pixels_of(sheet_spots))[:, 0]))
     return Rig(campaign.rig, campaign.stereo, campaign.rig.priors, sheets, {}, {}, dict(COSTS_S))
 
 
 class WatchDesigns:
-    """Plans for watching a calibration, and what they notice.
+    """Plans for watching a calibration, and their powers.
 
     Args:
         fit: converged.
-        rig: limits, costs and sheets; None takes the campaign's own counters and the usual costs.
+        rig: limits, costs and sheets; None: the campaign's own counters and default costs.
         seed: of the noise scales and of the directions of a change.
     """
 
@@ -124,8 +124,8 @@ class WatchDesigns:
         spots = ordered_spots(self.campaign)
         used = np.asarray(fit.arrays.spots.valid)[: len(spots)] > 0
         self.rig = _rig_of(self.campaign, spots, used) if rig is None else rig
-        every = _candidates(self.campaign, spots, used)
-        self.candidates = [one for one in every if self._reachable(one)]
+        all_candidates = _candidates(self.campaign, spots, used)
+        self.candidates = [look for look in all_candidates if self._reachable(look)]
         if not self.candidates:
             raise InputError(
                 "no-look",
@@ -134,36 +134,36 @@ class WatchDesigns:
                 remedy="name the campaign's sheets in [sheets], widen the limits in [positioner], or plan looks with "
                 "`plan RIG`",
             )
-        # The campaign as its own second day: what its looks show, with the columns of the changes.
-        again = WatchedLooks(fit, replace(fit.campaign, spots=tuple(one.spot for one in self.candidates)))
-        later = again.problem.spots[again.first :]
+        # The candidates as new looks of a second session, with the columns of the changes.
+        watched = WatchedLooks(fit, replace(fit.campaign, spots=tuple(look.spot for look in self.candidates)))
+        new_spots = watched.problem.spots[watched.first :]
         shift = max(spot.spot for spot in spots) + 1
-        rows = {spot.spot - shift: again.first + place for place, spot in enumerate(later)}
-        self.changes = again.changes
-        self._learn(again.linear(self.z), again.first, [rows[one.spot.spot] for one in self.candidates])
+        rows = {spot.spot - shift: watched.first + place for place, spot in enumerate(new_spots)}
+        self.changes = watched.changes
+        self._prepare(watched.linear(self.z), watched.first, [rows[look.spot.spot] for look in self.candidates])
 
     @cached_property
     def _overshoot(self) -> np.ndarray:
-        """Run-up (pan, tilt) that takes up the play as the fit found it, steps."""
+        """Run-up (pan, tilt) that takes up the play by the fit, steps."""
         physical = physical_at(self.z, self.fit.space).value
         return run_up_steps(physical, physical[BACKLASH_COLUMNS])
 
     @cached_property
     def _limits(self) -> np.ndarray:
-        """Lowest and highest counter of (pan, tilt): the rig's, else those that the campaign reached; (2, 2)."""
+        """Lowest and highest counter of (pan, tilt): the rig's, else those of the campaign; (2, 2)."""
         reached = {axis: [getattr(move, f"{axis}_steps") for move in self.campaign.moves] for axis in AXES}
         known = self.rig.limits.within({axis: (min(reach), max(reach)) for axis, reach in reached.items()})
         return np.array([known[axis] for axis in AXES])
 
-    def _reachable(self, one: Candidate) -> bool:
-        if one.target not in self.rig.depths_mm:
+    def _reachable(self, candidate: Candidate) -> bool:
+        if candidate.target not in self.rig.depths_mm:
             return False
-        start = np.array(one.steps) - np.array(one.side) * self._overshoot
-        both = np.stack([np.array(one.steps), start])
-        return bool(np.all((both >= self._limits[:, 0]) & (both <= self._limits[:, 1])))
+        start = np.array(candidate.steps) - np.array(candidate.side) * self._overshoot
+        end_points = np.stack([np.array(candidate.steps), start])
+        return bool(np.all((end_points >= self._limits[:, 0]) & (end_points <= self._limits[:, 1])))
 
-    def _learn(self, linear: LinearSpots, first: int, places: list[int]) -> None:
-        """What the first day knows, and what every candidate (its row) would show, stop errors integrated out."""
+    def _prepare(self, linear: LinearSpots, first: int, places: list[int]) -> None:
+        """Information of the first session, and of every candidate (its row), stop errors integrated out."""
         errors = linear.places.shape[2]
         self.parameters = len(NAMES)
         spelled = linear.spelled_out(linear.places)
@@ -171,35 +171,35 @@ class WatchDesigns:
         fisher = stop_information(rows_of(spelled, slice(first))).fisher
         keep = np.r_[: self.parameters, self.parameters + shifts : self.parameters + shifts + errors]
         self.known = fisher[np.ix_(keep, keep)] + np.eye(len(keep))
-        shown = []
-        for one, row in zip(self.candidates, places, strict=True):
+        whitened = []
+        for candidate, row in zip(self.candidates, places, strict=True):
             slope = linear.load[row, :, :2]
-            variance = self._stop_variance(one)
+            variance = self._stop_variance(candidate)
             columns = spelled.jacobian[row]
-            kept = columns[:, keep].copy()
-            # The path since homing is short in these plans: the contrast is left to the first day.
-            kept[:, [INDEX[f"ratio_contrast_deg_per_step.{axis}"] for axis in AXES]] = 0.0
-            whole = np.concatenate([kept, columns[:, self.parameters : self.parameters + shifts], slope], axis=1)
+            fitted = columns[:, keep].copy()
+            # The path since homing is short in these plans: the contrast is left to the first session.
+            fitted[:, [INDEX[f"ratio_contrast_deg_per_step.{axis}"] for axis in AXES]] = 0.0
+            joined = np.concatenate([fitted, columns[:, self.parameters : self.parameters + shifts], slope], axis=1)
             root = np.linalg.cholesky(np.eye(4) + slope @ np.diag(variance) @ slope.T)
-            shown.append(np.linalg.solve(root, whole))
-        rows = np.array(shown)
+            whitened.append(np.linalg.solve(root, joined))
+        rows = np.array(whitened)
         self.each = np.einsum("mia,mib->mab", rows, rows)
         self.shifts = shifts
         generator = random_stream(self.seed, Stream.WATCHED_CHANGES)
-        self._ways = []
+        self._directions = []
         for change in self.changes:
-            ways = generator.standard_normal((DIRECTIONS, len(change.names)))
-            self._ways.append(change.size * ways / np.linalg.norm(ways, axis=1, keepdims=True))
+            directions = generator.standard_normal((CHANGE_DIRECTIONS, len(change.names)))
+            self._directions.append(change.size * directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
-    def _stop_variance(self, one: Candidate) -> np.ndarray:
+    def _stop_variance(self, candidate: Candidate) -> np.ndarray:
         physical = physical_at(self.z, self.fit.space).value
-        names = ("left" if one.side[0] > 0 else "right", "up" if one.side[1] > 0 else "down")
+        names = ("left" if candidate.side[0] > 0 else "right", "up" if candidate.side[1] > 0 else "down")
         return np.radians([physical[INDEX[f"stop_sd_deg.{name}"]] for name in names]) ** 2
 
     def information(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:
-        """Of the changes, after a pattern with so many homings on every sheet, shape (q, q).
+        """Information on the changes after a pattern with so many homings on every sheet, shape (q, q).
 
-        With `also_before` the campaign had as many of them added.
+        With `also_before` the same looks are added to the campaign too.
         """
         total = np.zeros((self.each.shape[1] - 2,) * 2)
         for looks in pattern.looks.values():
@@ -212,57 +212,57 @@ class WatchDesigns:
         return total[count:, count:] - coupling.T @ np.linalg.solve(known, coupling)
 
     def powers(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:
-        """Of every change, at a limit by Bonferroni's bound."""
+        """Power for every change, at a limit by Bonferroni's bound."""
         information = self.information(pattern, homings, also_before)
         departure = Departure(0.0, 0, np.zeros(len(information)), information, self.changes)
         return np.array(powers(departure, np.log(FALSE_ALARM_RATE / len(self.changes)), self.seed))
 
-    def _worth(self, pattern: Pattern, homings: float) -> float:
-        """What patterns are chosen by: logs of the noncentralities that are too small, over directions and changes."""
+    def _score(self, pattern: Pattern, homings: float) -> float:
+        """Score of a pattern: mean logs of insufficient noncentralities, over directions and changes."""
         information, total = self.information(pattern, homings), 0.0
-        for rows, ways in zip(columns_of(self.changes), self._ways, strict=True):
-            shares = np.einsum("ni,ij,nj->n", ways, information[rows, rows], ways) / ENOUGH
+        for rows, directions in zip(columns_of(self.changes), self._directions, strict=True):
+            shares = np.einsum("ni,ij,nj->n", directions, information[rows, rows], directions) / NONCENTRALITY_ENOUGH
             total += float(np.mean(np.minimum(np.log(np.maximum(shares, 1e-12)), 0.0)))
         return total
 
     def grown(self, sheets: Sequence[str], homings: float) -> list[Pattern]:
-        """Patterns of one look on every sheet, two and so on, each the best beside those before it."""
+        """Patterns of one look on every sheet, two and so on, each the best in addition to the previous ones."""
         pattern, patterns = Pattern(dict.fromkeys(sheets, ())), []
         for _ in range(PATTERN_MAX):
             for sheet in sheets:
-                numbers = [k for k, one in enumerate(self.candidates) if one.target == sheet]
-                tried = [Pattern({**pattern.looks, sheet: (*pattern.looks[sheet], number)}) for number in numbers]
-                pattern = max(tried, key=lambda one: self._worth(one, homings))
+                numbers = [k for k, candidate in enumerate(self.candidates) if candidate.target == sheet]
+                extensions = [Pattern({**pattern.looks, sheet: (*pattern.looks[sheet], number)}) for number in numbers]
+                pattern = max(extensions, key=lambda candidate: self._score(candidate, homings))
             patterns.append(pattern)
         return patterns
 
     def patterns(self) -> list[Pattern]:
-        """For every choice of sheets, grown for few homings and for many."""
-        names = list(dict.fromkeys(one.target for one in self.candidates))
+        """Patterns for every choice of sheets, grown for few homings and for many."""
+        names = list(dict.fromkeys(candidate.target for candidate in self.candidates))
         choices = [(name,) for name in names] + list(combinations(names, 2))
         grown = [pattern for sheets in choices for homings in (1.0, 8.0) for pattern in self.grown(sheets, homings)]
         return list({tuple(pattern.looks.items()): pattern for pattern in grown}.values())
 
     def steps(self, pattern: Pattern, homings: int) -> tuple[PlanStep, ...]:
-        """The plan: each sheet placed once, on it a homing, the pattern, the next homing."""
+        """The plan: each sheet placed once, with the pattern after every homing."""
         return tuple(step for step, _ in self._ordered(pattern, homings))
 
     def _ordered(self, pattern: Pattern, homings: int) -> list[tuple[PlanStep, Spot | None]]:
-        """Steps with the spot that each look saw in the campaign."""
+        """Steps with the spot of each look in the campaign."""
         plan, counts = PlanBuilder(), {}
         for sheet, looks in pattern.looks.items():
             for homing in range(homings):
                 plan.home()
                 if not homing:
                     plan.place(sheet)
-                for one in (self.candidates[k] for k in looks):
+                for look in (self.candidates[k] for k in looks):
                     start = [
-                        goal - side * over if (goal - at) * side < over else at
-                        for goal, side, over, at in zip(one.steps, one.side, self._overshoot, plan.at, strict=True)
+                        goal - side * run_up if (goal - at) * side < run_up else at
+                        for goal, side, run_up, at in zip(look.steps, look.side, self._overshoot, plan.at, strict=True)
                     ]
                     plan.move(*map(int, start))
-                    plan.move(*one.steps)
-                    counts[len(plan.steps)] = one.spot
+                    plan.move(*look.steps)
+                    counts[len(plan.steps)] = look.spot
                     plan.look()
         return [(step, counts.get(step.step)) for step in plan.steps]
 
@@ -274,9 +274,9 @@ class WatchDesigns:
         """Powers of the plan by its own moves, at the limit of all tests together."""
         ordered = self._ordered(pattern, homings)
         log = run_plan([step for step, _ in ordered], self.rig)
-        shown = [spot for _, spot in ordered if spot is not None]
+        seen = [spot for _, spot in ordered if spot is not None]
         spots = tuple(
-            spot.renumbered(number, look.move) for number, (spot, look) in enumerate(zip(shown, log.looks, strict=True))
+            spot.renumbered(number, look.move) for number, (spot, look) in enumerate(zip(seen, log.looks, strict=True))
         )
         planned = replace(self.fit.campaign, moves=tuple(log.moves), spots=spots)
         departure = WatchedLooks(self.fit, planned).departure(self.z)
@@ -284,18 +284,18 @@ class WatchDesigns:
 
 
 MINUTES = 10.0
-"""Of a plan that nobody limits."""
+"""Default limit of a plan."""
 HOMINGS_MAX = 3000
-"""On a sheet, up to which a need is told."""
-RUNGS = np.unique(np.geomspace(1, HOMINGS_MAX, 30).round().astype(int))
-"""Homings that are tried before the smallest number is sought between two of them."""
+"""Largest number of homings on a sheet in a stated need."""
+HOMING_COUNTS = np.unique(np.geomspace(1, HOMINGS_MAX, 30).round().astype(int))
+"""Trial numbers of homings, before bisection between two of them."""
 CORRECTIONS = 4
-"""Times that a plan grows by a tenth where its own moves notice less than independent stops would."""
+"""Largest number of increases by a tenth where the plan's own moves have less power than independent stops."""
 
 
 @dataclass(frozen=True)
-class _Tried:
-    """A pattern with its powers at `RUNGS`, shape (rungs, changes), and what it takes."""
+class _Trial:
+    """A pattern with its powers at `HOMING_COUNTS`, shape (counts, changes), and its duration."""
 
     pattern: Pattern
     powers: np.ndarray
@@ -303,136 +303,136 @@ class _Tried:
     minutes_each: float
 
     def looks(self, homings: int) -> int:
-        """On all its sheets."""
+        """Number of looks on all its sheets."""
         return homings * self.pattern.size
 
     def minutes(self, homings: int) -> float:
-        """Of so many homings on every sheet."""
+        """Duration with so many homings on every sheet."""
         return self.first_minutes + (homings - 1) * self.minutes_each
 
     def allowed(self, minutes: float) -> np.ndarray:
-        """Which rungs a budget allows."""
-        looks = RUNGS * self.pattern.size
-        taken = np.array([self.minutes(int(homings)) for homings in RUNGS])
-        return (taken <= minutes) & (looks <= LOOKS_MAX) & (looks >= LOOKS_MIN)
+        """Mask of `HOMING_COUNTS` within a budget."""
+        looks = HOMING_COUNTS * self.pattern.size
+        minutes_needed = np.array([self.minutes(int(homings)) for homings in HOMING_COUNTS])
+        return (minutes_needed <= minutes) & (looks <= LOOKS_MAX) & (looks >= LOOKS_MIN)
 
 
-def _tried(designs: WatchDesigns) -> list[_Tried]:
+def _trials(designs: WatchDesigns) -> list[_Trial]:
     trials = []
     for pattern in designs.patterns():
-        powers = np.array([designs.powers(pattern, float(homings)) for homings in RUNGS])
+        powers = np.array([designs.powers(pattern, float(homings)) for homings in HOMING_COUNTS])
         once, twice = (designs.minutes(pattern, homings) for homings in (1, 2))
-        trials.append(_Tried(pattern, powers, once, twice - once))
+        trials.append(_Trial(pattern, powers, once, twice - once))
     return trials
 
 
-def _smallest(designs: WatchDesigns, tried: _Tried, wanted: np.ndarray) -> int | None:
-    """Homings at which a pattern notices the wanted changes (a mask) often enough."""
-    good = np.flatnonzero(np.all(tried.powers[:, wanted] >= POWER_MIN, axis=1))
-    if not good.size:
+def _smallest(designs: WatchDesigns, trial: _Trial, mask: np.ndarray) -> int | None:
+    """Least number of homings at which a pattern detects the changes of a mask with enough power."""
+    sufficient = np.flatnonzero(np.all(trial.powers[:, mask] >= POWER_MIN, axis=1))
+    if not sufficient.size:
         return None
-    rung = int(good[0])
-    low, high = (int(RUNGS[rung - 1]) if rung else 0), int(RUNGS[rung])
+    rung = int(sufficient[0])
+    low, high = (int(HOMING_COUNTS[rung - 1]) if rung else 0), int(HOMING_COUNTS[rung])
     while high - low > 1:
         middle = (low + high) // 2
-        enough = np.all(designs.powers(tried.pattern, float(middle))[wanted] >= POWER_MIN)
+        enough = np.all(designs.powers(trial.pattern, float(middle))[mask] >= POWER_MIN)
         low, high = (low, middle) if enough else (middle, high)
-    return max(high, -(-LOOKS_MIN // tried.pattern.size))
+    return max(high, -(-LOOKS_MIN // trial.pattern.size))
 
 
 @dataclass(frozen=True)
 class _Need:
-    """The fewest looks for something."""
+    """A pattern with the fewest looks for a purpose."""
 
-    tried: _Tried
+    trial: _Trial
     homings: int
 
     @property
     def looks(self) -> int:
-        return self.tried.looks(self.homings)
+        return self.trial.looks(self.homings)
 
     @property
     def minutes(self) -> float:
-        return self.tried.minutes(self.homings)
+        return self.trial.minutes(self.homings)
 
 
-def _fewest(designs: WatchDesigns, every: list[_Tried], wanted: np.ndarray, minutes: float = np.inf) -> _Need | None:
-    """The fewest looks that notice the wanted changes; of equally many those that take the least time."""
-    # By rungs first: what is seen between two of them costs a bisection for every pattern.
-    rough = sorted(
-        (tried.looks(int(RUNGS[rung])), number)
-        for number, tried in enumerate(every)
-        if (rung := int(np.argmax(np.all(tried.powers[:, wanted] >= POWER_MIN, axis=1)))) or _at_once(tried, wanted)
+def _fewest(designs: WatchDesigns, trials: list[_Trial], mask: np.ndarray, minutes: float = np.inf) -> _Need | None:
+    """The fewest looks that detect the changes of a mask; among equal numbers the least time."""
+    # Rank by trial counts first: values in between cost a bisection for every pattern.
+    ranked = sorted(
+        (trial.looks(int(HOMING_COUNTS[rung])), number)
+        for number, trial in enumerate(trials)
+        if (rung := int(np.argmax(np.all(trial.powers[:, mask] >= POWER_MIN, axis=1)))) or _meets_at_first(trial, mask)
     )
     needs = []
-    for _, number in rough[:12]:
-        homings = _smallest(designs, every[number], wanted)
-        if homings is not None and every[number].minutes(homings) <= minutes:
-            needs.append(_Need(every[number], homings))
+    for _, number in ranked[:12]:
+        homings = _smallest(designs, trials[number], mask)
+        if homings is not None and trials[number].minutes(homings) <= minutes:
+            needs.append(_Need(trials[number], homings))
     return min(needs, key=lambda need: (need.looks, need.minutes), default=None)
 
 
-def _at_once(tried: _Tried, wanted: np.ndarray) -> bool:
-    return bool(np.all(tried.powers[0, wanted] >= POWER_MIN))
+def _meets_at_first(trial: _Trial, mask: np.ndarray) -> bool:
+    return bool(np.all(trial.powers[0, mask] >= POWER_MIN))
 
 
-def _most(every: list[_Tried], minutes: float) -> np.ndarray:
-    """The largest set of changes that a plan within the budget notices, as a mask."""
-    best, best_key = np.zeros(every[0].powers.shape[1], dtype=bool), (-1, -1.0)
-    for tried in every:
-        for of_changes in tried.powers[tried.allowed(minutes)]:
-            noticed = of_changes >= POWER_MIN
-            key = int(noticed.sum()), float(np.sum(of_changes))
+def _noticeable(trials: list[_Trial], minutes: float) -> np.ndarray:
+    """The largest set of changes that a plan within the budget detects, as a mask."""
+    best, best_key = np.zeros(trials[0].powers.shape[1], dtype=bool), (-1, -1.0)
+    for trial in trials:
+        for row in trial.powers[trial.allowed(minutes)]:
+            noticed = row >= POWER_MIN
+            key = int(noticed.sum()), float(np.sum(row))
             if key > best_key:
                 best, best_key = noticed, key
     return best
 
 
-def _fullest(every: list[_Tried], minutes: float) -> _Need:
-    """Where nothing can be noticed often enough: what notices most."""
+def _most_powerful(trials: list[_Trial], minutes: float) -> _Need:
+    """The pattern with the largest total power, where no change can be detected with enough power."""
     by_power = [
-        (float(tried.powers[rung].sum()), number, int(RUNGS[rung]))
-        for number, tried in enumerate(every)
-        for rung in np.flatnonzero(tried.allowed(minutes))
+        (float(trial.powers[rung].sum()), number, int(HOMING_COUNTS[rung]))
+        for number, trial in enumerate(trials)
+        for rung in np.flatnonzero(trial.allowed(minutes))
     ]
     _, number, homings = max(by_power)
-    return _Need(every[number], homings)
+    return _Need(trials[number], homings)
 
 
 def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTES, seed: int = 0) -> WatchPlan:
-    """The fewest looks that notice every stated change with a power of 80 %, or as many of them as the time allows.
+    """The fewest looks that detect every stated change with a power of 80 %, or as many changes as the time allows.
 
     Args:
         fit: of the campaign to be watched.
-        rig: limits and costs; None takes the counters that the campaign reached, and the usual costs.
+        rig: limits and costs; None: the counters of the campaign, and default costs.
         minutes: the plan must not take longer.
         seed: of noise scales, null distribution and directions.
 
     Raises:
         NotConverged: the fit.
-        InputError: no look can be taken again, or the time is too short for the smallest plan.
+        InputError: no look can be repeated, or the time is too short for the smallest plan.
     """
     if not fit.converged:
         raise NotConverged.of(fit.problems, "see `tvsbayes fit`")
     designs = WatchDesigns(fit, rig, seed)
-    every = _tried(designs)
-    if not any(tried.allowed(minutes).any() for tried in every):
-        least = min(tried.minutes(-(-LOOKS_MIN // tried.pattern.size)) for tried in every)
+    trials = _trials(designs)
+    if not any(trial.allowed(minutes).any() for trial in trials):
+        least_minutes = min(trial.minutes(-(-LOOKS_MIN // trial.pattern.size)) for trial in trials)
         raise InputError(
             "minutes",
-            f"{LOOKS_MIN} looks take {least:.1f} minutes",
+            f"{LOOKS_MIN} looks take {least_minutes:.1f} minutes",
             column="--minutes",
-            allowed=f"at least {least:.1f}",
+            allowed=f"at least {least_minutes:.1f}",
             remedy="allow more minutes, or lower [costs] if the machine is faster",
         )
-    wanted = _most(every, minutes)
-    need = (_fewest(designs, every, wanted, minutes) if wanted.any() else None) or _fullest(every, minutes)
-    homings, judged = _corrected(designs, need, wanted, minutes)
-    pattern = need.tried.pattern
-    changes = _changes(designs, every, judged)
+    noticed = _noticeable(trials, minutes)
+    need = (_fewest(designs, trials, noticed, minutes) if noticed.any() else None) or _most_powerful(trials, minutes)
+    homings, judged = _corrected(designs, need, noticed, minutes)
+    pattern = need.trial.pattern
+    changes = _changes(designs, trials, judged)
     return WatchPlan(
         steps=designs.steps(pattern, homings),
-        looks=need.tried.looks(homings),
+        looks=need.trial.looks(homings),
         homings=homings * len(pattern.looks),
         minutes=designs.minutes(pattern, homings),
         minutes_allowed=minutes,
@@ -443,43 +443,43 @@ def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTE
     )
 
 
-def _changes(designs: WatchDesigns, every: list[_Tried], judged: list[float]) -> tuple[PlannedChange, ...]:
-    """What the plan notices of every change, and what each by itself would take."""
-    alone = [_fewest(designs, every, mask) for mask in np.eye(len(designs.changes), dtype=bool)]
-    added = _to_add(designs, every) if None in alone else [None] * len(alone)
+def _changes(designs: WatchDesigns, trials: list[_Trial], judged: list[float]) -> tuple[PlannedChange, ...]:
+    """The plan's power for every change, and the need of each change alone."""
+    needs = [_fewest(designs, trials, mask) for mask in np.eye(len(designs.changes), dtype=bool)]
+    additions = _looks_to_add(designs, trials) if None in needs else [None] * len(needs)
     changes = []
-    for change, power, need, more in zip(designs.changes, judged, alone, added, strict=True):
+    for change, power, need, looks_to_add in zip(designs.changes, judged, needs, additions, strict=True):
         description = change.what, change.size, change.unit, power
         if need is None:
-            changes.append(PlannedChange(*description, None, None, None, more))
+            changes.append(PlannedChange(*description, None, None, None, looks_to_add))
         else:
-            homings = need.homings * len(need.tried.pattern.looks)
+            homings = need.homings * len(need.trial.pattern.looks)
             changes.append(PlannedChange(*description, need.looks, homings, need.minutes, None))
     return tuple(changes)
 
 
-def _to_add(designs: WatchDesigns, every: list[_Tried]) -> list[int | None]:
-    """Looks that the campaign and every watch must have more before each change is noticed, to the next rung."""
+def _looks_to_add(designs: WatchDesigns, trials: list[_Trial]) -> list[int | None]:
+    """Additional looks of the campaign and of every watch to detect each change, to the next trial count."""
     fewest: list[int | None] = [None] * len(designs.changes)
-    for tried in every:
-        for homings in RUNGS:
-            looks, enough = tried.looks(int(homings)), designs.powers(tried.pattern, float(homings), True) >= POWER_MIN
+    for trial in trials:
+        for homings in HOMING_COUNTS:
+            looks, enough = trial.looks(int(homings)), designs.powers(trial.pattern, float(homings), True) >= POWER_MIN
             fewest = [
-                min(looks, best or looks) if good else best for best, good in zip(fewest, enough.tolist(), strict=True)
+                min(looks, best or looks) if met else best for best, met in zip(fewest, enough.tolist(), strict=True)
             ]
             if enough.all():
                 break
     return fewest
 
 
-def _corrected(designs: WatchDesigns, need: _Need, wanted: np.ndarray, minutes: float) -> tuple[int, list[float]]:
-    """Homings, and powers by the plan's own moves: more where neighbours that share a stop notice less."""
+def _corrected(designs: WatchDesigns, need: _Need, noticed: np.ndarray, minutes: float) -> tuple[int, list[float]]:
+    """Homings, and powers by the plan's own moves: more homings where shared stops reduce the power."""
     homings = need.homings
-    judged = designs.judged(need.tried.pattern, homings)
+    judged = designs.judged(need.trial.pattern, homings)
     for _ in range(CORRECTIONS):
-        more = homings + -(-homings // 10)
-        enough = np.all(np.array(judged)[wanted] >= POWER_MIN)
-        if enough or need.tried.minutes(more) > minutes or need.tried.looks(more) > LOOKS_MAX:
+        increased = homings + -(-homings // 10)
+        enough = np.all(np.array(judged)[noticed] >= POWER_MIN)
+        if enough or need.trial.minutes(increased) > minutes or need.trial.looks(increased) > LOOKS_MAX:
             break
-        homings, judged = more, designs.judged(need.tried.pattern, more)
+        homings, judged = increased, designs.judged(need.trial.pattern, increased)
     return homings, judged

@@ -27,8 +27,8 @@ from tvsbayes.model.headlines import Derived
 from tvsbayes.model.parameter_space import half_normal_sd, half_normal_slope
 from tvsbayes.planning.candidates import BACKLASH_COLUMNS
 from tvsbayes.planning.drawn_rigs import instruments_in
-from tvsbayes.planning.expectation import Knowledge, fit_places, information_of, prior_knowledge, taught_errors
-from tvsbayes.planning.gear_places import NO_PLACES, believed_scales
+from tvsbayes.planning.expectation import Knowledge, fit_places, fitted_errors, information_of, prior_knowledge
+from tvsbayes.planning.gear_places import NO_PLACES, expected_scales
 from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.target import Target, sensitivity
 from tvsbayes.posterior.draws import Posterior
@@ -150,7 +150,7 @@ def reported(job: StudyJob, result: JointFit, estimates: Estimates) -> float | N
     target = job.target
     if target.point_mm is None:
         return target.factor * float(spread(estimates)[list(target.indices)].max())
-    taught = taught_errors(result, estimates.covariance)
+    taught = fitted_errors(result, estimates.covariance)
     gears, covariance = (NO_PLACES, estimates.covariance) if taught is None else (taught.places, taught.covariance)
     try:
         at = sensitivity(target, estimates.z, result.space, job.rig.table, result.reference_pose_rad, gears)
@@ -187,7 +187,7 @@ def _compared(job: StudyJob, result: JointFit, estimates: Estimates, true: Truth
     instruments = instruments_in(bare, [true])
     z, space = instruments.z[0], instruments.space_of(0)
     # Ratios are the lines that the fit's are, over gears as good as the true ones.
-    knowledge = bare.with_places(replace(fit_places(result), scales=believed_scales(z, space, True)))
+    knowledge = bare.with_places(replace(fit_places(result), scales=expected_scales(z, space, True)))
     information = information_of(job.steps, knowledge, aperture=job.aperture, z=z, space=space)
     at_truth = knowledge.gears.headlines(z, space, pose)
     predicted = predicted_sds(knowledge, information.fisher, np.asarray(at_truth.gradient), z)

@@ -28,7 +28,7 @@ from tvsbayes.instrument.campaign import (
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES, unit_of
 from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import parameter_space
-from tvsbayes.pipeline import StoredOrFitted, Tell, compile_for, untold
+from tvsbayes.pipeline import StoredOrFitted, Tell, compile_for, no_output
 from tvsbayes.posterior.predictive import repeated_rad
 from tvsbayes.report.evidence import GearBand, gear_bands
 from tvsbayes.results.comparison_record import Comparison
@@ -350,7 +350,7 @@ def stored_campaign(folder: Path) -> StoredCampaign:
     return StoredCampaign(campaign, Fitted(fit, record, stop_residuals(fit), gear_bands(calibration)), None)
 
 
-def look_at(folder: Path, beside: Path | None = None, tell: Tell = untold) -> Looked:
+def look_at(folder: Path, beside: Path | None = None, tell: Tell = no_output) -> Looked:
     """What a page shows of a campaign, beside another where one is named.
 
     Args:
