@@ -27,14 +27,14 @@ from experiments.cameras.stereo_coverage import OPENCV_PAIRS, chi2
 from experiments.common.command_line import act, study_parser
 from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.cameras.assumed_covariance import (
-    CORRELATED,
+    CORRELATION_FACTOR,
     GROUPS,
     GUESS_FACTOR,
     USUAL_BOARD,
     USUAL_PITCH_MM,
     USUAL_RMS_PX,
     USUAL_VIEWS,
-    Known,
+    Provenance,
     calibration_covariance,
     with_assumed_covariance,
 )
@@ -135,9 +135,10 @@ def whiten(task: tuple[str, int]) -> dict[str, object]:
     bench = drawn_bench(seed)
     found, rms = by_opencv(bench, way)
     difference = found.vector - bench.true.vector
-    known = Known(rms, len(bench.left), (bench.board.columns, bench.board.rows), bench.board.pitch_mm)
+    known = Provenance(rms, len(bench.left), (bench.board.columns, bench.board.rows), bench.board.pitch_mm)
     whole = replace(known, fixed_intrinsics=way == "fixed")
-    made = (with_assumed_covariance(found, one, Known()).parameter_covariance for one in (whole, known, Known()))
+    none = Provenance()
+    made = (with_assumed_covariance(found, one, none).parameter_covariance for one in (whole, known, none))
     judgements = {name: judged(difference, one) for name, one in zip(MADE, made, strict=True)}
     return {"way": way, "seed": seed, "rms_px": rms, **judgements}
 
@@ -247,7 +248,8 @@ def table(arguments: argparse.Namespace) -> None:
         for kind in ("independent corners", *MADE):
             ratio = np.log(np.array(row["sd"][kind]) / own)
             print(f"| {name} | {kind} | {' | '.join(f'{np.exp(ratio[g].mean()):.2f}' for g in GROUPS.values())} |")
-    print(f"\n`CORRELATED` is {CORRELATED:g}; the sds of a guess are taken as good to a factor of {GUESS_FACTOR:g}.")
+    guess = f"the sds of a guess are taken as good to a factor of {GUESS_FACTOR:g}"
+    print(f"\n`CORRELATION_FACTOR` is {CORRELATION_FACTOR:g}; {guess}.")
     print("Where nothing is stated, RMS and views are those of a careless calibration.")
 
 

@@ -111,8 +111,9 @@ def run_cell(size, peak, ambient, contrast, seed: int) -> dict:
     row = {"size": size, "peak": peak, "ambient": ambient, "contrast": contrast, "bound": float(np.mean(bounds))}
     patches = [spot_window.patch_around(picture) for picture in pictures]
     camera = contour.rectified_pair(flat_stereo())[0]
-    pilots = [one for one in patches[: detection.PILOTS_MAX] if not isinstance(one, str)]
-    learned = detection._learned([one for one in pilots if one.clipped_share <= spot_window.CLIPPED_SHARE_MAX], None)
+    pilots = [one for one in patches[: detection.PILOT_LOOKS_MAX] if not isinstance(one, str)]
+    unclipped = [one for one in pilots if one.clipped_share <= spot_window.CLIPPED_SHARE_MAX]
+    learned = detection._estimated_noise(unclipped, None)
     for method in METHODS:
         if method == "fit":
             found = [spot_fit.centre_of(patch, learned) for patch in patches]

@@ -12,10 +12,10 @@ import pytest
 from msgspec import structs
 
 from tvsbayes.cameras.assumed_covariance import (
-    CORRELATED,
+    CORRELATION_FACTOR,
     GROUPS,
     USUAL_PITCH_SHARE,
-    Known,
+    Provenance,
     calibration_covariance,
     placed_boards,
     view_information,
@@ -145,9 +145,9 @@ def test_opencvs_errors_are_as_large_as_assumed(fixed):
         true, poses = drawn(seed)
         found, rms = by_opencv(true, poses, seed, fixed)
         difference = found.vector - true.vector
-        stated = Known(rms, VIEWS, (9, 6), 25.0, fixed_intrinsics=fixed)
-        for kind, known in (("all", stated), ("nothing", Known())):
-            covariance = with_assumed_covariance(found, known, Known()).parameter_covariance
+        stated = Provenance(rms, VIEWS, (9, 6), 25.0, fixed_intrinsics=fixed)
+        for kind, known in (("all", stated), ("nothing", Provenance())):
+            covariance = with_assumed_covariance(found, known, Provenance()).parameter_covariance
             for name in ("focal length", "principal point", "rotation", "translation"):
                 own = covariance[np.ix_(GROUPS[name], GROUPS[name])]
                 error = difference[GROUPS[name]]
@@ -159,8 +159,8 @@ def test_opencvs_errors_are_as_large_as_assumed(fixed):
 
 def test_a_stated_uncertainty_replaces_that_of_its_group(mounted):
     """Exactly, with the group's correlations; the others follow as they depend on it."""
-    plain = with_assumed_covariance(mounted, Known(), Known())
-    stated = Known(u_focal_percent=0.5, u_principal_px=3.0, u_rotation_mrad=0.7, u_baseline_mm=0.2)
+    plain = with_assumed_covariance(mounted, Provenance(), Provenance())
+    stated = Provenance(u_focal_percent=0.5, u_principal_px=3.0, u_rotation_mrad=0.7, u_baseline_mm=0.2)
     for name, values in (
         ("u_focal_percent", 0.005 * mounted.vector[GROUPS["focal length"]]),
         ("u_principal_px", np.full(4, 3.0)),
@@ -170,7 +170,7 @@ def test_a_stated_uncertainty_replaces_that_of_its_group(mounted):
         group = GROUPS[
             {"focal": "focal length", "princ": "principal point", "rotat": "rotation"}.get(name[2:7], "translation")
         ]
-        found = with_assumed_covariance(mounted, Known(**{name: getattr(stated, name)}), Known())
+        found = with_assumed_covariance(mounted, Provenance(**{name: getattr(stated, name)}), Provenance())
         np.testing.assert_allclose(np.sqrt(np.diag(found.parameter_covariance))[group], values, rtol=1e-9)
         assert "(stated)" in found.assumed_from and found.assumed
         stereo_bytes(found)
@@ -193,14 +193,14 @@ def test_what_was_stated_goes_before_the_file_and_that_before_what_is_usual(moun
         (tmp_path / name).write_bytes(data)
     paths = [tmp_path / name for name in files]
     of_file = read_calibration(paths).stereo
-    expected = Known(0.41, 17, (8, 5))
-    assert of_file.assumed_from == with_assumed_covariance(of_file, Known(), expected).assumed_from
+    expected = Provenance(0.41, 17, (8, 5))
+    assert of_file.assumed_from == with_assumed_covariance(of_file, Provenance(), expected).assumed_from
     assert (
         "RMS 0.41 px (of the file), 17 views (of the file), a board of 8x5 corners (of the file)"
         in of_file.assumed_from
     )
     assert of_file.rms_px == 0.41 and "squares of 25 mm (usual)" in of_file.assumed_from
-    stated = read_calibration(paths, stated=Known(0.21, 20, pitch_mm=30.0)).stereo
+    stated = read_calibration(paths, stated=Provenance(0.21, 20, pitch_mm=30.0)).stereo
     assert "RMS 0.21 px (stated), 20 views (stated), a board of 8x5 corners (of the file)" in stated.assumed_from
     board = Board(8, 5, 30.0)
     np.testing.assert_allclose(stated.parameter_covariance, calibration_covariance(stated, board, 20, 0.21), rtol=1e-12)
@@ -208,13 +208,13 @@ def test_what_was_stated_goes_before_the_file_and_that_before_what_is_usual(moun
     np.testing.assert_allclose(
         of_file.parameter_covariance, calibration_covariance(of_file, board, 17, 0.41), rtol=1e-12
     )
-    assert CORRELATED >= 1
+    assert CORRELATION_FACTOR >= 1
 
 
 def test_cameras_that_share_no_view_are_refused(mounted):
     away = replace(mounted, R=rotation_matrix(np.array([0, 2.8, 0])))
     with pytest.raises(InputError, match="do not see one board together"):
-        with_assumed_covariance(away, Known(), Known())
+        with_assumed_covariance(away, Provenance(), Provenance())
     with pytest.raises(InputError, match="calibrate no pair"):
         calibration_covariance(mounted, Board(3, 3, 25.0), 0, 0.2)
 

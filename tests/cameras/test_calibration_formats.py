@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tvsbayes.cameras.assumed_covariance import Known, with_assumed_covariance
+from tvsbayes.cameras.assumed_covariance import Provenance, with_assumed_covariance
 from tvsbayes.cameras.calibration_containers import read_container
 from tvsbayes.cameras.calibration_export import exported
 from tvsbayes.cameras.calibration_formats import read_calibration
@@ -69,8 +69,8 @@ def test_what_is_exported_is_imported_again(mounted, tmp_path, form, backwards):
     found = read_calibration(paths[::-1] if backwards else paths)
     assert found.source == form
     close(found.stereo, mounted)
-    way = Known(fixed_intrinsics={"opencv": None, "ros": True}[form])
-    assert found.stereo.assumed_from == with_assumed_covariance(found.stereo, Known(), way).assumed_from
+    way = Provenance(fixed_intrinsics={"opencv": None, "ros": True}[form])
+    assert found.stereo.assumed_from == with_assumed_covariance(found.stereo, Provenance(), way).assumed_from
     assert any(found.stereo.assumed_from in note for note in found.notes)
     assert found.stereo.assumed and b'"assumed": true' in stereo_bytes(found.stereo)
 

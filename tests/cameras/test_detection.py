@@ -177,7 +177,7 @@ def test_deep_frames_are_detected_with_all_their_bits(tmp_path, monkeypatch):
     for name in sorted((folder.path / "frames").iterdir()):
         deep = cv2.imread(str(name)).astype(np.uint16) * 16 + 7
         name.write_bytes(png_bytes(np.minimum(deep, 4095)))
-    monkeypatch.setattr("tvsbayes.cameras.detection.PILOTS_MAX", 2)
+    monkeypatch.setattr("tvsbayes.cameras.detection.PILOT_LOOKS_MAX", 2)
     for name in sorted((folder.path / "frames").glob("0000[05]0_*")):
         name.write_bytes(png_bytes(cv2.imread(str(name), cv2.IMREAD_UNCHANGED) // 5))
     told = []

@@ -16,7 +16,7 @@ from support.drawn_boards import PAIR, POSES, pictures, write_pair
 
 from experiments.cameras.stereo_coverage import calibrate, chi2
 from experiments.common.board_views import CORNER_SD_PX, corners_of, scenes, true_corners
-from tvsbayes.cameras.board_errors import _by_corner
+from tvsbayes.cameras.board_errors import _corner_slopes
 from tvsbayes.cameras.boards import Board, View, Views, corner_orders, find_views
 from tvsbayes.cameras.bundle_adjustment import (
     RESTARTS_MAX,
@@ -104,7 +104,7 @@ def test_a_board_that_is_no_grid_is_in_the_covariance(off_mm):
         views = []
         for k, scene in enumerate(drawn):
             view = corners_of(scene, f"{k:02d}", rng)
-            moved = np.einsum("qca,ca->cq", _by_corner(view, BOARD, scene.stereo), away)
+            moved = np.einsum("qca,ca->cq", _corner_slopes(view, BOARD, scene.stereo), away)
             views.append(replace(view, left=view.left + moved[:, :2], right=view.right + moved[:, 2:]))
         found = calibrate_stereo(views, BOARD, SIZE)
         # 155 displacements tell their sd to 6 %; three of them, and what noise of the corners leaves open.

@@ -2,7 +2,7 @@
 
 Interlaced and two-tap readouts take alternate lines at another moment or with another gain. A constant gain moves no
 centre: the height of each half takes it up. A beam that moved in between, or a gain that changes along the spot, does,
-and the two are indistinguishable on a Gaussian. White noise of pixels puts the halves' centres apart with four times
+and the two are indistinguishable on a Gaussian. White noise of pixels separates the halves' centres with four times
 the covariance C of the whole's (each half has 2 C). Where a difference d is beyond that chance, the whole's centre lies
 anywhere between both with equal right: d d'/12 is added to C (JCGM 100:2008, 4.3.7: limits d apart, uniform).
 
@@ -19,23 +19,23 @@ import numpy as np
 from tvsbayes.cameras.spot_window import Patch, block_means
 
 LINES = ("rows", "columns")
-CHANCE = 1e-5
-"""Of noise alone to be taken for a difference: of one spot, or of all of a camera together. A campaign of 1000 looks
-makes 4000 such tests."""
+SIGNIFICANCE = 1e-5
+"""Significance level for one spot, or for all spots of a camera together. A campaign of 1000 looks makes 4000 such
+tests."""
 EXCESS_MIN = 4.0
 """Least mean of chi-square per coordinate over a camera's spots: stated noise may be wrong by some tens of per cent."""
-_HIGH = np.array([-0.25, 0.5, -0.25], np.float32)
-"""Passes what alternates from line to line whole, and nothing that is straight over three lines."""
-_ONE = np.ones(1, np.float32)
+_HIGH_PASS = np.array([-0.25, 0.5, -0.25], np.float32)
+"""Gain 1 for values that alternate from line to line, 0 for values that are linear over three lines."""
+_IDENTITY = np.ones(1, np.float32)
 
 
 @dataclass(frozen=True)
 class AlternateLines:
-    """That even and odd lines of a camera's spots show the beam in two places.
+    """A disagreement of even and odd lines about the centres of a camera's spots.
 
     Attributes:
         lines: "rows" or "columns".
-        spots: how many of the camera's spots were widened for it.
+        spots: number of spots with an increased covariance.
         apart_px: median distance of the two centres over these spots.
     """
 
@@ -46,7 +46,7 @@ class AlternateLines:
 
 @dataclass(frozen=True)
 class Widening:
-    """What is added to the covariances of a camera's centres (n, 2, 2), px^2, and why."""
+    """Terms added to the covariances of a camera's centres (n, 2, 2), px^2, and the disagreeing lines."""
 
     added_px2: np.ndarray
     lines: tuple[AlternateLines, ...]
@@ -55,8 +55,8 @@ class Widening:
 def shift_of_lines(patch: Patch, jacobian: np.ndarray, weights: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Centre of the odd less that of the even rows, then columns: (2, 2) of u and v, px.
 
-    The centres of both halves with the weights of the whole, to first order: what alternates in the picture goes
-    through the fit's own normal equations.
+    The centres of both halves with the weights of the whole, to first order: the alternating part of the picture is the
+    right side of the fit's own normal equations.
 
     Args:
         patch: the pixels; lines are counted from the picture's border.
@@ -79,10 +79,10 @@ def shift_of_lines(patch: Patch, jacobian: np.ndarray, weights: np.ndarray, resi
 
 
 def widening(shifts_px: Sequence[np.ndarray], covariances_px2: Sequence[np.ndarray]) -> Widening:
-    """What the differences of alternate lines add to the centres of one camera.
+    """Additional covariance of the centres of one camera from the differences of alternate lines.
 
-    A spot whose own difference is beyond chance is widened by it; where those of the others are together beyond
-    chance, and `EXCESS_MIN` times as large in mean square as stated, every spot is, each by its own.
+    A significant difference increases the covariance of its spot; where the differences of the others are significant
+    together, and `EXCESS_MIN` times as large in mean square as stated, those of all spots do.
 
     Args:
         shifts_px: (2, 2) of each spot, as `shift_of_lines` makes them.
@@ -97,20 +97,20 @@ def widening(shifts_px: Sequence[np.ndarray], covariances_px2: Sequence[np.ndarr
     inverse = np.linalg.inv(4 * np.array(covariances_px2))
     chi2 = np.einsum("nki,nij,nkj->nk", shifts, inverse, shifts)
     for number, lines in enumerate(LINES):
-        beyond = chi2[:, number] > chdtri(2, CHANCE)
-        rest = chi2[~beyond, number]
-        if rest.size and rest.sum() > max(chdtri(2 * rest.size, CHANCE), 2 * EXCESS_MIN * rest.size):
-            beyond[:] = True
-        if beyond.any():
-            apart = shifts[beyond, number]
-            added[beyond] += np.einsum("ni,nj->nij", apart, apart) / 12
-            disagreeing.append(AlternateLines(lines, int(beyond.sum()), float(np.median(np.hypot(*apart.T)))))
+        significant = chi2[:, number] > chdtri(2, SIGNIFICANCE)
+        rest = chi2[~significant, number]
+        if rest.size and rest.sum() > max(chdtri(2 * rest.size, SIGNIFICANCE), 2 * EXCESS_MIN * rest.size):
+            significant[:] = True
+        if significant.any():
+            gaps = shifts[significant, number]
+            added[significant] += np.einsum("ni,nj->nij", gaps, gaps) / 12
+            disagreeing.append(AlternateLines(lines, int(significant.sum()), float(np.median(np.hypot(*gaps.T)))))
     return Widening(added, tuple(disagreeing))
 
 
 def _high_pass(raw: np.ndarray, axis: int) -> np.ndarray:
-    """What differs from the mean of the lines before and after."""
+    """Difference from the mean of the lines before and after."""
     import cv2
 
-    along = (_ONE, _HIGH) if axis == 0 else (_HIGH, _ONE)
-    return cv2.sepFilter2D(raw, cv2.CV_32F, *along)
+    kernels = (_IDENTITY, _HIGH_PASS) if axis == 0 else (_HIGH_PASS, _IDENTITY)
+    return cv2.sepFilter2D(raw, cv2.CV_32F, *kernels)

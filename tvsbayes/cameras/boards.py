@@ -1,4 +1,4 @@
-"""Checkerboards in pictures, plain or with markers: where the inner corners are, in an order both cameras share.
+"""Checkerboards in pictures, plain or with markers: the inner corners, in the same order for both cameras.
 
 Corners are px with the integer at a pixel's centre, shape (corners, 2), row by row. The board's frame: origin in the
 middle, x along the columns, y along the rows, z away from the viewer, mm. Pictures pass the checks of `files` before
@@ -48,18 +48,18 @@ Finder = Literal["classic", "sector"]
 REFINING_SHARE = 0.25
 """Half the window of cornerSubPix over the smallest distance of two corners: the window must hold one corner only,
 and a wide one averages more noise. On OpenCV's pairs (22 to 37 px) fixed halves of 3, 5, 7, 9, 11 px leave 0.23,
-0.20, 0.18, 0.20, 0.41 px: the best is a quarter of the distance, and from half on neighbours pull."""
+0.20, 0.18, 0.20, 0.41 px: the best is a quarter of the distance; from half of it on, neighbours bias the corner."""
 WIDEST_SHARE = 0.5
-"""The same share, where the narrower window loses a corner: beyond it neighbours are inside."""
+"""Largest such share, where the narrower window loses a corner: a wider one contains neighbours."""
 REFINING_HALF_MIN, REFINING_HALF_MAX = 2, 11
 WORKERS_MAX = 8
 PICTURES_MAX = 2000
 PIXELS_MAX = 20_000_000
-"""Of one picture, and of those that are searched at the same time: one of 20 million takes 0.8 GB to search."""
-TRIED_MAX, TRIED_AT_ONCE = 12, 4
-"""Pictures in which a board is looked for before all are searched; as soon as one shows it, all are."""
+"""Of one picture, and of all that are searched in parallel: one of 20 million takes 0.8 GB."""
+SAMPLE_MAX, SAMPLE_BATCH = 12, 4
+"""Pictures that are searched first, in batches; all are searched once one shows the board."""
 SMALLEST = (3, 3)
-"""Inner corners from which a board is searched that may have more."""
+"""Least inner corners in the search for a board of unknown size."""
 SECTOR_PIXELS_MAX = 3_000_000
 """Larger pictures are searched by sectors in a smaller copy, then refined: 20 million pixels would take 3.8 GB and half
 a minute."""
@@ -67,7 +67,7 @@ DARK_DN, BRIGHT_DN = 40.0, 225.0
 """Mean grey level below or above which a picture is too dark or overexposed to show a board."""
 BLURRED_SHARE = 0.02
 """Largest second difference of neighbours over the range of grey levels: below it no edge is in focus. An edge in focus
-has about 1, one that is smeared over 10 px 0.03."""
+has about 1, an edge blurred over 10 px 0.03."""
 CLIPPED_SHARE = 0.3
 _BOARD_SIZE = re.compile(r"([0-9]{1,3})\s*[xX*]\s*([0-9]{1,3})")
 
@@ -81,7 +81,7 @@ class Board:
         rows: inner corners along y.
         pitch_mm: side of a square.
         pitch_u_mm: standard uncertainty of the mean pitch (GUM type B: certificate, ruler, printer).
-        markers: of a ChArUco board, of which a picture may show a part; None of a plain checkerboard.
+        markers: of a ChArUco board, which may be partly visible; None for a plain checkerboard.
     """
 
     columns: int
@@ -127,8 +127,8 @@ class Board:
             raise _bad_option("--charuco", escaped(squares), "COLUMNSxROWS of squares", "write for example 15x10")
         columns, rows = int(match[1]), int(match[2])
         share = None if marker_mm is None else marker_mm / pitch_mm
-        bare = dictionary.strip().removeprefix("DICT_")
-        return cls(columns - 1, rows - 1, pitch_mm, pitch_u_mm, Markers((columns, rows), bare, share))
+        name = dictionary.strip().removeprefix("DICT_")
+        return cls(columns - 1, rows - 1, pitch_mm, pitch_u_mm, Markers((columns, rows), name, share))
 
     @property
     def corners(self) -> int:
@@ -157,7 +157,7 @@ def _bad_option(option: str, found: str, allowed: str, remedy: str) -> InputErro
 class View:
     """Corners of the board at one pose: `left` and `right` of shape (corners, 2), px, row by row; None where unseen.
 
-    Of a board with markers single corners may be unseen: NaN.
+    Single corners of a board with markers may be unseen: NaN.
     """
 
     name: str
@@ -167,19 +167,19 @@ class View:
 
 @dataclass(frozen=True)
 class Views:
-    """What a folder of pictures holds.
+    """The board in a folder of pictures.
 
     Attributes:
         views: with the board in at least one picture, in the order of their names.
         image_width: of one camera, px.
         image_height: px.
-        unpaired: pictures of one camera without their counterpart; where they show the board, they are in `views`.
-        unnamed: pictures whose names tell no camera, and that hold no two side by side; not used.
+        unpaired: pictures of one camera without one of the other; where they show the board, they are in `views`.
+        unnamed: pictures without a camera in their names that hold no two pictures side by side; not used.
         without_board: pictures in which no board was found.
         other_size: pictures of another size than most; not used.
         by_fallback: pictures whose board only the other finder found.
-        reordered: views whose right corners were turned to agree with the left ones.
-        right_image_size: of the right camera's pictures where it is another; its corners are scaled to the left one's.
+        reordered: views whose right corners were reordered to match the left ones.
+        right_image_size: of the right camera's pictures where it differs; its corners are scaled to the left size.
     """
 
     views: tuple[View, ...]
@@ -202,48 +202,48 @@ def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> 
 
     Args:
         grey: (height, width) uint8.
-        board: what to look for; where it has markers, they are the finder.
-        finder: which to try first.
+        board: the board; its markers, if any, are the finder.
+        finder: the first to try.
 
     Returns:
-        Corners (corners, 2), px, right-handed (x, then y, turn towards the image's own x, y), and whether the
-        fallback found them; None where neither did.
+        Corners (corners, 2), px, in right-handed order (the sense of the image's x, y), and whether the fallback found
+        them; None where neither did.
     """
     if board.markers is not None:
-        detected = marker_board_corners(grey, board.markers)
-        return None if detected is None else (detected, False)
-    for attempt in (finder, "sector" if finder == "classic" else "classic"):
-        corners = _find_classic(grey, board) if attempt == "classic" else _find_sector(grey, board)
+        marker_corners = marker_board_corners(grey, board.markers)
+        return None if marker_corners is None else (marker_corners, False)
+    for method in (finder, "sector" if finder == "classic" else "classic"):
+        corners = _find_classic(grey, board) if method == "classic" else _find_sector(grey, board)
         if corners is None or not np.isfinite(corners).all():
             continue
         grid = corners.reshape(board.rows, board.columns, 2)
         along, across = (grid[:, -1] - grid[:, 0]).mean(0), (grid[-1] - grid[0]).mean(0)
-        # A board is not transparent: seen from the front, rows turn the same way in every picture.
+        # Every picture shows the front of the board, so the order has the same sense in all of them.
         if along[0] * across[1] - along[1] * across[0] < 0:
             grid = grid[:, ::-1]
-        return grid.reshape(-1, 2), attempt != finder
+        return grid.reshape(-1, 2), method != finder
     return None
 
 
 def _find_classic(grey: np.ndarray, board: Board) -> np.ndarray | None:
-    corners = _whole(board, *cv2.findChessboardCorners(grey, (board.columns, board.rows)))
+    corners = _all_corners(board, *cv2.findChessboardCorners(grey, (board.columns, board.rows)))
     return None if corners is None else _refined(grey, corners.astype(np.float32), board)
 
 
-def _whole(board: Board, detected: bool, corners: np.ndarray | None) -> np.ndarray | None:
-    """Corners (corners, 2) of a detection, if it is all of them."""
-    whole = detected and corners is not None and np.size(corners) == 2 * board.corners
-    return np.asarray(corners, float).reshape(-1, 2) if whole else None
+def _all_corners(board: Board, detected: bool, corners: np.ndarray | None) -> np.ndarray | None:
+    """Corners (corners, 2) of a complete detection; else None."""
+    complete = detected and corners is not None and np.size(corners) == 2 * board.corners
+    return np.asarray(corners, float).reshape(-1, 2) if complete else None
 
 
 def _refined(grey: np.ndarray, corners: np.ndarray, board: Board) -> np.ndarray:
-    """Corners (n, 2) by cornerSubPix, in a window that fits their distances."""
+    """Corners (n, 2) by cornerSubPix, with a window that depends on their distances."""
     grid = corners.reshape(board.rows, board.columns, 2)
     nearest = min(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1))
     half = int(np.clip(round(REFINING_SHARE * nearest), REFINING_HALF_MIN, REFINING_HALF_MAX))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-    # A corner whose search leaves the window is given back as it came, off by pixels (steeply seen boards): widen
-    # the window then, up to the neighbours, whose distance is itself known to pixels only.
+    # cornerSubPix returns a corner unchanged, wrong by pixels, where its search leaves the window (boards at a steep
+    # angle): widen the window then, up to the neighbours, whose distance is itself known to pixels only.
     for size in range(half, max(half + 1, int(WIDEST_SHARE * nearest)) + 1):
         refined = cv2.cornerSubPix(grey, corners.reshape(-1, 1, 2).copy(), (size, size), (-1, -1), criteria)
         refined = np.asarray(refined).reshape(-1, 2)
@@ -255,7 +255,7 @@ def _refined(grey: np.ndarray, corners: np.ndarray, board: Board) -> np.ndarray:
 def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     small = shrunk(grey)
-    corners = _whole(board, *cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags))
+    corners = _all_corners(board, *cv2.findChessboardCornersSB(small, (board.columns, board.rows), flags=flags))
     if corners is None or small is grey:
         return corners
     scale = np.array(grey.shape[::-1]) / small.shape[::-1]
@@ -263,7 +263,7 @@ def _find_sector(grey: np.ndarray, board: Board) -> np.ndarray | None:
 
 
 def corner_orders(board: Board) -> list[np.ndarray]:
-    """Orders that a finder may give to corners: as they are, half turns, of square boards quarter turns."""
+    """Possible orders of corners: unchanged, half turns, for square boards quarter turns."""
     index = np.arange(board.corners).reshape(board.rows, board.columns)
     if board.markers is not None:
         return [index.ravel()]
@@ -271,8 +271,8 @@ def corner_orders(board: Board) -> list[np.ndarray]:
     return [np.rot90(index, quarter).ravel() for quarter in quarters]
 
 
-def _first_colour(grey: np.ndarray, corners: np.ndarray, board: Board) -> bool:
-    """Whether the square behind the first corner is brighter than its neighbours, by all squares."""
+def _first_is_bright(grey: np.ndarray, corners: np.ndarray, board: Board) -> bool:
+    """Whether the square behind the first corner is bright, judged by all squares."""
     grid = corners.reshape(board.rows, board.columns, 2)
     middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     u, v = np.clip(np.rint(middles).astype(int), 0, np.array(grey.shape[::-1]) - 1).transpose(2, 0, 1)
@@ -282,28 +282,28 @@ def _first_colour(grey: np.ndarray, corners: np.ndarray, board: Board) -> bool:
 
 
 @dataclass(frozen=True)
-class _Detection:
-    """Corners of one picture; `colours[k]` is the first square's under the k-th order of `corner_orders`."""
+class _Detected:
+    """Corners of one picture; `colours[k]` tells whether the first square is bright in the k-th of `corner_orders`."""
 
     corners: np.ndarray
     colours: tuple[bool, ...]
     by_fallback: bool
 
 
-def _agreeing(left: _Detection, right: _Detection, board: Board) -> tuple[np.ndarray, bool]:
-    """Right corners in the order of the left ones, and whether they were turned.
+def _same_order(left: _Detected, right: _Detected, board: Board) -> tuple[np.ndarray, bool]:
+    """Right corners in the order of the left ones, and whether they were reordered.
 
-    The colours decide where the board's turned image differs from it (one of columns and rows odd, one even).
-    Otherwise the two cameras are taken to be turned by less than half of the board's symmetry against each other.
+    The colours decide where a turned board looks different (one of columns and rows odd, one even). Otherwise the
+    relative rotation of the cameras is assumed to be less than half of the board's symmetry angle.
     """
     if board.markers is not None:
         return right.corners, False
     grids = [right.corners[turn].reshape(board.rows, board.columns, 2) for turn in corner_orders(board)]
-    kept = [k for k, colour in enumerate(right.colours) if colour == left.colours[0]] or list(range(len(grids)))
+    candidates = [k for k, colour in enumerate(right.colours) if colour == left.colours[0]] or list(range(len(grids)))
     grid = left.corners.reshape(board.rows, board.columns, 2)
     along = (grid[:, -1] - grid[:, 0]).mean(0)
-    ways = [(each[:, -1] - each[:, 0]).mean(0) for each in grids]
-    best = max(kept, key=lambda k: float(along @ ways[k]) / max(float(np.linalg.norm(ways[k])), 1e-12))
+    rows_px = [(candidate[:, -1] - candidate[:, 0]).mean(0) for candidate in grids]
+    best = max(candidates, key=lambda k: float(along @ rows_px[k]) / max(float(np.linalg.norm(rows_px[k])), 1e-12))
     return grids[best].reshape(-1, 2), best != 0
 
 
@@ -315,17 +315,17 @@ def find_views(
     pairing: Pairing = AS_NAMED,
     advance: Advance = unshown,
 ) -> Views:
-    """Finds the board in all pictures of a folder.
+    """Find the board in all pictures of a folder.
 
-    Pictures (PNG, JPEG) are paired as `paired_pictures` says. Where no file is named after a camera, pictures at least
-    twice as wide as high are split in the middle. Other files are ignored; those that are pictures are named.
+    Pictures (PNG, JPEG) are paired as in `paired_pictures`. Where no file is named after a camera, pictures at least
+    twice as wide as high are split in the middle. Other files are ignored; other pictures are listed.
 
     Args:
         folder: of the pictures.
-        board: what to look for.
+        board: the board.
         finder: see `find_corners`.
-        pairing: which picture is of which camera.
-        advance: called with the share of the pictures that is done.
+        pairing: the camera of each picture.
+        advance: called with the share of pictures searched.
 
     Raises:
         InputError: no folder, an unreadable picture, or two for one camera and view.
@@ -333,16 +333,16 @@ def find_views(
     """
     pictures = read_folder(folder, PICTURES_MAX, PIXELS_MAX, pairing)
     usual, used = pictures.usual, pictures.used
-    _refuse_unlike(pictures)
-    tried = spread(used, TRIED_MAX)
+    _check_sizes(pictures)
+    sample = spread(used, SAMPLE_MAX)
     if board.markers is not None:
-        greys = [part for picture in tried for part in _greys(picture, pictures).values()]
+        greys = [part for picture in sample for part in _greys(picture, pictures).values()]
         board = replace(board, markers=fitted_markers(greys, board.markers))
-    if len(used) > len(tried) and not _any_board(tried, pictures, board, finder):
-        raise _without_board(tried, pictures, board)
-    boards: dict[str, dict[str, _Detection]] = {}
+    if len(used) > len(sample) and not _any_board(sample, pictures, board, finder):
+        raise _no_board_error(sample, pictures, board)
+    boards: dict[str, dict[str, _Detected]] = {}
     names: dict[tuple[str, str], str] = {}
-    without, fallback = [], []
+    boardless, fallback = [], []
     for count, (picture, detections) in enumerate(
         zip(used, _detections(used, pictures, board, finder), strict=True), start=1
     ):
@@ -352,30 +352,30 @@ def find_views(
             name += f" ({side})" if len(picture.sides) > 1 else ""
             names[picture.view, side] = name
             if detection is None:
-                without.append(name)
+                boardless.append(name)
                 continue
             boards.setdefault(picture.view, {})[side] = detection
             if detection.by_fallback:
                 fallback.append(name)
     if not boards:
-        raise _without_board(tried, pictures, board)
+        raise _no_board_error(sample, pictures, board)
     views, reordered = [], []
     for name in sorted(boards, key=natural_order):
         left, right = (boards[name].get(side) for side in CAMERAS)
         corners = None if right is None else right.corners
         if left is not None and right is not None:
-            corners, turned = _agreeing(left, right, board)
+            corners, turned = _same_order(left, right, board)
             reordered += [name] * turned
         corners = None if corners is None else scaled_px(corners, usual["right"], usual["left"])
         views.append(View(name, None if left is None else left.corners, corners))
-    lonely = [n for (view, side), n in names.items() if (view, CAMERAS[side == "left"]) not in names]
+    unpaired = [n for (view, side), n in names.items() if (view, CAMERAS[side == "left"]) not in names]
     return Views(
         views=tuple(views),
         image_width=usual["left"][0],
         image_height=usual["left"][1],
-        unpaired=tuple(sorted(lonely, key=natural_order)),
+        unpaired=tuple(sorted(unpaired, key=natural_order)),
         unnamed=pictures.unnamed,
-        without_board=tuple(without),
+        without_board=tuple(boardless),
         other_size=tuple(path.as_posix() for path in pictures.other_size),
         right_image_size=None if usual["right"] == usual["left"] else usual["right"],
         by_fallback=tuple(fallback),
@@ -383,51 +383,51 @@ def find_views(
     )
 
 
-def _any_board(tried: Sequence[Picture], pictures: PictureFolder, board: Board, finder: Finder) -> bool:
-    """Whether one of some pictures shows the board: all would take minutes."""
-    for k in range(0, len(tried), TRIED_AT_ONCE):
-        some = _detections(tried[k : k + TRIED_AT_ONCE], pictures, board, finder)
-        if any(one is not None for detections in some for one in detections.values()):
+def _any_board(sample: Sequence[Picture], pictures: PictureFolder, board: Board, finder: Finder) -> bool:
+    """Whether a picture of the sample shows the board: a search of all would take minutes."""
+    for k in range(0, len(sample), SAMPLE_BATCH):
+        batch = _detections(sample[k : k + SAMPLE_BATCH], pictures, board, finder)
+        if any(detection is not None for detections in batch for detection in detections.values()):
             return True
     return False
 
 
-def _without_board(tried: Sequence[Picture], pictures: PictureFolder, board: Board) -> NothingToEstimate:
-    """That pictures do not show the board, and what they show instead."""
-    count, sizes = len(pictures.used), dict.fromkeys(pictures.sizes[one] for one in tried)
-    greys = [part for picture in tried for part in _greys(picture, pictures).values()]
-    of_sizes = " and ".join(f"{width} x {height}" for width, height in sizes)
+def _no_board_error(sample: Sequence[Picture], pictures: PictureFolder, board: Board) -> NothingToEstimate:
+    """The refusal of pictures without the board, with what they show instead."""
+    count, sizes = len(pictures.used), dict.fromkeys(pictures.sizes[one] for one in sample)
+    greys = [part for picture in sample for part in _greys(picture, pictures).values()]
+    sizes_text = " and ".join(f"{width} x {height}" for width, height in sizes)
     reason, remedy = why_no_board(greys, board.columns, board.rows)
     if board.markers is None:
-        looked = spread(greys)
-        name, markers = most_markers(looked)
-        if markers >= MARKERS_MIN * len(looked):
+        shown = spread(greys)
+        name, markers = most_markers(shown)
+        if markers >= MARKERS_MIN * len(shown):
             reason += f"; {markers} markers of {name.partition('_')[0]} are seen, as on a ChArUco board"
             remedy = f"--charuco COLUMNSxROWS --dictionary {name} in place of --board, counting squares"
     else:
         reason = "of no view enough markers are seen"
         remedy = "hold the board nearer, with at least three rows and columns of corners in the picture"
-    where = f"{len(tried)} of {count} pictures" if len(tried) < count else f"{count} pictures"
+    where = f"{len(sample)} of {count} pictures" if len(sample) < count else f"{count} pictures"
     return NothingToEstimate(
         "no-board",
-        f"no board of {board.columns}x{board.rows} inner corners in {where} of {of_sizes} px: {reason}",
+        f"no board of {board.columns}x{board.rows} inner corners in {where} of {sizes_text} px: {reason}",
         allowed="pictures that show the whole board",
         remedy=remedy,
     )
 
 
 def _greys(picture: Picture, pictures: PictureFolder) -> dict[str, np.ndarray]:
-    """The grey images in a picture by their camera, uint8."""
+    """The grey images in a picture by camera, uint8."""
     pixels, width = in_grey_levels(read_image(picture.path, pictures.folder)), pictures.sizes[picture][0]
-    # The finders want 8 bits; a corner is an average over hundreds of pixels.
+    # The finders need 8 bits; a corner is an average over hundreds of pixels.
     if pixels.dtype != np.uint8:
         pixels = np.rint(pixels).astype(np.uint8)
     grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
     return {side: np.ascontiguousarray(grey[:, k * width : (k + 1) * width]) for k, side in enumerate(picture.sides)}
 
 
-def _refuse_unlike(pictures: PictureFolder) -> None:
-    """Refuses pictures of one camera alone and of two proportions: the right ones are not the left ones, scaled."""
+def _check_sizes(pictures: PictureFolder) -> None:
+    """Refuse pictures of one camera alone, and sizes of two proportions: they are no scaled copies."""
     if not pictures.sizes:
         raise NothingToEstimate(
             "no-pictures",
@@ -457,20 +457,20 @@ def _refuse_unlike(pictures: PictureFolder) -> None:
 
 
 def _detections(
-    some: Sequence[Picture], pictures: PictureFolder, board: Board, finder: Finder
-) -> Iterator[dict[str, _Detection | None]]:
-    """The boards in pictures, by the camera whose image holds it."""
+    sample: Sequence[Picture], pictures: PictureFolder, board: Board, finder: Finder
+) -> Iterator[dict[str, _Detected | None]]:
+    """The board in each picture, by camera."""
 
-    def detect(picture: Picture) -> dict[str, _Detection | None] | InputError:
+    def detect(picture: Picture) -> dict[str, _Detected | None] | InputError:
         try:
             return {side: _detection(part, board, finder) for side, part in _greys(picture, pictures).items()}
         except InputError as error:
             return error
 
-    at_once = PIXELS_MAX // max(len(one.sides) * math.prod(pictures.sizes[one]) for one in some)
-    with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, at_once))) as pool:
+    parallel = PIXELS_MAX // max(len(one.sides) * math.prod(pictures.sizes[one]) for one in sample)
+    with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, parallel))) as pool:
         refused = []
-        for detections in pool.map(detect, some):
+        for detections in pool.map(detect, sample):
             if isinstance(detections, InputError):
                 refused.append(detections)
             else:
@@ -479,19 +479,19 @@ def _detections(
         raise all_of(refused)
 
 
-def _detection(grey: np.ndarray, board: Board, finder: Finder) -> _Detection | None:
+def _detection(grey: np.ndarray, board: Board, finder: Finder) -> _Detected | None:
     result = find_corners(grey, board, finder)
     if result is None:
         return None
     corners, by_fallback = result
     if board.markers is not None:
-        return _Detection(corners, (True,), by_fallback)
-    colours = tuple(_first_colour(grey, corners[turn], board) for turn in corner_orders(board))
-    return _Detection(corners, colours, by_fallback)
+        return _Detected(corners, (True,), by_fallback)
+    colours = tuple(_first_is_bright(grey, corners[turn], board) for turn in corner_orders(board))
+    return _Detected(corners, colours, by_fallback)
 
 
 def shrunk(grey: np.ndarray) -> np.ndarray:
-    """A picture as it can be searched by sectors: the very one, or a smaller copy."""
+    """A picture for the search by sectors: unchanged, or a smaller copy."""
     shrink = math.ceil(math.sqrt(grey.size / SECTOR_PIXELS_MAX))
     return grey if shrink == 1 else cv2.resize(grey, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
 
@@ -506,14 +506,14 @@ def inner_corners(grey: np.ndarray) -> tuple[int, int] | None:
 
 
 def why_no_board(pictures: Sequence[np.ndarray], columns: int, rows: int) -> tuple[str, str]:
-    """What pictures without the board show, and what to do.
+    """A reason why pictures do not show the board, and a remedy.
 
     Args:
-        pictures: some of a camera.
-        columns: inner corners that were looked for, along one side.
+        pictures: a sample of one camera.
+        columns: inner corners of the board along one side.
         rows: along the other.
     """
-    wanted = (max(columns, rows), min(columns, rows))
+    stated = (max(columns, rows), min(columns, rows))
     boards = Counter(size for grey in pictures if (size := inner_corners(grey)) is not None)
     if boards:
         (long, short), count = boards.most_common(1)[0]
@@ -521,10 +521,10 @@ def why_no_board(pictures: Sequence[np.ndarray], columns: int, rows: int) -> tup
         if (
             len(boards) > 1
             and 2 * count <= boards.total()
-            and all(a <= wanted[0] and b <= wanted[1] for a, b in boards)
+            and all(a <= stated[0] and b <= stated[1] for a, b in boards)
         ):
             return (
-                f"parts of a board are seen, {listed} inner corners of {wanted[0]}x{wanted[1]}: partly outside?",
+                f"parts of a board are seen, {listed} inner corners of {stated[0]}x{stated[1]}: partly outside?",
                 "hold the whole board into both pictures; or is it smaller: count where four squares meet",
             )
         remedy = f"--board {long}x{short}? count where four squares meet, not the squares"
@@ -546,7 +546,7 @@ def why_no_board(pictures: Sequence[np.ndarray], columns: int, rows: int) -> tup
 
 
 def _sharpness(grey: np.ndarray) -> float:
-    """Of the sharpest edges: second differences over the range of grey levels."""
+    """Sharpness of the best edges: second differences over the range of grey levels."""
     low, high = np.percentile(grey, (1, 99))
     second = np.abs(cv2.Laplacian(grey, cv2.CV_32F))
     return float(np.percentile(second, 99.5)) / max(float(high - low), 8.0)

@@ -33,17 +33,18 @@ from tvsbayes.statistics.least_squares import LinearResidual, least_squares_cova
 VIEWS_PER_BUCKET, CORNERS_PER_BUCKET = 16, 32
 """Padding: calibrations of like size share one compilation."""
 POSE_STEPS, POSE_TOLERANCE = 40, 1e-20
-"""Gauss-Newton steps of a pose, and the squared step, in units of rad and board sizes, at which it is settled."""
+"""Largest number of Gauss-Newton steps of a pose, and the squared step at convergence, in rad and board sizes."""
 TOLERANCE, STEPS_MAX = 1e-7, 200
-"""In whitened coordinates this ended within 1e-7 standard errors of the minimum; the end is checked all the same."""
+"""In whitened coordinates this ended within 1e-7 standard errors of the minimum; the end is also checked."""
 RESTART_SD = 3.0
 """The repeated adjustment starts this many standard errors away in every parameter."""
 RESTART_AGREEMENT_SD = 1e-2
 RESTARTS_MAX, LOWER_SHARE = 4, 1e-6
-"""A repetition that ends lower is taken and itself repeated: lenses far from the model have several minima."""
+"""A repetition with a lower end replaces the first and is itself repeated: lenses far from the model have several
+minima."""
 STATIONARY_SD = 1e-3
 EXACT_PX = 1e-7
-"""Exact corners leave rounding errors, whose direction means nothing."""
+"""Residuals of exact corners are rounding errors, whose direction is meaningless."""
 
 
 class BoardArrays(eqx.Module):
@@ -104,10 +105,10 @@ def _pose_gain(pose, parameters, corners_px, weight, points_mm):
     return by_pose, scale[:, None] * jnp.linalg.solve(normal + ridge * jnp.eye(6), scaled.T), scale
 
 
-def _settled_pose(pose, parameters, corners_px, weight, points_mm):
+def _converged_pose(pose, parameters, corners_px, weight, points_mm):
     """The pose of least squares for given cameras, by Gauss-Newton steps from a pose nearby."""
 
-    def unsettled(state):
+    def not_converged(state):
         _, step2, steps = state
         return (step2 > POSE_TOLERANCE) & (steps < POSE_STEPS)
 
@@ -117,7 +118,7 @@ def _settled_pose(pose, parameters, corners_px, weight, points_mm):
         change = gain @ _view_residuals(pose, parameters, corners_px, weight, points_mm)
         return pose - change, jnp.sum((change / scale) ** 2), steps + 1
 
-    return jax.lax.while_loop(unsettled, step, (pose, jnp.asarray(jnp.inf), 0))[0]
+    return jax.lax.while_loop(not_converged, step, (pose, jnp.asarray(jnp.inf), 0))[0]
 
 
 def _over_views(function):
@@ -127,13 +128,12 @@ def _over_views(function):
 def reduced_residuals(z: Float[Array, "24"], arrays: BoardArrays) -> Float[Array, " residuals"]:
     """All residuals with every board at its optimum, px, as a function of the cameras alone.
 
-    Its derivative is (1 - P) J of the full problem: what a change of the cameras leaves after the boards have
-    followed.
+    Its derivative is (1 - P) J of the full problem: the effect of a change of the cameras with the boards readjusted.
     """
     parameters = arrays.origin + arrays.root @ z
     views = (arrays.corners_px, arrays.weight, arrays.points_mm)
     fixed = jax.lax.stop_gradient(parameters)
-    poses = jax.lax.stop_gradient(_over_views(_settled_pose)(arrays.poses, fixed, *views))
+    poses = jax.lax.stop_gradient(_over_views(_converged_pose)(arrays.poses, fixed, *views))
     by_pose, gain, _ = jax.lax.stop_gradient(_over_views(_pose_gain)(poses, fixed, *views))
     residuals = _over_views(_view_residuals)(poses, parameters, *views)
     return (residuals - jnp.einsum("vrp,vps,vs->vr", by_pose, gain, residuals)).ravel()
@@ -179,7 +179,7 @@ class Adjustment:
 def correlation_factor(
     jacobian: np.ndarray, residuals: np.ndarray, views: np.ndarray, noise_sd: float, explained: float = 0.0
 ) -> float:
-    """How much larger the scores of whole views are than independent corners would make them; at least 1.
+    """Ratio of the scores of whole views to those expected for independent corners; at least 1.
 
     Corner errors of one picture have common causes (light, defocus, a lens that is not quite the model, a bent
     board): they are not independent, and (J^T J)^-1 s^2 is then too small. The score of view i, J_i^T r_i, shows
@@ -219,7 +219,7 @@ def bundle_adjustment(
         free: (24,) of bool; the others keep their start.
 
     Raises:
-        NothingToEstimate: the views leave a combination of parameters open.
+        NothingToEstimate: the views do not determine all parameters.
         NotConverged: no minimum was found.
     """
     arrays = _padded(views, board, start, poses, free)
@@ -275,17 +275,17 @@ def _padded(views: Sequence[View], board: Board, start: np.ndarray, poses: np.nd
     return BoardArrays(*map(placed, (points, pixels, weight, start_poses, np.asarray(start, float), unit)))
 
 
-def _check_minimum(jacobian: np.ndarray, residuals: np.ndarray, apart: np.ndarray, noise_sd: float) -> None:
-    """Refuses an end that is no minimum.
+def _check_minimum(jacobian: np.ndarray, residuals: np.ndarray, difference: np.ndarray, noise_sd: float) -> None:
+    """Refuse an end that is no minimum.
 
-    What the linear model would still move, and `apart`, how far off the repetition ended, both as distances in
-    standard errors whatever the conditioning: |J dz| / s.
+    Checks the next step of the linear model and `difference`, the deviation of the repetition, both as distances in
+    standard errors for any conditioning: |J dz| / s.
     """
-    left = float(np.linalg.norm(np.linalg.qr(jacobian)[0].T @ residuals))
+    next_step = float(np.linalg.norm(np.linalg.qr(jacobian)[0].T @ residuals))
     problems = []
-    if not left <= STATIONARY_SD * noise_sd + EXACT_PX:
-        problems.append(f"the next step would be {left / noise_sd:.2g} standard errors")
-    if not float(np.linalg.norm(jacobian @ apart)) <= RESTART_AGREEMENT_SD * noise_sd + EXACT_PX:
+    if not next_step <= STATIONARY_SD * noise_sd + EXACT_PX:
+        problems.append(f"the next step would be {next_step / noise_sd:.2g} standard errors")
+    if not float(np.linalg.norm(jacobian @ difference)) <= RESTART_AGREEMENT_SD * noise_sd + EXACT_PX:
         problems.append("a second adjustment from a start nearby ended elsewhere")
     if problems:
         raise NotConverged(
@@ -298,7 +298,7 @@ def _check_minimum(jacobian: np.ndarray, residuals: np.ndarray, apart: np.ndarra
 
 @dataclass(frozen=True)
 class _End:
-    """Where a descent ended: coordinates z (24,), residuals and Jacobian there."""
+    """The end of a descent: coordinates z (24,), residuals and Jacobian."""
 
     z: np.ndarray
     residuals: np.ndarray
@@ -310,25 +310,25 @@ class _End:
 
 
 def _lowest(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> tuple[_End, _End]:
-    """The lowest end that was found, and where the last repetition from beside it ended."""
+    """The lowest end, and the end of the last repetition from a start near it."""
     again = _repeated(end, arrays, free, dof)
     for _ in range(RESTARTS_MAX):
         if not again.noise_sd(dof) < (1 - LOWER_SHARE) * end.noise_sd(dof):
             break
-        # What is returned was always repeated itself: an end compared with itself would pass for confirmed.
+        # The returned end is always repeated itself: compared with itself it would seem confirmed.
         end, again = again, _repeated(again, arrays, free, dof)
     return end, again
 
 
 def _repeated(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> _End:
-    """Where a descent from beside an end ends."""
-    # Alternating signs, so that no parameter's shift can be taken up by another's.
+    """The end of a descent from a start near another end."""
+    # Alternating signs, so that the shift of one parameter does not cancel that of another.
     shift = RESTART_SD * end.noise_sd(dof) * np.where(np.arange(24) % 2, -1.0, 1.0) * free
     return _descended(end.z + shift, arrays)
 
 
 def _descended(z: np.ndarray, arrays: BoardArrays) -> _End:
-    """Where Levenberg-Marquardt ends."""
+    """The end of Levenberg-Marquardt steps."""
 
     def linearised(at: np.ndarray) -> LinearResidual:
         linear = _linearised(at, arrays)
@@ -339,7 +339,7 @@ def _descended(z: np.ndarray, arrays: BoardArrays) -> _End:
 
 
 def undetermined(reason: str) -> NothingToEstimate:
-    """The refusal of views that leave something open."""
+    """The refusal of views that do not determine all parameters."""
     return NothingToEstimate(
         "undetermined",
         f"the views do not determine the cameras: {reason}",

@@ -1,10 +1,10 @@
-"""Files in which programs keep calibrations, by content: YAML, XML and JSON (OpenCV's too), TOML, .npz, MATLAB's .mat.
+"""Reads containers of calibrations by content: YAML, XML and JSON (OpenCV's too), TOML, .npz, MATLAB's .mat.
 
-What cameras' own programs print is text of other kinds: `maker_calibrations` knows it.
+`maker_calibrations` reads the text that the programs of camera makers print.
 
-Every container comes out as nested maps, lists and numbers, `Keys` that know file and line. OpenCV's matrices stay maps
-of rows, cols, data. OpenCV's FileStorage has had memory errors on hostile files (CVE-2019-5063, -5064; opencv #28619):
-libraries of the formats read instead, under caps: bytes, entries (aliases written out), depth; no entities, pickles.
+Every container becomes nested maps, lists and numbers, as `Keys` with file and line. OpenCV's matrices stay maps of
+rows, cols, data. OpenCV's FileStorage has had memory errors on hostile files (CVE-2019-5063, -5064; opencv #28619):
+general libraries read the formats instead, with limits: bytes, entries (aliases expanded), depth; no entities, pickles.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ MATRIX_TAG = "!!opencv-matrix"
 CONTAINER_BYTES_MAX = 4 * 1024 * 1024
 ENTRIES_MAX = 200_000
 DEPTH_MAX = 12
-TOO_MANY, ALONE = f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
-_ALLOWED = (
+LIMITS_TEXT, TRIM_REMEDY = f"more than {ENTRIES_MAX} entries, or {DEPTH_MAX} levels", "keep the calibration alone"
+_FORMATS_TEXT = (
     "YAML, XML or JSON of OpenCV, ROS, Kalibr and others, TOML, .npz, .mat of MATLAB up to version 7, a ZED's SN*.conf,"
     " what rs-enumerate-devices -c prints"
 )
-AS_WRITTEN = "write it as its own program does"
+REWRITE_REMEDY = "write it as its own program does"
 _TEXT_REMEDY = "name a calibration file; from Python save the matrices by numpy.savez, not as pickles or pictures"
 MAT_SECONDS_MAX = 60.0
 _MAT_HEADER_BYTES, _MAT_COMPRESSED = 128, 15
@@ -46,61 +46,61 @@ _MAT_HEADER_BYTES, _MAT_COMPRESSED = 128, 15
 
 
 def read_container(data: bytes, file: str) -> list[Keys]:
-    """The top map of a calibration file; several where messages of several cameras follow each other.
+    """The top map of a calibration file; several where it holds messages of several cameras.
 
     Raises:
-        InputError: too large, unknown, damaged, or with more than such files hold; names file and line.
+        InputError: too large, unknown, damaged, or above the limits; with file and line.
     """
     if len(data) > CONTAINER_BYTES_MAX:
         found, allowed = f"{len(data)} bytes", f"at most {CONTAINER_BYTES_MAX} bytes"
         raise refusal("size", file=file, found=found, allowed=allowed, remedy="remove what is not needed")
-    for begin, reader in _BINARY.items():
-        if data.startswith(begin):
+    for magic, reader in _BINARY.items():
+        if data.startswith(magic):
             try:
                 values = reader(data)
             except (ValueError, TypeError, KeyError, OSError, zlib.error, zipfile.BadZipFile, NotImplementedError) as e:
-                raise bad(file, None, str(e), "write it again with its program") from e
+                raise container_error(file, None, str(e), "write it again with its program") from e
             except (MemoryError, RecursionError, struct.error, IndexError, AttributeError, OverflowError) as e:
-                raise bad(file, None, "a damaged file", "write it again with its program") from e
-            return [Keys(_plain(values, file), file, "")]
-    text, _ = text_of(data, file, _ALLOWED, _TEXT_REMEDY)
+                raise container_error(file, None, "a damaged file", "write it again with its program") from e
+            return [Keys(_plain_values(values, file), file, "")]
+    text, _ = text_of(data, file, _FORMATS_TEXT, _TEXT_REMEDY)
     try:
         printed = printed_values(text)
     except ValueError as error:
-        raise bad(file, None, str(error), "take the file as the camera's program wrote it") from error
+        raise container_error(file, None, str(error), "take the file as the camera's program wrote it") from error
     if printed is not None:
-        return [Keys(_plain(printed, file), file, text)]
+        return [Keys(_plain_values(printed, file), file, text)]
     first = text.lstrip()[:1]
     if first == "<":
-        return [Keys(_plain(_xml(text, file), file), file, "")]
+        return [Keys(_plain_values(_xml(text, file), file), file, "")]
     if first == "{":
         return [parse_json(text.encode(), file)]
     if re.match(r"(\s|#.*\n)*(\[[\w.\"-]+\]\s*(#.*)?$|[\w.-]+\s*=)", text, re.MULTILINE):
         return [parse_toml(text.encode(), file)]
-    return [Keys(_plain(one, file), file, text) for one in _yaml(text, file)]
+    return [Keys(_plain_values(document, file), file, text) for document in _yaml(text, file)]
 
 
-def bad(file: str, line: int | None, found: str, remedy: str = AS_WRITTEN) -> InputError:
+def container_error(file: str, line: int | None, found: str, remedy: str = REWRITE_REMEDY) -> InputError:
     """The refusal of a container."""
-    return refusal("container", file=file, line=line, found=escaped(found, 120), allowed=_ALLOWED, remedy=remedy)
+    return refusal("container", file=file, line=line, found=escaped(found, 120), allowed=_FORMATS_TEXT, remedy=remedy)
 
 
-def _plain(value: Any, file: str) -> Any:
-    """Maps, lists, numbers and text alone; capped."""
+def _plain_values(value: Any, file: str) -> Any:
+    """Only maps, lists, numbers and text, within the limits."""
     count = 0
 
     def plain(value: Any, depth: int) -> Any:
         nonlocal count
         count += 1
         if count > ENTRIES_MAX or depth > DEPTH_MAX:
-            raise bad(file, None, TOO_MANY, ALONE)
+            raise container_error(file, None, LIMITS_TEXT, TRIM_REMEDY)
         if isinstance(value, dict):
-            return {str(key): plain(each, depth + 1) for key, each in value.items()}
+            return {str(key): plain(item, depth + 1) for key, item in value.items()}
         if isinstance(value, list | tuple):
-            return [plain(each, depth + 1) for each in value]
+            return [plain(item, depth + 1) for item in value]
         if isinstance(value, np.ndarray | np.generic):
             if value.size > ENTRIES_MAX:
-                raise bad(file, None, f"an array of {value.size} numbers", ALONE)
+                raise container_error(file, None, f"an array of {value.size} numbers", TRIM_REMEDY)
             return plain(value.tolist(), depth)
         if isinstance(value, float) and not math.isfinite(value):
             return None
@@ -139,23 +139,24 @@ json.dump(plain(loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True
 def _mat(data: bytes) -> dict[str, Any]:
     """Variables of a MAT-file of version 5 (saved by -v6 or -v7); structures become maps.
 
-    `scipy.io.loadmat` ends in a segmentation fault on some damaged files: a process of its own reads them.
+    `scipy.io.loadmat` ends in a segmentation fault on some damaged files: a separate process reads them.
     """
-    at, whole = _MAT_HEADER_BYTES, 0
+    offset, unpacked = _MAT_HEADER_BYTES, 0
     order = "<" if data[126:128] == b"IM" else ">"
-    while at + 8 <= len(data):
-        kind, size = struct.unpack(f"{order}II", data[at : at + 8])
+    while offset + 8 <= len(data):
+        kind, size = struct.unpack(f"{order}II", data[offset : offset + 8])
         if kind == _MAT_COMPRESSED:
-            whole += len(zlib.decompressobj().decompress(data[at + 8 : at + 8 + size], CONTAINER_BYTES_MAX + 1))
-        if whole > CONTAINER_BYTES_MAX:
+            packed = data[offset + 8 : offset + 8 + size]
+            unpacked += len(zlib.decompressobj().decompress(packed, CONTAINER_BYTES_MAX + 1))
+        if unpacked > CONTAINER_BYTES_MAX:
             raise ValueError(f"variables of more than {CONTAINER_BYTES_MAX} bytes")
-        at += 8 + size
+        offset += 8 + size
     command = [sys.executable, "-I", "-c", _MAT_PROGRAM]
     try:
-        done = subprocess.run(command, input=data, capture_output=True, timeout=MAT_SECONDS_MAX, check=True)
+        result = subprocess.run(command, input=data, capture_output=True, timeout=MAT_SECONDS_MAX, check=True)
     except subprocess.SubprocessError as error:
         raise ValueError("a damaged file, or variables that are no plain matrices and structures") from error
-    variables = json.loads(done.stdout)
+    variables = json.loads(result.stdout)
     return variables if isinstance(variables, dict) else {}
 
 
@@ -169,7 +170,7 @@ _BINARY: dict[bytes, Callable[[bytes], dict[str, Any]]] = {
     b"\x89HDF": _hdf5,
     b"MATLAB 7.3": _hdf5,
 }
-"""Readers by how a file begins."""
+"""Readers by the first bytes of a file."""
 
 
 def _xml(text: str, file: str) -> dict[str, Any]:
@@ -177,16 +178,16 @@ def _xml(text: str, file: str) -> dict[str, Any]:
     from xml.etree import ElementTree
 
     if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
-        raise bad(file, None, "a document type or entity")
+        raise container_error(file, None, "a document type or entity")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         line = getattr(error, "position", (None,))[0]
-        raise bad(file, line, str(error)) from error
+        raise container_error(file, line, str(error)) from error
 
     def value(element: Any, depth: int) -> Any:
         if depth > DEPTH_MAX:
-            raise bad(file, None, f"elements nested deeper than {DEPTH_MAX}")
+            raise container_error(file, None, f"elements nested deeper than {DEPTH_MAX}")
         if len(element):
             listed = all(child.tag == "_" for child in element)
             children = [value(child, depth + 1) for child in element]
@@ -209,22 +210,22 @@ def _number(word: str) -> int | float | None:
 
 
 def _yaml(text: str, file: str) -> list[dict[str, Any]]:
-    """The documents of YAML, by PyYAML's safe loader; tags of OpenCV mean nothing to it.
+    """The documents of YAML, by PyYAML's safe loader, which does not know the tags of OpenCV.
 
-    Messages of one camera that repeat differ in their headers alone.
+    Repeated messages of one camera, which differ only in their headers, are left out.
     """
     import yaml
 
     class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-        """Maps with every key once; numbers as OpenCV, ROS and Kalibr write them (`1.`, `2e-05`)."""
+        """Refuses duplicate keys; reads numbers as OpenCV, ROS and Kalibr write them (`1.`, `2e-05`)."""
 
     def mapping(loader: Any, node: Any) -> dict[str, Any]:
         keys = [str(key.value) for key, _ in node.value]
         for k, key in enumerate(keys):
             if key in keys[:k]:
                 line = node.value[k][0].start_mark.line + 1
-                raise bad(file, line, f"{shown(key)} twice", "remove one of them")
-        return {key: loader.construct_object(each, deep=True) for key, (_, each) in zip(keys, node.value, strict=True)}
+                raise container_error(file, line, f"{shown(key)} twice", "remove one of them")
+        return {key: loader.construct_object(part, deep=True) for key, (_, part) in zip(keys, node.value, strict=True)}
 
     def scalar(loader: Any, node: Any) -> Any:
         number = None if node.style in ("'", '"', "|", ">") else _number(node.value)
@@ -238,34 +239,34 @@ def _yaml(text: str, file: str) -> list[dict[str, Any]]:
     for kind in ("opencv-matrix", "opencv-nd-matrix"):
         Loader.yaml_constructors[f"tag:yaml.org,2002:{kind}"] = mapping
     Loader.yaml_constructors[None] = yaml.SafeLoader.construct_undefined
-    # OpenCV's header is no directive of YAML, and separators of ROS' dumps begin documents that are not wanted.
+    # OpenCV's header is no YAML directive; separators of ROS' dumps start empty documents.
     body = re.sub(r"\A%YAML[^\n]*\n", "\n", text)
     try:
-        _counted(yaml.parse(body, Loader=Loader), file)
+        _check_limits(yaml.parse(body, Loader=Loader), file)
         documents = list(yaml.load_all(body, Loader=Loader))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or str(error)
-        remedy = "save lists, M.tolist(), or the matrices by numpy.savez" if "python/" in problem else AS_WRITTEN
-        raise bad(file, None if mark is None else mark.line + 1, str(problem), remedy) from error
+        remedy = "save lists, M.tolist(), or the matrices by numpy.savez" if "python/" in problem else REWRITE_REMEDY
+        raise container_error(file, None if mark is None else mark.line + 1, str(problem), remedy) from error
     except (RecursionError, ValueError) as error:
-        raise bad(file, None, "YAML that is nested too deeply") from error
-    kept: list[dict[str, Any]] = []
-    for one in documents or [None]:
-        if not isinstance(one, dict) and (one or not kept):
-            raise bad(file, 1, shown(one) if one else "nothing", "name a calibration file")
-        plain = {key: value for key, value in (one or {}).items() if key != "header"}
-        if plain and plain not in kept:
-            kept.append(plain)
-    return kept
+        raise container_error(file, None, "YAML that is nested too deeply") from error
+    distinct: list[dict[str, Any]] = []
+    for document in documents or [None]:
+        if not isinstance(document, dict) and (document or not distinct):
+            raise container_error(file, 1, shown(document) if document else "nothing", "name a calibration file")
+        plain = {key: value for key, value in (document or {}).items() if key != "header"}
+        if plain and plain not in distinct:
+            distinct.append(plain)
+    return distinct
 
 
-def _counted(events: Iterable[Any], file: str) -> None:
-    """Refuse depth and number of entries before anything is built; what aliases multiply is counted by `_plain`."""
+def _check_limits(events: Iterable[Any], file: str) -> None:
+    """Check depth and number of entries before anything is built; `_plain_values` counts expanded aliases."""
     depth = count = 0
     for event in events:
         name, line = type(event).__name__, event.start_mark.line + 1
         count += 1
         depth += name.endswith("StartEvent") - name.endswith("EndEvent")
         if depth > DEPTH_MAX or count > ENTRIES_MAX:
-            raise bad(file, line, TOO_MANY, ALONE)
+            raise container_error(file, line, LIMITS_TEXT, TRIM_REMEDY)

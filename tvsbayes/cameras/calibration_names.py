@@ -1,9 +1,8 @@
-"""Which number of somebody's calibration file is which: one table of names, asked for every entry with its path.
+"""The meaning of each number of a calibration file: one table of names, searched for every entry with its path.
 
-A name says a field and often a camera: `M1`, `K_left`, `cameraMatrixL`, `cam0.intrinsics`, `Camera1.fx`. Small and
-capital letters, dots and underscores count for nothing; the innermost names of a path count, up to three of them. An
-entry fits a field by its name and by how many numbers it holds: `P1` of 12 numbers is a projection, `p1` of one a
-coefficient of a lens.
+A name states a field and often a camera: `M1`, `K_left`, `cameraMatrixL`, `cam0.intrinsics`, `Camera1.fx`. Case, dots
+and underscores are ignored; the innermost names of a path count, up to three of them. An entry fits a field by its name
+and by its number of values: `P1` of 12 numbers is a projection, `p1` of one number is a coefficient of a lens.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from tvsbayes.instrument.stereo_pair import rotation_matrix, rotation_vector
 NAMES_LISTED = 12
 NUMBER_MAX = 1e12
 ROTATION_TOLERANCE = 1e-3
-"""R from a file of few digits may miss a rotation by this much; the nearest rotation is taken."""
+"""Largest deviation of R from a rotation, for files of few digits; the nearest rotation is taken."""
 FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
     # Of each camera.
     "M": (
@@ -88,25 +87,25 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
     "board_columns": ((1,), "boardwidth boardcolumns boardcols"),
     "board_rows": ((1,), "boardheight boardrows"),
 }
-"""Numbers that a field may hold, and its names. Every name of a camera's field stands before or after a side."""
-MADE_BY = tuple(FIELDS)[tuple(FIELDS).index("rms_px") :]
-"""How a calibration was made, as its file says. The pitch is left out: its unit is not known."""
-OF_CAMERA = tuple(FIELDS)[: tuple(FIELDS).index("R")]
+"""Counts of numbers that a field can have, and its names. The side is before or after the name of a camera's field."""
+PROVENANCE_FIELDS = tuple(FIELDS)[tuple(FIELDS).index("rms_px") :]
+"""Fields that state how a calibration was made. The pitch is left out: its unit is not known."""
+CAMERA_FIELDS = tuple(FIELDS)[: tuple(FIELDS).index("R")]
 SIDES = {"left": 0, "right": 1, "l": 0, "r": 1, "first": 0, "second": 1}
-"""Words for the camera; numbers count from 0 where one is 0, else from 1."""
+"""Words for the camera; numbers start at 0 where one of them is 0, else at 1."""
 _MARKS = ("cam", "camera", "cameraparameters", "sensor", "")
 _SIDED = re.compile(r"left|right|first|second|[0-9]|l|r")
-_OTHER_TABLES = {"roi", "region_of_interest", "header"}
-"""Tables whose sizes and numbers are of other things."""
+_IGNORED_TABLES = {"roi", "region_of_interest", "header"}
+"""Tables whose numbers are no part of the calibration."""
 MODEL_NAMES = ("distortionmodel", "distmodel", "cameratype", "cameramodel", "model", "lensmodel", "distortiontype")
 
 
 def _table() -> dict[str, list[tuple[str, str]]]:
-    """Field and side by name; the side "" is none."""
+    """Field and side by name; the side is "" where the name states none."""
     fields: dict[str, list[tuple[str, str]]] = {}
     for field, (_, words) in FIELDS.items():
         names = {(f"{mark}{word}", "") for word in words.split() for mark in _MARKS}
-        if field in OF_CAMERA:
+        if field in CAMERA_FIELDS:
             for word in words.split():
                 for side in (*SIDES, "0", "1", "2"):
                     for mark in _MARKS:
@@ -125,10 +124,10 @@ class Entry:
     """Numbers of a file.
 
     Attributes:
-        keys: the table that holds them.
+        keys: their table.
         key: their name in it.
         numbers: flat.
-        shape: as the file has them.
+        shape: in the file.
         file: number of the file.
     """
 
@@ -153,7 +152,7 @@ class Entry:
         return self.keys.refuse(self.key, code, allowed, remedy, found)
 
     def rotation(self) -> np.ndarray:
-        """The rotation (3, 3) of nine numbers, the nearest where the file's digits allow, or of Rodrigues' three."""
+        """The rotation (3, 3): the nearest to a matrix of nine numbers, or that of Rodrigues' three."""
         if self.numbers.size == 3:
             if np.linalg.norm(self.numbers) > math.pi:
                 found = escaped(str(self.numbers.tolist()), 60)
@@ -162,7 +161,7 @@ class Entry:
         return self._nearest(self.numbers.reshape(3, 3))
 
     def transposed(self) -> Entry:
-        """The same turn the other way: the transpose of a matrix, the opposite of a vector."""
+        """The inverse rotation: the transpose of a matrix, the negative of a vector."""
         return replace(self, numbers=self.numbers.reshape(3, 3).T.ravel() if self.numbers.size == 9 else -self.numbers)
 
     def pose(self) -> np.ndarray:
@@ -181,21 +180,21 @@ class Entry:
 
 
 def numbers_of(value: Any) -> tuple[np.ndarray, tuple[int, ...]] | None:
-    """Finite numbers and their shape: of a number, of nested lists, of OpenCV's or ROS' rows, cols, data; else None."""
+    """Finite numbers and shape of a number, of nested lists or of OpenCV's or ROS' rows, cols, data; else None."""
     if isinstance(value, Mapping):
         rows, cols = value.get("rows", value.get("Rows")), value.get("cols", value.get("Cols"))
-        inner = numbers_of(value.get("data", value.get("Data")))
-        if inner is not None and "sizes" in value:
-            return inner[0], (inner[0].size,)
-        if inner is None or not isinstance(rows, int) or not isinstance(cols, int) or rows * cols != inner[0].size:
+        data = numbers_of(value.get("data", value.get("Data")))
+        if data is not None and "sizes" in value:
+            return data[0], (data[0].size,)
+        if data is None or not isinstance(rows, int) or not isinstance(cols, int) or rows * cols != data[0].size:
             if {"x", "y", "z"} <= set(value) <= {"x", "y", "z", "rotation"}:
-                # BoofCV's pose has its rotation beside.
+                # BoofCV states the rotation of a pose in the same table.
                 shift, turn = numbers_of([value[axis] for axis in "xyz"]), numbers_of(value.get("rotation"))
                 if shift is None or turn is None or turn[0].size != 9:
                     return shift
                 return np.column_stack([turn[0].reshape(3, 3), shift[0]]).ravel(), (3, 4)
             return None
-        return inner[0], (rows, cols)
+        return data[0], (rows, cols)
     if isinstance(value, bool) or not isinstance(value, int | float | list):
         return None
     try:
@@ -208,58 +207,58 @@ def numbers_of(value: Any) -> tuple[np.ndarray, tuple[int, ...]] | None:
 
 
 def entries_of(keys: Keys, file: int) -> Iterator[Entry]:
-    """Every entry of numbers in a file, in its order."""
+    """All entries with numbers, in the order of the file."""
     for key, value in keys.values.items():
         numbers = numbers_of(value)
         if numbers is None and isinstance(value, dict) and {"rows", "cols", "data"} <= {name.lower() for name in value}:
             raise keys.refuse(key, "matrix", "rows times cols finite numbers", "take the file as its tool wrote it")
-        if isinstance(value, str) and _bare(key) in FIELDS["width"][1].split() + FIELDS["height"][1].split():
+        if isinstance(value, str) and _letters(key) in FIELDS["width"][1].split() + FIELDS["height"][1].split():
             raise keys.refuse(key, "integer", "a whole number of px", "correct the value")
         if numbers is not None:
             yield Entry(keys, key, *numbers, file)
         elif isinstance(value, dict):
             yield from entries_of(keys.table(key), file)
-        elif isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
-            for number, one in enumerate(value):
-                yield from entries_of(Keys(one, keys.file, keys.text, (*keys.path, key, str(number))), file)
+        elif isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
+            for number, item in enumerate(value):
+                yield from entries_of(Keys(item, keys.file, keys.text, (*keys.path, key, str(number))), file)
         elif isinstance(value, list):
             yield Entry(keys, key, np.empty(0), (0,), file)
 
 
-def _bare(name: str) -> str:
+def _letters(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 def meanings(entry: Entry, *, of_any_count: bool = False) -> list[tuple[str, str]]:
-    """Fields and sides that an entry may be, by the longest part of its path that is a name.
+    """Fields and sides that an entry may have, by the longest part of its path that is a known name.
 
     Args:
         entry: of a file.
-        of_any_count: by its name alone, however many numbers it holds.
+        of_any_count: by its name alone, for any count of numbers.
     """
     parts = (*entry.keys.path, entry.key)
-    if _OTHER_TABLES & set(parts):
+    if _IGNORED_TABLES & set(parts):
         return []
     for count in range(min(4, len(parts)), 0, -1):
-        named = _NAMES.get(_bare("".join(parts[-count:])), ())
-        matches = [one for one in named if of_any_count or entry.numbers.size in FIELDS[one[0]][0]]
+        known = _NAMES.get(_letters("".join(parts[-count:])), ())
+        matches = [match for match in known if of_any_count or entry.numbers.size in FIELDS[match[0]][0]]
         if matches:
-            # A name without a side may stand in the table of one camera.
+            # A name without a side may be in the table of one camera.
             side = next((s for part in reversed(parts[:-count]) if (s := _side_of(part))), "")
-            return [(field, stated or (side if field in OF_CAMERA else "")) for field, stated in matches]
+            return [(field, stated or (side if field in CAMERA_FIELDS else "")) for field, stated in matches]
     return []
 
 
 def _side_of(part: str) -> str:
-    """The camera that a table's name tells, or ""."""
-    bare = _bare(part)
+    """The camera in the name of a table, or ""."""
+    name = _letters(part)
     for mark in ("cameraparameters", "camera", "cam", "sensor"):
-        bare = bare.replace(mark, "", 1)
-    return bare if bare in (*SIDES, "0", "1", "2") else ""
+        name = name.replace(mark, "", 1)
+    return name if name in (*SIDES, "0", "1", "2") else ""
 
 
 def _side_in_name(file: str) -> int | None:
-    """The camera that a file's name tells."""
+    """The camera in the name of a file; None without one."""
     for number, pattern in enumerate((r"left|cam(era)?[ _-]?0", r"right|cam(era)?[ _-]?1")):
         if re.search(pattern, file.lower()):
             return number
@@ -267,45 +266,45 @@ def _side_in_name(file: str) -> int | None:
 
 
 class Fields:
-    """Entries of all files by field, those of cameras by field and number (0 left, 1 right)."""
+    """Entries of all files by field; those of cameras by field and number (0 left, 1 right)."""
 
     def __init__(self, files: Sequence[Keys], stated: Mapping[str, str]):
-        """Entries by name, and by `stated`: field such as M1 to the path that holds it."""
+        """Sort the entries by name, and by `stated`: field, such as M1, to the path of its entry."""
         self.files, self.stated = files, set(stated)
         self.entries = [entry for k, keys in enumerate(files) for entry in entries_of(keys, k)]
         self.pair: dict[str, Entry] = {}
         self.cameras: tuple[dict[str, Entry], dict[str, Entry]] = ({}, {})
         self.twice: dict[str, tuple[Entry, Entry]] = {}
-        sided = [(entry, *meaning) for entry in self.entries for meaning in meanings(entry)]
-        # What has no side stands in for what a camera lacks.
-        sided.sort(key=lambda one: not one[2])
-        numbers = {side for _, _, side in sided if side.isdigit()}
-        first = 0 if "0" in numbers or not numbers else 1
-        # Files of one camera each hold entries without a side: the first named is the left one, unless names say.
-        whole = [k for k in range(len(files)) if self._whole(sided, k)]
-        alone = len(whole) == 2
-        if alone and [_side_in_name(files[k].file) for k in whole] == [1, 0]:
-            whole.reverse()
-        self.by_file = alone
-        for entry, field, side in sided:
-            if field in MADE_BY:
+        readings = [(entry, *meaning) for entry in self.entries for meaning in meanings(entry)]
+        # Entries without a side come last: they fill what a camera lacks.
+        readings.sort(key=lambda reading: not reading[2])
+        numbers = {side for _, _, side in readings if side.isdigit()}
+        offset = 0 if "0" in numbers or not numbers else 1
+        # Files of one camera each have entries without a side: the first file is the left one, unless its name tells.
+        camera_files = [k for k in range(len(files)) if self._has_camera(readings, k)]
+        one_camera_each = len(camera_files) == 2
+        if one_camera_each and [_side_in_name(files[k].file) for k in camera_files] == [1, 0]:
+            camera_files.reverse()
+        self.by_file = one_camera_each
+        for entry, field, side in readings:
+            if field in PROVENANCE_FIELDS:
                 if not any(map(_side_of, entry.keys.path)):
                     self.pair.setdefault(field, entry)
-            elif field not in OF_CAMERA:
-                if not (alone and field == "R" and entry.file in whole):
-                    self._keep(self.pair, field, field, entry)
+            elif field not in CAMERA_FIELDS:
+                if not (one_camera_each and field == "R" and entry.file in camera_files):
+                    self._add(self.pair, field, field, entry)
             elif side:
-                number = SIDES[side] if side in SIDES else int(side) - first
+                number = SIDES[side] if side in SIDES else int(side) - offset
                 if number in (0, 1):
-                    self._keep(self.cameras[number], field, f"{field}{number + 1}", entry)
-            elif alone and entry.file in whole:
-                number = whole.index(entry.file)
-                self._keep(self.cameras[number], field, f"{field}{number + 1}", entry)
+                    self._add(self.cameras[number], field, f"{field}{number + 1}", entry)
+            elif one_camera_each and entry.file in camera_files:
+                number = camera_files.index(entry.file)
+                self._add(self.cameras[number], field, f"{field}{number + 1}", entry)
             elif field in ("size", "width", "height"):
                 for camera in self.cameras:
                     camera.setdefault(field, entry)
         for field, name in stated.items():
-            entry = self._named(field, name)
+            entry = self._stated_entry(field, name)
             self.twice.pop(field, None)
             if field in ("R", "T"):
                 self.pair[field] = entry
@@ -314,26 +313,26 @@ class Fields:
                 self.cameras[int(field[-1]) - 1][field[:-1]] = entry
 
     @staticmethod
-    def _whole(sided: Sequence[tuple[Entry, str, str]], file: int) -> bool:
-        """Whether a file holds one camera's matrix without a side."""
-        return any(e.file == file and field in ("M", "fx") and not side for e, field, side in sided)
+    def _has_camera(readings: Sequence[tuple[Entry, str, str]], file: int) -> bool:
+        """Whether a file has a camera matrix without a side."""
+        return any(e.file == file and field in ("M", "fx") and not side for e, field, side in readings)
 
-    def _keep(self, into: dict[str, Entry], field: str, name: str, entry: Entry) -> None:
-        kept = into.get(field)
-        if kept is None or (kept.numbers.size == 3 and entry.numbers.size == 9):
+    def _add(self, table: dict[str, Entry], field: str, name: str, entry: Entry) -> None:
+        previous = table.get(field)
+        if previous is None or (previous.numbers.size == 3 and entry.numbers.size == 9):
             # Of a rotation's vector and its matrix, the matrix.
-            into[field] = entry
-        elif kept.numbers.size == entry.numbers.size and not np.array_equal(kept.numbers, entry.numbers):
-            self.twice[name] = kept, entry
+            table[field] = entry
+        elif previous.numbers.size == entry.numbers.size and not np.array_equal(previous.numbers, entry.numbers):
+            self.twice[name] = previous, entry
 
-    def _named(self, field: str, name: str) -> Entry:
-        """The entry that a user named, transposed where NAME.T says so."""
-        some = [entry for entry in self.entries if name in (entry.path, entry.key)]
-        if not some and field == "R" and name.endswith(".T"):
-            return self._named(field, name.removesuffix(".T")).transposed()
-        if len(some) != 1 or some[0].numbers.size not in STATED_SIZES[field[0]]:
+    def _stated_entry(self, field: str, name: str) -> Entry:
+        """The entry that the user named; transposed for NAME.T."""
+        hits = [entry for entry in self.entries if name in (entry.path, entry.key)]
+        if not hits and field == "R" and name.endswith(".T"):
+            return self._stated_entry(field, name.removesuffix(".T")).transposed()
+        if len(hits) != 1 or hits[0].numbers.size not in KEY_SIZES[field[0]]:
             paths = [entry.path for entry in self.entries]
-            found = f"{len(some)} entries of that name" if len(some) != 1 else f"{some[0].numbers.size} numbers"
+            found = f"{len(hits)} entries of that name" if len(hits) != 1 else f"{hits[0].numbers.size} numbers"
             raise refusal(
                 "usage",
                 file=self.files[0].file,
@@ -341,21 +340,21 @@ class Fields:
                 allowed=f"one of {listed([escaped(path, 40) for path in paths], NAMES_LISTED)}",
                 remedy=closest(name[:80], paths) if paths else "name a file that holds numbers",
             )
-        return some[0]
+        return hits[0]
 
-    def missing(self, wanted: Sequence[str]) -> InputError:
-        """The refusal of files that lack something, with what there is."""
-        nobodys = {f: [e.path for e in self.entries if (f, "") in meanings(e)] for f in ("M", "D")}
-        if len(self.files) == 1 and len(nobodys["M"]) > 1 and "M1" in wanted:
-            stated = [f"--key {field}{k}={name}" for field in nobodys for k, name in enumerate(nobodys[field][:2], 1)]
+    def missing(self, fields_missing: Sequence[str]) -> InputError:
+        """The refusal of files that lack fields; it lists the fields that exist."""
+        sideless = {f: [e.path for e in self.entries if (f, "") in meanings(e)] for f in ("M", "D")}
+        if len(self.files) == 1 and len(sideless["M"]) > 1 and "M1" in fields_missing:
+            stated = [f"--key {field}{k}={name}" for field in sideless for k, name in enumerate(sideless[field][:2], 1)]
             return refusal(
                 "missing-key",
                 file=self.files[0].file,
-                found=f"camera matrices that no name gives to left and right: {listed(nobodys['M'], NAMES_LISTED)}",
+                found=f"camera matrices that no name gives to left and right: {listed(sideless['M'], NAMES_LISTED)}",
                 allowed="names with left and right, 0 and 1 or 1 and 2",
                 remedy=f"say which is which: {' '.join(stated)}",
             )
-        if len(self.files) == 1 and nobodys["M"]:
+        if len(self.files) == 1 and sideless["M"]:
             return refusal(
                 "missing-file",
                 file=self.files[0].file,
@@ -363,7 +362,7 @@ class Fields:
                 allowed="a pair: both cameras, and R and T between them",
                 remedy="name the other camera's file too: --import LEFT --import RIGHT; R and T need pictures of both",
             )
-        fields = {field.rstrip("12") for field in wanted}
+        fields = {field.rstrip("12") for field in fields_missing}
         for entry in self.entries:
             names = {field for field, _ in meanings(entry, of_any_count=True)} & fields
             if names and entry.numbers.size != 1 and not meanings(entry):
@@ -378,34 +377,34 @@ class Fields:
         others = listed([escaped(path, 40) for path in unknown], NAMES_LISTED) if unknown else "no other numbers"
         remedy = "a pair needs M D of both cameras and R T between them: name the other file too"
         if unknown:
-            remedy = f"name what holds it: --key {wanted[0]}=NAME"
+            remedy = f"name what holds it: --key {fields_missing[0]}=NAME"
         return refusal(
             "missing-key",
             file=", ".join(keys.file for keys in self.files),
-            found=f"no {' '.join(wanted)} under a name that is known, and {others}",
+            found=f"no {' '.join(fields_missing)} under a name that is known, and {others}",
             allowed="M1 D1 M2 D2 and R T, or what gives them",
             remedy=remedy,
         )
 
     def model(self, camera: int) -> str:
-        """The name of the lens model that the files state for a camera, in small letters; "" where none is."""
-        place = next((self.cameras[camera][f] for f in ("D", "M", "fx") if f in self.cameras[camera]), None)
+        """The name of a camera's lens model in the files, lower case; "" without one."""
+        lens = next((self.cameras[camera][f] for f in ("D", "M", "fx") if f in self.cameras[camera]), None)
         tables = list(self.files)
-        if place is not None:
-            tables = [self.files[place.file]]
-            for part in place.keys.path:
+        if lens is not None:
+            tables = [self.files[lens.file]]
+            for part in lens.keys.path:
                 if isinstance(tables[0].values.get(part), dict):
                     tables.insert(0, tables[0].table(part))
-            tables.insert(0, place.keys)
+            tables.insert(0, lens.keys)
         for keys in tables:
             for key, value in keys.values.items():
-                bare = _bare(key)
+                bare = _letters(key)
                 if isinstance(value, str) and any(bare.endswith(name) for name in MODEL_NAMES):
-                    if bare.endswith(("cameramodel", "cameratype")) and _bare(value) in ("pinhole", "perspective"):
+                    if bare.endswith(("cameramodel", "cameratype")) and _letters(value) in ("pinhole", "perspective"):
                         continue
                     return value.strip().lower()
         return ""
 
 
-STATED_SIZES = {"M": (4, 9), "D": (4, 5, 8, 12, 14), "R": (3, 9), "T": (3,)}
-"""How many numbers a field that is named by --key may hold."""
+KEY_SIZES = {"M": (4, 9), "D": (4, 5, 8, 12, 14), "R": (3, 9), "T": (3,)}
+"""Counts of numbers that a field named by --key can have."""

@@ -1,15 +1,14 @@
 """The stereo cameras on OpenCV.
 
-A picture counts only if its exposure began after it was asked for. Drivers keep old frames in their buffers, and no
-frame says when it was exposed. So every `grab` first empties the buffers: a buffered frame comes as fast as it can be
-decoded, a live one at the camera's own rate, which is measured at opening; only behind the first live frames, which
-may still have been in the pipe, one is taken. A camera that never makes us wait is refused: its frames could be of any
-age. Where decoding takes as long as the camera's period the two are indistinguishable; then the proof by light holds
-that the driver of the laser adds. Streams of the network are read all the time (`network_stream`).
+A picture is valid only if its exposure began after the request. Drivers keep old frames in their buffers, and frames
+have no time stamp. So every `grab` first empties the buffers: a buffered frame arrives as fast as it can be decoded, a
+live one at the rate of the camera, which is measured at opening; the first live frames, which may be older, are
+dropped. A camera whose frames never need a wait is refused: they could be of any age. Where decoding takes as long as
+the camera's period the two cases are indistinguishable; then the test by light of the laser's driver decides. Network
+streams are read continuously (`network_stream`).
 
-Pictures are (height, width, 3), blue, green, red, uint8 or uint16 as the camera gives them; raw pixels, nothing
-rectified, no depth lost.
-Seconds where a name says `_s`.
+Pictures are (height, width, 3), blue, green, red, uint8 or uint16 as the camera gives them: raw pixels, not rectified,
+with full depth. Names with `_s` are in seconds.
 """
 
 from __future__ import annotations
@@ -32,16 +31,16 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import Clock
 
 LIVE_S = 0.004
-"""A frame that took less than this was in a buffer, whatever the rate: cameras up to 200 frames/s are slower."""
+"""A frame that took less than this was in a buffer, at any rate: cameras up to 200 frames/s are slower."""
 LIVE_SHARE = 0.7
 """Share of the camera's period that a frame must take to count as live."""
 RATE_FRAMES, RATE_S = 12, 0.4
-"""The rate is measured over at least so many frames and seconds at opening, and read off the last eight."""
+"""Least number of frames and seconds for the measurement of the rate at opening; the last eight frames are used."""
 PIPELINE_FRAMES = 2
-"""Live frames to leave out: one was being exposed when it was asked for, one may be on its way."""
+"""Live frames to leave out: one was being exposed at the request, one may be in transfer."""
 FLUSH_FRAMES_MAX = 2_000
 FLUSH_MAX_S = 10.0
-"""The longest emptying of buffers, in frames and in seconds: sockets hold some hundred small frames."""
+"""Limits for emptying the buffers, in frames and in seconds: sockets hold some hundred small frames."""
 STREAM_TIMEOUT_MS = 5_000
 FFMPEG_QUIET = "-8"
 """FFmpeg's AV_LOG_QUIET."""
@@ -60,17 +59,17 @@ class StereoImage:
 
     @property
     def full_scale(self) -> int:
-        """What is white here: as the driver states it, else the least that converters of usual bits have."""
+        """The largest value: as the driver states it, else that of the smallest usual converter."""
         return self.white or white_level(max(int(self.left.max()), int(self.right.max())))
 
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What the cameras say of themselves after they were set.
+    """Settings that the cameras report.
 
     Attributes:
-        values: readings by name and camera, e.g. "left.exposure"; what a camera does not report is left out.
-        warnings: what could not be fixed, in words.
+        values: readings by name and camera, e.g. "left.exposure"; without those that a camera does not report.
+        warnings: settings that could not be fixed, in words.
     """
 
     values: dict[str, float]
@@ -78,29 +77,29 @@ class CameraSettings:
 
 
 class StereoCamera(Protocol):
-    """A pair of cameras, whatever they depend on."""
+    """A pair of cameras of any driver."""
 
     def grab(self) -> StereoImage:
         """A pair whose exposure began after this call."""
 
     def settings(self) -> CameraSettings:
-        """Exposure, gain, white balance and focus as they stand."""
+        """Current exposure, gain, white balance and focus."""
 
     def close(self) -> None:
-        """Give the cameras back; never raises."""
+        """Release the cameras; never raises."""
 
 
 @contextmanager
 def _quiet_opencv() -> Iterator[None]:
-    """OpenCV and its FFmpeg write no warnings to stderr meanwhile: what fails is raised, with a remedy.
+    """Suppresses warnings of OpenCV and its FFmpeg on stderr: failures are raised, with a remedy.
 
-    Anyone who has set their variables OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL wants to read them. FFmpeg's is read
-    once, at the first stream that a process opens, and stays.
+    Not where a user has set OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL. FFmpeg reads its variable once, at the first
+    stream that a process opens.
     """
     import cv2
 
     logging = cv2.utils.logging
-    before = None if "OPENCV_LOG_LEVEL" in os.environ else logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    previous = None if "OPENCV_LOG_LEVEL" in os.environ else logging.setLogLevel(logging.LOG_LEVEL_SILENT)
     ffmpeg = "OPENCV_FFMPEG_LOGLEVEL" not in os.environ
     if ffmpeg:
         os.environ["OPENCV_FFMPEG_LOGLEVEL"] = FFMPEG_QUIET
@@ -109,12 +108,12 @@ def _quiet_opencv() -> Iterator[None]:
     finally:
         if ffmpeg:
             os.environ.pop("OPENCV_FFMPEG_LOGLEVEL", None)
-        if before is not None:
-            logging.setLogLevel(before)
+        if previous is not None:
+            logging.setLogLevel(previous)
 
 
 def without_password(source: str) -> str:
-    """A source as messages and logs may hold it: an address without user and password."""
+    """A source for messages and logs: an address without user and password."""
     return re.sub(r"://[^/?#]*@", "://", source)
 
 
@@ -138,12 +137,12 @@ def open_capture(source: str | int) -> Capture:
 
 
 def _open_stream(address: str) -> Capture:
-    """A stream, whose opening and reading end in time."""
+    """A stream with timeouts for opening and reading."""
     import cv2
 
-    waits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, STREAM_TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, STREAM_TIMEOUT_MS]
+    timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, STREAM_TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, STREAM_TIMEOUT_MS]
     with _quiet_opencv():
-        return _opened(cv2.VideoCapture(address, cv2.CAP_FFMPEG, waits), address)
+        return _opened(cv2.VideoCapture(address, cv2.CAP_FFMPEG, timeouts), address)
 
 
 def _opened(capture: Any, source: str | int) -> Capture:
@@ -167,15 +166,15 @@ def open_cameras(
         InputError: neither, or both.
         DeviceFault: they cannot be opened or set.
     """
-    pair = "left" in table and "right" in table
-    if pair == ("source" in table):
+    two_devices = "left" in table and "right" in table
+    if two_devices == ("source" in table):
         remedy = "give source = ... (side by side), or left = ... and right = ..."
         raise InputError("cameras", "[cameras] of the rig file names no cameras", column="cameras", remedy=remedy)
     captures: list[Capture] = []
     exposure = float(table["exposure"]) if "exposure" in table else None
     with _quiet_opencv():
         try:
-            for source in (table[key] for key in (("left", "right") if pair else ("source",))):
+            for source in (table[key] for key in (("left", "right") if two_devices else ("source",))):
                 captures.append(opener(source if isinstance(source, str) else int(source)))
         except BaseException:
             for capture in captures:
@@ -198,11 +197,11 @@ class OpenCVCamera:
     """Two devices, or one that delivers both pictures side by side.
 
     Args:
-        captures: one (side by side) or two (left, right) open captures; they belong to this object from now on.
+        captures: one (side by side) or two (left, right) open captures; this object closes them.
         width: of one picture, px.
         height: px.
-        exposure: in the driver's unit; None leaves the automatic off and the exposure where it is.
-        clock: where time comes from.
+        exposure: in the driver's unit; None switches the automatic off and keeps the current exposure.
+        clock: source of the time.
 
     Raises:
         DeviceFault: an exposure that does not read back as set.
@@ -227,10 +226,10 @@ class OpenCVCamera:
         return ("left", "right") if len(self._captures) == 2 else ("stereo",)
 
     def _fix(self, name: str, capture: Capture, exposure: float | None) -> None:
-        """Everything automatic off, size and exposure set; what does not obey is a fault or a warning."""
+        """Switch off all automatics, set size and exposure; a refused setting is a fault or a warning."""
         import cv2
 
-        # One frame in the buffer, where the driver lets us: less to empty.
+        # One frame in the buffer, if the driver allows it: less to empty.
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._width * (1 if len(self._captures) == 2 else 2))
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._height)
@@ -239,15 +238,15 @@ class OpenCVCamera:
             "white balance": capture.set(cv2.CAP_PROP_AUTO_WB, 0),
             "focus": capture.set(cv2.CAP_PROP_AUTOFOCUS, 0),
         }
-        refused = [what for what, done in fixed.items() if not done]
+        refused = [setting for setting, accepted in fixed.items() if not accepted]
         if refused:
             self._warnings.append(f"{name}: {', '.join(refused)} cannot be fixed from here; fix it at the camera")
         if exposure is None:
             return
-        done, read = capture.set(cv2.CAP_PROP_EXPOSURE, exposure), capture.get(cv2.CAP_PROP_EXPOSURE)
+        accepted, reported = capture.set(cv2.CAP_PROP_EXPOSURE, exposure), capture.get(cv2.CAP_PROP_EXPOSURE)
         # Drivers round to their own steps: 5 % of the value, or one unit.
-        if not done or abs(read - exposure) > max(0.05 * abs(exposure), 1.0):
-            found = f"{name}: exposure {exposure:g} was set and {read:g} read back"
+        if not accepted or abs(reported - exposure) > max(0.05 * abs(exposure), 1.0):
+            found = f"{name}: exposure {exposure:g} was set and {reported:g} read back"
             remedy = "leave [cameras] exposure out and fix it at the camera, or give a value the driver takes"
             raise fault("exposure", found, remedy)
 
@@ -276,7 +275,7 @@ class OpenCVCamera:
         """See `StereoCamera.grab`.
 
         Raises:
-            DeviceFault: no frame, one of another size, or a camera that never makes us wait.
+            DeviceFault: no frame, one of another size, or a camera whose frames never need a wait.
         """
         for capture, period_s in zip(self._captures, self._period_s, strict=True):
             self._flush(capture, max(LIVE_S, LIVE_SHARE * period_s))
@@ -296,24 +295,24 @@ class OpenCVCamera:
 
     def _flush(self, capture: Capture, live_s: float) -> None:
         """Take frames until the next one was exposed after this call."""
-        start = before = self._clock.monotonic()
+        start = previous = self._clock.monotonic()
         live = 0
         for _ in range(FLUSH_FRAMES_MAX):
             if not capture.grab():
                 raise _no_frame(self._names[self._captures.index(capture)])
             now = self._clock.monotonic()
-            live += now - before > live_s
+            live += now - previous > live_s
             if live >= PIPELINE_FRAMES:
                 return
             if now - start > FLUSH_MAX_S:
                 break
-            before = now
+            previous = now
         remedy = "lower the frame rate of the camera, or serve its stream at the rate of the exposures"
         raise fault("stale", "the camera's frames never have to be waited for", remedy)
 
     def _retrieve(self, name: str, capture: Capture) -> np.ndarray:
-        good, picture = capture.retrieve()
-        if not good or picture is None:
+        ok, picture = capture.retrieve()
+        if not ok or picture is None:
             raise _no_frame(name)
         expected = self._height, self._width * (1 if len(self._captures) == 2 else 2)
         if picture.shape[:2] != expected or picture.dtype not in (np.uint8, np.uint16):
@@ -328,8 +327,8 @@ class OpenCVCamera:
     def _split(self, pictures: list[np.ndarray]) -> StereoImage:
         if len(pictures) == 2:
             return StereoImage(pictures[0], pictures[1])
-        both = pictures[0]
-        return StereoImage(both[:, : self._width].copy(), both[:, self._width :].copy())
+        picture = pictures[0]
+        return StereoImage(picture[:, : self._width].copy(), picture[:, self._width :].copy())
 
     def close(self) -> None:
         """See `StereoCamera.close`."""
@@ -339,7 +338,7 @@ class OpenCVCamera:
 
 
 def _manual_exposure(capture: Capture) -> int:
-    """What CAP_PROP_AUTO_EXPOSURE calls manual: Video4Linux' own V4L2_EXPOSURE_MANUAL = 1 there, elsewhere no.
+    """The value of CAP_PROP_AUTO_EXPOSURE for manual: V4L2_EXPOSURE_MANUAL = 1 with Video4Linux, elsewhere 0.
 
     On Windows 1 would switch the automatic on (opencv pull request 22635).
     """

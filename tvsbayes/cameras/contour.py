@@ -25,7 +25,7 @@ REGION_HALF_PX = 60
 
 @dataclass(frozen=True)
 class Rectified:
-    """One camera of the paper's pipeline: maps of the rectified picture and the way back."""
+    """One camera of the paper's pipeline: maps of the rectified picture and the parameters of the inverse."""
 
     maps: tuple[np.ndarray, np.ndarray]
     rotation: np.ndarray
@@ -46,38 +46,38 @@ def rectified_pair(stereo: Stereo) -> tuple[Rectified, Rectified]:
 
     size = stereo.image_width, stereo.image_height
     first, second = (stereo.M1, stereo.D1.reshape(1, 5)), (stereo.M2, stereo.D2.reshape(1, 5))
-    turns = cv2.stereoRectify(
+    parts = cv2.stereoRectify(
         *first, *second, size, np.asarray(stereo.R, float), np.asarray(stereo.T, float).reshape(3, 1)
     )
     cameras = []
-    for (matrix, distortion), rotation, projection in ((first, turns[0], turns[2]), (second, turns[1], turns[3])):
+    for (matrix, distortion), rotation, projection in ((first, parts[0], parts[2]), (second, parts[1], parts[3])):
         maps = cv2.initUndistortRectifyMap(matrix, distortion, rotation, projection, size, cv2.CV_32FC1)
         cameras.append(Rectified(maps, rotation, projection, matrix, distortion.ravel()))
     return cameras[0], cameras[1]
 
 
 def contour_of(picture: np.ndarray, camera: Rectified, noise: SpotNoise) -> Centre:
-    """The paper's way: centroid of the region above a threshold on V of HSV, in the rectified picture.
+    """The paper's method: centroid of the region above a threshold on V of HSV, in the rectified picture.
 
     The threshold is on V alone: at 808 nm hue is undefined and saturation low. The stated variance is that of the
-    region's outline, moved by noise over slope and rounded to whole pixels, for a round Gaussian spot: each of its
-    2 pi r pixels on its own.
+    region's outline, displaced by noise over slope and rounded to whole pixels, for a round Gaussian spot: its 2 pi r
+    pixels are independent.
     """
     import cv2
 
     if picture.dtype != np.uint8:
         # The paper's method has 8 bits.
         picture = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
-    flat = cv2.remap(picture, *camera.maps, cv2.INTER_LINEAR)
-    value = cv2.cvtColor(flat, cv2.COLOR_BGR2HSV)[..., 2]
+    rectified = cv2.remap(picture, *camera.maps, cv2.INTER_LINEAR)
+    value = cv2.cvtColor(rectified, cv2.COLOR_BGR2HSV)[..., 2]
     height, width = value.shape
     smooth = cv2.blur(value, (5, 5))
     top = np.array(np.unravel_index(int(smooth.argmax()), smooth.shape))[::-1]
     low, high = np.maximum(top - REGION_HALF_PX, 0), np.minimum(top + REGION_HALF_PX + 1, (width, height))
     region = value[low[1] : high[1], low[0] : high[0]]
     floor, peak = float(np.median(region)), float(region.max())
-    spread = 1.4826 * float(np.median(np.abs(region - floor))) + 1.0
-    if smooth[top[1], top[0]] - floor < 3 * spread:
+    noise_dn = 1.4826 * float(np.median(np.abs(region - floor))) + 1.0
+    if smooth[top[1], top[0]] - floor < 3 * noise_dn:
         return Centre("no-spot")
     mask = (region > floor + BRIGHT_SHARE * (peak - floor)).astype(np.uint8)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -87,25 +87,25 @@ def contour_of(picture: np.ndarray, camera: Rectified, noise: SpotNoise) -> Cent
     if area < AREA_MIN_PX:
         return Centre("too-small")
     outline = camera.raw(outlines[0].reshape(-1, 2) + low)
-    clipped = (flat[low[1] : high[1], low[0] : high[0]] >= CLIPPED_DN).any(axis=2) & (mask > 0)
+    clipped = (rectified[low[1] : high[1], low[0] : high[0]] >= CLIPPED_DN).any(axis=2) & (mask > 0)
     radius = sqrt(area / pi)
     sd = radius / sqrt(-2 * log(BRIGHT_SHARE))
     clipped_share = float(clipped.sum() / mask.sum())
-    known = partial(Centre, axes_px=(sd, sd), clipped_share=clipped_share, outline_px=outline)
+    result = partial(Centre, axes_px=(sd, sd), clipped_share=clipped_share, outline_px=outline)
     if len(outlines) > 1 and cv2.contourArea(outlines[1]) > SECOND_SHARE * area:
-        return known("two-spots")
+        return result("two-spots")
     if clipped_share > CLIPPED_SHARE_MAX:
-        return known("clipped")
+        return result("clipped")
     if area > AREA_MAX_SHARE * width * height:
-        return known("too-large")
+        return result("too-large")
     centre = camera.raw(np.array([[moments["m10"], moments["m01"]]]) / area + low)[0]
     if (outline < 1).any() or (outline > np.array([width, height]) - 2).any():
-        return known("border")
+        return result("border")
     signal = BRIGHT_SHARE * (peak - floor)
     background = background_variance(picture, centre, int(3 * sd + 3))
-    moved = background + noise.gain_dn * signal + (noise.speckle_contrast * signal) ** 2
-    variance = (moved / (signal * radius / sd**2) ** 2 + 1 / 12) / (pi * radius)
-    return known("ok", centre, variance * np.eye(2))
+    pixel_variance = background + noise.gain_dn * signal + (noise.speckle_contrast * signal) ** 2
+    variance = (pixel_variance / (signal * radius / sd**2) ** 2 + 1 / 12) / (pi * radius)
+    return result("ok", centre, variance * np.eye(2))
 
 
 def epipolar_residual(pixels: np.ndarray, stereo: Stereo) -> np.ndarray:
@@ -117,7 +117,7 @@ def epipolar_residual(pixels: np.ndarray, stereo: Stereo) -> np.ndarray:
 
 
 def epipolar_refused(pixels: np.ndarray, covariances: np.ndarray, stereo: Stereo) -> np.ndarray:
-    """Which pairs (n,) cannot be images of one point, for all that spots and calibration leave open.
+    """Which pairs (n,) cannot be images of one point within the uncertainties of spots and calibration.
 
     Args:
         pixels: (n, 4) u_left, v_left, u_right, v_right.
@@ -136,14 +136,14 @@ def epipolar_refused(pixels: np.ndarray, covariances: np.ndarray, stereo: Stereo
     sds = np.sqrt(np.diag(covariance))
     free = np.flatnonzero(sds > 0)
     if len(free):
-        by_camera = []
+        slopes = []
         for row in free:
             step = np.zeros(24)
             step[row] = 0.1 * sds[row]
-            ends = (epipolar_residual(pixels, stereo.with_vector(vector + sign * step)) for sign in (1, -1))
-            by_camera.append((next(ends) - next(ends)) / (2 * step[row]))
-        moved = np.array(by_camera)
-        variance = variance + np.einsum("in,ij,jn->n", moved, covariance[np.ix_(free, free)], moved)
+            residuals = (epipolar_residual(pixels, stereo.with_vector(vector + sign * step)) for sign in (1, -1))
+            slopes.append((next(residuals) - next(residuals)) / (2 * step[row]))
+        camera_slope = np.array(slopes)
+        variance = variance + np.einsum("in,ij,jn->n", camera_slope, covariance[np.ix_(free, free)], camera_slope)
     distance = np.abs(residual) / np.linalg.norm(slope, axis=1)
     allowed = EPIPOLAR_SIGMAS * np.sqrt(variance) / np.linalg.norm(slope, axis=1)
     # Beyond where the lens model turns back nothing can be undistorted: NaN is refused too.

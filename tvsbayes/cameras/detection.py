@@ -1,14 +1,14 @@
-"""Laser spots in the frames of a campaign: centres with covariances, or the reason why there is none.
+"""Laser spots in the frames of a campaign: centres with covariances, or the reason for a refusal.
 
 Raw image px with the integer at the centre of a pixel. Two methods: `fit` (`cameras.spot_fit`), the default, and
 `contour` (`cameras.contour`), the paper's (section 2.4): rectify, region of interest, HSV, threshold, contour, centroid
 of the binary region, here taken back to the raw pixels of the format.
 
-Gain and contrast are learned from the campaign itself, per camera, from what a symmetric fit cannot follow: third-order
-(skew) residuals have the scale of the spot, are noise alone for any symmetric spot, and average demosaicing and the
-grain of speckle as the centre does. A skewed beam counts as noise and widens the sd. Sd of an intensity centroid under
-speckle alone: contrast / sqrt(8 pi) = 0.2 contrast px, whatever the size of the spot (Gaussian spot, independent
-pixels).
+Gain and contrast are estimated from the campaign itself, per camera, from third-order (skew) residuals, which a
+symmetric fit does not remove: they have the scale of the spot, are pure noise for any symmetric spot, and average
+demosaicing and the grain of speckle as the centre does. A skewed beam counts as noise and increases the sd. Sd of an
+intensity centroid under speckle alone: contrast / sqrt(8 pi) = 0.2 contrast px for any size of the spot (Gaussian spot,
+independent pixels).
 
 Refusals (status in spots.csv: reason, then the camera): see `REASONS`.
 """
@@ -28,7 +28,7 @@ import numpy as np
 from tvsbayes.cameras.alternate_lines import AlternateLines
 from tvsbayes.cameras.contour import Rectified, contour_of, epipolar_refused, rectified_pair
 from tvsbayes.cameras.picture_pairs import SUFFIXES
-from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skewness, widened, with_own_noise
+from tvsbayes.cameras.spot_fit import Centre, Located, centre_of, fit_spot, skewness, widened, with_measured_noise
 from tvsbayes.cameras.spot_noise import CONTRAST_DEFAULT, SHAPE_SPOTS_MIN, SpotNoise, learn_noise, mean_noise
 from tvsbayes.cameras.spot_window import CLIPPED_DN, CLIPPED_SHARE_MAX, WIDE_SD_PX, Patch, patch_around
 from tvsbayes.errors import InputError, NothingToEstimate, all_of, escaped, refusal, typed
@@ -48,7 +48,7 @@ from tvsbayes.progress import Job, Show
 
 METHODS = ("fit", "contour")
 _Patches = tuple[Patch | str, Patch | str]
-"""Left and right patch of a look, or why there is none."""
+"""Left and right patch of a look, or the reason why there is none."""
 REASONS = {
     "no-spot": "nothing stands out of the background",
     "two-spots": "a second spot holds over a quarter of the light of the first",
@@ -63,31 +63,31 @@ REASONS = {
     "epipolar": "left and right are not images of one point",
 }
 LEVELLING, LEARNING, DETECTING = "finding the brightest pixel", "learning the noise", "detecting"
-"""What takes time; the first only of pictures of more than 8 bits."""
-PILOTS_MAX = 24
-"""Looks from which the weights of the fits are learned; uncertainties are stated from all."""
+"""Stages of the progress; the first only for pictures of more than 8 bits."""
+PILOT_LOOKS_MAX = 24
+"""Largest number of looks that determine the weights of the fits; all looks determine the uncertainties."""
 LEARNING_ROUNDS = 3
 SKEW_SPOTS_MAX = 1000
 OVERLAY_HALF_PX, OVERLAY_ZOOM = 32, 8
-"""Half the side of the square that an overlay shows, and how many of its pixels show one."""
+"""Half the side of the square in an overlay, and its magnification."""
 PEDESTAL_DN = 8.0
-"""Beside a difference of pictures, so that the noise of a dark background keeps both of its sides."""
+"""Offset added to a difference of pictures, so that the noise of a dark background is not cut at 0."""
 
 
 @dataclass(frozen=True)
 class Detection:
-    """What `detect` found.
+    """The result of `detect`.
 
     Attributes:
-        campaign: the campaign with its new spots, rows as before.
+        campaign: the campaign with its new spots, in the same rows.
         method: "fit" or "contour".
         processed: rows whose two frames were read.
-        missing: rows without frames; they stay as they were.
-        kept: rows refused by somebody else (a status that is none of `REASONS`); they stay as well.
+        missing: rows without frames; unchanged.
+        kept: rows refused by a person (a status that is none of `REASONS`); unchanged.
         statuses: number of processed rows by status.
-        noise: what spots of the left and of the right camera were weighted with.
+        noise: noise of the left and of the right camera, for the weights.
         median_sd_px: median stated sd of the ok coordinates; None without any.
-        lines: of the left and of the right camera, whether rows or columns were read in two fields that disagree.
+        lines: disagreeing rows or columns of the left and of the right camera.
     """
 
     campaign: Campaign
@@ -103,9 +103,7 @@ class Detection:
     def as_json(self) -> dict[str, object]:
         """The document of `tvsbayes detect --json`."""
         refused = {status: count for status, count in self.statuses.items() if status != "ok"}
-        noise = {
-            side: {"gain_dn": one.gain_dn, "speckle_contrast": one.speckle_contrast} for side, one in self.noise.items()
-        }
+        noise = {side: {"gain_dn": n.gain_dn, "speckle_contrast": n.speckle_contrast} for side, n in self.noise.items()}
         return {
             "method": self.method,
             "spots": len(self.campaign.spots),
@@ -115,31 +113,31 @@ class Detection:
             "kept": self.kept,
             "median_sd_px": self.median_sd_px,
             "noise": noise,
-            "alternate_lines": {side: [asdict(one) for one in lines] for side, lines in self.lines.items()},
+            "alternate_lines": {side: [asdict(n) for n in lines] for side, lines in self.lines.items()},
         }
 
 
 def pair_status(left: Centre, right: Centre) -> str:
     """The word "ok", or the reasons of both cameras with their sides, as `spots.csv` holds them."""
-    bad = [(c.status, side) for c, side in zip((left, right), CAMERAS, strict=True) if c.status != "ok"]
-    if len(bad) == 2 and bad[0][0] == bad[1][0]:
-        return f"{bad[0][0]} both"
-    return ", ".join(f"{reason} {side}" for reason, side in bad) or "ok"
+    refusals = [(c.status, side) for c, side in zip((left, right), CAMERAS, strict=True) if c.status != "ok"]
+    if len(refusals) == 2 and refusals[0][0] == refusals[1][0]:
+        return f"{refusals[0][0]} both"
+    return ", ".join(f"{reason} {side}" for reason, side in refusals) or "ok"
 
 
 def _row(spot: Spot, left: Centre, right: Centre) -> Spot:
-    """A row with what was found; pixels stay empty where a camera refused."""
+    """A row with its centres; pixels stay empty where one camera has a refusal."""
     status = pair_status(left, right)
     if status != "ok":
         return with_pixels(spot, status)
     pixels: list[float] = []
     sds: list[float] = []
     correlations: list[float] = []
-    for one in (left, right):
-        located = one.located
+    for centre in (left, right):
+        located = centre.located
         sd = np.sqrt(np.diag(located.covariance_px2))
         pixels += [round(float(value), 6) for value in located.centre_px]
-        # The format's smallest sd; no spot is known that well.
+        # The smallest sd of the format; no spot is that accurate.
         sds += [max(round(float(value), 7), 1e-4) for value in sd]
         correlations.append(round(float(located.covariance_px2[0, 1] / sd[0] / sd[1]), 6))
     return with_pixels(spot, status, pixels, sds, correlations)
@@ -149,8 +147,8 @@ def _row(spot: Spot, left: Centre, right: Centre) -> Spot:
 class _Frames:
     """Reads the frames of a campaign: names are fixed by the format, links out of the folder are refused.
 
-    `white` is the largest value of its cameras where they give more than 8 bits; None before it is known. `dark` has
-    pictures with the laser off, of the same names or one for each camera.
+    `white` is the largest value of cameras with more than 8 bits; None before it is known. `dark` has pictures with the
+    laser off, of the same names or one for each camera.
     """
 
     folder: Path
@@ -167,20 +165,20 @@ class _Frames:
     def read(self, spot: Spot, side: str) -> np.ndarray:
         """A picture (height, width, 3): uint8, or float32 grey levels of 8 bits (DN) where it is deeper.
 
-        Without its dark picture where there is one, beside `PEDESTAL_DN`; what is clipped stays as bright as it was.
+        A dark picture, if any, is subtracted and `PEDESTAL_DN` added; clipped pixels stay unchanged.
         """
         lit = in_grey_levels(decode_image(self._data(spot, side), self.path(spot, side).name), self.white)
         if self.dark is None:
             return lit
-        place = self._dark_picture(spot, side)
-        data = read_bytes(place, IMAGE_BYTES_MAX, self.dark)
-        self._require_size(data, place, side)
-        dark = in_grey_levels(decode_image(data, place.name), self.white)
-        left = np.maximum(lit.astype(np.float32) - dark + PEDESTAL_DN, 0.0)
-        return np.where(lit >= CLIPPED_DN, lit.astype(np.float32), left)
+        dark_path = self._dark_picture(spot, side)
+        data = read_bytes(dark_path, IMAGE_BYTES_MAX, self.dark)
+        self._require_size(data, dark_path, side)
+        dark = in_grey_levels(decode_image(data, dark_path.name), self.white)
+        difference = np.maximum(lit.astype(np.float32) - dark + PEDESTAL_DN, 0.0)
+        return np.where(lit >= CLIPPED_DN, lit.astype(np.float32), difference)
 
     def _dark_picture(self, spot: Spot, side: str) -> Path:
-        """That of a look, else of its camera."""
+        """The dark picture of a look, else of its camera."""
         assert self.dark is not None
         name_of_look = frame_name(spot.spot, side)
         names = [Path(name_of_look).name, *(f"{side}{suffix}" for suffix in SUFFIXES)]
@@ -202,11 +200,11 @@ class _Frames:
     def largest(self, spot: Spot) -> int:
         """The largest value in those pictures of a look that have more than 8 bits; 0 without any."""
         data = {side: self._data(spot, side) for side in CAMERAS}
-        deep = {side: one for side, one in data.items() if is_deep(one)}
-        return max((int(decode_image(one, self.path(spot, side).name).max()) for side, one in deep.items()), default=0)
+        deep = {side: png for side, png in data.items() if is_deep(png)}
+        return max((int(decode_image(png, self.path(spot, side).name).max()) for side, png in deep.items()), default=0)
 
     def refused(self, picture: tuple[Spot, str]) -> InputError | None:
-        """Why the picture of a look and a side cannot be used; None where it can."""
+        """The reason why the picture of a look and a side cannot be used; None where it can."""
         try:
             decode_image(self._data(*picture), self.path(*picture).name)
         except InputError as error:
@@ -215,7 +213,7 @@ class _Frames:
 
     def _data(self, spot: Spot, side: str) -> bytes:
         path = self.path(spot, side)
-        # Its size before it is decoded: a small file can hold 50 million pixels, on every thread.
+        # The size is checked before decoding: a small file can hold 50 million pixels, on every thread.
         data = read_bytes(path, IMAGE_BYTES_MAX, self.folder)
         self._require_size(data, path, side)
         return data
@@ -233,8 +231,8 @@ class _Frames:
             )
 
 
-def _parallel[Item, Result](job: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[Result]:
-    """Results in order. Decoding and OpenCV leave Python's lock, so threads do; Ctrl-C drops what has not begun."""
+def _threaded[Item, Result](job: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[Result]:
+    """Results in order. Decoding and OpenCV release Python's lock, so threads suffice; Ctrl-C cancels waiting jobs."""
     pool = ThreadPoolExecutor(workers)
     try:
         yield from pool.map(job, items)
@@ -252,61 +250,61 @@ def detect(
     overlay: Path | None = None,
     progress: Show | None = None,
 ) -> Detection:
-    """Find the spots in the frames of a campaign folder; nothing is written but overlay pictures.
+    """Find the spots in the frames of a campaign folder; writes overlay pictures only.
 
     Args:
         campaign: read from a folder.
         method: "fit" or "contour".
-        speckle_contrast: contrast per independent pixel, taken as known; by default `fit` learns it from the
-            looks of each camera and `contour` takes 0.4.
+        speckle_contrast: known contrast per independent pixel; by default `fit` estimates it from the looks of each
+            camera and `contour` takes 0.4.
         dark: folder of pictures with the laser off, to be subtracted: named as the frames, or one for each camera,
             left.png and right.png.
         workers: threads; default one per core.
         overlay: folder for one picture per look: outline of the bright area and centre.
-        progress: called with the progress.
+        progress: shows the progress.
 
     Raises:
         InputError: a frame that cannot be read safely, has another size, or a campaign without folder.
         NothingToEstimate: no row has both frames.
     """
     frames = replace(_frames_of(campaign, method), dark=dark)
-    rows = [row for row, spot in enumerate(campaign.spots) if _ours(spot.status)]
+    rows = [row for row, spot in enumerate(campaign.spots) if _may_detect(spot.status)]
     present = [row for row in rows if frames.present(campaign.spots[row])]
     if not present:
         raise _no_frames(campaign)
     workers = workers or os.cpu_count() or 1
-    learning = min(PILOTS_MAX, len(present)) if method == "fit" else 0
+    pilot_looks = min(PILOT_LOOKS_MAX, len(present)) if method == "fit" else 0
     present_spots = [campaign.spots[row] for row in present]
     try:
-        levelling = len(present) if frames.deep(present_spots[0]) else 0
-        with Job({LEVELLING: levelling, LEARNING: learning, DETECTING: len(present)}, progress) as job:
+        deep_looks = len(present) if frames.deep(present_spots[0]) else 0
+        with Job({LEVELLING: deep_looks, LEARNING: pilot_looks, DETECTING: len(present)}, progress) as job:
             job.begin(LEVELLING)
             largest = 0
-            # All of them: no few looks need hold the brightest, and one level has to serve every look.
-            for count, largest_value in enumerate(_parallel(frames.largest, present_spots, workers)):
+            # All looks: a few may not contain the brightest pixel, and all looks need the same level.
+            for count, largest_value in enumerate(_threaded(frames.largest, present_spots, workers)):
                 largest = max(largest, largest_value)
                 job.at(count / len(present))
             frames = replace(frames, white=white_level(largest) if largest else None)
             job.begin(LEARNING)
-            looks = _looks(campaign, method, frames, present, speckle_contrast, workers, overlay)
+            looks = _prepared_looks(campaign, method, frames, present, speckle_contrast, workers, overlay)
             job.begin(DETECTING)
             pairs = []
-            for pair in _parallel(looks.centres, present, workers):
+            for pair in _threaded(looks.centres, present, workers):
                 pairs.append(pair)
                 job.at(len(pairs) / len(present), f"{len(pairs)} of {len(present)} looks")
     except InputError as first:
-        every = [error for error in _parallel(frames.refused, list(product(present_spots, CAMERAS)), workers) if error]
-        raise all_of(every or [first]) from None
-    noise = _relearned(looks.noise, pairs, speckle_contrast) if method == "fit" else looks.noise
+        errors = [error for error in _threaded(frames.refused, list(product(present_spots, CAMERAS)), workers) if error]
+        raise all_of(errors or [first]) from None
+    noise = _final_noise(looks.noise, pairs, speckle_contrast) if method == "fit" else looks.noise
     sides = {side: widened([pair[k].under(noise[side]) for pair in pairs]) for k, side in enumerate(CAMERAS)}
     sizes = campaign.stereo.image_sizes
     right = [centre.scaled(sizes["right"], sizes["left"]) for centre in sides["right"].centres]
     centres = list(zip(sides["left"].centres, right, strict=True))
     spots = _rows(campaign.spots, present, centres, campaign.stereo)
-    after = [spots[row] for row in present]
+    detected = [spots[row] for row in present]
     sds = [
         sd
-        for spot in after
+        for spot in detected
         if spot.status == "ok"
         for sd in (spot.su_left_px, spot.sv_left_px, spot.su_right_px, spot.sv_right_px)
         if sd is not None
@@ -317,7 +315,7 @@ def detect(
         processed=len(present),
         missing=len(rows) - len(present),
         kept=len(campaign.spots) - len(rows),
-        statuses=dict(Counter(spot.status for spot in after).most_common()),
+        statuses=dict(Counter(spot.status for spot in detected).most_common()),
         noise=noise,
         median_sd_px=float(np.median(sds)) if sds else None,
         lines={side: one.lines for side, one in sides.items()},
@@ -325,7 +323,7 @@ def detect(
 
 
 def _no_frames(campaign: Campaign) -> NothingToEstimate:
-    """Why there is nothing to detect, and how pictures get there."""
+    """The refusal of a campaign without frames, with how to add pictures."""
     pairing = (
         f"`tvsbayes new {typed(campaign.path)} --pictures FOLDER` lists the pictures of a folder and copies them there"
     )
@@ -341,7 +339,7 @@ def _no_frames(campaign: Campaign) -> NothingToEstimate:
 
 
 def _frames_of(campaign: Campaign, method: str) -> _Frames:
-    """Where the frames lie, of a campaign that has some, for a method that there is."""
+    """The frames of a campaign, after checks of method and campaign."""
     if method not in METHODS:
         remedy = "choose one of them"
         raise InputError("method", f"no method {method!r}", found=method, allowed=", ".join(METHODS), remedy=remedy)
@@ -355,7 +353,7 @@ def _frames_of(campaign: Campaign, method: str) -> _Frames:
 
 @dataclass(frozen=True)
 class _Looks:
-    """Finds the centres of one look after the other.
+    """Finds the centres of single looks.
 
     Attributes:
         spots: all rows of spots.csv.
@@ -392,7 +390,7 @@ class _Looks:
         return centre_of(patch_around(picture), self.noise[camera])
 
 
-def _looks(
+def _prepared_looks(
     campaign: Campaign,
     method: str,
     frames: _Frames,
@@ -401,16 +399,16 @@ def _looks(
     workers: int,
     overlay: Path | None,
 ) -> _Looks:
-    """What a method knows before it begins: the noise of each camera from pilots, or the rectified pictures."""
+    """The inputs of a method: the noise of each camera from pilot looks, or the rectified pictures."""
     noise: dict[str, SpotNoise] = {}
     patches: dict[int, _Patches] = {}
     rectified: dict[str, Rectified] = {}
     if method == "fit":
         patches = _pilots(campaign.spots, present, frames, workers)
         for number, camera in enumerate(CAMERAS):
-            usable = [patch for pair in patches.values() if not isinstance(patch := pair[number], str)]
-            noise[camera] = _learned(
-                [one for one in usable if one.clipped_share <= CLIPPED_SHARE_MAX], speckle_contrast
+            patches_of_camera = [patch for pair in patches.values() if not isinstance(patch := pair[number], str)]
+            noise[camera] = _estimated_noise(
+                [one for one in patches_of_camera if one.clipped_share <= CLIPPED_SHARE_MAX], speckle_contrast
             )
     else:
         noise["left"] = noise["right"] = SpotNoise(speckle_contrast=_contrast(speckle_contrast))
@@ -420,15 +418,15 @@ def _looks(
     return _Looks(campaign.spots, frames, noise, patches, rectified, overlay)
 
 
-def _relearned(
+def _final_noise(
     noise: dict[str, SpotNoise], pairs: Sequence[tuple[Centre, Centre]], speckle_contrast: float | None
 ) -> dict[str, SpotNoise]:
     """The noise of each camera from all of its spots."""
     result = dict(noise)
     for number, camera in enumerate(CAMERAS):
-        good = [pair[number] for pair in pairs if pair[number].status in ("ok", "misshapen")]
-        skews = [centre.skews for centre in good if centre.skews is not None]
-        wide = all(min(centre.axes_px) >= WIDE_SD_PX for centre in good)
+        usable = [pair[number] for pair in pairs if pair[number].status in ("ok", "misshapen")]
+        skews = [centre.skews for centre in usable if centre.skews is not None]
+        wide = all(min(centre.axes_px) >= WIDE_SD_PX for centre in usable)
         if len(skews) >= SHAPE_SPOTS_MIN or (skews and not wide):
             table = np.stack(skews)
             result[camera] = learn_noise(table[:: -(-len(table) // SKEW_SPOTS_MAX)], speckle_contrast)
@@ -436,38 +434,38 @@ def _relearned(
 
 
 def _pilots(spots: Sequence[Spot], present: Sequence[int], frames: _Frames, workers: int) -> dict[int, _Patches]:
-    """Left and right patch, or why there is none, of looks spread evenly over the campaign, by row of spots.csv."""
-    rows = [present[k] for k in np.unique(np.linspace(0, len(present) - 1, PILOTS_MAX).astype(int))]
+    """Left and right patch, or the reason for none, of looks spread evenly over the campaign, by row of spots.csv."""
+    rows = [present[k] for k in np.unique(np.linspace(0, len(present) - 1, PILOT_LOOKS_MAX).astype(int))]
 
     def patches(row: int) -> _Patches:
         return patch_around(frames.read(spots[row], "left")), patch_around(frames.read(spots[row], "right"))
 
-    return dict(zip(rows, _parallel(patches, rows, workers), strict=True))
+    return dict(zip(rows, _threaded(patches, rows, workers), strict=True))
 
 
 def _rows(
     spots: Sequence[Spot], present: Sequence[int], centres: Sequence[tuple[Centre, Centre]], stereo: Stereo
 ) -> list[Spot]:
-    """All rows of spots.csv, those in `present` with what was seen (left, right); off their epipolar line: refused."""
+    """All rows of spots.csv, those in `present` with their centres (left, right); refused off their epipolar line."""
     rows = list(spots)
-    good: list[tuple[int, Located, Located]] = []
+    matched: list[tuple[int, Located, Located]] = []
     for row, (left, right) in zip(present, centres, strict=True):
         rows[row] = _row(rows[row], left, right)
         if rows[row].status == "ok":
-            good.append((row, left.located, right.located))
-    pixels, covariances = np.zeros((len(good), 4)), np.zeros((len(good), 4, 4))
-    for place, (_, one, other) in enumerate(good):
-        pixels[place] = *one.centre_px, *other.centre_px
-        covariances[place, :2, :2], covariances[place, 2:, 2:] = one.covariance_px2, other.covariance_px2
+            matched.append((row, left.located, right.located))
+    pixels, covariances = np.zeros((len(matched), 4)), np.zeros((len(matched), 4, 4))
+    for place, (_, left_spot, right_spot) in enumerate(matched):
+        pixels[place] = *left_spot.centre_px, *right_spot.centre_px
+        covariances[place, :2, :2], covariances[place, 2:, 2:] = left_spot.covariance_px2, right_spot.covariance_px2
     refused = epipolar_refused(pixels, covariances, stereo)
-    for (row, _, _), bad in zip(good, refused, strict=True):
-        if bad:
+    for (row, _, _), is_refused in zip(matched, refused, strict=True):
+        if is_refused:
             rows[row] = replace(rows[row], status="epipolar")
     return rows
 
 
-def _ours(status: str) -> bool:
-    """Whether a row may be detected (again): a refusal by a person stands."""
+def _may_detect(status: str) -> bool:
+    """Whether a row may be detected (again): a refusal by a person is kept."""
     return status in ("ok", UNDETECTED) or status.split(" ")[0] in REASONS
 
 
@@ -475,15 +473,15 @@ def _contrast(given: float | None) -> float:
     return CONTRAST_DEFAULT if given is None else given
 
 
-def _learned(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNoise:
-    """The noise of one camera from some of its spots: weights follow what is learned, so a few rounds.
+def _estimated_noise(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNoise:
+    """The noise of one camera from some of its spots: weights depend on the noise, so in a few rounds.
 
-    Too few spots show no scatter between looks; the pixels of wide ones then tell what they can.
+    Too few spots show no scatter between looks; then the pixels of wide spots give the estimate.
     """
-    # Wide spots: first as if there were no speckle, whose weights would make much of wings that are no Gaussian's.
+    # Wide spots: first without speckle, whose weights would overrate the wings, which are not Gaussian.
     wide = bool(patches) and speckle_contrast is None and all(patch.wide for patch in patches)
     if wide and len(patches) < SHAPE_SPOTS_MIN:
-        return mean_noise([with_own_noise(patch)[1] for patch in patches])
+        return mean_noise([with_measured_noise(patch)[1] for patch in patches])
     noise = SpotNoise(speckle_contrast=0.0 if wide else _contrast(speckle_contrast))
     for _ in range(LEARNING_ROUNDS):
         fits = [(fitted, patch) for patch in patches if (fitted := fit_spot(patch, noise)) is not None]
@@ -494,7 +492,7 @@ def _learned(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNo
 
 
 def _overlay_of(picture: np.ndarray, centre: Centre) -> np.ndarray:
-    """The surroundings of a spot enlarged: outline green, centre red, the reason of a refusal in words (Figure 9)."""
+    """An enlarged picture of a spot: outline green, centre red, reason of a refusal in words (Figure 9)."""
     import cv2
 
     if picture.dtype != np.uint8:
@@ -505,15 +503,15 @@ def _overlay_of(picture: np.ndarray, centre: Centre) -> np.ndarray:
     if middle is None:
         outline = centre.outline_px
         middle = np.array([width, height]) / 2 if outline is None or not len(outline) else outline.mean(axis=0)
-    low = np.clip(np.round(middle).astype(int) - half, 0, np.maximum((width, height) - np.array(2 * half), 0))
-    crop = picture[low[1] : low[1] + 2 * half, low[0] : low[0] + 2 * half]
+    corner = np.clip(np.round(middle).astype(int) - half, 0, np.maximum((width, height) - np.array(2 * half), 0))
+    crop = picture[corner[1] : corner[1] + 2 * half, corner[0] : corner[0] + 2 * half]
     crop = cv2.copyMakeBorder(crop, 0, 2 * half - crop.shape[0], 0, 2 * half - crop.shape[1], cv2.BORDER_CONSTANT)
     large = cv2.resize(crop, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
     if centre.outline_px is not None and len(centre.outline_px):
-        outline = np.round((centre.outline_px - low + 0.5) * zoom).astype(np.int32)
+        outline = np.round((centre.outline_px - corner + 0.5) * zoom).astype(np.int32)
         cv2.polylines(large, [outline.reshape(-1, 1, 2)], True, (0, 255, 0), 1, cv2.LINE_AA)
     if centre.centre_px is not None:
-        dot = np.round((centre.centre_px - low + 0.5) * zoom).astype(int)
+        dot = np.round((centre.centre_px - corner + 0.5) * zoom).astype(int)
         cv2.circle(large, tuple(map(int, dot)), zoom // 2, (0, 0, 255), -1, cv2.LINE_AA)
     if centre.status != "ok":
         cv2.putText(

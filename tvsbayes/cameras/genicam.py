@@ -1,12 +1,11 @@
 """GenICam cameras (GigE Vision, USB3 Vision) through a GenTL producer, by `harvesters` (`driver = "genicam"`).
 
-The extra `tvsbayes[genicam]` brings `harvesters`; the producer, a `.cti` file, comes from the camera's maker and is
-named in `[cameras.options]`. Pictures are triggered: each is exposed after it was asked for, whatever was in the
-buffers, by software at one call, or by a line that the positioner pulses. A camera without a trigger runs freely; then
-its buffers are emptied first, and of what follows the frames that may have been under way are left out.
+The extra `tvsbayes[genicam]` installs `harvesters`; the producer, a `.cti` file, comes from the camera's maker and is
+named in `[cameras.options]`. Pictures are triggered, by software in one call or by a line that the positioner pulses,
+so each is exposed after the request. A camera without a trigger runs freely; then its buffers are emptied first, and
+the next frames, which may be older than the request, are left out.
 
-Mono8 to Mono16 and colour of 8 bits are taken at their full depth, as the camera gives them. Seconds where a name says
-`_s`.
+Mono8 to Mono16 and colour of 8 bits are taken at full depth. Names with `_s` are in seconds.
 """
 
 from __future__ import annotations
@@ -27,29 +26,29 @@ FETCH_S = 5.0
 """Longest wait for a picture after its trigger."""
 OPTIONS = ("producer", "pixel_format", "gain", "trigger")
 PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16, "BGR8": 8, "RGB8": 8}
-"""Formats that are taken, by their PFNC name, with the bits that carry grey levels."""
+"""Accepted formats by their PFNC name, with the bits of their grey levels."""
 SOFTWARE = "Software"
-DRAIN_MAX = 64
-"""The most buffers that are emptied; producers use a handful."""
+DRAIN_BUFFERS_MAX = 64
+"""Largest number of buffers to empty; producers use about five."""
 STEP_SHARE = 0.05
 STEPS = {"ExposureTime": 1.0, "Gain": 0.1}
-"""A camera rounds to steps of its own: it has taken a value that reads back within this share or this much of it, us
-and the camera's unit of gain, mostly dB."""
+"""Largest relative and absolute deviation of a value that reads back, since cameras round: us, and the camera's unit of
+gain, mostly dB."""
 _NAMES = ("left", "right")
 _refused = partial(entry_refusal, "cameras", "cameras")
 
 
 @dataclass(frozen=True)
 class GenicamSettings:
-    """What the rig file states.
+    """Settings in the rig file.
 
     Attributes:
         producer: the `.cti` file.
         cameras: serial numbers or user-defined names of left and right.
         pixel_format: of `PIXEL_BITS`.
-        exposure_us: microseconds; None leaves it as the camera has it.
-        gain: in the camera's unit; None leaves it as the camera has it.
-        trigger: what starts an exposure, a `TriggerSource` of the camera: "Software", or a line.
+        exposure_us: microseconds; None keeps that of the camera.
+        gain: in the camera's unit; None keeps that of the camera.
+        trigger: starts an exposure, a `TriggerSource` of the camera: "Software", or a line.
     """
 
     producer: str
@@ -61,7 +60,7 @@ class GenicamSettings:
 
     @classmethod
     def of(cls, table: Mapping[str, Setting]) -> GenicamSettings:
-        """Those of `[cameras]`.
+        """The settings of the table `[cameras]`.
 
         Raises:
             InputError: an entry that is missing or does not belong to GenICam cameras.
@@ -111,8 +110,8 @@ class GenicamCamera:
     """See `StereoCamera`.
 
     Args:
-        harvester: a `harvesters.core.Harvester` without files; belongs to this object from now on.
-        stated: what the rig file states.
+        harvester: a `harvesters.core.Harvester` without files; this object closes it.
+        stated: settings of the rig file.
         width: of one picture, px.
         height: px.
 
@@ -133,55 +132,55 @@ class GenicamCamera:
             if isinstance(error, DeviceFault):
                 raise
             raise fault(
-                "camera", f"the GenTL producer: {_said(error)}", "check the .cti file and the cables"
+                "camera", f"the GenTL producer: {_error_text(error)}", "check the .cti file and the cables"
             ) from error
 
     def _open(self) -> None:
         self._harvester.add_file(self._stated.producer)
         self._harvester.update()
-        for name, wanted in zip(_NAMES, self._stated.cameras, strict=True):
-            known = self._harvester.device_info_list
-            fits = [
-                n for n, d in enumerate(known) if wanted in (_text(d, "serial_number"), _text(d, "user_defined_name"))
+        for name, key in zip(_NAMES, self._stated.cameras, strict=True):
+            devices = self._harvester.device_info_list
+            matches = [
+                n for n, d in enumerate(devices) if key in (_text(d, "serial_number"), _text(d, "user_defined_name"))
             ]
-            if len(fits) != 1:
-                serials = ", ".join(_text(d, "serial_number") for d in known) or "none"
-                found = f"{name}: {len(fits)} cameras are {escaped(wanted)}; there are: {escaped(serials, 200)}"
+            if len(matches) != 1:
+                serials = ", ".join(_text(d, "serial_number") for d in devices) or "none"
+                found = f"{name}: {len(matches)} cameras are {escaped(key)}; there are: {escaped(serials, 200)}"
                 raise fault("camera", found, "correct [cameras], check cable and supply, close other programs")
-            acquirer = self._harvester.create(fits[0])
+            acquirer = self._harvester.create(matches[0])
             self._acquirers.append(acquirer)
             self._fix(name, acquirer.remote_device.node_map)
             acquirer.start()
 
     def _fix(self, name: str, nodes: Any) -> None:
         """Size, format, software trigger, exposure; automatics off."""
-        stated = self._stated
-        must: dict[str, object] = {"PixelFormat": stated.pixel_format, "Width": self._size[0], "Height": self._size[1]}
+        stated, (width, height) = self._stated, self._size
+        features: dict[str, object] = {"PixelFormat": stated.pixel_format, "Width": width, "Height": height}
         if hasattr(nodes, "TriggerMode"):
-            must |= {"TriggerSelector": "FrameStart", "TriggerMode": "On", "TriggerSource": stated.trigger}
+            features |= {"TriggerSelector": "FrameStart", "TriggerMode": "On", "TriggerSource": stated.trigger}
         elif stated.trigger == SOFTWARE:
             self._warnings.append(f"{name}: runs freely, without a trigger; buffers are emptied before every look")
         else:
             raise fault("camera-setting", f"{name}: no trigger", "leave out [cameras.options] trigger")
         if stated.exposure_us is not None:
-            must["ExposureTime"] = stated.exposure_us
+            features["ExposureTime"] = stated.exposure_us
         if stated.gain is not None:
-            must["Gain"] = stated.gain
+            features["Gain"] = stated.gain
         for automatic in ("ExposureAuto", "GainAuto", "BalanceWhiteAuto"):
             if not _set(nodes, automatic, "Off") and hasattr(nodes, automatic):
                 self._warnings.append(f"{name}: {automatic} cannot be switched off; fix it with the maker's program")
-        for node, value in must.items():
+        for node, value in features.items():
             if not _set(nodes, node, value):
                 found = f"{name}: {node} = {value} was not taken"
                 raise fault("camera-setting", found, "see what the maker's program allows, correct [cameras]")
 
     @property
     def wants_pulse(self) -> bool:
-        """Whether exposures wait for a line that somebody has to pulse."""
+        """Whether exposures wait for a pulse on a line."""
         return self._stated.trigger != SOFTWARE
 
     def use_trigger(self, pulse: Callable[[], object]) -> None:
-        """How the line is pulsed on which the cameras wait."""
+        """Set the function that pulses the trigger line of the cameras."""
         self._pulse = pulse
 
     def settings(self) -> CameraSettings:
@@ -196,10 +195,10 @@ class GenicamCamera:
         return CameraSettings(values, tuple(self._warnings))
 
     def grab(self) -> StereoImage:
-        """See `StereoCamera.grab`: both are triggered now, one right behind the other.
+        """See `StereoCamera.grab`: triggers both immediately one after the other.
 
         Raises:
-            DeviceFault: no picture, one of another size, or nobody who pulses the trigger line.
+            DeviceFault: no picture, one of another size, or no pulse for the trigger line.
         """
         if self.wants_pulse and self._pulse is None:
             remedy = "use a positioner that offers one (driver serial), or leave out [cameras.options] trigger"
@@ -210,43 +209,43 @@ class GenicamCamera:
             free = [not hasattr(acquirer.remote_device.node_map, "TriggerMode") for acquirer in self._acquirers]
             self._expose(free)
             left, right = (
-                self._picture(name, acquirer, PIPELINE_FRAMES if runs else 0)
-                for name, acquirer, runs in zip(_NAMES, self._acquirers, free, strict=True)
+                self._picture(name, acquirer, PIPELINE_FRAMES if free_running else 0)
+                for name, acquirer, free_running in zip(_NAMES, self._acquirers, free, strict=True)
             )
         except DeviceFault:
             raise
         except Exception as error:
-            raise fault("no-frame", f"a camera delivers no frame: {_said(error)}", "check its cable") from error
+            raise fault("no-frame", f"a camera delivers no frame: {_error_text(error)}", "check its cable") from error
         return StereoImage(left, right, 2 ** PIXEL_BITS[self._stated.pixel_format] - 1)
 
     def _expose(self, free: Sequence[bool]) -> None:
-        """Trigger those that do not run by themselves."""
+        """Trigger the cameras that do not run freely."""
         if self._pulse is not None:
             self._pulse()
             return
-        for acquirer, runs in zip(self._acquirers, free, strict=True):
-            if not runs:
+        for acquirer, free_running in zip(self._acquirers, free, strict=True):
+            if not free_running:
                 acquirer.remote_device.node_map.TriggerSoftware.execute()
 
     def _picture(self, name: str, acquirer: Any, skipped: int) -> np.ndarray:
-        """(height, width, 3), uint8 or uint16, blue, green, red: the next but `skipped`."""
+        """The next picture after `skipped` others: (height, width, 3), uint8 or uint16, blue, green, red."""
         for _ in range(skipped):
             acquirer.fetch(timeout=FETCH_S).queue()
         with acquirer.fetch(timeout=FETCH_S) as buffer:
-            part = buffer.payload.components[0]
-            size = int(part.width), int(part.height)
+            component = buffer.payload.components[0]
+            size = int(component.width), int(component.height)
             if size != self._size:
                 found = f"{name}: pictures of {size[0]} x {size[1]} px"
                 raise fault("image-size", found, f"{self._size[0]} x {self._size[1]} px were calibrated")
             # The memory belongs to the producer again once the buffer is given back.
-            data = np.array(part.data)
+            data = np.array(component.data)
         return _as_bgr(data, self._size, self._stated.pixel_format)
 
     def close(self) -> None:
         """See `StereoCamera.close`."""
-        for undo in [*(a.destroy for a in self._acquirers), self._harvester.reset]:
+        for release in [*(a.destroy for a in self._acquirers), self._harvester.reset]:
             try:
-                undo()
+                release()
             except Exception:
                 # A camera that has gone cannot be given back.
                 continue
@@ -263,8 +262,8 @@ def _as_bgr(data: np.ndarray, size: tuple[int, int], pixel_format: str) -> np.nd
 
 
 def _drain(acquirer: Any) -> None:
-    """Lets pictures go that nobody fetched."""
-    for _ in range(DRAIN_MAX):
+    """Drop pictures that were not fetched."""
+    for _ in range(DRAIN_BUFFERS_MAX):
         buffer = acquirer.try_fetch(timeout=0.001)
         if buffer is None:
             return
@@ -272,25 +271,25 @@ def _drain(acquirer: Any) -> None:
 
 
 def _set(nodes: Any, name: str, value: object) -> bool:
-    """Sets a feature and reads it back; whether the camera has taken it."""
+    """Set a feature and read it back; returns whether the camera accepted it."""
     try:
         node = getattr(nodes, name)
         node.value = value
-        read = node.value
+        reported = node.value
     except Exception:
         return False
-    if isinstance(value, float) and isinstance(read, (int, float)):
-        return abs(read - value) <= max(STEP_SHARE * abs(value), STEPS[name])
-    return bool(read == value)
+    if isinstance(value, float) and isinstance(reported, (int, float)):
+        return abs(reported - value) <= max(STEP_SHARE * abs(value), STEPS[name])
+    return bool(reported == value)
 
 
 def _text(device: Any, name: str) -> str:
-    """An entry of the device list; producers raise errors of their own for one that a camera does not have."""
+    """An entry of the device list, "" without one: producers raise errors of any type."""
     try:
         return str(getattr(device, name) or "")
     except Exception:
         return ""
 
 
-def _said(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     return f"{type(error).__name__}: {escaped(str(error), 200)}"

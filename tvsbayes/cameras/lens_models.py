@@ -34,27 +34,27 @@ INVERSE = ("inverse_brown_conrady",)
 """librealsense's: five coefficients that bring pixels to rays, not rays to pixels (rs2_deproject_pixel_to_point)."""
 FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "kannalabrandt8", "kannala_brandt8", "equi")
 GRID = 25
-"""Pixels each way over the picture."""
+"""Number of grid points along each side of the picture."""
 ERROR_MAX_PX = 0.1
-"""What a fit may miss: a centroid's own error."""
+"""Largest error of a fit: that of a centroid."""
 WIDEST_TAN = 4.0
 """Tangent of the angle off the axis, 76 deg, beyond which five coefficients are not tried."""
 
 
 @dataclass(frozen=True)
 class FittedLens:
-    """Five coefficients, and by how much they miss the other model in the picture, px; infinite where it has no ray."""
+    """Five coefficients and their largest error in the picture, px; infinite where the other model has no ray."""
 
     distortion: np.ndarray
     error_px: float
 
 
 def kind_of(model: str) -> Kind | None:
-    """The kind of a lens model by its name; "five" where none is stated, None where nothing here knows it."""
-    bare = re.sub(r"[ -]", "_", model.strip().lower()).removeprefix("distortion.")
+    """The kind of a lens model by its name; "five" where none is stated, None for an unknown one."""
+    name = re.sub(r"[ -]", "_", model.strip().lower()).removeprefix("distortion.")
     names: dict[Kind, tuple[str, ...]] = {"five": (*FIVE, ""), "rational": RATIONAL, "fisheye": FISHEYE}
     names["inverse"] = INVERSE
-    return next((kind for kind, known in names.items() if bare in known), None)
+    return next((kind for kind, models in names.items() if name in models), None)
 
 
 def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, int], kind: Kind) -> FittedLens:
@@ -69,10 +69,10 @@ def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, 
     grid = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 1, 2)
     if kind == "inverse":
         rays: np.ndarray = distort((grid.reshape(-1, 2) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], distortion)
-        again: np.ndarray = grid.reshape(-1, 2)
+        reprojected: np.ndarray = grid.reshape(-1, 2)
     elif kind == "fisheye":
         rays = cv2.fisheye.undistortPoints(grid, matrix, distortion.reshape(4, 1)).reshape(-1, 2)
-        again = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), matrix, distortion.reshape(4, 1)).reshape(-1, 2)
+        reprojected = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), matrix, distortion.reshape(4, 1)).reshape(-1, 2)
     else:
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
         if hasattr(cv2, "undistortPointsIter"):
@@ -80,14 +80,14 @@ def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, 
         else:
             rays = cv2.undistortPoints(grid, matrix, distortion, criteria=criteria).reshape(-1, 2)
         points = np.column_stack([rays, np.ones(len(rays))])
-        again = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
+        reprojected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
     pixels = grid.reshape(-1, 2)
-    good = np.isfinite(rays).all(axis=1) & (np.linalg.norm(rays, axis=1) < WIDEST_TAN)
-    good[good] &= np.abs(again[good] - pixels[good]).max(axis=1) < ERROR_MAX_PX
-    if not good.all():
+    valid = np.isfinite(rays).all(axis=1) & (np.linalg.norm(rays, axis=1) < WIDEST_TAN)
+    valid[valid] &= np.abs(reprojected[valid] - pixels[valid]).max(axis=1) < ERROR_MAX_PX
+    if not valid.all():
         return FittedLens(np.zeros(5), np.inf)
-    wanted = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
-    columns = [(distort(rays, one) - rays).ravel() for one in np.eye(5)]
-    distortion5 = np.linalg.lstsq(np.stack(columns, axis=1), (wanted - rays).ravel())[0]
-    missed = (distort(rays, distortion5) - wanted) * matrix[[0, 1], [0, 1]]
-    return FittedLens(distortion5, float(np.linalg.norm(missed, axis=1).max()))
+    target = (pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    columns = [(distort(rays, unit) - rays).ravel() for unit in np.eye(5)]
+    distortion5 = np.linalg.lstsq(np.stack(columns, axis=1), (target - rays).ravel())[0]
+    errors_px = (distort(rays, distortion5) - target) * matrix[[0, 1], [0, 1]]
+    return FittedLens(distortion5, float(np.linalg.norm(errors_px, axis=1).max()))

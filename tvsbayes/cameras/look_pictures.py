@@ -1,7 +1,7 @@
-"""Pictures of spots from a folder of any names: to which look each pair belongs, and their way into `frames/`.
+"""Pictures of spots from a folder with any names: finds the look of each pair and copies the pictures to `frames/`.
 
-A pair belongs to the row of `spots.csv` (where there are rows), else to the move, whose number stands in its name;
-where no number does, pairs and rows are matched one by one in the order of the names. Nothing is overwritten.
+The number in its name gives the row of `spots.csv` of a pair (where there are rows), else its move; without such a
+number, pairs and rows are matched one by one in the order of the names. Nothing is overwritten.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from tvsbayes.progress import Advance, unshown
 
 Matching = Literal["number", "order"]
 LOOKS_MAX = 100_000
-SPARSE_ROWS = 10
-"""Beyond twice as many rows as numbers in names, and so many more, these are no moves but a clock, a counter."""
+SPARSE_MARGIN = 10
+"""The numbers in names are a clock or a counter, no moves, where the largest exceeds twice their count plus this."""
 _NUMBER = re.compile(r"[0-9]{1,9}")
 
 
@@ -41,8 +41,8 @@ class View:
     """Both pictures of one moment.
 
     Attributes:
-        name: what their names share.
-        pictures: left and right; twice the same where one file holds both.
+        name: the common part of their names.
+        pictures: left and right; the same picture twice where one file holds both.
     """
 
     name: str
@@ -50,12 +50,12 @@ class View:
 
     @property
     def numbers(self) -> list[int]:
-        """The numbers in its name, in order."""
+        """Numbers in the name, in order."""
         return [int(number) for number in _NUMBER.findall(self.name)]
 
-    def without_number(self, place: int) -> str:
-        """Its name without one of its numbers: what else it says, such as the sheet."""
-        number = list(_NUMBER.finditer(self.name))[place]
+    def without_number(self, position: int) -> str:
+        """The name without one of its numbers: the rest may name the sheet."""
+        number = list(_NUMBER.finditer(self.name))[position]
         rest = f"{self.name[: number.start()]} {self.name[number.end() :]}"
         return re.sub(r"[\s_.-]+", " ", rest).strip(" =+-@")
 
@@ -67,10 +67,10 @@ class ViewedFolder:
     Attributes:
         views: pairs, in the natural order of their names.
         image_sizes: of most pictures of the left and of the right camera, px.
-        unpaired: files without their other camera.
-        unnamed: files whose names tell no camera, and that hold no two pictures side by side.
+        unpaired: files without a picture of the other camera.
+        unnamed: files without a camera in their names that hold no two pictures side by side.
         other_size: files of another size than most.
-        unread: files of kinds that are not read.
+        unread: files in formats that are not read.
     """
 
     views: tuple[View, ...]
@@ -86,12 +86,12 @@ class PairedLooks:
     """Rows of `spots.csv` with their pictures.
 
     Attributes:
-        spots: all rows, as they are to be written.
-        pictures: of each of them that has some, by its `spot`.
+        spots: all rows to be written.
+        pictures: of each row that has some, by its `spot`.
         matching: by number or in order.
-        left_over: views whose row has a pair already.
-        without: numbers of the rows, or moves, that have no pictures.
-        renumbered: lowest and highest number in the names, where moves are counted anew instead; else None.
+        left_over: views whose row has another pair.
+        without: numbers of the rows, or moves, without pictures.
+        renumbered: lowest and highest number in the names, where moves get new numbers; else None.
     """
 
     spots: tuple[Spot, ...]
@@ -106,7 +106,7 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
     """The pairs of pictures in a folder.
 
     Args:
-        folder: where they lie; see `picture_pairs` for names.
+        folder: of the pictures; see `picture_pairs` for names.
         swap: the left camera's image is the right half of a wide picture.
 
     Raises:
@@ -117,30 +117,30 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
     by_view: dict[str, dict[str, Picture]] = {}
     for picture in pictures.used:
         by_view.setdefault(picture.view, {}).update(dict.fromkeys(picture.sides, picture))
-    whole = {name: both for name, both in by_view.items() if len(both) == 2}
-    if not whole:
+    complete = {name: pair for name, pair in by_view.items() if len(pair) == 2}
+    if not complete:
         found = f"no pair among {pictures.count} PNG and JPEG pictures"
         remedy = "rename them so that one word tells the camera and the rest of both names is the same"
         allowed = f"{NAMING} (PNG or JPEG); or pictures of both cameras side by side"
         place = escaped(str(folder), 200)
         raise refusal("no-pictures", file=place, found=found, allowed=allowed, remedy=remedy)
     return ViewedFolder(
-        views=tuple(View(n, (whole[n]["left"], whole[n]["right"])) for n in sorted(whole, key=natural_order)),
+        views=tuple(View(n, (complete[n]["left"], complete[n]["right"])) for n in sorted(complete, key=natural_order)),
         image_sizes=dict(pictures.usual),
-        unpaired=tuple(p.path.name for both in by_view.values() if len(both) == 1 for p in both.values()),
+        unpaired=tuple(p.path.name for pair in by_view.values() if len(pair) == 1 for p in pair.values()),
         unnamed=pictures.unnamed,
         other_size=tuple(path.name for path in pictures.other_size),
         unread=tuple(unread),
     )
 
 
-def _numbered(views: Sequence[View], ids: Sequence[int] | None) -> int | None:
-    """Which number of the names tells the look: the one that differs most, where all of them are among `ids`."""
-    places = range(min(len(view.numbers) for view in views))
+def _number_position(views: Sequence[View], ids: Sequence[int] | None) -> int | None:
+    """Position of the number that gives the look: the one with most values, all of them among `ids`; None without."""
+    positions = range(min(len(view.numbers) for view in views))
     known = None if ids is None else set(ids)
-    numbers = {place: {view.numbers[place] for view in views} for place in places}
-    fitting = [place for place in places if known is None or numbers[place] <= known]
-    best = max(fitting, key=lambda place: (len(numbers[place]), place), default=None)
+    numbers = {position: {view.numbers[position] for view in views} for position in positions}
+    fitting = [position for position in positions if known is None or numbers[position] <= known]
+    best = max(fitting, key=lambda position: (len(numbers[position]), position), default=None)
     return best if best is not None and (len(numbers[best]) > 1 or len(views) == 1) else None
 
 
@@ -151,75 +151,75 @@ def pair_looks(
 
     Args:
         views: of a folder.
-        moves: numbers of the moves; None where nobody has listed any yet: the numbers in the names are then those of
-            moves, counted anew where they are too sparse for that; without numbers every view is one.
-        rows: of `spots.csv`; where there are any, pictures belong to those that wait for them ("undetected").
-        matching: "number" or "order"; None takes the number where every name has one that fits, else the order.
+        moves: numbers of the moves; None where none are listed yet: the numbers in the names are then moves, and get
+            new numbers where they are too sparse; without numbers every view is a move.
+        rows: of `spots.csv`; pictures then belong to the rows without detection ("undetected").
+        matching: "number" or "order"; None takes the number where every name has one that matches, else the order.
 
     Raises:
-        InputError: neither numbers nor counts fit.
+        InputError: neither numbers nor counts match.
     """
     waiting = [spot.spot for spot in rows if spot.status == UNDETECTED and spot.u_left_px is None]
     if rows and not waiting:
         found, allowed = f"{len(rows)} looks, none of which waits for pictures", "rows with the status undetected"
         raise refusal("occupied", file="spots.csv", found=found, allowed=allowed, remedy="name a new folder")
     ids, file = (waiting, "spots.csv") if rows else (moves, "moves.csv")
-    place = None if matching == "order" else _numbered(views, ids)
+    slot = None if matching == "order" else _number_position(views, ids)
     names, renumbered = [""] * len(views), None
-    if place is not None:
-        stated, names = [view.numbers[place] for view in views], [view.without_number(place) for view in views]
+    if slot is not None:
+        stated, names = [view.numbers[slot] for view in views], [view.without_number(slot) for view in views]
         ranks = {number: rank for rank, number in enumerate(sorted(set(stated)))}
         numbers = stated
-        if ids is None and max(stated) >= 2 * len(ranks) + SPARSE_ROWS:
+        if ids is None and max(stated) >= 2 * len(ranks) + SPARSE_MARGIN:
             numbers, renumbered = [ranks[number] for number in stated], (min(stated), max(stated))
     elif matching == "number" or (ids is not None and len(views) != len(ids)):
         raise _unmatched(views, ids or (), file)
     else:
         numbers = list(range(len(views)) if ids is None else ids)
-    how: Matching = "order" if place is None else "number"
+    method: Matching = "order" if slot is None else "number"
     if rows:
-        return _onto_rows(views, numbers, rows, waiting, how)
+        return _pair_rows(views, numbers, rows, waiting, method)
     order = sorted(range(len(views)), key=lambda k: (numbers[k], natural_order(views[k].name)))
     targets = _differences(names)
     spots = [Spot(spot=n, move=numbers[k], target=targets[k], status=UNDETECTED) for n, k in enumerate(order)]
     used = set(numbers)
     without = tuple(move for move in (range(1 + max(used)) if moves is None else moves) if move not in used)
-    return PairedLooks(tuple(spots), {spot: views[k] for spot, k in enumerate(order)}, how, (), without, renumbered)
+    return PairedLooks(tuple(spots), {spot: views[k] for spot, k in enumerate(order)}, method, (), without, renumbered)
 
 
 def _differences(names: Sequence[str]) -> list[str]:
-    """What names say that not all of them say, cut to the length of a target."""
+    """Words of each name that not all names have, cut to the length of a target."""
     words = [name.split() for name in names]
     common = set.intersection(*map(set, words))
-    return [" ".join(word for word in of_name if word not in common)[:100] for of_name in words]
+    return [" ".join(word for word in own_words if word not in common)[:100] for own_words in words]
 
 
-def _onto_rows(
-    views: Sequence[View], numbers: Sequence[int], rows: Sequence[Spot], waiting: Sequence[int], how: Matching
+def _pair_rows(
+    views: Sequence[View], numbers: Sequence[int], rows: Sequence[Spot], waiting: Sequence[int], matching: Matching
 ) -> PairedLooks:
-    """Each row that waits with the first view of its number."""
+    """Pair each waiting row with the first view of its number."""
     pictures: dict[int, View] = {}
     left_over = []
     for number, view in zip(numbers, views, strict=True):
         if pictures.setdefault(number, view) is not view:
             left_over.append(view.name)
     without = tuple(spot for spot in waiting if spot not in pictures)
-    return PairedLooks(tuple(rows), pictures, how, tuple(left_over), without)
+    return PairedLooks(tuple(rows), pictures, matching, tuple(left_over), without)
 
 
 def _unmatched(views: Sequence[View], ids: Sequence[int], file: str) -> InputError:
-    what = "moves" if file == "moves.csv" else "rows with the status undetected"
+    noun = "moves" if file == "moves.csv" else "rows with the status undetected"
     span = f" ({min(ids)} to {max(ids)})" if ids else ""
-    found = f"{len(views)} pairs of pictures for {len(ids)} {what}{span}, and not in every name a number of one of them"
+    found = f"{len(views)} pairs of pictures for {len(ids)} {noun}{span}, and not in every name a number of one of them"
     allowed = "as many pairs as rows, or in every name the number of its row"
-    remedy = f"name them after their row (left_0012.png, right_0012.png for {what[:-1] if len(what) < 6 else 'row'} 12)"
+    remedy = f"name them after their row (left_0012.png, right_0012.png for {noun[:-1] if len(noun) < 6 else 'row'} 12)"
     if file == "moves.csv":
         remedy += ", or list the looks in spots.csv with the status undetected and call it again"
     return refusal("pictures", file=file, found=found, allowed=allowed, remedy=remedy)
 
 
-def _part(view: View, camera: int) -> bytes:
-    """The PNG of one camera: the file itself where it is one, else its pixels."""
+def _camera_png(view: View, camera: int) -> bytes:
+    """The PNG of one camera: the file itself where it is a PNG of this camera, else its pixels encoded."""
     picture = view.pictures[camera]
     data = read_bytes(picture.path, IMAGE_BYTES_MAX)
     if len(picture.sides) == 1 and data.startswith(PNG_SIGNATURE):
@@ -234,19 +234,19 @@ def copy_frames(pictures: dict[int, View], campaign: Path, advance: Advance = un
 
     Args:
         pictures: both pictures of each look, by its `spot`.
-        campaign: the folder that is to hold `frames/`; a picture that is there already and the same stays.
-        advance: called with the share that is done.
+        campaign: the folder that will hold `frames/`; an identical picture there stays.
+        advance: called with the share that is complete.
 
     Returns:
-        How many pictures lie there now.
+        Number of pictures in `frames/`.
 
     Raises:
-        InputError: another picture has the name already, one cannot be read, or the folder not be written.
+        InputError: another picture has the name, a picture cannot be read, or the folder cannot be written.
     """
     make_folder(campaign / "frames")
     for count, (spot, view) in enumerate(pictures.items(), start=1):
         for camera, side in enumerate(CAMERAS):
-            path, data = campaign / frame_name(spot, side), _part(view, camera)
+            path, data = campaign / frame_name(spot, side), _camera_png(view, camera)
             if not path.exists():
                 write_atomically(path, data)
             elif read_bytes(path, IMAGE_BYTES_MAX, campaign) != data:

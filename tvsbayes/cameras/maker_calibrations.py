@@ -1,8 +1,8 @@
-"""Calibrations as makers of stereo cameras write them, brought to the names of `calibration_names`.
+"""Calibrations in the formats of the makers of stereo cameras, converted to the names of `calibration_names`.
 
-A name is not enough for them: cameras by the number of a socket and poses by a chain (DepthAI), one calibration for
-each size of the pictures (ZED, RealSense), a pose in components. Each becomes tables `left` and `right` and the pose
-between them; no number is changed but by the transformation that the format states.
+They need more than names: cameras by the number of a socket and poses by a chain (DepthAI), one calibration for each
+size of the pictures (ZED, RealSense), a pose in components. Each becomes tables `left` and `right` and the pose between
+them; numbers change only by the transformation that the format defines.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ STEREO_STREAMS = ("Infrared 1", "Infrared 2")
 
 @dataclass(frozen=True)
 class MakersPair:
-    """A calibration in names that are known.
+    """A maker's calibration under the names of `calibration_names`.
 
     Attributes:
-        keys: its tables, which refuse in the name of the file.
-        source: whose it is.
-        unit: of its translation: "m", "cm", "mm"; "" where the file does not tell.
-        notes: what was assumed.
+        keys: its tables; refusals name the file.
+        source: the maker.
+        unit: of the translation: "m", "cm", "mm"; "" where the file does not state it.
+        notes: assumptions.
     """
 
     keys: Keys
@@ -59,7 +59,7 @@ class MakersPair:
 
 
 def printed_values(text: str) -> Values | None:
-    """The values of a ZED's settings file or of what RealSense's tools print; None where a text is neither."""
+    """The values of a ZED's settings file or of the output of RealSense's tools; None for any other text."""
     if _ZED_SECTION.search(text):
         return _sections(text)
     if _STREAM.search(text) or len(_STREAM_OBJECT.findall(text)) > 1:
@@ -68,17 +68,17 @@ def printed_values(text: str) -> Values | None:
 
 
 def makers_pair(keys: Keys, size: Size | None) -> MakersPair | None:
-    """A maker's file in known names; None where it is none.
+    """A maker's file under known names; None for any other file.
 
     Args:
         keys: the file.
         size: of the pictures, px, where the user states it.
 
     Raises:
-        InputError: no pair in the file, or several sizes of pictures and none stated.
+        InputError: no pair in the file, or several picture sizes and none stated.
     """
-    for recognised, read in _MAKERS:
-        if recognised(keys.values):
+    for matches, read in _MAKERS:
+        if matches(keys.values):
             try:
                 return read(keys.values, keys, size)
             except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
@@ -93,7 +93,7 @@ def makers_pair(keys: Keys, size: Size | None) -> MakersPair | None:
 
 
 def _sections(text: str) -> Values:
-    """Sections of an ini file, keys in small letters."""
+    """Sections of an ini file, keys in lower case."""
     parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=(";", "#"))
     try:
         parser.read_string(text)
@@ -121,16 +121,16 @@ def _streams(text: str) -> Values:
         fields = {key.lower(): rest.partition(f"{key}:")[2].split("\n")[0] for key in ("PPX", "PPY", "Fx", "Fy")}
         model, coefficients = (rest.partition(f"{key}:")[2].split("\n")[0] for key in ("Distortion", "Coeffs"))
         streams.append(_stream(name, (width, height), fields, model, coefficients))
-    for one, other, rest in (match.groups() for part in parts if (match := _POSE.match(part))):
-        turn, _, shift = rest.partition("Translation Vector:")
-        shift = shift.strip().split("\n")[0]
-        poses.append({"from": one, "to": other, "R": _numbers(turn), "T": _numbers(shift)})
+    for source, target, rest in (match.groups() for part in parts if (match := _POSE.match(part))):
+        turn, _, translation = rest.partition("Translation Vector:")
+        translation = translation.strip().split("\n")[0]
+        poses.append({"from": source, "to": target, "R": _numbers(turn), "T": _numbers(translation)})
     for number, (width, height, ppx, ppy, fx, fy, model, rest) in enumerate(_STREAM_OBJECT.findall(text)):
         fields = {"ppx": ppx, "ppy": ppy, "fx": fx, "fy": fy}
         streams.append(_stream(f"camera {number + 1}", (width, height), fields, model, rest))
-    for turn, shift in _POSE_OBJECT.findall(text):
+    for turn, translation in _POSE_OBJECT.findall(text):
         rows = np.array(numbers).reshape(3, 3).T.ravel().tolist() if len(numbers := _numbers(turn)) == 9 else numbers
-        poses.append({"from": "camera 1", "to": "camera 2", "R": rows, "T": _numbers(shift)})
+        poses.append({"from": "camera 1", "to": "camera 2", "R": rows, "T": _numbers(translation)})
     return {"streams": streams, "poses": poses}
 
 
@@ -140,13 +140,13 @@ def _stream(name: str, size: Sequence[str], fields: Mapping[str, str], model: st
     return {"name": name, "width": int(size[0]), "height": int(size[1]), **inner}
 
 
-def _chosen(sizes: Mapping[str, Size], size: Size | None, file: str) -> str:
-    """The name whose size the user states, or the only one."""
-    fitting = [name for name, own in sizes.items() if size in (None, own)]
-    if len(fitting) == 1:
-        return fitting[0]
-    each = listed([f"{width}x{height}" for width, height in sizes.values()], len(ZED_SIZES))
-    found = f"calibrations for pictures of {each} px" if sizes else "no calibration of both cameras for one size"
+def _name_of_size(sizes: Mapping[str, Size], size: Size | None, file: str) -> str:
+    """The name of the size that the user states, or the only one."""
+    matching = [name for name, picture_size in sizes.items() if size in (None, picture_size)]
+    if len(matching) == 1:
+        return matching[0]
+    sizes_text = listed([f"{width}x{height}" for width, height in sizes.values()], len(ZED_SIZES))
+    found = f"calibrations for pictures of {sizes_text} px" if sizes else "no calibration of both cameras for one size"
     example = "x".join(map(str, next(iter(sizes.values()), (1280, 720))))
     raise refusal(
         "image-size",
@@ -163,16 +163,16 @@ def _zed(document: Values, keys: Keys, size: Size | None) -> MakersPair:
     As StereoLabs' zedx-one-capture writes it from cv2.stereoCalibrate (stereo_calibration/main.cpp).
     """
     sections = {name: table for name, table in document.items() if isinstance(table, dict)}
-    both = {
+    complete = {
         name: picture_size
         for name, picture_size in ZED_SIZES.items()
         if f"left_cam_{name}" in sections and f"right_cam_{name}" in sections
     }
-    name = _chosen(both, size, keys.file)
+    name = _name_of_size(complete, size, keys.file)
     stereo, notes = sections.get("stereo", {}), []
 
-    def number(table: Values, section: str, key: str, other: float | None = None) -> float:
-        value = table.get(f"{key}_{name}", table.get(key, other))
+    def number(table: Values, section: str, key: str, default: float | None = None) -> float:
+        value = table.get(f"{key}_{name}", table.get(key, default))
         if not isinstance(value, float):
             found = "nothing" if value is None else escaped(str(value), 40)
             remedy = "take the file as the ZED's program wrote it"
@@ -186,26 +186,26 @@ def _zed(document: Values, keys: Keys, size: Size | None) -> MakersPair:
         lens = sections.get(f"{side}_disto", sections[section])
         names = ("k1", "k2", "p1", "p2", "k3") + (("k4", "k5", "k6") if "k4" in lens else ())
         values[side] = {key: number(sections[section], section, key) for key in ("fx", "fy", "cx", "cy")}
-        values[side] |= dict(zip(("width", "height"), both[name], strict=True))
+        values[side] |= dict(zip(("width", "height"), complete[name], strict=True))
         values[side]["D"] = [number(lens, section, key, 0.0 if key in ("p1", "p2", "k3") else None) for key in names]
     values["R"] = [number(stereo, "stereo", key) for key in ("rx", "cv", "rz")]
     if not {"ty", f"ty_{name}"} & set(stereo):
         notes.append("TY and TZ: none in the file, so 0")
-    aside = [number(stereo, "stereo", key, 0.0) for key in ("ty", "tz")]
-    values["T"] = [-number(stereo, "stereo", "baseline"), *aside]
+    ty_tz = [number(stereo, "stereo", key, 0.0) for key in ("ty", "tz")]
+    values["T"] = [-number(stereo, "stereo", "baseline"), *ty_tz]
     return MakersPair(Keys(values, keys.file, keys.text), "zed", "mm", tuple(notes))
 
 
 def _depthai(document: Values, keys: Keys, size: Size | None) -> MakersPair:
     """EEPROM of an OAK: x_to = R x_from + T along a chain of sockets, cm (`CalibrationHandler` of depthai-core)."""
     del size
-    cameras = {one[0]: one[1] for one in document["cameraData"] if _is_socket(one)}
+    cameras = {entry[0]: entry[1] for entry in document["cameraData"] if _is_socket(entry)}
     stated = document.get("stereoRectificationData", {})
     sockets = [stated.get(f"{side}CameraSocket") for side in ("left", "right")]
     if not all(socket in cameras for socket in sockets) or sockets[0] == sockets[1]:
         # CAM_B and CAM_C, where the rectification was never stored.
         sockets = [1, 2]
-    poses = [_to_base(cameras, socket) for socket in sockets if socket in cameras] + [None, None]
+    poses = [_chain_pose(cameras, socket) for socket in sockets if socket in cameras] + [None, None]
     if poses[0] is None or poses[1] is None or poses[0][0] != poses[1][0]:
         raise refusal(
             "missing-key",
@@ -219,37 +219,37 @@ def _depthai(document: Values, keys: Keys, size: Size | None) -> MakersPair:
     for side, socket in zip(("left", "right"), sockets, strict=True):
         camera = cameras[socket]
         kind = camera.get("cameraType", 0)
-        kept = {key: camera[key] for key in ("intrinsicMatrix", "distortionCoeff", "width", "height") if key in camera}
-        values[side] = {**kept, "camera_model": DEPTHAI_MODELS.get(kind, f"cameraType {escaped(str(kind), 20)}")}
+        lens = {key: camera[key] for key in ("intrinsicMatrix", "distortionCoeff", "width", "height") if key in camera}
+        values[side] = {**lens, "camera_model": DEPTHAI_MODELS.get(kind, f"cameraType {escaped(str(kind), 20)}")}
     note = f"sockets {sockets[0]} (left) and {sockets[1]} (right)"
     return MakersPair(Keys(values, keys.file, keys.text), "depthai", "cm", (note,))
 
 
-def _is_socket(one: object) -> bool:
-    return isinstance(one, list) and len(one) == 2 and isinstance(one[0], int) and isinstance(one[1], dict)
+def _is_socket(entry: object) -> bool:
+    return isinstance(entry, list) and len(entry) == 2 and isinstance(entry[0], int) and isinstance(entry[1], dict)
 
 
-def _to_base(cameras: Mapping[int, Values], socket: int) -> tuple[int, np.ndarray] | None:
-    """The socket at the end of a camera's chain, and the transformation (4, 4) to it; None where the chain breaks."""
-    whole = np.eye(4)
+def _chain_pose(cameras: Mapping[int, Values], socket: int) -> tuple[int, np.ndarray] | None:
+    """The last socket of a camera's chain, and the transformation (4, 4) to it; None for a broken chain."""
+    pose = np.eye(4)
     for _ in cameras:
-        outer = cameras[socket]["extrinsics"]
-        if outer["toCameraSocket"] not in cameras:
-            return socket, whole
+        extrinsics = cameras[socket]["extrinsics"]
+        if extrinsics["toCameraSocket"] not in cameras:
+            return socket, pose
         step = np.eye(4)
-        step[:3, :3] = outer["rotationMatrix"]
-        step[:3, 3] = [outer["translation"][axis] for axis in "xyz"]
-        whole, socket = step @ whole, outer["toCameraSocket"]
+        step[:3, :3] = extrinsics["rotationMatrix"]
+        step[:3, 3] = [extrinsics["translation"][axis] for axis in "xyz"]
+        pose, socket = step @ pose, extrinsics["toCameraSocket"]
     return None
 
 
 def _realsense(document: Values, keys: Keys, size: Size | None) -> MakersPair:
-    """What rs-enumerate-devices -c prints, or printed objects of pyrealsense2: m."""
+    """The output of rs-enumerate-devices -c, or printed objects of pyrealsense2; lengths in m."""
     printed = document["realsense"]
     names = list(dict.fromkeys(stream["name"] for stream in printed["streams"]))
     pair = STEREO_STREAMS if set(STEREO_STREAMS) <= set(names) else tuple(names)
-    between = [p for p in printed["poses"] if (p["from"], p["to"]) == pair and len(p["R"]) == 9 and len(p["T"]) == 3]
-    if len(pair) != 2 or not between:
+    poses = [p for p in printed["poses"] if (p["from"], p["to"]) == pair and len(p["R"]) == 9 and len(p["T"]) == 3]
+    if len(pair) != 2 or not poses:
         raise refusal(
             "missing-key",
             file=keys.file,
@@ -259,9 +259,9 @@ def _realsense(document: Values, keys: Keys, size: Size | None) -> MakersPair:
         )
     by_name = [{(s["width"], s["height"]): s for s in printed["streams"] if s["name"] == name} for name in pair]
     sizes = {f"{width}x{height}": (width, height) for width, height in by_name[0] if (width, height) in by_name[1]}
-    chosen = sizes[_chosen(sizes, size, keys.file)]
+    chosen = sizes[_name_of_size(sizes, size, keys.file)]
     values = {side: streams[chosen] for side, streams in zip(("left", "right"), by_name, strict=True)}
-    pose = {"R": np.reshape(between[0]["R"], (3, 3)).tolist(), "T": between[0]["T"]}
+    pose = {"R": np.reshape(poses[0]["R"], (3, 3)).tolist(), "T": poses[0]["T"]}
     note = f"left is {escaped(pair[0], 30)}, right {escaped(pair[1], 30)}"
     return MakersPair(Keys({**values, **pose}, keys.file, keys.text), "realsense", "m", (note,))
 

@@ -18,18 +18,18 @@ DICTIONARIES = sorted(name.removeprefix("DICT_") for name in dir(cv2.aruco) if n
 WIDEST_DICTIONARIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", "APRILTAG_36h11")
 """Each holds the smaller ones of its bits as its first markers."""
 CORNERS_MIN, LINES_MIN = 8, 3
-"""Corners of a view, and different rows and columns among them: fewer leave the tilt of the board open."""
+"""Least corners of a view, and different rows and columns among them: fewer do not determine the tilt of the board."""
 MISFIT_SQUARES = 0.2
-"""Centres of markers may miss the plane of the board by so much: lenses bend it by less over a picture."""
+"""Largest deviation of centres of markers from a plane, in squares: distortion of a lens is smaller."""
 MARKERS_MIN = 6
 """A homography has eight parameters: four markers fit any arrangement."""
-LOOKED_AT = 4
-"""Pictures in which markers of other dictionaries are looked for: a thousand markers take 0.2 s of one."""
+SAMPLE_PICTURES = 4
+"""Pictures that are searched for markers of other dictionaries: a thousand markers take 0.2 s per picture."""
 SQUARES_MAX = 60
 GAP_SHARE = 0.9
-"""Half the window of cornerSubPix over the gap between a corner and the markers beside it, which must stay outside."""
-SHARE_USUAL = 0.75
-"""Of a marker's side in a square's, where no picture shows markers enough to tell."""
+"""Half the window of cornerSubPix over the gap between a corner and the next markers, which must stay outside."""
+SHARE_DEFAULT = 0.75
+"""Side of a marker over that of a square, where no picture shows enough markers."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ class Markers:
     def board(self, squares: tuple[int, int] | None = None) -> cv2.aruco.CharucoBoard:
         """OpenCV's board, in units of a square."""
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
-        made = cv2.aruco.CharucoBoard(squares or self.squares, 1.0, self.share or SHARE_USUAL, dictionary)
-        made.setLegacyPattern(self.legacy)
-        return made
+        board = cv2.aruco.CharucoBoard(squares or self.squares, 1.0, self.share or SHARE_DEFAULT, dictionary)
+        board.setLegacyPattern(self.legacy)
+        return board
 
 
 @dataclass(frozen=True)
@@ -85,72 +85,72 @@ def _markers(grey: np.ndarray, dictionary: str) -> _Detected:
     return _Detected(np.array(corners, float).reshape(-1, 4, 2), np.ravel(numbers))
 
 
-def _plane_of(detected: _Detected, board: cv2.aruco.CharucoBoard) -> tuple[float, float] | None:
-    """How far the centres of markers miss those on a board, and their side, in squares; None where too few are seen."""
+def _plane_fit(detected: _Detected, board: cv2.aruco.CharucoBoard) -> tuple[float, float] | None:
+    """Rms deviation of the centres of markers from those of a board, and their side, in squares; None for too few."""
     places = np.array([np.asarray(four, float)[:, :2] for four in board.getObjPoints()])
-    kept = detected.numbers < len(places)
-    if kept.sum() < MARKERS_MIN:
+    on_board = detected.numbers < len(places)
+    if on_board.sum() < MARKERS_MIN:
         return None
-    centres, corners = places[detected.numbers[kept]].mean(axis=1), detected.corners_px[kept]
+    centres, corners = places[detected.numbers[on_board]].mean(axis=1), detected.corners_px[on_board]
     # From pixels to squares, by the centres alone.
     plane, _ = cv2.findHomography(corners.mean(axis=1), centres)
     if plane is None or not np.isfinite(plane).all():
         return None
-    ways = (cv2.perspectiveTransform(part.reshape(-1, 1, 2), plane) for part in (corners.mean(axis=1), corners))
-    back, flat = (np.reshape(way, (-1, 2)) for way in ways)
-    missed = float(np.sqrt(np.mean(np.sum((back - centres) ** 2, axis=1))))
+    parts = (cv2.perspectiveTransform(part.reshape(-1, 1, 2), plane) for part in (corners.mean(axis=1), corners))
+    back, flat = (np.reshape(part_squares, (-1, 2)) for part_squares in parts)
+    rms = float(np.sqrt(np.mean(np.sum((back - centres) ** 2, axis=1))))
     sides = np.linalg.norm(flat.reshape(-1, 4, 2) - np.roll(flat.reshape(-1, 4, 2), 1, axis=1), axis=2)
-    return missed, float(np.median(sides))
+    return rms, float(np.median(sides))
 
 
 def fitted_markers(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
     """The markers with the size and the first square that pictures show.
 
     Args:
-        pictures: some of a camera, grey, uint8.
+        pictures: a sample of one camera, grey, uint8.
         markers: as stated.
 
     Raises:
-        NothingToEstimate: the markers stand otherwise than on that board, or are of another dictionary.
+        NothingToEstimate: the markers are arranged otherwise than on that board, or are of another dictionary.
     """
     detected = [_markers(grey, markers.dictionary) for grey in pictures]
-    tried = {}
+    fits = {}
     for legacy in (markers.legacy, not markers.legacy):
         board = replace(markers, legacy=legacy).board()
-        tried[legacy] = [fit for one in detected if (fit := _plane_of(one, board)) is not None]
-    best = min(tried, key=lambda legacy: np.median([fit[0] for fit in tried[legacy]] or [np.inf]))
-    if not tried[best]:
+        fits[legacy] = [fit for markers_seen in detected if (fit := _plane_fit(markers_seen, board)) is not None]
+    best = min(fits, key=lambda legacy: np.median([fit[0] for fit in fits[legacy]] or [np.inf]))
+    if not fits[best]:
         _refuse_other_markers(spread(pictures), markers)
-        return replace(markers, share=markers.share or SHARE_USUAL)
-    if np.median([fit[0] for fit in tried[best]]) > MISFIT_SQUARES:
+        return replace(markers, share=markers.share or SHARE_DEFAULT)
+    if np.median([fit[0] for fit in fits[best]]) > MISFIT_SQUARES:
         raise _other_board(detected, markers)
-    share = markers.share or float(np.clip(np.median([fit[1] for fit in tried[best]]), 0.2, 0.98))
+    share = markers.share or float(np.clip(np.median([fit[1] for fit in fits[best]]), 0.2, 0.98))
     return replace(markers, legacy=best, share=share)
 
 
 def _other_board(detected: Sequence[_Detected], markers: Markers) -> NothingToEstimate:
-    """The refusal of a board whose markers are arranged otherwise, with the number of squares that fits."""
-    wanted = f"{markers.squares[0]}x{markers.squares[1]}"
+    """The refusal of a board with another arrangement of markers, with the number of squares that matches."""
+    stated = f"{markers.squares[0]}x{markers.squares[1]}"
     misfits: dict[int, float] = {}
-    for across in range(3, SQUARES_MAX + 1):
-        down = -(-2 * (1 + max(int(one.numbers.max(initial=0)) for one in detected)) // across)
+    for columns in range(3, SQUARES_MAX + 1):
+        rows = -(-2 * (1 + max(int(markers_seen.numbers.max(initial=0)) for markers_seen in detected)) // columns)
         for legacy in (False, True):
-            board = replace(markers, legacy=legacy).board((across, max(3, down + down % 2)))
-            fits = [fit[0] for one in detected if (fit := _plane_of(one, board)) is not None]
-            misfits[across] = min(misfits.get(across, np.inf), float(np.median(fits)) if fits else np.inf)
-    best = min(misfits, key=lambda across: misfits[across])
+            board = replace(markers, legacy=legacy).board((columns, max(3, rows + rows % 2)))
+            fits = [fit[0] for markers_seen in detected if (fit := _plane_fit(markers_seen, board)) is not None]
+            misfits[columns] = min(misfits.get(columns, np.inf), float(np.median(fits)) if fits else np.inf)
+    best = min(misfits, key=lambda columns: misfits[columns])
     remedy = "count squares, columns x rows, with the first marker at the upper left"
     if misfits[best] <= MISFIT_SQUARES:
         remedy = f"markers stand as on a board of {best} squares across: --charuco {best}xROWS; {remedy}"
     return NothingToEstimate(
         "no-board",
-        f"the markers do not stand as on a board of {wanted} squares",
+        f"the markers do not stand as on a board of {stated} squares",
         allowed="the board in the pictures",
         remedy=remedy,
     )
 
 
-def spread[T](pictures: Sequence[T], count: int = LOOKED_AT) -> list[T]:
+def spread[T](pictures: Sequence[T], count: int = SAMPLE_PICTURES) -> list[T]:
     """So many of the pictures, spread evenly over all."""
     places = np.linspace(0, len(pictures) - 1, min(count, len(pictures)))
     return [pictures[round(place)] for place in places]
@@ -168,9 +168,9 @@ def most_markers(pictures: Sequence[np.ndarray]) -> tuple[str, int]:
 
 
 def _refuse_other_markers(pictures: Sequence[np.ndarray], markers: Markers) -> None:
-    """Refuse pictures that show none of the dictionary's markers, or more of another's.
+    """Refuse pictures that show no markers of the dictionary, or more of another one.
 
-    Of few bits some are seen where none is.
+    False markers of dictionaries with few bits are usual.
     """
     matching = sum(len(_markers(grey, markers.dictionary).numbers) for grey in pictures)
     name, count = most_markers(pictures)
@@ -202,12 +202,12 @@ def marker_board_corners(grey: np.ndarray, markers: Markers) -> np.ndarray | Non
     if not any(np.isfinite(step).any() for step in steps):
         return None
     nearest = min(float(np.nanmin(step)) for step in steps if np.isfinite(step).any())
-    gap = nearest * (1 - (markers.share or SHARE_USUAL)) / 2
+    gap = nearest * (1 - (markers.share or SHARE_DEFAULT)) / 2
     half = int(np.clip(round(GAP_SHARE * gap), 2, 11))
-    at = np.isfinite(corners[:, 0])
+    seen = np.isfinite(corners[:, 0])
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-    start = corners[at].astype(np.float32).reshape(-1, 1, 2)
-    corners[at] = np.reshape(cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), criteria), (-1, 2))
+    start = corners[seen].astype(np.float32).reshape(-1, 1, 2)
+    corners[seen] = np.reshape(cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), criteria), (-1, 2))
     seen_rows, seen_columns = np.nonzero(np.isfinite(corners[:, 0]).reshape(rows, columns))
     enough = len(seen_rows) >= CORNERS_MIN and min(len(set(seen_rows)), len(set(seen_columns))) >= LINES_MIN
     return corners if enough else None

@@ -1,10 +1,10 @@
-"""A camera on the network, read all the time by a thread of its own, so that only the newest frame is ever handed on.
+"""A network camera that a separate thread reads continuously, so that a caller always gets the newest frame.
 
-A stream that nobody reads fills the buffers of both computers with old frames, and many servers drop a viewer who is
-idle for some seconds, as during a homing. The thread takes every frame as it comes and lets it go; a caller gets
-the next one that arrives. Where the stream ends it is opened again, once for every frame that came.
+An unread stream fills the buffers of both computers with old frames, and many servers drop a viewer who is idle for
+some seconds, as during a homing. The thread takes every frame and drops it; a caller gets the next one that arrives.
+A stream that ends is opened again, but only after at least one frame.
 
-The capture belongs to the thread: everything else is asked of it. Seconds where a name says `_s`.
+Only the thread uses the capture: other threads send it requests. Names with `_s` are in seconds.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from tvsbayes.errors import TvsError
 
 FRAME_WAIT_S = 20.0
-"""Longest wait for a frame: opening again and reading each end after 5 s by themselves."""
+"""Longest wait for a frame: opening and reading each have a timeout of 5 s."""
 
 
 class Capture(Protocol):
@@ -36,7 +36,7 @@ class Capture(Protocol):
         """Set a property; whether the driver took it."""
 
     def getBackendName(self) -> str:
-        """Through which of OpenCV's backends it is open."""
+        """Name of OpenCV's backend."""
 
     def release(self) -> None:
         """Give the device back."""
@@ -55,20 +55,20 @@ class NetworkStream:
     def __init__(self, open_stream: Callable[[], Capture]):
         self._open = open_stream
         self._capture = open_stream()
-        self._news = threading.Condition()
-        self._wanted, self._stopped, self._over = False, False, False
+        self._frame_event = threading.Condition()
+        self._wanted, self._stopped, self._ended = False, False, False
         self._picture: tuple[bool, Any] = (False, None)
-        self._questions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.reopened = 0
-        """How often the stream had to be opened again."""
+        """Number of times the stream was opened again."""
         self._thread = threading.Thread(target=self._read, name="network stream", daemon=True)
         self._thread.start()
 
     def grab(self) -> bool:
-        """Wait for the next frame that arrives; False once the stream has ended for good."""
-        with self._news:
-            self._wanted = not self._over
-            return self._news.wait_for(lambda: not self._wanted, FRAME_WAIT_S) and not self._over
+        """Wait for the next frame; False once the stream has finally ended."""
+        with self._frame_event:
+            self._wanted = not self._ended
+            return self._frame_event.wait_for(lambda: not self._wanted, FRAME_WAIT_S) and not self._ended
 
     def retrieve(self) -> tuple[bool, Any]:
         """The frame that `grab` waited for."""
@@ -91,51 +91,51 @@ class NetworkStream:
         self._stopped = True
         self._thread.join(FRAME_WAIT_S)
 
-    def _ask(self, question: Callable[[], Any], otherwise: Any) -> Any:
-        """What the thread answers between two frames."""
+    def _ask(self, request: Callable[[], Any], default: Any) -> Any:
+        """Run a request on the thread between two frames; its answer."""
         answers: list[Any] = []
         answered = threading.Event()
 
         def answer() -> None:
-            answers.append(question())
+            answers.append(request())
             answered.set()
 
-        self._questions.put(answer)
+        self._requests.put(answer)
         while not answered.wait(0.05):
-            if self._over or not self._thread.is_alive():
-                return otherwise
+            if self._ended or not self._thread.is_alive():
+                return default
         return answers[0]
 
     def _read(self) -> None:
-        """The thread: every frame as it comes, until the stream has ended for good."""
-        fresh = False
+        """The thread: read all frames until the stream has finally ended."""
+        reopen = False
         try:
             while not self._stopped:
-                while not self._questions.empty():
-                    self._questions.get()()
+                while not self._requests.empty():
+                    self._requests.get()()
                 if self._capture.grab():
-                    fresh = True
+                    reopen = True
                     self._hand_over()
-                elif fresh and not self._stopped:
-                    # Dropped: opened again, but not twice without a frame in between.
-                    fresh = False
+                elif reopen and not self._stopped:
+                    # Connection lost: open it again, but not twice without a frame in between.
+                    reopen = False
                     self._capture.release()
                     self._capture = self._open()
                     self.reopened += 1
                 else:
                     break
         except TvsError:
-            # It cannot be opened again: anyone who waits hears of it as of any camera without frames.
+            # It cannot be opened again: `grab` then returns False, as for any camera without frames.
             pass
         finally:
             self._capture.release()
-            with self._news:
-                self._over, self._wanted = True, False
-                self._news.notify_all()
+            with self._frame_event:
+                self._ended, self._wanted = True, False
+                self._frame_event.notify_all()
 
     def _hand_over(self) -> None:
-        with self._news:
+        with self._frame_event:
             if self._wanted:
                 self._picture = self._capture.retrieve()
                 self._wanted = False
-                self._news.notify_all()
+                self._frame_event.notify_all()

@@ -1,9 +1,9 @@
-"""Pictures of two cameras in a folder: which file is of which camera, and which belong together.
+"""Pictures of two cameras in a folder: the camera of each file, and the pairs.
 
-A view is one moment of both cameras; its name is what is left of a file's name without the mark of the camera. The
-documented names (`NAMING`) come first. Recorders number their cameras too, `cam0_3` and `cam1_3`, say it in the middle
-of a name or twice, keep a folder for each view, or name pictures by the time: each way is tried in turn, the most
-explicit first, and counts if its names pair up. Links are not followed. Headers tell sizes; nothing is decoded here.
+A view is one moment of both cameras; its name is the file name without the mark of the camera. The documented names
+(`NAMING`) come first. Recorders also number their cameras, `cam0_3` and `cam1_3`, put the mark in the middle of a name
+or twice, keep a folder for each view, or name pictures by the time: each naming is tried in turn, the most explicit
+first, and is used if the names form pairs. Links are not followed. Sizes come from headers; nothing is decoded here.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from tvsbayes.instrument.campaign import CAMERAS
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 OTHER_SUFFIXES = (".bmp", ".pgm", ".ppm", ".pnm", ".tif", ".tiff", ".webp")
-"""Pictures too, but none that `files.images` reads."""
+"""Picture formats that `files.images` does not read."""
 SIDE_BY_SIDE_RATIO = 2.0
-"""Width over height from which a picture that is named neither left nor right holds both cameras' images."""
+"""Least ratio of width to height of a picture without a side in its name that holds the images of both cameras."""
 Size = tuple[int, int]
 """Width and height, px."""
 NAMING = "left01.png with right01.png, 01_left.png with 01_right.png, or folders left/ and right/"
 """How pictures of two cameras are named, for messages."""
 DEPTH_MAX = 3
-"""Folders below the one that was named: set/left/, set/01/cam0/."""
+"""Levels of subfolders that are searched: set/left/, set/01/cam0/."""
 NUMBERED_PAIRS_MIN = 3
-"""A number tells cameras apart only where it does so this often: two frames may be called 0 and 1 by chance."""
+"""Least number of pairs for which a number marks the camera: two frames may be called 0 and 1 by chance."""
 _SIDES = {"l": "left", "r": "right", "left": "left", "right": "right"}
 _DOCUMENTED = (
     # left01, then 01_left, L01 or l_01, 01L or 01_l: a letter alone counts beside a digit or a separator only.
@@ -52,7 +52,7 @@ _NUMBERS = (
     re.compile(r"[_-]0*([0-9]{1,9})$"),
 )
 _Key = tuple[str, str]
-"""A name without the marks of the camera, and the side that they tell."""
+"""A name without the marks of the camera, and their side."""
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
@@ -62,7 +62,7 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 
 @dataclass(frozen=True)
 class Picture:
-    """A file and whose images its equal parts, from left to right, are."""
+    """A file, and the cameras of its equal parts from left to right."""
 
     view: str
     path: Path
@@ -71,7 +71,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Pairing:
-    """Which picture is of which camera, where somebody has said it.
+    """The camera of each picture, as the user states it.
 
     Attributes:
         swap: the left camera's image is the right half of a wide frame, or has the larger number or later folder.
@@ -85,7 +85,7 @@ class Pairing:
 
     @property
     def sides(self) -> tuple[str, str]:
-        """The cameras of the left half and the right one, of the smaller number and the larger one."""
+        """The cameras of the left and the right half, or of the smaller and the larger number."""
         return CAMERAS[::-1] if self.swap else CAMERAS
 
 
@@ -97,10 +97,10 @@ class PictureFolder:
     """The pictures of two cameras in a folder, by their headers.
 
     Attributes:
-        folder: where they lie.
-        count: of the pictures that were looked at.
-        sizes: of one camera's image, px, in every picture that tells its camera or holds both.
-        usual: the size that most pictures of each camera have; of equally many the larger; (0, 0) without any.
+        folder: of the pictures.
+        count: number of pictures read.
+        sizes: of one camera's image, px, in every picture of a known camera or of both.
+        usual: the most frequent picture size of each camera, the larger of equal counts; (0, 0) without any.
     """
 
     folder: Path
@@ -110,36 +110,36 @@ class PictureFolder:
 
     @property
     def used(self) -> list[Picture]:
-        """Those of the usual size."""
-        return [one for one, size in self.sizes.items() if all(size == self.usual[side] for side in one.sides)]
+        """Pictures of the usual size."""
+        return [p for p, size in self.sizes.items() if all(size == self.usual[side] for side in p.sides)]
 
     @property
     def other_size(self) -> list[Path]:
-        """Files of another size than most, from the folder."""
+        """Files of another size than most, relative to the folder."""
         used = set(self.used)
         return [picture.path.relative_to(self.folder) for picture in self.sizes if picture not in used]
 
     @property
     def unnamed(self) -> tuple[str, ...]:
-        """Pictures that lie in the folder or beside its pairs and are no part of them, from the folder, in order."""
+        """Pictures in the folder or beside its pairs that are no part of a pair, relative to the folder, in order."""
         known = {picture.path for picture in self.sizes}
-        places = {self.folder, *(path.parent for path in known)}
+        folders = {self.folder, *(path.parent for path in known)}
         names = [name for name in _names(self.folder) if name.lower().endswith(SUFFIXES)]
-        left = [name for name in names if (path := self.folder / name).parent in places and path not in known]
-        return tuple(sorted(left, key=natural_order))
+        rest = [name for name in names if (path := self.folder / name).parent in folders and path not in known]
+        return tuple(sorted(rest, key=natural_order))
 
 
 def read_folder(folder: Path, most: int, pixels_max: int, pairing: Pairing = AS_NAMED) -> PictureFolder:
-    """The pictures of a folder with their sizes; those that name no camera count where they are wide enough for both.
+    """The pictures of a folder with their sizes; a picture without a side counts where it is wide enough for both.
 
     Args:
-        folder: where they lie.
-        most: how many there may be.
-        pixels_max: of one of them.
-        pairing: which picture is of which camera.
+        folder: of the pictures.
+        most: largest number of pictures.
+        pixels_max: of one picture.
+        pairing: the camera of each picture.
 
     Raises:
-        InputError: as `paired_pictures`; pictures that cannot be read or are too large, all of them.
+        InputError: as `paired_pictures`; lists all pictures that cannot be read or are too large.
     """
     folder, sizes, refused = Path(folder), {}, []
     pictures = paired_pictures(folder, most, pairing)
@@ -159,8 +159,8 @@ def read_folder(folder: Path, most: int, pixels_max: int, pairing: Pairing = AS_
         raise all_of(refused)
     usual: dict[str, Size] = {}
     for side in CAMERAS:
-        counted = Counter(size for picture, size in sizes.items() if side in picture.sides)
-        usual[side] = max(counted, key=lambda one: (counted[one], one), default=(0, 0))
+        counts = Counter(size for picture, size in sizes.items() if side in picture.sides)
+        usual[side] = max(counts, key=lambda size_px: (counts[size_px], size_px), default=(0, 0))
     return PictureFolder(folder, len(pictures), sizes, usual)
 
 
@@ -168,34 +168,34 @@ def paired_pictures(folder: Path, most: int, pairing: Pairing = AS_NAMED) -> lis
     """The pictures of a folder: by the documented names where these give a pair, else by other marks, else wide ones.
 
     Args:
-        folder: with pictures in it or in folders below.
-        most: how many pictures there may be.
-        pairing: which picture is of which camera.
+        folder: with pictures in it or in its subfolders.
+        most: largest number of pictures.
+        pairing: the camera of each picture.
 
     Raises:
         InputError: no readable folder, too many pictures, two of one camera and view, or none of a format that is read;
             where pairs are stated, no two cameras or unlike numbers of pictures.
     """
     folder = Path(folder)
-    bad = partial(refusal, file=escaped(str(folder), 200))
+    refuse = partial(refusal, file=escaped(str(folder), 200))
     if pairing.globs is not None or pairing.in_order:
-        return _stated_pairs(folder, pairing, most, bad)
+        return _stated_pairs(folder, pairing, most, refuse)
 
-    def few(images: Sequence[object]) -> None:
+    def check_count(images: Sequence[object]) -> None:
         if len(images) > most:
             found, remedy = f"{len(images)} pictures", "move those that are not needed elsewhere"
-            raise bad("size", found=found, allowed=f"at most {most}", remedy=remedy)
+            raise refuse("size", found=found, allowed=f"at most {most}", remedy=remedy)
 
-    top = [folder / entry.name for entry in _entries(folder) if _is_picture(entry)]
-    documented = [Picture(key[0], path, (key[1],)) for path in top if (key := _documented(path.stem))]
-    documented = documented or _in_side_folders(folder)
-    few(documented or top)
-    places: dict[tuple[str, tuple[str, ...]], Path] = {}
+    direct = [folder / entry.name for entry in _entries(folder) if _is_picture(entry)]
+    documented = [Picture(key[0], path, (key[1],)) for path in direct if (key := _documented(path.stem))]
+    documented = documented or _from_side_folders(folder)
+    check_count(documented or direct)
+    first_paths: dict[tuple[str, tuple[str, ...]], Path] = {}
     for picture in documented:
-        first = places.setdefault((picture.view, picture.sides), picture.path)
+        first = first_paths.setdefault((picture.view, picture.sides), picture.path)
         if first != picture.path:
             found = f"{escaped(first.name)} and {escaped(picture.path.name)}, two pictures of one camera and view"
-            raise bad("duplicate", found=found, allowed="one", remedy="keep one file per camera and view")
+            raise refuse("duplicate", found=found, allowed="one", remedy="keep one file per camera and view")
     if any(count > 1 for count in Counter(picture.view for picture in documented).values()):
         return documented
     names = sorted(_names(folder), key=natural_order)
@@ -204,14 +204,14 @@ def paired_pictures(folder: Path, most: int, pairing: Pairing = AS_NAMED) -> lis
     if not images and others:
         found = f"{len(others)} pictures such as {escaped(others[0], 100)}"
         remedy = "convert them without loss, for example: mogrify -format png *" + Path(others[0]).suffix
-        raise bad("image", found=found, allowed="PNG or JPEG", remedy=remedy)
-    few(images)
-    otherwise = _paired_otherwise(folder, images, pairing.sides)
-    return otherwise or documented or [Picture(path.stem, path, pairing.sides) for path in top]
+        raise refuse("image", found=found, allowed="PNG or JPEG", remedy=remedy)
+    check_count(images)
+    by_marks = _paired_by_marks(folder, images, pairing.sides)
+    return by_marks or documented or [Picture(path.stem, path, pairing.sides) for path in direct]
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:
-    """What lies in a folder, in natural order, but for what is hidden."""
+    """The entries of a folder, in natural order, without hidden ones."""
     try:
         entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")]
     except OSError as error:
@@ -226,11 +226,11 @@ def _is_picture(entry: os.DirEntry[str]) -> bool:
 
 
 def _names(folder: Path, below: str = "", depth: int = 0) -> Iterator[str]:
-    """Files of a folder and of those in it, as paths from the outermost; links to folders are left out."""
+    """Files of a folder and its subfolders, relative to the outermost; links to folders are left out."""
     try:
         entries = _entries(folder)
     except InputError:
-        # What cannot be read holds no pictures for us; the outermost was read before.
+        # Subfolders that cannot be read are left out; the outermost folder was read before.
         return
     for entry in entries:
         if not entry.is_dir(follow_symlinks=False):
@@ -240,35 +240,35 @@ def _names(folder: Path, below: str = "", depth: int = 0) -> Iterator[str]:
 
 
 def _documented(stem: str) -> _Key | None:
-    """View and camera of a name without suffix that is one of `NAMING`; None where it tells no camera."""
+    """View and camera of a name without suffix that follows `NAMING`; None without a camera."""
     matches = (match for pattern in _DOCUMENTED if (match := pattern.fullmatch(stem)))
     return next(((match["view"], _SIDES[match["side"].lower()]) for match in matches), None)
 
 
-def _in_side_folders(folder: Path) -> list[Picture]:
-    """Pictures in folders that are named after their camera, by their own names."""
+def _from_side_folders(folder: Path) -> list[Picture]:
+    """Pictures in folders that are named after their camera; views by file name."""
     pictures = []
     for entry in _entries(folder):
         name = entry.name.lower()
-        ends = [side for side in CAMERAS if name.startswith(side) or name.endswith(side)]
-        side = _SIDES.get(name) or (ends[0] if len(ends) == 1 else None)
+        matches = [side for side in CAMERAS if name.startswith(side) or name.endswith(side)]
+        side = _SIDES.get(name) or (matches[0] if len(matches) == 1 else None)
         if side is None or not entry.is_dir(follow_symlinks=False):
             continue
-        for path in (Path(one.path) for one in _entries(Path(entry.path)) if _is_picture(one)):
+        for path in (Path(picture.path) for picture in _entries(Path(entry.path)) if _is_picture(picture)):
             key = _documented(path.stem)
             pictures.append(Picture(key[0] if key and key[1] == side else path.stem, path, (side,)))
     return pictures
 
 
-def _stated_pairs(folder: Path, pairing: Pairing, most: int, bad: Callable[..., InputError]) -> list[Picture]:
+def _stated_pairs(folder: Path, pairing: Pairing, most: int, refuse: Callable[..., InputError]) -> list[Picture]:
     """Pictures in the order of their names, the first of one camera with the first of the other.
 
     The cameras are those of two patterns, else of two folders, else of the names.
     """
     if pairing.globs is not None:
-        # Of a pattern that leaves the folder nothing is taken.
-        inside = [one for one in pairing.globs if not Path(one).is_absolute() and ".." not in Path(one).parts]
-        matches = [[p.relative_to(folder).as_posix() for p in folder.glob(one) if p.is_file()] for one in inside]
+        # A pattern that leaves the folder matches nothing.
+        inside = [glob for glob in pairing.globs if not Path(glob).is_absolute() and ".." not in Path(glob).parts]
+        matches = [[p.relative_to(folder).as_posix() for p in folder.glob(glob) if p.is_file()] for glob in inside]
         groups = [sorted(names, key=natural_order) for names in matches]
     else:
         names = sorted((n for n in _names(folder) if n.lower().endswith(SUFFIXES)), key=natural_order)
@@ -280,11 +280,11 @@ def _stated_pairs(folder: Path, pairing: Pairing, most: int, bad: Callable[..., 
     if len(groups) < 2 or not all(counts):
         found = f"{' and '.join(str(count) for count in counts) or 'no'} pictures of the left and the right camera"
         remedy = 'name them: --left "cam_a/*.png" --right "cam_b/*.png"'
-        raise bad("no-pictures", found=found, allowed="pictures of two cameras", remedy=remedy)
+        raise refuse("no-pictures", found=found, allowed="pictures of two cameras", remedy=remedy)
     if counts[0] != counts[1] or sum(counts) > most:
         found, allowed = f"{counts[0]} left and {counts[1]} right pictures", f"as many of both, together {most} at most"
         remedy = "take out those without their counterpart: pictures are paired by their order"
-        raise bad("size", found=found, allowed=allowed, remedy=remedy)
+        raise refuse("size", found=found, allowed=allowed, remedy=remedy)
     return _in_order(folder, groups)
 
 
@@ -296,7 +296,7 @@ def _by_side(names: Sequence[str], keys: Sequence[_Key | None]) -> dict[str, lis
 
 def _in_order(folder: Path, groups: Sequence[Sequence[str]]) -> list[Picture]:
     """The first of the left camera with the first of the right one."""
-    views = [_plain(Path(name).stem) for name in groups[0]]
+    views = [_view_name(Path(name).stem) for name in groups[0]]
     views = views if len(set(views)) == len(views) else [f"pair {k}" for k in range(1, len(views) + 1)]
     return [
         Picture(view, folder / name, (side,))
@@ -305,23 +305,23 @@ def _in_order(folder: Path, groups: Sequence[Sequence[str]]) -> list[Picture]:
     ]
 
 
-def _paired_otherwise(folder: Path, images: Sequence[str], numbered: tuple[str, str]) -> list[Picture]:
-    """The pictures with a side, by the first way in which names pair up; `numbered` are the sides of 0 and 1.
+def _paired_by_marks(folder: Path, images: Sequence[str], numbered: tuple[str, str]) -> list[Picture]:
+    """The pictures with a side, by the first method whose names form pairs; `numbered` are the sides of 0 and 1.
 
-    Where sides are known and no names are alike (times, say) the first belongs to the first.
+    Where sides are known and no names are alike (times, for example) pictures are paired in order.
     """
     stems = [name[: name.rindex(".")] for name in images]
     by_name = [[_by_words(stem) for stem in stems], [_by_letter(stem) for stem in stems]]
-    ways = [
+    methods = [
         *((keys, 1) for keys in by_name),
         *((_by_number(stems, pattern, numbered), NUMBERED_PAIRS_MIN) for pattern in _NUMBERS),
         (_by_folder(stems, numbered), NUMBERED_PAIRS_MIN),
     ]
-    for keys, least in ways:
+    for keys, pairs_min in methods:
         sided = [(key, name) for key, name in zip(keys, images, strict=True) if key is not None]
-        cameras = Counter(view for view, _ in {key for key, _ in sided})
-        if sum(count == 2 for count in cameras.values()) >= least:
-            return [Picture(_plain(view), folder / name, (side,)) for (view, side), name in sided]
+        pictures_of_view = Counter(view for view, _ in {key for key, _ in sided})
+        if sum(count == 2 for count in pictures_of_view.values()) >= pairs_min:
+            return [Picture(_view_name(view), folder / name, (side,)) for (view, side), name in sided]
     for keys in by_name:
         left, right = _by_side(images, keys).values()
         if len(left) == len(right) >= NUMBERED_PAIRS_MIN:
@@ -329,20 +329,20 @@ def _paired_otherwise(folder: Path, images: Sequence[str], numbered: tuple[str, 
     return []
 
 
-def _plain(key: str) -> str:
-    """A view's name: what the names of its pictures have in common."""
+def _view_name(key: str) -> str:
+    """The name of a view: the common part of the names of its pictures."""
     return re.sub(r"\*+", "", key).strip("/_- ") or key
 
 
 def _key(stem: str, pattern: re.Pattern[str]) -> _Key | None:
-    """The stem without its marks and the side that they name; None where they name none or both."""
+    """The stem without its marks, and their side; None for no side or both."""
     sides = {_SIDES[match.group().lower()] for match in pattern.finditer(stem)}
     return (pattern.sub("*", stem), sides.pop()) if len(sides) == 1 else None
 
 
 def _by_words(stem: str) -> _Key | None:
     key = _key(stem, _WORDS)
-    # stereoLeft/imageL0 says it twice.
+    # stereoLeft/imageL0 has two marks.
     return None if key is None else (_LETTERS.sub("*", key[0]), key[1])
 
 
@@ -351,7 +351,7 @@ def _by_letter(stem: str) -> _Key | None:
 
 
 def _by_number(stems: Sequence[str], pattern: re.Pattern[str], sides: tuple[str, str]) -> list[_Key | None]:
-    """Sides by the last number of a kind, where there are exactly two such numbers."""
+    """Sides by the last number that matches a pattern, where exactly two such numbers exist."""
     last = [next(reversed(list(pattern.finditer(stem))), None) for stem in stems]
     numbers = sorted({int(match[1]) for match in last if match is not None})
     if len(numbers) != 2:
@@ -363,9 +363,9 @@ def _by_number(stems: Sequence[str], pattern: re.Pattern[str], sides: tuple[str,
 
 
 def _by_folder(stems: Sequence[str], sides: tuple[str, str]) -> list[_Key | None]:
-    """Sides by the folder, where there are exactly two; equal names in both are a pair."""
+    """Sides by the folder, where exactly two exist; equal names in both are a pair."""
     parts = [stem.rpartition("/") for stem in stems]
-    folders = sorted({place for place, _, _ in parts}, key=natural_order)
+    folders = sorted({folder for folder, _, _ in parts}, key=natural_order)
     if len(folders) != 2:
         return [None] * len(stems)
-    return [(name, sides[folders.index(place)]) for place, _, name in parts]
+    return [(name, sides[folders.index(folder)]) for folder, _, name in parts]

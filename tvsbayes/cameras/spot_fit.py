@@ -1,10 +1,10 @@
-"""The centre of one camera's spot with its covariance, or the reason why there is none; and the noise it has.
+"""The centre of one camera's spot with its covariance, or the reason for a refusal; and the noise of its pixels.
 
-An elliptic Gaussian on a sloping background, fitted to the pixels around the spot by iterated weighted least squares.
-Pixels next to a clipped one are left out: a clipped core is normal, costs information and so widens the standard
-uncertainty. Grey is (B + 2 G + R) / 4, in which every photosite of a Bayer sensor weighs alike; 808 nm passes all three
-dyes, so hue tells nothing. Variance of a pixel with signal S: background + gain * S + (contrast * S)^2: what the frame
-shows without spot, shot noise, speckle.
+An elliptic Gaussian on a sloping background is fitted to the pixels around the spot by iterated weighted least squares.
+Pixels next to a clipped one are left out: a clipped core is normal, but it costs information and so widens the standard
+uncertainty. Grey is (B + 2 G + R) / 4, with equal weights for all photosites of a Bayer sensor; 808 nm passes all three
+dyes, so hue has no information. Variance of a pixel with signal S: background + gain * S + (contrast * S)^2: noise
+outside of the spot, shot noise, speckle.
 
 Raw image px with the integer at the centre of a pixel; DN = grey levels of 8 bits; pictures (height, width, 3), blue,
 green, red, uint8 or float32 DN of deeper ones.
@@ -30,21 +30,21 @@ AREA_MIN_PX = 4.0
 AXES_RATIO_MAX = 4.0
 """A sheet at 70 degrees to the beam gives 2.9."""
 BORDER_SDS = 3.0
-"""A spot cut off nearer than this has lost what tells its place."""
+"""Least distance of a centre from the border: a spot cut off there is biased."""
 SKEW_LIMIT = 80.0
 """Largest sum of a spot's four standardised squared skew residuals (normal: one in 10^15; speckle has longer tails)."""
-OWN_REACH = 3.5
-"""Sds of a wide spot, each way, within which its pixels tell its noise."""
+NOISE_REACH = 3.5
+"""Half width of the area that determines the noise of a wide spot, in sds of the spot."""
 SKEW_SHAPE_MAX = 0.15
-"""Up to this amplitude a spot may be skewed where there is no other one to compare with: half a Gaussian has 0.17, the
-worst of nine real beams 0.13."""
-SPECKLED = 0.1
-"""Contrast from which speckle is more than shot noise, and weights that know it are worth more than even ones."""
+"""Largest skew amplitude of a spot without others to compare with: half a Gaussian has 0.17, the worst of nine real
+beams 0.13."""
+SPECKLE_CONTRAST_MIN = 0.1
+"""Contrast from which speckle exceeds shot noise, so that weights by the noise model are better than equal ones."""
 WIDE_FLOOR_SHARE = 0.02
-"""Of the height: what stands for the background in the weights of wide spots, whose noise is mostly shot noise."""
+"""Of the height: replaces the background in the weights of wide spots, whose noise is mostly shot noise."""
 REACH, REACH_PX = 4.0, 9.0
-"""Where pixels fade out of a fit, in sds of the spot and px beyond: no real beam is Gaussian in its wings, and with an
-edge there the centre would depend on which pixels happen to be inside."""
+"""Distance at which the weights of pixels fade to 0, in sds of the spot and px beyond: no real beam is Gaussian in its
+wings, and with a sharp edge the centre would depend on which pixels happen to be inside."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Located:
 
 @dataclass(frozen=True)
 class Centre:
-    """One camera's spot, or why there is none.
+    """One camera's spot, or the reason for a refusal.
 
     Attributes:
         status: "ok" or a key of `REASONS`.
@@ -83,7 +83,7 @@ class Centre:
 
     @property
     def located(self) -> Located:
-        """Centre and covariance of a spot that counts."""
+        """Centre and covariance of a spot that was found."""
         assert self.centre_px is not None and self.covariance_px2 is not None, self.status
         return Located(self.centre_px, self.covariance_px2)
 
@@ -95,7 +95,7 @@ class Centre:
         return replace(self, centre_px=scaled_px(self.centre_px, size, to), covariance_px2=covariance)
 
     def under(self, noise: SpotNoise) -> Centre:
-        """The same centre with the covariance that this noise gives it; misshapen where its skew is no noise."""
+        """The same centre with its covariance under this noise; misshapen where its skew exceeds noise."""
         if self.parts_px2 is None or self.skews is None:
             return self
         units = np.array([1.0, noise.gain_dn, noise.speckle_contrast**2])
@@ -108,8 +108,8 @@ class Centre:
 
 
 @dataclass(frozen=True)
-class _Fitted:
-    """A converged fit: centre (2,), precision (2, 2), height, and what its covariance is made of.
+class _Fit:
+    """A converged fit: centre (2,), precision (2, 2), height, and the terms of its covariance.
 
     Over the n pixels of the patch: signal, its derivatives (9, n), weights (0 where not usable), residuals and the
     coordinates in sds of the spot.
@@ -128,7 +128,7 @@ class _Fitted:
 
 @dataclass(frozen=True)
 class _Model:
-    """The model of a spot at trial parameters: its precision's factor (a, b; 0, c), and over the pixels the signal."""
+    """The model of a spot at trial parameters: factor (a, b; 0, c) of its precision, and the signal of the pixels."""
 
     a: float
     b: float
@@ -140,9 +140,9 @@ class _Model:
 
 @dataclass(frozen=True)
 class _Pixels:
-    """A patch as a fit takes it: coordinates, data (n,), which of them count, and the derivatives (9, n) to be filled.
+    """A patch for the fit: coordinates, data (n,), which of them are usable, and the derivatives (9, n) to be filled.
 
-    The last three derivatives, of the background's level and slopes, never change.
+    The last three derivatives, of the background's level and slopes, are constant.
     """
 
     u: np.ndarray
@@ -160,7 +160,7 @@ class _Pixels:
         return cls(u, v, patch.grey.ravel().astype(float), patch.usable.ravel(), jacobian)
 
     def model(self, p: np.ndarray) -> _Model:
-        """The model at parameters p (9,), whose derivatives it leaves in `jacobian`."""
+        """The model at parameters p (9,); stores its derivatives in `jacobian`."""
         a, b, c = np.exp(p[3]), p[4], np.exp(p[5])
         x, y, jacobian = self.u - p[1], self.v - p[2], self.jacobian
         z1, z2 = a * x + b * y, c * y
@@ -177,12 +177,11 @@ class _Pixels:
         return _Model(a, b, c, z1, z2, signal)
 
 
-def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
-    """Elliptic Gaussian on a plane by weighted Gauss-Newton steps; None where they do not settle.
+def fit_spot(patch: Patch, noise: SpotNoise) -> _Fit | None:
+    """Elliptic Gaussian on a plane by weighted Gauss-Newton steps; None where they do not converge.
 
     Parameters: log height, centre, lower triangle of the precision's Cholesky factor with logs on its diagonal,
-    level and slopes of the background. Own steps and no library's: a general solver takes longer than the decoding
-    of the picture.
+    level and slopes of the background. A general solver of a library would take longer than decoding the picture.
     """
     if patch.usable.sum() < 25:
         return None
@@ -198,9 +197,9 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
         model = pixels.model(p)
         signal = model.signal
         residual = pixels.data - signal - p[6:] @ jacobian[6:]
-        # Far from the solution the weights of a wrong model mislead: equal ones first.
-        if patch.wide and noise.speckle_contrast < SPECKLED:
-            # No real beam is Gaussian, and a wide spot shows it: its centre must not depend on a guess of the noise.
+        # Far from the solution the weights of a wrong model are wrong: equal ones first.
+        if patch.wide and noise.speckle_contrast < SPECKLE_CONTRAST_MIN:
+            # No real beam is exactly Gaussian, which matters for a wide spot: its centre must not depend on the noise.
             variance = signal + WIDE_FLOOR_SHARE * np.exp(p[0]) if settled else 1.0
         else:
             variance = patch.background_variance + (
@@ -225,12 +224,12 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
         limits[4] = 0.4 * model.c
         step *= min(1.0, float((limits / np.maximum(np.abs(step), 1e-300)).min()))
         move, change = np.abs(step[1:3]).max() * max(model.a, model.c), np.abs(step[[0, 3, 5]]).max()
-        # In sds of the spot; what is left after the last step is ten times less.
+        # In sds of the spot; the error after the last step is ten times smaller.
         if settled > 1 and move < 5e-4 / patch.block and change < 5e-3 / patch.block:
             factor = np.array([[model.a, 0.0], [model.b, model.c]])
             centre = p[1:3] + step[1:3] + np.array(patch.corner)
             height = float(np.exp(p[0]))
-            return _Fitted(centre, factor @ factor.T, height, signal, jacobian, weights, residual, model.z1, model.z2)
+            return _Fit(centre, factor @ factor.T, height, signal, jacobian, weights, residual, model.z1, model.z2)
         settled += bool(settled or (move < 0.05 and change < 0.1) or iteration > 12)
         p = p + step
         if not np.isfinite(p).all() or max(abs(p[3]), abs(p[5])) > 6 or p[0] > 12:
@@ -238,49 +237,49 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fitted | None:
     return None
 
 
-def _covariance_parts(fitted: _Fitted, patch: Patch) -> np.ndarray:
+def _covariance_parts(fitted: _Fit, patch: Patch) -> np.ndarray:
     """Covariance (3, 2, 2) of the centre from the background's noise, per gain and per contrast^2, px^2."""
     weighted = fitted.jacobian * fitted.weights
-    # Two rows of the inverse; the inverse times every pixel would take longer than all the rest here.
+    # Two rows of the inverse; the full inverse times all pixels would take longer than the rest of this function.
     gains = np.linalg.solve(weighted @ fitted.jacobian.T, np.eye(9)[:, 1:3]).T @ weighted
     # The variance of u + v gives the covariance.
-    u, v, both = _noise_parts(np.vstack((gains, gains.sum(axis=0))), fitted.signal, patch).T
-    mixed = (both - u - v) / 2
-    return np.array([[u, mixed], [mixed, v]]).transpose(2, 0, 1)
+    u, v, sums = _noise_parts(np.vstack((gains, gains.sum(axis=0))), fitted.signal, patch).T
+    covariance = (sums - u - v) / 2
+    return np.array([[u, covariance], [covariance, v]]).transpose(2, 0, 1)
 
 
 def _noise_parts(filters: np.ndarray, signal: np.ndarray, patch: Patch) -> np.ndarray:
     """Variance (3, k) of filters (k, n) on a patch: from the background's noise, per gain and per contrast^2."""
-    by_noise = (filters, filters * np.sqrt(signal), filters * signal)
-    background, *others = (through_demosaicing(one, patch.grey.shape, patch.block) for one in by_noise)
-    return np.array([patch.background_variance * background, *others])
+    by_source = (filters, filters * np.sqrt(signal), filters * signal)
+    background, *scaled = (through_demosaicing(part, patch.grey.shape, patch.block) for part in by_source)
+    return np.array([patch.background_variance * background, *scaled])
 
 
-def skewness(fitted: _Fitted, patch: Patch) -> np.ndarray:
+def skewness(fitted: _Fit, patch: Patch) -> np.ndarray:
     """Rows (4, 4): amplitude of a skew shape in the spot, its variance from background, per gain and per contrast^2.
 
-    The four third-order Hermite functions of the spot, less what the fit's own parameters take up; 1 is the spot's own
-    height.
+    The four third-order Hermite functions of the spot without their projection on the fit's parameters; 1 is the height
+    of the spot.
     """
     z1, z2, signal = fitted.z1, fitted.z2, fitted.signal
-    one, two = z1 * z1, z2 * z2
-    shapes = np.stack(((one - 3) * z1, (one - 1) * z2, (two - 1) * z1, (two - 3) * z2)) * signal
+    z11, z22 = z1 * z1, z2 * z2
+    shapes = np.stack(((z11 - 3) * z1, (z11 - 1) * z2, (z22 - 1) * z1, (z22 - 3) * z2)) * signal
     weighted = fitted.jacobian * fitted.weights
-    taken = np.linalg.solve(weighted @ fitted.jacobian.T, weighted @ shapes.T)
-    filters = (shapes - taken.T @ fitted.jacobian) * fitted.weights
+    absorbed = np.linalg.solve(weighted @ fitted.jacobian.T, weighted @ shapes.T)
+    filters = (shapes - absorbed.T @ fitted.jacobian) * fitted.weights
     filters /= np.maximum(np.einsum("kn,kn->k", filters, shapes), 1e-300)[:, None]
     return np.column_stack((filters @ fitted.residual, *_noise_parts(filters, signal, patch)))
 
 
-def with_own_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
-    """A wide patch and its noise by its own pixels; its skew is taken for the beam's shape up to `SKEW_SHAPE_MAX`."""
-    # The weights of a wide spot without speckle know no noise, so any will do for this fit.
+def with_measured_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
+    """A wide patch and the noise of its own pixels; its skew up to `SKEW_SHAPE_MAX` counts as the beam's shape."""
+    # The weights of a wide spot without speckle do not depend on the noise.
     fitted = fit_spot(patch, SpotNoise(speckle_contrast=0.0))
     if fitted is None:
         return patch, SpotNoise()
     height, width = patch.raw.shape
-    low = np.maximum(np.floor(fitted.centre_px - patch.corner - OWN_REACH * patch.start_sd_px), 0).astype(int)
-    high = np.minimum(low + int(2 * OWN_REACH * patch.start_sd_px) + 1, (width, height))
+    low = np.maximum(np.floor(fitted.centre_px - patch.corner - NOISE_REACH * patch.start_sd_px), 0).astype(int)
+    high = np.minimum(low + int(2 * NOISE_REACH * patch.start_sd_px) + 1, (width, height))
     raw = patch.raw[low[1] : high[1], low[0] : high[0]]
     x = np.arange(low[0], high[0], dtype=np.float32) - np.float32(fitted.centre_px[0] - patch.corner[0])
     y = np.arange(low[1], high[1], dtype=np.float32)[:, None] - np.float32(fitted.centre_px[1] - patch.corner[1])
@@ -293,21 +292,21 @@ def with_own_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
 
 
 def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:
-    """The fit's answer for a patch, checked."""
+    """The checked result of a fit."""
     if isinstance(patch, str):
         return Centre(patch)
-    known = partial(Centre, clipped_share=patch.clipped_share, outline_px=patch.outline_px)
+    result = partial(Centre, clipped_share=patch.clipped_share, outline_px=patch.outline_px)
     if patch.clipped_share > CLIPPED_SHARE_MAX:
-        return known("clipped")
+        return result("clipped")
     fitted = fit_spot(patch, noise)
     if fitted is None:
-        return known(_at_border(patch.start_px, 2 * patch.start_sd_px, patch.size) or "unfitted")
-    spread = np.linalg.inv(fitted.precision)
-    short, long = np.sqrt(np.linalg.eigvalsh(spread))
+        return result(_at_border(patch.start_px, 2 * patch.start_sd_px, patch.size) or "unfitted")
+    shape = np.linalg.inv(fitted.precision)
+    short, long = np.sqrt(np.linalg.eigvalsh(shape))
     status = "ok"
     if 2 * pi * log(2) * long * short < AREA_MIN_PX:
         status = "too-small"
-    elif (reason := _at_border(fitted.centre_px, BORDER_SDS * np.sqrt(np.diag(spread)), patch.size)) is not None:
+    elif (reason := _at_border(fitted.centre_px, BORDER_SDS * np.sqrt(np.diag(shape)), patch.size)) is not None:
         status = reason
     elif long > AXES_RATIO_MAX * short:
         status = "elongated"
@@ -316,30 +315,30 @@ def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:
     parts, skews = _covariance_parts(fitted, patch), skewness(fitted, patch)
     lines = shift_of_lines(patch, fitted.jacobian, fitted.weights, fitted.residual)
     axes = float(long), float(short)
-    return known(status, fitted.centre_px, axes_px=axes, parts_px2=parts, skews=skews, lines_px=lines).under(noise)
+    return result(status, fitted.centre_px, axes_px=axes, parts_px2=parts, skews=skews, lines_px=lines).under(noise)
 
 
 @dataclass(frozen=True)
-class Widened:
-    """The centres of one camera, wider where alternate lines disagree, and which lines do."""
+class WidenedCentres:
+    """The centres of one camera, with larger covariance where alternate lines disagree, and these lines."""
 
     centres: tuple[Centre, ...]
     lines: tuple[AlternateLines, ...]
 
 
-def widened(centres: Sequence[Centre]) -> Widened:
-    """Centres of one camera, under its noise, with what the disagreement of alternate lines adds."""
-    good = [k for k, one in enumerate(centres) if one.status == "ok" and one.lines_px is not None]
-    shifts = [lines for k in good if (lines := centres[k].lines_px) is not None]
-    more = widening(shifts, [centres[k].located.covariance_px2 for k in good])
+def widened(centres: Sequence[Centre]) -> WidenedCentres:
+    """Centres of one camera under its noise, with the variance from the disagreement of alternate lines."""
+    usable = [k for k, centre in enumerate(centres) if centre.status == "ok" and centre.lines_px is not None]
+    shifts = [lines for k in usable if (lines := centres[k].lines_px) is not None]
+    added_noise = widening(shifts, [centres[k].located.covariance_px2 for k in usable])
     result = list(centres)
-    for k, added in zip(good, more.added_px2, strict=True):
+    for k, added in zip(usable, added_noise.added_px2, strict=True):
         result[k] = replace(result[k], covariance_px2=result[k].located.covariance_px2 + added)
-    return Widened(tuple(result), more.lines)
+    return WidenedCentres(tuple(result), added_noise.lines)
 
 
-def _at_border(centre: np.ndarray, reach: np.ndarray | float, size: tuple[int, int]) -> str | None:
-    outside = (centre - reach < 0) | (centre + reach > np.array(size) - 1)
+def _at_border(centre: np.ndarray, margin: np.ndarray | float, size: tuple[int, int]) -> str | None:
+    outside = (centre - margin < 0) | (centre + margin > np.array(size) - 1)
     return "border" if outside.any() else None
 
 
@@ -348,11 +347,11 @@ def find_spot(picture: np.ndarray, noise: SpotNoise | None = None, white: int | 
 
     Args:
         picture: (height, width, 3), blue, green, red, uint8 or uint16.
-        noise: of the camera, as `detect` learns it from many looks; default what the pixels of a wide spot show,
-            which has no speckle whose grain is wider than a few pixels; of a narrow one the priors' medians.
-        white: the largest value that the camera gives with more than 8 bits; default by the picture itself.
+        noise: of the camera, as `detect` estimates it from many looks; by default from the pixels of a wide spot,
+            without speckle whose grain exceeds a few pixels; for a narrow spot the medians of the priors.
+        white: largest value of a camera with more than 8 bits; by default from the picture.
     """
     patch = patch_around(in_grey_levels(picture, white))
     if noise is None and not isinstance(patch, str) and patch.wide and patch.clipped_share <= CLIPPED_SHARE_MAX:
-        patch, noise = with_own_noise(patch)
+        patch, noise = with_measured_noise(patch)
     return widened([centre_of(patch, noise or SpotNoise())]).centres[0]

@@ -1,4 +1,4 @@
-"""The noise of a camera's pixels around a laser spot: what demosaicing makes of it, and what a campaign tells of it.
+"""The noise of a camera's pixels around a laser spot: the effect of demosaicing, and estimates from a campaign.
 
 DN = grey levels of 8 bits; pictures (height, width, 3), blue, green, red, uint8 or float32 DN of deeper ones; grey is
 (B + 2 G + R) / 4, in which every photosite of a Bayer sensor weighs alike.
@@ -14,18 +14,18 @@ import numpy as np
 GAIN_MEDIAN_DN, GAIN_SD_OF_LOG = 0.05, 1.0
 """Prior of the shot-noise gain, log-normal, DN per DN of signal: 255 DN at 5000 electrons, within a factor of e."""
 CONTRAST_DEFAULT = 0.4
-"""Speckle contrast where no campaign tells it: the middle of what averaging leaves, 0.3 to 0.63."""
+"""Speckle contrast without a campaign: the middle of the contrasts after averaging, 0.3 to 0.63."""
 CONTRAST_SCALE, CONTRAST_MAX = 0.5, 2.0
 """Prior of the learned contrast: half-normal of this scale, up to here. Speckle may be absent; fully developed it has
 1, and its grain in px multiplies that."""
 SKEW_OUTLIER = 30.0
-"""A squared skew residual this many times its expectation teaches nothing about noise (normal: one in 10^7)."""
+"""A squared skew residual above this many times its expectation is left out (normal: one in 10^7)."""
 DEEP_VARIANCE_MIN = 1e-5
 """Least variance of a pixel of more than 8 bits, DN^2: rounding of 14 bits."""
 SHAPE_SPOTS_MIN = 4
 OWN_PIXELS_MIN, OWN_BINS, OWN_SHARE, OWN_DARK_SHARE, OWN_GAIN_MIN_DN = 200, 8, 0.05, 0.005, 1e-4
-"""Of `pixel_noise`: least pixels, bins of signal, the least signal that counts and the largest that is none, a gain
-that is as good as none."""
+"""Of `pixel_noise`: least number of pixels, number of bins, shares of the peak above which a pixel counts as lit and
+below which as dark, smallest gain."""
 _CELL = 8
 
 
@@ -34,7 +34,7 @@ def _autocorrelation(kernel: np.ndarray) -> np.ndarray:
     return np.array([[np.sum(kernel * padded[i : i + 3, j : j + 3]) for j in range(5)] for i in range(5)])
 
 
-# What one photosite's noise becomes in grey by bilinear demosaicing: red and blue sites, green sites; half of each.
+# Correlation of grey pixels after bilinear demosaicing: mean over red and blue sites and green sites.
 _CORRELATION = (
     _autocorrelation(np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 16)
     + _autocorrelation(np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 8)
@@ -73,9 +73,9 @@ def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> Spo
     squared = np.array(skews, dtype=float)
     squared[:, :, 0] = (skews[:, :, 0] - shape) ** 2 * (count / (count - 1) if shape.any() else 1.0)
     skews = squared.reshape(-1, 4)
-    away = np.linspace(-3, 3, 41)[:, None]
-    gains = GAIN_MEDIAN_DN * np.exp(away * GAIN_SD_OF_LOG)
-    # Equal steps of the root: fine near 0; each point weighs what lies around it.
+    deviations = np.linspace(-3, 3, 41)[:, None]
+    gains = GAIN_MEDIAN_DN * np.exp(deviations * GAIN_SD_OF_LOG)
+    # Equal steps of the root: fine near 0; the weight of a point is the width of its cell.
     contrasts = np.linspace(0, 1, 121) ** 2 * CONTRAST_MAX
     widths = np.gradient(contrasts)
     if speckle_contrast is not None:
@@ -85,13 +85,13 @@ def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> Spo
     expected = skews[:, 1] + skews[:, 2] * GAIN_MEDIAN_DN + skews[:, 3] * np.median(squares)
     ratio = skews[:, 0] / expected
     skews = skews[ratio <= SKEW_OUTLIER * np.median(ratio) / 0.455]  # 0.455: median of a squared normal value
-    logs = np.log(widths) - squares / CONTRAST_SCALE**2 / 2 - away**2 / 2
+    logs = np.log(widths) - squares / CONTRAST_SCALE**2 / 2 - deviations**2 / 2
     for measured, background, per_gain, per_contrast in skews:
         variance = background + per_gain * gains + per_contrast * squares
         logs -= (np.log(variance) + measured / variance) / 2
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    gain_dn = GAIN_MEDIAN_DN * float(np.exp(GAIN_SD_OF_LOG * (weights.sum(axis=1) @ away.ravel())))
+    gain_dn = GAIN_MEDIAN_DN * float(np.exp(GAIN_SD_OF_LOG * (weights.sum(axis=1) @ deviations.ravel())))
     return SpotNoise(gain_dn, float(weights.sum(axis=0) @ contrasts), tuple(shape.tolist()))
 
 
@@ -106,17 +106,17 @@ class PixelNoise:
 def pixel_noise(
     residual: np.ndarray, signal: np.ndarray, usable: np.ndarray, background: float, mono: bool
 ) -> PixelNoise:
-    """Gain and contrast of one picture from its own pixels: second differences of what a fit leaves, by signal.
+    """Gain and contrast of one picture from its own pixels: second differences of the residuals of a fit, by signal.
 
-    Differences over 1 px, of demosaiced pictures 3, see the noise of pixels and the finest grain of speckle, and little
-    of a beam's rings and fringes. A grain that is wider than that only the scatter between looks tells.
+    Differences over 1 px, in demosaiced pictures 3, contain the noise of pixels and the finest grain of speckle, and
+    little of a beam's rings and fringes. Only the scatter between looks shows a wider grain.
 
     Args:
         residual: grey less fitted (h, w), DN.
         signal: fitted light of the spot (h, w), DN.
         usable: which pixels count (h, w).
         background: variance of one photosite without light, DN^2, where too few pixels around the spot are dark.
-        mono: whether the pixels are photosites of their own, not demosaiced.
+        mono: whether the pixels are single photosites, not demosaiced.
     """
     from scipy.optimize import nnls
 
@@ -127,12 +127,12 @@ def pixel_noise(
         if length <= 2 * lag:
             continue
         parts = [np.arange(k * lag, length - (2 - k) * lag) for k in range(3)]
-        before, middle, after = (np.take(residual, part, axis) for part in parts)
-        counted = np.logical_and.reduce([np.take(usable, part, axis) for part in parts])
+        earlier, middle, later = (np.take(residual, part, axis) for part in parts)
+        inside = np.logical_and.reduce([np.take(usable, part, axis) for part in parts])
         # Of one value and two halves of others: 1 + 1/4 + 1/4.
         rows.append(
             np.stack(
-                ((middle - (before + after) / 2)[counted] ** 2 / 1.5 / single, np.take(signal, parts[1], axis)[counted])
+                ((middle - (earlier + later) / 2)[inside] ** 2 / 1.5 / single, np.take(signal, parts[1], axis)[inside])
             )
         )
     squares, light = np.hstack(rows) if rows else np.empty((2, 0))
@@ -145,7 +145,7 @@ def pixel_noise(
     bins = np.array_split(order[light[order] > OWN_SHARE * light.max()], OWN_BINS)
     level = np.array([light[part].mean() for part in bins])
     mean = np.array([squares[part].mean() for part in bins])
-    # Relative errors of the means are alike, so relative misses count.
+    # The means have equal relative errors, so relative residuals are fitted.
     weight = 1 / np.maximum(mean, 1e-12)
     excess = np.maximum(mean - background, 0.0)
     gain, contrast2 = nnls(np.column_stack((level, level**2)) * weight[:, None], excess * weight)[0]
@@ -153,14 +153,14 @@ def pixel_noise(
 
 
 def mean_noise(noises: Sequence[SpotNoise]) -> SpotNoise:
-    """One camera's noise from that of a few pictures: means of variances, the middle of the shapes."""
+    """One camera's noise from that of a few pictures: means of variances, median shape."""
     gain = float(np.mean([noise.gain_dn for noise in noises]))
     contrast = float(np.sqrt(np.mean([noise.speckle_contrast**2 for noise in noises])))
     return SpotNoise(gain, contrast, tuple(np.median([noise.skew for noise in noises], axis=0).tolist()))
 
 
 def is_mono(picture: np.ndarray) -> bool:
-    """Whether the three channels are one: a monochrome camera, or grey saved as colour."""
+    """Whether the three channels are equal: a monochrome camera, or grey saved as colour."""
     return bool((picture[..., 0] == picture[..., 1]).all() and (picture[..., 0] == picture[..., 2]).all())
 
 
@@ -182,9 +182,9 @@ def background_variance(picture: np.ndarray, centre: np.ndarray, half: int) -> f
     means = cv2.resize(region, (int(cells[0]), int(cells[1])), interpolation=cv2.INTER_AREA)
     v, u = np.indices(means.shape)
     middle = (_CELL - 1) / 2
-    off_u, off_v = np.abs(_CELL * u + middle + low[0] - centre[0]), np.abs(_CELL * v + middle + low[1] - centre[1])
-    far = np.maximum(off_u, off_v) > half + 2 * _CELL
-    values = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2)[far[:, 1:-1]]
+    away_u, away_v = np.abs(_CELL * u + middle + low[0] - centre[0]), np.abs(_CELL * v + middle + low[1] - centre[1])
+    outside = np.maximum(away_u, away_v) > half + 2 * _CELL
+    values = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2)[outside[:, 1:-1]]
     if values.size < 8:
         return 1.0
     # MAD: edges of other things in the picture are few. 1.5: variance of the difference of independent means.
@@ -193,14 +193,14 @@ def background_variance(picture: np.ndarray, centre: np.ndarray, half: int) -> f
 
 
 def through_demosaicing(filters: np.ndarray, shape: tuple[int, int], block: int = 1) -> np.ndarray:
-    """Variance (k,) of filters (k, n) on a patch (h, w) of unit noise per photosite, as grey shows it."""
+    """Variance (k,) of filters (k, n) on a grey patch (h, w) with unit noise per photosite."""
     import cv2
 
     if block > 1:
         # Demosaicing keeps the sum of its correlations at 1: wide blocks of pixels are independent.
         return np.einsum("kn,kn->k", filters, filters) / block**2
     pictures = filters.reshape(len(filters), *shape)
-    smooth = [cv2.filter2D(one, cv2.CV_64F, _CORRELATION, borderType=cv2.BORDER_CONSTANT) for one in pictures]
+    smooth = [cv2.filter2D(picture, cv2.CV_64F, _CORRELATION, borderType=cv2.BORDER_CONSTANT) for picture in pictures]
     return np.einsum("kij,kij->k", pictures, np.array(smooth))
 
 

@@ -1,4 +1,4 @@
-"""Where the spot of a picture is, and the pixels around it that a fit takes; the reason where there is not exactly one.
+"""The place of the spot in a picture, and the pixels around it for the fit; the reason where there is not exactly one.
 
 Raw image px with the integer at the centre of a pixel; DN = grey levels of 8 bits; pictures (height, width, 3), blue,
 green, red, uint8 or float32 DN of deeper ones.
@@ -26,13 +26,13 @@ AREA_MAX_SHARE = 0.05
 DETECTION_SIGMAS, DETECTION_MIN_DN = 8.0, 2.0
 """Least height of a spot over the background, of means of 4 x 4 px: in sds of them and in DN."""
 BLOCKS_PER_SD = 4
-"""Wide spots are fitted to means of blocks of pixels, a quarter of their sd wide: nothing is lost and time is saved."""
+"""Wide spots are fitted to means of blocks of pixels, a quarter of their sd wide: as accurate, and faster."""
 WIDE_SD_PX = 5.0
-"""Of a spot whose noise its own pixels show; in a narrower one they show its shape as well."""
+"""Least sd of a spot whose pixels determine the noise; in a narrower one they also show its shape."""
 SHRINK = 4
 LAMP_SHARE = 0.01
-"""Of the picture, from which on a bright area that reaches its border is a lamp or a window, without a spot beside."""
-LAMP_TIMES, LAMP_DIM = 4.0, 0.8
+"""Least area, over the picture, of a bright area at the border that is a lamp or a window and no spot."""
+LAMP_AREA_RATIO, LAMP_HEIGHT_SHARE = 4.0, 0.8
 """A bright area at the border, or larger than any spot, is a lamp or a window beside a spot of which it has so many
 times the area, or at most this share of the height: what of a laser's spot lies at the border is brighter than the
 reflections that it makes elsewhere, and no larger than they are."""
@@ -60,7 +60,7 @@ class Patch:
 
     @property
     def wide(self) -> bool:
-        """Whether its pixels tell noise and shape apart."""
+        """Whether noise and shape are separable in its pixels."""
         return self.start_sd_px >= WIDE_SD_PX
 
 
@@ -71,29 +71,29 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     height, width = picture.shape[:2]
     if min(height, width) < 2 * SHRINK:
         return "no-spot"
-    # To find the spot OpenCV's own weights of the colours will do; they are several times faster.
+    # OpenCV's weights of the colours are good enough to find the spot, and several times faster.
     small = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     small = cv2.resize(small, (width // SHRINK, height // SHRINK), interpolation=cv2.INTER_AREA)
     # Lamps and gradients are wide, a spot is not: 11 cells of 8 px hold it several times.
-    wide = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    wide = cv2.resize(_wide_median(wide), small.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    above = cv2.blur(cv2.subtract(small, wide, dtype=cv2.CV_32F), (2, 2))
+    background = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    background = cv2.resize(_wide_median(background), small.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    above = cv2.blur(cv2.subtract(small, background, dtype=cv2.CV_32F), (2, 2))
     noise = 1.4826 * float(np.median(np.abs(above[::3, ::3])))
     peak = float(above.max())
     if peak < max(DETECTION_SIGMAS * noise, DETECTION_MIN_DN):
         return "no-spot"
     bright = (above > max(SECOND_SHARE * peak, DETECTION_SIGMAS / 2 * noise)).astype(np.uint8)
-    # What follows looks at a few cells: it takes the time of the whole picture unless it is shown these alone.
+    # The next steps need a few cells only: the whole picture would take much longer.
     column, row, columns, rows = cv2.boundingRect(bright)
-    around = np.s_[row : row + rows, column : column + columns]
-    count, labels, stats, centroids = cv2.connectedComponentsWithStats(bright[around], connectivity=8)
+    box = np.s_[row : row + rows, column : column + columns]
+    count, labels, stats, centroids = cv2.connectedComponentsWithStats(bright[box], connectivity=8)
     lit = labels > 0
-    flux = np.bincount(labels[lit].astype(np.intp), weights=above[around][lit], minlength=count)
+    flux = np.bincount(labels[lit].astype(np.intp), weights=above[box][lit], minlength=count)
     heights = np.zeros(count)
-    np.maximum.at(heights, labels[lit].astype(np.intp), above[around][lit])
+    np.maximum.at(heights, labels[lit].astype(np.intp), above[box][lit])
     if count > 2 or stats[1, cv2.CC_STAT_AREA] > 0.2 * LAMP_SHARE * bright.size:
-        ground = cv2.subtract(small, above, dtype=cv2.CV_32F)[around]
-        levels = [float((ground[labels == k] + 0.5 * heights[k]).mean()) for k in range(1, count)]
+        surroundings = cv2.subtract(small, above, dtype=cv2.CV_32F)[box]
+        levels = [float((surroundings[labels == k] + 0.5 * heights[k]).mean()) for k in range(1, count)]
         inside = [np.argwhere(labels == k)[0] + (row, column) for k in range(1, count)]
         lamps, alone = _lamps(small, levels, inside, heights, flux)
         if alone:
@@ -157,29 +157,29 @@ def _lamps(
     import cv2
 
     count = len(levels)
-    area, odd, at_border = np.zeros(count + 1), np.ones(count + 1, dtype=bool), np.zeros(count + 1, dtype=bool)
+    area, suspect, at_border = np.zeros(count + 1), np.ones(count + 1, dtype=bool), np.zeros(count + 1, dtype=bool)
     for k, (level, (row, column)) in enumerate(zip(levels, inside, strict=True), start=1):
         _, labels, stats, _ = cv2.connectedComponentsWithStats((small > level).astype(np.uint8), connectivity=8)
-        whole = labels == labels[row, column]
+        area_mask = labels == labels[row, column]
         area[k] = stats[labels[row, column], cv2.CC_STAT_AREA] if labels[row, column] else 1
-        at_border[k] = whole[0].any() or whole[-1].any() or whole[:, 0].any() or whole[:, -1].any()
+        at_border[k] = area_mask[0].any() or area_mask[-1].any() or area_mask[:, 0].any() or area_mask[:, -1].any()
         at_border[k] &= bool(labels[row, column])
-        odd[k] = at_border[k] or area[k] > AREA_MAX_SHARE * small.size
-    if odd.all():
+        suspect[k] = at_border[k] or area[k] > AREA_MAX_SHARE * small.size
+    if suspect.all():
         return [], bool(at_border[int(flux.argmax())] and area[int(flux.argmax())] > LAMP_SHARE * small.size)
-    best = int(np.argmax(np.where(odd, -1.0, flux)))
-    large, dim = area >= LAMP_TIMES * area[best], heights <= LAMP_DIM * heights[best]
-    return [k for k in range(1, count + 1) if odd[k] and (large[k] or dim[k])], False
+    best = int(np.argmax(np.where(suspect, -1.0, flux)))
+    large, dim = area >= LAMP_AREA_RATIO * area[best], heights <= LAMP_HEIGHT_SHARE * heights[best]
+    return [k for k in range(1, count + 1) if suspect[k] and (large[k] or dim[k])], False
 
 
-def _wide_median(wide: np.ndarray) -> np.ndarray:
+def _wide_median(picture: np.ndarray) -> np.ndarray:
     """Median of 11 x 11; OpenCV has it for 8 bits."""
     import cv2
 
-    if wide.dtype == np.uint8:
-        return cv2.medianBlur(wide, 11)
-    step = max(float(wide.max()), 1e-9) / 255
-    return cv2.medianBlur((wide / step).astype(np.uint8), 11).astype(np.float32) * np.float32(step)
+    if picture.dtype == np.uint8:
+        return cv2.medianBlur(picture, 11)
+    step = max(float(picture.max()), 1e-9) / 255
+    return cv2.medianBlur((picture / step).astype(np.uint8), 11).astype(np.float32) * np.float32(step)
 
 
 def block_means(values: np.ndarray, block: int) -> np.ndarray:
@@ -189,5 +189,5 @@ def block_means(values: np.ndarray, block: int) -> np.ndarray:
     if block == 1:
         return values
     height, width = (length // block for length in values.shape)
-    whole = np.ascontiguousarray(values[: height * block, : width * block])
-    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+    cropped = np.ascontiguousarray(values[: height * block, : width * block])
+    return cv2.resize(cropped, (width, height), interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""From board pictures to a stereo calibration with its covariance, and what a careful reader would ask about it.
+"""From board pictures to a stereo calibration with its covariance, and checks of its plausibility.
 
 Type A: all corners of all views in one bundle adjustment, widened for errors that the corners of a picture share and
 for a board that is no perfect grid. Type B: the pitch of the board, to which all lengths are proportional. mm, px with
@@ -41,17 +41,17 @@ OUTLIER_Z, OUTLIER_SPREAD_MIN = 4.0, 0.2
 at least 0.2) above the median: never below 2.2 times the median rms. On clean views the logarithm scatters by 0.05."""
 FINDING, ADJUSTING = "finding corners", "adjusting all corners"
 STAGES = {FINDING: 2.0, ADJUSTING: 3.0}
-"""Of a calibration, with seconds: what progress predicts with."""
+"""Stages of a calibration with their usual seconds, for the progress."""
 VIEWS_ADVISED = 10
 """Zhang (2000), figure 3: the errors have fallen to a floor by about ten views."""
 TILT_ADVISED_DEG = 15.0
 COVERAGE_ADVISED = 0.6
 CORNER_SD_ADVISED_PX = 0.5
-TOGETHER_TIMES = 1.5
-"""More than this times the rms of each camera by itself: pairs of one moment and one rig stay below 1.15."""
-TOGETHER_MIN_PX = 0.05
-CONTRADICTION_TIMES, CONTRADICTION_PX = 4.0, 1.0
-"""Beyond both, there is no one pair of cameras in the pictures, and no covariance would be true."""
+PAIR_RMS_RATIO = 1.5
+"""Ratio of the pair's rms to that of single cameras for a warning: pairs of one moment and one rig stay below 1.15."""
+PAIR_RMS_MIN_PX = 0.05
+CONTRADICTION_RATIO, CONTRADICTION_PX = 4.0, 1.0
+"""Above both the pictures are not of one pair of cameras, and no covariance would be valid."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class ViewReport:
 
 @dataclass(frozen=True)
 class StereoCalibration:
-    """A stereo calibration with everything behind it.
+    """A stereo calibration with its uncertainties, views and warnings.
 
     Attributes:
         stereo: parameters and their full covariance (type A with `correlation_factor`, plus board and pitch).
@@ -78,17 +78,17 @@ class StereoCalibration:
         noise_sd_px: standard deviation of one corner coordinate.
         dof: degrees of freedom behind it.
         correlation_factor: factor on the covariance for errors that the corners of a picture share.
-        covariance_independent: (24, 24), type A for independent corners: what OpenCV and most tools report.
-        board_error_mm: how far corners of the board are off a grid, sd of one coordinate, by the residuals.
+        covariance_independent: (24, 24), type A for independent corners, as OpenCV and most tools report it.
+        board_error_mm: deviation of the board's corners from a grid, sd of one coordinate, by the residuals.
         covariance_board: (24, 24), from that.
         covariance_pitch: (24, 24), type B, from the pitch: scales T.
         coverage: share of the image inside the boards, by camera.
         triangulated_pitch_mm: mean and standard deviation of all sides of squares, triangulated.
-        pictures: what the folder held; None where corners were given.
+        pictures: the folder of pictures; None where corners were given.
         excluded: names of outlying views that were left out: no pairs at all, or by `robust`.
-        reordered: names of views whose right corners were put into another order, to agree with the left ones.
-        alone_rms_px: what each camera by itself would leave, rms over corners as in `stereo.rms_px`.
-        warnings: plausibility in words.
+        reordered: names of views whose right corners were reordered to match the left ones.
+        alone_rms_px: rms over corners, as in `stereo.rms_px`, with each camera calibrated alone.
+        warnings: implausible results, in words.
         seconds: wall time by stage.
     """
 
@@ -192,32 +192,32 @@ def calibrate_stereo(
         size: image width and height, px.
         fix_k3: keep both k3 at 0.
         robust: leave out outlying views and adjust again, once. Views whose two pictures cannot show one board (of
-            two moments, say) are left out in any case: nothing fits them.
-        pictures: what the folder held, for the report.
+            two moments, for example) are always left out.
+        pictures: the folder of pictures, for the report.
 
     Raises:
-        NothingToEstimate: fewer than `VIEWS_MIN` views of a camera, no pair, or views that leave parameters open.
+        NothingToEstimate: fewer than `VIEWS_MIN` views of a camera, no pair, or undetermined parameters.
         NotConverged: no minimum was found.
     """
-    began = time.perf_counter()
-    done = _adjusted(views, board, size, fix_k3, robust)
-    adjustment = done.adjustment
+    start_s = time.perf_counter()
+    adjusted = _adjust_views(views, board, size, fix_k3, robust)
+    adjustment = adjusted.adjustment
     pitch = np.zeros((24, 24))
-    # The pixels know angles only: all lengths, T among them, are proportional to the pitch.
+    # Pixels determine angles only: all lengths, T among them, are proportional to the pitch.
     shift = adjustment.vector[21:] * (board.pitch_u_mm / board.pitch_mm)
     pitch[21:, 21:] = np.outer(shift, shift)
-    rms, nothing = _rms(adjustment.residuals_px), np.zeros(1)
-    bare = Stereo(*size, nothing, nothing, nothing, nothing, nothing, nothing, pitch, rms)
+    rms, zeros = _rms(adjustment.residuals_px), np.zeros(1)
+    bare = Stereo(*size, zeros, zeros, zeros, zeros, zeros, zeros, pitch, rms)
     bare = replace(bare, right_image_size=None if pictures is None else pictures.right_image_size)
     stereo = bare.with_vector(adjustment.vector)
-    errors = board_errors(adjustment, done.views, board, stereo)
+    errors = board_errors(adjustment, adjusted.views, board, stereo)
     covariance = errors.correlation_factor * adjustment.covariance + errors.covariance + pitch
     stereo = replace(stereo, parameter_covariance=0.5 * (covariance + covariance.T))
-    poses = [pose_of(view, board, stereo) for view in done.views]
+    poses = [pose_of(view, board, stereo) for view in adjusted.views]
     result = StereoCalibration(
         stereo=stereo,
         board=board,
-        views=tuple(_view_reports(done, poses)),
+        views=tuple(_view_reports(adjusted, poses)),
         left_rms_px=_rms(adjustment.residuals_px[:, :2]),
         right_rms_px=_rms(adjustment.residuals_px[:, 2:]),
         noise_sd_px=adjustment.noise_sd_px,
@@ -227,29 +227,29 @@ def calibrate_stereo(
         board_error_mm=errors.sd_mm,
         covariance_board=errors.covariance,
         covariance_pitch=pitch,
-        coverage={side: _coverage([getattr(v, side) for v in done.views], size) for side in CAMERAS},
-        triangulated_pitch_mm=_triangulated_pitch(done.views, board, stereo),
+        coverage={side: _coverage([getattr(v, side) for v in adjusted.views], size) for side in CAMERAS},
+        triangulated_pitch_mm=_triangulated_pitch(adjusted.views, board, stereo),
         pictures=pictures,
-        excluded=done.excluded,
-        reordered=_reordered(pictures, done.turned),
-        alone_rms_px=done.alone_rms_px,
+        excluded=adjusted.excluded,
+        reordered=_reordered(pictures, adjusted.turned),
+        alone_rms_px=adjusted.alone_rms_px,
         warnings=(),
-        seconds={"adjustment": time.perf_counter() - began},
+        seconds={"adjustment": time.perf_counter() - start_s},
     )
     return replace(result, warnings=tuple(_plausibility(result, poses)))
 
 
 @dataclass(frozen=True)
 class _Adjusted:
-    """A bundle adjustment of views, and what was decided about them.
+    """A bundle adjustment and its choice of views.
 
     Attributes:
         adjustment: the result.
-        views: those in it, right corners in the agreed order.
-        outliers: which of them lie off.
-        excluded: names of those left out.
-        turned: names of those whose right corners were put into another order.
-        alone_rms_px: what each camera by itself would have left, rms over corners.
+        views: used views, right corners in the agreed order.
+        outliers: which of them are outliers.
+        excluded: names of views left out.
+        turned: names of views with reordered right corners.
+        alone_rms_px: rms over corners with each camera calibrated alone.
     """
 
     adjustment: Adjustment
@@ -260,8 +260,8 @@ class _Adjusted:
     alone_rms_px: float
 
 
-def _adjusted(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3: bool, robust: bool) -> _Adjusted:
-    """The adjustment of all views that are pairs; with `robust` repeated once without outlying ones."""
+def _adjust_views(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3: bool, robust: bool) -> _Adjusted:
+    """The adjustment of all consistent views; with `robust` repeated once without outliers."""
     views = [view for view in views if view.left is not None or view.right is not None]
     free = np.ones(24, bool)
     free[[8, 17]] = not fix_k3
@@ -271,44 +271,44 @@ def _adjusted(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3
     while True:
         views = list(start.views)
         if leave_out.any():
-            excluded += [view.name for view, out in zip(views, leave_out, strict=True) if out]
-            views = [view for view, out in zip(views, leave_out, strict=True) if not out]
+            excluded += [view.name for view, left_out in zip(views, leave_out, strict=True) if left_out]
+            views = [view for view, left_out in zip(views, leave_out, strict=True) if not left_out]
             start = start_of(views, board, size, fix_k3)
             views = list(start.views)
-        done = _lowest_adjustment(start, board, size, free)
-        together = _rms(done.residuals_px)
-        if together > max(CONTRADICTION_TIMES * start.alone_rms_px, CONTRADICTION_PX):
+        adjustment = _lowest_adjustment(start, board, size, free)
+        pair_rms = _rms(adjustment.residuals_px)
+        if pair_rms > max(CONTRADICTION_RATIO * start.alone_rms_px, CONTRADICTION_PX):
             alone = f"each camera by itself by {start.alone_rms_px:.2f}"
-            raise pairs_disagree(f"together they miss by {together:.2f} px, {alone}")
-        outliers = _outliers(done)
+            raise pairs_disagree(f"together they miss by {pair_rms:.2f} px, {alone}")
+        outliers = _outliers(adjustment)
         if not (robust and outliers.any()):
-            return _Adjusted(done, views, outliers, tuple(excluded), turned, start.alone_rms_px)
+            return _Adjusted(adjustment, views, outliers, tuple(excluded), turned, start.alone_rms_px)
         leave_out, robust = outliers, False
 
 
 def _lowest_adjustment(start: Start, board: Board, size: tuple[int, int], free: np.ndarray) -> Adjustment:
-    """The adjustment from a start; where it misses by much, also from OpenCV's own end, and the lower of the two."""
+    """The adjustment from a start; for large residuals also from OpenCV's result, and the lower of the two."""
     failed = None
     try:
-        done = bundle_adjustment(start.views, board, start.vector, start.poses, free)
-        if _rms(done.residuals_px) <= DOUBTFUL_START_PX:
-            return done
+        first = bundle_adjustment(start.views, board, start.vector, start.poses, free)
+        if _rms(first.residuals_px) <= DOUBTFUL_START_PX:
+            return first
     except TvsError as error:
         failed = error
     try:
         other = opencv_start(start, board, size, not free[8])
-        again = bundle_adjustment(other.views, board, other.vector, other.poses, free)
+        second = bundle_adjustment(other.views, board, other.vector, other.poses, free)
     except TvsError:
         if failed is not None:
             raise failed from None
-        return done
-    return again if failed is not None else min(done, again, key=lambda one: one.noise_sd_px)
+        return first
+    return second if failed is not None else min(first, second, key=lambda adjustment: adjustment.noise_sd_px)
 
 
 def _reordered(pictures: Views | None, turned: tuple[str, ...]) -> tuple[str, ...]:
-    """Views that by direction or by agreement, not by both, were put into another order: two half turns are none."""
-    before = () if pictures is None else pictures.reordered
-    return (*(name for name in before if name not in turned), *(name for name in turned if name not in before))
+    """Views reordered by direction or by agreement, but not by both: two half turns cancel."""
+    first = () if pictures is None else pictures.reordered
+    return (*(name for name in first if name not in turned), *(name for name in turned if name not in first))
 
 
 def calibrate_folder(
@@ -321,12 +321,12 @@ def calibrate_folder(
     robust: bool = False,
     progress: Show | None = None,
 ) -> StereoCalibration:
-    """`find_views`, then `calibrate_stereo`; their arguments and errors. `progress` is called with the progress."""
-    began = time.perf_counter()
+    """`find_views`, then `calibrate_stereo`; their arguments and errors. `progress` shows the progress."""
+    start_s = time.perf_counter()
     with Job(STAGES, progress) as job:
         job.begin(FINDING)
         pictures = find_views(folder, board, finder=finder, pairing=pairing, advance=job.at)
-        seconds = {"corners": time.perf_counter() - began}
+        seconds = {"corners": time.perf_counter() - start_s}
         size = (pictures.image_width, pictures.image_height)
         job.begin(ADJUSTING)
         result = calibrate_stereo(pictures.views, board, size, fix_k3=fix_k3, robust=robust, pictures=pictures)
@@ -338,9 +338,9 @@ def _rms(residuals_px: np.ndarray) -> float:
     return math.sqrt(2 * float(np.nanmean(residuals_px**2)))
 
 
-def _outliers(done: Adjustment) -> np.ndarray:
+def _outliers(adjustment: Adjustment) -> np.ndarray:
     """Which views lie above the rule of `OUTLIER_Z`, shape (views,)."""
-    logs = np.log([max(_rms(r), 1e-12) for r in done.residuals_px])
+    logs = np.log([max(_rms(r), 1e-12) for r in adjustment.residuals_px])
     middle = np.median(logs)
     spread = max(1.4826 * float(np.median(np.abs(logs - middle))), OUTLIER_SPREAD_MIN)
     return logs > middle + OUTLIER_Z * spread
@@ -350,9 +350,9 @@ def _normal(pose: np.ndarray) -> np.ndarray:
     return rotation_matrix(pose[:3])[:, 2]
 
 
-def _view_reports(done: _Adjusted, poses: Sequence[np.ndarray]) -> Iterator[ViewReport]:
+def _view_reports(adjusted: _Adjusted, poses: Sequence[np.ndarray]) -> Iterator[ViewReport]:
     for view, residuals, pose, outlier in zip(
-        done.views, done.adjustment.residuals_px, poses, done.outliers, strict=True
+        adjusted.views, adjusted.adjustment.residuals_px, poses, adjusted.outliers, strict=True
     ):
         yield ViewReport(
             view.name,
@@ -383,16 +383,16 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
     for view in views:
         if view.left is None or view.right is None:
             continue
-        both = visible_corners(view.left, view.right)
-        if not both.any():
+        common = visible_corners(view.left, view.right)
+        if not common.any():
             continue
         rays = [
-            cv2.undistortPoints(pixels_of(pixels[both]), M, D).reshape(-1, 2).T
+            cv2.undistortPoints(pixels_of(pixels[common]), M, D).reshape(-1, 2).T
             for pixels, M, D in ((view.left, stereo.M1, stereo.D1), (view.right, stereo.M2, stereo.D2))
         ]
         points = np.asarray(cv2.triangulatePoints(np.eye(3, 4), right, *rays))
         grid = np.full((board.corners, 3), np.nan)
-        grid[both] = (points[:3] / points[3]).T
+        grid[common] = (points[:3] / points[3]).T
         by_row = grid.reshape(board.rows, board.columns, 3)
         sides += [np.linalg.norm(np.diff(by_row, axis=axis), axis=2).ravel() for axis in (0, 1)]
     lengths = np.concatenate(sides)
@@ -401,7 +401,7 @@ def _triangulated_pitch(views: Sequence[View], board: Board, stereo: Stereo) -> 
 
 
 def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> list[str]:
-    """What a careful reader would ask about the views, in words."""
+    """Warnings about views and result, in words."""
     warnings = []
     if result.pairs < VIEWS_ADVISED:
         warnings.append(f"few views: {result.pairs} pairs; errors fall until about {VIEWS_ADVISED}, take 15 to 25")
@@ -425,7 +425,7 @@ def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> lis
             f"corners miss by {result.noise_sd_px:.2f} px (one coordinate); 0.1 to 0.2 is usual: look for blur, "
             "pictures not of one moment, a bent board, or a lens that five coefficients do not describe"
         )
-    if result.stereo.rms_px > TOGETHER_TIMES * result.alone_rms_px and result.noise_sd_px > TOGETHER_MIN_PX:
+    if result.stereo.rms_px > PAIR_RMS_RATIO * result.alone_rms_px and result.noise_sd_px > PAIR_RMS_MIN_PX:
         warnings.append(
             f"the pair misses by {result.stereo.rms_px:.2f} px, each camera by itself by {result.alone_rms_px:.2f}: "
             "look for pictures not of one moment, or cameras that moved against each other"
@@ -440,8 +440,8 @@ def _plausibility(result: StereoCalibration, poses: Sequence[np.ndarray]) -> lis
         warnings.append(
             f"left out, since the two pictures contradict the rest: {escaped(', '.join(result.excluded), 400)}"
         )
-    kept = [view.name for view in result.views if view.outlier]
-    if kept:
-        names = escaped(", ".join(kept), 400)
+    outlying = [view.name for view in result.views if view.outlier]
+    if outlying:
+        names = escaped(", ".join(outlying), 400)
         warnings.append(f"outlying views: {names}; look at their pictures, or leave them out with --robust")
     return warnings

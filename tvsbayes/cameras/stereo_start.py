@@ -1,4 +1,4 @@
-"""Where a stereo calibration starts: each camera by itself (Zhang 2000), the median relative pose, a pose per board.
+"""The start of a stereo calibration: each camera alone (Zhang 2000), the median relative pose, a pose per board.
 
 Poses are board to camera, (6,): Rodrigues vector, then mm; OpenCV's axes (x right, y down, z along the view);
 x_right = R x_left + T. px with the integer at a pixel's centre.
@@ -20,24 +20,24 @@ from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, rotation_vector
 
 VIEWS_MIN = 3
-"""Views per camera below which Zhang's method (2000) cannot find a focal length with both principal coordinates."""
+"""Least views per camera: Zhang's method (2000) finds no focal length and principal point from fewer."""
 START_VIEWS = 30
-"""The start needs no more; every further view enters the bundle adjustment alone."""
-MISMATCH_TIMES, MISMATCH_SHARE = 5.0, 0.01
-"""A view is no pair if its right corners miss the place that the left ones and the relative pose of most pairs predict
-by more than five times the median view and by more than 1 % of the image width."""
+"""Largest number of views for the start; further views enter the bundle adjustment only."""
+MISMATCH_RATIO, MISMATCH_SHARE = 5.0, 0.01
+"""A view is no pair if the distance of its right corners from those that the left ones and the relative pose of most
+pairs predict exceeds five times the median over views and 1 % of the image width."""
 POSE_CORNERS_MIN = 6
-"""Corners that both cameras see in a pair, below which it does not enter OpenCV's start."""
+"""Least corners that both cameras see in a pair of OpenCV's start."""
 DOUBTFUL_START_PX = 0.6
-"""A camera alone that misses by more may have ended in a local minimum: corners are found to 0.05 to 0.3 px."""
+"""Rms of one camera above which it may be in a local minimum: corners are accurate to 0.05 to 0.3 px."""
 DISAGREE_SHARE = 0.05
-"""Pairs whose median misses by more than this share of the image width show no one pose of the cameras: real pairs of a
-narrow or a wide lens miss by 0.1 to 1 %, pairs of other moments by 5 to 50 %."""
+"""Median deviation of pairs, over the image width, above which they contradict one pose of the cameras: real pairs of a
+narrow or a wide lens have 0.1 to 1 %, pairs of different moments 5 to 50 %."""
 
 
 @dataclass(frozen=True)
 class CameraStart:
-    """Zhang's solution for one camera: matrix, distortion, a pose (6,) for every view that it saw, rms over corners."""
+    """Zhang's solution for one camera: matrix, distortion, a pose (6,) for each of its views, rms over corners."""
 
     matrix: np.ndarray
     distortion: np.ndarray
@@ -46,21 +46,21 @@ class CameraStart:
 
     @property
     def vector(self) -> np.ndarray:
-        """The nine inner parameters, as `Stereo.vector` orders them."""
+        """The nine intrinsic parameters in the order of `Stereo.vector`."""
         return np.array([*self.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *self.distortion])
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where the adjustment starts.
+    """The start of the adjustment.
 
     Attributes:
         vector: the 24 parameters.
         poses: of the boards, (views, 6).
         views: as given, right corners in the order in which most pairs agree.
-        turned: names of views whose right corners were put into another order.
+        turned: names of views with reordered right corners.
         mismatched: which views are no pair at all, (views,).
-        alone_rms_px: what each camera by itself leaves, rms over the corners of both.
+        alone_rms_px: rms over the corners of both cameras, each calibrated alone.
     """
 
     vector: np.ndarray
@@ -82,63 +82,63 @@ def start_of(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3:
         corners = {k: getattr(v, side) for k, v in enumerate(views) if getattr(v, side) is not None}
         cameras.append(camera_start(corners, board, size, side, fix_k3))
     left, right = cameras
-    relation = _relation(views, board, left, right, MISMATCH_SHARE * size[0])
-    limit = max(MISMATCH_TIMES * relation.usual_px, MISMATCH_SHARE * size[0])
-    off = [k for k, miss in relation.misses.items() if miss > limit]
-    if relation.usual_px > DISAGREE_SHARE * size[0]:
+    relative = _relation(views, board, left, right, MISMATCH_SHARE * size[0])
+    limit = max(MISMATCH_RATIO * relative.usual_px, MISMATCH_SHARE * size[0])
+    mismatched = [k for k, miss in relative.misses.items() if miss > limit]
+    if relative.usual_px > DISAGREE_SHARE * size[0]:
         agreeing = [
-            escaped(views[k].name, 40) for k, miss in relation.misses.items() if miss <= MISMATCH_SHARE * size[0]
+            escaped(views[k].name, 40) for k, miss in relative.misses.items() if miss <= MISMATCH_SHARE * size[0]
         ]
-        reason = f"most of the {len(relation.misses)} pairs miss by {relation.usual_px:.0f} px and more"
+        reason = f"most of the {len(relative.misses)} pairs miss by {relative.usual_px:.0f} px and more"
         raise pairs_disagree(reason + (f"; only {', '.join(agreeing)} agree" if len(agreeing) > 1 else ""))
-    rotation, shift = rotation_matrix(relation.pose[:3]), relation.pose[3:]
+    rotation, shift = rotation_matrix(relative.pose[:3]), relative.pose[3:]
     poses, agreed, turned = [], list(views), []
     for k, view in enumerate(views):
         poses.append(left.poses[k] if k in left.poses else left_pose(right.poses[k], rotation, shift))
-        if relation.orders.get(k, 0) and k not in off:
+        if relative.orders.get(k, 0) and k not in mismatched:
             assert view.right is not None
-            agreed[k] = replace(view, right=view.right[corner_orders(board)[relation.orders[k]]])
+            agreed[k] = replace(view, right=view.right[corner_orders(board)[relative.orders[k]]])
             turned.append(view.name)
     return Start(
-        vector=np.concatenate([left.vector, right.vector, relation.pose]),
+        vector=np.concatenate([left.vector, right.vector, relative.pose]),
         poses=np.array(poses),
         views=tuple(agreed),
         turned=tuple(turned),
-        mismatched=np.isin(np.arange(len(views)), off),
+        mismatched=np.isin(np.arange(len(views)), mismatched),
         alone_rms_px=math.sqrt((left.rms_px**2 + right.rms_px**2) / 2),
     )
 
 
 def opencv_start(start: Start, board: Board, size: tuple[int, int], fix_k3: bool) -> Start:
-    """Where cv2.stereoCalibrate ends on up to `START_VIEWS` pairs: for views that leave more than one minimum.
+    """The result of cv2.stereoCalibrate on up to `START_VIEWS` pairs: for views with more than one minimum.
 
     Raises:
-        NothingToEstimate: it ends nowhere.
+        NothingToEstimate: it finds no pair.
     """
     pairs = [k for k, view in enumerate(start.views) if view.left is not None and view.right is not None]
     pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, START_VIEWS).astype(int))]
-    both = [visible_corners(start.views[k].left, start.views[k].right) for k in pairs]
-    kept = [place for place, visible in enumerate(both) if visible.sum() >= POSE_CORNERS_MIN]
-    pairs, both = [pairs[place] for place in kept], [both[place] for place in kept]
+    masks = [visible_corners(start.views[k].left, start.views[k].right) for k in pairs]
+    usable = [position for position, visible in enumerate(masks) if visible.sum() >= POSE_CORNERS_MIN]
+    pairs, masks = [pairs[position] for position in usable], [masks[position] for position in usable]
     left, right = (
-        [np.asarray(getattr(start.views[k], side)[visible], np.float32) for k, visible in zip(pairs, both, strict=True)]
+        [np.asarray(getattr(start.views[k], side)[seen], np.float32) for k, seen in zip(pairs, masks, strict=True)]
         for side in CAMERAS
     )
     pair = Stereo(*size, *(np.zeros(1),) * 6, np.zeros((24, 24)), 0.0).with_vector(start.vector)
-    points = [board.points_mm[visible].astype(np.float32) for visible in both]
+    points = [board.points_mm[visible].astype(np.float32) for visible in masks]
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
     try:
-        _, *inner, turn, shift, _, _, turns, shifts, _ = cv2.stereoCalibrateExtended(
+        _, *intrinsics, turn, shift, _, _, turns, shifts, _ = cv2.stereoCalibrateExtended(
             points, left, right, pair.M1, pair.D1, pair.M2, pair.D2, size, np.eye(3), np.zeros((3, 1)), flags=flags
         )
     except cv2.error as error:
         raise undetermined(f"OpenCV found no pair ({escaped(str(error.err), 100)})") from error
     cameras = [
         CameraStart(np.asarray(matrix, float), np.asarray(distortion, float).ravel()[:5], {}, 0.0)
-        for matrix, distortion in (inner[:2], inner[2:])
+        for matrix, distortion in (intrinsics[:2], intrinsics[2:])
     ]
-    outer = rotation_vector(np.asarray(turn)), np.ravel(shift)
-    vector = np.concatenate([cameras[0].vector, cameras[1].vector, *outer])
+    extrinsics = rotation_vector(np.asarray(turn)), np.ravel(shift)
+    vector = np.concatenate([cameras[0].vector, cameras[1].vector, *extrinsics])
     if not np.isfinite(vector).all():
         raise undetermined("OpenCV found no finite pair")
     calibrated = pair.with_vector(vector)
@@ -150,7 +150,7 @@ def opencv_start(start: Start, board: Board, size: tuple[int, int], fix_k3: bool
 
 
 def pairs_disagree(reason: str) -> NothingToEstimate:
-    """The refusal of pairs that do not show one board to one pair of cameras."""
+    """The refusal of pairs that contradict one pose of the cameras."""
     return NothingToEstimate(
         "pairs-disagree",
         f"the pairs contradict each other: {reason}",
@@ -181,7 +181,7 @@ def camera_start(
         simple = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_PRINCIPAL_POINT
         first = _zhang(points, pixels, size, side, simple)
         flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
-        start = min(start, _zhang(points, pixels, size, side, flags, first), key=lambda one: one.rms_px)
+        start = min(start, _zhang(points, pixels, size, side, flags, first), key=lambda candidate: candidate.rms_px)
     matrix, distortion = start.matrix, start.distortion
     poses = {k: board_pose(corners[k], board, matrix, distortion) for k in keys}
     return replace(start, poses=poses)
@@ -213,12 +213,12 @@ def _zhang(
 
 @dataclass(frozen=True)
 class _Relation:
-    """How the cameras stand to each other: R and T, (6,), and what that leaves.
+    """The relative pose of the cameras: R and T, (6,), and its residuals.
 
     Attributes:
         pose: rotation vector and translation.
-        misses: rms distance of the right corners from where the left ones put them, px, by pair.
-        orders: which of `corner_orders` the right corners of a pair come nearest in.
+        misses: rms distance of the right corners from those predicted by the left ones, px, by pair.
+        orders: the best of `corner_orders` for the right corners, by pair.
     """
 
     pose: np.ndarray
@@ -227,16 +227,16 @@ class _Relation:
 
     @property
     def usual_px(self) -> float:
-        """The miss that more than half of the pairs stay within."""
+        """The median of the misses (the upper one of two)."""
         return sorted(self.misses.values())[len(self.misses) // 2]
 
 
 def _relation(views: Sequence[View], board: Board, left: CameraStart, right: CameraStart, limit_px: float) -> _Relation:
     """The relation in which most pairs agree.
 
-    As the corners are ordered first: the median over pairs, which one wrong pair does not move. Where that leaves most
-    pairs beyond `limit_px`, every pair in every order is tried, and the one with the least median miss counts (least
-    median of squares: Rousseeuw 1984): half turns of a symmetric board and many wrong pairs do not move it.
+    First with the corners as ordered: the median over pairs, which is robust against one wrong pair. Where most misses
+    exceed `limit_px`, every pair in every order is tried, and the one with the least median miss is used (least median
+    of squares: Rousseeuw 1984): robust against half turns of a symmetric board and many wrong pairs.
     """
     pairs = sorted(set(left.poses) & set(right.poses))
     if not pairs:
@@ -255,7 +255,7 @@ def _relation(views: Sequence[View], board: Board, left: CameraStart, right: Cam
         rotation = rotation_matrix(right.poses[k][:3]) @ turn @ rotation_matrix(left.poses[k][:3]).T
         return np.concatenate([rotation_vector(rotation), right.poses[k][3:] - rotation @ left.poses[k][3:]])
 
-    def judged(pose: np.ndarray) -> _Relation:
+    def judge(pose: np.ndarray) -> _Relation:
         misses, nearest = {}, {}
         for k in pairs:
             by_order = _misses(views[k], board, left.poses[k], pose, right)
@@ -263,12 +263,12 @@ def _relation(views: Sequence[View], board: Board, left: CameraStart, right: Cam
             misses[k] = float(by_order[nearest[k]])
         return _Relation(pose, misses, nearest)
 
-    agreed = judged(_median_pose([relative(k, 0) for k in pairs]))
+    agreed = judge(_median_pose([relative(k, 0) for k in pairs]))
     if agreed.usual_px > limit_px and len(pairs) > 2:
         tried = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, START_VIEWS).astype(int))]
-        best = min((judged(relative(k, t)) for k in tried for t in range(len(orders))), key=lambda one: one.usual_px)
+        best = min((judge(relative(k, t)) for k in tried for t in range(len(orders))), key=lambda r: r.usual_px)
         near = [k for k in pairs if best.misses[k] <= best.usual_px]
-        agreed = min(best, judged(_median_pose([relative(k, best.orders[k]) for k in near])), key=lambda r: r.usual_px)
+        agreed = min(best, judge(_median_pose([relative(k, best.orders[k]) for k in near])), key=lambda r: r.usual_px)
     return agreed
 
 
@@ -278,7 +278,7 @@ def _median_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _misses(view: View, board: Board, pose: np.ndarray, relation: np.ndarray, right: CameraStart) -> np.ndarray:
-    """By corner order, how far the right corners lie from where a board's left pose puts them, rms, px."""
+    """Rms distance of the right corners from those predicted by a board's left pose, px, by corner order."""
     rotation, shift = rotation_matrix(relation[:3]), relation[3:]
     predicted = rotation_vector(rotation @ rotation_matrix(pose[:3])), rotation @ pose[3:] + shift
     pixels, _ = cv2.projectPoints(board.points_mm, *predicted, right.matrix, right.distortion)
@@ -291,8 +291,8 @@ def board_pose(corners: np.ndarray, board: Board, matrix: np.ndarray, distortion
     """Board to camera, shape (6,), from one picture: IPPE (Collins and Bartoli 2014), then least squares in px."""
     visible = visible_corners(corners)
     points, pixels = board.points_mm[visible], pixels_of(corners[visible])
-    done, turn, shift = cv2.solvePnP(points, pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
-    if not done or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+    solved, turn, shift = cv2.solvePnP(points, pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
+    if not solved or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
         raise undetermined("a board has no pose that OpenCV can find")
     # IPPE undistorts by a few iterations, which is not enough at the edge of a wide lens.
     turn, shift = cv2.solvePnPRefineLM(points, pixels, matrix, distortion, turn, shift)
@@ -315,7 +315,7 @@ def left_pose(right_pose: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np
 
 def visible_corners(*corners: np.ndarray | None) -> np.ndarray:
     """Which corners (corners,) all of some pictures show."""
-    return np.logical_and.reduce([np.isfinite(one).all(axis=1) for one in corners if one is not None])
+    return np.logical_and.reduce([np.isfinite(points).all(axis=1) for points in corners if points is not None])
 
 
 def pixels_of(corners: np.ndarray) -> np.ndarray:

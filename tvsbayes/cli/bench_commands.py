@@ -22,7 +22,7 @@ from tvsbayes.files.disk import write_atomically
 from tvsbayes.pipeline import compile_for
 
 if TYPE_CHECKING:
-    from tvsbayes.cameras.assumed_covariance import Known
+    from tvsbayes.cameras.assumed_covariance import Provenance
     from tvsbayes.cameras.boards import Board, Finder
     from tvsbayes.cameras.calibration_export import Format
     from tvsbayes.cameras.picture_pairs import Pairing
@@ -224,25 +224,25 @@ def _positive(**values: float | None) -> None:
 
 def _known(
     board: str | None, pitch_mm: float | None, pitch_u_mm: float | None, made_by: Mapping[str, float | None]
-) -> Known:
+) -> Provenance:
     """What the options say of an imported calibration."""
-    from tvsbayes.cameras.assumed_covariance import USUAL_PITCH_MM, Known
+    from tvsbayes.cameras.assumed_covariance import USUAL_PITCH_MM, Provenance
     from tvsbayes.cameras.boards import Board
 
     # Checked as that of pictures is.
     pattern = Board.named(board or "9x6", USUAL_PITCH_MM if pitch_mm is None else pitch_mm, pitch_u_mm or 0.0)
     size = None if board is None else (pattern.columns, pattern.rows)
-    return Known(board=size, pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, **made_by)  # type: ignore[arg-type]
+    return Provenance(board=size, pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, **made_by)  # type: ignore[arg-type]
 
 
 def _named_keys(keys: list[str] | None) -> dict[str, str]:
     """Fields with the names that hold them, of --key."""
-    from tvsbayes.cameras.calibration_formats import STATED
+    from tvsbayes.cameras.calibration_formats import KEY_FIELDS
 
     named = {}
     for text in keys or []:
         field, _, name = text.partition("=")
-        if field not in STATED or not name:
+        if field not in KEY_FIELDS or not name:
             remedy = "write --key M1=NAME, with M1, D1, M2, D2, R or T"
             raise InputError("usage", f"--key {escaped(text, 80)}: no such name", remedy=remedy)
         named[field] = name
@@ -250,7 +250,7 @@ def _named_keys(keys: list[str] | None) -> dict[str, str]:
 
 
 def _imported(
-    paths: list[Path], image_size: str | None, import_unit: str | None, known: Known, keys: Mapping[str, str]
+    paths: list[Path], image_size: str | None, import_unit: str | None, known: Provenance, keys: Mapping[str, str]
 ) -> MadePair:
     """A calibration of another tool, or of ours."""
     from tvsbayes.cameras.calibration_formats import UNITS_MM, read_calibration
