@@ -23,7 +23,7 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import INDEX, LOOK_SCATTER_NAMES, NAMES, names_of
 from tvsbayes.model.parameter_space import ParameterSpace, coordinates_of, free_mask, parameter_space, physical_at
-from tvsbayes.posterior.transport import SCALE_NAMES, Transport, transport
+from tvsbayes.posterior.transport import SCALE_NAMES, WALK_INFORMATION, Transport, transport
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -179,6 +179,21 @@ def test_looks_that_scatter_more_or_less_than_at_the_mode(scattered):
         w = np.where(names == name, 3.0, 0.0)[None]
         one, other = (path.conditional(each).own[0] for each in (w, 0 * w))
         assert np.abs(one @ one.T - other @ other.T).max() > 1e-3, axis
+
+
+@pytest.mark.parametrize(("information", "share"), [(1e-6, 1e-5), (WALK_INFORMATION, 0.2)])
+def test_a_drift_takes_from_the_map_what_it_takes_from_the_dense_campaign(dozen, monkeypatch, information, share):
+    """All of it by all terms; but for a fifth by those that the spots see."""
+    monkeypatch.setattr("tvsbayes.posterior.transport.WALK_INFORMATION", information)
+    drift = dict.fromkeys(names_of("drift_deg_per_root_hour"), 0.3)
+    held = (*LOOK_SCATTER_NAMES, *CREEP)
+    fitted = fit_of(dozen, dozen.campaign, VALUES | dict.fromkeys(LOOK_SCATTER_NAMES, 0.0) | drift, held, redraw=False)
+    path = transport(fitted)
+    dense, _ = dense_density(fitted, path, fitted.z)
+    paths = (path, replace(path, drift_scale=np.zeros(2)))
+    factors = [each.conditional(np.zeros((1, path.noise))).own[0] for each in paths]
+    drifting, still = ((factor @ factor.T)[::-1, ::-1] for factor in factors)
+    assert np.abs(drifting - dense).max() < share * np.abs(still - dense).max()
 
 
 def test_products_of_a_creep_are_those_of_the_covariance_of_all_others(dozen):

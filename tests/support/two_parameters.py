@@ -59,7 +59,7 @@ def route() -> Transport:
         bend=np.zeros((1, 0, 0)),
         place_angle_rad=np.zeros(0),
         place_on_tilt=np.zeros(0, bool),
-        walk=np.zeros((0, 2)),
+        drift_axis=np.zeros((0, 2)),
         drift_scale=np.zeros(2),
         drift_noise=np.zeros((2, 1)),
         gear_scale=np.zeros(len(GEAR_SCALES)),

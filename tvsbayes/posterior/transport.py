@@ -36,7 +36,7 @@ from tvsbayes.model.parameter_space import (
 from tvsbayes.posterior.linear_campaign import Conditional, Creep, LinearCampaign
 from tvsbayes.posterior.look_noise import LookNoise
 from tvsbayes.posterior.plays import Cut, HalfNormal
-from tvsbayes.posterior.stop_states import Elimination, stop_states
+from tvsbayes.posterior.stop_states import Elimination, StopStates, stop_states
 
 GEAR_SCALES = np.array(
     [
@@ -49,8 +49,11 @@ GEAR_SCALES = np.array(
 """Coordinates of what the covariance of the errors at places depends on."""
 DRIFT_COLUMNS = np.array([INDEX[name] for name in names_of("drift_deg_per_root_hour")])
 CREEP_COLUMNS = np.array([INDEX[name] for name in names_of("creep_deg")])
-WALK_TERMS = 3
-"""Terms of the Karhunen-Loeve series of a drift between two homings: 93 % of its variance."""
+WALK_STEPS = 128
+"""Steps of a drift between two homings, at most; it is linear within each."""
+WALK_INFORMATION = 1.0
+"""What the spots must say of a term of a drift that is one sd larger than at the mode, in prior precisions of the term:
+where a term that they see is left out, the rest of the map takes the drift for something else, such as a creep."""
 LEAST_SCALE = 1e-6
 """Of a noise scale over that at the mode: what is smaller moves nothing."""
 FAR_ABOVE = 1e200
@@ -137,7 +140,7 @@ class Transport:
             bend' y their parts along each other grow, shape (g, narrow, narrow).
         place_angle_rad, place_on_tilt: of places, as `gear_processes.place_blocks` takes them; their transmission
             errors and plays are the first of the e errors, terms of the drifts the others.
-        walk: sds of those terms, in units of the drift of their axis (pan, tilt), h^(1/2), shape (terms, 2).
+        drift_axis: 1 at the axis (pan, tilt) whose drift is the sd of each of those terms, shape (terms, 2).
         drift_scale: of the drifts at the mode, rad h^(-1/2), shape (2,).
         drift_noise: which noise coordinate each of them is, shape (2, q).
         gear_scale: values of `GEAR_SCALES` at the mode, in the units of their names, shape (12,).
@@ -160,7 +163,7 @@ class Transport:
     bend: np.ndarray
     place_angle_rad: np.ndarray
     place_on_tilt: np.ndarray
-    walk: np.ndarray
+    drift_axis: np.ndarray
     drift_scale: np.ndarray
     drift_noise: np.ndarray
     gear_scale: np.ndarray
@@ -241,7 +244,7 @@ class Transport:
         scales, valid = scales_at(values, self.period_deg), np.ones(len(self.place_on_tilt), dtype=bool)
         errors = place_blocks(scales, self.place_angle_rad, self.place_on_tilt, valid)
         drift = self.drift_scale * np.exp(log_scale @ self.drift_noise.T)
-        terms = (drift @ self.walk.T)[..., None] * np.eye(len(self.walk))
+        terms = (drift @ self.drift_axis.T)[..., None] * np.eye(len(self.drift_axis))
         return BlockRoot((*errors.blocks, terms))
 
     def _conditional(self, noise: np.ndarray, score_at_mode: np.ndarray) -> Conditional:
@@ -395,36 +398,46 @@ def centred_count(moved: np.ndarray) -> int:
 
 @dataclass(frozen=True)
 class Walks:
-    """Drifts of the zeros as a few terms of their Karhunen-Loeve series, anew after every homing.
+    """Drifts of the zeros as terms of unit prior variance that the spots see.
 
     Attributes:
-        columns: d(predicted)/d(term), shape (4 n, terms).
-        walk: as in `Transport`.
+        columns: d(predicted)/d(term) of a drift of 1 rad h^(-1/2), shape (4 n, terms).
+        axis: as in `Transport`.
     """
 
     columns: np.ndarray
-    walk: np.ndarray
+    axis: np.ndarray
 
 
-def walks(fit: JointFit) -> Walks:
-    """Of the axes whose drift is estimated (Ghanem and Spanos, Stochastic Finite Elements, Springer 1991, 2.3.3)."""
+def walks(fit: JointFit, stops: StopStates) -> Walks:
+    """Of the axes whose drift is estimated, anew after every homing.
+
+    A random walk is the sum of its steps from look to look. Rotated to where the spots, their stop errors eliminated,
+    see the terms apart, few of them count.
+    """
     slope = np.asarray(fit.linearised.slope)
     spots = jax.tree.map(lambda x: np.asarray(x)[: len(slope)], fit.arrays.spots)
     begins = np.flatnonzero(spots.new_segment)
-    columns, walk = [], []
+    sd = np.sqrt(stops.variance.sum(axis=1) + stops.constant)[None]
+    of_stops = Elimination.of(stops, sd, stops.gram[stops.overlapping][None])
+    above = fit.z[DRIFT_COLUMNS] + np.sqrt(np.diag(fit.covariance)[DRIFT_COLUMNS])
+    scale = np.radians(half_normal(above) * np.asarray(fit.space.u)[DRIFT_COLUMNS])
+    columns, axes = [np.empty((slope.size // 2, 0))], [np.empty((0, 2))]
     for axis in np.flatnonzero(fit.free[DRIFT_COLUMNS]):
         for begin, end in zip(begins, [*begins[1:], len(slope)], strict=True):
             hours = np.cumsum(spots.hours[begin:end])
-            if not hours[-1] > 0:
-                continue
-            for frequency in (np.arange(WALK_TERMS) + 0.5) * np.pi:
-                column = np.zeros(slope.shape[:2])
-                shape = np.sqrt(2) * np.sin(frequency * hours / hours[-1])
-                column[begin:end] = slope[begin:end, :, axis] * shape[:, None]
-                columns.append(column.ravel())
-                walk.append(np.sqrt(hours[-1]) / frequency * (np.arange(2) == axis))
-    rows = slope.shape[0] * slope.shape[1]
-    return Walks(np.reshape(columns, (len(columns), rows)).T, np.reshape(walk, (len(walk), 2)))
+            knots = np.unique([0.0, *hours])
+            knots = knots[np.linspace(0, len(knots) - 1, min(len(knots), WALK_STEPS + 1)).round().astype(int)]
+            steps = np.diff(knots)
+            walked = np.sqrt(steps) * np.clip((hours[:, None] - knots[:-1]) / steps, 0, 1)
+            column = np.zeros((*slope.shape[:2], len(steps)))
+            column[begin:end] = slope[begin:end, :, axis, None] * walked[:, None]
+            flat = column.reshape(-1, len(steps))
+            by_stops = of_stops.whitened(stops.load.T @ flat)[0]
+            information, turn = np.linalg.eigh(flat.T @ flat - by_stops.T @ by_stops)
+            columns.append(flat @ turn[:, scale[axis] ** 2 * information > WALK_INFORMATION])
+            axes.append(np.tile(np.arange(2) == axis, (columns[-1].shape[1], 1)))
+    return Walks(np.concatenate(columns, axis=1), np.concatenate(axes))
 
 
 def creep(fit: JointFit, by_y: np.ndarray, errors: int, looks: LookNoise) -> Creep | None:
@@ -506,7 +519,8 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
     noise = free[scales]
     noise = noise[np.argsort(~np.isin(names[noise], names_of("look_scatter_deg")), kind="stable")]
     of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
-    stops, drifts, looks = stop_states(fit, linear), walks(fit), look_noise(fit)
+    stops, looks = stop_states(fit, linear), look_noise(fit)
+    drifts = walks(fit, stops)
     by_noise = STOP_COLUMNS.reshape(4, 1) == noise
     places = fit.arrays.gears.without_padding().places
     present = np.flatnonzero(places.valid)
@@ -543,13 +557,13 @@ def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
             ),
             prior=(wide.T * precision) @ wide,
             looks=looks,
-            creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, 2 * len(present) + len(drifts.walk), looks),
+            creep=creep(fit, (others == CREEP_COLUMNS[:, None]) @ wide, 2 * len(present) + len(drifts.axis), looks),
         ),
         residuals=misfit,
         bend=np.zeros((len(others), 0, 0)),
         place_angle_rad=(places.steps * ratio[places.on_tilt.astype(int)])[present],
         place_on_tilt=np.asarray(places.on_tilt)[present],
-        walk=drifts.walk,
+        drift_axis=drifts.axis,
         drift_scale=np.radians(np.asarray(fit.mode.physical)[DRIFT_COLUMNS]),
         drift_noise=(DRIFT_COLUMNS[:, None] == noise).astype(float),
         gear_scale=np.asarray(fit.mode.physical)[GEAR_SCALES],
