@@ -37,7 +37,7 @@ from tvsbayes.acquisition.replanning import (
 )
 from tvsbayes.acquisition.running_estimate import FIRST_LOOKS, GROWTH, EstimateOptions
 from tvsbayes.acquisition.simulated_instrument import Instrument
-from tvsbayes.cli.acquire_command import ahead_of, fitted, proposed
+from tvsbayes.cli.acquire_command import laplace_estimate, proposal_of, propose_looks
 from tvsbayes.errors import NotConverged
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.instrument.axes import DIRECTIONS
@@ -86,7 +86,7 @@ class Beside(Replanning):
         except NotConverged:
             return
         self._last.fit, self._last.sampled = found, proposed.confirmed
-        self.latest = self._read(ahead_of(proposed, looks))
+        self.latest = self._read(proposal_of(proposed, looks))
 
 
 def laplace_sds(found: JointFit) -> np.ndarray:
@@ -118,7 +118,7 @@ def adapted(seed: int, folder: Path) -> dict[str, object]:
     rig, plan, last = mounted_rig(), shipped_plan("grid"), Last()
     truth = Instrument(rig, seed).truth
     session.Replanning = partial(Beside, last=last)
-    wish, minutes = EstimateOptions(fitted, TARGET), AdaptOptions(partial(proposed, Path()), MINUTES)
+    wish, minutes = EstimateOptions(laplace_estimate, TARGET), AdaptOptions(partial(propose_looks, Path()), MINUTES)
     outcome = session.acquire(rig, plan, folder, simulate=True, seed=seed, estimate=wish, adapt=minutes)
     campaign, journal = read_campaign(folder), read_journal(folder)
     steps = adapted_plan(plan, journal.records)

@@ -99,7 +99,7 @@ def test_the_command_says_by_what_it_ended(tmp_path, monkeypatch, capsys):
     from tvsbayes.files.disk import shipped_data
     from tvsbayes.instrument.plan import write_plan
 
-    monkeypatch.setattr("tvsbayes.cli.acquire_command.proposed", partial(given_rig, "d2", 5, 1.0, True))
+    monkeypatch.setattr("tvsbayes.cli.acquire_command.propose_looks", partial(given_rig, "d2", 5, 1.0, True))
     write_plan(small_plan(4), tmp_path / "plan.csv")
     rig, plan = shipped_data() / "rigs" / "mounted" / "rig.toml", tmp_path / "plan.csv"
     words = ["acquire", rig, plan, tmp_path / "c", "--simulate", "--centroids", "--adapt", "--target-u", "8e-4"]

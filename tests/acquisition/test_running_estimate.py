@@ -125,11 +125,11 @@ def test_estimate_of_the_command_is_the_laplace_fit(monkeypatch):
     fits = {"paper twin": summary}
     monkeypatch.setattr("tvsbayes.estimators.joint_fit.fit", lambda campaign: campaign.title)
     monkeypatch.setattr("tvsbayes.assessment.summary.summarise", lambda fit: fits[fit])
-    found = acquire_command.fitted(campaign, 384)
+    found = acquire_command.laplace_estimate(campaign, 384)
     assert (found.looks, found.tier) == (384, "laplace")
     assert found.deg_per_step == {"left": summary.effective["left"].value}
     assert found.u_deg_per_step == {"left": summary.effective["left"].sd}
     astray = structs.replace(summary, problems=("astray",), answer=None, converged=False)
     monkeypatch.setattr("tvsbayes.assessment.summary.summarise", lambda fit: astray)
     with pytest.raises(NotConverged):
-        acquire_command.fitted(campaign, 384)
+        acquire_command.laplace_estimate(campaign, 384)

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from tvsbayes.cli.app import keep, tell_removed
+from tvsbayes.cli.app import keep, report_removed
 
 pytestmark = pytest.mark.usefixtures("own_compilation_cache")
 
@@ -21,10 +21,10 @@ def test_what_cannot_be_kept_costs_nobody_the_result(tmp_path, capsys):
 
 def test_what_makes_a_removed_file_again_is_what_there_is(capsys):
     """`calibrate` has no --dcc, and an axis no certificate."""
-    tell_removed(["report.pdf", "dcc.xml"], {"report": "r/report.html"})
+    report_removed(["report.pdf", "dcc.xml"], {"report": "r/report.html"})
     assert "removed: report.pdf, dcc.xml" in (told := capsys.readouterr().err)
     assert "`tvsbayes report --pdf` or `--dcc`" in told
-    tell_removed(["report.pdf"], {}, certificates=False)
+    report_removed(["report.pdf"], {}, certificates=False)
     assert "`tvsbayes report --pdf`" in (told := capsys.readouterr().err) and "--dcc" not in told
-    tell_removed(["report.pdf"], {"pdf": "r/report.pdf"})
+    report_removed(["report.pdf"], {"pdf": "r/report.pdf"})
     assert not capsys.readouterr().err

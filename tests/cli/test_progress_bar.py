@@ -14,7 +14,7 @@ import pytest
 from support.commands import MOUNTED
 from support.pseudo_terminal import needs_pseudo_terminals
 
-from tvsbayes.cli.progress_bar import chain_kept
+from tvsbayes.cli.progress_bar import chain_progress
 from tvsbayes.pipeline import FITTING, SAMPLING
 from tvsbayes.posterior.sampling import WALKING
 from tvsbayes.progress import Progress, time_left
@@ -137,7 +137,7 @@ def test_time_left_in_words(seconds, text):
 
 @pytest.mark.parametrize(("blocks", "said"), [(0, False), (1, False), (3, True)])
 def test_an_interrupted_fit_says_that_its_chain_is_kept_where_there_is_one(capsys, blocks, said):
-    with pytest.raises(KeyboardInterrupt), chain_kept("go on with --resume") as show:
+    with pytest.raises(KeyboardInterrupt), chain_progress("go on with --resume") as show:
         show(Progress(FITTING, 0.5, 1.0, None))
         for _ in range(blocks):
             show(Progress(f"{SAMPLING}: {WALKING}", 0.7, 2.0, None))

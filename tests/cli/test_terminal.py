@@ -10,7 +10,7 @@ import pytest
 
 from tvsbayes.cli.examples import EXAMPLES
 from tvsbayes.cli.main import COMMANDS, run
-from tvsbayes.cli.terminal import shown
+from tvsbayes.cli.terminal import styled
 
 
 class Terminal:
@@ -24,27 +24,27 @@ def test_files_pipes_and_whoever_forbids_it_get_plain_text(monkeypatch, tty, env
     monkeypatch.setenv("TERM", "xterm")
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    assert shown("error: no such file", Terminal(tty)) == "error: no such file"
+    assert styled("error: no such file", Terminal(tty)) == "error: no such file"
 
 
 def test_a_terminal_gets_sentences_folded_between_words_and_tables_as_they_are(monkeypatch):
     monkeypatch.setenv("NO_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "30")
     sentence, row = "one sentence of more words than fit", "a row of a table      1.25     2.50"
-    assert shown(f"{sentence}\n{row}", Terminal(True)) == f"one sentence of more words\n  than fit\n{row}"
-    assert shown(sentence, Terminal(False)) == sentence
+    assert styled(f"{sentence}\n{row}", Terminal(True)) == f"one sentence of more words\n  than fit\n{row}"
+    assert styled(sentence, Terminal(False)) == sentence
     monkeypatch.setenv("COLUMNS", "40")
     told = 'fault    port: no such port as this; write port = "..." there'
-    assert shown(told, Terminal(True)) == ('fault    port: no such port as this;\n         write port = "..." there'), (
-        "a sentence behind cells goes on below itself"
-    )
+    assert styled(told, Terminal(True)) == (
+        'fault    port: no such port as this;\n         write port = "..." there'
+    ), "a sentence behind cells goes on below itself"
 
 
 def test_a_terminal_gets_verdicts_in_colour_line_by_line(monkeypatch):
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
     plain, good, bad = "a table", "verdict: usable", "verdict: VALIDATION FAILED, multiply"
-    lines = shown(f"{plain}\n{good}\n{bad}", Terminal(True)).split("\n")
+    lines = styled(f"{plain}\n{good}\n{bad}", Terminal(True)).split("\n")
     assert lines[0] == plain
     assert lines[1] == f"\x1b[32m\x1b[1m{good}\x1b[0m" and lines[2] == f"\x1b[31m\x1b[1m{bad}\x1b[0m"
 
@@ -62,7 +62,7 @@ def test_verdicts_of_an_axis_and_of_a_watch_have_their_colours_too(monkeypatch, 
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "80")
-    assert shown(line, Terminal(True)) == f"\x1b[{colour}m\x1b[1m{line}\x1b[0m"
+    assert styled(line, Terminal(True)) == f"\x1b[{colour}m\x1b[1m{line}\x1b[0m"
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.__name__)

@@ -1,4 +1,4 @@
-"""acquire: a plan run at the bench or on its twin, looked at in a browser where somebody wants to."""
+"""acquire: runs a plan at the bench or on its twin, optionally with a page in a browser."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from tvsbayes.cli.app import (
     TARGET_MISSED,
     Ended,
     Json,
+    check_order,
     finish,
     finite,
-    in_order,
     refuse_options,
     report_line,
 )
@@ -107,13 +107,13 @@ def acquire(
         refuse_options("for --adapt", "add --adapt, or leave it out", minutes=minutes)
     if not live:
         refuse_options("for --live", "add --live, or leave it out", port=port, no_browser=no_browser)
-    in_order(rig, plan)
+    check_order(rig, plan)
     instrument = read_rig(rig)
     refuse_sightings(instrument.table.mechanism.sightings)
     steps = read_plan(plan)
     if dry_run:
-        unfit = {"live": live, "place_command": place_command}
-        refuse_options("for a run, and --dry-run makes none", "leave out one of them", **unfit)
+        run_options = {"live": live, "place_command": place_command}
+        refuse_options("for a run, and --dry-run makes none", "leave out one of them", **run_options)
         _rehearse(instrument, steps, as_json)
         return
     from tvsbayes.acquisition.bench import Vision
@@ -124,11 +124,11 @@ def acquire(
     from tvsbayes.acquisition.running_estimate import EstimateOptions
     from tvsbayes.acquisition.session import acquire as run_plan
 
-    placing = None if place_command is None else PlaceCommand.parsed(place_command, place_seconds)
+    placement = None if place_command is None else PlaceCommand.parsed(place_command, place_seconds)
     vision = Vision()
     if not centroids:
         vision = Vision(live_detector(instrument.stereo), twin_renderer(instrument, seed or 0) if simulate else None)
-    with LiveLine() as line, _live_page(port or 0 if live else None, no_browser) as watched:
+    with LiveLine() as line, _live_page(port or 0 if live else None, no_browser) as live_run:
         outcome = run_plan(
             instrument,
             steps,
@@ -138,18 +138,18 @@ def acquire(
             resume=resume,
             laser_class=laser_class,
             seed=seed or 0,
-            estimate=EstimateOptions(fitted, target_u, estimate),
-            adapt=AdaptOptions(partial(proposed, rig), minutes) if adapt else None,
+            estimate=EstimateOptions(laplace_estimate, target_u, estimate),
+            adapt=AdaptOptions(partial(propose_looks, rig), minutes) if adapt else None,
             vision=vision,
             terminal=Terminal(report_line, line.show, line.ask),
-            live=watched,
-            place_command=placing,
+            live=live_run,
+            place_command=placement,
         )
-    _end(outcome, out, target_u, as_json)
+    _finish_run(outcome, out, target_u, as_json)
 
 
-def fitted(folder: Path, looks: int) -> Estimate:
-    """The Laplace estimate of a campaign; called in a process beside the run.
+def laplace_estimate(folder: Path, looks: int) -> Estimate:
+    """The Laplace estimate of a campaign; called in a process parallel to the run.
 
     Raises:
         TvsError: no campaign, or a fit that must not be used.
@@ -165,12 +165,12 @@ def fitted(folder: Path, looks: int) -> Estimate:
     error = unusable(summary)
     if error is not None:
         raise error
-    moved = {direction: e for direction, e in summary.effective.items() if e is not None}
-    return Estimate(looks, {d: e.value for d, e in moved.items()}, {d: e.sd for d, e in moved.items()})
+    known = {direction: e for direction, e in summary.effective.items() if e is not None}
+    return Estimate(looks, {d: e.value for d, e in known.items()}, {d: e.sd for d, e in known.items()})
 
 
-def proposed(rig: Path, folder: Path, looks: int, target_u: float, count: int, confirm_below: float) -> Ahead:
-    """The looks that go on best from a campaign; called in a process beside the run.
+def propose_looks(rig: Path, folder: Path, looks: int, target_u: float, count: int, confirm_below: float) -> Ahead:
+    """The best next looks of a campaign; called in a process parallel to the run.
 
     Raises:
         TvsError: no campaign, or a fit that must not be used.
@@ -184,21 +184,21 @@ def proposed(rig: Path, folder: Path, looks: int, target_u: float, count: int, c
 
     compile_for(no_output)
     target = parse_target(f"u(worst) <= {target_u:g} deg/step")
-    ahead = next_looks(fit(read_campaign(folder)), read_rig(rig), target, count, confirm_below=confirm_below)
-    return ahead_of(ahead, looks)
+    looks_ahead = next_looks(fit(read_campaign(folder)), read_rig(rig), target, count, confirm_below=confirm_below)
+    return proposal_of(looks_ahead, looks)
 
 
-def ahead_of(chosen: NextLooks, looks: int) -> Ahead:
-    """What a run takes of the next looks after so many."""
+def proposal_of(chosen: NextLooks, looks: int) -> Ahead:
+    """Estimates and proposal of next looks for a run, after a number of looks."""
     from tvsbayes.acquisition.replanning import Ahead, Proposal
     from tvsbayes.acquisition.running_estimate import Estimate
 
     proposal = Proposal(chosen.steps, chosen.after_each, chosen.now, looks, chosen.why)
-    laplace, checked = Estimate(looks, chosen.deg_per_step, chosen.u_deg_per_step), chosen.confirmed
-    if checked is None:
+    laplace, sampled_check = Estimate(looks, chosen.deg_per_step, chosen.u_deg_per_step), chosen.confirmed
+    if sampled_check is None:
         return Ahead(laplace, proposal)
-    sampled = Estimate(looks, checked.deg_per_step, checked.u_deg_per_step, "importance")
-    return Ahead(laplace, proposal, sampled, checked.accepted)
+    sampled = Estimate(looks, sampled_check.deg_per_step, sampled_check.u_deg_per_step, "importance")
+    return Ahead(laplace, proposal, sampled, sampled_check.accepted)
 
 
 @contextmanager
@@ -215,7 +215,7 @@ def _live_page(port: int | None, no_browser: bool) -> Iterator[LiveRun | None]:
         if not no_browser:
             import webbrowser
 
-            # In a thread of its own: browsers of a terminal do not return before they are closed.
+            # In a separate thread: browsers of a terminal do not return before they are closed.
             threading.Thread(target=webbrowser.open, args=(page.link,), daemon=True).start()
 
     run = LiveRun(begun)
@@ -224,7 +224,7 @@ def _live_page(port: int | None, no_browser: bool) -> Iterator[LiveRun | None]:
 
 
 def _rehearse(rig: Rig, plan: Sequence[PlanStep], as_json: bool) -> None:
-    """What a run would do, step by step, and how long it would take."""
+    """Print the steps of a run and its duration."""
     from tvsbayes.acquisition.replanning import check_plan
     from tvsbayes.instrument.plan import outline, plan_seconds
 
@@ -234,22 +234,22 @@ def _rehearse(rig: Rig, plan: Sequence[PlanStep], as_json: bool) -> None:
     finish({"steps": lines, "minutes": minutes}, text, as_json)
 
 
-def _end(outcome: Outcome, out: Path, target_u: float | None, as_json: bool) -> None:
-    """What has become of a run, and the exit code that says so."""
+def _finish_run(outcome: Outcome, out: Path, target_u: float | None, as_json: bool) -> None:
+    """Print the outcome of a run; ends with its exit code."""
     text = f"{escaped(str(out), 200)}: {outcome.reason}, {outcome.ok} of {outcome.looks} looks count"
     if outcome.references:
         planned = outcome.looks - outcome.references
         text += f" ({planned} of the plan, {outcome.references} reference looks of resumed runs)"
     lines = [text]
     if outcome.estimate is not None:
-        way = {"importance": "the sampled posterior", "laplace": "the Laplace approximation"}[outcome.estimate.tier]
-        lines.append(f"deg/step by {way} of {outcome.estimate.looks} looks: {outcome.estimate.text}")
+        method = {"importance": "the sampled posterior", "laplace": "the Laplace approximation"}[outcome.estimate.tier]
+        lines.append(f"deg/step by {method} of {outcome.estimate.looks} looks: {outcome.estimate.text}")
     lines += [f"warning: {warning}" for warning in outcome.warnings]
     finish({"campaign": str(out), **outcome.as_json()}, "\n".join(lines), as_json)
     if outcome.reason in ("interrupted", "declined"):
         report_line(f"{outcome.reason}; go on with --resume")
         raise Ended(INTERRUPTED)
     if target_u is not None and outcome.reason != "target met":
-        ended = "the time is over" if outcome.reason == "time over" else "the plan is done"
-        report_line(f"{ended} and the target is not met: plan more with tvsbayes plan --given")
+        cause = "the time is over" if outcome.reason == "time over" else "the plan is done"
+        report_line(f"{cause} and the target is not met: plan more with tvsbayes plan --given")
         raise Ended(TARGET_MISSED)

@@ -1,4 +1,4 @@
-"""The command, and what all commands share: options, output as text or one JSON document, errors."""
+"""The command, and the common parts of all commands: options, output as text or one JSON document, errors."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Annotated, Any
 import typer
 
 from tvsbayes.cli.examples import FIRST, epilog
-from tvsbayes.cli.terminal import shown
+from tvsbayes.cli.terminal import styled
 from tvsbayes.errors import InputError, TvsError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, write_atomically
 
 INTERRUPTED = 130
 TARGET_MISSED = 1
-"""Done, but a limit or target that the user gave is not met."""
+"""Exit code of a complete command whose limit or target is not met."""
 app = typer.Typer(
     name="tvsbayes",
     help="What one motor step of a geared laser positioner does to the beam, and how sure that is.",
@@ -30,8 +30,8 @@ app = typer.Typer(
 )
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(requested: bool) -> None:
+    if requested:
         from importlib.metadata import version
 
         _print(f"tvsbayes {version('tvsbayes')}")
@@ -56,7 +56,7 @@ CampaignFolder = Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campai
 
 
 class Ended(Exception):
-    """Ends a command whose document is out with an exit code other than 0."""
+    """Ends a command with an exit code other than 0 after its document was printed."""
 
     def __init__(self, exit_code: int):
         super().__init__(exit_code)
@@ -64,51 +64,51 @@ class Ended(Exception):
 
 
 def report_line(text: str) -> None:
-    """A line for people, on stderr; text from files may hold control characters."""
+    """Print a line for people on stderr; control characters in text from files are replaced."""
     try:
-        typer.echo(shown("".join(c if c.isprintable() else "?" for c in text), sys.stderr), err=True)
+        typer.echo(styled("".join(c if c.isprintable() else "?" for c in text), sys.stderr), err=True)
     except OSError:
-        # Ctrl-C ends the `tee` behind us too: nobody is left to be informed, and the work goes on. What is still in the
+        # Ctrl-C also ends a `tee` that reads stderr: nobody reads it any more, and the work continues. The rest of the
         # stream's buffer must not fail again while Python ends.
         sys.stderr = open(os.devnull, "w", encoding="utf-8")
 
 
 class OutputFailed(Exception):
-    """Standard output took no more, as on a full disk."""
+    """Standard output accepts no more data, as on a full disk."""
 
 
 def _print(text: str) -> None:
     try:
-        typer.echo(shown(text, sys.stdout))
+        typer.echo(styled(text, sys.stdout))
     except OSError as error:
-        # What is still in its buffer must not fail again while Python ends.
+        # The rest of its buffer must not fail again while Python ends.
         sys.stdout = open(os.devnull, "w", encoding="utf-8")
         if isinstance(error, BrokenPipeError):
-            # Anyone who read has gone, like `head`; the work is done, and its exit code stands.
+            # The reader, such as `head`, has ended; the work is complete, and its exit code is kept.
             return
         raise OutputFailed(error.strerror or str(error)) from error
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """The one document on stdout; NaN is a bug, not a value."""
+    """Print the only document on stdout; NaN is an error in the program, no value."""
     _print(json.dumps(document, indent=1, allow_nan=False, ensure_ascii=True))
 
 
 def error_document(error: TvsError) -> dict[str, Any]:
-    """What `--json` prints of an error."""
+    """The JSON document of an error."""
     fields = {"code": error.code, "file": error.file, "line": error.line, "column": error.column}
     fields |= {"message": error.message, "found": error.found, "allowed": error.allowed, "remedy": error.remedy}
     return {"error": fields}
 
 
-def somebody_there() -> bool:
-    """Whether a question would be read by somebody; a closed standard input (`<&-`) is None."""
+def is_interactive() -> bool:
+    """Whether standard input is a terminal; a closed one (`<&-`) is None."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 
 def confirmed(lines: list[str], to: Path, yes: bool, as_json: bool) -> bool:
-    """Whether an import may be written; somebody who can answer is shown the `lines`, which are empty then."""
-    if yes or as_json or not somebody_there():
+    """Whether an import may be written; an interactive user is shown the `lines`, which are then cleared."""
+    if yes or as_json or not is_interactive():
         return yes
     typer.echo("\n".join(lines))
     lines.clear()
@@ -116,14 +116,14 @@ def confirmed(lines: list[str], to: Path, yes: bool, as_json: bool) -> bool:
 
 
 def report_error(error: TvsError) -> None:
-    """An error for people, with what to do where the message does not say it."""
+    """Print an error for people, with the remedy where the message does not contain it."""
     report_line(f"error: {error.message}")
     if error.remedy and error.remedy not in error.message:
         report_line(f"what to do: {error.remedy}")
 
 
 def finish(document: Mapping[str, Any], text: str, as_json: bool, error: TvsError | None = None) -> None:
-    """Print a result in the wanted form; one that must not be used carries its error and its exit code."""
+    """Print a result as text or JSON; a result that must not be used has an error, which sets the exit code."""
     if as_json:
         print_json(document if error is None else {**document, **error_document(error)})
     else:
@@ -134,27 +134,27 @@ def finish(document: Mapping[str, Any], text: str, as_json: bool, error: TvsErro
         raise Ended(error.exit_code)
 
 
-def tell_part(text: str, as_json: bool) -> None:
-    """A part of a longer command's text, as soon as it is known; under --json the document at the end has it."""
+def print_part(text: str, as_json: bool) -> None:
+    """Print a part of a longer command's text at once; with --json it is part of the document at the end."""
     if not as_json:
         _print(f"{text}\n")
 
 
-def tell_removed(names: Iterable[str], written: Mapping[str, str], *, certificates: bool = True) -> None:
-    """Say which files made of an earlier page are gone, but for those written anew; an axis has no certificates."""
-    gone = [name for name in names if name not in {Path(place).name for place in written.values()}]
-    if gone:
-        again = "`tvsbayes report --pdf`" + " or `--dcc`" * certificates
-        report_line(f"removed: {', '.join(gone)}, made of an earlier report; {again} makes them again")
+def report_removed(names: Iterable[str], written: Mapping[str, str], *, certificates: bool = True) -> None:
+    """Report the removed files of an earlier page, except those written again; an axis has no certificates."""
+    removed = [name for name in names if name not in {Path(place).name for place in written.values()}]
+    if removed:
+        command = "`tvsbayes report --pdf`" + " or `--dcc`" * certificates
+        report_line(f"removed: {', '.join(removed)}, made of an earlier report; {command} makes them again")
 
 
 def command_line(*words: object) -> str:
-    """A command to be typed, its words quoted where a shell needs it."""
+    """The text of a command, its words quoted where a shell needs it."""
     return "tvsbayes " + " ".join(typed(word, 400) for word in words)
 
 
 def keep(document: Mapping[str, Any], path: Path) -> bool:
-    """Write what a later report will show; a folder that cannot be written costs nobody the result."""
+    """Write a document for a later report; a folder that cannot be written gives only a warning."""
     try:
         make_folder(path.parent)
         write_atomically(path, json.dumps(document, indent=1, allow_nan=False).encode())
@@ -165,48 +165,48 @@ def keep(document: Mapping[str, Any], path: Path) -> bool:
 
 
 PARTS = ("campaign.toml", "stereo.json", "moves.csv", "spots.csv", "readings.csv", "log.jsonl")
-"""Of a campaign, of a scanner or an axis, and its journal."""
+"""Files of a campaign of a scanner or an axis, and its journal."""
 
 
 def is_part(path: Path) -> bool:
-    """Whether a file is one of those that make a campaign of the folder it lies in, or one of its pictures."""
-    pictured = path.parent.name == "frames"
-    folder = path.parent.parent if pictured else path.parent
-    return (pictured or path.name in PARTS) and path.is_file() and (folder / PARTS[0]).is_file()
+    """Whether a file is a part of a campaign in its folder, or one of its pictures."""
+    is_picture = path.parent.name == "frames"
+    folder = path.parent.parent if is_picture else path.parent
+    return (is_picture or path.name in PARTS) and path.is_file() and (folder / PARTS[0]).is_file()
 
 
 def refuse_options(reason: str, remedy: str, **given: object) -> None:
-    """Refuse options that this use of a command would ignore; given are those that are neither None nor False."""
-    named = ["--" + name.replace("_", "-") for name, value in given.items() if value is not None and value is not False]
-    if named:
-        raise InputError("usage", f"{' and '.join(named)} {'are' if len(named) > 1 else 'is'} {reason}", remedy=remedy)
+    """Refuse options that this use of a command would ignore; None and False are options not given."""
+    names = ["--" + name.replace("_", "-") for name, value in given.items() if value is not None and value is not False]
+    if names:
+        raise InputError("usage", f"{' and '.join(names)} {'are' if len(names) > 1 else 'is'} {reason}", remedy=remedy)
 
 
-def in_order(rig: Path, plan: Path) -> None:
-    """Refuse a rig file and a plan in each other's place."""
+def check_order(rig: Path, plan: Path) -> None:
+    """Refuse a rig file and a plan in swapped order."""
     if rig.suffix.lower() == ".csv" and plan.suffix.lower() == ".toml":
-        both = f"{escaped(str(plan), 200)} {escaped(str(rig), 200)}"
+        swapped = f"{escaped(str(plan), 200)} {escaped(str(rig), 200)}"
         message = "the plan stands where the rig file belongs: they are swapped"
-        raise InputError("usage", message, allowed="RIG PLAN", remedy=f"write {both}")
+        raise InputError("usage", message, allowed="RIG PLAN", remedy=f"write {swapped}")
 
 
-def spared(out: Path | None, *inputs: Path | None) -> None:
-    """Refuse an output before the work: without a folder, or in the place of what is read or of a campaign's data."""
+def check_output(out: Path | None, *inputs: Path | None) -> None:
+    """Refuse an output before the work: without a folder, or on a path that is an input or a part of a campaign."""
     if out is None:
         return
     name = escaped(str(out), 200)
     if not out.parent.is_dir():
         found, remedy = "no such folder", "make the folder, or name another place"
         raise refusal("write", file=name, found=found, allowed="a writable folder with free space", remedy=remedy)
-    read = out.is_file() and any(one is not None and one.is_file() and one.samefile(out) for one in inputs)
-    if read or is_part(out):
-        what = "a file that is read" if read else "data of the campaign in that folder"
-        message = f"-o {name} would replace {what}"
+    is_input = out.is_file() and any(path is not None and path.is_file() and path.samefile(out) for path in inputs)
+    if is_input or is_part(out):
+        replaced = "a file that is read" if is_input else "data of the campaign in that folder"
+        message = f"-o {name} would replace {replaced}"
         raise InputError("usage", message, found=name, allowed="another file", remedy="name another file")
 
 
 def finite(**values: float | None) -> None:
-    """Refuse NaN and infinity, which option parsing lets through."""
+    """Refuse NaN and infinity, which option parsing accepts."""
     for name, value in values.items():
         if value is not None and not math.isfinite(value):
             option = "--" + name.replace("_", "-")

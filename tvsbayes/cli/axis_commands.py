@@ -1,6 +1,6 @@
-"""What commands do with an axis folder: check, fit, calibrate, compare, report, plan, simulate, new.
+"""Commands for an axis folder: check, fit, calibrate, compare, report, plan, simulate, new.
 
-The commands themselves stand with their groups; `cli/instruments` sends them here by the folder.
+The modules of the commands contain their options; `cli/instruments` calls these functions for an axis folder.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import command_line, finish, keep, report_line, tell_part, tell_removed
+from tvsbayes.cli.app import command_line, finish, keep, print_part, report_line, report_removed
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, write_atomically
@@ -39,8 +39,8 @@ def new(out: Path, as_json: bool) -> None:
     finish({"campaign": str(out), "files": names}, text, as_json)
 
 
-def held(folder: Path) -> dict[str, Any]:
-    """What `check` says of an axis folder."""
+def contents(folder: Path) -> dict[str, Any]:
+    """The document of `check` for an axis folder."""
     from tvsbayes.single_axis.axis_campaign import read_axis
     from tvsbayes.single_axis.axis_doubts import axis_warnings
     from tvsbayes.single_axis.axis_rows import rows_of
@@ -73,7 +73,7 @@ def classic(folder: Path, as_json: bool) -> None:
 
 
 def _classic(data: AxisCampaign) -> tuple[dict[str, Any], str]:
-    """What `classic` says, as a document and as text."""
+    """The result of `classic`, as a document and as text."""
     from tvsbayes.report.axis_document import classic_text
     from tvsbayes.single_axis.axis_rows import rows_of
     from tvsbayes.single_axis.classic_line import classic_axis
@@ -98,16 +98,16 @@ def fit(
     from tvsbayes.single_axis.axis_campaign import read_axis
 
     place = out or output_place(folder, "results")
-    kept = _fitted(read_axis(folder), place, quick, no_sample, max_minutes, seed)
-    text = axis_fit_text(kept.summary, details, list(kept.files.values()))
-    if kept.error is None and out is None:
+    stored = _kept_fit(read_axis(folder), place, quick, no_sample, max_minutes, seed)
+    text = axis_fit_text(stored.summary, details, list(stored.files.values()))
+    if stored.error is None and out is None:
         text += f"\nnext: {command_line('report', folder)}"
-    finish(kept.as_json(seed), text, as_json, kept.error)
+    finish(stored.as_json(seed), text, as_json, stored.error)
 
 
 @dataclass(frozen=True)
-class Kept:
-    """A fit in its folder: what it says, its files by kind, and why it must not be used, None where it may."""
+class StoredFit:
+    """A fit in its folder: summary, files by kind, and the error of a fit that must not be used, else None."""
 
     summary: AxisSummary
     files: dict[str, str]
@@ -118,8 +118,8 @@ class Kept:
         return {**self.summary.as_json(), "seed": seed, "files": self.files}
 
 
-def _fitted(data: AxisCampaign, place: Path, quick: bool, no_sample: bool, max_minutes: float, seed: int) -> Kept:
-    """Fit an axis and keep the results in a folder; options as of `fit`."""
+def _kept_fit(data: AxisCampaign, to: Path, quick: bool, no_sample: bool, max_minutes: float, seed: int) -> StoredFit:
+    """Fit an axis and write the results into a folder; options as of `fit`."""
     from tvsbayes.single_axis.axis_fit import fit_axis
     from tvsbayes.single_axis.axis_record import keep_fit, summarise_axis, uninformed
 
@@ -133,7 +133,7 @@ def _fitted(data: AxisCampaign, place: Path, quick: bool, no_sample: bool, max_m
             progress=progress,
         )
     summary = summarise_axis(result)
-    return Kept(summary, keep_fit(result, summary, place), result.error or uninformed(summary))
+    return StoredFit(summary, keep_fit(result, summary, to), result.error or uninformed(summary))
 
 
 def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool, as_json: bool) -> None:
@@ -143,22 +143,22 @@ def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed:
     from tvsbayes.single_axis.axis_campaign import read_axis
 
     data = read_axis(folder)
-    documents: dict[str, Any] = {"check": held(folder)}
-    tell_part(check_text(documents["check"]), as_json)
+    documents: dict[str, Any] = {"check": contents(folder)}
+    print_part(check_text(documents["check"]), as_json)
     documents["classic"], text = _classic(data)
-    tell_part(text, as_json)
-    kept = _fitted(data, output_place(folder, "results"), quick, no_sample, MAX_MINUTES, seed)
-    documents["fit"] = kept.as_json(seed)
-    text = axis_fit_text(kept.summary, written=list(kept.files.values()))
-    if kept.error is not None:
-        finish({**documents, "report": None}, text, as_json, kept.error)
-    tell_part(text, as_json)
+    print_part(text, as_json)
+    stored = _kept_fit(data, output_place(folder, "results"), quick, no_sample, MAX_MINUTES, seed)
+    documents["fit"] = stored.as_json(seed)
+    text = axis_fit_text(stored.summary, written=list(stored.files.values()))
+    if stored.error is not None:
+        finish({**documents, "report": None}, text, as_json, stored.error)
+    print_part(text, as_json)
     page = documents["report"] = _page(data, folder, issue, pdf)
     finish(documents, f"next: open {', '.join(page['files'].values())} in a browser", as_json)
 
 
 def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_json: bool) -> None:
-    """Every position left out in turn, beside the classic."""
+    """Hold out each position in turn, for the fit and for the classic line."""
     if other is not None:
         message = "B is a later campaign of a scanner; axes are compared one by one"
         raise InputError("usage", message, remedy="leave out B")
@@ -190,7 +190,7 @@ def report(folder: Path, *, issue: Issue, pdf: bool, out: Path | None, as_json: 
 
 
 def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path | None = None) -> dict[str, Any]:
-    """Write the page of an axis, and print it where that is wanted: the document of `report --json`."""
+    """Write the page of an axis, and print it with `pdf`: the document of `report --json`."""
     from tvsbayes.report.axis_document import axis_document, curve_commands
     from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page
     from tvsbayes.single_axis.axis_record import results_for
@@ -200,10 +200,10 @@ def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path |
         find_browser()
     path = out or output_place(folder, "results") / "report.html"
     files = {"report": str(path)}
-    read = rows_of(data).command
+    commands = rows_of(data).command
     stages = {FITTING: 3.0, "drawing the page": 1.5, PRINTING: 3.0 if pdf else 0.0}
     with waiting() as progress, Job(stages, progress) as job:
-        shown = curve_commands(float(read.min()), float(read.max()))
+        shown = curve_commands(float(commands.min()), float(commands.max()))
         results = results_for(data, shown, job.part(FITTING), notify=report_line)
         job.begin("drawing the page")
         page = axis_document(results, issue)
@@ -211,14 +211,14 @@ def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path |
         if pdf:
             job.begin(PRINTING)
             files["pdf"] = str(print_to_pdf(path))
-    tell_removed(removed, files, certificates=False)
+    report_removed(removed, files, certificates=False)
     return {"criteria": [], "number": page.number, "files": files}
 
 
 def plan(
     folder: Path, *, alone: bool, target: str | None, minutes: float | None, out: Path | None, seed: int, as_json: bool
 ) -> None:
-    """What to read next; `alone` where the folder is the only thing named, by --given."""
+    """The next readings; `alone` where the folder is given alone, by --given."""
     if not alone:
         message, remedy = "an axis is planned from its folder alone", "give --given FOLDER without RIG"
         raise InputError("usage", message, remedy=remedy)
@@ -227,14 +227,14 @@ def plan(
     from tvsbayes.single_axis.axis_record import results_for
     from tvsbayes.single_axis.next_stops import TARGETS, plan_next, unit_of
 
-    wanted = target or TARGETS[0]
-    if wanted not in TARGETS:
-        message, allowed = f"--target {escaped(wanted)}: unknown for an axis", ", ".join(TARGETS)
+    goal = target or TARGETS[0]
+    if goal not in TARGETS:
+        message, allowed = f"--target {escaped(goal)}: unknown for an axis", ", ".join(TARGETS)
         raise InputError("target", message, column="--target", allowed=allowed, remedy=f"name one of {allowed}")
     data = read_axis(folder)
     with waiting() as progress, Job({FITTING: 1.0, PLANNING: 3.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
-        stops = plan_next(results.fit, wanted, minutes=minutes, progress=job.part(PLANNING))
+        stops = plan_next(results.fit, goal, minutes=minutes, progress=job.part(PLANNING))
     document, text = {**stops.as_json(), "unit": data.unit, "seed": seed}, axis_plan_text(stops, data.unit)
     document["u_unit"] = unit_of(stops.target, data.unit)
     if out is not None and stops.next:
@@ -249,17 +249,17 @@ def plan(
 
 
 def simulate(folder: Path, *, moves: Path | None, out: Path, seed: int, as_json: bool) -> None:
-    """A drawn axis with the priors of a folder, moved as listed."""
+    """A random axis from the priors of a folder, with the listed moves."""
     from tvsbayes.files.csv_table import CSV_BYTES_MAX
     from tvsbayes.files.disk import read_bytes
     from tvsbayes.single_axis.axis_campaign import parse_axis_moves, read_axis
     from tvsbayes.twin.simulated_axis import simulate_axis
 
     template = read_axis(folder)
-    listed = None if moves is None else parse_axis_moves(read_bytes(moves, CSV_BYTES_MAX), escaped(moves.name, 200))
-    drawn = simulate_axis(template, listed, seed)
-    drawn.write(out)
-    count, read = len(drawn.campaign.moves), len(drawn.campaign.readings)
+    axis_moves = None if moves is None else parse_axis_moves(read_bytes(moves, CSV_BYTES_MAX), escaped(moves.name, 200))
+    axis = simulate_axis(template, axis_moves, seed)
+    axis.write(out)
+    count, read = len(axis.campaign.moves), len(axis.campaign.readings)
     document = {"campaign": str(out), "moves": count, "readings": read, "ok": read, "seed": seed}
     text = f"{escaped(str(out), 200)}: {count} moves, {read} readings; the truth is in truth.json"
     finish(document, text, as_json)

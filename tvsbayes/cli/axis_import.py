@@ -1,4 +1,4 @@
-"""`import` of a table or log into an axis folder: moves and readings, after what was understood has been shown."""
+"""`import` of a table or log into an axis folder: moves and readings, written after the columns were shown."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tvsbayes.cli.app import confirmed, finish, refuse_options
-from tvsbayes.cli.understood_columns import CORRECT_IT, import_end, not_sure, table_document, table_lines
+from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, import_ending, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, write_atomically
 from tvsbayes.files.documents import toml_line
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
     from tvsbayes.single_axis.guide_log import GuideRun
 
 KINDS = ("csv", "phd2", "epics", "klipper")
-"""Of files of an axis: tables, guide logs, series that camonitor or Klipper logged."""
+"""Kinds of files of an axis: tables, guide logs, series logged by camonitor or Klipper."""
 NEEDED = ("command", "value")
 UNIT = "deg"
-"""Of readings in the template, where no column names one."""
+"""Unit of readings in the template, where no column states one."""
 
 
 @dataclass(frozen=True)
-class AxisNotation:
-    """How a file of an axis is meant, as the options say.
+class FileOptions:
+    """Options for the meaning of a file of an axis.
 
     Attributes:
         kind: "auto" or one of `KINDS`.
         run: number of a run of a guide log.
         deviations: whether readings are actual less commanded position.
-        counts_per_turn: where readings begin anew.
+        counts_per_turn: counts after which readings restart.
         assume: numbers that a guide log does not state, by name.
     """
 
@@ -45,8 +45,8 @@ class AxisNotation:
 
 
 @dataclass(frozen=True)
-class _Understood:
-    """A file, understood: lines that say what, the same for programs, and what comes of it."""
+class _ReadFile:
+    """The contents of a file: lines for people, a document for programs, readings and their unit."""
 
     lines: list[str]
     document: dict[str, Any]
@@ -55,9 +55,9 @@ class _Understood:
 
 
 def import_readings(
-    file: Path, to: Path, stated: Mapping[str, str], sheet: str | None, wish: AxisNotation, *, yes: bool, as_json: bool
+    file: Path, to: Path, stated: Mapping[str, str], sheet: str | None, wish: FileOptions, *, yes: bool, as_json: bool
 ) -> None:
-    """A table or log of an axis into its folder, new or still with the tables of the template."""
+    """Import a table or log of an axis into a folder that is new or has only the tables of the template."""
     from tvsbayes.files.csv_table import CSV_BYTES_MAX
     from tvsbayes.files.disk import read_bytes
     from tvsbayes.files.foreign_table import read_foreign, text_of
@@ -69,15 +69,15 @@ def import_readings(
     text = "" if packed else data.decode("utf-8-sig", errors="replace")
     kind = wish.kind
     if kind == "auto":
-        known = {"phd2": is_guide_log(text), "epics": is_camonitor(text), "klipper": is_klipper(data)}
-        kind = next((kind for kind, fits in known.items() if fits), "csv")
-    _refuse_unfit(kind, wish, stated, sheet)
+        recognised = {"phd2": is_guide_log(text), "epics": is_camonitor(text), "klipper": is_klipper(data)}
+        kind = next((kind for kind, matches in recognised.items() if matches), "csv")
+    _check_options(kind, wish, stated, sheet)
     if kind == "phd2":
         runs = read_runs(text_of(data, name)[0], name)
         if wish.run is None and len(runs) > 1:
             _list_runs(file, to, runs, yes=yes, as_json=as_json)
             return
-        understood = _run_understood(runs, file, wish)
+        contents = _read_run(runs, file, wish)
     else:
         if kind == "epics":
             table = camonitor_table(text_of(data, name)[0], name, stated)
@@ -86,48 +86,48 @@ def import_readings(
             table = klipper_table(data, name)
         else:
             table = read_foreign(file, sheet)
-        understood = _table_understood(table, stated, wish, to)
+        contents = _read_table(table, stated, wish, to)
     _refuse_filled(to)
-    _finish_import(understood, to, yes=yes, as_json=as_json)
+    _finish_import(contents, to, yes=yes, as_json=as_json)
 
 
-def _finish_import(understood: _Understood, to: Path, *, yes: bool, as_json: bool) -> None:
-    """Show what was understood, write it if that is wanted, and say what is next."""
-    table, named = understood.readings, understood.unit
-    unit_line = _unit_line(to, named)
+def _finish_import(contents: _ReadFile, to: Path, *, yes: bool, as_json: bool) -> None:
+    """Show the contents of a file, write them if confirmed, and print the next command."""
+    table, unit = contents.readings, contents.unit
+    unit_line = _unit_line(to, unit)
     assumed = [*table.assumed, unit_line, *_drive_lines(table)]
-    lines = [*understood.lines, *table.notes, *(f"assumed: {text}" for text in assumed)]
+    lines = [*contents.lines, *table.notes, *(f"assumed: {text}" for text in assumed)]
     ok = sum(reading.status == "ok" for reading in table.readings)
     lines.append(f"gives: {len(table.moves)} moves, {len(table.readings)} readings{_minutes(table)}")
-    written = _write(to, table, named) if confirmed(lines, to, yes, as_json) else []
-    document = {**understood.document, "notes": list(table.notes), "assumed": assumed, "moves": len(table.moves)}
-    following = f"tvsbayes calibrate {typed(to)}" if written else None
-    document |= {"readings": len(table.readings), "ok": ok, "campaign": str(to), "files": written, "next": following}
-    lines.append(import_end(written, f"`{following}`", CORRECT_IT))
+    written = _write(to, table, unit) if confirmed(lines, to, yes, as_json) else []
+    document = {**contents.document, "notes": list(table.notes), "assumed": assumed, "moves": len(table.moves)}
+    next_command = f"tvsbayes calibrate {typed(to)}" if written else None
+    document |= {"readings": len(table.readings), "ok": ok, "campaign": str(to), "files": written, "next": next_command}
+    lines.append(import_ending(written, f"`{next_command}`", CORRECT_HINT))
     finish(document, "\n".join(lines), as_json)
 
 
 def _minutes(readings: ForeignReadings) -> str:
-    """How long a log lasts."""
+    """The duration of a log, as text."""
     times = [reading.time_s for reading in readings.readings if reading.time_s is not None]
     return f" over {(times[-1] - times[0]) / 60:.1f} minutes" if times else ""
 
 
-def _refuse_unfit(kind: str, wish: AxisNotation, stated: Mapping[str, str], sheet: str | None) -> None:
+def _check_options(kind: str, opts: FileOptions, stated: Mapping[str, str], sheet: str | None) -> None:
     """Refuse options that a file of this kind would ignore."""
     log = kind == "phd2"
-    unfit: dict[str, object] = {"run": None if log else wish.run, "assume": None if log else wish.assume or None}
+    refused: dict[str, object] = {"run": None if log else opts.run, "assume": None if log else opts.assume or None}
     if log:
-        unfit |= {"column": stated or None, "deviations": wish.deviations, "counts_per_turn": wish.counts_per_turn}
-    unfit |= {"sheet": None if kind == "csv" else sheet}
-    refuse_options(f"of another kind of file: this one is read as {kind}", "leave it out, or name --format", **unfit)
+        refused |= {"column": stated or None, "deviations": opts.deviations, "counts_per_turn": opts.counts_per_turn}
+    refused |= {"sheet": None if kind == "csv" else sheet}
+    refuse_options(f"of another kind of file: this one is read as {kind}", "leave it out, or name --format", **refused)
 
 
 def _list_runs(file: Path, to: Path, runs: Sequence[GuideRun], *, yes: bool, as_json: bool) -> None:
-    """The runs of a log, of which an import takes one.
+    """Print the runs of a log, one of which can be imported.
 
     Raises:
-        InputError: one was to be written, and nobody said which.
+        InputError: --yes without the number of a run.
     """
     from tvsbayes.report.tables import TableView
     from tvsbayes.single_axis.guide_log import run_rows
@@ -146,29 +146,29 @@ def _list_runs(file: Path, to: Path, runs: Sequence[GuideRun], *, yes: bool, as_
     finish({**document, "next": command}, text, as_json)
 
 
-def _run_understood(runs: Sequence[GuideRun], file: Path, wish: AxisNotation) -> _Understood:
+def _read_run(runs: Sequence[GuideRun], file: Path, options: FileOptions) -> _ReadFile:
     """One run of a guide log."""
     from tvsbayes.single_axis.guide_log import readings_of_run, run_rows
 
-    number = 1 if wish.run is None else wish.run
+    number = 1 if options.run is None else options.run
     if not 1 <= number <= len(runs):
         message = f"--run {number}: {escaped(file.name)} holds {len(runs)} runs; allowed: 1 to {len(runs)}"
         remedy = "leave --run and --yes out for the list"
         raise InputError("usage", message, allowed=f"1 to {len(runs)}", remedy=remedy)
     run = runs[number - 1]
-    readings = readings_of_run(run, escaped(file.name), wish.assume)
+    readings = readings_of_run(run, escaped(file.name), options.assume)
     (row,) = run_rows([run])
     lines = [f"{escaped(file.name)}: guide log of PHD2, run {number} of {len(runs)}, {escaped(run.mount)}"]
     lines.append(f"begins {escaped(run.begins)}, {run.minutes:.1f} minutes")
     document = {"file": escaped(file.name), "kind": "phd2", "run": row, "rows": len(run.frames) + len(run.dropped)}
-    return _Understood(lines, document, readings, readings.unit)
+    return _ReadFile(lines, document, readings, readings.unit)
 
 
-def _table_understood(table: ForeignTable, stated: Mapping[str, str], wish: AxisNotation, to: Path) -> _Understood:
-    """A table, its columns as they were understood, and what the cells tell besides.
+def _read_table(table: ForeignTable, stated: Mapping[str, str], options: FileOptions, to: Path) -> _ReadFile:
+    """The contents of a table, by the names of its columns and by its cells.
 
     Raises:
-        InputError: columns or cells that do not say enough, or what they must not.
+        InputError: missing or ambiguous columns, or cells that are not valid.
     """
     from tvsbayes.files.csv_table import NUMBER
     from tvsbayes.instrument.column_names import READING_UNITS, SECONDS, unit_of_name
@@ -182,33 +182,33 @@ def _table_understood(table: ForeignTable, stated: Mapping[str, str], wish: Axis
     missing = [field for field in NEEDED if field not in known.columns]
     if missing or known.ambiguous:
         besides = "; or is a column actual less commanded position: --column value=NAME --deviations"
-        wanted = [*missing, *(f for f in known.ambiguous if f not in missing)]
-        raise not_sure(table, known, wanted, AXIS_FIELDS, NEEDED, besides * ("value" in missing))
-    if not wish.deviations and "value" not in stated:
+        fields = [*missing, *(f for f in known.ambiguous if f not in missing)]
+        raise column_refusal(table, known, fields, AXIS_FIELDS, NEEDED, besides * ("value" in missing))
+    if not options.deviations and "value" not in stated:
         refuse_small(table, known.columns)
-    apart = {} if wish.deviations else deviation_columns(table, known.columns)
-    for name, text in apart.items():
+    deviations = {} if options.deviations else deviation_columns(table, known.columns)
+    for name, text in deviations.items():
         remarks.append(f"column {escaped(name)} is {text} in every row: a deviation, no uncertainty; set aside")
-    kept = {field: name for field, name in known.columns.items() if name not in apart or field in stated}
-    known = replace(known, columns=kept, unused=tuple(dict.fromkeys((*known.unused, *apart))))
-    readings = readings_of(table, known.columns, wish.deviations)
+    columns = {field: name for field, name in known.columns.items() if name not in deviations or field in stated}
+    known = replace(known, columns=columns, unused=tuple(dict.fromkeys((*known.unused, *deviations))))
+    readings = readings_of(table, known.columns, options.deviations)
     unit = readings.unit or unit_of_name(known.columns["value"], READING_UNITS)
     cells = [cell for cell in table.columns[known.columns["value"]] if cell]
     numbers = [float(cell) for cell in cells if NUMBER.fullmatch(cell)]
     if unit is None and numbers and all(n.is_integer() for n in numbers) and max(numbers) - min(numbers) > 360:
         unit = "counts"
         remarks.append("unit: whole numbers over more than 360, so counts; `unit` in campaign.toml says another")
-    readings = unwrapped(readings, unit_of_folder(to) or unit or UNIT, wish.counts_per_turn)
+    readings = unwrapped(readings, unit_of_folder(to) or unit or UNIT, options.counts_per_turn)
     readings = replace(readings, assumed=(*remarks, *readings.assumed))
 
     def unit_shown(field: str, name: str) -> str:
         return unit_of_name(name, SECONDS) or "s" if field == "time_s" else ""
 
-    return _Understood(table_lines(table, known, AXIS_FIELDS, unit_shown), table_document(table, known), readings, unit)
+    return _ReadFile(table_lines(table, known, AXIS_FIELDS, unit_shown), table_document(table, known), readings, unit)
 
 
 def _drive_lines(readings: ForeignReadings) -> list[str]:
-    """What campaign.toml gets of a drive at constant rate."""
+    """Entries of campaign.toml for a drive at constant rate, as lines."""
     drive = readings.drive
     if drive is None:
         return []
@@ -222,17 +222,17 @@ def _drive_lines(readings: ForeignReadings) -> list[str]:
     return lines
 
 
-def _unit_line(to: Path, named: str | None) -> str:
-    """Which unit results will have: a reading in mm must not be reported in degrees."""
-    kept = (to / "campaign.toml").is_file()
-    if named and not kept:
-        return f"unit: {named}, as the file says; it goes into campaign.toml"
-    says = f"; the column says {named}" if named else ""
-    return f"unit: of readings as campaign.toml says{'' if kept else f', {UNIT} until you change it'}{says}"
+def _unit_line(to: Path, unit: str | None) -> str:
+    """The unit of the results, as a line: a reading in mm must not be reported in degrees."""
+    has_header = (to / "campaign.toml").is_file()
+    if unit and not has_header:
+        return f"unit: {unit}, as the file says; it goes into campaign.toml"
+    note = f"; the column says {unit}" if unit else ""
+    return f"unit: of readings as campaign.toml says{'' if has_header else f', {UNIT} until you change it'}{note}"
 
 
 def _refuse_filled(to: Path) -> None:
-    """Nothing is overwritten: a table goes only where none is."""
+    """Refuse a folder with tables that have rows: nothing is overwritten."""
     from tvsbayes.single_axis.axis_campaign import axis_templates
 
     if not (to / "campaign.toml").is_file():
@@ -240,14 +240,14 @@ def _refuse_filled(to: Path) -> None:
             make_folder(to, empty=True)
         return
     for name, template in axis_templates().items():
-        place = to / name
-        if name.endswith(".csv") and place.is_file() and place.read_bytes() != template:
+        path = to / name
+        if name.endswith(".csv") and path.is_file() and path.read_bytes() != template:
             allowed, remedy = "no rows yet", "name another folder with --to; nothing is overwritten"
-            raise refusal("occupied", file=escaped(str(place), 200), found="rows", allowed=allowed, remedy=remedy)
+            raise refusal("occupied", file=escaped(str(path), 200), found="rows", allowed=allowed, remedy=remedy)
 
 
 def _write(to: Path, rows: ForeignReadings, unit: str | None) -> list[str]:
-    """The tables, in a folder with the explained campaign.toml, which comes last; `unit` as the column says."""
+    """Write the tables and last the commented campaign.toml; `unit` is that of the column."""
     from tvsbayes.single_axis.axis_campaign import axis_moves_bytes, axis_templates, readings_bytes
 
     contents = {"moves.csv": axis_moves_bytes(rows.moves), "readings.csv": readings_bytes(rows.readings)}
@@ -263,10 +263,10 @@ def _write(to: Path, rows: ForeignReadings, unit: str | None) -> list[str]:
 
 
 def _with_drive(template: bytes, drive: LoggedDrive) -> bytes:
-    """The explained campaign.toml of a drive at constant rate."""
+    """The commented campaign.toml of a drive at constant rate."""
     header = "\n".join(toml_line(key, value) for key, value in {"rate": drive.rate, **drive.header}.items())
-    given = {name: {"value": value, "u": u} for name, (value, u) in drive.priors.items()}
-    axis = [toml_line(name, entry) for name, entry in given.items()]
+    priors = {name: {"value": value, "u": u} for name, (value, u) in drive.priors.items()}
+    axis = [toml_line(name, entry) for name, entry in priors.items()]
     if drive.period_between is not None:
         axis += [toml_line("periods_in", "seconds"), toml_line("period_between", list(drive.period_between))]
     text = template.decode().replace('\nname = "my axis"\n', f"\n{header}\n")

@@ -1,4 +1,4 @@
-"""Commands that begin a campaign with what somebody has: new.
+"""The command that creates a campaign: new.
 
 Options in, library called, table or JSON out; heavy imports stand inside the commands.
 """
@@ -14,7 +14,7 @@ import typer
 from tvsbayes.cli.app import Json, finish, refuse_options
 from tvsbayes.cli.instruments import INSTRUMENTS
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.cli.understood_columns import few
+from tvsbayes.cli.understood_columns import first_names
 from tvsbayes.errors import InputError, escaped, listed, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, csv_bytes
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 COPYING = "copying pictures"
 NAMES_LISTED = 6
-"""Of files and numbers that could not be paired, in a line."""
+"""Largest number of unpaired files or numbers in a line."""
 
 
 def new(
@@ -54,15 +54,15 @@ def new(
     if mechanism not in WORDS:
         found, allowed = f"--mechanism {escaped(mechanism)}", ", ".join(WORDS)
         raise InputError("usage", f"{found}; allowed: {allowed}", allowed=allowed, remedy="name one of them")
-    head = mechanism != WORDS[0]
-    if sightings and not head:
+    is_head = mechanism != WORDS[0]
+    if sightings and not is_head:
         raise InputError("usage", "--sightings are those of a head", remedy="add --mechanism pan-tilt")
     if axis:
         INSTRUMENTS["axis"].carry_out(
-            "new", out, pictures=pictures, mechanism=head, sightings=sightings, as_json=as_json
+            "new", out, pictures=pictures, mechanism=is_head, sightings=sightings, as_json=as_json
         )
         return
-    if head:
+    if is_head:
         refuse_options("for a scanner", "leave it out, and copy what `tvsbayes new` makes", pictures=pictures)
         _new_head(out, sightings, as_json)
         return
@@ -87,8 +87,8 @@ def _new_head(out: Path, sightings: bool, as_json: bool) -> None:
     for name, data in files.items():
         write_atomically(out / name, data)
     text = f"{escaped(str(out), 200)}: {', '.join(files)}\n"
-    wanted = "moves and sightings" if sightings else "put stereo.json beside them, log moves and spots"
-    text += f"next: {f'log {wanted}' if sightings else wanted}, then `tvsbayes check` this folder"
+    tables = "moves and sightings" if sightings else "put stereo.json beside them, log moves and spots"
+    text += f"next: {f'log {tables}' if sightings else tables}, then `tvsbayes check` this folder"
     finish({"campaign": str(out), "files": list(files)}, text, as_json)
 
 
@@ -103,67 +103,67 @@ def write_templates(out: Path) -> list[str]:
 
 
 def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_json: bool) -> None:
-    """Looks and frames of a folder of pictures, in a new campaign or in one that waits for them."""
+    """Looks and frames of a folder of pictures, for a new campaign or for one without pictures."""
     from tvsbayes.cameras.look_pictures import copy_frames, pair_looks, views_of
     from tvsbayes.instrument.campaign import spots_bytes
 
     if pair is not None and pair not in ("number", "order"):
         found, remedy = f"--pair {escaped(pair)}", "write --pair number or --pair order, or leave it out"
         raise InputError("usage", f"{found}; allowed: number, order", allowed="number, order", remedy=remedy)
-    listed_in = moves_file(out, folder)
+    moves_path = moves_file(out, folder)
     rows = _rows_of(out)
     views = views_of(folder, swap=swap)
-    moves = _moves_of(listed_in)
-    numbers = None if listed_in is None else range(len(moves))
+    moves = _moves_of(moves_path)
+    numbers = None if moves_path is None else range(len(moves))
     paired = pair_looks(views.views, numbers, rows, pair)  # type: ignore[arg-type]
     _refuse_other_size(out, views)
     if not (out / "campaign.toml").is_file():
         make_folder(out, empty=True)
         write_templates(out)
-    if listed_in is None:
-        write_atomically(out / "moves.csv", _moves_to_fill_in(1 + max(spot.move for spot in paired.spots)))
-    elif listed_in.parent != out:
-        write_atomically(out / "moves.csv", read_bytes(listed_in, CSV_BYTES_MAX))
+    if moves_path is None:
+        write_atomically(out / "moves.csv", _blank_moves(1 + max(spot.move for spot in paired.spots)))
+    elif moves_path.parent != out:
+        write_atomically(out / "moves.csv", read_bytes(moves_path, CSV_BYTES_MAX))
     with waiting() as progress, Job({COPYING: 1.0}, progress) as job:
         job.begin(COPYING)
         copied = copy_frames(paired.pictures, out, job.at)
-    # Last: a folder whose looks are listed has all their pictures.
+    # Written last: a folder with listed looks has all their pictures.
     write_atomically(out / "spots.csv", spots_bytes(paired.spots))
     lines = _unpaired_lines(views, paired, "spots" if rows else "moves")
-    text = _paired_text(out, paired, copied, "pan_steps and tilt_steps" if listed_in is None else None, moves)
+    text = _paired_text(out, paired, copied, "pan_steps and tilt_steps" if moves_path is None else None, moves)
     if not rows and paired.matching == "number" and paired.renumbered is None and 0 in paired.without:
         text += (
             "\nthe numbers in the names are those of moves, which count from 0: where yours count from 1, every look "
             "is now at the move behind its own, and `tvsbayes check` says so once the spots are detected"
         )
     document: dict[str, Any] = {"campaign": str(out), "looks": len(paired.pictures), "pictures": copied}
-    document |= {"paired_by": paired.matching, "warnings": lines, "moves_to_fill_in": listed_in is None}
+    document |= {"paired_by": paired.matching, "warnings": lines, "moves_to_fill_in": moves_path is None}
     finish(document, "\n".join([text, *(f"not paired: {line}" for line in lines)]), as_json)
 
 
 def moves_file(out: Path, folder: Path) -> Path | None:
-    """Where the moves of the pictures are listed: in the campaign, beside the pictures, or not yet."""
+    """The file with the moves of the pictures: in the campaign or beside the pictures; None without one."""
     from tvsbayes.instrument.campaign import campaign_templates
 
-    target, beside = out / "moves.csv", folder / "moves.csv"
+    target, nearby = out / "moves.csv", folder / "moves.csv"
     if target.is_file() and read_bytes(target, CSV_BYTES_MAX) != campaign_templates()["moves.csv"]:
         return target
-    return beside if beside.is_file() else None
+    return nearby if nearby.is_file() else None
 
 
 def _moves_of(file: Path | None) -> tuple[Move | None, ...]:
-    """The moves of a file, checked; a None for each of those of a file to fill in, which are counted, not read."""
+    """The checked moves of a file; a None for each row of a file to fill in, which is only counted."""
     from tvsbayes.instrument.campaign import parse_moves
 
     if file is None:
         return ()
     data = read_bytes(file, CSV_BYTES_MAX)
     rows = len(data.splitlines()) - 1
-    return (None,) * rows if data == _moves_to_fill_in(rows) else parse_moves(data, str(file))
+    return (None,) * rows if data == _blank_moves(rows) else parse_moves(data, str(file))
 
 
-def _moves_to_fill_in(count: int) -> bytes:
-    """A `moves.csv` whose counters are left to its owner."""
+def _blank_moves(count: int) -> bytes:
+    """A `moves.csv` with empty counters for the user to fill in."""
     from tvsbayes.instrument.campaign import MOVES
 
     rows = ((k, 0, float(k), None, None, *(("unknown",) * 2 if k == 0 else ("", ""))) for k in range(count))
@@ -171,51 +171,51 @@ def _moves_to_fill_in(count: int) -> bytes:
 
 
 def _rows_of(out: Path) -> tuple[Spot, ...]:
-    """The looks that a campaign lists already; none of a folder that is not there."""
+    """The looks that a campaign lists; none for a missing folder."""
     from tvsbayes.instrument.campaign import read_campaign
 
-    return read_campaign(out).spots if rows_listed(out) else ()
+    return read_campaign(out).spots if has_rows(out) else ()
 
 
-def rows_listed(out: Path) -> bool:
+def has_rows(out: Path) -> bool:
     """Whether spots.csv has rows below its header."""
     spots = out / "spots.csv"
     return spots.is_file() and len(read_bytes(spots, CSV_BYTES_MAX).splitlines()) > 1
 
 
 def _refuse_other_size(out: Path, views: ViewedFolder) -> None:
-    """Pictures of another size than those of the calibration beside them give no usable centre."""
+    """Refuse pictures of another size than that of the calibration: they give no usable centre."""
     from tvsbayes.instrument.stereo_pair import read_stereo
 
     if not (out / "stereo.json").is_file():
         return
-    wanted = read_stereo(out / "stereo.json").image_sizes
-    if views.image_sizes != wanted:
-        found, allowed = f"pictures of {_sizes_px(views.image_sizes)}", f"{_sizes_px(wanted)} as in stereo.json"
+    calibrated = read_stereo(out / "stereo.json").image_sizes
+    if views.image_sizes != calibrated:
+        found, allowed = f"pictures of {_sizes_px(views.image_sizes)}", f"{_sizes_px(calibrated)} as in stereo.json"
         place, remedy = escaped(str(out / "stereo.json"), 200), "calibrate and observe at one image size"
         raise refusal("image-size", file=place, found=found, allowed=allowed, remedy=remedy)
 
 
 def _sizes_px(sizes: Mapping[str, tuple[int, int]]) -> str:
-    """Sizes of pictures in words, once where both cameras have one."""
+    """Sizes of pictures in words; one where both cameras have the same."""
     return " and ".join(f"{width} x {height} px" for width, height in dict.fromkeys(sizes.values()))
 
 
 def _paired_text(
     out: Path, pairs: PairedLooks, copied: int, to_fill_in: str | None, moves: Sequence[Move | None]
 ) -> str:
-    """How many pictures went where, by what rule, and what to do next."""
+    """Counts of pictures and looks, the rule of pairing, and the next step."""
     place = escaped(str(out), 200)
     first = next(iter(pairs.pictures.items()), None)
-    how = "the number in the name" if pairs.matching == "number" else "the order of the names"
-    lines = [f"{place}: {copied} pictures in frames/, {len(pairs.pictures)} looks in spots.csv, paired by {how}"]
+    method = "the number in the name" if pairs.matching == "number" else "the order of the names"
+    lines = [f"{place}: {copied} pictures in frames/, {len(pairs.pictures)} looks in spots.csv, paired by {method}"]
     if first is not None:
         left, right = (escaped(picture.path.name) for picture in first[1].pictures)
         move = next(spot.move for spot in pairs.spots if spot.spot == first[0])
-        both = left if left == right else f"{left} and {right}"
-        reached = moves[move] if move < len(moves) else None
-        at = "" if reached is None else f" at pan {reached.pan_steps}, tilt {reached.tilt_steps} steps"
-        lines.append(f"for example {both}: spot {first[0]}, seen after move {move}{at}")
+        names = left if left == right else f"{left} and {right}"
+        arrival = moves[move] if move < len(moves) else None
+        position = "" if arrival is None else f" at pan {arrival.pan_steps}, tilt {arrival.tilt_steps} steps"
+        lines.append(f"for example {names}: spot {first[0]}, seen after move {move}{position}")
     if to_fill_in is not None:
         rows = 1 + max(spot.move for spot in pairs.spots)
         lines.append(f"fill in moves.csv: {to_fill_in} of all {rows} rows, absolute counters AFTER the move")
@@ -234,7 +234,7 @@ def _paired_text(
 
 
 def _unpaired_lines(views: ViewedFolder, pairs: PairedLooks, rows: str) -> list[str]:
-    """What could not be paired, a line for each kind."""
+    """Unpaired files and rows, a line for each kind."""
     files = {
         "without the picture of the other camera": views.unpaired,
         "their names tell no camera": views.unnamed,
@@ -242,7 +242,7 @@ def _unpaired_lines(views: ViewedFolder, pairs: PairedLooks, rows: str) -> list[
         "of a kind that is not read; save them as PNG of 8 bits": views.unread,
         "a second pair for its row": pairs.left_over,
     }
-    lines = [f"{few(names)}: {why}" for why, names in files.items() if names]
+    lines = [f"{first_names(names)}: {reason}" for reason, names in files.items() if names]
     if pairs.without:
         lines.append(f"{rows} {listed(pairs.without, NAMES_LISTED)}: no pictures, which they need not have")
     return lines

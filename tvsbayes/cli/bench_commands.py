@@ -98,9 +98,9 @@ def stereo(
         *((export, ("opencv", "ros")), (finder, ("classic", "sector"))),
         (pair, ("name", "order")),
     )
-    if odd := [escaped(str(value)) for value, allowed in words if value not in (None, *allowed)]:
+    if invalid := [escaped(str(value)) for value, allowed in words if value not in (None, *allowed)]:
         remedy = "--export opencv or ros, --finder classic or sector, --pair name or order"
-        raise InputError("usage", f"{', '.join(odd)}: no option of stereo takes this value", remedy=remedy)
+        raise InputError("usage", f"{', '.join(invalid)}: no option of stereo takes this value", remedy=remedy)
     if (folder is None) == (not imports):
         message = "stereo needs pictures of a board, or a calibration to import"
         message = message if folder is None else "stereo takes pictures or a calibration to import, not both"
@@ -109,16 +109,16 @@ def stereo(
     uncertainties |= {"u_rotation_mrad": u_rotation_mrad, "u_baseline_mm": u_baseline_mm}
     finite(pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, marker_mm=marker_mm, rms_px=rms_px, **uncertainties)
     made_by = {"rms_px": rms_px, "views": views, "fixed_intrinsics": fixed_intrinsics, **uncertainties}
-    form: Format | None = None if export is None else "ros" if export == "ros" else "opencv"
-    places = _new_files(out, form)
+    export_format: Format | None = None if export is None else "ros" if export == "ros" else "opencv"
+    places = _output_paths(out, export_format)
     if folder is None:
         options: dict[str, object] = {"finder": finder, "swap": swap, "fix_k3": fix_k3, "robust": robust}
         options |= {"pair": pair, "left": left, "right": right}
         options |= {"charuco": charuco, "dictionary": dictionary, "marker_mm": marker_mm}
         refuse_options("for pictures of a board", "leave out --import", **options)
         _positive(rms_px=rms_px, **uncertainties)
-        known = _known(board, pitch_mm, pitch_u_mm, made_by)
-        made = _imported(imports or [], image_size, import_unit, known, _named_keys(key))
+        provenance = _provenance(board, pitch_mm, pitch_u_mm, made_by)
+        pair_made = _imported(imports or [], image_size, import_unit, provenance, _keys_by_field(key))
     else:
         given = {
             "image_size": image_size,
@@ -144,12 +144,12 @@ def stereo(
                 folder, pattern, finder=kind, pairing=pairing, fix_k3=fix_k3, robust=robust, progress=progress
             )
         document = {"source": "pictures", **result.as_json()}
-        made = MadePair(result.stereo, stereo_calibration_text(result), document)
-    _write_pair(made, places, form, as_json)
+        pair_made = PrintedPair(result.stereo, stereo_calibration_text(result), document)
+    _write_pair(pair_made, places, export_format, as_json)
 
 
 def _pairing(pair: str | None, left: str | None, right: str | None, swap: bool) -> Pairing:
-    """Which picture is of which camera, by the options."""
+    """The camera of each picture, by the options."""
     from tvsbayes.cameras.picture_pairs import Pairing
 
     if (left is None) != (right is None):
@@ -162,24 +162,24 @@ def _pairing(pair: str | None, left: str | None, right: str | None, swap: bool) 
 
 
 @dataclass(frozen=True)
-class MadePair:
-    """A calibrated pair with what is printed of it."""
+class PrintedPair:
+    """A calibrated pair with its text and document."""
 
     stereo: Stereo
     text: str
     document: dict[str, object]
 
 
-def _new_files(out: Path | None, export: Format | None) -> dict[str, Path]:
-    """Where the pair is to be written, by kind; refused before pictures are read, which takes minutes."""
+def _output_paths(out: Path | None, export: Format | None) -> dict[str, Path]:
+    """Output paths of the pair, by kind; checked before pictures are read, which takes minutes."""
     from tvsbayes.cameras.calibration_export import EXPORT_NAMES
 
-    beside = Path() if out is None else out.parent
+    folder = Path() if out is None else out.parent
     places = {} if out is None else {"stereo": out}
-    places |= {name: beside / name for name in (() if export is None else EXPORT_NAMES[export])}
+    places |= {name: folder / name for name in (() if export is None else EXPORT_NAMES[export])}
     for path in places.values():
         if os.path.lexists(path):
-            # Fits stand on a calibration by its hash.
+            # Fits refer to a calibration by its hash.
             remedy = "name another file, or move this one away; nothing is overwritten"
             place = escaped(str(path), 200)
             raise refusal("occupied", file=place, found="a file that is there", allowed="a new file", remedy=remedy)
@@ -222,37 +222,37 @@ def _positive(**values: float | None) -> None:
             raise InputError("usage", f"{option} {value:g}: allowed are numbers above 0", remedy="correct it")
 
 
-def _known(
+def _provenance(
     board: str | None, pitch_mm: float | None, pitch_u_mm: float | None, made_by: Mapping[str, float | None]
 ) -> Provenance:
-    """What the options say of an imported calibration."""
+    """The provenance of an imported calibration, by the options."""
     from tvsbayes.cameras.assumed_covariance import USUAL_PITCH_MM, Provenance
     from tvsbayes.cameras.boards import Board
 
-    # Checked as that of pictures is.
+    # Checked like a board for pictures.
     pattern = Board.named(board or "9x6", USUAL_PITCH_MM if pitch_mm is None else pitch_mm, pitch_u_mm or 0.0)
     size = None if board is None else (pattern.columns, pattern.rows)
     return Provenance(board=size, pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, **made_by)  # type: ignore[arg-type]
 
 
-def _named_keys(keys: list[str] | None) -> dict[str, str]:
-    """Fields with the names that hold them, of --key."""
+def _keys_by_field(keys: list[str] | None) -> dict[str, str]:
+    """Names of entries by field, from --key."""
     from tvsbayes.cameras.calibration_formats import KEY_FIELDS
 
-    named = {}
+    names = {}
     for text in keys or []:
         field, _, name = text.partition("=")
         if field not in KEY_FIELDS or not name:
             remedy = "write --key M1=NAME, with M1, D1, M2, D2, R or T"
             raise InputError("usage", f"--key {escaped(text, 80)}: no such name", remedy=remedy)
-        named[field] = name
-    return named
+        names[field] = name
+    return names
 
 
 def _imported(
-    paths: list[Path], image_size: str | None, import_unit: str | None, known: Provenance, keys: Mapping[str, str]
-) -> MadePair:
-    """A calibration of another tool, or of ours."""
+    paths: list[Path], image_size: str | None, import_unit: str | None, stated: Provenance, keys: Mapping[str, str]
+) -> PrintedPair:
+    """A calibration of another program, or a `stereo.json`."""
     from tvsbayes.cameras.calibration_formats import UNITS_MM, read_calibration
     from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
     from tvsbayes.report.command_text import stereo_text
@@ -263,37 +263,37 @@ def _imported(
         if not 0 < unit_mm <= UNITS_MM["m"]:
             allowed, remedy = "mm, cm, m or a number of mm", "write --import-unit 25 where T counts squares of 25 mm"
             raise InputError("usage", f"--import-unit {escaped(import_unit)}", allowed=allowed, remedy=remedy)
-    made = read_calibration(paths, _image_size(image_size), unit_mm=unit_mm, stated=known, keys=keys)
-    if made.source == "tvsbayes":
+    imported = read_calibration(paths, _image_size(image_size), unit_mm=unit_mm, stated=stated, keys=keys)
+    if imported.source == "tvsbayes":
         options = {"image_size": image_size, "import_unit": import_unit, "key": keys or None}
         refuse_options("for files of other programs", "leave it out: this file tells it", **options)
-    remarks = [*(f"note: {note}" for note in made.notes), *(f"warning: {warning}" for warning in made.warnings)]
-    pair = made.stereo
+    remarks = [*(f"note: {note}" for note in imported.notes), *(f"warning: {warning}" for warning in imported.warnings)]
+    pair = imported.stereo
     sds = [float(variance) ** 0.5 for variance in pair.parameter_covariance.diagonal()]
     values = zip(STEREO_PARAMETER_NAMES, pair.vector.tolist(), sds, strict=True)
     document: dict[str, object] = {
-        **{"source": made.source, "image_width": pair.image_width, "image_height": pair.image_height},
+        **{"source": imported.source, "image_width": pair.image_width, "image_height": pair.image_height},
         "parameters": {name: {"value": value, "sd": sd} for name, value, sd in values},
         **{"rms_px": pair.rms_px, "assumed": pair.assumed, "assumed_from": pair.assumed_from},
-        **{"warnings": [*made.notes, *made.warnings]},
+        **{"warnings": [*imported.notes, *imported.warnings]},
     }
-    return MadePair(pair, "\n".join([stereo_text(pair), *remarks]), document)
+    return PrintedPair(pair, "\n".join([stereo_text(pair), *remarks]), document)
 
 
-def _write_pair(made: MadePair, places: dict[str, Path], export: Format | None, as_json: bool) -> None:
-    """Write a pair where it was asked for, and say so."""
+def _write_pair(pair: PrintedPair, places: dict[str, Path], export: Format | None, as_json: bool) -> None:
+    """Write a pair to its output paths, and print the result."""
     from tvsbayes.cameras.calibration_export import exported
     from tvsbayes.instrument.stereo_pair import write_stereo
 
-    contents = {} if export is None else exported(made.stereo, export)
+    contents = {} if export is None else exported(pair.stereo, export)
     for name, path in places.items():
         if name == "stereo":
-            write_stereo(made.stereo, path)
+            write_stereo(pair.stereo, path)
         else:
             write_atomically(path, contents[name])
     written = {name: str(path) for name, path in places.items()}
     ending = f"written: {', '.join(written.values())}" if written else "nothing written: give -o stereo.json"
-    finish({**made.document, "files": written}, f"{made.text}\n{ending}", as_json)
+    finish({**pair.document, "files": written}, f"{pair.text}\n{ending}", as_json)
 
 
 def _image_size(text: str | None) -> tuple[int, int] | None:
@@ -361,6 +361,6 @@ def export(
     from tvsbayes.acquisition.nexus_file import write_nexus
     from tvsbayes.results.records import plain
 
-    done = write_nexus(folder, nexus)
-    text = f"{escaped(str(nexus), 200)}: {done.moves} moves, {done.looks} looks ({done.ok} ok), {done.events} events"
-    finish({"nexus": str(nexus), **plain(done)}, text, as_json)
+    made = write_nexus(folder, nexus)
+    text = f"{escaped(str(nexus), 200)}: {made.moves} moves, {made.looks} looks ({made.ok} ok), {made.events} events"
+    finish({"nexus": str(nexus), **plain(made)}, text, as_json)

@@ -16,9 +16,9 @@ from tvsbayes.cli.app import (
     CampaignFolder,
     Json,
     Seed,
+    check_order,
     finish,
     finite,
-    in_order,
     is_part,
     report_line,
 )
@@ -61,7 +61,7 @@ def demo(
         campaign = read_campaign(folder)
         rig = read_truth(folder / "truth.json", campaign.stereo)
         classic_result = estimate_classic(campaign)
-        # Evidence for reports takes as long again: only where it is kept.
+        # Evidence for reports takes as long as the fit: only where the results are kept.
         with waiting() as progress:
             if out is None:
                 summary = _sampled(campaign, progress)
@@ -70,7 +70,7 @@ def demo(
                 summary = results.record.summary
     pose = (summary.reference_pose_deg["pan"], summary.reference_pose_deg["tilt"])
     true = rig.headlines(campaign, pose) or {}
-    others = {of.name: true[of.name] for of in TARGETS.values() if not of.ratio}
+    others = {quantity.name: true[quantity.name] for quantity in TARGETS.values() if not quantity.ratio}
     truth = {direction: true[f"effective_deg_per_step.{direction}"] for direction in DIRECTIONS} | others
     document = {"classic": classic_result.as_json(), "fit": summary.as_json(), "truth": truth}
     finish(document, f"{demo_text(classic_result, summary, truth)}\n\n{DEMO_NOTE}", as_json, unusable(summary))
@@ -100,12 +100,12 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """The digital twin runs a plan on a true rig that it draws. Writes the campaign and truth.json."""
-    given = {"aperture": aperture, "frames": frames, "unrecorded_sides": unrecorded_sides, "seed": seed}
-    if serve("simulate", rig, moves=None if out is None else plan, out=out or plan, as_json=as_json, **given):
+    options = {"aperture": aperture, "frames": frames, "unrecorded_sides": unrecorded_sides, "seed": seed}
+    if serve("simulate", rig, moves=None if out is None else plan, out=out or plan, as_json=as_json, **options):
         return
     if out is None:
         raise InputError("usage", "Missing argument 'OUT'.", remedy="see tvsbayes --help")
-    in_order(rig, plan)
+    check_order(rig, plan)
     from tvsbayes.instrument.axes import HOME_APPROACH
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
@@ -128,11 +128,11 @@ def simulate(
         from tvsbayes.twin.frames import write_with_frames
 
         board = Board()
-        with _frames_kept() as progress:
+        with _frame_progress() as progress:
             pictures = write_with_frames(out, result.undetected(), seed, progress=progress)
         size = f"{board.columns}x{board.rows}"
-        drawn = {"columns": board.columns, "rows": board.rows, "pitch_mm": board.pitch_mm}
-        document |= {"ok": 0, "in_view": in_view, "pictures": pictures, "board": drawn}
+        board_drawn = {"columns": board.columns, "rows": board.rows, "pitch_mm": board.pitch_mm}
+        document |= {"ok": 0, "in_view": in_view, "pictures": pictures, "board": board_drawn}
         text += f"\n{pictures} pictures in frames/ and boards/; spots.csv waits for `tvsbayes detect {typed(out)}`"
         text += f"\nboard: {size} inner corners, squares of {board.pitch_mm:g} mm: `tvsbayes stereo "
         text += f"{typed(out / 'boards')} --board {size} --pitch-mm {board.pitch_mm:g} -o stereo.json`"
@@ -142,8 +142,8 @@ def simulate(
 
 
 @contextmanager
-def _frames_kept() -> Iterator[Show | None]:
-    """`waiting` for pictures; Ctrl-C says how to go on with them."""
+def _frame_progress() -> Iterator[Show | None]:
+    """`waiting` for pictures; after Ctrl-C a line tells how to continue."""
     try:
         with waiting() as shown:
             yield shown
@@ -179,10 +179,10 @@ def detect(
     pictures = output_place(campaign, "results", "overlay") if overlay else None
     data = read_campaign(campaign)
     with waiting() as progress:
-        looks = find(data, method, speckle_contrast=speckle_contrast, dark=dark, overlay=pictures, progress=progress)
-    write_atomically(campaign / "spots.csv", spots_bytes(looks.campaign.spots))
-    document = {"campaign": str(campaign), **looks.as_json()}
-    text = detection_text(looks) + f"\nwritten: {escaped(str(campaign / 'spots.csv'), 200)}"
+        result = find(data, method, speckle_contrast=speckle_contrast, dark=dark, overlay=pictures, progress=progress)
+    write_atomically(campaign / "spots.csv", spots_bytes(result.campaign.spots))
+    document = {"campaign": str(campaign), **result.as_json()}
+    text = detection_text(result) + f"\nwritten: {escaped(str(campaign / 'spots.csv'), 200)}"
     if overlay:
         document["overlay"] = str(pictures)
         text += f", {escaped(str(pictures), 200)}"
@@ -212,19 +212,19 @@ def check(
     from tvsbayes.instrument.sightings import SIGHTINGS
     from tvsbayes.report.command_text import check_text
 
-    document = _held(path, plan_file)
+    document = _contents(path, plan_file)
     warnings, is_sighted = document["warnings"], (path / SIGHTINGS.file).is_file()
-    end = f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}"
-    finish(document, f"{check_text(document, is_sighted)}\n{end}", as_json)
+    summary = f"{escaped(str(path), 200)}: readable, {len(warnings)} warning{'s' * (len(warnings) != 1)}"
+    finish(document, f"{check_text(document, is_sighted)}\n{summary}", as_json)
 
 
-def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
-    """What a plan with its rig, a plan, a rig, a journal or a campaign holds; warnings under their own key."""
+def _contents(path: Path, plan_file: Path | None) -> dict[str, Any]:
+    """Contents of a plan with its rig, a plan, a rig, a journal or a campaign; warnings under their own key."""
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
 
     if plan_file is not None:
-        _refuse_other_than_rig(path, plan_file)
+        _check_rig_and_plan(path, plan_file)
         rig = read_rig(path)
         steps = read_plan(plan_file, not rig.table.mechanism.sightings)
         from tvsbayes.planning.plan_check import check_plan
@@ -232,7 +232,7 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         compile_for(report_line)
         with waiting() as progress:
             return check_plan(rig, steps, progress=progress).as_json()
-    # Nobody can check one of them without those beside it.
+    # A part of a campaign cannot be checked without the others.
     if is_part(path):
         found, remedy = f"{escaped(path.name)} is a part of a campaign", f"check {escaped(str(path.parent), 200)}"
         raise InputError("usage", f"{found}, checked as a whole", allowed="a campaign folder", remedy=remedy)
@@ -247,13 +247,13 @@ def _held(path: Path, plan_file: Path | None) -> dict[str, Any]:
         rig = read_rig(path)
         return {"kind": "rig", "sheets_mm": rig.sheets_mm, "costs_s": rig.costs_s, "warnings": []}
     instrument = instrument_of(path)
-    separate = instrument is not None and "check" not in instrument.shared
-    return campaign_held(path) if instrument is None or not separate else instrument.command("held")(path)
+    has_own = instrument is not None and "check" not in instrument.shared
+    return campaign_contents(path) if instrument is None or not has_own else instrument.command("contents")(path)
 
 
-def _refuse_other_than_rig(path: Path, plan_file: Path) -> None:
-    """Refuse what stands where the rig file of a plan belongs, by what it is; a missing file is left to the reader."""
-    in_order(path, plan_file)
+def _check_rig_and_plan(path: Path, plan_file: Path) -> None:
+    """Refuse another kind of path in place of the rig file of a plan; the reader refuses a missing file."""
+    check_order(path, plan_file)
     name = escaped(str(path), 200)
     if path.is_dir():
         rig_file = path / "rig.toml"
@@ -272,10 +272,10 @@ def _refuse_other_than_rig(path: Path, plan_file: Path) -> None:
     raise InputError("usage", message, found=found, allowed="RIG PLAN", remedy=remedy)
 
 
-def campaign_held(path: Path, campaign: Campaign | None = None) -> dict[str, Any]:
-    """What `check` says of a campaign and its journal; of the journal alone where nothing has moved yet.
+def campaign_contents(path: Path, campaign: Campaign | None = None) -> dict[str, Any]:
+    """The document of `check` for a campaign and its journal; for the journal alone before the first move.
 
-    `campaign` is what lies at the path, where it was read already.
+    `campaign` is the campaign of the path, if it was read already.
     """
     from tvsbayes.estimators.plausibility import check_campaign
     from tvsbayes.instrument.campaign import read_campaign

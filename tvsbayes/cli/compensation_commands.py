@@ -1,4 +1,4 @@
-"""compensate and verify: a table for a controller with its promise, and whether the machine keeps it."""
+"""compensate and verify: a table for a controller with its promise, and the test of this promise."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tvsbayes.cli.app import (
     Ended,
     Json,
     Seed,
+    check_output,
     command_line,
     finish,
     keep,
     report_line,
-    spared,
 )
 from tvsbayes.cli.head_commands import compensate as compensate_head
 from tvsbayes.cli.progress_bar import waiting
@@ -39,7 +39,7 @@ LETTERS, APPLIERS = "XYZABC", ("controller", "host")
 
 
 def _mechanism(folder: Path) -> Mechanism | None:
-    """Of two axes, a scanner's or a head's; None of an axis, and where nothing can be read."""
+    """The mechanism of a scanner or a head; None for an axis, and where no header can be read."""
     from tvsbayes.instrument.campaign_header import mechanism_of
 
     return MECHANISMS.get(mechanism_of(folder))
@@ -83,13 +83,13 @@ def compensate(
     from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
     from tvsbayes.single_axis.axis_record import results_for
 
-    spared(out)
+    check_output(out)
     if (mechanism := _mechanism(campaign)) is not None:
-        # Counters of two axes follow from the calibration as a whole: it is the table.
+        # Counters of two axes follow from the whole calibration: it is the table.
         default = "urdf" if mechanism.terms else "header"
         if to != default:
-            what = "a pan-tilt head" if mechanism.terms else "a scanner"
-            message = f"compensate --to {escaped(to)} is for an axis, and {escaped(str(campaign), 200)} is {what}"
+            kind = "a pan-tilt head" if mechanism.terms else "a scanner"
+            message = f"compensate --to {escaped(to)} is for an axis, and {escaped(str(campaign), 200)} is {kind}"
             counters = "; `tvsbayes steps-for` gives the counters of a direction" if mechanism.terms else ""
             remedy = f"its compensation is `tvsbayes compensate CAMPAIGN --to {default}`{counters}"
             raise InputError("usage", message, remedy=remedy)
@@ -98,37 +98,37 @@ def compensate(
         else:
             export_calibration(campaign, to, out, as_json)
         return
-    _one_of("--applied-by", applied_by, APPLIERS)
-    _one_of("--letter", letter, tuple(LETTERS))
+    _check_choice("--applied-by", applied_by, APPLIERS)
+    _check_choice("--letter", letter, tuple(LETTERS))
     wish = Wish(to, "host" if applied_by == "host" else "controller", per_command, resolution, in_force, letter, period)
     checked(wish)
     data = read_axis(campaign)
     with waiting() as progress, Job({FITTING: 1.0, MAKING: 1.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed, notify=report_line)
-        made = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
-    document = {"format": COMPENSATION_FORMAT, **made.as_json(), **plain(provenance(axis_hashes(data), seed))}
+        compensation = compensation_of(results, wish, seed=seed, progress=job.part(MAKING))
+    document = {"format": COMPENSATION_FORMAT, **compensation.as_json(), **plain(provenance(axis_hashes(data), seed))}
     files: dict[str, str] = {}
     if out is not None:
-        write_atomically(out, file_text(made, data).encode())
+        write_atomically(out, file_text(compensation, data).encode())
         files[to] = str(out)
-        if (beside := file_beside(made, data)) is not None:
+        if (yaml_text := file_beside(compensation, data)) is not None:
             second = out.with_name(f"{out.name}.yaml")
-            spared(second)
-            write_atomically(second, beside.encode())
+            check_output(second)
+            write_atomically(second, yaml_text.encode())
             files["yaml"] = str(second)
-        if keep(document, kept := output_place(campaign, "results") / "compensation.json"):
-            files["compensation"] = str(kept)
-    text = compensation_text(made, list(files.values()))
+        if keep(document, record_path := output_place(campaign, "results") / "compensation.json"):
+            files["compensation"] = str(record_path)
+    text = compensation_text(compensation, list(files.values()))
     if out is None:
-        text += f"\nnothing written: give -o FILE; it would hold:\n\n{file_text(made, data)}".rstrip("\n")
+        text += f"\nnothing written: give -o FILE; it would hold:\n\n{file_text(compensation, data)}".rstrip("\n")
     else:
-        following = made.shown_by if made.in_motion else command_line("verify", campaign, "FRESH")
-        text += f"\nnext: apply it, then {following}"
+        next_step = compensation.shown_by if compensation.in_motion else command_line("verify", campaign, "FRESH")
+        text += f"\nnext: apply it, then {next_step}"
     finish({**document, "files": files}, text, as_json)
 
 
 def export_calibration(campaign: Path, kind: str, out: Path | None, as_json: bool) -> None:
-    """The calibration for another language, printed or into a file."""
+    """Print the calibration for another language, or write it into a file."""
     from tvsbayes.calibration.c_header import calibration_header
     from tvsbayes.calibration.calibration_file import Origin, calibration_json
     from tvsbayes.instrument.campaign import read_campaign
@@ -147,8 +147,8 @@ def export_calibration(campaign: Path, kind: str, out: Path | None, as_json: boo
     finish(document, text.rstrip("\n"), as_json)
 
 
-def _one_of(option: str, given: str, allowed: tuple[str, ...]) -> None:
-    """Refuse a word that is none of these."""
+def _check_choice(option: str, given: str, allowed: tuple[str, ...]) -> None:
+    """Refuse a word that is not allowed."""
     if given not in allowed:
         names = ", ".join(allowed)
         raise InputError("usage", f"{option} {escaped(given)}", allowed=names, remedy=f"name one of {names}")
@@ -183,10 +183,10 @@ def verify(
     if distance_mm is not None and (mechanism is None or mechanism.sightings):
         message = "--distance-mm is not for an axis, nor for a head that says where it points"
         raise InputError("usage", message, remedy="leave it out")
-    judge = _verified_scanner if scanner else _verified_axis
-    result, made_of = judge(campaign, fresh, seed, distance_mm)
+    verify_machine = _verify_scanner if scanner else _verify_axis
+    result, inputs = verify_machine(campaign, fresh, seed, distance_mm)
     keep(
-        {"format": VERIFICATION_FORMAT, **made_of, **result.as_json()},
+        {"format": VERIFICATION_FORMAT, **inputs, **result.as_json()},
         output_place(campaign, "results") / "verification.json",
     )
     for remark in result.remarks if as_json else ():
@@ -196,35 +196,35 @@ def verify(
         raise Ended(NothingToEstimate.exit_code if result.verdict == CANNOT_TELL else TARGET_MISSED)
 
 
-def _verified_axis(folder: Path, fresh: Path, seed: int, _: float | None) -> tuple[Verification, dict[str, object]]:
-    """Readings of an axis, and of which data and table that is."""
+def _verify_axis(folder: Path, fresh: Path, seed: int, _: float | None) -> tuple[Verification, dict[str, object]]:
+    """Verification of an axis, and the hashes of its data and table."""
     from tvsbayes.compensation.verification import stored_compensation, verify_axis
     from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
 
     data = read_axis(folder)
-    made = stored_compensation(data)
+    compensation = stored_compensation(data)
     with waiting() as progress:
-        result = verify_axis(data, fresh, made=made, seed=seed, progress=progress)
-    return result, {"inputs": axis_hashes(data), "table": made.digest}
+        result = verify_axis(data, fresh, made=compensation, seed=seed, progress=progress)
+    return result, {"inputs": axis_hashes(data), "table": compensation.digest}
 
 
-def _verified_scanner(
+def _verify_scanner(
     folder: Path, fresh: Path, seed: int, distance_mm: float | None
 ) -> tuple[Verification, dict[str, object]]:
-    """Looks of a scanner or head, and of which data and calibration that is."""
+    """Verification of a scanner or head, and the hashes of its data and calibration."""
     from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
     from tvsbayes.instrument.campaign import input_hashes, read_campaign
 
     data = read_campaign(folder)
     with waiting() as progress:
-        judged = verified(
+        result = verified(
             data, fresh, distance_mm=distance_mm or 1000.0, seed=seed, tell=report_line, progress=progress
         )
-    return judged, {"inputs": input_hashes(data), "table": content_sha256(calibration_json(load_calibration(folder)))}
+    return result, {"inputs": input_hashes(data), "table": content_sha256(calibration_json(load_calibration(folder)))}
 
 
 def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bool) -> None:
-    """`plan FOLDER --verify`: the readings that tell soonest what became of a table."""
+    """`plan FOLDER --verify`: the fewest readings that verify a table."""
     from tvsbayes.compensation.verification import plan_verification, stored_compensation
     from tvsbayes.report.compensation_text import verify_plan_text
     from tvsbayes.results.records import plain
@@ -238,11 +238,11 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
         _plan_looks(folder, out, as_json)
         return
     data = read_axis(folder)
-    made = stored_compensation(data)
+    compensation = stored_compensation(data)
     with waiting() as progress, Job({FITTING: 1.0, "choosing stops": 1.0}, progress) as job:
         results = results_for(data, progress=job.part(FITTING), seed=seed)
         job.begin("choosing stops")
-        stops = plan_verification(results.fit, made, seed=seed)
+        stops = plan_verification(results.fit, compensation, seed=seed)
     document, text = plain(stops), verify_plan_text(stops)
     if out is not None:
         write_atomically(out, stops.plan_bytes())
@@ -252,7 +252,7 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
 
 
 def _plan_looks(folder: Path, out: Path | None, as_json: bool) -> None:
-    """The looks of a scanner or head that tell soonest, at the target that the campaign looked at most."""
+    """The fewest looks that verify a scanner or head, at the target with most looks in the campaign."""
     from collections import Counter
 
     from tvsbayes.comparison.verified_looks import accepted_calibration, plan_looks

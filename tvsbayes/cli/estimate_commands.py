@@ -1,4 +1,4 @@
-"""Commands that estimate and tell: classic, fit, compare.
+"""Commands that estimate and compare: classic, fit, compare.
 
 Options in, library called, table or JSON out; heavy imports stand inside the commands.
 """
@@ -23,7 +23,7 @@ from tvsbayes.cli.app import (
     report_line,
 )
 from tvsbayes.cli.instruments import serve
-from tvsbayes.cli.progress_bar import chain_kept, waiting
+from tvsbayes.cli.progress_bar import chain_progress, waiting
 from tvsbayes.errors import InputError, NothingToEstimate, escaped
 from tvsbayes.files.disk import output_place
 from tvsbayes.pipeline import FITTING, MAX_MINUTES, StoredOrFitted, calibrate, compile_for
@@ -36,15 +36,15 @@ if TYPE_CHECKING:
     from tvsbayes.results.comparison_record import ComparisonRecord
     from tvsbayes.results.estimates import FitSummary
 HOLDING_OUT = "hold-out"
-GO_ON = "--anyway fits it all the same"
-"""How to go on at a certain finding of `check`."""
+OVERRIDE_HINT = "--anyway fits it all the same"
+"""Hint for a certain finding of `check`."""
 
 
-def _warn_of(campaign: Campaign, *, stops: bool = False) -> None:
-    """What `check` says of data that no rig can have measured, for a user who did not ask it first.
+def _warn_implausible(campaign: Campaign, *, stops: bool = False) -> None:
+    """Print findings of `check` on impossible data, for a user who did not run it.
 
     Raises:
-        InputError: `stops`, and it is certain of something.
+        InputError: `stops`, and a finding is certain.
     """
     from tvsbayes.acquisition.campaign_files import behind_journal
     from tvsbayes.estimators.findings import stop_at
@@ -58,7 +58,7 @@ def _warn_of(campaign: Campaign, *, stops: bool = False) -> None:
         if not (stops and finding.certain):
             report_line(f"warning: {finding.sentence}")
     if stops:
-        stop_at(findings, GO_ON)
+        stop_at(findings, OVERRIDE_HINT)
 
 
 def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
@@ -70,7 +70,7 @@ def classic(campaign: CampaignFolder, as_json: Json = False) -> None:
     from tvsbayes.report.fit_text import classic_text
 
     data = read_campaign(campaign)
-    _warn_of(data)
+    _warn_implausible(data)
     result = estimate(data)
     finish(result.as_json(), classic_text(result), as_json)
 
@@ -115,19 +115,19 @@ def fit(
     minutes = MAX_MINUTES if max_minutes is None else max_minutes
     model = {"robust": robust, "per_axis": per_axis, "harmonics": harmonics, "no_backlash": no_backlash}
     model["perfect_gears"] = perfect_gears
-    ways = {"quick": quick, "no_sample": no_sample, "max_minutes": minutes, "resume": resume, "anyway": anyway}
-    if serve("fit", campaign, **model, **ways, details=details, out=out, seed=seed, as_json=as_json):
+    sampling = {"quick": quick, "no_sample": no_sample, "max_minutes": minutes, "resume": resume, "anyway": anyway}
+    if serve("fit", campaign, **model, **sampling, details=details, out=out, seed=seed, as_json=as_json):
         return
     from tvsbayes.instrument.campaign import read_campaign
 
     data = read_campaign(campaign)
-    _warn_of(data, stops=not anyway)
+    _warn_implausible(data, stops=not anyway)
     from tvsbayes.instrument.model_choice import ModelChoice
     from tvsbayes.report.advice import assumed_stereo
     from tvsbayes.report.fit_text import fit_text
 
     compile_for(report_line)
-    with chain_kept("go on with --resume") as progress:
+    with chain_progress("go on with --resume") as progress:
         results = calibrate(
             data,
             out or output_place(campaign, "results"),
@@ -139,7 +139,7 @@ def fit(
             seed=seed,
             tell=report_line,
             progress=progress,
-            first=_show_first,
+            first=_print_first,
         )
     summary, files = results.record.summary, results.files
     document = {**summary.as_json(), "seed": seed, "files": files}
@@ -152,8 +152,8 @@ def fit(
     finish(document, text, as_json, results.error)
 
 
-def _show_first(summary: FitSummary) -> None:
-    """What importance sampling says, on stderr, before the chain that must agree with it."""
+def _print_first(summary: FitSummary) -> None:
+    """Print the result of importance sampling on stderr, before the chain that must agree with it."""
     from tvsbayes.report.fit_text import first_text
 
     for line in first_text(summary).splitlines():
@@ -196,11 +196,11 @@ def compare(
     if other is None and not len(select_experiments(data[0]).experiments):
         raise _no_experiments()
     results = output_place(campaign, "results")
-    fitting = [f"{FITTING} of {escaped(str(folder), 60)}" for folder in folders]
-    stages = dict.fromkeys(fitting, 1.0) | {HOLDING_OUT: 0.0 if other else 6.0}
+    fit_stages = [f"{FITTING} of {escaped(str(folder), 60)}" for folder in folders]
+    stages = dict.fromkeys(fit_stages, 1.0) | {HOLDING_OUT: 0.0 if other else 6.0}
     with waiting() as progress, Job(stages, progress) as job:
-        parts = map(job.part, fitting)
-        fits = [StoredOrFitted(each, report_line, part).fit for each, part in zip(data, parts, strict=True)]
+        parts = map(job.part, fit_stages)
+        fits = [StoredOrFitted(d, report_line, part).fit for d, part in zip(data, parts, strict=True)]
         record = None if other else _classic_against_joint(fits[0], by or "steps", seed or 0, job.part(HOLDING_OUT))
     if record is None:
         from tvsbayes.comparison.changes import compare as compare_fits
@@ -219,7 +219,7 @@ def compare(
 
 
 def _compare_positions(campaign: Path, as_json: bool) -> None:
-    """Every counter left out and predicted by the looks at all others."""
+    """Hold out each counter and predict it from the looks at all others."""
     from tvsbayes.comparison.held_positions import hold_out_positions
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.command_text import positions_text
@@ -233,7 +233,7 @@ def _compare_positions(campaign: Path, as_json: bool) -> None:
 
 
 def _compare_pointing(data: Campaign, as_json: bool) -> None:
-    """Terms of a head by least squares, without gears, beside those of the fit."""
+    """Terms of a head by least squares without gears, and those of the fit."""
     import numpy as np
 
     from tvsbayes.head.pointing_model import pointing_model

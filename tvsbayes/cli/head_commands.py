@@ -1,4 +1,4 @@
-"""Commands of a head that says where it was found to point, where they differ from the scanner's.
+"""Commands of a head with sightings, where they differ from the scanner's.
 
 Options in, library called, table or JSON out; heavy imports stand inside the commands.
 """
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import command_line, confirmed, finish, report_line, spared, tell_removed
+from tvsbayes.cli.app import check_output, command_line, confirmed, finish, report_line, report_removed
 from tvsbayes.cli.progress_bar import waiting
-from tvsbayes.cli.understood_columns import CORRECT_IT, import_end, not_sure, table_document, table_lines
+from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, import_ending, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
 
 FITTING, DRAWING = "fit", "drawing the page"
 HEAD_URDF = "head.urdf"
-"""In a campaign folder: the model that `import --urdf` read."""
-PARTS = ("campaign.toml", "moves.csv", "spots.csv")
-"""Of a campaign that `new` made."""
-HEADS = ("campaign.toml", "rig.toml")
+"""File in a campaign folder: the model from `import --urdf`."""
+TEMPLATE_FILES = ("campaign.toml", "moves.csv", "spots.csv")
+"""Files of a campaign as `new` writes it."""
+PRIOR_FILES = ("campaign.toml", "rig.toml")
 """Files with [rig.prior]."""
 RATIO_U = 0.01
 """Relative u of a nominal ratio."""
 
 
 def refuse_sightings(sightings: bool) -> None:
-    """`acquire` does not take the rig file of a head that says where it points: it has no cameras to look with.
+    """Refuse the rig file of a head with sightings for `acquire`: it has no stereo pair.
 
     Raises:
         InputError: `sightings`.
@@ -54,7 +54,7 @@ def refuse_sightings(sightings: bool) -> None:
 
 
 def refuse_head(calibration: Calibration) -> None:
-    """`locate` needs the scanner's aperture: it does not take a head.
+    """Refuse a head for `locate`, which needs the scanner's aperture.
 
     Raises:
         InputError: the calibration is one of a head.
@@ -69,7 +69,7 @@ def refuse_head(calibration: Calibration) -> None:
 def import_urdf(
     file: Path, to: Path, joints: Mapping[str, str | None], steps_per_turn: float | None, *, yes: bool, as_json: bool
 ) -> None:
-    """Nominal geometry of two joints into a new campaign of a head, or into one that `new` made."""
+    """Import the nominal geometry of two joints into a new campaign of a head, or into one made by `new`."""
     from tvsbayes.head.urdf import URDF_BYTES_MAX, head_joints, ratios_of
     from tvsbayes.instrument.campaign import head_templates
     from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
@@ -77,8 +77,8 @@ def import_urdf(
 
     data = read_bytes(file, URDF_BYTES_MAX)
     head = head_joints(data, escaped(file.name), joints)
-    spots = {name: (to / name).read_bytes() for name in PARTS if (to / name).is_file()}
-    untouched = {name: text for name, text in head_templates(False).items() if name in PARTS}
+    spots = {name: (to / name).read_bytes() for name in TEMPLATE_FILES if (to / name).is_file()}
+    untouched = {name: text for name, text in head_templates(False).items() if name in TEMPLATE_FILES}
     kind = HEAD if spots == untouched else SIGHTING_HEAD
     ratios = {} if steps_per_turn is None else ratios_of(head, steps_per_turn)
     priors = {name: Prior(value, RATIO_U * value) for name, value in ratios.items()}
@@ -99,15 +99,15 @@ def import_urdf(
     lines = [f"nominal: {name} = {prior.value:.6g}" for name, prior in priors.items()]
     lines += [f"assumed: {text}" for text in assumed]
     yes = confirmed(lines, to, yes, as_json)
-    following = f"log moves and spots there, then `tvsbayes check {typed(to)}`"
+    next_step = f"log moves and spots there, then `tvsbayes check {typed(to)}`"
     if kind is SIGHTING_HEAD:
-        following = f"`tvsbayes import LOG --sightings --to {typed(to)}` with moves and sightings"
+        next_step = f"`tvsbayes import LOG --sightings --to {typed(to)}` with moves and sightings"
     if yes:
         if kind is SIGHTING_HEAD:
             make_folder(to, empty=True)
         for name, text in files.items():
             write_atomically(to / name, text)
-    lines.append(import_end([escaped(str(to), 200)] * yes, following))
+    lines.append(import_ending([escaped(str(to), 200)] * yes, next_step))
     document = {"campaign": str(to), "joints": dict(head.names), "signs": dict(head.sign), "assumed": assumed}
     document |= {"nominal": {name: prior.value for name, prior in priors.items()}}
     finish({**document, "written": yes, "files": list(files) if yes else []}, "\n".join(lines), as_json)
@@ -125,28 +125,28 @@ def import_sightings(
     yes: bool,
     as_json: bool,
 ) -> None:
-    """A table of moves and sightings into a new campaign of a head, or into one without rows."""
+    """Import a table of moves and sightings into a new campaign of a head, or into one without rows."""
     from tvsbayes.files.foreign_table import read_foreign
     from tvsbayes.head.foreign_sightings import NEEDED, SIGHTING_FIELDS, sighting_field, sightings_of_table
     from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SECONDS, map_columns, unit_of_name
 
     def unit(field: str, name: str) -> str:
-        of_name = unit_of_name(name, SECONDS if field == "time_s" else DEGREES)
-        usual = "s" if field == "time_s" else "steps" if field in COUNTERS else notation.angle_unit or "deg"
-        return (of_name or usual) if field in ("time_s", "u_deg", *NEEDED) else ""
+        stated_unit = unit_of_name(name, SECONDS if field == "time_s" else DEGREES)
+        default = "s" if field == "time_s" else "steps" if field in COUNTERS else notation.angle_unit or "deg"
+        return (stated_unit or default) if field in ("time_s", "u_deg", *NEEDED) else ""
 
     table = read_foreign(file, sheet)
-    known = map_columns(table.columns, stated, SIGHTING_FIELDS, sighting_field)
-    missing = [field for field in NEEDED if field not in known.columns]
-    if missing or known.ambiguous:
-        wanted = [*missing, *(field for field in known.ambiguous if field not in missing)]
-        raise not_sure(table, known, wanted, SIGHTING_FIELDS, NEEDED)
+    mapping = map_columns(table.columns, stated, SIGHTING_FIELDS, sighting_field)
+    missing = [field for field in NEEDED if field not in mapping.columns]
+    if missing or mapping.ambiguous:
+        fields = [*missing, *(field for field in mapping.ambiguous if field not in missing)]
+        raise column_refusal(table, mapping, fields, SIGHTING_FIELDS, NEEDED)
     joints = _joints_of(to)
-    falling = () if joints is None else [axis for axis in AXES if joints.sign[axis] < 0]
-    sightings = sightings_of_table(table, known.columns, notation, correction, u_deg, falling)
+    reversed_axes = () if joints is None else [axis for axis in AXES if joints.sign[axis] < 0]
+    sightings = sightings_of_table(table, mapping.columns, notation, correction, u_deg, reversed_axes)
     written = _sighting_files(sightings, to, table.file)
     ok = sum(sighting.status == "ok" for sighting in sightings.sightings)
-    lines = [*table_lines(table, known, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in written.assumed)]
+    lines = [*table_lines(table, mapping, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in written.assumed)]
     lines.append(f"gives: {len(sightings.moves)} moves, {len(sightings.sightings)} sightings, {ok} of use")
     yes = confirmed(lines, to, yes, as_json)
     files = [str(to / name) for name in written.files] if yes else []
@@ -154,15 +154,15 @@ def import_sightings(
         to.mkdir(parents=True, exist_ok=True)
         for name, data in written.files.items():
             write_atomically(to / name, data)
-    lines.append(import_end(files, f"`tvsbayes check {typed(to)}`", CORRECT_IT))
-    document = {**table_document(table, known), "assumed": written.assumed, "moves": len(sightings.moves)}
+    lines.append(import_ending(files, f"`tvsbayes check {typed(to)}`", CORRECT_HINT))
+    document = {**table_document(table, mapping), "assumed": written.assumed, "moves": len(sightings.moves)}
     document |= {"sightings": len(sightings.sightings), "ok": ok, "campaign": str(to), "files": files}
     finish(document, "\n".join(lines), as_json)
 
 
 @dataclass(frozen=True)
 class _SightingFiles:
-    """Files of a head by name, and what they assume, in words."""
+    """Files of a head by name, and their assumptions, in words."""
 
     files: dict[str, bytes]
     assumed: list[str]
@@ -172,51 +172,51 @@ def _sighting_files(rows: ForeignSightings, to: Path, table: str) -> _SightingFi
     """The tables, and campaign and rig file with ratios where those of the folder state none.
 
     Raises:
-        InputError: a folder of another instrument, with rows, or with ratios that are none of an encoder.
+        InputError: a folder of another instrument, with rows, or with stated ratios for angles of an encoder.
     """
     from tvsbayes.instrument.campaign import MOVES, head_templates
     from tvsbayes.instrument.campaign_header import mechanism_of
     from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
     from tvsbayes.instrument.sightings import SIGHTINGS
 
-    kept = templates = head_templates(True)
-    known: set[str] = set()
-    if not (fresh := not (to / "campaign.toml").is_file()):
+    current = templates = head_templates(True)
+    stated: set[str] = set()
+    if not (is_new := not (to / "campaign.toml").is_file()):
         if mechanism_of(to) != SIGHTING_HEAD.key:
-            what, allowed = "a campaign without sightings.csv", "one that `new --mechanism pan-tilt --sightings` made"
+            found, allowed = "a campaign without sightings.csv", "one that `new --mechanism pan-tilt --sightings` made"
             remedy = "name a new folder with --to"
-            raise refusal("instrument", file=escaped(str(to), 200), found=what, allowed=allowed, remedy=remedy)
-        kept = {name: read_bytes(to / name, TOML_BYTES_MAX, to) for name in HEADS if (to / name).is_file()}
-        known = _stated_priors(to)
+            raise refusal("instrument", file=escaped(str(to), 200), found=found, allowed=allowed, remedy=remedy)
+        current = {name: read_bytes(to / name, TOML_BYTES_MAX, to) for name in PRIOR_FILES if (to / name).is_file()}
+        stated = _stated_priors(to)
     elif to.exists():
         make_folder(to, empty=True)
     for name in (MOVES.file, SIGHTINGS.file):
-        place = to / name
-        if place.is_file() and place.read_bytes() != templates[name]:
+        path = to / name
+        if path.is_file() and path.read_bytes() != templates[name]:
             allowed, remedy = "no rows yet", "name another folder with --to; nothing is overwritten"
-            raise refusal("occupied", file=escaped(str(place), 200), found="rows", allowed=allowed, remedy=remedy)
+            raise refusal("occupied", file=escaped(str(path), 200), found="rows", allowed=allowed, remedy=remedy)
     for axis in sorted(rows.encoders):
-        if (name := f"degrees_per_step.{axis}") in known:
-            what, allowed = f"angles of an encoder, and {name} in campaign.toml", "counters of the stated ratio"
+        if (name := f"degrees_per_step.{axis}") in stated:
+            found, allowed = f"angles of an encoder, and {name} in campaign.toml", "counters of the stated ratio"
             remedy = "give a table of counters, or name a new folder with --to"
-            raise refusal("encoder", file=table, found=what, allowed=allowed, remedy=remedy)
-    priors = {name: prior for name, prior in rows.priors.items() if name not in known}
-    files = dict(templates) if fresh else {}
-    files |= with_priors(kept, priors) if priors else {}
+            raise refusal("encoder", file=table, found=found, allowed=allowed, remedy=remedy)
+    priors = {name: prior for name, prior in rows.priors.items() if name not in stated}
+    files = dict(templates) if is_new else {}
+    files |= with_priors(current, priors) if priors else {}
     files |= {MOVES.file: MOVES.content(rows.moves), SIGHTINGS.file: SIGHTINGS.content(rows.sightings)}
-    return _SightingFiles(files, [text for text in rows.assumed if text.partition(":")[0] not in known])
+    return _SightingFiles(files, [text for text in rows.assumed if text.partition(":")[0] not in stated])
 
 
 def _joints_of(folder: Path) -> HeadJoints | None:
-    """Of the URDF that a campaign folder states and keeps; None where it does not."""
+    """The joints of the URDF in a campaign folder; None without one."""
     from tvsbayes.head.urdf import URDF_BYTES_MAX, head_joints
     from tvsbayes.instrument.campaign_header import header_values
 
     if not ((folder / "campaign.toml").is_file() and (folder / HEAD_URDF).is_file()):
         return None
     stated = header_values(folder).get("urdf")
-    known: dict[str, Any] = stated if isinstance(stated, dict) else {}
-    joints: dict[str, str | None] = {axis: known.get(f"{axis}_joint") for axis in AXES}
+    names: dict[str, Any] = stated if isinstance(stated, dict) else {}
+    joints: dict[str, str | None] = {axis: names.get(f"{axis}_joint") for axis in AXES}
     return head_joints(read_bytes(folder / HEAD_URDF, URDF_BYTES_MAX, folder), HEAD_URDF, joints)
 
 
@@ -230,19 +230,19 @@ def _stated_priors(folder: Path) -> set[str]:
 
 
 def with_priors(
-    templates: Mapping[str, bytes], priors: Mapping[str, Prior], more: Mapping[str, Sequence[str]] | None = None
+    templates: Mapping[str, bytes], priors: Mapping[str, Prior], tables: Mapping[str, Sequence[str]] | None = None
 ) -> dict[str, bytes]:
     """Templates of campaign and rig with priors in [rig.prior], and further lines at their ends."""
     entries = [
         toml_line(name, {"value": float(f"{p.value:.9g}"), "u": float(f"{p.u:.3g}")}) for name, p in priors.items()
     ]
     files = {}
-    for name in (name for name in HEADS if name in templates):
-        kept = [line for line in templates[name].decode().splitlines() if not _states(line, priors)]
-        if "[rig.prior]" not in kept:
-            kept.append("[rig.prior]")
-        at, table = kept.index("[rig.prior]") + 1, (more or {}).get(name, ())
-        files[name] = "\n".join([*kept[:at], *entries, *kept[at:], *([""] if table else []), *table, ""]).encode()
+    for name in (name for name in PRIOR_FILES if name in templates):
+        lines = [line for line in templates[name].decode().splitlines() if not _is_prior_line(line, priors)]
+        if "[rig.prior]" not in lines:
+            lines.append("[rig.prior]")
+        at, end = lines.index("[rig.prior]") + 1, (tables or {}).get(name, ())
+        files[name] = "\n".join([*lines[:at], *entries, *lines[at:], *([""] if end else []), *end, ""]).encode()
     return files
 
 
@@ -255,20 +255,20 @@ def _urdf_files(
     tables = {"campaign.toml": ["[urdf]", *(toml_line(key, value) for key, value in joints.items())], "rig.toml": []}
     for axis, keys in LIMIT_KEYS.items() if steps_per_turn is not None else ():
         ratio = priors[f"degrees_per_step.{axis}"].value
-        if (ends := head.limits_deg(axis)) is not None:
-            tables["rig.toml"] += [toml_line(key, round(end / ratio)) for key, end in zip(keys, ends, strict=True)]
+        if (limits := head.limits_deg(axis)) is not None:
+            tables["rig.toml"] += [toml_line(key, round(end / ratio)) for key, end in zip(keys, limits, strict=True)]
     if tables["rig.toml"]:
         tables["rig.toml"].insert(0, "[positioner]")
     return {**templates, **with_priors(templates, priors, tables)}
 
 
-def _states(line: str, priors: Mapping[str, Prior]) -> bool:
+def _is_prior_line(line: str, priors: Mapping[str, Prior]) -> bool:
     """Whether a line of a template states one of these priors."""
     return line.partition("=")[0].strip().strip('"') in priors
 
 
 def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
-    """The model of the robot with what was estimated, and beside it YAML with the covariance."""
+    """The model of the robot with the estimated terms, and YAML with their covariance."""
     import hashlib
 
     import numpy as np
@@ -285,19 +285,19 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
     kind = data.rig.mechanism
     terms = {f"backlash_deg.{axis}" for axis in AXES} | {f"degrees_per_step.{axis}" for axis in AXES}
     terms |= {term.name for term in kind.terms.values() if term.name in kind.documented}
-    kept = [k for k, name in enumerate(calibration.names) if name in terms and calibration.covariance[k, k] > 0]
+    used = [k for k, name in enumerate(calibration.names) if name in terms and calibration.covariance[k, k] > 0]
     stated = data.header.get("urdf")
-    known: dict[str, Any] = stated if isinstance(stated, dict) else {}
-    made = (
+    urdf: dict[str, Any] = stated if isinstance(stated, dict) else {}
+    origin_text = (
         f"made by tvsbayes {origin.tvsbayes}, {origin.exported}, of {escaped(origin.campaign)}; applied to nothing yet"
     )
     model = HeadModel(
-        names=tuple(calibration.names[k] for k in kept),
-        values=calibration.mean[kept],
-        covariance=calibration.covariance[np.ix_(kept, kept)],
-        origin=made,
+        names=tuple(calibration.names[k] for k in used),
+        values=calibration.mean[used],
+        covariance=calibration.covariance[np.ix_(used, used)],
+        origin=origin_text,
         data_sha256=hashlib.sha256("".join(input_hashes(data).values()).encode()).hexdigest(),
-        steps_per_turn=known.get("steps_per_turn"),
+        steps_per_turn=urdf.get("steps_per_turn"),
     )
     head = _joints_of(folder)
     text, document = model.urdf(head), model.document(head)
@@ -309,14 +309,14 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
     lines += [f"not in the file: {words}" for words in document["unsaid"]]
     files: dict[str, str] = {}
     if out is None:
-        what = "xacro properties" if head is None else f"{HEAD_URDF} with these terms"
-        lines.append(f"nothing written: give -o FILE; it would hold {what}, and FILE.yaml their covariance")
+        described = "xacro properties" if head is None else f"{HEAD_URDF} with these terms"
+        lines.append(f"nothing written: give -o FILE; it would hold {described}, and FILE.yaml their covariance")
     else:
-        second = out.with_name(f"{out.name}.yaml")
-        spared(second)
+        yaml_path = out.with_name(f"{out.name}.yaml")
+        check_output(yaml_path)
         write_atomically(out, text)
-        write_atomically(second, f"# {made}\n{yaml.safe_dump(document, sort_keys=False)}".encode())
-        files = {"urdf": str(out), "yaml": str(second)}
+        write_atomically(yaml_path, f"# {origin_text}\n{yaml.safe_dump(document, sort_keys=False)}".encode())
+        files = {"urdf": str(out), "yaml": str(yaml_path)}
         lines.append(f"written: {', '.join(files.values())}")
         lines.append(f"next: load it in place of the old model, then {command_line('verify', folder, 'FRESH')}")
     finish({**document, "target": "urdf", "files": files}, "\n".join(lines), as_json)
@@ -346,10 +346,10 @@ def report(folder: Path, issue: Issue, pdf: bool, out: Path | None, as_json: boo
     with waiting() as progress, Job({FITTING: 3.0, DRAWING: 1.0}, progress) as job:
         record = StoredOrFitted(data, report_line, job.part(FITTING)).record
         job.begin(DRAWING)
-        page = head_document(data, record, issue, check_campaign(data).warnings)
-        removed = replace_page(path, page_html(page), out)
+        document_page = head_document(data, record, issue, check_campaign(data).warnings)
+        removed = replace_page(path, page_html(document_page), out)
         if pdf:
             files["pdf"] = str(print_to_pdf(path))
-    tell_removed(removed, files, certificates=False)
-    document = {"criteria": [], "number": page.number, "files": files}
-    finish(document, f"report {page.number}\nwritten: {', '.join(files.values())}", as_json)
+    report_removed(removed, files, certificates=False)
+    document = {"criteria": [], "number": document_page.number, "files": files}
+    finish(document, f"report {document_page.number}\nwritten: {', '.join(files.values())}", as_json)

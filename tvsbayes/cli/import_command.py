@@ -1,4 +1,4 @@
-"""`import`: a table of somebody's own becomes moves and looks, after what was understood has been shown.
+"""`import`: a user's table becomes moves and looks, written after its columns were shown.
 
 Options in, library called, table or JSON out; heavy imports stand inside the command.
 """
@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import Json, confirmed, finish, refuse_options, report_line, somebody_there
-from tvsbayes.cli.begin_commands import moves_file, rows_listed, write_templates
+from tvsbayes.cli.app import Json, confirmed, finish, is_interactive, refuse_options, report_line
+from tvsbayes.cli.begin_commands import has_rows, moves_file, write_templates
 from tvsbayes.cli.head_commands import HEAD_URDF, import_sightings, import_urdf
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
-from tvsbayes.cli.understood_columns import CORRECT_IT, import_end, not_sure, table_document, table_lines
+from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, import_ending, table_document, table_lines
 from tvsbayes.errors import InputError, closest, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
@@ -114,16 +114,16 @@ def import_(
     correction = Correction(flipped, shifts, swap)
     if file.is_dir():
         sides = {f"{a}_approach": None if side == "unknown" else side for a, side in zip(AXES, approach, strict=True)}
-        unfit = {"column": column, "sheet": sheet, "angles": angles, "sd_px": sd_px, "axis": axis, **sides}
-        refuse_options("for tables of other programs, and FILE is a folder", "leave it out", **unfit)
-        wish = replace(correction, pixels_from=pixels_from, relative=relative)
-        _correct_campaign(file, to, wish, yes=yes, as_json=as_json)
+        refused = {"column": column, "sheet": sheet, "angles": angles, "sd_px": sd_px, "axis": axis, **sides}
+        refuse_options("for tables of other programs, and FILE is a folder", "leave it out", **refused)
+        full_correction = replace(correction, pixels_from=pixels_from, relative=relative)
+        _correct_campaign(file, to, full_correction, yes=yes, as_json=as_json)
         return
-    of_urdf = {"pan_joint": pan_joint, "tilt_joint": tilt_joint, "steps_per_turn": steps_per_turn}
+    urdf_options = {"pan_joint": pan_joint, "tilt_joint": tilt_joint, "steps_per_turn": steps_per_turn}
     if not urdf:
-        refuse_options("for a URDF", "add --urdf, or leave it out", **of_urdf)
+        refuse_options("for a URDF", "add --urdf, or leave it out", **urdf_options)
     if urdf or kind == POINTING:
-        others: dict[str, object] = {
+        other_options: dict[str, object] = {
             "column": column,
             "sheet": sheet,
             "angles": angles,
@@ -131,8 +131,8 @@ def import_(
             "relative": relative,
             "flip": flip,
         }
-        others |= {"shift_moves": shift_moves, "swap": swap, "sd_px": sd_px, "sightings": sightings}
-        refuse_options("for other tables", "leave it out", **others)
+        other_options |= {"shift_moves": shift_moves, "swap": swap, "sd_px": sd_px, "sightings": sightings}
+        refuse_options("for other tables", "leave it out", **other_options)
     if urdf:
         refuse_options("for other tables", "leave it out", format=kind if kind != "auto" else None)
         import_urdf(file, to, {"pan": pan_joint, "tilt": tilt_joint}, steps_per_turn, yes=yes, as_json=as_json)
@@ -141,23 +141,23 @@ def import_(
         _import_pointing(file, to, yes=yes, as_json=as_json)
         return
     if axis or instrument_of(to) is INSTRUMENTS["axis"]:
-        from tvsbayes.cli.axis_import import AxisNotation, import_readings
+        from tvsbayes.cli.axis_import import FileOptions, import_readings
         from tvsbayes.single_axis.guide_log import ASSUMPTIONS
 
-        unfit = {"pixels_from": pixels_from or None, "angles": angles, "sd_px": sd_px, "relative": relative}
-        unfit |= {"flip": flip, "shift_moves": shift_moves, "swap": swap}
+        refused = {"pixels_from": pixels_from or None, "angles": angles, "sd_px": sd_px, "relative": relative}
+        refused |= {"flip": flip, "shift_moves": shift_moves, "swap": swap}
         sides = {f"{a}_approach": None if side == "unknown" else side for a, side in zip(AXES, approach, strict=True)}
-        refuse_options("for a scanner, and this is an axis folder", "leave it out", **unfit, **sides)
+        refuse_options("for a scanner, and this is an axis folder", "leave it out", **refused, **sides)
         given = dict(_assumption(text, ASSUMPTIONS, "declination_deg=45.9") for text in assume or ())
-        meant = AxisNotation(_word(kind), run, deviations, counts_per_turn, given)
-        import_readings(file, to, stated, sheet, meant, yes=yes, as_json=as_json)
+        file_options = FileOptions(_axis_kind(kind), run, deviations, counts_per_turn, given)
+        import_readings(file, to, stated, sheet, file_options, yes=yes, as_json=as_json)
         return
-    of_axis: dict[str, object] = {"run": run, "deviations": deviations, "counts_per_turn": counts_per_turn}
-    of_axis |= {"format": None if kind == "auto" else kind}
-    refuse_options("for files of an axis", "add --axis, or leave it out", **of_axis)
+    axis_options: dict[str, object] = {"run": run, "deviations": deviations, "counts_per_turn": counts_per_turn}
+    axis_options |= {"format": None if kind == "auto" else kind}
+    refuse_options("for files of an axis", "add --axis, or leave it out", **axis_options)
     if sightings or instrument_of(to) is INSTRUMENTS["pan-tilt-sightings"]:
-        unfit = {"pixels_from": pixels_from or None, "sd_px": sd_px, "swap": swap}
-        refuse_options("for spots in pictures, and these are sightings", "leave it out", **unfit)
+        refused = {"pixels_from": pixels_from or None, "sd_px": sd_px, "swap": swap}
+        refuse_options("for spots in pictures, and these are sightings", "leave it out", **refused)
         given = dict(_assumption(text, {"u_deg": "standard uncertainty"}, "u_deg=0.005") for text in assume or ())
         notation = Notation(0, angles, SD_PX, relative, approach)
         import_sightings(file, to, stated, sheet, notation, correction, given.get("u_deg"), yes=yes, as_json=as_json)
@@ -165,26 +165,26 @@ def import_(
     refuse_options("for a guide log or sightings", "add --axis or --sightings, or leave it out", assume=assume)
     listed = _listed_moves(to)
     table = read_foreign(file, sheet)
-    asking = not (yes or as_json) and somebody_there()
-    known = _completed(table, map_columns(table.columns, stated), stated, listed is not None, asking)
+    interactive = not (yes or as_json) and is_interactive()
+    mapping = _complete_mapping(table, map_columns(table.columns, stated), stated, listed is not None, interactive)
     notation = Notation(pixels_from, angles, SD_PX if sd_px is None else sd_px, relative, approach)
-    looks = looks_of(table, known.columns, notation, listed)
-    mended = corrected(looks.moves, looks.spots, correction, None if listed is None else len(listed))
-    looks = replace(looks, moves=mended.moves, spots=mended.spots, assumed=(*looks.assumed, *mended.changes))
-    _refuse_listed(to, looks)
-    document = _understood_document(table, known, looks)
-    lines = [_understood_text(table, known, notation, looks)]
+    looks = looks_of(table, mapping.columns, notation, listed)
+    changed = corrected(looks.moves, looks.spots, correction, None if listed is None else len(listed))
+    looks = replace(looks, moves=changed.moves, spots=changed.spots, assumed=(*looks.assumed, *changed.changes))
+    _check_no_rows(to, looks)
+    document = _mapping_document(table, mapping, looks)
+    lines = [_mapping_text(table, mapping, notation, looks)]
     written = _write_looks(to, looks) if confirmed(lines, to, yes, as_json) else []
     document |= {"campaign": str(to), "files": written}
-    following = f"`tvsbayes check {typed(to)}`"
+    next_step = f"`tvsbayes check {typed(to)}`"
     if not (to / "stereo.json").is_file():
         cameras = f"tvsbayes stereo --import CALIBRATION -o {typed(to / 'stereo.json')}"
-        following = f"`{cameras}`, or of pictures of a board, then {following}"
-    finish(document, "\n".join([*lines, import_end(written, following, CORRECT_IT)]), as_json)
+        next_step = f"`{cameras}`, or of pictures of a board, then {next_step}"
+    finish(document, "\n".join([*lines, import_ending(written, next_step, CORRECT_HINT)]), as_json)
 
 
 def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
-    """A pointing table of a telescope becomes a campaign of sightings."""
+    """Import a pointing table of a telescope as a campaign of sightings."""
     from tvsbayes.head.foreign_sightings import STEP_DEG
     from tvsbayes.head.pointing_table import U_ARCSEC, campaign_of, read_stars
     from tvsbayes.instrument.campaign import write_campaign
@@ -204,7 +204,7 @@ def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
     yes = confirmed(lines, to, yes, as_json)
     if yes:
         write_campaign(campaign, to)
-    lines.append(import_end([escaped(str(to), 200)] * yes, f"`tvsbayes check {typed(to)}`"))
+    lines.append(import_ending([escaped(str(to), 200)] * yes, f"`tvsbayes check {typed(to)}`"))
     document = {"campaign": str(to), "moves": moves, "sightings": sightings, "assumed": assumed, "written": yes}
     finish(document, "\n".join(lines), as_json)
 
@@ -218,7 +218,7 @@ def _field_and_column(text: str) -> tuple[str, str]:
     return field.strip(), name.strip()
 
 
-def _word(kind: str) -> str:
+def _axis_kind(kind: str) -> str:
     """The value of --format for an axis."""
     from tvsbayes.cli.axis_import import KINDS
 
@@ -232,7 +232,7 @@ def _word(kind: str) -> str:
 def _assumption(text: str, known: Mapping[str, str], example: str) -> tuple[str, float]:
     """The two sides of --assume NAME=NUMBER, of names with their meanings."""
     name, _, number = text.partition("=")
-    allowed = ", ".join(f"{key}=NUMBER ({what})" for key, what in known.items())
+    allowed = ", ".join(f"{key}=NUMBER ({meaning})" for key, meaning in known.items())
     if name.strip() not in known or not NUMBER.fullmatch(number.strip()):
         remedy = f"write --assume {example}"
         raise InputError("usage", f"--assume {escaped(text)}; allowed: {allowed}", allowed=allowed, remedy=remedy)
@@ -240,7 +240,7 @@ def _assumption(text: str, known: Mapping[str, str], example: str) -> tuple[str,
 
 
 def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bool, as_json: bool) -> None:
-    """Write a copy of a campaign with corrected tables; what else lies in its folder stays there alone."""
+    """Write a copy of a campaign with corrected tables; other files of its folder are not copied."""
     from tvsbayes.instrument.campaign import looks_bytes, looks_file, moves_bytes, read_campaign
     from tvsbayes.instrument.corrections import Correction, corrected
 
@@ -251,8 +251,8 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
         raise InputError("usage", f"{escaped(str(folder), 200)} is a campaign already", remedy=remedy)
     campaign = read_campaign(folder)
     if campaign.rig.mechanism.sightings:
-        unfit = {"swap": correction.swapped or None, "pixels_from": correction.pixels_from or None}
-        refuse_options("for spots in pictures, and these are sightings", "leave it out", **unfit)
+        refused = {"swap": correction.swapped or None, "pixels_from": correction.pixels_from or None}
+        refuse_options("for spots in pictures, and these are sightings", "leave it out", **refused)
     changed = corrected(campaign.moves, campaign.spots, correction)
     moves, spots = changed.moves or (), changed.spots or ()
     campaign = replace(campaign, moves=moves, spots=spots)
@@ -263,19 +263,19 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
     written = []
     if yes:
         make_folder(to, empty=True)
-        beside = [name for name in ("campaign.toml", "stereo.json", HEAD_URDF) if (folder / name).is_file()]
-        contents = {name: read_bytes(folder / name, CSV_BYTES_MAX, folder) for name in beside}
+        copied = [name for name in ("campaign.toml", "stereo.json", HEAD_URDF) if (folder / name).is_file()]
+        contents = {name: read_bytes(folder / name, CSV_BYTES_MAX, folder) for name in copied}
         contents |= {"moves.csv": moves_bytes(moves), looks_file(campaign): looks_bytes(campaign)}
         for name, data in contents.items():
             write_atomically(to / name, data)
         written = [str(to / name) for name in contents]
-    lines.append(import_end(written, f"`tvsbayes check {typed(to)}`"))
+    lines.append(import_ending(written, f"`tvsbayes check {typed(to)}`"))
     document = {"assumed": list(changed.changes), "moves": len(moves), "spots": len(spots), "ok": ok}
     finish({**document, "campaign": str(to), "files": written}, "\n".join(lines), as_json)
 
 
 def _listed_moves(to: Path) -> tuple[Move, ...] | None:
-    """The moves that a campaign lists already, beyond the row of the template."""
+    """The moves of a campaign; None without any but the row of the template."""
     from tvsbayes.instrument.campaign import campaign_templates, parse_moves
     from tvsbayes.instrument.column_names import COUNTERS
 
@@ -303,50 +303,50 @@ def _listed_moves(to: Path) -> tuple[Move, ...] | None:
         ) from error
 
 
-def _completed(
-    table: ForeignTable, known: ColumnMapping, stated: Mapping[str, str], moves_known: bool, asking: bool
+def _complete_mapping(
+    table: ForeignTable, mapping: ColumnMapping, stated: Mapping[str, str], moves_known: bool, interactive: bool
 ) -> ColumnMapping:
-    """What was understood, with what was missing asked for at a terminal.
+    """The mapping of the columns, with missing ones asked for at a terminal.
 
     Raises:
-        InputError: something is missing, or claimed by two columns, and nobody can be asked.
+        InputError: missing or ambiguous columns, and no terminal.
     """
     from tvsbayes.instrument.column_names import COUNTERS, FIELDS, PIXELS, map_columns, missing
 
-    open_fields = [*missing(known.columns, moves_known), *known.ambiguous]
+    open_fields = [*missing(mapping.columns, moves_known), *mapping.ambiguous]
     if not open_fields:
-        return known
+        return mapping
     names = ", ".join(escaped(name) for name in table.columns)
-    if asking:
+    if interactive:
         answers = dict(stated)
         report_line(f"{table.file} has the columns {names}")
         for field in dict.fromkeys(open_fields):
             answers[field] = typer.prompt(f"which of them is {field}? (empty: none)", default="", show_default=False)
-        known = map_columns(table.columns, answers)
-        open_fields = missing(known.columns, moves_known)
+        mapping = map_columns(table.columns, answers)
+        open_fields = missing(mapping.columns, moves_known)
         if not open_fields:
-            return known
-    strange = set(known.columns).isdisjoint((*PIXELS, *COUNTERS))
-    besides = "; or --axis, where one axis and its readings are meant, --sightings, where a head says where it points"
-    besides *= strange
-    raise not_sure(table, known, list(dict.fromkeys(open_fields)), FIELDS, (*PIXELS, *COUNTERS), besides)
+            return mapping
+    no_columns = set(mapping.columns).isdisjoint((*PIXELS, *COUNTERS))
+    hint = "; or --axis, where one axis and its readings are meant, --sightings, where a head says where it points"
+    hint *= no_columns
+    raise column_refusal(table, mapping, list(dict.fromkeys(open_fields)), FIELDS, (*PIXELS, *COUNTERS), hint)
 
 
-def _refuse_listed(to: Path, looks: ForeignLooks) -> None:
-    """Nothing is overwritten: a table goes only where none is."""
+def _check_no_rows(to: Path, looks: ForeignLooks) -> None:
+    """Refuse a folder whose tables have rows: nothing is overwritten."""
     if to.exists() and not (to / "campaign.toml").is_file():
         make_folder(to, empty=True)
     remedy = "name another folder with --to; nothing is overwritten"
     if looks.moves is not None and _listed_moves(to) is not None:
-        place, allowed = escaped(str(to / "moves.csv"), 200), "no moves yet"
-        raise refusal("occupied", file=place, found="moves", allowed=allowed, remedy=remedy)
-    if looks.spots is not None and rows_listed(to):
-        place, allowed = escaped(str(to / "spots.csv"), 200), "no looks yet"
-        raise refusal("occupied", file=place, found="looks", allowed=allowed, remedy=remedy)
+        path, allowed = escaped(str(to / "moves.csv"), 200), "no moves yet"
+        raise refusal("occupied", file=path, found="moves", allowed=allowed, remedy=remedy)
+    if looks.spots is not None and has_rows(to):
+        path, allowed = escaped(str(to / "spots.csv"), 200), "no looks yet"
+        raise refusal("occupied", file=path, found="looks", allowed=allowed, remedy=remedy)
 
 
 def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
-    """The tables, in a folder with everything else of a campaign."""
+    """Write the tables, and templates of the other files of a campaign where they are missing."""
     from tvsbayes.instrument.campaign import moves_bytes, spots_bytes
 
     if not (to / "campaign.toml").is_file():
@@ -359,10 +359,10 @@ def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
     return [str(to / name) for name in contents]
 
 
-def _understood_document(table: ForeignTable, known: ColumnMapping, looks: ForeignLooks) -> dict[str, Any]:
-    """The same as `_understood_text`, for programs."""
+def _mapping_document(table: ForeignTable, mapping: ColumnMapping, looks: ForeignLooks) -> dict[str, Any]:
+    """The same as `_mapping_text`, for programs."""
     return {
-        **table_document(table, known),
+        **table_document(table, mapping),
         "assumed": list(looks.assumed),
         "moves": None if looks.moves is None else len(looks.moves),
         "spots": None if looks.spots is None else len(looks.spots),
@@ -370,8 +370,8 @@ def _understood_document(table: ForeignTable, known: ColumnMapping, looks: Forei
     }
 
 
-def _understood_text(table: ForeignTable, known: ColumnMapping, notation: Notation, looks: ForeignLooks) -> str:
-    """The columns that were found beside their fields, units and first values; what was assumed; what comes out."""
+def _mapping_text(table: ForeignTable, mapping: ColumnMapping, notation: Notation, looks: ForeignLooks) -> str:
+    """Fields with columns, units and first values; assumptions; counts of the result."""
     from tvsbayes.instrument.column_names import DEGREES, FIELDS, SECONDS, unit_of_name
 
     def unit(field: str, name: str) -> str:
@@ -383,7 +383,7 @@ def _understood_text(table: ForeignTable, known: ColumnMapping, notation: Notati
             return unit_of_name(name, SECONDS) or "s"
         return "px" if field.endswith("_px") else "steps" if field.endswith("_steps") else ""
 
-    lines = table_lines(table, known, FIELDS, unit)
+    lines = table_lines(table, mapping, FIELDS, unit)
     lines += [f"assumed: {text}" for text in looks.assumed]
     ok = sum(spot.status == "ok" for spot in looks.spots or ())
     counts = [] if looks.moves is None else [f"{len(looks.moves)} moves"]

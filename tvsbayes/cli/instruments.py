@@ -1,7 +1,7 @@
-"""The instruments that commands serve beside the scanner: a list, and the one place that asks which one a folder is of.
+"""The instruments other than the scanner, and their dispatch: finds the instrument of a folder and runs its command.
 
-A room of commands is a module with a function for every command that the instrument has (`fit`, `plan`, `check` ...):
-the folder first, then the options by their names. An option that it does not take is refused, as is a command.
+Each instrument has a module with a function for each of its commands (`fit`, `plan`, `check` ...): the folder first,
+then the options by their names. Unknown options and commands are refused.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from tvsbayes.errors import InputError, escaped
 
 @dataclass(frozen=True)
 class Instrument:
-    """An instrument beside the scanner.
+    """An instrument other than the scanner.
 
     Attributes:
-        words: with their article, as a sentence names it.
-        folder: the same of its campaign folder.
+        words: its name in a sentence, with article.
+        folder: the same for its campaign folder.
         commands: module of its commands.
-        served: what to do instead of a command that it does not have.
-        remedies: the same for single commands and for their options, by the name of the command.
-        shared: commands of the scanner that serve it as they are.
+        served: remedy for a command that it does not have.
+        remedies: remedies for single commands and their options, by the name of the command.
+        shared: commands of the scanner that it uses unchanged.
     """
 
     words: str
@@ -37,7 +37,7 @@ class Instrument:
     shared: tuple[str, ...] = ()
 
     def command(self, name: str) -> Any:
-        """Its function for a command, None where it has none."""
+        """Its function for a command; None without one."""
         return getattr(import_module(self.commands), name.replace("-", "_"), None)
 
     def carry_out(self, name: str, path: Path, **options: object) -> None:
@@ -46,20 +46,20 @@ class Instrument:
         Args:
             name: of the command.
             path: campaign folder.
-            options: all that `tvsbayes` knows for it; None or False where not given.
+            options: all options of the command; None or False where not given.
 
         Raises:
-            InputError: it does not have the command, or does not take an option that is given.
+            InputError: an unknown command, or an unknown option that is given.
         """
         function = self.command(name)
         if function is None:
             message = f"{name} is for a scanner, not {self.words}, and {escaped(str(path), 200)} is {self.folder}"
             raise InputError("usage", message, remedy=self.remedies.get(name, self.served))
-        taken = inspect.signature(function).parameters
-        unfit = {option: value for option, value in options.items() if option not in taken}
+        parameters = inspect.signature(function).parameters
+        refused = {option: value for option, value in options.items() if option not in parameters}
         remedy = self.remedies.get(name, "leave it out")
-        refuse_options(f"for a scanner, and this is {self.folder}", remedy, **unfit)
-        function(path, **{option: value for option, value in options.items() if option in taken})
+        refuse_options(f"for a scanner, and this is {self.folder}", remedy, **refused)
+        function(path, **{option: value for option, value in options.items() if option in parameters})
 
 
 INSTRUMENTS = {
@@ -88,16 +88,16 @@ INSTRUMENTS = {
 
 
 def instrument_of(path: Path | None) -> Instrument | None:
-    """Whose campaign folder this is: of an instrument of the list; None of a scanner, and where none can be read."""
+    """The instrument of a campaign folder; None for a scanner, and where no header can be read."""
     from tvsbayes.instrument.campaign_header import mechanism_of
 
     return None if path is None else INSTRUMENTS.get(mechanism_of(path))
 
 
 def serve(command: str, campaign: Path | None, **options: object) -> bool:
-    """Whether a folder is of an instrument of the list, which has then carried the command out.
+    """Run a command if the folder is of an instrument of the list; returns whether it was run.
 
-    A command that begins with it hands on `locals()`: its options by name.
+    A command calls it first with `locals()`: its options by name.
 
     Raises:
         InputError: as `Instrument.carry_out`.

@@ -16,7 +16,7 @@ import sys
 try:
     import typer
 except ModuleNotFoundError as missing:
-    # Who installed without dependencies has the Python side of a robot, not the command.
+    # An installation without dependencies has only the Python part for robots, not the command.
     sys.exit(f"error: the command tvsbayes needs the package {missing.name}; what to do: pip install tvsbayes")
 
 from tvsbayes.cli.acquire_command import acquire
@@ -47,9 +47,9 @@ COMMANDS = (
     *(demo, new, import_, simulate, detect, stereo, check, acquire, doctor, export),
     *(classic, fit, calibrate, report, view, compare, watch, locate, steps_for, compensate, verify, plan, study),
 )
-"""In the order of `--help`."""
-COLLECTIONS = 100_000, 20, 20
-"""Thresholds of Python's garbage collector in a command; its own, 2000 new objects, is for small programs."""
+"""Commands in the order of `--help`."""
+GC_THRESHOLDS = 100_000, 20, 20
+"""Thresholds of Python's garbage collector in a command; the default, 2000 new objects, is for small programs."""
 _DECIMAL_COMMA = re.compile(r"(?:--[a-z0-9-]+=)?([-+]?[0-9]*,[0-9]+)")
 for command in COMMANDS:
     name = command.__name__.rstrip("_").replace("_", "-")
@@ -86,14 +86,14 @@ def _run(arguments: list[str]) -> int:
         # Wrong options are bad input like any other; typer's own classes carry the text to show.
         if not (hasattr(error, "format_message") and hasattr(error, "show")):
             raise
-        commas = [match[1] for word in arguments if (match := _DECIMAL_COMMA.fullmatch(word))]
-        remedy = f"write a decimal point: {commas[0].replace(',', '.')}" if commas else "see tvsbayes --help"
+        numbers = [match[1] for word in arguments if (match := _DECIMAL_COMMA.fullmatch(word))]
+        remedy = f"write a decimal point: {numbers[0].replace(',', '.')}" if numbers else "see tvsbayes --help"
         if wants_json:
             print_json(error_document(InputError("usage", error.format_message(), remedy=remedy)))
         else:
             usage = io.StringIO()
             error.show(file=usage)
-            for line in [*usage.getvalue().splitlines(), *[f"what to do: {remedy}"] * bool(commas)]:
+            for line in [*usage.getvalue().splitlines(), *[f"what to do: {remedy}"] * bool(numbers)]:
                 report_line(line)
         return InputError.exit_code
     if code == INTERRUPTED:
@@ -105,25 +105,25 @@ def _run(arguments: list[str]) -> int:
 
 def main() -> None:
     """Entry point of the `tvsbayes` script."""
-    # Read when NumPy is first imported. The matrices here are small: OpenBLAS' second thread only waits, and its
-    # busy waiting takes the time of XLA's threads, tenfold where two fits share two cores.
+    # Read at the first import of NumPy. The matrices are small: OpenBLAS' second thread only waits, and its busy
+    # waiting slows XLA's threads, tenfold where two fits share two cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # XLA calls a compilation of more than two minutes, as on a small computer, an error to be filed with its authors.
+    # XLA reports a compilation of more than two minutes, as on a small computer, as an error for its authors.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    # A command ends after seconds: the collector's walks over all that JAX holds cost a twentieth of them.
-    gc.set_threshold(*COLLECTIONS)
-    # A closed stream (`2>&-`) is None; its number would go to the next file, into which libraries then write errors.
+    # A command ends after seconds: the collector's passes over the objects of JAX take a twentieth of them.
+    gc.set_threshold(*GC_THRESHOLDS)
+    # A closed stream (`2>&-`) is None; the next file would get its number, and libraries would write errors into it.
     sys.stdout, sys.stderr = (
         open(os.devnull, "w", encoding="utf-8") if stream is None else stream for stream in (sys.stdout, sys.stderr)
     )
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        # As Python's own stderr: what a terminal or file cannot show of a name is escaped, and the command goes on.
+        # Like Python's own stderr: characters of a name that cannot be encoded are escaped, and the command continues.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = run(sys.argv[1:])
     except KeyboardInterrupt:
         # Between the end of a command and the end of the process.
         code = INTERRUPTED
-    # What lives now ends with the process: Python would search all of it for cycles once more, for half a second.
+    # All objects end with the process: Python would search them for cycles once more, for half a second.
     gc.freeze()
     sys.exit(code)

@@ -1,6 +1,6 @@
-"""The bar that shows a wait: on stderr, where that is a terminal, for a wait that has lasted two seconds.
+"""The progress bar: on stderr, if it is a terminal, after two seconds of waiting.
 
-What an interrupted wait leaves behind is said too.
+After an interruption a line reports the files that were kept.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tvsbayes.progress import DelayedDisplay, Progress, Show, Write, time_left
 
 @contextmanager
 def waiting() -> Iterator[Show | None]:
-    """What shows the progress of the block; None where nobody sees it."""
+    """A function that shows the progress of the block; None without a terminal."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -28,30 +28,30 @@ def waiting() -> Iterator[Show | None]:
 
 
 @contextmanager
-def chain_kept(further: str) -> Iterator[Show]:
-    """`waiting` for a fit; Ctrl-C says that its chain is kept, and how to go on with it."""
+def chain_progress(hint: str) -> Iterator[Show]:
+    """`waiting` for a fit; after Ctrl-C a line reports that the chain is kept, and how to continue it."""
     from tvsbayes.posterior.sampling import WALKING
 
     announced = 0
     try:
-        with waiting() as shown:
+        with waiting() as show_progress:
 
             def show(state: Progress) -> None:
                 nonlocal announced
                 announced += state.doing == f"{SAMPLING}: {WALKING}"
-                if shown is not None:
-                    shown(state)
+                if show_progress is not None:
+                    show_progress(state)
 
             yield show
     except KeyboardInterrupt:
-        # It is announced once when it begins: before the first block of steps there is no chain to keep.
+        # The first announcement is the start of the chain: before the first block of steps there is nothing to keep.
         if announced > 1:
-            report_line(f"the chain so far is kept in chain.npz; {further}")
+            report_line(f"the chain so far is kept in chain.npz; {hint}")
         raise
 
 
 def _bar() -> Write:
-    """A bar on stderr that leaves no trace."""
+    """A bar on stderr that is removed at its end."""
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn
     from rich.progress import Progress as Bar
@@ -65,8 +65,8 @@ def _bar() -> Write:
         if state is None:
             bar.stop()
             return
-        left = time_left(state.seconds_left)
-        bar.update(task, description=state.doing, completed=state.share, left=left)
+        time_text = time_left(state.seconds_left)
+        bar.update(task, description=state.doing, completed=state.share, left=time_text)
         bar.start()
 
     return write

@@ -1,4 +1,4 @@
-"""Commands that end on somebody's desk: report, and calibrate, which does all that comes before it too.
+"""The commands report, and calibrate, which also runs all steps before the report.
 
 Options in, library called, table or JSON out; heavy imports stand inside the commands.
 """
@@ -18,19 +18,19 @@ from tvsbayes.cli.app import (
     Ended,
     Json,
     Seed,
+    check_output,
     command_line,
     finish,
     finite,
+    print_part,
     refuse_options,
     report_line,
-    spared,
-    tell_part,
-    tell_removed,
+    report_removed,
 )
-from tvsbayes.cli.campaign_commands import campaign_held
-from tvsbayes.cli.estimate_commands import GO_ON
+from tvsbayes.cli.campaign_commands import campaign_contents
+from tvsbayes.cli.estimate_commands import OVERRIDE_HINT
 from tvsbayes.cli.instruments import serve
-from tvsbayes.cli.progress_bar import chain_kept, waiting
+from tvsbayes.cli.progress_bar import chain_progress, waiting
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from tvsbayes.results.fit_record import FitRecord
 
 DCC_MESSAGES = 20
-"""Of a schema validator, shown at most."""
+"""Largest number of messages of a schema validator to show."""
 RANGE_MM = 1e3
 GATHERING, DRAWING, PRINTING = "gathering evidence", "drawing the page", "printing to PDF"
 
@@ -87,7 +87,7 @@ def report(
     from tvsbayes.instrument.campaign import read_campaign
 
     finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm)
-    spared(out)
+    check_output(out)
     if out is not None and out.suffix.lower() == ".pdf":
         message, remedy = "-o names the HTML page, and its PDF lies beside it", "write -o NAME.html --pdf"
         raise InputError("usage", message, column="--out", allowed="NAME.html", remedy=remedy)
@@ -97,29 +97,29 @@ def report(
     countries = _countries(country, customer_country)
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm}
     limits["range_mm"] = range_mm if range_mm != RANGE_MM else None
-    certified = {"dcc": dcc, "dcc_schema": dcc_schema}
-    if serve("report", campaign, issue=issue, pdf=pdf, out=out, as_json=as_json, **limits, **certified):
+    certificate = {"dcc": dcc, "dcc_schema": dcc_schema}
+    if serve("report", campaign, issue=issue, pdf=pdf, out=out, as_json=as_json, **limits, **certificate):
         return
     data = read_campaign(campaign)
-    wish = PageWish(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf, out)
-    page = wish.write(data)
+    options = PageOptions(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf, out)
+    page = options.write(data)
     missed, lines, result = page.missed, page.lines(), page.as_json()
     if dcc or dcc_schema:
         from tvsbayes.report.page import certificate_place
 
         content = _certificate(data, page, issue, countries)
-        place = certificate_place(page.path, out)
-        write_atomically(place, content)
-        page.files["dcc"] = str(place)
+        path = certificate_place(page.path, out)
+        write_atomically(path, content)
+        page.files["dcc"] = str(path)
         if dcc_schema:
             from tvsbayes.metrology.dcc import check_dcc
 
-            checked = check_dcc(content, dcc_schema)
-            verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[checked.valid]
-            lines += [f"DCC by {checked.tool} against {dcc_schema}: {verdict}", *checked.messages[:DCC_MESSAGES]]
-            result["dcc_schema"] = asdict(checked)
-            missed |= not checked.valid
-    tell_removed(page.removed, page.files)
+            check = check_dcc(content, dcc_schema)
+            verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[check.valid]
+            lines += [f"DCC by {check.tool} against {dcc_schema}: {verdict}", *check.messages[:DCC_MESSAGES]]
+            result["dcc_schema"] = asdict(check)
+            missed |= not check.valid
+    report_removed(page.removed, page.files)
     finish(result, "\n".join([*lines, f"written: {', '.join(page.files.values())}"]), as_json)
     if missed:
         raise Ended(TARGET_MISSED)
@@ -128,11 +128,11 @@ def report(
 def _issue(laboratory: str | None, customer: str | None) -> Issue:
     from tvsbayes.report.document import Issue
 
-    return replace(Issue.today(), laboratory=_named("laboratory", laboratory), customer=_named("customer", customer))
+    return replace(Issue.today(), laboratory=_text("laboratory", laboratory), customer=_text("customer", customer))
 
 
-def _named(option: str, text: str | None) -> str:
-    """What an option says, "" without it; an empty one is refused: nobody types it on purpose."""
+def _text(option: str, text: str | None) -> str:
+    """The text of an option, "" without it; an empty one is refused as a mistake."""
     if text is not None and not text.strip():
         remedy = "write the name, or leave the option out: the report says `not stated` then"
         raise InputError("usage", f"--{option} is empty", column=f"--{option}", allowed="a name", remedy=remedy)
@@ -140,14 +140,14 @@ def _named(option: str, text: str | None) -> str:
 
 
 def _countries(place: str | None, customer: str | None) -> dict[str, str]:
-    """Countries by the field of `Parties` that they go to, of those that were stated."""
-    stated = {"country": _named("country", place), "customer_country": _named("customer-country", customer)}
+    """Stated countries by their field of `Parties`."""
+    stated = {"country": _text("country", place), "customer_country": _text("customer-country", customer)}
     return {name: text for name, text in stated.items() if text}
 
 
 @dataclass(frozen=True)
-class PageWish:
-    """What page is wanted of a campaign; fields as the options of `report`."""
+class PageOptions:
+    """Options for the page of a campaign; fields as the options of `report`."""
 
     campaign: Path
     issue: Issue
@@ -158,7 +158,7 @@ class PageWish:
     out: Path | None = None
 
     def write(self, data: Campaign) -> WrittenPage:
-        """Gather, draw and write it, and print it where that is wanted; fits first where results are missing."""
+        """Gather evidence, draw and write the page, and print it if requested; fits first where results are missing."""
         from tvsbayes.calibration.calibration_file import load_calibration
         from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page
         from tvsbayes.report.scanner_document import report_document
@@ -174,9 +174,9 @@ class PageWish:
         with waiting() as progress, Job(stages, progress) as job:
             record = StoredOrFitted(data, report_line, job.part(FITTING)).record
             job.begin(GATHERING)
-            doubts = campaign_held(self.campaign, data)["warnings"]
+            warnings = campaign_contents(self.campaign, data)["warnings"]
             calibration = load_calibration(self.campaign)
-            evidence = gather(data, record, calibration, range_mm=self.range_mm, doubts=doubts, **limits)
+            evidence = gather(data, record, calibration, range_mm=self.range_mm, doubts=warnings, **limits)
             job.begin(DRAWING)
             page = report_document(evidence, self.issue)
             html = page_html(page)
@@ -192,12 +192,12 @@ class WrittenPage:
     """A page on disk.
 
     Attributes:
-        record, evidence: what it was made of.
+        record, evidence: its sources.
         number: on its first page.
         html: its bytes.
-        path: where it lies.
-        files: it and what was made of it, by kind.
-        removed: names of files that belonged to the page that stood there before.
+        path: its file.
+        files: the page and files made of it, by kind.
+        removed: names of removed files of an earlier page.
     """
 
     record: FitRecord
@@ -216,7 +216,7 @@ class WrittenPage:
         return any(c.verdict != MET for c in self.evidence.criteria)
 
     def lines(self) -> list[str]:
-        """What the limits have come to, for a terminal."""
+        """Verdicts on the limits, for a terminal."""
         from tvsbayes.report.fit_text import validation_lines
         from tvsbayes.report.tables import chance_text
 
@@ -273,8 +273,8 @@ def calibrate(
         find_browser()
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm, "anyway": anyway}
     limits["range_mm"] = range_mm if range_mm != RANGE_MM else None
-    ways = {"quick": quick, "no_sample": no_sample, "seed": seed}
-    if serve("calibrate", campaign, issue=issue, **ways, pdf=pdf, as_json=as_json, **limits):
+    sampling = {"quick": quick, "no_sample": no_sample, "seed": seed}
+    if serve("calibrate", campaign, issue=issue, **sampling, pdf=pdf, as_json=as_json, **limits):
         return
     from tvsbayes.estimators.findings import stop_at
     from tvsbayes.estimators.plausibility import implausible
@@ -283,14 +283,14 @@ def calibrate(
     from tvsbayes.report.fit_text import fit_text
 
     data = read_campaign(campaign)
-    documents: dict[str, Any] = {"check": campaign_held(campaign, data)}
-    tell_part(check_text(documents["check"]), as_json)
+    documents: dict[str, Any] = {"check": campaign_contents(campaign, data)}
+    print_part(check_text(documents["check"]), as_json)
     if not anyway:
-        stop_at(implausible(data), GO_ON)
+        stop_at(implausible(data), OVERRIDE_HINT)
     documents["classic"], printed = _classic(data)
-    tell_part(printed, as_json)
+    print_part(printed, as_json)
     compile_for(report_line)
-    with chain_kept(f"go on with `{command_line('fit', campaign)} --resume`") as progress:
+    with chain_progress(f"go on with `{command_line('fit', campaign)} --resume`") as progress:
         results = calibrate_campaign(
             data,
             output_place(campaign, "results"),
@@ -305,9 +305,9 @@ def calibrate(
     printed = fit_text(summary, written=list(results.files.values()), causes=results.causes)
     if results.error is not None:
         finish({**documents, "report": None}, printed, as_json, results.error)
-    tell_part(printed, as_json)
-    page = PageWish(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf).write(data)
-    tell_removed(page.removed, page.files)
+    print_part(printed, as_json)
+    page = PageOptions(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf).write(data)
+    report_removed(page.removed, page.files)
     documents["report"] = page.as_json()
     text = "\n".join([*page.lines(), f"next: open {', '.join(page.files.values())} in a browser"])
     finish(documents, text, as_json)
@@ -316,7 +316,7 @@ def calibrate(
 
 
 def _classic(data: Campaign) -> tuple[dict[str, Any] | None, str]:
-    """Document and table of the four-point estimator; None, and why, without a complete experiment."""
+    """Document and table of the four-point estimator; None, and the reason, without a complete experiment."""
     from tvsbayes.estimators.four_point import classic
     from tvsbayes.report.fit_text import classic_text
 

@@ -1,6 +1,6 @@
-"""How lines look on a terminal: colour by how they begin, sentences folded between words.
+"""Lines on a terminal: colour by their first words, sentences wrapped between words.
 
-Colour only where nobody said NO_COLOR (https://no-color.org); files and pipes get the plain text, line by line.
+No colour where NO_COLOR is set (https://no-color.org); files and pipes get the plain text, line by line.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import IO
 
 import typer
 
-COLOUR_OF = (
+COLOUR_STARTS = (
     ("red", ("error:", "VALIDATION FAILED", "NOT CONVERGED", "UNCONVERGED", "EXTRAPOLATED", "verdict: NOT CONVERGED")),
     ("red", ("verdict: VALIDATION FAILED", "verdict: UNCONVERGED", "verdict: PRIOR CONFLICT", "NO NUMBER OF LOOKS")),
     ("red", ("MOVED (p ",)),
@@ -21,12 +21,12 @@ COLOUR_OF = (
     ("green", ("verdict: usable", "OK (p ")),
     ("cyan", ("next:", "what to do:", "what helps:")),
 )
-"""Colour, and how lines of that colour begin."""
-TABLE = "  "
-"""Stands between cells, never between words of a sentence."""
-LAST_CELL_LEAST = 24
-"""Columns that a cell needs to go on below itself."""
-BOLD = ("error:", "verdict:", "next:", "VALIDATION FAILED", "MOVED (p ", "CANNOT TELL (p ", "OK (p ")
+"""Colour, and the first words of lines of that colour."""
+CELL_GAP = "  "
+"""Separates cells, never words of a sentence."""
+LAST_CELL_MIN = 24
+"""Least width of the last cell for which it is wrapped below itself."""
+BOLD_STARTS = ("error:", "verdict:", "next:", "VALIDATION FAILED", "MOVED (p ", "CANNOT TELL (p ", "OK (p ")
 
 
 def shows_colour(stream: IO[str]) -> bool:
@@ -34,8 +34,8 @@ def shows_colour(stream: IO[str]) -> bool:
     return not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb" and stream.isatty()
 
 
-def shown(text: str, stream: IO[str]) -> str:
-    """Text as a terminal is to show it; the text itself where the stream is none."""
+def styled(text: str, stream: IO[str]) -> str:
+    """Text with colours and line breaks for a terminal; unchanged for other streams."""
     if not stream.isatty():
         return text
     width, colours = shutil.get_terminal_size().columns, shows_colour(stream)
@@ -44,24 +44,24 @@ def shown(text: str, stream: IO[str]) -> str:
 
 def _line(line: str, width: int, colours: bool) -> str:
     folded = line if len(line) <= width else _folded(line, width)
-    colour = next((colour for colour, begins in COLOUR_OF if line.startswith(begins)), None)
+    colour = next((colour for colour, starts in COLOUR_STARTS if line.startswith(starts)), None)
     if colour is None or not colours:
         return folded
-    return typer.style(folded, fg=colour, bold=line.startswith(BOLD))
+    return typer.style(folded, fg=colour, bold=line.startswith(BOLD_STARTS))
 
 
 def _folded(line: str, width: int) -> str:
-    """A sentence goes on below, two columns in; one that is the last cell of a row goes on below that cell."""
-    begins = line.rstrip().rfind(TABLE) + len(TABLE) if TABLE in line.strip() else 0
-    if begins > width - LAST_CELL_LEAST:
+    """A wrapped line: a sentence is indented by two columns, the last cell of a row to the start of the cell."""
+    start = line.rstrip().rfind(CELL_GAP) + len(CELL_GAP) if CELL_GAP in line.strip() else 0
+    if start > width - LAST_CELL_MIN:
         return line
-    indent = " " * (begins or 2)
+    indent = " " * (start or 2)
     lines = textwrap.wrap(
-        line[begins:],
+        line[start:],
         width,
-        initial_indent=" " * begins,
+        initial_indent=" " * start,
         subsequent_indent=indent,
         break_long_words=False,
         break_on_hyphens=False,
     )
-    return line[:begins] + "\n".join(lines)[begins:]
+    return line[:start] + "\n".join(lines)[start:]

@@ -1,4 +1,4 @@
-"""Commands that use a calibration or look ahead: locate, steps-for, plan, study.
+"""Commands that use a calibration or plan looks: locate, steps-for, plan, study.
 
 Options in, library called, table or JSON out; heavy imports stand inside the commands.
 """
@@ -19,13 +19,13 @@ from tvsbayes.cli.app import (
     Json,
     OldOut,
     Seed,
+    check_order,
+    check_output,
     finish,
     finite,
-    in_order,
     keep,
     refuse_options,
     report_line,
-    spared,
 )
 from tvsbayes.cli.compensation_commands import export_calibration, plan_verify
 from tvsbayes.cli.head_commands import refuse_head
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 
 WORKERS = 2
 PLAN_DRAWS = 200
-"""As `planning.planner` has it, which brings JAX."""
+"""Equal to that of `planning.planner`, which would import JAX."""
 NEAREST_POINT_MM = 10.0
-"""A point nearer to the middle of the baseline is nowhere that the beam goes, and most rooms end before 10 m."""
+"""Least distance of a point from the middle of the baseline: smaller numbers are probably metres."""
 PLANNING, LOCATING = "plan", "points"
 
 
@@ -91,23 +91,23 @@ def locate(
     refuse_options("for files of points", "give --points FILE.csv with it", cloud=cloud)
     if pan_steps is None or tilt_steps is None or aperture_deg is None:
         given = {"--pan-steps": pan_steps, "--tilt-steps": tilt_steps, "--aperture-deg": aperture_deg}
-        lacking = [name for name, value in given.items() if value is None]
-        message = f"locate needs one point or a file of points; missing: {', '.join(lacking)}"
-        remedy = f"give {' and '.join(lacking)} too, or --points FILE.csv"
+        missing = [name for name, value in given.items() if value is None]
+        message = f"locate needs one point or a file of points; missing: {', '.join(missing)}"
+        remedy = f"give {' and '.join(missing)} too, or --points FILE.csv"
         raise InputError("usage", message, allowed=", ".join(given), remedy=remedy)
     finite(pan_steps=pan_steps, tilt_steps=tilt_steps, aperture_deg=aperture_deg)
     from tvsbayes.instrument.axes import sides_of
     from tvsbayes.instrument.campaign import read_campaign
 
-    where = (pan_steps, tilt_steps, aperture_deg, (pan_approach or "left", tilt_approach or "up"))
-    sides_of(where[-1])
+    look = (pan_steps, tilt_steps, aperture_deg, (pan_approach or "left", tilt_approach or "up"))
+    sides_of(look[-1])
     with waiting() as progress:
         calibration = StoredOrFitted(read_campaign(campaign), report_line, progress).calibration
     from tvsbayes.coordinates.location import locate as locate_points
     from tvsbayes.report.command_text import budget_text, locations_text
 
     refuse_head(calibration)
-    located = locate_points(calibration, *where, draws=draws, seed=seed)
+    located = locate_points(calibration, *look, draws=draws, seed=seed)
     if located.refused[0] is not None:
         raise located.refused[0]
     document = {"estimator": located.estimator, "draws": located.draws, **located.as_json(0)}
@@ -115,33 +115,33 @@ def locate(
     if budget:
         from tvsbayes.metrology.look_budget import budget as point_budget
 
-        parts = point_budget(calibration, *where)
-        document["budget"] = parts.as_json()
-        text += f"\n\n{budget_text(parts)}"
+        point_parts = point_budget(calibration, *look)
+        document["budget"] = point_parts.as_json()
+        text += f"\n\n{budget_text(point_parts)}"
     finish(document, text, as_json)
 
 
 def _locate_all(campaign: Path, file: Path, draws: int, seed: int, as_json: bool) -> None:
-    """Every point of a file, refused one by one."""
+    """Locate all points of a file; each may be refused."""
     from tvsbayes.coordinates.looks_file import read_looks
     from tvsbayes.instrument.campaign import read_campaign
 
     points = read_looks(file)
-    where = (points.pan_steps, points.tilt_steps, points.aperture_deg, points.approach)
+    looks = (points.pan_steps, points.tilt_steps, points.aperture_deg, points.approach)
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
         calibration = StoredOrFitted(read_campaign(campaign), report_line, job.part(FITTING)).calibration
         from tvsbayes.coordinates.location import locate as locate_points
         from tvsbayes.report.command_text import locations_text
 
         refuse_head(calibration)
-        located = locate_points(calibration, *where, draws=draws, seed=seed, progress=job.part(LOCATING))
+        located = locate_points(calibration, *looks, draws=draws, seed=seed, progress=job.part(LOCATING))
     entries = [located.as_json(k) for k in range(len(located.refused))]
     document = {"estimator": located.estimator, "draws": located.draws, "points": entries}
     finish(document, locations_text(located), as_json)
 
 
-def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int, as_json: bool) -> None:
-    """The points of a file of any length as a cloud."""
+def _write_cloud(campaign: Path, file: Path, out: Path, draws: int, seed: int, as_json: bool) -> None:
+    """Write the points of a file of any length as a cloud."""
     from tvsbayes.coordinates.cloud import EvenSample, checked
     from tvsbayes.coordinates.cloud import cloud as points_of
     from tvsbayes.coordinates.cloud_files import cloud_place, write_cloud
@@ -151,7 +151,7 @@ def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int,
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.command_text import cloud_text
 
-    cloud_place(place, file)
+    cloud_place(out, file)
     with waiting() as progress, Job({FITTING: 1.0, LOCATING: 1.0}, progress) as job:
         measured = read_campaign(campaign)
         calibration = StoredOrFitted(measured, report_line, job.part(FITTING)).calibration
@@ -160,10 +160,10 @@ def _write_cloud(campaign: Path, file: Path, place: Path, draws: int, seed: int,
         job.begin(LOCATING)
         sample = EvenSample()
         blocks = points_of(calibration, sample.of(look_blocks(file, job.at)), simple)
-        written = write_cloud(blocks, place, tuple(simple))
-        law = checked(calibration, sample, draws, seed)
-    document = {"estimator": calibration.estimator, **written.as_json(), "checked": asdict(law)}
-    finish(document, cloud_text(written, law, calibration), as_json)
+        written = write_cloud(blocks, out, tuple(simple))
+        check = checked(calibration, sample, draws, seed)
+    document = {"estimator": calibration.estimator, **written.as_json(), "checked": asdict(check)}
+    finish(document, cloud_text(written, check, calibration), as_json)
 
 
 def steps_for(
@@ -193,7 +193,7 @@ def steps_for(
     if export:
         options = {"pan_approach": pan_approach, "tilt_approach": tilt_approach, "rig": rig}
         target = {"x_mm": x_mm, "y_mm": y_mm, "z_mm": z_mm, "azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
-        spared(out)
+        check_output(out)
         remedy = "leave it out, --export writes the calibration itself; or leave out --export"
         refuse_options("for one target", remedy, **target, **options)
         export_calibration(campaign, export, out, as_json)
@@ -257,23 +257,23 @@ def plan(
 ) -> None:
     """How many looks, which ones, and when to stop. With --given: what next."""
     out = out or output
-    spared(out, rig)
+    check_output(out, rig)
     finite(minutes=minutes, confirm=confirm)
-    # What a plan of looks towards a target may state beside it.
-    spare: dict[str, object] = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS, "aperture": aperture}
+    # Further options of a plan of looks for a target.
+    extra: dict[str, object] = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS, "aperture": aperture}
     onward = {"next": count, "confirm": confirm}
     if verify:
-        held: dict[str, object] = {"target": target, "minutes": minutes, "watch": watch, **spare, **onward}
-        refuse_options("not for --verify", "leave it out", **held)
+        refused: dict[str, object] = {"target": target, "minutes": minutes, "watch": watch, **extra, **onward}
+        refuse_options("not for --verify", "leave it out", **refused)
         plan_verify(given or rig, out=out, seed=seed, as_json=as_json)
         return
     if watch:
-        refuse_options("for targets, not for --watch", "leave it out", target=target, **spare, **onward)
+        refuse_options("for targets, not for --watch", "leave it out", target=target, **extra, **onward)
         plan_watch(rig, given, minutes=minutes, out=out, seed=seed, as_json=as_json)
         return
     common = {"target": target, "minutes": minutes, "out": out, "seed": seed, "as_json": as_json}
-    alone = given is not None and rig is None
-    if serve("plan", given or rig, **common, alone=alone, **spare, **onward):
+    folder_alone = given is not None and rig is None
+    if serve("plan", given or rig, **common, alone=folder_alone, **extra, **onward):
         return
     if rig is None:
         raise InputError("usage", "Missing argument 'RIG'.", remedy="see tvsbayes --help")
@@ -288,10 +288,10 @@ def plan(
     from tvsbayes.report.command_text import plan_text
     from tvsbayes.results.plan_record import plan_document
 
-    wanted = parse_target(target or DEFAULT_TARGET)
+    parsed_target = parse_target(target or DEFAULT_TARGET)
     if count is not None:
-        refuse_options("for whole plans, not for --next", "leave it out", **spare, minutes=minutes, out=out)
-        _next_looks(instrument, data, wanted, count, confirm, as_json)
+        refuse_options("for whole plans, not for --next", "leave it out", **extra, minutes=minutes, out=out)
+        _next_looks(instrument, data, parsed_target, count, confirm, as_json)
         return
     refuse_options("for --next", "add --next, or leave it out", confirm=confirm)
     if criterion not in CRITERIA:
@@ -302,7 +302,7 @@ def plan(
         fitted = None if data is None else StoredOrFitted(data, report_line, job.part(FITTING)).fit
         result = find_plan(
             instrument,
-            wanted,
+            parsed_target,
             given=fitted,
             minutes=minutes,
             criterion=criterion,
@@ -319,7 +319,7 @@ def plan(
     elif out is not None:
         text += f"\nnothing written to {escaped(str(out), 200)}: there is nothing more to measure"
     if data is not None and given is not None:
-        # Where the report looks for what to measure next.
+        # The report reads the next looks from this file.
         keep(plan_document(document, input_hashes(data)), output_place(given, "results") / "plan.json")
     finish(document, text, as_json)
     if target is not None and not result.met:
@@ -329,7 +329,7 @@ def plan(
 def _next_looks(
     rig: Rig, data: Campaign | None, target: Target, count: int, confirm: float | None, as_json: bool
 ) -> None:
-    """`plan --given --next`: a few looks that go on where the campaign ended."""
+    """`plan --given --next`: a few looks that continue the campaign."""
     if data is None:
         raise InputError("usage", "--next goes on from a campaign", remedy="add --given CAMPAIGN")
     compile_for(report_line)
@@ -379,7 +379,7 @@ def study(
         refuse_options("for the engine dask", "add --engine dask", scheduler=scheduler)
     if scheduler is not None:
         refuse_options("for a cluster that is started here", "leave it out, or leave out --scheduler", workers=workers)
-    in_order(rig, plan_file)
+    check_order(rig, plan_file)
     instrument = read_rig(rig)
     steps = read_plan(plan_file, not instrument.table.mechanism.sightings)
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
@@ -394,19 +394,19 @@ def study(
         raise InputError("usage", f"--estimator {escaped(estimator)}: allowed are {allowed}", remedy="choose one")
     compile_for(report_line)
     job = StudyJob(instrument, steps, parse_target(target or DEFAULT_TARGET), seed, aperture, estimator)
-    kept = StudyRows(rows or plan_file.with_suffix(".study.jsonl"))
-    missing = n - sum(index < n for index in kept.of(job.key))
-    report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(kept.path), 200)}")
+    stored = StudyRows(rows or plan_file.with_suffix(".study.jsonl"))
+    missing = n - sum(index < n for index in stored.of(job.key))
+    report_line(f"{n} campaigns, {missing} to go on engine {escaped(engine)}; rows in {escaped(str(stored.path), 200)}")
 
     try:
         with waiting() as progress:
             result = run_study(
-                job, n, kept, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress
+                job, n, stored, engine=engine, workers=workers or WORKERS, address=scheduler, progress=progress
             )
     except KeyboardInterrupt:
         report_line("every campaign that is done is kept; the same command goes on from there")
         raise
-    document = {**result.as_json(), "rows": str(kept.path), "engine": engine, "seed": seed}
+    document = {**result.as_json(), "rows": str(stored.path), "engine": engine, "seed": seed}
     finish(document, study_text(result), as_json)
     if target is not None and result.assurance < ASSURED[0]:
         raise Ended(TARGET_MISSED)

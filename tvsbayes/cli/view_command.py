@@ -1,4 +1,4 @@
-"""view: a campaign as one HTML file to look at."""
+"""view: a campaign as one HTML file for a browser."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tvsbayes.cli.app import CampaignFolder, Json, finish, report_line, spared
+from tvsbayes.cli.app import CampaignFolder, Json, check_output, finish, report_line
 from tvsbayes.cli.instruments import serve
 from tvsbayes.cli.progress_bar import waiting
 from tvsbayes.files.disk import make_folder, output_place, write_atomically
@@ -31,26 +31,26 @@ def view(
     if serve("view", **locals()) or serve("view", beside):
         return
     folders = [folder for folder in (campaign, beside) if folder is not None]
-    spared(out)
+    check_output(out)
     from tvsbayes.view.scene import look_at
 
-    looked = look_at(campaign, beside, report_line)
+    result_scenes = look_at(campaign, beside, report_line)
     from tvsbayes.view.page import document, page_html
     from tvsbayes.view.pictures import PICTURES_BYTES_MAX, look_pictures
 
     pictures, share = [], PICTURES_BYTES_MAX // len(folders)
     stages = ("pictures", "pictures of the second campaign")[: len(folders)]
     with waiting() as progress, Job(dict.fromkeys(stages, 1.0), progress) as job:
-        for folder, one, stage in zip(folders, looked.scenes, stages, strict=True):
+        for folder, scene, stage in zip(folders, result_scenes.scenes, stages, strict=True):
             job.begin(stage)
-            pictures.append(look_pictures(folder, one.looks, share, job.at))
-    html = page_html(document(looked, pictures))
+            pictures.append(look_pictures(folder, scene.looks, share, job.at))
+    html = page_html(document(result_scenes, pictures))
     path = out or output_place(campaign, "results") / "view.html"
     if out is None:
         make_folder(path.parent)
     write_atomically(path, html)
-    counts = [len(one.looks.spot) for one in looked.scenes]
-    pictured, fitted = [len(few) for few in pictures], [one.fitted for one in looked.scenes]
-    result = {"view": str(path), "bytes": len(html), "looks": counts, "pictures": pictured, "fitted": fitted}
-    notes = "".join(f"note: {note}\n" for one in looked.scenes for note in one.notes)
+    counts = [len(scene.looks.spot) for scene in result_scenes.scenes]
+    picture_counts, fitted = [len(chosen) for chosen in pictures], [scene.fitted for scene in result_scenes.scenes]
+    result = {"view": str(path), "bytes": len(html), "looks": counts, "pictures": picture_counts, "fitted": fitted}
+    notes = "".join(f"note: {note}\n" for scene in result_scenes.scenes for note in scene.notes)
     finish(result, f"{notes}written: {path} ({len(html) / 1e6:.1f} MB); open it in a browser", as_json)

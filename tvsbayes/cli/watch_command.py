@@ -1,4 +1,4 @@
-"""watch: new looks against a stored calibration, the table that a nightly job keeps, and the plan of the looks."""
+"""watch: compares new looks with a stored calibration; also the table of a nightly job, and the plan of the looks."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def watch(
 
 
 def _append(table: Path, result: Watch) -> InputError | None:
-    """Add the line of now, UTC; why it could not be added costs nobody the result."""
+    """Append the current line (time in UTC); returns the error of a failure, so that the result is still printed."""
     import datetime
 
     from tvsbayes.files.csv_table import append_line
@@ -75,15 +75,15 @@ def _append(table: Path, result: Watch) -> InputError | None:
 
 
 def plan_watch(
-    place: Path | None, given: Path | None, *, minutes: float | None, out: Path | None, seed: int, as_json: bool
+    path: Path | None, given: Path | None, *, minutes: float | None, out: Path | None, seed: int, as_json: bool
 ) -> None:
     """`plan CAMPAIGN --watch`, or `plan RIG --given CAMPAIGN --watch`: limits and costs of the rig file.
 
     Args:
-        place: the campaign, or the rig file where the campaign is given.
+        path: the campaign, or the rig file where the campaign is given.
         given: the campaign, or None.
-        minutes: that the plan may take.
-        out: where it is written.
+        minutes: longest duration of the plan.
+        out: file of the plan.
         seed: of the search.
         as_json: print the document.
     """
@@ -93,14 +93,14 @@ def plan_watch(
     from tvsbayes.instrument.plan import write_plan
     from tvsbayes.instrument.rig import read_rig
 
-    campaign = given or place
+    campaign = given or path
     if campaign is None or instrument_of(campaign) is INSTRUMENTS["axis"]:
         raise InputError(
             "usage",
             "--watch needs the campaign of a scanner or a head",
             remedy="write tvsbayes plan CAMPAIGN --watch -o looks.csv",
         )
-    known, rig = read_campaign(campaign), None if given is None or place is None else read_rig(place)
+    known, rig = read_campaign(campaign), None if given is None or path is None else read_rig(path)
     compile_for(report_line)
     with waiting() as progress, Job({FITTING: 1.0, PLANNING: 8.0}, progress) as job:
         fitted = StoredOrFitted(known, report_line, job.part(FITTING)).fit

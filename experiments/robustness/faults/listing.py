@@ -173,7 +173,7 @@ FAULTS = (
           Returns("value.replace('.', '') if commas else value"), "test_every_notation_gives_the_same_table"),
     Fault("a file is renamed before it is on the disk", "written_whole", Call("fsync", "None"),
           "test_interrupted_write_leaves_the_old_file_whole"),
-    Fault("an output replaces the data of a campaign", "app.spared", Never("read"),
+    Fault("an output replaces the data of a campaign", "app.check_output", Never("is_input"),
           "test_no_output_replaces_the_data_of_a_campaign"),
     # Acquisition: light, positions, lost events.
     Fault("the laser stays on when a camera fails", "CameraObserver.observe", Call("laser", "value if arg0 else None"),
