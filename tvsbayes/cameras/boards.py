@@ -394,7 +394,7 @@ def _any_board(sample: Sequence[Picture], pictures: PictureFolder, board: Board,
 
 def _no_board_error(sample: Sequence[Picture], pictures: PictureFolder, board: Board) -> NothingToEstimate:
     """The refusal of pictures without the board, with what they show instead."""
-    count, sizes = len(pictures.used), dict.fromkeys(pictures.sizes[one] for one in sample)
+    count, sizes = len(pictures.used), dict.fromkeys(pictures.sizes[p] for p in sample)
     greys = [part for picture in sample for part in _greys(picture, pictures).values()]
     sizes_text = " and ".join(f"{width} x {height}" for width, height in sizes)
     reason, remedy = why_no_board(greys, board.columns, board.rows)
@@ -467,7 +467,7 @@ def _detections(
         except InputError as error:
             return error
 
-    parallel = PIXELS_MAX // max(len(one.sides) * math.prod(pictures.sizes[one]) for one in sample)
+    parallel = PIXELS_MAX // max(len(p.sides) * math.prod(pictures.sizes[p]) for p in sample)
     with ThreadPoolExecutor(max(1, min(WORKERS_MAX, os.cpu_count() or 1, parallel))) as pool:
         refused = []
         for detections in pool.map(detect, sample):

@@ -167,15 +167,15 @@ class _Frames:
 
         A dark picture, if any, is subtracted and `PEDESTAL_DN` added; clipped pixels stay unchanged.
         """
-        lit = in_grey_levels(decode_image(self._data(spot, side), self.path(spot, side).name), self.white)
+        picture = in_grey_levels(decode_image(self._data(spot, side), self.path(spot, side).name), self.white)
         if self.dark is None:
-            return lit
+            return picture
         dark_path = self._dark_picture(spot, side)
         data = read_bytes(dark_path, IMAGE_BYTES_MAX, self.dark)
         self._require_size(data, dark_path, side)
         dark = in_grey_levels(decode_image(data, dark_path.name), self.white)
-        difference = np.maximum(lit.astype(np.float32) - dark + PEDESTAL_DN, 0.0)
-        return np.where(lit >= CLIPPED_DN, lit.astype(np.float32), difference)
+        difference = np.maximum(picture.astype(np.float32) - dark + PEDESTAL_DN, 0.0)
+        return np.where(picture >= CLIPPED_DN, picture.astype(np.float32), difference)
 
     def _dark_picture(self, spot: Spot, side: str) -> Path:
         """The dark picture of a look, else of its camera."""
@@ -318,7 +318,7 @@ def detect(
         statuses=dict(Counter(spot.status for spot in detected).most_common()),
         noise=noise,
         median_sd_px=float(np.median(sds)) if sds else None,
-        lines={side: one.lines for side, one in sides.items()},
+        lines={side: camera.lines for side, camera in sides.items()},
     )
 
 
@@ -408,7 +408,7 @@ def _prepared_looks(
         for number, camera in enumerate(CAMERAS):
             patches_of_camera = [patch for pair in patches.values() if not isinstance(patch := pair[number], str)]
             noise[camera] = _estimated_noise(
-                [one for one in patches_of_camera if one.clipped_share <= CLIPPED_SHARE_MAX], speckle_contrast
+                [p for p in patches_of_camera if p.clipped_share <= CLIPPED_SHARE_MAX], speckle_contrast
             )
     else:
         noise["left"] = noise["right"] = SpotNoise(speckle_contrast=_contrast(speckle_contrast))
@@ -469,8 +469,8 @@ def _may_detect(status: str) -> bool:
     return status in ("ok", UNDETECTED) or status.split(" ")[0] in REASONS
 
 
-def _contrast(given: float | None) -> float:
-    return CONTRAST_DEFAULT if given is None else given
+def _contrast(stated: float | None) -> float:
+    return CONTRAST_DEFAULT if stated is None else stated
 
 
 def _estimated_noise(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNoise:

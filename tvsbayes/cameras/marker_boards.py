@@ -163,7 +163,7 @@ def most_markers(pictures: Sequence[np.ndarray]) -> tuple[str, int]:
         counted[name] = sum(len(_markers(grey, name).numbers) for grey in pictures)
         if counted[name] >= MARKERS_MIN * len(pictures):
             return name, counted[name]
-    name = max(counted, key=lambda one: counted[one])
+    name = max(counted, key=lambda key: counted[key])
     return name, counted[name]
 
 

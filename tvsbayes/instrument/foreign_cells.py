@@ -259,7 +259,7 @@ def word_of(status: str) -> str:
     return "".join(letter for letter in plain if not unicodedata.combining(letter))
 
 
-def left_out(cells: FieldCells, statuses: Iterable[str], what: str) -> list[str]:
+def left_out(cells: FieldCells, statuses: Iterable[str], noun: str) -> list[str]:
     """A sentence on the rows that a column of statuses excludes: an unknown word may mean that the row is good."""
     counts = Counter(escaped(text, 24) for text in statuses if text.strip() and word_of(text) not in GOOD)
     if not counts:
@@ -268,24 +268,24 @@ def left_out(cells: FieldCells, statuses: Iterable[str], what: str) -> list[str]
     words = ", ".join(listed) + " ..." * (len(counts) > WORDS_SHOWN)
     count = sum(counts.values())
     return [
-        f"status: {count} {what}{'s' * (count != 1)} left out by column {escaped(cells.columns['status'])}: {words}"
+        f"status: {count} {noun}{'s' * (count != 1)} left out by column {escaped(cells.columns['status'])}: {words}"
     ]
 
 
-def status_of(cells: FieldCells, row: int, values: Mapping[str, float | None], what: str) -> str:
+def status_of(cells: FieldCells, row: int, values: Mapping[str, float | None], noun: str) -> str:
     """The word "ok", or why a row cannot be used, as our tables allow it.
 
     Args:
         cells: of the table.
         row: of it.
         values: by field; a row that is ok has all of them.
-        what: noun for a row.
+        noun: noun for a row.
     """
     text = cells.text("status")[row]
     if (word := word_of(text)) in GOOD or not word:
         for field, value in values.items():
             if value is None:
-                allowed = f"a number where the {what} is ok"
+                allowed = f"a number where the {noun} is ok"
                 raise cells.refuse(row, field, allowed, "complete the cell, or its status")
         return "ok"
     return readable(f"refused: {text}" if word_of(text) in BAD else text, "refused:", 200) or "refused"

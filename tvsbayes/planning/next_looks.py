@@ -150,12 +150,12 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
     )
 
 
-def _choices(problem: DesignProblem, count: int, at: tuple[int, int]) -> list[Choice]:
+def _choices(problem: DesignProblem, count: int, start: tuple[int, int]) -> list[Choice]:
     """The best looks on every sheet and on every pair of sheets."""
     search, sheet_of_look = problem.search(), problem.candidates.looks.sheet
     subsets = [s for size in (1, 2) for s in combinations(range(len(problem.knowledge.sheets)), size)]
     masks = (np.isin(sheet_of_look, subset) for subset in subsets)
-    return [problem.choose(search, allowed, count, at) for allowed in masks if allowed.any()]
+    return [problem.choose(search, allowed, count, start) for allowed in masks if allowed.any()]
 
 
 def _after_each(problem: DesignProblem, best: Choice) -> tuple[float, ...]:

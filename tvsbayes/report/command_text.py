@@ -243,8 +243,8 @@ def detection_text(detection: Detection) -> str:
     rows += [["undetected", str(detection.missing), "no frames"]] if detection.missing else []
     rows += [["as it was", str(detection.kept), "refused by somebody else"]] if detection.kept else []
     noise = ", ".join(
-        f"{side} contrast {one.speckle_contrast:.2f}, gain {one.gain_dn:.3f} DN"
-        for side, one in detection.noise.items()
+        f"{side} contrast {model.speckle_contrast:.2f}, gain {model.gain_dn:.3f} DN"
+        for side, model in detection.noise.items()
     )
     sd = (
         ""
@@ -254,12 +254,12 @@ def detection_text(detection: Detection) -> str:
     title = f"{detection.processed} looks"
     table = TableView(title, ["status", "looks", "meaning"], rows)
     lines = [
-        f"{side} camera: odd and even {one.lines} of {one.spots} spot{'s' * (one.spots != 1)} show the beam "
-        f"{one.apart_px:.2g} px apart, more than their noise: an interlaced readout, or a beam that moved or flickered "
+        f"{side} camera: odd and even {gap.lines} of {gap.spots} spot{'s' * (gap.spots != 1)} show the beam "
+        f"{gap.apart_px:.2g} px apart, more than their noise: an interlaced readout, or a beam that moved or flickered "
         "while it was read. Their uncertainty is widened by the difference / sqrt(12); read whole frames at once "
         "(progressive, global shutter), or let the beam come to rest"
-        for side, found_there in detection.lines.items()
-        for one in found_there
+        for side, gaps in detection.lines.items()
+        for gap in gaps
     ]
     return terminal(table, f"method {detection.method}; {sd}noise: {noise}", *lines)
 
@@ -298,21 +298,21 @@ def _points(count: int) -> str:
     return f"{count} point{'s' * (count != 1)}"
 
 
-def cloud_text(cloud: CloudFile, law: LawChecked, calibration: Calibration) -> str:
+def cloud_text(cloud: CloudFile, check: LawChecked, calibration: Calibration) -> str:
     """A written cloud as text: files, refused points, validity of its uncertainties."""
     lines = [f"written: {escaped(str(cloud.path), 200)}, {_points(cloud.points)}, frame T, mm"]
     lines.append(f"properties: {', '.join(cloud.columns)}")
     agreement = (
-        f"sds by the law of propagation (GUM): of {_points(law.points)} carried by draws too it holds to a digit or "
+        f"sds by the law of propagation (GUM): of {_points(check.points)} carried by draws too it holds to a digit or "
     )
-    agreement += f"more at {law.held}"
-    if law.off_mm is not None and law.most_off_mm is not None:
-        agreement += f"; ends of 95 % intervals differ by {two_digits(law.off_mm)} mm at half of them, at most by "
-        agreement += f"{two_digits(law.most_off_mm)} mm"
+    agreement += f"more at {check.held}"
+    if check.off_mm is not None and check.most_off_mm is not None:
+        agreement += f"; ends of 95 % intervals differ by {two_digits(check.off_mm)} mm at half of them, at most by "
+        agreement += f"{two_digits(check.most_off_mm)} mm"
     lines.append(agreement)
-    if law.held < LAW_SHARE * law.points:
+    if check.held < LAW_SHARE * check.points:
         lines.append("do not rely on the sds of this cloud: `tvsbayes locate` --points without --cloud gives draws")
-    elif law.points:
+    elif check.points:
         lines.append("the sds may be relied on")
     if cloud.extrapolated:
         ranges = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in calibration.seen_steps.items())

@@ -141,8 +141,8 @@ def homing_lines(summary: FitSummary) -> list[str]:
     lines = []
     for axis, chances in summary.homing_side.items():
         ordered = sorted(chances.items(), key=lambda item: -item[1])
-        ways = ", ".join(f"{side} {100 * chance:.1f} %" for side, chance in ordered)
-        lines.append(f"{axis} homing side, not recorded: {ways}")
+        sides = ", ".join(f"{side} {100 * chance:.1f} %" for side, chance in ordered)
+        lines.append(f"{axis} homing side, not recorded: {sides}")
     return lines
 
 

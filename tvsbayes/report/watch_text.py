@@ -87,13 +87,13 @@ def _need(change: PlannedChange) -> str:
 def watch_plan_text(plan: WatchPlan) -> str:
     """A plan for watching a calibration, as text."""
     rows = [[c.what, f"{c.size:g} {c.unit}", f"{100 * c.power:.0f} %", _need(c)] for c in plan.changes]
-    wanted = f"{100 * plan.power_wanted:.0f} %"
+    power = f"{100 * plan.power_wanted:.0f} %"
     summary = (
         f"{plan.looks} looks after {plan.homings} homings, {plan.minutes:.1f} of {plan.minutes_allowed:g} minutes; "
         f"false alarms {100 * plan.false_alarm_rate:g} %"
     )
     table = TableView(
-        "What `watch` will notice", ["change", "of", "noticed by this plan", f"looks for {wanted} of it alone"], rows
+        "What `watch` will notice", ["change", "of", "noticed by this plan", f"looks for {power} of it alone"], rows
     )
     lines = [summary]
     for c in plan.changes:

@@ -417,8 +417,8 @@ class AxisResults(Shown):
         return self.summary.shown()
 
 
-def _stored_w(folder: Path, names: int, again: str) -> np.ndarray:
-    """Coordinates (draws, names) in the `results/` of a folder; `again` is the remedy where they are damaged.
+def _stored_w(folder: Path, names: int, remedy: str) -> np.ndarray:
+    """Coordinates (draws, names) in the `results/` of a folder; `remedy` is the remedy where they are damaged.
 
     Raises:
         InputError: no file, or one that is damaged.
@@ -432,7 +432,7 @@ def _stored_w(folder: Path, names: int, again: str) -> np.ndarray:
     except (KeyError, ValueError) as error:
         found = "no w" if isinstance(error, KeyError) else escaped(str(error), 120)
         allowed = f"w of shape (draws, {names}), finite, as in results/fit.json"
-        raise refusal("damaged", file=place, found=found, allowed=allowed, remedy=again) from error
+        raise refusal("damaged", file=place, found=found, allowed=allowed, remedy=remedy) from error
     return w
 
 

@@ -373,9 +373,9 @@ FLOOR_SHARE = 1e-9
 """Least u of a reading in motion, as a share of the travel."""
 
 
-def _neighbours_sd(off: np.ndarray, move: np.ndarray) -> float:
+def _neighbours_sd(deviations: np.ndarray, move: np.ndarray) -> float:
     """Scatter of single readings by the second differences of neighbours, robust: their median is 0.6745 sds."""
-    second = off[2:] - 2 * off[1:-1] + off[:-2]
+    second = deviations[2:] - 2 * deviations[1:-1] + deviations[:-2]
     second = second[move[2:] == move[:-2]]
     return float(np.median(np.abs(second)) / 0.6745 / np.sqrt(6.0)) if len(second) else 0.0
 

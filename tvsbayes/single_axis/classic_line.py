@@ -74,12 +74,12 @@ def classic_axis(rows: AxisRows) -> ClassicAxis:
     """The least-squares line with a reversal, and ISO 230-2."""
     line = fit_line(rows)
     u = np.sqrt(np.maximum(np.diag(line.covariance), 0.0))
-    both = rows.both_sides
+    has_backlash = rows.both_sides
     return ClassicAxis(
         per_command=float(line.solution[1]),
         u_per_command=float(u[1]),
-        backlash=float(line.solution[2]) if both else None,
-        u_backlash=float(u[2]) if both else None,
+        backlash=float(line.solution[2]) if has_backlash else None,
+        u_backlash=float(u[2]) if has_backlash else None,
         residual_sd=line.scatter,
         iso230=iso230_figures(rows),
     )

@@ -256,14 +256,14 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
     order = np.argsort(times, kind="stable")
     readings, counters = _series(angles_s), Series(times[order], positions[order])
     # Steps are instantaneous commands, without interpolation.
-    before = np.searchsorted(counters.times_s, readings.times_s, side="right") - 1
-    inside = before >= 0
+    latest = np.searchsorted(counters.times_s, readings.times_s, side="right") - 1
+    inside = latest >= 0
     if not inside.any():
         remedy = "log both at once, while the stepper moves"
         raise refusal("empty", file=file, found="no angle after a step", allowed="steps and angles", remedy=remedy)
     notes = [f"Klipper, {', '.join(map(escaped, names))}"]
     notes.append(f"{int((~inside).sum())} angles before the first step left out")
-    commands = Series(readings.times_s[inside], counters.values[before[inside]])
+    commands = Series(readings.times_s[inside], counters.values[latest[inside]])
     return _pairs_table(file, notes, commands, readings.values[inside], ("steps", "angle (deg)"))
 
 
