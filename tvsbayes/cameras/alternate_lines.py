@@ -1,12 +1,12 @@
-"""Do the even and the odd rows (columns) of a spot show the beam in one place?
+"""Tests whether the even and the odd rows (columns) of a spot have the same centre.
 
 Interlaced and two-tap readouts take alternate lines at another moment or with another gain. A constant gain moves no
-centre: the height of each half takes it up. A beam that moved in between, or a gain that changes along the spot, does,
-and the two are indistinguishable on a Gaussian. White noise of pixels separates the halves' centres with four times
-the covariance C of the whole's (each half has 2 C). Where a difference d is beyond that chance, the whole's centre lies
-anywhere between both with equal right: d d'/12 is added to C (JCGM 100:2008, 4.3.7: limits d apart, uniform).
+centre: it changes only the height of each half. A beam that moved in between, or a gain that changes along the spot,
+does, and the two are indistinguishable on a Gaussian. Under white noise of pixels the difference of the halves' centres
+has four times the covariance C of the whole's (each half has 2 C). Where a difference d is significant, all positions
+between both are equally probable: d d'/12 is added to C (JCGM 100:2008, 4.3.7: limits d apart, uniform).
 
-Demosaicing mixes lines: pictures in colour show about a quarter of d, and noise less, so they need larger ones.
+Demosaicing mixes lines: pictures in colour show about a quarter of d, and noise less, so a larger d is needed.
 """
 
 from __future__ import annotations

@@ -161,7 +161,7 @@ class Adjustment:
         covariance: (24, 24), type A, under `noise_sd_px` alone: independent corners.
         residuals_px: projected minus found, shape (views, 4, corners), NaN where no corner was seen.
         noise_sd_px: standard deviation of one corner coordinate, from the residuals.
-        dof: degrees of freedom behind it: coordinates - camera parameters - 6 per view.
+        dof: its degrees of freedom: coordinates - camera parameters - 6 per view.
         jacobian: of the residuals by the whitened coordinates of the free parameters, boards following, shape (views,
             4, corners, free); 0 where no corner was seen.
         root: d(parameters)/d(whitened coordinates), (24, free).

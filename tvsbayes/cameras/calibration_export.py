@@ -68,8 +68,8 @@ def _ros_text(name: str, size: tuple[int, int], matrices: Mapping[str, np.ndarra
     return ("\n".join(lines) + "\n").encode()
 
 
-def _entries(matrix: np.ndarray, indent: str, form: str, *more: str) -> list[str]:
-    """Rows, columns, what a format says besides, and the numbers in its form of a list."""
+def _entries(matrix: np.ndarray, indent: str, form: str, *format_lines: str) -> list[str]:
+    """Rows, columns, further lines of a format, and the numbers in its form of a list."""
     rows, cols = matrix.shape
     data = form.format(", ".join(map(repr, map(float, matrix.ravel()))))
-    return [f"{indent}{entry}" for entry in (f"rows: {rows}", f"cols: {cols}", *more, f"data: {data}")]
+    return [f"{indent}{entry}" for entry in (f"rows: {rows}", f"cols: {cols}", *format_lines, f"data: {data}")]

@@ -247,7 +247,7 @@ class GenicamCamera:
             try:
                 release()
             except Exception:
-                # A camera that has gone cannot be given back.
+                # A disconnected camera cannot be released.
                 continue
         self._acquirers = []
 

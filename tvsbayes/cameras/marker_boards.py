@@ -151,7 +151,7 @@ def _other_board(detected: Sequence[_Detected], markers: Markers) -> NothingToEs
 
 
 def spread[T](pictures: Sequence[T], count: int = SAMPLE_PICTURES) -> list[T]:
-    """So many of the pictures, spread evenly over all."""
+    """A sample of `count` pictures, spread evenly over all."""
     places = np.linspace(0, len(pictures) - 1, min(count, len(pictures)))
     return [pictures[round(place)] for place in places]
 

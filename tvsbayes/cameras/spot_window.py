@@ -33,16 +33,16 @@ SHRINK = 4
 LAMP_SHARE = 0.01
 """Least area, over the picture, of a bright area at the border that is a lamp or a window and no spot."""
 LAMP_AREA_RATIO, LAMP_HEIGHT_SHARE = 4.0, 0.8
-"""A bright area at the border, or larger than any spot, is a lamp or a window beside a spot of which it has so many
-times the area, or at most this share of the height: what of a laser's spot lies at the border is brighter than the
-reflections that it makes elsewhere, and no larger than they are."""
+"""A bright area at the border, or larger than any spot, is a lamp or a window if there is a spot in the picture and the
+area is this many times larger or has at most this share of its height: a laser spot at the border would be brighter
+than its own reflections, and no larger."""
 
 
 @dataclass(frozen=True)
 class Patch:
-    """The pixels around a spot: grey (h, w) DN, usable (h, w), where its corner lies, and first guesses.
+    """The pixels around a spot: grey (h, w) DN, usable (h, w), position of its corner, and first estimates.
 
-    Where `block` is over 1, grey has means of so many pixels each way, and `raw` what it was made of.
+    Where `block` is over 1, grey has means of block x block pixels of `raw`.
     """
 
     grey: np.ndarray
@@ -142,14 +142,14 @@ def patch_around(picture: np.ndarray) -> Patch | str:
 def _lamps(
     small: np.ndarray, levels: Sequence[float], inside: Sequence[np.ndarray], heights: np.ndarray, flux: np.ndarray
 ) -> tuple[list[int], bool]:
-    """Bright areas that are lamps or windows beside a spot, and whether there is a lamp and no spot.
+    """Bright areas that are lamps or windows in a picture with a spot, and whether there is a lamp and no spot.
 
-    Beside a spot: at the border or too large, and large or dim beside it.
+    With a spot: areas at the border or too large, and large or dim compared with it.
 
     Args:
         small: the picture in cells, (h, w).
-        levels: half way between what surrounds each area and its peak, DN: all that is connected above it belongs to
-            the area, also where the median of the surroundings had taken it away.
+        levels: half way between the surroundings of each area and its peak, DN: all connected pixels above it belong to
+            the area, also those that the median of the surroundings removed.
         inside: row and column of a cell of each area.
         heights: over the background, DN, of the areas from the second on; (n + 1,).
         flux: sum over the area, likewise; (n + 1,).

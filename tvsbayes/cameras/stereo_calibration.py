@@ -76,7 +76,7 @@ class StereoCalibration:
         views: every view used, with its residuals.
         left_rms_px, right_rms_px: rms over corners as OpenCV defines it; of both cameras in `stereo.rms_px`.
         noise_sd_px: standard deviation of one corner coordinate.
-        dof: degrees of freedom behind it.
+        dof: its degrees of freedom.
         correlation_factor: factor on the covariance for errors that the corners of a picture share.
         covariance_independent: (24, 24), type A for independent corners, as OpenCV and most tools report it.
         board_error_mm: deviation of the board's corners from a grid, sd of one coordinate, by the residuals.
@@ -339,7 +339,7 @@ def _rms(residuals_px: np.ndarray) -> float:
 
 
 def _outliers(adjustment: Adjustment) -> np.ndarray:
-    """Which views lie above the rule of `OUTLIER_Z`, shape (views,)."""
+    """Which views are outliers by the rule of `OUTLIER_Z`, shape (views,)."""
     logs = np.log([max(_rms(r), 1e-12) for r in adjustment.residuals_px])
     middle = np.median(logs)
     spread = max(1.4826 * float(np.median(np.abs(logs - middle))), OUTLIER_SPREAD_MIN)

@@ -1,6 +1,6 @@
 """Commands on campaigns: demo, simulate, detect, check.
 
-Options in, library called, table or JSON out; heavy imports stand inside the commands.
+Reads options, calls the library, prints a table or JSON; heavy imports are inside the commands.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Commands that estimate and compare: classic, fit, compare.
 
-Options in, library called, table or JSON out; heavy imports stand inside the commands.
+Reads options, calls the library, prints a table or JSON; heavy imports are inside the commands.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ def _no_experiments() -> NothingToEstimate:
 
 
 def _classic_against_joint(joint: JointFit, by: str, seed: int, progress: Show | None) -> ComparisonRecord:
-    """Why both estimators differ, and which predicts what it has not seen.
+    """The difference of both estimators term by term, and their predictions of held-out looks.
 
     Raises:
         NothingToEstimate: no complete experiment has an angle.

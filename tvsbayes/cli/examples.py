@@ -55,9 +55,9 @@ EXAMPLES = {
     ),
     "study": ("tvsbayes study rig.toml plan.csv --n 100 --engine processes",),
 }
-"""By command; each runs as it stands where the files have these names."""
+"""Examples by command; each runs unchanged with files of these names."""
 FIRST = ("tvsbayes demo", "tvsbayes new mine", "tvsbayes calibrate mine")
-"""What somebody new does."""
+"""First commands of a new user."""
 
 
 def epilog(examples: tuple[str, ...]) -> str:

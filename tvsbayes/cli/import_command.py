@@ -1,6 +1,6 @@
 """`import`: a user's table becomes moves and looks, written after its columns were shown.
 
-Options in, library called, table or JSON out; heavy imports stand inside the command.
+Reads options, calls the library, prints a table or JSON; heavy imports are inside the command.
 """
 
 from __future__ import annotations

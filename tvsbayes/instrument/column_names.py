@@ -1,7 +1,7 @@
 """Which column of a foreign table is which field of `moves.csv` and `spots.csv`, by the words in its name.
 
-A name is taken apart into words ("xLeft (px)" is x, left, px); a rule is a set of words that all stand in it. Units in
-the name are read too. What two columns claim is nobody's until it is said which.
+A name is split into words ("xLeft (px)" is x, left, px); a rule is a set of words that it must contain. Units in the
+name are read too. A field that two columns match is ambiguous until the user names the column.
 """
 
 from __future__ import annotations
