@@ -33,7 +33,7 @@ VALUES = {
     **{"play_variation_deg.tilt": 0.05, "harmonic_amplitude_deg.pan.1": 0.03, "harmonic_amplitude_deg.pan.2": 0.02},
     **{"harmonic_amplitude_deg.tilt.1": 0.04, "drift_deg_per_root_hour.pan": 0.0, "drift_deg_per_root_hour.tilt": 0.0},
 }
-"""Without drift: few coordinates see it, and the map leaves it out."""
+"""Without drift, of which the map has no more than the terms that the spots see."""
 SCATTER = dict(zip(LOOK_SCATTER_NAMES, (0.01, 0.015), strict=True))
 """Less than the stops' own errors: a variance that scatter of the mode leaves is never below none."""
 CREEP = {"creep_deg.pan": 2e-4, "creep_deg.tilt": -1e-4, "creep_minutes": 3.0}
