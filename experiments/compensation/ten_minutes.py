@@ -111,7 +111,7 @@ FILE = """The file says of what it is and what is promised. LinuxCNC takes it by
 """
 FRESH = """## Fresh readings
 
-Apply the file, once, in one place. Then take fresh readings, from a homing on. Which ones tell soonest:
+Apply the file, once, in one place. Then take fresh readings, from a homing on. The most informative ones:
 """
 VERIFY = """Twelve readings at commands of one's own do as well. `fresh.csv` lists the commands that were asked for: the
 controller adds its corrections by itself.

@@ -288,7 +288,7 @@ def test_the_table_names_every_status(found_speckled):
     text = detection_text(
         replace(found_speckled, missing=3, kept=2, statuses={"ok": 9, "border left, no-spot right": 1})
     )
-    for word in ("ok", "border left", "undetected", "refused by somebody else", "contrast"):
+    for word in ("ok", "border left", "undetected", "refused by hand", "contrast"):
         assert word in text
 
 

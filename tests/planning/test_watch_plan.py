@@ -131,6 +131,6 @@ def test_the_command_writes_the_plan(watched_fit, planned, tmp_path, monkeypatch
     assert asked[0][0].costs_s == rig.costs_s and asked[1][0] is None
     assert [named["minutes"] for _, named in asked] == [3, 10]
     text = capsys.readouterr().out
-    assert "no number of looks does better: the campaign knows too little of it: add about" in text
+    assert "no number of looks improves that: the campaign determines it too poorly: add about" in text
     assert run(["plan", "mine", "--watch", "--target", "u(worst) <= 1e-4 deg/step"]) == 2
     assert "--target is for targets" in capsys.readouterr().err

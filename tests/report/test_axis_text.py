@@ -24,7 +24,7 @@ from tvsbayes.single_axis.next_stops import AxisPlan, NextStop
 def test_a_plan_that_hardly_helps_says_so(after, said):
     stop = NextStop(1_250_000.0, "forward", None, after, 1.0 - after, 0.1)
     text = axis_plan_text(AxisPlan("per_command", 1.0, (stop,), 0.5), "mm")
-    assert ("these stops hardly help: u falls by" in text) is said
+    assert ("these stops have little effect: u falls by" in text) is said
     assert "1250000 " in text, "a counter is no power of ten"
 
 
@@ -50,8 +50,8 @@ def clean():
     ("warnings", "said"),
     [
         ((), "usable"),
-        (("segment 2 reads 16 times what others read",), "usable; mind the warning"),
-        (("reading 5 lies 9 sds off", "all moves have the same time"), "usable; mind the 2 warnings"),
+        (("segment 2 reads 16 times what others read",), "usable; see the warning"),
+        (("reading 5 lies 9 sds off", "all moves have the same time"), "usable; see the 2 warnings"),
     ],
 )
 def test_the_verdict_alone_says_that_warnings_stand_beside_it(clean, warnings, said):
@@ -72,7 +72,9 @@ def test_a_fit_says_what_goes_into_firmware(clean):
     begun = f"for your firmware, from 0 to 1250000: -20.00(20) commands per {clean.unit}, "
     assert said(0.15, 0.13, 0.17) == f"{begun}play of 3.00(20) commands"
     assert said(-0.15, -0.17, -0.13) == f"{begun}no play: a reversal overshoots by 3.00(20) commands"
-    assert said(0.015, -0.01, 0.04) == f"{begun}play of 0.30(20) commands is not proved: its 95 % interval holds 0"
+    assert (
+        said(0.015, -0.01, 0.04) == f"{begun}play of 0.30(20) commands is not significant: its 95 % interval contains 0"
+    )
 
 
 def test_a_fit_says_where_the_error_by_position_is_largest_and_whose_it_may_be(clean):
@@ -82,8 +84,11 @@ def test_a_fit_says_where_the_error_by_position_is_largest_and_whose_it_may_be(c
         PositionDeviation(2500000.0, 0.03, 0.01, (0.01, 0.05)),
     )
     said = worst_place(structs.replace(clean, deviations=deviations))
-    assert f"at command 1250000: -0.050(10) {clean.unit} off the line; it is that of gears and encoder" in said
-    assert "holds 0; it is" in worst_place(structs.replace(clean, deviations=deviations[:1]))
+    assert (
+        f"at command 1250000: -0.050(10) {clean.unit} off the line; it is the sum of the errors of gears and encoder"
+        in said
+    )
+    assert "contains 0; it is" in worst_place(structs.replace(clean, deviations=deviations[:1]))
 
 
 def test_numbers_that_must_not_be_used_are_not_offered_to_firmware(clean):

@@ -31,7 +31,9 @@ def test_a_fit_astray_shows_no_results():
     assert "tvsbayes check" in next_steps(astray, "mine")[0]
 
 
-@pytest.mark.parametrize(("estimator", "word"), [("laplace", "too short; sample"), ("posterior", "intervals hold it")])
+@pytest.mark.parametrize(
+    ("estimator", "word"), [("laplace", "too short; sample"), ("posterior", "intervals include this")]
+)
 def test_few_stops_are_said(estimator, word):
     lines = fit_text(structs.replace(small_summary(), few_stops={"up": 3, "down": 2}, estimator=estimator)).splitlines()
     (line,) = (line for line in lines if line.startswith("few stops"))
@@ -49,7 +51,7 @@ def test_fit_text_shows_what_the_reader_must_know():
     assert lines["stop scatter up, deg"].endswith("fixed")
     assert "left - right" not in text
     assert "chi2 31.0 for 30.5 degrees of freedom" in text
-    assert "weak (the data leave it to the priors): the tilt axis was never moved" in text
+    assert "weak (set by the priors, not by the data): the tilt axis was never moved" in text
     assert "depends on one stop: without move 0 it is lost" in text
     assert "excluded spots: 17\n" in text
     # A flood of ids helps nobody.
@@ -74,7 +76,7 @@ def test_a_fit_ends_with_its_table_and_its_verdict():
     blank = lines.index("")
     assert lines[blank + 1].startswith("joint estimator") and len(lines) - blank < 24
     assert "written: results/fit.json" in lines[:blank]
-    assert "--details and the report say more: 1 weak direction, 1 stop on which a result hangs" in lines[:blank]
+    assert "--details and the report say more: 1 weak direction, 1 stop that decides a result" in lines[:blank]
     assert not [line for line in lines if line.startswith(("weak", "hangs"))]
     assert max(map(len, lines[blank:])) <= 80
 

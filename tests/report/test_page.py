@@ -151,7 +151,7 @@ def test_what_check_warns_of_stands_on_the_first_page(evidence, no_pictures):
     doubted = replace(evidence, criteria=(), doubts=("whether steps were lost in segment 0 is not known",))
     first = " ".join(" ".join(Nodes(report_html(doubted).split(b"<nav")[0] + b"</header></body></html>").text).split())
     assert (
-        "mind what check warns of. No limit" in first and "check warns: whether steps were lost in segment 0" in first
+        "see the warnings of check. No limit" in first and "check warns: whether steps were lost in segment 0" in first
     )
     assert "check warns" not in " ".join(Nodes(report_html(replace(evidence, criteria=()))).text)
 

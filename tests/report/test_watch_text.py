@@ -16,7 +16,7 @@ def test_sizes_beyond_the_linear_are_called_rough(value, unit, rough):
     """Their u is that of the linear law: of a positioner that fell over it would be believed."""
     moved = (MovedPart("positioner: shift along y", value, 0.1, unit),)
     text = watch_text(Watch(MOVED, 0.0, 0.01, moved, 16, 0.5, (), True), 0.8)
-    assert f"moved: {moved[0].what}" in text and ("are rough" in text) == rough
+    assert f"moved: {moved[0].what}" in text and ("are inaccurate" in text) == rough
 
 
 def test_what_follows_the_best_explanation_is_not_called_a_motion_of_its_own():
@@ -24,6 +24,6 @@ def test_what_follows_the_best_explanation_is_not_called_a_motion_of_its_own():
     parts = tuple(MovedPart(f"{what}: shift along y", 3.0, 0.1, "mm") for what in ("cameras", "positioner"))
     text = watch_text(Watch(MOVED, 0.0, 0.01, parts, 16, 0.5, (), True), 0.8)
     assert "what to do: calibrate the cameras anew" in text and "fasten it" not in text
-    assert "positioner takes up what the first leaves" in text
+    assert "positioner may show residuals of the first cause only" in text
     alone = watch_text(Watch(MOVED, 0.0, 0.01, parts[1:], 16, 0.5, (), True), 0.8)
     assert "fasten it" in alone and "takes what" not in alone

@@ -237,7 +237,7 @@ def _unpaired_lines(views: ViewedFolder, pairs: PairedLooks, rows: str) -> list[
     """Unpaired files and rows, a line for each kind."""
     files = {
         "without the picture of the other camera": views.unpaired,
-        "their names tell no camera": views.unnamed,
+        "no camera in the name": views.unnamed,
         f"not of {_sizes_px(views.image_sizes)} as most": views.other_size,
         "of a kind that is not read; save them as PNG of 8 bits": views.unread,
         "a second pair for its row": pairs.left_over,

@@ -87,7 +87,7 @@ def verdict_line(summary: FitSummary) -> str:
             f"usable; no sign of a model error in {len(validation.tests)} tests (least p {validation.tests[0].p:.2g})"
         )
     if unmoved:
-        verdict += f"; the data say nothing of {', '.join(unmoved)}"
+        verdict += f"; the data do not determine {', '.join(unmoved)}"
     return f"verdict: {verdict}"
 
 
@@ -149,7 +149,7 @@ def next_steps(summary: FitSummary, folder: str, causes: Sequence[Finding] = ())
         )
     if summary.few_stops:
         directions = ", ".join(f"{direction} ({count})" for direction, count in summary.few_stops.items())
-        steps.append(f"Add stops reached by moving {directions}: so few hardly tell their own scatter.")
+        steps.append(f"Add stops reached by moving {directions}: too few to estimate their scatter.")
     if summary.estimator == "laplace":
         steps.append(f"Sample the posterior, which takes minutes: `tvsbayes fit {folder}`, then make the report again.")
     texts = [weak.text for weak in summary.weak_directions if asks_for_looks(weak)]

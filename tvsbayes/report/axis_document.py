@@ -60,8 +60,8 @@ HELPLESS_SHARE = 0.95
 """Largest useful remaining share of an uncertainty after further stops."""
 MORE_HELPS = "many more stops (--minutes) help, or readings of smaller u"
 HELPS = {
-    "per_command": "a longer travel helps, over which errors by position count less; the line over the commands read "
-    "is known better: --target effective_per_command"
+    "per_command": "a longer travel helps: errors by position then have less effect; the line over the commands "
+    "read is known better: --target effective_per_command"
 }
 """Alternatives by target where further stops hardly help."""
 CONFLICT_TEXT = "the numbers hold only if the readings, not the priors, are wrong"
@@ -107,7 +107,7 @@ def parameter_table(summary: AxisSummary) -> TableView:
         if name != "per_command":
             share = "" if estimate.contraction is None else f"{100 * max(estimate.contraction, 0.0):.0f} %"
             rows.append([labels.get(name, name), *_row(name, estimate)[1:], share])
-    caption = f"parameters, {escaped(summary.unit)}; 100 %: the readings tell it, 0 %: the prior does"
+    caption = f"parameters, {escaped(summary.unit)}; 100 %: set by the readings, 0 %: set by the prior"
     return TableView(caption, ["", "value(u)", "95 % interval", "data"], rows)
 
 
@@ -121,7 +121,7 @@ def for_firmware(summary: AxisSummary) -> str:
     play = summary.parameters["backlash"]
     in_commands = concise(play.value / abs(ratio), play.sd / abs(ratio))
     if play.interval95[0] <= 0 <= play.interval95[1]:
-        return f"{text}play of {in_commands} commands is not proved: its 95 % interval holds 0"
+        return f"{text}play of {in_commands} commands is not significant: its 95 % interval contains 0"
     if play.value < 0:
         overshoot = concise(-play.value / abs(ratio), play.sd / abs(ratio))
         return f"{text}no play: a reversal overshoots by {overshoot} commands"
@@ -155,8 +155,8 @@ def worst_place(summary: AxisSummary) -> str:
     text = f"the error by position is largest at command {worst.position:.10g}: {concise(worst.value, worst.sd)} "
     text += f"{escaped(summary.unit)} off the line"
     if worst.interval95[0] <= 0 <= worst.interval95[1]:
-        text += ", whose 95 % interval holds 0"
-    return f"{text}; it is that of gears and encoder together, which one encoder alone cannot tell apart"
+        text += ", whose 95 % interval contains 0"
+    return f"{text}; it is the sum of the errors of gears and encoder, which one encoder cannot separate"
 
 
 def deviation_table(deviations: Sequence[PositionDeviation], unit: str, limit: int) -> TableView:
@@ -204,7 +204,7 @@ def _lines(title: str, texts: Sequence[str]) -> list[str]:
 def warnings_note(summary: AxisSummary) -> str:
     """A reference to the warnings, at the end of a verdict."""
     count = len(summary.warnings)
-    return f"; mind the {count} warnings" if count > 1 else "; mind the warning" * count
+    return f"; see the {count} warnings" if count > 1 else "; see the warning" * count
 
 
 def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence[str] = ()) -> str:
@@ -221,7 +221,7 @@ def axis_fit_text(summary: AxisSummary, details: bool = False, written: Sequence
     if details:
         deviations = deviation_table(summary.deviations, summary.unit, DEVIATIONS_SHOWN)
         parts = [deviations if summary.deviations else None, iso230_table(summary.classic, summary.unit)]
-        parts += _lines("weak (the readings leave it to the priors)", summary.weak_directions)
+        parts += _lines("weak (set by the priors, not by the readings)", summary.weak_directions)
     elif count := len(summary.weak_directions):
         parts = [f"--details and the report say more: {count} weak direction{'s' * (count > 1)}"]
     title = "not accepted" if summary.explained else "NOT CONVERGED"
@@ -283,9 +283,10 @@ def next_table(plan: AxisPlan, unit: str) -> TableView:
 def axis_plan_text(plan: AxisPlan, unit: str) -> str:
     """A plan as text."""
     if not plan.next:
-        return "there is no time for a single stop"
+        return "the time is too short for a single stop"
     share = plan.next[-1].u / plan.u_now
-    warning = f"these stops hardly help: u falls by {100 * (1 - share):.1f} %; {HELPS.get(plan.target, MORE_HELPS)}"
+    helps = HELPS.get(plan.target, MORE_HELPS)
+    warning = f"these stops have little effect: u falls by {100 * (1 - share):.1f} %; {helps}"
     minutes = f"{plan.minutes:.1f} minutes in all"
     return terminal(next_table(plan, unit), minutes, warning if share > HELPLESS_SHARE else None)
 
@@ -337,7 +338,7 @@ def axis_sections(results: AxisResults, figures: Sequence[FigureView]) -> list[S
         Section("Result", result_texts, tables=parameters, figures=figures, opened=True),
         Section("What repeats by position", tables=deviations),
         *compensation_sections,
-        Section("What the readings cannot tell", items=summary.weak_directions or ["Nothing of note."]),
+        Section("What the readings do not determine", items=summary.weak_directions or ["No remarks."]),
         Section("Classic", [line], tables=[iso230_table(classic, unit)]),
         Section("Method", METHOD),
     ]

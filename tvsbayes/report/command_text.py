@@ -112,7 +112,7 @@ def _expected_table(expected: Mapping[str, float], contraction: Mapping[str, flo
         if u > 0 or share is not None:
             rows.append([name, two_digits(u), unit, "fixed" if share is None else f"{round(100 * share)} %"])
     columns = ["result", "u expected", "unit", "set by the data"]
-    return TableView("what the plan will tell (100 %: the priors no longer matter)", columns, rows)
+    return TableView("what the plan will determine (100 %: the priors no longer matter)", columns, rows)
 
 
 LAW = (
@@ -162,7 +162,7 @@ def plan_text(result: PlanResult) -> str:
         lines.append(
             f"classic, {c.direction}: n = (t s / E)^2 = {c.experiments} four-point experiments ({low} to {high}) for "
             f"s = {c.sd:.2g} deg/step ({source}), E = {c.half_width:.2g}; its systematic error {c.systematic:+.2g} "
-            f"({c.systematic_interval95[0]:+.2g} to {c.systematic_interval95[1]:+.2g}) stays whatever n"
+            f"({c.systematic_interval95[0]:+.2g} to {c.systematic_interval95[1]:+.2g}) does not depend on n"
         )
     lines += [f"note: {note}" for note in result.notes]
     if result.next:
@@ -221,7 +221,7 @@ def stereo_calibration_text(result: StereoCalibration) -> str:
     if (pictures := result.pictures) is not None:
         names_by_note = {
             "without their counterpart": pictures.unpaired,
-            "names tell no camera, not used": pictures.unnamed,
+            "no camera in the name, not used": pictures.unnamed,
             "no board found": pictures.without_board,
             "another size, not used": pictures.other_size,
             "found by the other finder": pictures.by_fallback,
@@ -241,7 +241,7 @@ def detection_text(detection: Detection) -> str:
 
     rows = [[status, str(count), REASONS.get(status.split(" ")[0], "")] for status, count in detection.statuses.items()]
     rows += [["undetected", str(detection.missing), "no frames"]] if detection.missing else []
-    rows += [["as it was", str(detection.kept), "refused by somebody else"]] if detection.kept else []
+    rows += [["as it was", str(detection.kept), "refused by hand"]] if detection.kept else []
     noise = ", ".join(
         f"{side} contrast {model.speckle_contrast:.2f}, gain {model.gain_dn:.3f} DN"
         for side, model in detection.noise.items()
@@ -405,8 +405,8 @@ def changes_text(comparison: Comparison) -> str:
     if ratios and not any(c.significant for c in comparison.changes):
         share = max(comparison.limit * c.u / abs(c.first) for c in ratios)
         verdict += (
-            f"\nthat is no proof of none: a ratio may have changed by {100 * share:.2g} % unseen; "
-            "`tvsbayes watch A B` holds the looks of B against A and sees smaller changes"
+            f"\nsmaller changes are not excluded: a ratio may have changed by up to {100 * share:.2g} % undetected; "
+            "`tvsbayes watch A B` compares the looks of B with A and detects smaller changes"
         )
     return terminal(table, verdict)
 
@@ -428,10 +428,10 @@ def study_text(result: StudyResult) -> str:
     share = f"{100 * result.assurance:.1f} % of fits ({100 * a:.1f} to {100 * b:.1f} %)"
     lines.append(f"{t.text}: reported as met by {share}")
     if a < ASSURED[0] <= b:
-        lines.append(f"so many campaigns do not tell whether {100 * ASSURED[0]:.0f} % do: add to them with more --n")
+        lines.append(f"too few campaigns to decide whether {100 * ASSURED[0]:.0f} % do: add more with a larger --n")
     lines.append(
-        f"bounds: what a true sd leaves with all but a chance of {BOUND:g}; power: share of fits that tell it from 0 "
-        "or the stated ratio; how many looks a target needs is asked of `tvsbayes plan`"
+        f"bounds: exceeded with a probability of {BOUND:g} if the sd is correct; power: share of fits that distinguish "
+        "it from 0 or the stated ratio; `tvsbayes plan` gives the number of looks for a target"
     )
     if result.reported is not None:
         lines.append("reported: {:.3g}, {:.3g}, {:.3g}".format(*result.reported) + f" {t.unit} (5, 50, 95 % of fits)")

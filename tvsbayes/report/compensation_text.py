@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 REMEDIES = {
     NOT_APPLIED: "the controller does not use the table, or not its play: is the file loaded, were the settings saved, "
     "does compensation start only after homing?",
-    TWICE: "the table, or its play, acts in two places: take one of them out (a backlash setting beside the table?)",
-    WRONG_SIGN: "the controller adds what it is to take off, or holds forward and backward in each other's place",
+    TWICE: "the table, or its play, acts in two places: remove one of them (a backlash setting beside the table?)",
+    WRONG_SIGN: "the controller adds the correction instead of subtracting it, or forward and backward are exchanged",
     OTHER_MACHINE: "the table is of another machine, or this one changed: measure it again and compensate anew",
     APPLIED: "readings lie farther off than the table allows: measure again, and compensate anew if that stays",
 }
@@ -38,16 +38,16 @@ REMEDIES = {
 SCANNER_REMEDIES = {
     NOT_APPLIED: "counters follow the nominal degrees per step, or come without the run-up that takes up the play: use "
     "those of `tvsbayes steps-for` with `via_pan_steps` and `via_tilt_steps`, or the header's",
-    TWICE: "the calibration acts in the host and in the controller: take one of them out",
-    WRONG_SIGN: "the correction is taken off instead of added, or left and right, up and down are exchanged",
+    TWICE: "the calibration acts in the host and in the controller: remove one of them",
+    WRONG_SIGN: "the correction is subtracted instead of added, or left and right, up and down are exchanged",
     OTHER_MACHINE: "something moved, a counter has the other sign, or the calibration is of another machine: "
-    "`tvsbayes check FRESH` and `tvsbayes watch CAMPAIGN FRESH` tell",
+    "see `tvsbayes check FRESH` and `tvsbayes watch CAMPAIGN FRESH`",
     APPLIED: "looks lie farther off than the calibration allows: `tvsbayes watch CAMPAIGN FRESH` says what moved",
 }
 """The same for a scanner."""
 HELPS = {
     "homing": "the scatter of homings; read after several homings, or verify without homing in between",
-    "stops": "the scatter of single stops; no table takes that out",
+    "stops": "the scatter of single stops; no table corrects that",
     "table": "the table itself; read more, at more positions",
     "format": "what the format cannot hold; csv, linuxcnc and header hold both sides by position",
     "drift": "the walk of the zero; home more often, or guide",
@@ -109,7 +109,7 @@ def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
         *(f"the format: {text}" for text in result.unsaid),
     ]
     if result.homings == 1 and not result.in_motion:
-        lines.append("one homing alone was read: how far the next one is off is known by its prior; home_sd in [axis]")
+        lines.append("only one homing was read: the error of the next one is set by its prior, home_sd in [axis]")
         bounds = [
             f"{side} {two_digits(p.shift_free95)}" for side, p in result.promise.items() if p.shift_free95 is not None
         ]
@@ -155,12 +155,12 @@ def verification_text(verification: Verification) -> str:
         lines.append(f"what to do: {remedies[verification.world]}")
     elif verification.verdict == CANNOT_TELL and verification.needed is None:
         lines.append(
-            "no number of such readings tells: what the table corrects is lost in what homing and fit leave open"
+            "no number of such readings decides: the correction is smaller than the uncertainty of homing and fit"
         )
     elif verification.verdict == CANNOT_TELL:
         kind = "readings" if is_axis else "looks"
         more = f"about {verification.needed} {kind} of this kind" if verification.needed else f"some more {kind}"
-        lines.append(f"what to do: {more} would tell; `tvsbayes plan --verify FOLDER` names those that tell soonest")
+        lines.append(f"what to do: take {more}; `tvsbayes plan --verify FOLDER` lists the most informative")
     return terminal(*lines)
 
 
@@ -216,5 +216,5 @@ def aim_plan_text(plan: AimPlan) -> str:
 def _power(plan: VerifyPlan | AimPlan) -> str:
     """Whether a plan separates the worlds, in words."""
     if plan.enough:
-        return f"they tell the worlds apart in 95 of 100: {plan.distance:.1f} standard deviations"
-    return f"they hardly tell: the nearest two worlds are {plan.distance:.1f} standard deviations apart"
+        return f"they separate the hypotheses in 95 % of cases: {plan.distance:.1f} standard deviations"
+    return f"they do not separate the hypotheses: the nearest two are {plan.distance:.1f} standard deviations apart"

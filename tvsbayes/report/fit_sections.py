@@ -187,8 +187,8 @@ def gear_section(e: Evidence) -> Section:
     ratios = TableView("Line through the looks, and gear ratio times slope of the mirrors", ESTIMATE_COLUMNS, rows)
     text = [
         f"Effective ratios are slopes of lines through the looks, {range_text(summary)}, errors of the gears included; "
-        "over other counters these errors count anew. Local ratios are those of gears and mirrors without them, at the "
-        "mean angles of the looks.",
+        "at other counters these errors are different. Local ratios are those of gears and mirrors without them, at "
+        "the mean angles of the looks.",
         "Where no look reached (grey) nothing is known of the errors but their size: located points there are marked "
         "as extrapolated, and their uncertainty grows.",
     ]
@@ -239,11 +239,11 @@ def identifiability_section(e: Evidence) -> Section:
     text = []
     if not items:
         text.append("Every direction that matters is set by the data; no single stop decides a result.")
-    caption = "Results that another prior would move: by how many of their sds, and the factor on the sd"
+    caption = "Results that depend on a prior: shift in sds, and factor on the sd"
     columns = ["prior", "result", "shift, sd", "sd, factor"]
     priors = TableView(caption, columns, sensitive) if sensitive else None
     table = TableView("Correlations beyond 0.8", ["parameters", "correlation"], rows) if rows else None
-    return Section("What the data tell apart", text, items, [table, priors], views)
+    return Section("What the data determine", text, items, [table, priors], views)
 
 
 def residuals_section(e: Evidence) -> Section:
@@ -314,7 +314,7 @@ def validation_section(e: Evidence) -> Section:
     else:
         text.append(f"Held-out experiments: {e.held_out.verdict}: {e.held_out.reason}.")
         rows = [[d, f"{u:.1e}"] for d, u in e.held_out.unseen.items()]
-        caption = "What no hold-out sees: u by stereo calibration and focal scale, common to all spots, deg/step"
+        caption = "Not tested by a hold-out: u by stereo calibration and focal scale, common to all spots, deg/step"
         tables += [hold_out_table(e.held_out), TableView(caption, ["direction", "u"], rows)]
     return Section("Validation", text, items, tables)
 

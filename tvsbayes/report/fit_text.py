@@ -94,11 +94,11 @@ def more_line(summary: FitSummary) -> str:
     """Further contents of --details and the report; "" where there are none."""
     counts = {
         "weak direction": len(summary.weak_directions),
-        "stop on which a result hangs": len(summary.leverage),
+        "stop that decides a result": len(summary.leverage),
         "prior that matters": len({entry.parameter for entry in summary.prior_sensitivity}),
     }
     plural = {
-        "stop on which a result hangs": "stops on which a result hangs",
+        "stop that decides a result": "stops that decide a result",
         "prior that matters": "priors that matter",
     }
     phrases = [f"{n} {name if n == 1 else plural.get(name, name + 's')}" for name, n in counts.items() if n]
@@ -131,7 +131,7 @@ def detail_lines(summary: FitSummary) -> list[Part]:
             f"prior: with {word} the u of {entry.parameter}, {entry.quantity} moves {entry.shift_sd:+.2f} sd and its "
             f"sd changes by a factor {entry.sd_ratio:.2f}"
         )
-    lines += [f"weak (the data leave it to the priors): {weak.text}" for weak in summary.weak_directions]
+    lines += [f"weak (set by the priors, not by the data): {weak.text}" for weak in summary.weak_directions]
     lines += [f"depends on one stop: {entry.text}" for entry in summary.leverage]
     return lines
 
@@ -171,9 +171,9 @@ def suspect_line(spots: Sequence[int]) -> str:
 def few_stops_line(counts: Mapping[str, int], estimator: str) -> str:
     """The effect of few stops of a direction on its intervals."""
     counts_text = ", ".join(f"{direction} {count}" for direction, count in counts.items())
-    sentence = f"few stops ({counts_text}): they hardly tell their own scatter"
+    sentence = f"few stops ({counts_text}): too few to estimate their scatter"
     if estimator == "posterior":
-        return f"{sentence}; the intervals hold it, more stops would shorten them"
+        return f"{sentence}; the intervals include this, more stops would shorten them"
     sentence += ", and the Laplace intervals of ratio and backlash are too short"
     return f"{sentence}; sample the posterior (`tvsbayes fit`), or add stops"
 
@@ -183,11 +183,11 @@ def validation_lines(validation: Validation) -> list[str]:
     tests = validation.tests
     if validation.passed:
         if not tests:
-            return ["validation: nothing can be asked of so few spots"]
+            return ["validation: too few spots to look for model errors"]
         least = f"least p {tests[0].p:.2g} ({tests[0].name})"
         return [
-            f"validation: no sign of a model error in {len(tests)} tests, {least}; shapes that gears, mirrors and "
-            "play can take themselves are not seen"
+            f"validation: no sign of a model error in {len(tests)} tests, {least}; errors of the same shape as "
+            "those of gears, mirrors and play are not detected"
         ]
     warning = f"VALIDATION FAILED: {validation.cause} (p {tests[0].p:.1e}); the table is as fitted, "
     warning += factor_text(validation)

@@ -61,8 +61,8 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
         ),
         Section("Stops", text=_noise_text(record), figures=[view for axis in AXES for view in stop_views(stops, axis)]),
         Section(
-            "What the sightings cannot tell",
-            items=[sentence_in_words(text) for text in weaknesses] or ["Nothing of note."],
+            "What the sightings do not determine",
+            items=[sentence_in_words(text) for text in weaknesses] or ["No remarks."],
         ),
         Section("Signs of model errors", items=validation or ["Not asked."]),
         Section("Method", text=METHOD),

@@ -81,7 +81,7 @@ def verdict_of(summary: FitSummary, criteria: Sequence[Criterion], doubts: Seque
     if failed and not criteria:
         return Verdict(f"{failed}No limit was stated", "cannot-tell")
     if not criteria:
-        usable = verdict_line(summary).removeprefix("verdict: ") + "; mind what check warns of" * bool(doubts)
+        usable = verdict_line(summary).removeprefix("verdict: ") + "; see the warnings of check" * bool(doubts)
         return Verdict(f"{sentence(usable)} No limit was stated", "cannot-tell")
     judgements = []
     for verdict in (NOT_MET, CANNOT_TELL, MET):
@@ -198,7 +198,7 @@ def error_sources(e: Evidence) -> list[str]:
     """Causes of the joint calibration's error, and of the larger error of the last simple one."""
     order = np.argsort(-e.budget.share)[:CAUSES_LISTED]
     causes = ", ".join(f"{cause_in_words(e.budget.causes[k])} {100 * e.budget.share[k]:.0f} %" for k in order)
-    sentences = [f"What the joint one leaves comes from, as shares of the variance: {causes}."]
+    sentences = [f"Causes of the remaining error of the joint one, as shares of the variance: {causes}."]
     for name, error in list(e.simple_errors.items())[-1:]:
         sentences.append(
             f"Why {name} is off there: its beam points {error.azimuth_deg:+.2f} deg in azimuth and "
@@ -251,5 +251,5 @@ def _steps(e: Evidence) -> list[str]:
         steps.append("Nothing: use the calibration, and repeat it when the instrument was moved, opened or dropped.")
     if not e.criteria and e.fit.summary.converged:
         limit = f"`tvsbayes report {folder} --limit-mm 5`, or `--limit-deg-per-step 0.0005`"
-        steps.append(f"State the largest error that you can bear, and the page says whether it is kept: {limit}.")
+        steps.append(f"State the largest permissible error; the page then says whether it is met: {limit}.")
     return steps

@@ -76,7 +76,7 @@ def _no_better(e: Evidence, ranges_mm: Sequence[str]) -> str:
     )
     text += f" at {e.range_mm:g} mm"
     if not any(spot.aperture_deg is not None for spot in e.campaign.spots):
-        text += "; the campaign has no aperture readings, which tell the range of a point"
+        text += "; the campaign has no aperture readings, which determine the range of a point"
     return f"{text}."
 
 
@@ -166,7 +166,7 @@ def _gum_table(tables: Sequence[BudgetTable], caption: str) -> TableView:
     rows.insert(-1, [OTHERS, *[""] * (len(columns) - 1), *(c for table in tables for c in _others(table, names))])
     if is_single and any(row.share > 1 for each in rows_by_name.values() for row in each):
         # GUM 5.2.2: correlated inputs have cross terms.
-        caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations takes them back"
+        caption += "; the inputs are correlated: single shares exceed 100 %, the row of correlations compensates for it"
     suffixes = [""] if is_single else [f", {table.quantity.rpartition('.')[2]}" for table in tables]
     columns += [f"{word}{part}" for part in suffixes for word in ("contribution", "share %")]
     return TableView(caption, columns, rows)
@@ -198,11 +198,11 @@ def _gap_note(table: BudgetTable, result: Estimate | None) -> str:
     linear_ends = table.estimate - table.expanded, table.estimate + table.expanded
     parameter = parameter_of(table.quantity)
     never_below = parameter is not None and parameter.prior.distribution == "half-normal"
-    note = ", which reaches below 0, where no value can be" * (never_below and linear_ends[0] < 0 <= low)
+    note = ", which extends below 0, where no value is possible" * (never_below and linear_ends[0] < 0 <= low)
     rounding = 10.0 ** (math.floor(math.log10(half)) - 1) if half > 0 else 0.0
     shift = max(abs(linear_ends[0] - low), abs(linear_ends[1] - high))
     if note or abs(table.expanded - half) > rounding or shift > END_SHIFT * half:
-        note += f" (the first page, which counts: {interval_text(low, high, result.sd)}, U = {two_digits(half)} "
+        note += f" (the first page, which applies: {interval_text(low, high, result.sd)}, U = {two_digits(half)} "
         note += f"{table.unit})"
     return note
 
@@ -300,7 +300,7 @@ def limits_section(e: Evidence) -> Section:
     items = [
         "The scale of all angles is that of the stereo calibration; an error of its board or of the focal length at "
         "the laser's wavelength beyond the stated uncertainty is in no residual.",
-        "Baseline, emission angle at pan 0 (C0) and the aperture's zero cannot be seen in spots: without aperture "
+        "Baseline, emission angle at pan 0 (C0) and the aperture's zero have no effect on spots: without aperture "
         "readings they are the user's statement.",
         "Results hold for the range of counters and depths that was seen, at the temperature of the campaign, moving "
         "slowly enough to lose no step.",

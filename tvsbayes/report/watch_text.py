@@ -12,10 +12,10 @@ from tvsbayes.results.watch_record import CANNOT_TELL, LOOKS_MAX, MOVED, MovedPa
 HELPS = {
     "cameras: rotation": "more looks on both sheets, over the whole picture",
     "cameras: shift": "more looks on both sheets, over the whole picture",
-    "positioner: rotation": "more homings, each with its looks: what a homing leaves open looks the same",
+    "positioner: rotation": "more homings, each with its looks: the scatter of homings has the same effect",
     "positioner: shift": "looks on both sheets at more counters",
-    "zero: azimuth": "more homings, each with its sightings: what a homing leaves open looks the same",
-    "zero: elevation": "more homings, each with its sightings: what a homing leaves open looks the same",
+    "zero: azimuth": "more homings, each with its sightings: the scatter of homings has the same effect",
+    "zero: elevation": "more homings, each with its sightings: the scatter of homings has the same effect",
     "base: lean": "sightings all round, in opposite azimuths",
     "beam: not square": "sightings low and high, at the same azimuths",
     "ratio: pan": "pan counters further apart, each reached several times",
@@ -62,14 +62,14 @@ def watch_text(watch: Watch, power_min: float) -> str:
     lines += [f"moved: {moved_text(part)}" for part in watch.moved]
     if any(abs(part.value) > LINEAR.get(part.unit, math.inf) for part in watch.moved):
         lines.append(
-            "sizes are linear about the calibration: such large ones are rough, beyond the u that stands there"
+            "sizes are linearised about the calibration: so large ones are inaccurate by more than the stated u"
         )
     if watch.verdict == MOVED:
         causes = list(dict.fromkeys(part.what.split(":")[0] for part in watch.moved))
         lines.append(f"what to do: {REMEDIES[causes[0]]}")
         if len(causes) > 1:
             others = ", ".join(causes[1:])
-            lines.append(f"then watch again: {others} takes up what the first leaves, and may not have moved itself")
+            lines.append(f"then watch again: {others} may show residuals of the first cause only")
     unseen = watch.unseen(power_min)
     if watch.verdict == CANNOT_TELL:
         lines += [f"cannot see {c.size:g} {c.unit} of {c.what}: {HELPS[c.what]}" for c in unseen]
@@ -101,14 +101,14 @@ def watch_plan_text(plan: WatchPlan) -> str:
             continue
         text = f"{c.size:g} {c.unit} of {c.what} is noticed in {100 * c.power:.0f} % of the cases"
         if c.looks_needed is not None:
-            need = f"{c.looks_needed} looks after {c.homings_needed} homings ({c.minutes_needed:.0f} minutes) would do"
+            need = f"{c.looks_needed} looks after {c.homings_needed} homings ({c.minutes_needed:.0f} minutes) suffice"
             if c.looks_needed > LOOKS_MAX:
                 need += f", more than the {LOOKS_MAX} that are planned at most"
             lines.append(f"{text}: {need}; {HELPS[c.what]}")
         else:
-            remedy = "; what would do was not found"
+            remedy = "; a sufficient number was not found"
             if c.looks_to_add is not None:
                 remedy = f": add about {c.looks_to_add} looks to it like those of this plan, homed as often (others, "
-                remedy += "after one homing, tell less), and take as many at every watch"
-            lines.append(f"{text}, and no number of looks does better: the campaign knows too little of it{remedy}")
+                remedy += "after one homing, are less informative), and take as many at every watch"
+            lines.append(f"{text}, and no number of looks improves that: the campaign determines it too poorly{remedy}")
     return terminal(*lines, "", table)
