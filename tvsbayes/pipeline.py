@@ -83,8 +83,7 @@ def unusable(summary: FitSummary, causes: Sequence[Finding] = ()) -> TvsError | 
     if not summary.headline_informed:
         return NothingToEstimate(
             "uninformed",
-            "the spots tell no more about any effective ratio than the priors do: they took away less than a tenth "
-            "of its variance",
+            "the spots do not determine any effective ratio: they reduce its prior variance by less than a tenth",
             remedy="observe stops before and after moves of both axes",
         )
     return None

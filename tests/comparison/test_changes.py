@@ -32,7 +32,9 @@ def test_a_calibration_has_not_changed_from_itself(mixed_fit):
     # What is least known may hide most: here the second ratio, made ten times less sure.
     worst = structs.replace(same.changes[1], u=10 * same.changes[1].u)
     less = structs.replace(same, changes=(same.changes[0], worst, *same.changes[2:]))
-    assert f"may have changed by up to {100 * same.limit * worst.u / worst.first:.2g} % undetected" in changes_text(less)
+    assert f"may have changed by up to {100 * same.limit * worst.u / worst.first:.2g} % undetected" in changes_text(
+        less
+    )
     for change in same.changes:
         assert change.difference == 0.0 and change.normalised == 0.0 and change.u > 0
     # A second pair of cameras: nothing is shared, every u grows.

@@ -42,7 +42,7 @@ def test_the_papers_protocol_is_warned_of_on_both_axes(mounted_rig):
     # Not "only one": between pan and tilt experiments each axis goes to its middle once.
     for axis in ("pan", "tilt"):
         reason = "nearly every leg has |N| = 200 and reverses"
-        assert f"{axis} ratio and {axis} backlash are hard to tell apart: {reason}" in text
+        assert f"{axis} ratio and {axis} backlash are poorly separated: {reason}" in text
 
 
 def test_swapped_cameras_are_suspected(paper_twin):

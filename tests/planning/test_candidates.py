@@ -88,7 +88,7 @@ def test_limits_too_narrow_for_a_run_up_are_refused_with_its_length(mounted_rig)
     assert "[positioner]" in refused.value.remedy
     check = check_plan(rig, (PlanStep(0, "place", target="d1"), PlanStep(1, "look")))
     assert [f.addition for f in check.faults] == [(), ()]
-    assert any("no cure can be sought on this rig" in w for w in check.warnings)
+    assert any("no looks can be added on this rig" in w for w in check.warnings)
 
 
 def test_a_rig_without_sheets_is_refused(mounted_rig):

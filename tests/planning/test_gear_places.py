@@ -276,9 +276,9 @@ def test_the_papers_two_counters_are_worse_off_elsewhere_and_named(real, real_ri
     grid = grid_protocol(pan_steps=(0, 60, 120, 180, 240), tilt_steps=(-90, -45, 0, 45, 90))
     assert baseline_of("grid", information_of(grid, known), known, WORST).joint < 0.8 * paper.joint
     warnings = check_plan(real_rig, paper_protocol(12)).warnings
-    named = [text for text in warnings if "cannot tell gear error from ratio" in text]
+    named = [text for text in warnings if "do not separate gear error from ratio" in text]
     assert [text.split()[0] for text in named] == ["pan", "tilt"]
-    assert "would tell" in named[0] and "elsewhere" in named[0]
+    assert "would separate them" in named[0] and "elsewhere" in named[0]
     assert not [text for text in check_plan(real_rig, grid).warnings if "gear error" in text]
 
 

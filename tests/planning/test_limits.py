@@ -90,7 +90,7 @@ def test_a_target_below_the_floor_names_the_term_and_what_would_do(mounted_rig):
     wanted = 0.8 * reachable.floor
     short = limit(0.002, wanted)
     assert not short.reachable and short.cause == "focal scale" and short.floor == reachable.floor
-    needed = re.fullmatch(r"it would do to know u\(focal_scale\) = (\S+) instead of 0\.002", short.needed)
+    needed = re.fullmatch(r"it suffices to know u\(focal_scale\) = (\S+) instead of 0\.002", short.needed)
     assert limit(float(needed[1]), wanted).floor <= wanted
     # Two digits rounded down: the next number is too large.
     last = 10.0 ** (math.floor(math.log10(float(needed[1]))) - 1)
@@ -177,7 +177,7 @@ def test_an_input_has_to_be_known_as_much_better_as_the_floor_is_too_high(knowle
     limit = limit_of(knowledge, nothing, only, target_of(0.51))
     assert (limit.floor, limit.cause, limit.reachable) == (2.0, "focal scale", False)
     # 0.255 of 0.002, stated to two digits.
-    assert limit.needed == "it would do to know u(focal_scale) = 0.00051 instead of 0.002"
+    assert limit.needed == "it suffices to know u(focal_scale) = 0.00051 instead of 0.002"
     assert limit_of(knowledge, nothing, only, target_of(2.0)).reachable
 
 
@@ -186,7 +186,7 @@ def test_what_is_needed_is_never_rounded_up(knowledge):
     nothing, only = np.zeros((PARAMETERS, PARAMETERS)), Sensitivity(at({SCALE: 1.0})[None])
     for share in (0.2578, 0.2598):
         needed = limit_of(knowledge, nothing, only, target_of(share)).needed
-        assert needed == "it would do to know u(focal_scale) = 0.00051 instead of 0.002"
+        assert needed == "it suffices to know u(focal_scale) = 0.00051 instead of 0.002"
 
 
 def test_two_inputs_are_asked_for_where_one_is_not_enough(knowledge):
@@ -195,7 +195,7 @@ def test_two_inputs_are_asked_for_where_one_is_not_enough(knowledge):
     limit = limit_of(knowledge, nothing, both, target_of(2.0))
     assert limit.shares == pytest.approx({"stereo calibration": 16 / 25, "focal scale": 9 / 25})
     stereo = "the stereo calibration to 10 % of its present uncertainty"
-    assert limit.needed == f"it would do to know {stereo}; u(focal_scale) = 0.0013 instead of 0.002"
+    assert limit.needed == f"it suffices to know {stereo}; u(focal_scale) = 0.0013 instead of 0.002"
 
 
 @pytest.mark.parametrize(("gain_per_minute", "stop"), [(0.98e-3, True), (1.02e-3, False)])

@@ -97,8 +97,8 @@ def _scatter_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
     if max(looks.values(), default=1) > 1:
         return None
     text = (
-        f"every stop of the {axis} axis was looked at once: the data tell the stop scatter and the look scatter "
-        "together, the priors how much is which; look twice at some stops"
+        f"every stop of the {axis} axis was looked at once: the data determine only the sum of stop and look "
+        "variance, the priors its division; look twice at some stops"
     )
     return WeakDirection(text, {look: 1.0, **dict.fromkeys(stops, -1.0)})
 
@@ -133,7 +133,7 @@ def _shift_directions(fit: JointFit, axis: Axis) -> list[WeakDirection]:
             if np.ptp(values) > 1e-12 * np.max(np.abs(values)):
                 correlation = float(np.corrcoef(values, draws)[0, 1])
                 if inseparable(correlation):
-                    text = f"{what} and {words} are hardly separated (correlation {correlation:+.2f}): {cure}"
+                    text = f"{what} and {words} are poorly separated (correlation {correlation:+.2f}): {cure}"
                     directions.append(WeakDirection(text, {name: 1.0, shift: correlation}))
     return directions
 
@@ -143,7 +143,8 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
     directions = []
     for axis, pair in SENSES.items():
         if not moved & set(pair):
-            text = f"the {axis} axis was never moved: its ratio and backlash are the prior's; add moves on that axis"
+            stated = "its ratio and backlash are those of the prior"
+            text = f"the {axis} axis was never moved: {stated}; add moves on that axis"
             directions.append(WeakDirection(text, {f"degrees_per_step.{axis}": 1.0}))
             continue
         weak = _backlash_direction(fit, axis, pair[0] if pair[0] in moved else pair[1])

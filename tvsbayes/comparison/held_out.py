@@ -63,7 +63,7 @@ def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: d
     if len(lengths) == 1:
         reason = f"all experiments have |N| = {lengths[0]}: a constant lost motion looks like a ratio in all of them"
     elif blocks_seen < BLOCKS_MIN:
-        reason = f"{blocks_seen} blocks (fold and direction) tell nothing of their scatter"
+        reason = f"{blocks_seen} blocks (fold and direction) are too few to estimate their scatter"
     else:
         interval = ratio_interval(means["classic"], means["joint"])
         if interval[0] > 1:

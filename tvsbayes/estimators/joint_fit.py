@@ -250,7 +250,7 @@ def fit(
                 "nothing-free",
                 "every parameter is stated as exactly known (u = 0), the cameras included",
                 file="campaign.toml",
-                remedy="state a u above 0 for what the campaign is to teach",
+                remedy="state a u above 0 for the parameters to be estimated",
             )
         problem.compile_aside(executor)
         try:

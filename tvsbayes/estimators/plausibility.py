@@ -67,7 +67,7 @@ def sighting_findings(campaign: Campaign) -> tuple[Finding, ...]:
         turned = _misfit_deg(campaign, axis, -steps[:, k], angles_deg[:, k])
         if misfit_deg < FAR_DEG:
             continue
-        what = f"{names[k]} does not follow {axis}_steps by the stated ratio ({misfit_deg:.0f} deg off in the middle)"
+        what = f"{names[k]} does not follow {axis}_steps by the stated ratio ({misfit_deg:.0f} deg off in the median)"
         if turned * NEARER < misfit_deg:
             remedy = f"it does with the other sign: turn the sign of {axis}_steps, or of {names[k]}"
             findings.append(Finding("counter-sign", what, remedy, certain=True, file=SIGHTINGS.file))
@@ -345,18 +345,18 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     for axis in AXES if ok else ():
         reason = separation(observed_stops(campaign.moves, observed, axis), axis)
         if reason is not None:
-            warnings.append(f"{axis} ratio and {axis} backlash are hard to tell apart: {reason}")
+            warnings.append(f"{axis} ratio and {axis} backlash are poorly separated: {reason}")
     unknown = [m.segment for m in campaign.moves if "unknown" in (m.pan_approach, m.tilt_approach)]
     if unknown:
         begin = (
             f"segments {listed(unknown, SPOTS_LISTED)} begin" if len(unknown) > 1 else f"segment {unknown[0]} begins"
         )
-        warnings.append(f"{begin} with an unknown approach: the first reversal tells less")
+        warnings.append(f"{begin} with an unknown approach: the first reversal is less informative")
     depths_mm = points_mm[:, 0]
     if len(depths_mm) and np.all(_can_stand(depths_mm)) and depths_mm.max() < SHALLOW * depths_mm.min():
-        warnings.append("all spots lie at one depth: a second sheet position sharpens ratios threefold")
+        warnings.append("all spots lie at one depth: a second sheet position lowers u of ratios threefold")
     if campaign.stereo.assumed:
-        warnings.append("the stereo covariance is assumed, not estimated: uncertainties are only as good as it is")
+        warnings.append("the stereo covariance is assumed, not estimated: uncertainties depend on it")
     if not sightings and not np.any(campaign.stereo.parameter_covariance):
         warnings.append(
             "the stereo covariance is zero: its error (0.3 to 0.5 % of a ratio) is missing from every interval"

@@ -120,10 +120,10 @@ def too_few_counters(axis: str, counters: Sequence[int], suggested: Sequence[int
     """
     listed = ", ".join(map(str, counters))
     text = (
-        f"{axis} is seen at {len(counters)} counters only ({listed}), which cannot tell gear error from ratio: "
+        f"{axis} is seen at {len(counters)} counters only ({listed}), which do not separate gear error from ratio: "
         "the ratio holds between them, elsewhere the gear error of the prior is added"
     )
-    return f"{text}; looks at {axis} {', '.join(map(str, suggested))} would tell" if suggested else text
+    return f"{text}; looks at {axis} {', '.join(map(str, suggested))} would separate them" if suggested else text
 
 
 def line_share(places: SeenPlaces, used: np.ndarray) -> np.ndarray:

@@ -104,10 +104,10 @@ def _needed_at_point(aim: Sensitivity, target: Target) -> str | None:
     unit = target.unit
     if stop > target.limit:
         reason = f"{stop:.3g} {unit} come from the stop and the reading at the point itself"
-        return f"{reason}: only a smaller stop error or aperture noise would do"
+        return f"{reason}: only a smaller stop error or aperture noise would help"
     if worst > target.limit:
         reason = f"{worst:.3g} {unit} come from the point itself: {stop:.3g} from the stop and the reading there, "
-        reason += f"{gear:.3g} from errors of the gears, of which looks elsewhere do not tell"
+        reason += f"{gear:.3g} from errors of the gears, which looks at other counters do not determine"
         return f"{reason}; widen the limits in [positioner] until looks reach the point's counters"
     return None
 
@@ -158,7 +158,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: T
             if with_inputs(others) <= target.limit:
                 scaled = others
         stated = "; ".join(_requirement(knowledge.rig.table, groups[n], s) for n, s in scaled.items())
-        return Limit(floor, cause, shares, False, f"it would do to know {stated}")
+        return Limit(floor, cause, shares, False, f"it suffices to know {stated}")
     return Limit(floor, cause, shares, False, "no single input stands in the way: widen the limits or add sheets")
 
 
@@ -200,7 +200,7 @@ def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch],
         return Advice(True, f"the target is met: {value}", rule)
     if not limit.reachable:
         reason = f"no number of looks meets the target: the floor is {limit.floor:.3g} {target.unit}"
-        return Advice(after_data, reason if after_data else f"{reason}; measure if that will do", rule)
+        return Advice(after_data, reason if after_data else f"{reason}; measure if that suffices", rule)
     if best < least_gain:
         return Advice(True, f"the best next four looks lower {value} by only {best:.2g} {target.unit} a minute", rule)
     return Advice(False, f"{value} now; the best next four looks lower it by {best:.2g} {target.unit} a minute", rule)

@@ -36,7 +36,7 @@ from tvsbayes.results.estimates import CONTRACTION_LIMIT
 
 CURE_LOOKS = 24
 """Largest number of looks in an addition."""
-JUDGING, CURING = "judging the plan", "seeking a cure"
+JUDGING, CURING = "evaluating the plan", "searching for more looks"
 JUDGED_SECONDS, EXPECT_COMPILED_SECONDS, CURED_SECONDS = 0.2, 12.0, 1.0
 """Expected durations for the progress."""
 
@@ -142,9 +142,9 @@ class Judgement:
         stops = self.stops(axis)
         free = self.prior[self.rows(axis)[1]] > 0
         if ratio < CONTRACTION_LIMIT:
-            text = f"the plan tells nothing of the {axis} ratio"
+            text = f"the plan does not determine the {axis} ratio"
         elif backlash < CONTRACTION_LIMIT:
-            text = f"the plan tells nothing of the {axis} backlash"
+            text = f"the plan does not determine the {axis} backlash"
         elif inseparable(self.exchange(axis)) or (free and one_sided(stops, axis) is not None):
             text = self.inseparable_text(axis)
         else:
@@ -224,10 +224,12 @@ def _fault(
         return PlanFault(axis, text, (), before, None)
     cure = _cure(steps, knowledge, possible, axis, plan)
     if cure is None:
-        return PlanFault(axis, f"{text}; no {CURE_LOOKS} looks cure it on this rig", (), before, None)
+        return PlanFault(
+            axis, f"{text}; up to {CURE_LOOKS} more looks do not change that on this rig", (), before, None
+        )
     looks, after = sum(s.action == "look" for s in cure.addition), cure.after.u(axis)
     looks_text = f"{looks} more look{'s' * (looks != 1)}, {describe_looks(knowledge.rig, cure.addition, steps)}"
-    text += f"; smallest cure: {looks_text}: u of the {axis} ratio {before:.2g} -> {after:.2g} deg/step"
+    text += f"; smallest addition: {looks_text}: u of the {axis} ratio {before:.2g} -> {after:.2g} deg/step"
     return PlanFault(axis, text, cure.addition, before, after)
 
 
@@ -236,7 +238,7 @@ def _candidates(knowledge: Knowledge, warnings: list[str]) -> Candidates | None:
     try:
         return candidates(knowledge)
     except InputError as error:
-        warnings.append(f"no cure can be sought on this rig: {error.message}")
+        warnings.append(f"no looks can be added on this rig: {error.message}")
         return None
 
 
@@ -245,7 +247,7 @@ def _few_stops(knowledge: Knowledge, plan: Judgement) -> list[str]:
     counts = few_stops(plan.information.moves, plan.information.seen_moves)
     free = np.asarray(knowledge.space.u) > 0
     counts_text = ", ".join(f"{name} {count}" for name, count in counts.items() if free[INDEX[f"stop_sd_deg.{name}"]])
-    return [f"few stops ({counts_text}): they will hardly tell their own scatter; add stops"] if counts_text else []
+    return [f"few stops ({counts_text}): too few to estimate their scatter; add stops"] if counts_text else []
 
 
 def _few_counters(knowledge: Knowledge, plan: Judgement) -> list[str]:
@@ -310,7 +312,7 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = N
     placed = {s.target for s in steps if s.action == "place"}
     if len({rig.sheets_mm[name] for name in placed}) == 1 and len(rig.sheets_mm) > 1:
         warnings.append(
-            "all looks are at one depth: a second sheet position sharpens ratios; place "
+            "all looks are at one depth: a second sheet position lowers u of ratios; place "
             + ", ".join(name for name in knowledge.sheets if name not in placed)
         )
     u, shares = np.sqrt(np.diag(plan.covariance)), plan.contraction()

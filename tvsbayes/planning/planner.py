@@ -255,7 +255,7 @@ def few_looks(looks: Looks, target: Target) -> list[str]:
         reached = f"only {stops} stop{'s' * (stops != 1)} {direction}"
         cure = "plan u(worst), which asks for every direction"
         if target.quantity == "worst":
-            cure = f"look more often: {FEW_STOPS} stops tell their own scatter"
+            cure = f"look more often: {FEW_STOPS} stops determine their scatter"
         notes.append(f"{reached}: this plan is for its target alone; for reliable intervals of {direction} {cure}")
     return notes
 
@@ -275,7 +275,7 @@ def design_problem(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | 
     if problem.now == 0:
         raise InputError(
             "target",
-            f"{target.quantity} is held fixed by the rig (u = 0): its uncertainty is 0 whatever is measured",
+            f"{target.quantity} is held fixed by the rig (u = 0): no plan changes its uncertainty",
             column="--target",
             found=target.text,
             allowed="a quantity that is to be estimated",

@@ -113,8 +113,8 @@ class Reading:
     u: Annotated[
         float,
         Column(
-            "standard uncertainty; empty or 0 where nobody knows: readings repeated at one move tell it, else the "
-            "scatter of stops covers it",
+            "standard uncertainty; empty or 0 where unknown: readings repeated at one move then determine it, else "
+            "the scatter of stops includes it",
             *(0.0, COMMAND_MAX),
             names=" ".join(["u", *sorted(SPREAD - {"s"})]),
         ),

@@ -172,8 +172,8 @@ def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
         if sample.probability > 0.5 and len(groups) > 1 and sample.wave.known is None:
             shares = ", ".join(f"{group.mean:.4g} {unit} ({100 * group.share:.0f} %)" for group in groups[:4])
             sentences.append(
-                f"the readings cannot tell which period the wave has: {shares}; read a longer run, at places that are "
-                "not evenly spaced"
+                f"the readings do not determine the period of the wave: {shares}; read a longer run, at places that "
+                "are not evenly spaced"
             )
     return sentences + strong_harmonics(samples, fit.campaign.unit) + _one_wave_twice(fit)
 

@@ -333,18 +333,23 @@ def _weak(fit: AxisFit) -> list[str]:
     """Quantities that the data do not determine, in words, with remedies."""
     rows, sentences = fit.rows, _weak_in_time(fit)
     if rows.in_motion:
-        return [*sentences, "a drive at constant rate cannot tell error by position from drift: both are in the drift"]
+        return [
+            *sentences,
+            "a drive at constant rate does not separate error by position from drift: both are in the drift",
+        ]
     sides = set(rows.side.tolist()) - {0}
     if not rows.both_sides:
         sentences.append("backlash is not determined: every stop was reached from one side; add stops from the other")
     if len(rows.positions) < POSITIONS_FEW:
         sentences.append(
-            f"{len(rows.positions)} positions cannot tell the error by position from the ratio; read at least "
+            f"{len(rows.positions)} positions do not separate the error by position from the ratio; read at least "
             f"{POSITIONS_FEW}, spread over the travel"
         )
     repeats = [np.sum((rows.command == p) & (rows.side == s)) for p in rows.positions for s in sides]
     if max(repeats, default=0) < 2:
-        sentences.append("no position was reached twice from one side: scatter and error by position hardly come apart")
+        sentences.append(
+            "no position was reached twice from one side: scatter and error by position are poorly separated"
+        )
     return sentences
 
 
@@ -362,7 +367,7 @@ def _weak_in_time(fit: AxisFit) -> list[str]:
     if in_turn and (fit.model.priors["ratio_contrast"].u or "creep" in fit.model.shifts):
         sentences.append(
             "the places were read one after the other: errors by position, a creep of the zero and a contrast of the "
-            "directions are hardly separated: read them again in another order; of gears whose teeth keep step state "
+            "directions are poorly separated: read them again in another order; of gears whose teeth keep step state "
             "`ratio_contrast = { value = 0, u = 0 }` in [axis], of a warm machine `creep` likewise"
         )
     for shift, remedy in {
@@ -375,7 +380,7 @@ def _weak_in_time(fit: AxisFit) -> list[str]:
             a, b = fit.draws[shift], fit.draws[name]
             if a.std() and b.std() and abs(np.corrcoef(a, b)[0, 1]) > CREEP_SHARE:
                 words = "a creep of the zero" if shift == "creep" else "a shift with the temperature"
-                sentences.append(f"{effect} and {words} are hardly separated: {remedy}")
+                sentences.append(f"{effect} and {words} are poorly separated: {remedy}")
     return sentences
 
 
@@ -386,8 +391,7 @@ def uninformed(summary: AxisSummary) -> TvsError | None:
         return None
     return NothingToEstimate(
         "uninformed",
-        "the readings tell no more about the unit per command than its prior does: they took away less than a tenth "
-        "of its variance",
+        "the readings do not determine the unit per command: they reduce its prior variance by less than a tenth",
         remedy="read stops farther apart, or state a wider prior",
     )
 

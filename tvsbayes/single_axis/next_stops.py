@@ -188,7 +188,7 @@ def plan_next(
             "in-motion",
             "a drive at constant rate has no stops to choose",
             file="campaign.toml",
-            remedy="drive on: a run of N periods tells a period to about period / (2 N) times noise over amplitude",
+            remedy="drive on: a run of N periods gives a period to about period / (2 N) times noise over amplitude",
         )
     if target not in TARGETS:
         allowed = ", ".join(TARGETS)

@@ -114,7 +114,7 @@ def predicted_stops(
     if fit.rows.in_motion:
         raise NothingToEstimate(
             "in-motion",
-            "the readings are of a drive at constant rate: they tell nothing of stops or of a reversal",
+            "the readings are of a drive at constant rate: they contain no stops and no reversal",
             file="campaign.toml",
             remedy="read stops from both directions into a folder without `rate`",
         )
