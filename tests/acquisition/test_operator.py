@@ -42,12 +42,12 @@ def test_questions_go_to_stderr(monkeypatch, capsys):
 def test_without_standard_input_nobody_can_be_asked(monkeypatch, capsys):
     """Python has None for a stream that was closed, as by `tvsbayes acquire ... <&-`."""
     monkeypatch.setattr("sys.stdin", None)
-    with pytest.raises(InputError, match="nobody can be asked"):
+    with pytest.raises(InputError, match="the laser hazard cannot be asked"):
         check_hazard(None, simulate=False)
     said = []
     operator = TerminalOperator(StopKey(), Terminal(said.append, ask=LiveLine().ask), laser_class="3B")
     assert operator.place("d1", 175.0, 0, "") is False and operator.stop.requested
-    assert said == ["nobody can be asked, standard input has ended: go on in a terminal, with --resume"]
+    assert said == ["standard input has ended, the question cannot be asked: go on in a terminal, with --resume"]
 
 
 def test_stop_key_interrupts_a_question_at_once():

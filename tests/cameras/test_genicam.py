@@ -176,7 +176,7 @@ def test_colour_is_turned_to_the_order_of_opencv():
 def test_a_line_is_pulsed_by_the_positioner(mounted_rig):
     maker, instrument = Maker(), Instrument(mounted_rig, 1)
     camera, positioner = opened(maker, trigger="Line0"), instrument.positioner()
-    with pytest.raises(DeviceFault, match="nobody pulses it"):
+    with pytest.raises(DeviceFault, match="which is not driven"):
         camera.grab()
     connect_trigger(positioner, camera)
     with pytest.raises(DeviceFault, match="no frame"):

@@ -68,7 +68,7 @@ def test_pictures_become_looks_that_detect_finds(ask, say, two_looks, tmp_path):
     # Both scatter by 0.1 px or less; five of those.
     np.testing.assert_allclose(found, pixels_of(campaign.spots), rtol=0, atol=0.5)
     code, document = ask("new", out, "--pictures", pictures)
-    assert code == 2 and "none of which waits" in assert_error(document, "occupied")["message"]
+    assert code == 2 and "none waits" in assert_error(document, "occupied")["message"]
 
 
 def test_moves_beside_the_pictures_come_along(ask, two_looks, tmp_path):

@@ -374,7 +374,9 @@ def test_counters_of_a_scanner_are_left_out_and_predicted(ask, say, grid_folder,
     assert code == 0 and document["kind"] == "positions left out" and document["unit"] == "deg"
     held = document["hold_out"]
     assert {(p["axis"], p["position"]) for p in held["positions"]} == {("pan", 0), ("pan", 100), ("pan", 200)}
-    assert held["rms_z"] < 3 and held["warnings"] == ["tilt is seen at 2 counters: with one left out no line is left"]
+    assert held["rms_z"] < 3 and held["warnings"] == [
+        "tilt is seen at 2 counters: with one left out no line is determined"
+    ]
     code, text, _ = say("compare", grid_folder, "--by", "positions")
     assert code == 0 and "RMS z" in text and "predicted" in text
     code, refused = ask("compare", grid_folder, "--by", "weeks")

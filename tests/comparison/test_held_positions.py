@@ -65,7 +65,7 @@ def test_counters_are_predicted_within_their_u_where_the_model_knows_that_gears_
         ("pan", counter, side) for counter in PAN for side in ("left", "right")
     }
     assert sum(p.n for p in found.positions) == len(ordered_spots(campaign))
-    assert found.warnings == ("tilt is seen at 2 counters: with one left out no line is left",)
+    assert found.warnings == ("tilt is seen at 2 counters: with one left out no line is determined",)
     limit = np.sqrt(stats.chi2.ppf(0.999, len(PAN)) / len(PAN))
     assert found.rms_z < limit
     document = json.loads(json.dumps(hold_out_document(found, "deg"), allow_nan=False))

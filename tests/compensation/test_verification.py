@@ -74,7 +74,7 @@ def test_what_lies_outside_or_takes_longer_is_said():
     asked, read = to_and_fro(np.array([-15.0, 1.0, 23.0]))
     slow = tuple(replace(m, time_s=100 * m.time_s) for m in asked)
     found = verify_readings(results().fit, table(), driven(true_axis(), slow, read, 4, by=Correction.of(table())))
-    assert "outside" in found.remarks[0] and "what is expected is wider" in found.remarks[1]
+    assert "outside" in found.remarks[0] and "larger errors are expected" in found.remarks[1]
 
 
 def test_other_units_and_missing_tables_are_refused(tmp_path):

@@ -85,7 +85,7 @@ def test_what_belongs_to_somebody_else_is_not_trusted(folder, which, monkeypatch
 
     monkeypatch.setattr(os, "lstat" if which == "folder" else "fstat", another)
     assert folder.read("a") is None
-    assert (folder.fault() == "it belongs to somebody else") is (which == "folder")
+    assert (folder.fault() == "it belongs to another user") is (which == "folder")
 
 
 @posix

@@ -297,7 +297,7 @@ def _picture(side: str, picture: np.ndarray, white: int) -> list[Check]:
 def _laser(positioner: Positioner | None, camera: StereoCamera | None, requested: bool) -> Check:
     """Whether both cameras see the spot; the laser is off afterwards, whatever happens."""
     if positioner is None or camera is None:
-        return Check("laser", "skipped", "needs positioner and cameras", "cure the faults above first")
+        return Check("laser", "skipped", "needs positioner and cameras", "correct the faults above first")
     if not requested:
         return Check("laser", "skipped", "not requested", "run doctor with --laser, goggles on")
     stop = StopKey()

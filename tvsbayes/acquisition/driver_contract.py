@@ -48,7 +48,7 @@ def positioner_violations(
             expect(state_now.status == "idle" and not state_now.laser_on, "behind a motion it is idle and dark")
         for on in (True, False):
             expect(positioner.laser(on).laser_on is on, f"laser({on}) returns once the device has said so")
-            expect(positioner.state().laser_on is on, f"state tells the laser behind laser({on})")
+            expect(positioner.state().laser_on is on, f"state reports the laser as set by laser({on})")
         counters = _at(positioner.state())
         expect(_refused(lambda: positioner.move_to(*forbidden)), f"{forbidden} is refused: a DeviceFault with a remedy")
         expect(_at(positioner.state()) == counters, "what is refused moves nothing")

@@ -154,7 +154,9 @@ class TerminalOperator:
         try:
             return self.terminal.ask(question).strip().lower()
         except EOFError:
-            self.terminal.say("nobody can be asked, standard input has ended: go on in a terminal, with --resume")
+            self.terminal.say(
+                "standard input has ended, the question cannot be asked: go on in a terminal, with --resume"
+            )
         except KeyboardInterrupt:
             pass
         finally:
@@ -189,7 +191,7 @@ def check_hazard(laser_class: str | None, simulate: bool) -> None:
     # A closed standard input is None.
     if not simulate and laser_class is None and not (sys.stdin and sys.stdin.isatty()):
         remedy = "run it in a terminal, or state --laser-class"
-        raise InputError("usage", "nobody can be asked about the laser hazard", remedy=remedy)
+        raise InputError("usage", "the question about the laser hazard cannot be asked", remedy=remedy)
 
 
 class LiveLine:

@@ -69,7 +69,7 @@ def _origin_lines(calibration: Calibration, origin: Origin | None) -> str:
         return " * Of a calibration without a campaign."
     name = _UNCOMMENTED.sub("_", origin.campaign)
     sha256 = content_sha256(cast(Mapping[str, object], calibration_json(calibration)))
-    measured = origin.measured or "on a day that nobody recorded"
+    measured = origin.measured or "on an unrecorded date"
     sentence = f"Campaign: {name}, measured {measured}; exported {origin.exported} by tvsbayes {origin.tvsbayes}."
     return f" * {sentence}\n * SHA-256 of the same calibration as JSON, without its origin: {sha256}."
 

@@ -443,7 +443,7 @@ def _check_sizes(pictures: PictureFolder) -> None:
                 "no-pictures",
                 f"{place}: no picture of the {side} camera",
                 allowed=f"{NAMING} (PNG or JPEG)",
-                remedy="put those of both cameras there; names that tell no camera: --left GLOB --right GLOB",
+                remedy="put those of both cameras there; names without the camera need --left GLOB --right GLOB",
             )
     if not same_shape(usual["left"], usual["right"]):
         left, right = (f"{width} x {height}" for width, height in usual.values())

@@ -296,7 +296,7 @@ class _Reader:
             kind, f"a lens of {values.size} coefficients"
         )
         if not fitted.error_px <= ERROR_MAX_PX:
-            miss = f"up to {fitted.error_px:.2g} px" if math.isfinite(fitted.error_px) else "more than any fit tells"
+            miss = f"up to {fitted.error_px:.2g} px" if math.isfinite(fitted.error_px) else "an undetermined amount"
             allowed = f"what k1 k2 p1 p2 k3 describe to {ERROR_MAX_PX:g} px over the picture"
             remedy = "do not rename the model: calibrate again with five coefficients, or crop the pictures"
             raise entry.refuse("lens-model", allowed, remedy, f"{lens}, which five coefficients miss by {miss}")

@@ -202,7 +202,7 @@ class GenicamCamera:
         """
         if self.wants_pulse and self._pulse is None:
             remedy = "use a positioner that offers one (driver serial), or leave out [cameras.options] trigger"
-            raise fault("trigger", f"the cameras wait for {self._stated.trigger} and nobody pulses it", remedy)
+            raise fault("trigger", f"the cameras wait for {self._stated.trigger}, which is not driven", remedy)
         try:
             for acquirer in self._acquirers:
                 _drain(acquirer)

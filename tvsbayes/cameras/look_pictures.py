@@ -120,7 +120,7 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
     complete = {name: pair for name, pair in by_view.items() if len(pair) == 2}
     if not complete:
         found = f"no pair among {pictures.count} PNG and JPEG pictures"
-        remedy = "rename them so that one word tells the camera and the rest of both names is the same"
+        remedy = "rename them so that one word names the camera and the rest of both names is the same"
         allowed = f"{NAMING} (PNG or JPEG); or pictures of both cameras side by side"
         place = escaped(str(folder), 200)
         raise refusal("no-pictures", file=place, found=found, allowed=allowed, remedy=remedy)
@@ -161,7 +161,7 @@ def pair_looks(
     """
     waiting = [spot.spot for spot in rows if spot.status == UNDETECTED and spot.u_left_px is None]
     if rows and not waiting:
-        found, allowed = f"{len(rows)} looks, none of which waits for pictures", "rows with the status undetected"
+        found, allowed = f"{len(rows)} looks, none waits for pictures", "rows with the status undetected"
         raise refusal("occupied", file="spots.csv", found=found, allowed=allowed, remedy="name a new folder")
     ids, file = (waiting, "spots.csv") if rows else (moves, "moves.csv")
     slot = None if matching == "order" else _number_position(views, ids)

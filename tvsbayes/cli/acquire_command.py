@@ -83,7 +83,7 @@ def acquire(
     no_browser: Annotated[bool, typer.Option("--no-browser", help="With --live: only print the link.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Drive positioner and cameras through a plan into a campaign. Nothing is lost, whatever ends it.
+    """Drive positioner and cameras through a plan into a campaign. An interrupted run loses nothing.
 
     LASER: 808 nm is invisible and likely class 3B. Goggles on, beam path shut in.
     """

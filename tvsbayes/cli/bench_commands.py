@@ -45,7 +45,7 @@ def stereo(
         str | None, typer.Option("--dictionary", help="Of its markers, as in OpenCV: 5X5_100.")
     ] = None,
     marker_mm: Annotated[
-        float | None, typer.Option("--marker-mm", help="Side of a marker; without, the pictures tell it.")
+        float | None, typer.Option("--marker-mm", help="Side of a marker (default: found from the pictures).")
     ] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="stereo.json to write.")] = None,
     imports: Annotated[
@@ -126,7 +126,7 @@ def stereo(
             "joint": fixed_intrinsics is False,
             "key": bool(key),
         }
-        refuse_options("for --import", "leave it out: pictures tell it", **given, **made_by)
+        refuse_options("for --import", "leave it out: it is found from the pictures", **given, **made_by)
         if charuco is not None:
             refuse_options("of no use beside --charuco", "leave it out", board=board, finder=finder)
             pattern = _marker_board(charuco, dictionary, pitch_mm, marker_mm, pitch_u_mm or 0.0)
@@ -266,7 +266,7 @@ def _imported(
     imported = read_calibration(paths, _image_size(image_size), unit_mm=unit_mm, stated=stated, keys=keys)
     if imported.source == "tvsbayes":
         options = {"image_size": image_size, "import_unit": import_unit, "key": keys or None}
-        refuse_options("for files of other programs", "leave it out: this file tells it", **options)
+        refuse_options("for files of other programs", "leave it out: it is in this file", **options)
     remarks = [*(f"note: {note}" for note in imported.notes), *(f"warning: {warning}" for warning in imported.warnings)]
     pair = imported.stereo
     sds = [float(variance) ** 0.5 for variance in pair.parameter_covariance.diagonal()]
@@ -313,13 +313,13 @@ def doctor(
         bool, typer.Option("--laser", help="LASER ON for one picture, invisible and likely class 3B: goggles on.")
     ] = False,
     contract: Annotated[
-        bool, typer.Option("--contract", help="With --laser: MOTORS MOVE, LASER ON; do drivers keep their promises?")
+        bool, typer.Option("--contract", help="With --laser: MOTORS MOVE, LASER ON; test the contract of the drivers.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Is the instrument fit for a campaign?
+    """Test whether the instrument is ready for a campaign.
 
-    Nothing moves but with --contract.
+    Nothing moves without --contract.
     Checks ports, firmware, cameras, exposure, focus, laser, timing, disk and the compilation cache.
     """
     if contract and not laser:
@@ -335,7 +335,7 @@ def doctor(
     instrument = read_rig(rig)
     checks = examine(instrument, Path.cwd(), laser=laser)
     if contract and any(check.status == "fault" for check in checks):
-        checks.append(Check("contract", "skipped", "needs a bench without faults", "cure the faults above first"))
+        checks.append(Check("contract", "skipped", "needs a bench without faults", "correct the faults above first"))
     elif contract:
         checks += contract_checks(instrument)
     cache = cache_state()

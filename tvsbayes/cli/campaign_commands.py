@@ -143,7 +143,7 @@ def simulate(
 
 @contextmanager
 def _frame_progress() -> Iterator[Show | None]:
-    """`waiting` for pictures; after Ctrl-C a line tells how to continue."""
+    """`waiting` for pictures; after Ctrl-C a line says how to continue."""
     try:
         with waiting() as shown:
             yield shown
@@ -192,14 +192,14 @@ def detect(
 def check(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="Campaign folder, rig file or plan.")],
     plan_file: Annotated[
-        Path | None, typer.Argument(metavar="PLAN", help="With a rig file: what can this plan not separate?")
+        Path | None, typer.Argument(metavar="PLAN", help="With a rig file: what the plan does not separate.")
     ] = None,
     repair_to: Annotated[
-        Path | None, typer.Option("--repair-to", help="New folder for what is whole of a damaged journal.")
+        Path | None, typer.Option("--repair-to", help="New folder for the intact part of a damaged journal.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """What a campaign, rig, plan or journal holds and cannot tell. Reads strictly, changes nothing."""
+    """Contents and faults of a campaign, rig, plan or journal. Reads strictly, changes nothing."""
     if repair_to is not None:
         if plan_file is not None:
             raise InputError("usage", "a repaired journal takes no plan", remedy="leave out PLAN or --repair-to")

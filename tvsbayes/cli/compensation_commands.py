@@ -68,11 +68,11 @@ def compensate(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """A controller's table, and the promise of what it leaves.
+    """Correction table of a controller, with a bound on its errors.
 
-    Nothing is applied. With -o the promise is kept in results/compensation.json, for `verify`. Of a scanner `--to
-    header` gives its calibration for a microcontroller; its promise is that of `locate`. Of a pan-tilt head `--to urdf`
-    gives its model: zeros, axes and reductions of the joints, and beside it YAML with their covariance.
+    Nothing is applied. With -o that bound, the promise, is kept in results/compensation.json, for `verify`. Of a
+    scanner `--to header` gives its calibration for a microcontroller; its promise is that of `locate`. Of a pan-tilt
+    head `--to urdf` gives its model: zeros, axes and reductions of the joints, and YAML with their covariance.
     """
     from tvsbayes.compensation.formats import Wish, checked
     from tvsbayes.compensation.promise import compensation_of, file_beside, file_text
@@ -165,11 +165,11 @@ def verify(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Whether a machine keeps the promise of its table or calibration.
+    """Test a table or calibration in force against its promise.
 
     KEPT, BROKEN or CANNOT TELL: exit 0, 1 or 3. Of an axis FRESH lists the commands that were asked for, before the
-    correction; of a scanner or head the counters that steps-for or the header gave, and the looks there. Which
-    world fits: applied, not applied, applied twice, wrong sign, another machine.
+    correction; of a scanner or head the counters that steps-for or the header gave, and the looks there. The
+    most probable of: applied, not applied, applied twice, wrong sign, another machine.
     """
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT

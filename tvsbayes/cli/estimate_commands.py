@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from tvsbayes.results.comparison_record import ComparisonRecord
     from tvsbayes.results.estimates import FitSummary
 HOLDING_OUT = "hold-out"
-OVERRIDE_HINT = "--anyway fits it all the same"
+OVERRIDE_HINT = "--anyway fits it regardless"
 """Hint for a certain finding of `check`."""
 
 
@@ -92,9 +92,7 @@ def fit(
         bool, typer.Option("--perfect-gears", help="No errors by position but stated or freed harmonics; no drift.")
     ] = False,
     anyway: Anyway = False,
-    details: Annotated[
-        bool, typer.Option("--details", help="Also print what else the fit says: gears, priors, weak directions.")
-    ] = False,
+    details: Annotated[bool, typer.Option("--details", help="Also print gears, priors and weak directions.")] = False,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Folder for results (default CAMPAIGN/results).")
     ] = None,

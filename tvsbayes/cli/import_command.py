@@ -224,7 +224,7 @@ def _axis_kind(kind: str) -> str:
 
     if kind not in ("auto", *KINDS):
         allowed = ", ".join(("auto", *KINDS))
-        remedy = closest(kind, KINDS, "leave it out: the file itself says it")
+        remedy = closest(kind, KINDS, "leave it out: it is in the file")
         raise InputError("usage", f"--format {escaped(kind)}; allowed: {allowed}", allowed=allowed, remedy=remedy)
     return kind
 

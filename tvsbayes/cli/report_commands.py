@@ -261,7 +261,7 @@ def calibrate(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Check, classic, fit and report in one go. From a campaign folder to the report on the desk."""
+    """Check, classic, fit and report in one go. From a campaign folder to the report."""
     finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm)
     if no_sample:
         refuse_options("for a sampler, and --no-sample runs none", "give one of them", quick=quick)

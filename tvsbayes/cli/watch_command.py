@@ -30,7 +30,7 @@ def watch(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Whether a calibration still holds: OK, MOVED or CANNOT TELL.
+    """Test whether a calibration still holds: OK, MOVED or CANNOT TELL.
 
     Exit 0, 1 or 3. What moved (cameras, positioner, ratio, play), by how much, and what the looks can see.
     """

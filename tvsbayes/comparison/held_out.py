@@ -70,8 +70,8 @@ def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: d
             verdict = BETTER_JOINT
         elif interval[1] < 1:
             verdict = BETTER_CLASSIC
-        reason = f"over {blocks_seen} blocks (fold and direction) the classic errs {ratio:.2g} times as much as the "
-        reason += f"joint, 95 % interval {interval[0]:.2g} to {interval[1]:.2g}"
+        reason = f"over {blocks_seen} blocks (fold and direction) the classic error is {ratio:.2g} times the "
+        reason += f"joint one, 95 % interval {interval[0]:.2g} to {interval[1]:.2g}"
     return HoldOut(
         by, tuple(predictions), scores["classic"], scores["joint"], float(ratio), interval, verdict, reason, unseen
     )

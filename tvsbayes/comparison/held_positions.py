@@ -47,13 +47,13 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
         steps, sign = (np.array([getattr(rest, name) for rest in rests]) for name in ("steps", "sign"))
         counters = np.unique(steps[used])
         if len(counters) < POSITIONS_MIN:
-            warnings.append(f"{axis} is seen at {len(counters)} counters: with one left out no line is left")
+            warnings.append(f"{axis} is seen at {len(counters)} counters: with one left out no line is determined")
             continue
         folds |= {f"{axis} {counter}": (number, used & (steps == counter), sign) for counter in counters.tolist()}
     if not folds:
         raise NothingToEstimate(
             "too-few-positions",
-            "neither axis was seen at three counters: with one left out no line is left",
+            "neither axis was seen at three counters: with one left out no line is determined",
             file="moves.csv",
             remedy="look from at least three counters of an axis",
         )

@@ -330,7 +330,7 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
     nominal = aimed.nominal_steps({name: prior.value for name, prior in campaign.rig.priors.items()})
     off = [aimed.off_deg(nominal, *factors)[:, k] for factors in ((0.0, 0.0), (1.0, 0.0))]
     if not np.any(off[0]):
-        what = f"the nominal counters of {AXES[k]} are those of the calibration: nothing is applied that could be lost"
+        what = f"the nominal counters of {AXES[k]} are those of the calibration: there is no correction to verify"
         raise NothingToEstimate("no-correction", what, remedy="verify that nothing moved with `tvsbayes watch`")
     noise = np.array([calibration.noise_variance[f"stop_sd_deg.{SIDES[AXES[k]][int(s > 0)]}"] for s in sides[:, k]])
     common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + HOME_SD_DEG**2
@@ -358,7 +358,8 @@ def _remarks(campaign: Campaign, looks: Campaign, aimed: AimedLooks) -> tuple[st
     outside = sum(not aimed.calibration.covers(*steps) for steps in aimed.steps.tolist())
     if outside:
         remarks.append(
-            f"{outside} of {len(aimed.steps)} looks lie outside the counters of the campaign: less is promised there"
+            f"{outside} of {len(aimed.steps)} looks lie outside the counters of the campaign: "
+            "the promise is weaker there"
         )
     if input_hashes(campaign)["stereo"] != input_hashes(looks)["stereo"]:
         remarks.append("the fresh looks state other cameras; those of the campaign are used")

@@ -238,13 +238,15 @@ class Format:
     beside: Callable[[Compensation, Origin], str] | None = None
 
 
-_NO_POSITION = "error by position stays: the format has no place for it"
+_NO_POSITION = "error by position remains: the format has no entry for it"
 FORMATS: Mapping[str, Format] = {
     "csv": Format("table", _csv),
     "linuxcnc": Format("table", _linuxcnc),
     "header": Format("table", _header),
     # gnea/grbl, doc/markdown/settings.md: $100 to $102 are steps per mm; no setting compensates backlash.
-    "grbl": Format("ratio", _grbl, in_force="$100", unsaid=("grbl knows no play: all of it stays", _NO_POSITION)),
+    "grbl": Format(
+        "ratio", _grbl, in_force="$100", unsaid=("grbl has no correction of play: all play remains", _NO_POSITION)
+    ),
     # grblHAL core, settings.h: Setting_AxisBacklash is $160 and on, built in by ENABLE_BACKLASH_COMPENSATION.
     "grblhal": Format(
         "ratio and play",
@@ -252,21 +254,24 @@ FORMATS: Mapping[str, Format] = {
         zero_free=True,
         in_force="$100",
         unsaid=(
-            "grblHAL knows one play for all positions, and only where ENABLE_BACKLASH_COMPENSATION is built in",
+            "grblHAL has one play for all positions, and only where ENABLE_BACKLASH_COMPENSATION is built in",
             _NO_POSITION,
         ),
     ),
     # Klipper, Config_Reference.md: [stepper_x] rotation_distance; no option compensates backlash of a stepper.
     "klipper": Format(
-        "ratio", _klipper, in_force="rotation_distance", unsaid=("Klipper knows no play: all of it stays", _NO_POSITION)
+        "ratio",
+        _klipper,
+        in_force="rotation_distance",
+        unsaid=("Klipper has no correction of play: all play remains", _NO_POSITION),
     ),
     "urdf": Format(
         "ratio",
         _urdf,
-        unsaid=("a URDF knows zero and ratio: play and error by position stay",),
+        unsaid=("a URDF holds zero and ratio: play and error by position remain",),
         beside=_urdf_yaml,
     ),
-    "pec": Format("period", _pec, unsaid=("a table of one period knows no play, and only what repeats with it",)),
+    "pec": Format("period", _pec, unsaid=("a table of one period holds no play, only errors that repeat with it",)),
 }
 
 

@@ -55,7 +55,7 @@ def strongest_period(rows: AxisRows, waves: Sequence[WaveSample]) -> float:
     for sample in waves:
         if rows.in_motion or sample.wave.clock == "position":
             return commands_of(rows, sample)
-    message = "--to pec needs a period, and the fit knows no wave of the gear"
+    message = "--to pec needs a period, and the fit has no wave of the gear"
     remedy = "add --period, in commands; or ask for one by `periods` or `period_between` in [axis], and fit again"
     raise InputError("usage", message, remedy=remedy)
 
@@ -127,7 +127,7 @@ def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
     if not kept:
         raise NothingToEstimate(
             "no-wave",
-            f"no wave that the fit knows repeats with a period of {period:.6g} commands",
+            f"no wave of the fit has a period of {period:.6g} commands",
             file="campaign.toml",
             remedy="give another --period, or none; `periods` in [axis] asks for one by name, then fit again",
         )

@@ -39,7 +39,7 @@ TRIED = 20
 """Commands at which the promise is tried, from each side."""
 UNIT_COMMANDS = 0.2
 """Share by which the ratio may differ from 1 or -1 where commands count in the unit of readings."""
-ONE_SIDED = "every stop was read from one side: the play is not known, and what is left on the other is by its prior"
+ONE_SIDED = "every stop was read from one side: the play is not determined; its prior sets the error on the other side"
 RUNS_MAX = 20
 """Up and down, in a prediction: a longer travel is not followed."""
 SIDES = (("forward", 1), ("backward", -1))
@@ -313,7 +313,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
     if form.holds == "period" and wish.period is None:
         wish = replace(wish, period=strongest_period(rows, known_waves(fit)))
     if wish.per_command is not None and not (np.isfinite(wish.per_command) and wish.per_command * fitted > 0):
-        message = f"--per-command {wish.per_command:g}: the readings go by {fitted:.6g} per command"
+        message = f"--per-command {wish.per_command:g}: the readings change by {fitted:.6g} per command"
         raise InputError("usage", message, remedy="give the nominal ratio with the sign of the readings")
     nominal = _nominal(campaign, fitted, wish)
     low, high = float(rows.positions[0]), float(rows.positions[-1])

@@ -233,13 +233,13 @@ def _remarks(made: Compensation, fresh: _Fresh, campaign: AxisCampaign) -> tuple
     if outside:
         remarks.append(
             f"{outside} of {len(fresh.command)} stops lie outside {low:.10g} to {high:.10g}: the promise does not hold "
-            "there; what is expected of them is wider"
+            "there; larger errors are expected of them"
         )
     since = Since.of(campaign.moves)
     if since.hours > BEYOND * made.hours or since.travel > BEYOND * made.travel_command:
         remarks.append(
             f"the fresh readings go on for {since.hours:.3g} h and {since.travel:.4g} commands of travel after a "
-            f"homing, the promise for {made.hours:.3g} h and {made.travel_command:.4g}: what is expected is wider"
+            f"homing, the promise for {made.hours:.3g} h and {made.travel_command:.4g}: larger errors are expected"
         )
     named = campaign.header.get("serial") or campaign.header.get("name")
     if named and made.machine and named != made.machine:

@@ -250,7 +250,7 @@ def _sign_finding(seen: _Seen, axes: list[Axis], followed: Mapping[Axis, _Follow
         remedy += ", or state in [rig.prior] extrinsics.rotation_rad that the cameras hang upside down"
     lags = [lag for lag in (1, -1) if _shift_shows_the_same(seen, axes, lag)]
     remedy += "".join(
-        "; looks of an axis that goes to and fro show the same where their rows are one apart, then "
+        "; on an axis that moves to and fro, rows shifted by one have the same effect, then "
         + mending_command(seen.campaign, f"--shift-moves {lag}")
         for lag in lags[:1]
     )

@@ -123,7 +123,9 @@ class Table:
             remedy = "write a whole number, no point" if is_decimal else number_remedy(cell, whole=True)
         else:
             code, allowed = "number", f"a finite decimal number from {low:g} to {high:g}"
-            remedy = "mind the unit of the column" if is_decimal and math.isfinite(float(cell)) else number_remedy(cell)
+            remedy = (
+                "check the unit of the column" if is_decimal and math.isfinite(float(cell)) else number_remedy(cell)
+            )
         return self.refuse(row, column, code, allowed + ", or an empty cell" * empty, remedy)
 
     def texts(self, column: str, chars_max: int = 100, empty: bool = True) -> list[str]:

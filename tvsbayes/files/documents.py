@@ -152,7 +152,7 @@ class Keys:
         allowed = f"a finite number from {low:g} to {high:g}" if low < high else f"exactly {low:g}"
         value = self._get(key, allowed)
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise self.refuse(key, "number", allowed, "correct the value and mind its unit")
+            raise self.refuse(key, "number", allowed, "correct the value and check its unit")
         return float(value)
 
     def integer(self, key: str, low: int, high: int) -> int:
@@ -199,7 +199,7 @@ class Keys:
             float(e) for e in entries if isinstance(e, int | float) and not isinstance(e, bool) and low <= e <= high
         ]
         if len(values) != len(entries) or not 1 <= len(values) <= most or len(set(values)) != len(values):
-            raise self.refuse(key, "numbers", allowed, "correct the values and mind their unit")
+            raise self.refuse(key, "numbers", allowed, "correct the values and check their unit")
         return tuple(values)
 
     def table(self, key: str) -> Keys:

@@ -43,11 +43,11 @@ class OwnFolder:
         except FileNotFoundError:
             return "it does not exist"
         except OSError as error:
-            return error.strerror or "it cannot be looked at"
+            return error.strerror or "it cannot be read"
         if not stat.S_ISDIR(status.st_mode):
             return "it is no folder"
         if os.name == "posix" and status.st_uid != os.geteuid():
-            return "it belongs to somebody else"
+            return "it belongs to another user"
         return "others may write into it" if _others_may_change(status) else ""
 
     def make(self) -> str:

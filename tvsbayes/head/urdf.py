@@ -417,7 +417,7 @@ def ratios_of(head: HeadJoints, steps_per_turn: float) -> dict[str, float]:
 
 
 UNSAID = (
-    "a URDF knows no play, no error by position, no flexure and no beam over the tilt axis: they stay",
+    "a URDF holds no play, no error by position, no flexure and no beam over the tilt axis: they stay",
     "a driver turns counters into joint angles by the reduction alone: zeros are in the origins of the joints",
 )
 

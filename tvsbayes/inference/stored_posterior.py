@@ -123,7 +123,7 @@ def _answer(keys: Keys) -> AnswerKind:
         NotConverged: they are of no mode that explains the data.
     """
     if not keys.flag("converged"):
-        remedy = "see what `tvsbayes fit` says of it, mend that and fit again"
+        remedy = "see the message of `tvsbayes fit`, correct the fault and fit again"
         raise NotConverged(
             "not-converged", "results/fit.json: the fit has not converged: no draw of it counts", remedy=remedy
         )

@@ -111,7 +111,7 @@ def _listed_moves(cells: FieldCells, known_moves: Sequence[Move]) -> list[int]:
     table, count = cells.table, len(cells.table)
     if "move" not in cells:
         if len(known_moves) != count:
-            found = f"{count} looks for {len(known_moves)} moves, and no column that tells which"
+            found = f"{count} looks for {len(known_moves)} moves, and no column of move numbers"
             allowed, remedy = "a column of move numbers, or a look for every move", "add --column move=NAME"
             raise refusal("missing-column", file=table.file, found=found, allowed=allowed, remedy=remedy)
         return list(range(count))

@@ -474,7 +474,7 @@ def pair_doubts(stereo: Stereo, places: Mapping[str, str] | None = None) -> tupl
             )
         fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
         if abs(fx / fy - 1) > ASPECT_SHARE_MAX:
-            doubts.append(f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are seldom so oblong")
+            doubts.append(f"the {side} fx and fy differ by {100 * abs(fx / fy - 1):.0f} %: pixels are nearly square")
         number, distortion = ("1", stereo.D1) if side == "left" else ("2", stereo.D2)
         doubts += _lens_doubts(matrix, distortion, size_px, place[f"M{number}"], place[f"D{number}"])
     return tuple(doubts)

@@ -47,7 +47,7 @@ COUNTRY_NOT_STATED = "ZZ"
 """User-assigned in ISO 3166-1: valid for the schema, named by PTB's Schematron."""
 NOT_ACCREDITED = (
     "This document is not an accredited calibration certificate. It was written by software from a campaign of its "
-    "user in the format of the DCC schema; it is not signed, and nobody but its user vouches for it."
+    "user in the format of the DCC schema; it is not signed, and its user alone is responsible for it."
 )
 ITEM_ONLY = "The results relate only to the item named here, in the state and under the conditions of the campaign."
 COVERAGE = (

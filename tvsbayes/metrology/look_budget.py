@@ -82,7 +82,7 @@ def budget(
         InputError: an approach that does not exist, or beam and line of sight do not meet.
     """
     if not calibration.causes:
-        raise ValueError("this calibration does not know its causes: fit the campaign again")
+        raise ValueError("this calibration has no causes of uncertainty: fit the campaign again")
     jacobian = calibration.derivatives(pan_steps, tilt_steps, aperture_deg, approach)
     steps = float(pan_steps), float(tilt_steps)
     covariance, parts = calibration.look_covariance(steps), calibration.cause_covariance

@@ -108,7 +108,7 @@ def cache_state() -> CacheState:
     folder = own_cache_folder()
     place = folder.path
     if fault := folder.fault():
-        remedy = f"let nobody else write into it (chmod go-w), or name a folder of your own in {VARIABLE}"
+        remedy = f"take write permission from others (chmod go-w), or name a folder of your own in {VARIABLE}"
         return CacheState(False, f"not used, every run compiles anew: {place}: {fault}", remedy)
     try:
         first, second = _tried(), _tried()

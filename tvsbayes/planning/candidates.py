@@ -180,7 +180,7 @@ def _visible_positions(knowledge: Knowledge, box: np.ndarray, turns: Sequence[in
     if (visible & in_box).sum() < 2 * LOOKS_PER_EXPERIMENT:
         visible = in_box & (positions.visible(knowledge, knowledge.z[None]) > 0)
         notes.append(
-            "where the positioner stands is stated so loosely that looks may miss the images (as few as "
+            "the pose of the positioner is stated with so large a u that looks may miss the images (as few as "
             f"{100 * share[visible].min(initial=1.0):.0f} % of drawn instruments see one): state all six extrinsics in "
             "[rig.prior], to some 0.03 rad and 5 mm, or measure little and plan with --given"
         )

@@ -159,7 +159,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: T
                 scaled = others
         stated = "; ".join(_requirement(knowledge.rig.table, groups[n], s) for n, s in scaled.items())
         return Limit(floor, cause, shares, False, f"it suffices to know {stated}")
-    return Limit(floor, cause, shares, False, "no single input stands in the way: widen the limits or add sheets")
+    return Limit(floor, cause, shares, False, "no single input is the limit: widen the limits or add sheets")
 
 
 def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:

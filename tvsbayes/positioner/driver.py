@@ -63,7 +63,7 @@ _ALARMS = {
     "limit": "a limit switch opened: clear the way, check the limits in the rig file, then home; "
     "should homing end like this too, turn the axis back by hand and check the wire of the limit switches",
     "home": "a home switch was not found: check its wiring, then home",
-    "abort": "somebody aborted: make sure that all is well, then home",
+    "abort": "the motion was aborted: make sure that it is safe, then home",
 }
 
 

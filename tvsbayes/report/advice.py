@@ -31,7 +31,7 @@ REMEDIES = {
     "single spots disagree": f"{SPOTS_REMEDY}, which leaves them out by name",
 }
 """Remedies by the beginning of the failed test's name."""
-ANY_REMEDY = "find the cause in the section Validation of the report, mend it and measure again"
+ANY_REMEDY = "find the cause in the section Validation of the report, correct it and measure again"
 SPOTS_LISTED = 20
 """Largest number of listed ids of spots that disagree."""
 SHARE_NAMED = 0.05

@@ -222,8 +222,8 @@ def _one_wave_twice(fit: AxisFit) -> list[str]:
             span = float(np.ptp(rows.value))
             if abs(1 / wave.peak - 1 / other.peak) * span < 1.0:
                 sentences.append(
-                    f"gear and encoder both have a wave of about {other.peak:.4g} {fit.campaign.unit}: how it is split "
-                    "between them is weak, their sum is not; turn the encoder's shaft against the gear, or read with a "
+                    f"gear and encoder both have a wave of about {other.peak:.4g} {fit.campaign.unit}: their "
+                    "sum is determined, its division is not; turn the encoder's shaft against the gear, or read with a "
                     "second instrument"
                 )
     return sentences

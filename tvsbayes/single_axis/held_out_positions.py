@@ -94,7 +94,7 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
     if len(positions) < POSITIONS_MIN:
         raise NothingToEstimate(
             "too-few-positions",
-            f"{len(positions)} positions: with one left out no line is left",
+            f"{len(positions)} positions: with one left out no line is determined",
             file="moves.csv",
             remedy="read at least three positions",
         )
