@@ -69,7 +69,7 @@ class NothingToEstimate(TvsError):
 
 
 MISFIT_REMEDY = (
-    "see what `tvsbayes check` warns of: a camera that was knocked, rows that are one apart, counters; if of nothing, "
+    "see what `tvsbayes check` warns of: a camera that was knocked, rows shifted by one, counters; without warnings "
     "check for swapped cameras, or state the extrinsics better in [rig.prior]"
 )
 """Where no beam of the model passes the spots."""

@@ -455,7 +455,7 @@ def _why_not_stored(campaign: Campaign) -> str:
     if path is None or not path.exists():
         is_interrupted = path is not None and path.with_name("chain.npz").exists()
         return (
-            "results/ hold an interrupted chain alone (`tvsbayes fit --resume`)"
+            "results/ hold only an interrupted chain (`tvsbayes fit --resume`)"
             if is_interrupted
             else "there are no results/ yet"
         )

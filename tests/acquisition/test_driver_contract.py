@@ -90,7 +90,7 @@ def _nameless(positioner):
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        *((_one_step_off, "counters ordered"), (_bright_home, "off behind home"), (_deaf_laser, "laser(True)")),
+        *((_one_step_off, "counters ordered"), (_bright_home, "off after home"), (_deaf_laser, "laser(True)")),
         *((_careless, "before homing"), (_no_remedy, "with a remedy"), (_nameless, '"fw"')),
         (_lit_mover, "off in motion"),
     ],

@@ -111,7 +111,7 @@ def test_commands_that_are_told_can_be_typed_as_they_stand(say, tmp_path):
 def test_moves_that_are_numbered_anew_are_told(say, tmp_path):
     drawn(tmp_path / "pictures", *pairs("0930", "1015"))
     code, text, _ = say("new", tmp_path / "mine", "--pictures", tmp_path / "pictures")
-    assert code == 0 and "930 to 1015, are too sparse for moves: these are counted anew" in text
+    assert code == 0 and "930 to 1015, are too sparse for moves: these are renumbered in order" in text
 
 
 def test_pictures_are_for_a_calibration_of_their_size(ask, tmp_path):

@@ -62,7 +62,7 @@ def test_whoever_waits_for_a_fit_is_told_why(grid_folder, monkeypatch):
     assert why() == "there are no results/ yet"
     (grid_folder / "results").mkdir()
     (grid_folder / "results" / "chain.npz").touch()
-    assert why() == "results/ hold an interrupted chain alone (`tvsbayes fit --resume`)"
+    assert why() == "results/ hold only an interrupted chain (`tvsbayes fit --resume`)"
     (grid_folder / "results" / "chain.npz").unlink()
     path, campaign = grid_folder / "results" / "fit.json", read_campaign(grid_folder)
     own = small_record(whole_summary(), seed=3)

@@ -151,8 +151,8 @@ def test_numbers_that_cannot_be_kept_are_told():
     assert [(s.spot, s.experiment, s.point) for s in found.spots] == [(0, 3, 1), (1, None, None), (2, None, None)]
     told = [text for text in found.assumed if text.startswith(("spot", "experiment"))]
     assert told == [
-        "spot: numbers are missing or stand twice, so looks are numbered by their rows",
-        "experiment, point: 2 rows with one of both alone, which is left out",
+        "spot: numbers are missing or repeated, so looks are numbered by their rows",
+        "experiment, point: 2 rows with only one of them, which is left out",
     ]
     # A move without a look has no number to lose.
     whole = looks("0 0 1 1 1 1 7 3 1", "50 0 - - - - - - -", "0 0 1 1 1 1 9 3 2", header=header)

@@ -74,7 +74,7 @@ def test_our_firmware_with_other_line_ends_is_named():
     device = SimulatedDevice(VirtualClock(), Mechanics())
     with pytest.raises(DeviceFault, match="CR LF") as caught:
         SerialPositioner(lambda: WithCrLf(device), {}, device.clock)
-    assert "<0 ok" in caught.value.found and "LF alone" in caught.value.remedy
+    assert "<0 ok" in caught.value.found and "LF only" in caught.value.remedy
 
 
 def test_a_used_up_sequence_is_named():

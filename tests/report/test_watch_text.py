@@ -23,7 +23,7 @@ def test_what_follows_the_best_explanation_is_not_called_a_motion_of_its_own():
     """Of cameras that moved far the linear law leaves something that the positioner explains."""
     parts = tuple(MovedPart(f"{what}: shift along y", 3.0, 0.1, "mm") for what in ("cameras", "positioner"))
     text = watch_text(Watch(MOVED, 0.0, 0.01, parts, 16, 0.5, (), True), 0.8)
-    assert "what to do: calibrate the cameras anew" in text and "fasten it" not in text
+    assert "what to do: calibrate the cameras again" in text and "fasten it" not in text
     assert "positioner may show residuals of the first cause only" in text
     alone = watch_text(Watch(MOVED, 0.0, 0.01, parts[1:], 16, 0.5, (), True), 0.8)
     assert "fasten it" in alone and "takes what" not in alone

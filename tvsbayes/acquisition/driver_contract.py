@@ -43,9 +43,9 @@ def positioner_violations(
         expect(isinstance(report, HomeReport) and report.state.status == "idle", "home ends at rest: status idle")
         for target in [*targets, targets[-1]]:
             reached, state_now = positioner.move_to(*target), positioner.state()
-            for state, order in ((reached, "move_to"), (state_now, "state behind it")):
+            for state, order in ((reached, "move_to"), (state_now, "state after it")):
                 expect(_at(state) == target, f"{order} reports the counters ordered, {target}, not {_at(state)}")
-            expect(state_now.status == "idle" and not state_now.laser_on, "behind a motion it is idle and dark")
+            expect(state_now.status == "idle" and not state_now.laser_on, "after a motion it is idle and dark")
         for on in (True, False):
             expect(positioner.laser(on).laser_on is on, f"laser({on}) returns once the device has said so")
             expect(positioner.state().laser_on is on, f"state reports the laser as set by laser({on})")
@@ -53,7 +53,7 @@ def positioner_violations(
         expect(_refused(lambda: positioner.move_to(*forbidden)), f"{forbidden} is refused: a DeviceFault with a remedy")
         expect(_at(positioner.state()) == counters, "what is refused moves nothing")
         positioner.laser(True)
-        expect(not positioner.home().state.laser_on, "the laser is off behind home")
+        expect(not positioner.home().state.laser_on, "the laser is off after home")
         positioner.laser(True)
         expect(not positioner.move_to(*targets[0]).laser_on, "the laser is off in motion, no matter who left it on")
         positioner.laser(True)

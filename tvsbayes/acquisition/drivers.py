@@ -87,20 +87,20 @@ def _connected(group: str, name: str, rig: Rig) -> Any:
         raise
     except Exception as error:
         found = f"driver {escaped(name)} failed: {type(error).__name__}: {escaped(str(error), 200)}"
-        raise fault("driver", found, "see the manual of the package that brought it") from error
+        raise fault("driver", found, "see the manual of the package that provides it") from error
 
 
 def _factory(group: str, name: str) -> Callable[[Rig], Any]:
     drivers = known(group)
     if name not in drivers:
-        remedy = f"{closest(name, tuple(drivers))}, or install the package that brings it"
+        remedy = f"{closest(name, tuple(drivers))}, or install the package that provides it"
         raise entry_refusal("driver", _TABLES[group], "driver", escaped(name), ", ".join(drivers), remedy)
     module, _, function = drivers[name].partition(":")
     try:
         factory: Callable[[Rig], Any] = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
         found = f"driver {escaped(name)} cannot be loaded: {escaped(str(error), 200)}"
-        remedy = "install the package that brings it anew, with all that it needs"
+        remedy = "install the package that provides it again, with its dependencies"
         raise InputError(
             "driver", f"{found}; {remedy}", column=f"{_TABLES[group]}.driver", found=found, remedy=remedy
         ) from error

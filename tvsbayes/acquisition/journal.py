@@ -44,7 +44,7 @@ FRAME_BYTES_MAX = 128 * 1024 * 1024
 FRAME_FOLDERS = ("frames", "dark")
 """Pictures with the laser on and, for the background, off."""
 LOG_LINE = re.compile(rb"([0-9a-f]{8}) (0|[1-9][0-9]{0,8}) ([0-9a-f]{8}) (\{[ -~]*\})")
-EMPTY_REMEDY = "nothing was written down: begin anew in another folder, without --resume"
+EMPTY_REMEDY = "nothing was recorded: begin again in another folder, without --resume"
 """Remedy for a run that was killed before its first event, or whose journal was emptied."""
 REPAIR_REMEDY = "copy the intact part to a new folder: tvsbayes check FOLDER --repair-to NEW"
 

@@ -307,8 +307,8 @@ def read_draws(path: Path) -> Calibration:
         if "format" not in file and "physical" in file:
             raise InputError(
                 NO_CALIBRATION,
-                f"{escaped(path.name)} holds draws and no calibration: the fit behind it did not converge, or an "
-                "older tvsbayes made it",
+                f"{escaped(path.name)} holds draws and no calibration: its fit did not converge, or an older "
+                "tvsbayes wrote it",
                 file=escaped(path.name),
                 remedy="run `tvsbayes fit` on the campaign again",
             )

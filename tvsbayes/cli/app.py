@@ -186,7 +186,7 @@ def check_order(rig: Path, plan: Path) -> None:
     """Refuse a rig file and a plan in swapped order."""
     if rig.suffix.lower() == ".csv" and plan.suffix.lower() == ".toml":
         swapped = f"{escaped(str(plan), 200)} {escaped(str(rig), 200)}"
-        message = "the plan stands where the rig file belongs: they are swapped"
+        message = "the plan is given in place of the rig file: they are swapped"
         raise InputError("usage", message, allowed="RIG PLAN", remedy=f"write {swapped}")
 
 

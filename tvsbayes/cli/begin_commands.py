@@ -134,7 +134,7 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
     if not rows and paired.matching == "number" and paired.renumbered is None and 0 in paired.without:
         text += (
             "\nthe numbers in the names are those of moves, which count from 0: where yours count from 1, every look "
-            "is now at the move behind its own, and `tvsbayes check` says so once the spots are detected"
+            "is now at the move after its own, and `tvsbayes check` says so once the spots are detected"
         )
     document: dict[str, Any] = {"campaign": str(out), "looks": len(paired.pictures), "pictures": copied}
     document |= {"paired_by": paired.matching, "warnings": lines, "moves_to_fill_in": moves_path is None}
@@ -222,7 +222,7 @@ def _paired_text(
     if pairs.renumbered is not None:
         low, high = pairs.renumbered
         lines.append(
-            f"the numbers in the names, {low} to {high}, are too sparse for moves: these are counted anew, in order; "
+            f"the numbers in the names, {low} to {high}, are too sparse for moves: these are renumbered in order; "
             "with a moves.csv of your own begin again: put it beside the pictures, and name another folder"
         )
     if not (out / "stereo.json").is_file():

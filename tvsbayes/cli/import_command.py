@@ -64,7 +64,7 @@ def import_(
     ] = False,
     counts_per_turn: Annotated[
         float | None,
-        typer.Option("--counts-per-turn", min=0.0, max=1e12, help="Of an axis: where readings begin anew; 0: nowhere."),
+        typer.Option("--counts-per-turn", min=0.0, max=1e12, help="Of an axis: where readings restart; 0: nowhere."),
     ] = None,
     assume: Annotated[
         list[str] | None,
@@ -194,7 +194,7 @@ def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
     moves, sightings = len(campaign.moves), len(campaign.spots)
     assumed = [
         f"counters are the encoders' degrees in steps of {STEP_DEG:g} deg, whose scale is known to 1e-6",
-        "the azimuth axis stands on the turn that a star's azimuth states, and came to the first from an unknown side",
+        "the azimuth axis is on the turn of the star's azimuth, and came to the first from an unknown side",
         f"a star's place is known to {U_ARCSEC:g} arcsec; refraction is as the table has it",
         "no transmission error and no play of more than arcseconds: state another scale in [rig.prior]",
     ]

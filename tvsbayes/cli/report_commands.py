@@ -83,7 +83,7 @@ def report(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """The calibration report as one HTML page. Verdict and answer first, then everything behind them."""
+    """The calibration report as one HTML page. Verdict and results first, then the evidence."""
     from tvsbayes.instrument.campaign import read_campaign
 
     finite(limit_deg_per_step=limit_deg_per_step, limit_mm=limit_mm, range_mm=range_mm)

@@ -50,7 +50,7 @@ PROMISED_DRAWS = 4000
 
 SURER = (
     "state how the axes came to the first row, if you know it; run `tvsbayes fit` again, without --no-sample or "
-    "--quick, or with --perfect-gears where gears err by less than looks scatter"
+    "--quick, or with --perfect-gears where gear errors are below the scatter of looks"
 )
 """What makes a rough answer an accepted one."""
 

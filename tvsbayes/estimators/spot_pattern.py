@@ -181,7 +181,7 @@ def _knock_doubts(pattern: SpotPattern) -> tuple[str, ...]:
     first, middles = pattern.spots[row], [float(np.median(off[later == side])) for side in (False, True)]
     return (
         f"from spot {first.spot} (move {first.move}) on left and right contradict each other by {middles[1]:+.1f} px, "
-        f"before by {middles[0]:+.1f} px: was a camera knocked, turned or focused anew? give the spots that "
+        f"before by {middles[0]:+.1f} px: was a camera knocked, turned or refocused? give the spots that "
         "stereo.json was not made for another status than ok",
     )
 

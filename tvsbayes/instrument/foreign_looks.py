@@ -223,7 +223,7 @@ def _spots(cells: FieldCells, move_of_row: Sequence[int], notation: Notation, as
     look_numbers = [number for number, is_one in zip(numbers, is_look, strict=True) if is_one]
     unique = None not in look_numbers and len(set(look_numbers)) == len(look_numbers)
     if "spot" in cells and not unique:
-        assumed.append("spot: numbers are missing or stand twice, so looks are numbered by their rows")
+        assumed.append("spot: numbers are missing or repeated, so looks are numbered by their rows")
     four_point = [field for field in FOUR_POINT if field in cells]
     if len(four_point) == 1:
         # "Point 1 ... 200" counts looks.
@@ -234,7 +234,7 @@ def _spots(cells: FieldCells, move_of_row: Sequence[int], notation: Notation, as
     )
     half = sum((a is None) != (b is None) for a, b in zip(experiments, points, strict=True))
     if half:
-        assumed.append(f"experiment, point: {half} row{'s' * (half != 1)} with one of both alone, which is left out")
+        assumed.append(f"experiment, point: {half} row{'s' * (half != 1)} with only one of them, which is left out")
     scale_deg = DEGREES[notation.angle_unit or unit_of_name(cells.columns.get("aperture_deg", ""), DEGREES) or "deg"]
     limit = APERTURE_MAX_DEG / scale_deg
     readings = cells.read(SPOTS["aperture_deg"], -limit, limit)

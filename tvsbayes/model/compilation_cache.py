@@ -109,14 +109,14 @@ def cache_state() -> CacheState:
     place = folder.path
     if fault := folder.fault():
         remedy = f"take write permission from others (chmod go-w), or name a folder of your own in {VARIABLE}"
-        return CacheState(False, f"not used, every run compiles anew: {place}: {fault}", remedy)
+        return CacheState(False, f"not used, every run compiles again: {place}: {fault}", remedy)
     try:
         first, second = _tried(), _tried()
         answer = json.loads(second.stdout)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
         return CacheState(False, f"could not be tried: {type(error).__name__}", "run a fit and see what it says")
     if REJECTED in first.stderr + second.stderr or not answer["hits"]:
-        state = f"rejected, every run compiles anew: what is written to {place} is refused when it is read"
+        state = f"rejected, every run compiles again: what is written to {place} is refused when it is read"
         remedy = "free space there; else try another version of jaxlib (github.com/jax-ml/jax/issues/38445)"
         return CacheState(False, state, remedy)
     if answer["traces"]:

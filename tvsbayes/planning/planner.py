@@ -256,7 +256,7 @@ def few_looks(looks: Looks, target: Target) -> list[str]:
         cure = "plan u(worst), which asks for every direction"
         if target.quantity == "worst":
             cure = f"look more often: {FEW_STOPS} stops determine their scatter"
-        notes.append(f"{reached}: this plan is for its target alone; for reliable intervals of {direction} {cure}")
+        notes.append(f"{reached}: this plan is for its target only; for reliable intervals of {direction} {cure}")
     return notes
 
 

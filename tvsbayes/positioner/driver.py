@@ -139,7 +139,7 @@ class SerialPositioner:
         reached = (state.pan_steps, state.tilt_steps)
         if reached != target or (state.pan_target_steps, state.tilt_target_steps) != target:
             found = f"the device says done at {reached}, ordered was {target}"
-            raise fault("position", found, "home again; if it happens twice, flash the firmware anew")
+            raise fault("position", found, "home again; if it happens twice, flash the firmware again")
         return state
 
     def laser(self, on: bool) -> DeviceState:
@@ -388,4 +388,4 @@ class SerialPositioner:
 
 def _sequence_exhausted(sequence: int) -> DeviceFault:
     found = f"the device has used up its sequence numbers (the last one was {sequence})"
-    return fault("sequence", found, "unplug it and plug it in again: they begin anew with a reset; then home")
+    return fault("sequence", found, "unplug it and plug it in again: they restart with a reset; then home")

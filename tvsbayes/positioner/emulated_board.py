@@ -157,7 +157,7 @@ class EmulatedBoard:
         program, hand, monitor = folder / "sketch.elf", folder / "hand", folder / "monitor"
         compilation = build_sketch(program)
         if compilation.returncode:
-            remedy = f"install {PACKAGES} anew, or rehearse with --simulate alone"
+            remedy = f"install {PACKAGES} again, or rehearse with --simulate alone"
             raise InputError("emulator", f"the firmware does not compile: {compilation.stderr[-300:]}", remedy=remedy)
         for suffix in (".in", ".out"):
             os.mkfifo(f"{hand}{suffix}")
@@ -203,6 +203,6 @@ class EmulatedBoard:
         while True:
             reply = json.loads(self._monitor.readline() or '{"error": "ended"}')
             if "error" in reply:
-                raise DeviceFault("emulator", f"emulated board: {reply['error']}", remedy="begin the rehearsal anew")
+                raise DeviceFault("emulator", f"emulated board: {reply['error']}", remedy="start the rehearsal again")
             if "return" in reply:
                 return reply["return"]

@@ -182,7 +182,7 @@ class GrblPositioner:
             raise fault("stopped", f"the motion ended in {status.state}", "home again")
         reached = self._board.counters(status.position_mm)
         if reached != target:
-            found = f"the board stands at {reached}, ordered was {target}"
+            found = f"the board is at {reached}, ordered was {target}"
             raise fault("position", found, "home again; look for soft limits ($20) and feed hold")
         self._done += 1
         return self._require_dark(self._state(status, laser_on=self._laser_on()))

@@ -64,7 +64,7 @@ def explained(heard: bytes) -> Heard:
     lines = heard.split(b"\n")
     if any(_is_message(line[:-1]) for line in lines if line.endswith(b"\r")):
         remedy = (
-            "let the firmware end its lines in LF alone: Serial.write of the line as it is, no println; or flash ours"
+            "let the firmware end its lines in LF only: Serial.write of the line as it is, no println; or flash ours"
         )
         return Heard("cr-lf", f"this protocol, but with lines that end in CR LF: {quote}", remedy)
     if any(_is_message(line) for line in lines):

@@ -125,7 +125,7 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun[Ta
                 f"{name} was written by another version of tvsbayes: {escaped(stored_format)}",
                 file=name,
                 allowed=f"format {CHAIN_FORMAT}",
-                remedy="run without --resume; the chain starts anew",
+                remedy="run without --resume; the chain starts again",
             )
         if stored_format != CHAIN_FORMAT:
             raise ValueError(f"format {stored_format!r}")
@@ -140,7 +140,7 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun[Ta
             f"{name} is not a chain that tvsbayes wrote: {escaped(str(error), 200)}",
             file=name,
             allowed=f"format {CHAIN_FORMAT}",
-            remedy="run without --resume; the chain starts anew",
+            remedy="run without --resume; the chain starts again",
         ) from error
     if not same:
         raise InputError(

@@ -27,7 +27,7 @@ REMEDIES = {
     "the gears have a transmission error": "state its period in [rig] and fit with --harmonics, or visit more counters",
     "stops depend on the step phase": "use full steps, or more current: microsteps are not even",
     "stops depend on the length": "let the axis settle longer before each look, or arrive by moves of one length",
-    "the sheets disagree": "check that every sheet is flat, stands still and bears the right name in spots.csv",
+    "the sheets disagree": "check that every sheet is flat, stands still and has the right name in spots.csv",
     "single spots disagree": f"{SPOTS_REMEDY}, which leaves them out by name",
 }
 """Remedies by the beginning of the failed test's name."""

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 def extrapolated_text(unseen: str) -> str:
     """The warning of a result at counters without looks; `unseen` names them."""
-    return f"EXTRAPOLATED: {unseen}, where looks were; errors of the gears are predicted there by their size alone"
+    return f"EXTRAPOLATED: {unseen}, where looks were; errors of the gears are predicted there from their size only"
 
 
 KEY_WORDS = {

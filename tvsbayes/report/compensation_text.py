@@ -31,8 +31,8 @@ REMEDIES = {
     "does compensation start only after homing?",
     TWICE: "the table, or its play, acts in two places: remove one of them (a backlash setting beside the table?)",
     WRONG_SIGN: "the controller adds the correction instead of subtracting it, or forward and backward are exchanged",
-    OTHER_MACHINE: "the table is of another machine, or this one changed: measure it again and compensate anew",
-    APPLIED: "readings lie farther off than the table allows: measure again, and compensate anew if that stays",
+    OTHER_MACHINE: "the table is of another machine, or this one changed: measure it again and compensate again",
+    APPLIED: "readings lie farther off than the table allows: measure again, and compensate again if that persists",
 }
 """Remedies by the most probable world, where the promise is broken."""
 SCANNER_REMEDIES = {

@@ -242,7 +242,7 @@ def agreement_line(sampling: Sampling) -> str | None:
     if sampling.steps is None or sampling.importance is None:
         return None
     if sampling.agreement is None:
-        return "importance sampling was not accepted: the chain stands alone"
+        return "importance sampling was not accepted: results are those of the chain"
     words = "agree on every result" if sampling.agreement.agrees else "DISAGREE"
     worst = sampling.agreement.worst
     text = f"{CHAIN} and importance sampling {words}: the largest difference is {worst.value:.1f} Monte Carlo errors"

@@ -27,13 +27,13 @@ HELPS = {
 LINEAR = {"deg": 1.0, "mm": 10.0}
 """Largest change whose size is estimated correctly, by unit."""
 REMEDIES = {
-    "cameras": "calibrate the cameras anew, then the rig",
-    "positioner": "fasten it and calibrate anew; until then coordinates are off by the amount above",
-    "zero": "look for a homing switch or a coupling that slipped, then calibrate anew",
-    "base": "fasten it and calibrate anew",
-    "beam": "fasten camera or telescope on the head, then calibrate anew",
-    "ratio": "look for a slipping gear or lost steps, then calibrate anew",
-    "play": "look for wear or a loose grub screw, then calibrate anew",
+    "cameras": "calibrate the cameras again, then the rig",
+    "positioner": "fasten it and calibrate again; until then coordinates are off by the amount above",
+    "zero": "look for a homing switch or a coupling that slipped, then calibrate again",
+    "base": "fasten it and calibrate again",
+    "beam": "fasten camera or telescope on the head, then calibrate again",
+    "ratio": "look for a slipping gear or lost steps, then calibrate again",
+    "play": "look for wear or a loose grub screw, then calibrate again",
 }
 """Remedies by the first word of the moved part."""
 

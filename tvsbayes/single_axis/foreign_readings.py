@@ -323,8 +323,8 @@ class _Stops:
         if n := self._inserted:
             name = escaped(self._cells.columns["approach"])
             sentences.append(
-                f"{n} move{'s' * (n > 1)} put in, {self._reach:.6g} past the stop, where column {name} says another "
-                "side than the row before leads to; --column approach= takes sides from the order alone"
+                f"{n} move{'s' * (n > 1)} added, {self._reach:.6g} past the stop, where column {name} states another "
+                "side than the row before gives; --column approach= takes sides from the order only"
             )
         if "approach" not in self._cells:
             sentences.append("approach: unknown at the beginning of each segment")
@@ -410,5 +410,5 @@ def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
     if abs(typical - turn) <= JUMP_SDS * float(np.median(np.abs(residuals))) + 2.0:
         return turn
     found, allowed = f"readings that jump by about {typical:.0f} counts, {len(jumps)} times", "a continuous count"
-    remedy = "say where the encoder begins anew, --counts-per-turn N; or that these are motions, --counts-per-turn 0"
+    remedy = "state where the encoder restarts, --counts-per-turn N; or that these are motions, --counts-per-turn 0"
     raise refusal("wrapped", file="value", found=found, allowed=allowed, remedy=remedy)

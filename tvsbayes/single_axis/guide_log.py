@@ -137,7 +137,7 @@ def read_runs(text: str, file: str) -> list[GuideRun]:
         elif line.startswith("Frame,"):
             columns = line.split(",")
             if missing := [name for name in NEEDED if name not in columns]:
-                found, remedy = f"no column {', '.join(missing)}", "export the log of the guider as it was written"
+                found, remedy = f"no column {', '.join(missing)}", "export the log of the guider unchanged"
                 raise refusal("csv", file=file, line=number, found=found, allowed=", ".join(NEEDED), remedy=remedy)
         elif columns is None:
             _header(run, line)
@@ -147,7 +147,7 @@ def read_runs(text: str, file: str) -> list[GuideRun]:
     for k, run in enumerate(runs_kept, start=1):
         run.number = k
     if not runs_kept:
-        found, remedy = "no run with frames", "give a log that holds guiding, not calibration alone"
+        found, remedy = "no run with frames", "give a log that holds guiding, not only calibration"
         raise refusal("empty", file=file, found=found, allowed=f'frames after "{BEGINS.strip()}"', remedy=remedy)
     return runs_kept
 

@@ -140,7 +140,7 @@ class Ask(Guarded):
                 raise web.HTTPError(403, reason=reason)
             taken = self.live.ask(what)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise web.HTTPError(400, reason="nothing that can be asked of a run") from error
+            raise web.HTTPError(400, reason="not a request that a run accepts") from error
         if not taken:
             raise web.HTTPError(409, reason="the run has ended")
         self.set_status(202)
