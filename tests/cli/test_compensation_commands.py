@@ -60,7 +60,7 @@ def test_from_a_fit_to_a_verified_machine(ask, say, folder, tmp_path, no_picture
     assert (code, told["verdict"]) == (0, "KEPT")
     code, _, _ = say("report", folder)
     shown = (folder / "results" / "report.html").read_text()
-    assert "Applied, and what is left" in shown and "KEPT: 12 fresh readings" in shown
+    assert "Applied correction and remaining error" in shown and "KEPT: 12 fresh readings" in shown
 
     code, told, _ = say("verify", folder, drive(folder, tmp_path / "turned", (-1.0, -1.0)))
     assert code == 1 and told.startswith("BROKEN: wrong sign") and "what to do" in told

@@ -209,14 +209,14 @@ RIG_REFUSED = {
     "period in prior": (
         "[rig.prior]\n'harmonic_period_deg.pan' = { value = 30, u = 0 }",
         2,
-        r"belongs into \[rig\] itself",
+        r"belongs in \[rig\] itself",
     ),
     "period of no axis": (
         "[rig]\n'harmonic_period_deg.pen' = { value = 30, u = 0 }",
         2,
         "did you mean harmonic_period_deg.pan",
     ),
-    "harmonic in rig": ("[rig]\n'harmonic_deg.pan.1.cos' = { value = 0, u = 0 }", 2, r"belongs into \[rig.prior\]"),
+    "harmonic in rig": ("[rig]\n'harmonic_deg.pan.1.cos' = { value = 0, u = 0 }", 2, r"belongs in \[rig.prior\]"),
     "third harmonic": (
         "[rig.prior]\n'harmonic_deg.pan.3.cos' = { value = 0, u = 0.1 }",
         2,
@@ -232,7 +232,7 @@ RIG_REFUSED = {
         4,
         "remove one",
     ),
-    "prior in rig": ("[rig]\nmirror_offset_mm = { value = 30, u = 0 }", 2, r"belongs into \[rig.prior\]"),
+    "prior in rig": ("[rig]\nmirror_offset_mm = { value = 30, u = 0 }", 2, r"belongs in \[rig.prior\]"),
     "misspelt": ("[rig]\nbaselin_mm = { value = 200, u = 0 }", 2, "did you mean baseline_mm"),
     "misspelt prior": (
         "[rig.prior]\n'backlash.pan' = { value = 0, u = 1 }",

@@ -143,7 +143,7 @@ def test_the_first_page_has_the_answer_and_who_asked(page, evidence, no_pictures
         # Typed by nobody who reads: a command stands as code, with the folder's name, and no option of `fit` is undone.
         assert "`" not in first and "--no-sample" not in first and "tvsbayes fit twin" in first
         # What makes the millimetres: of the joint calibration, and why the classic is farther off.
-        assert "Why classic is off there" in first and "of the variance" in first
+        assert "Error of classic there" in first and "of the variance" in first
 
 
 def test_what_check_warns_of_stands_on_the_first_page(evidence, no_pictures):

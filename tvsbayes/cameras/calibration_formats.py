@@ -116,7 +116,7 @@ def read_calibration(
         hint = "; ".join(doubts) or "look at R, T and the image size"
         found = "two cameras that do not see one board together"
         raise refusal("no-common-view", file=", ".join(names), found=found, allowed="a pair", remedy=hint) from error
-    good_to = f"all its sds together are good to a factor of {GUESS_FACTOR:g}"
+    good_to = f"all its sds together are correct within a factor of {GUESS_FACTOR:g}"
     reader.notes.append(f"the file has no covariance: assumed from {stereo.assumed_from}; {good_to}")
     reader.notes.append(f"for a better one {ASSUMED_REMEDY}")
     return Imported(stereo, reader.source, tuple(reader.notes), doubts)
@@ -499,7 +499,7 @@ class _Reader:
                 "unit",
                 file=self.places["T"],
                 found=found,
-                allowed=f"{low:g} to {high:g} mm without a word",
+                allowed=f"{low:g} to {high:g} mm without an option",
                 remedy=remedy,
             )
         if not stated:

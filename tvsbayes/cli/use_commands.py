@@ -70,9 +70,7 @@ def locate(
         typer.Option("--cloud", help="Write the points of --points here, in the format of the ending: OUT.ply."),
     ] = None,
     draws: Annotated[int, typer.Option("--draws", min=500, max=100_000, help="Draws per point.")] = 1000,
-    budget: Annotated[
-        bool, typer.Option("--budget", help="Also what the uncertainty of the point consists of.")
-    ] = False,
+    budget: Annotated[bool, typer.Option("--budget", help="Also print the uncertainty budget of the point.")] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -231,7 +229,7 @@ def plan(
     rig: Annotated[
         Path | None, typer.Argument(metavar="RIG", help="Rig file; none with an axis folder; CAMPAIGN with --watch.")
     ] = None,
-    given: Annotated[Path | None, typer.Option("--given", help="Campaign measured already: what next?")] = None,
+    given: Annotated[Path | None, typer.Option("--given", help="Existing campaign: plan what to measure next.")] = None,
     target: TargetText = None,
     minutes: Annotated[float | None, typer.Option("--minutes", min=0.1, help="Longest plan.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Write the plan here (plan.csv).")] = None,

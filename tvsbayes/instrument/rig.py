@@ -177,12 +177,12 @@ def _explanation(name: str, allowed: tuple[str, ...]) -> str:
     """The remedy of a name that is not allowed in its table."""
     stem, _, last = name.partition(".")
     if name in _PERIOD_NAMES:
-        return "it belongs into [rig] itself: tooth counts fix it, so it has no prior and no other truth"
+        return "it belongs in [rig] itself: tooth counts fix it, so it has no prior and no other truth"
     parameter = parameter_of(name)
     if parameter is not None and parameter.place != "stereo":
         elsewhere = parameter.place == "rig.prior" and "backlash_deg.pan" not in allowed
         other = "it means nothing to this mechanism: leave it out, or correct `mechanism` in [rig]"
-        return "it belongs into [rig.prior]" if elsewhere else other
+        return "it belongs in [rig.prior]" if elsewhere else other
     if stem == "degrees_per_step" and last in DIRECTION_SIGNS:
         axis, _ = DIRECTION_SIGNS[last]
         return f"it is derived: state degrees_per_step.{axis} and ratio_contrast_deg_per_step.{axis}"

@@ -61,7 +61,7 @@ _REFUSALS = {
 }
 _ALARMS = {
     "limit": "a limit switch opened: clear the way, check the limits in the rig file, then home; "
-    "should homing end like this too, turn the axis back by hand and check the wire of the limit switches",
+    "if homing also ends like this, turn the axis back by hand and check the wire of the limit switches",
     "home": "a home switch was not found: check its wiring, then home",
     "abort": "the motion was aborted: make sure that it is safe, then home",
 }
@@ -138,7 +138,7 @@ class SerialPositioner:
         state = self._wait_for_motion(reply, timeout_s)
         reached = (state.pan_steps, state.tilt_steps)
         if reached != target or (state.pan_target_steps, state.tilt_target_steps) != target:
-            found = f"the device says done at {reached}, ordered was {target}"
+            found = f"the device reports {reached}, ordered was {target}"
             raise fault("position", found, "home again; if it happens twice, flash the firmware again")
         return state
 

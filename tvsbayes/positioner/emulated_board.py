@@ -145,7 +145,7 @@ class EmulatedBoard:
                     self.starts += 1
                     self.on_laser(False)
                 elif letter == "V":
-                    found = "emulated board: a direction stood too short before its step"
+                    found = "emulated board: the direction signal came too shortly before its step"
                     raise DeviceFault("direction-set-up", found, remedy="raise kDirectionSetupUs in the sketch")
 
     def laser_pin(self) -> bool:

@@ -49,7 +49,7 @@ POLL_S = 0.1
 """Time between two status reports; GRBL's manual asks for 5 Hz to 10 Hz."""
 HOME_S = 300.0
 LINE_CHARS_MAX = 256
-NO_WATCHDOG = "a GRBL board has no watchdog: when this computer dies the laser stays on, unless something else cuts it"
+NO_WATCHDOG = "a GRBL board has no watchdog: when this computer fails the laser stays on, unless something else cuts it"
 COUNTERS_MAX = 2_000_000
 """GRBL computes in single precision: beyond this a position is off by more than an eighth of a step."""
 OPTIONS = ("laser", "laser_power", "unwatched_laser")
@@ -97,7 +97,9 @@ class GrblSettings:
         speed, unwatched = table.get("speed_steps_per_s"), options.get("unwatched_laser", 0)
         # Any text is true in Python, also "false" and "no": it would permit the laser without consent.
         if unwatched not in (0, 1):
-            remedy = "write true, without quotes, once something else cuts the light when the computer dies; else false"
+            remedy = (
+                "write true, without quotes, once something else cuts the light when the computer fails; else false"
+            )
             raise _refused("options.unwatched_laser", escaped(str(unwatched)), "true or false (1 or 0)", remedy)
         return cls(
             laser,
@@ -194,7 +196,7 @@ class GrblPositioner:
             if not self._settings.unwatched:
                 raise fault(
                     "laser",
-                    "a GRBL board leaves the laser on when this computer dies",
+                    "a GRBL board leaves the laser on when this computer fails",
                     "have something else cut it, then write unwatched_laser = true into [positioner.options]",
                 )
         # Before the order: an interruption does not say whether it has arrived.

@@ -105,7 +105,7 @@ def compensation_text(result: Compensation, written: Sequence[str] = ()) -> str:
         promise_table(result),
         "",
         *_validity(result),
-        f"most of what is left: {HELPS[largest]}",
+        f"largest remaining error: {HELPS[largest]}",
         *(f"the format: {text}" for text in result.unsaid),
     ]
     if result.homings == 1 and not result.in_motion:
@@ -164,7 +164,7 @@ def verification_text(verification: Verification) -> str:
     return terminal(*lines)
 
 
-APPLIED_TITLE = "Applied, and what is left"
+APPLIED_TITLE = "Applied correction and remaining error"
 
 
 def compensation_section(result: Compensation, verification: Verification | None) -> Section:

@@ -201,7 +201,7 @@ def error_sources(e: Evidence) -> list[str]:
     sentences = [f"Causes of the remaining error of the joint one, as shares of the variance: {causes}."]
     for name, error in list(e.simple_errors.items())[-1:]:
         sentences.append(
-            f"Why {name} is off there: its beam points {error.azimuth_deg:+.2f} deg in azimuth and "
+            f"Error of {name} there: its beam points {error.azimuth_deg:+.2f} deg in azimuth and "
             f"{error.elevation_deg:+.2f} deg in elevation from the joint one (ratios, lost motion, mirrors), which "
             f"alone makes {_mm(error.by_direction_mm)}; where it takes beam and aperture to stand, and the aperture's "
             f"zero, alone make {_mm(error.by_place_mm)}."
