@@ -15,7 +15,7 @@ import argparse
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.rows import output, read_rows, run_rows
+from experiments.common.rows import commit, output, read_rows, run_rows
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
@@ -113,7 +113,7 @@ TEXT = """# Axes that creep, follow the temperature and make waves
 Made by `python -m experiments.intervals.axis_in_time`: axes drawn from the priors and fitted by `fit --quick`. Shares
 of truths in central intervals, RMS of z = (mean - truth) / sd; bounds are two-sided at 1e-4 for so many axes.
 Amplitude, period and phase: of the waves that are there, given that there is one; of those too weak to be seen the
-interval is wide.
+interval is wide. {axes} axes, commit {commit}.
 
 | protocol | quantity | axes | in 50 % | bounds | in 95 % | bounds | RMS z | bounds |
 |---|---|---|---|---|---|---|---|---|"""
@@ -139,7 +139,7 @@ def table(arguments: argparse.Namespace) -> None:
     """Both tables."""
     rows = [row for row in read_rows(arguments.rows) if not row["problems"]]
     every = read_rows(arguments.rows)
-    print(TEXT)
+    print(TEXT.format(axes=len(rows), commit=commit()))
     for protocol, what in PROTOCOLS.items():
         mine = [row for row in rows if row["protocol"] == protocol]
         for name in PARAMETERS:
