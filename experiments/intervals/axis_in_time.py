@@ -137,9 +137,9 @@ def _line(protocol: str, name: str, scores: list[dict]) -> str:
 
 def table(arguments: argparse.Namespace) -> None:
     """Both tables."""
-    rows = [row for row in read_rows(arguments.rows) if not row["problems"]]
     every = read_rows(arguments.rows)
-    print(TEXT.format(axes=len(rows), commit=commit()))
+    rows = [row for row in every if not row["problems"]]
+    print(TEXT.format(axes=len(every), commit=commit()))
     for protocol, what in PROTOCOLS.items():
         mine = [row for row in rows if row["protocol"] == protocol]
         for name in PARAMETERS:
