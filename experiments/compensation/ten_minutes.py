@@ -97,8 +97,8 @@ page again); the commands are those for a real one.
 
 ## A log
 
-Drive the axis up and down through its range, beyond both ends, several times, and home it in between: what a homing
-leaves open is part of every promise, and one homing alone does not tell it. A line for every move; where nothing is
+Drive the axis up and down through its range, beyond both ends, several times, and home it in between: the error of a
+homing is part of every promise, and one homing alone does not determine it. A line for every move; where nothing is
 read, `value_mm` is empty. Commands here count in mm, with a nominal ratio of 1.
 """
 TABLE = """## A table, and what it promises
@@ -119,7 +119,7 @@ controller adds its corrections by itself.
 TURNED = """Had the sign been turned:
 """
 END = """`tvsbayes report stage` shows table, promise and verdict beside the calibration. A nightly job may run
-`verify`: it exits with 0 where the promise is kept, 1 where it is broken, 3 where the readings do not tell.
+`verify`: it exits with 0 where the promise is kept, 1 where it is broken, 3 where the readings do not decide.
 
 ## A mount that tracks
 
