@@ -165,8 +165,8 @@ MISTAKES: dict[str, tuple[Change, str]] = {
     "pixels counted from 1": (from_one, "count from 1"),
     "one pixel 10 px off": (mistyped(10.0), "apart from all others"),
     "one pixel 100 px off": (mistyped(100.0), "apart from all others|triangulate outside"),
-    "spots one move early": (shifted, "the move after theirs|their rows are one apart"),
-    "a row of the log missing halfway": (one_missing, "the move before theirs|their rows are one apart"),
+    "spots one move early": (shifted, "the move after theirs|rows shifted by one"),
+    "a row of the log missing halfway": (one_missing, "the move before theirs|rows shifted by one"),
     "right camera knocked by 3 px halfway": (knocked, "was a camera knocked"),
     "mirror offset in metres": (in_metres, "in metres"),
 }
