@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from experiments.common.headlines import LEAST_CONTRACTION, marked, rms_limits
-from experiments.common.rows import commit, read_rows
+from experiments.common.rows import commit, commits_of, read_rows
 from tvsbayes.errors import TvsError
 from tvsbayes.estimators.joint_fit import JointFit, fit
 from tvsbayes.model.compilation_cache import use_compilation_cache
@@ -95,11 +95,10 @@ def tables(arguments: argparse.Namespace, text: str, titles: Mapping[str, str], 
         answers = Counter(row["answer"] for row in rows)
         counts = ", ".join(f"{count} {word}" for word, count in answers.most_common())
         cpu = np.median([row["cpu_s"] for row in rows])
-        commits = ", ".join(dict.fromkeys(str(row.get("commit", "?")) for row in rows))
         low, high = (100 * share for share in binomial_bounds(len(good), LEVEL))
         least, most = rms_bounds(len(good))
         print(f"\n## {title}\n\n{len(rows)} {what}s: {counts}; median {cpu:.0f} CPU s. ", end="")
-        print(f"Commit {commits}. Bounds {low:.0f} to {high:.0f} % and {rms_limits(len(good))}.\n")
+        print(f"Commit {commits_of(rows)}. Bounds {low:.0f} to {high:.0f} % and {rms_limits(len(good))}.\n")
         print("| quantity | 95 % interval holds | RMS z | prior's variance taken away |\n|---|---|---|---|")
         every = []
         for name in good[0]["quantities"]:

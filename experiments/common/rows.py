@@ -9,7 +9,7 @@ import json
 import multiprocessing
 import os
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -83,3 +83,8 @@ def git(*words: str) -> str:
 def commit(revision: str = "HEAD") -> str:
     """Short name of a commit; ? outside git."""
     return git("rev-parse", "--short", revision) or "?"
+
+
+def commits_of(rows: Iterable[Mapping[str, object]]) -> str:
+    """The commits at which rows were made, in their order; ? for a row that names none."""
+    return ", ".join(dict.fromkeys(str(row.get("commit", "?")) for row in rows))

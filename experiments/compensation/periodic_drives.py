@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.rows import commit, output, read_rows, run_rows
+from experiments.common.rows import commit, commits_of, output, read_rows, run_rows
 from tvsbayes.compensation.correction import Correction
 from tvsbayes.compensation.formats import Wish
 from tvsbayes.compensation.promise import compensation_of
@@ -98,9 +98,9 @@ def table(arguments: argparse.Namespace) -> None:
     rows = read_rows(arguments.rows)
     made = [row for row in rows if "promised" in row]
     there = [row for row in rows if row["there"]]
-    commits = ", ".join(dict.fromkeys(str(row["commit"]) for row in rows))
     print("# Tables of one period, of drives at constant rate\n")
-    print(f"Made by `python -m experiments.compensation.periodic_drives`, commit {commits}. Errors in arcsec.\n")
+    made_by = "python -m experiments.compensation.periodic_drives"
+    print(f"Made by `{made_by}`, commit {commits_of(rows)}. Errors in arcsec.\n")
     kept = sum(row["there"] for row in made)
     print(
         f"{len(rows)} drives, {len(there)} with a wave: {kept} of these got a table, {len(made) - kept} of the others."

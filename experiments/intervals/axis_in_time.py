@@ -15,7 +15,7 @@ import argparse
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
-from experiments.common.rows import commit, output, read_rows, run_rows
+from experiments.common.rows import commit, commits_of, output, read_rows, run_rows
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, Reading
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
@@ -81,7 +81,8 @@ def one_axis(task: tuple[str, int]) -> dict[str, object]:
     made = simulate_axis(template(protocol, seed), seed=seed)
     found = fit_axis(made.campaign, tier="importance", seed=seed)
     true, draws = made.truth.parameters, found.draws
-    row: dict[str, object] = {"protocol": protocol, "seed": seed, "problems": list(found.missing), "waves": []}
+    row: dict[str, object] = {"protocol": protocol, "seed": seed, "commit": commit(), "waves": []}
+    row["problems"] = list(found.missing)
     for name in PARAMETERS:
         if name in draws and draws[name].std() > 0 and not (protocol == "drive" and name == "backlash"):
             row[name] = _scored(draws[name], true[name])
@@ -139,7 +140,7 @@ def table(arguments: argparse.Namespace) -> None:
     """Both tables."""
     every = read_rows(arguments.rows)
     rows = [row for row in every if not row["problems"]]
-    print(TEXT.format(axes=len(every), commit=commit()))
+    print(TEXT.format(axes=len(every), commit=commits_of(every)))
     for protocol, what in PROTOCOLS.items():
         mine = [row for row in rows if row["protocol"] == protocol]
         for name in PARAMETERS:

@@ -114,10 +114,8 @@ def _joined(parts: list[Any], axis: int) -> Any:
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=axis)
 
 
-def _roots(
-    scales: GearScales, rows: Callable[[Any], Any], angle_rad: Any, together: Any, xp: ModuleType
-) -> tuple[Any, Any]:
-    """Factors for transmission errors and for plays; `rows` gives a number of an axis to the rows of its places."""
+def _roots(scales: GearScales, rows: Callable[[Any], Any], angle_rad: Any, together: Any, xp: ModuleType) -> BlockRoot:
+    """Transmission errors, then plays, a block each; `rows` gives a number of an axis to the rows of its places."""
     size, distance = angle_rad.shape[-1], angle_rad[..., :, None] - angle_rad[..., None, :]
     amplitudes, periods = (
         [rows(x[..., k]) for k in range(PERIODS_MAX)] for x in (scales.amplitude_rad, scales.period_rad)
@@ -130,7 +128,8 @@ def _roots(
     error_root = xp.linalg.cholesky(xp.where(together, covariance, error**2 * xp.eye(size)) + floor * xp.eye(size))
     # Scaled after its factor: where there is no play its slope exists all the same.
     near = xp.where(together, near, xp.eye(size))
-    return error_root, rows(scales.play_rad) * xp.linalg.cholesky(near + JITTER * xp.eye(size))
+    play_root = rows(scales.play_rad) * xp.linalg.cholesky(near + JITTER * xp.eye(size))
+    return BlockRoot((error_root, play_root))
 
 
 def place_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray, valid: np.ndarray) -> BlockRoot:
@@ -146,14 +145,14 @@ def place_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray,
     if np.any(np.diff(kinds) < 0):
         raise ValueError("places are those of pan, then of tilt, then padding")
 
-    def roots(kind: int) -> tuple[Any, Any]:
+    def roots(kind: int) -> BlockRoot:
         def rows(of_axis: Any) -> Any:
             return of_axis[..., kind % 2, None, None]
 
         return _roots(scales, rows, angle_rad[..., kinds == kind], kind < 2, np)
 
-    by_kind = [roots(kind) for kind in np.unique(kinds).tolist()]
-    blocks = tuple(root for roots in zip(*by_kind, strict=True) for root in roots)
+    by_kind = [roots(kind).blocks for kind in np.unique(kinds).tolist()]
+    blocks = tuple(root for of_kinds in zip(*by_kind, strict=True) for root in of_kinds)
     return BlockRoot(blocks or (np.zeros((*scales.error_rad.shape[:-1], 0, 0)),))
 
 
@@ -180,7 +179,7 @@ def place_root(
     def rows(of_axis: Any) -> Any:
         return _by_axis(of_axis, on_tilt, xp)[..., None]
 
-    error_root, play_root = _roots(scales, rows, angle_rad, together, xp)
+    error_root, play_root = _roots(scales, rows, angle_rad, together, xp).blocks
     nothing = xp.zeros_like(error_root)
     above = xp.concatenate([error_root, nothing], axis=-1)
     return xp.concatenate([above, xp.concatenate([nothing, play_root], axis=-1)], axis=-2)
