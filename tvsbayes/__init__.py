@@ -1,24 +1,24 @@
-"""tvsbayes: what one motor step of a geared laser positioner does to the beam, and how sure that is.
+"""tvsbayes: estimates the motion of a beam per motor step of a geared laser positioner, with its uncertainty.
 
 From a campaign folder to a robot:
 
-    campaign = tvsbayes.read_campaign("mine")            # of any instrument: moves, spots, cameras, what is known
+    campaign = tvsbayes.read_campaign("mine")            # any instrument: moves, spots, cameras, priors
     fit = tvsbayes.fit(campaign)                         # mode and Laplace approximation
-    posterior = tvsbayes.sample(fit)                     # its posterior; .propagate carries it into any quantity
+    posterior = tvsbayes.sample(fit)                     # its posterior; .propagate takes it to any quantity
     calibration = tvsbayes.calibration_of(fit, posterior)
     found = tvsbayes.locate(calibration, 100, 20, 70.0)  # counters and aperture reading -> mm, with covariance
-    results = tvsbayes.calibrate(campaign, folder)       # all of it at once, and the files that `tvsbayes fit` writes
-    calibration = tvsbayes.load_calibration("mine")      # the same from results/ after `tvsbayes fit mine`: NumPy alone
-    posterior = tvsbayes.load_posterior("mine")          # its draws, of a scanner or an axis: without JAX
+    results = tvsbayes.calibrate(campaign, folder)       # all steps above, and the files that `tvsbayes fit` writes
+    calibration = tvsbayes.load_calibration("mine")      # from results/ after `tvsbayes fit mine`: needs NumPy alone
+    posterior = tvsbayes.load_posterior("mine")          # its draws, for a scanner or an axis: without JAX
 
-One axis: `compensate("stage", "linuxcnc")` makes a table for a controller. `verify("stage", "fresh")`, also of a
-scanner, says whether the machine keeps what table or calibration promise.
+For one axis `compensate("stage", "linuxcnc")` makes a table for a controller. `verify("stage", "fresh")` tests whether
+the machine keeps what its table, or a scanner's calibration, promises.
 
-mm, px, and degrees where a name says `deg`; frames, signs and names are in `data/docs/conventions.md`, the map of all
-modules in `data/docs/architecture.md`, more examples in `data/docs/python.md`. Figures: `tvsbayes.plots`. Classic
+Units are mm, px, and degrees where a name says `deg`. Frames, signs and names: `data/docs/conventions.md`; the map of
+all modules: `data/docs/architecture.md`; more examples: `data/docs/python.md`. Figures: `tvsbayes.plots`. Classic
 estimator: `tvsbayes.estimators.four_point`; simulation: `tvsbayes.twin.simulated_campaign`; planning:
-`tvsbayes.planning.planner`; two campaigns: `tvsbayes.comparison.changes`. Refused input raises
-`tvsbayes.errors.InputError`, which says where, what was found and what to do.
+`tvsbayes.planning.planner`; two campaigns: `tvsbayes.comparison.changes`. Input that cannot be used raises
+`tvsbayes.errors.InputError`, which states the place, the value found and the remedy.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ __all__ = [*_HOME, "plots"]
 
 
 def __getattr__(name: str) -> object:
-    """Load what is asked for when it is first asked for: readers bring NumPy, the estimator brings JAX."""
+    """Load a public name when it is first used: readers import NumPy, the estimator imports JAX."""
     if name in _HOME:
         return getattr(import_module(f"tvsbayes.{_HOME[name]}"), name)
     if name == "plots":
@@ -94,5 +94,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """The public names, loaded or not."""
+    """Return the public names, loaded or not."""
     return sorted([*__all__, "__version__"])

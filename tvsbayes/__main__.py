@@ -1,4 +1,4 @@
-"""`python -m tvsbayes`: the command, also where no script of that name was installed."""
+"""Runs the command as `python -m tvsbayes`, also where the script `tvsbayes` is not installed."""
 
 from tvsbayes.cli.main import main
 

@@ -1,7 +1,7 @@
-"""How results show themselves in a session and in a notebook: a short table instead of all their arrays.
+"""Show results in a Python session and in a notebook: a short table instead of all arrays.
 
-A result says what it is in `shown()`; `repr`, the notebook's HTML and `to_dataframe` are made of that. Plain Python;
-pandas is loaded by `to_dataframe` alone.
+A result describes itself in `shown()`; `repr`, the notebook's HTML and `to_dataframe` use this description. Only
+`to_dataframe` loads pandas.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     import pandas as pd
 
 type Cell = str | float | int | bool | None
-"""One entry of a view: a number as it is, text, or nothing."""
+"""One entry of a view: a number, a text or nothing."""
 ROWS = 24
-"""Shown of a long table, at most; `to_dataframe` has all."""
+"""Largest number of rows shown of a table; `to_dataframe` returns all."""
 
 
 def concise(value: float, sd: float) -> str:
-    """`0.059394(81)`: the standard uncertainty's two digits in units of the last place (GUM 7.2.2).
+    """Format `0.059394(81)`: two digits of the standard uncertainty in units of the last place (GUM 7.2.2).
 
     From 1 on the uncertainty keeps its decimal point, as in `21.3(1.5)`.
     """
     if not 0 < sd < math.inf:
         return f"{value:.6g}"
-    # Of the rounded sd: 0.0996 has the digits 10, not 100.
+    # Digits are those of the rounded sd: 0.0996 has the digits 10, not 100.
     mantissa, exponent = f"{sd:.1e}".split("e")
     decimals = max(0, 1 - int(exponent))
     digits = mantissa.replace(".", "") if int(exponent) < 0 else f"{float(f'{sd:.1e}'):.{decimals}f}"
@@ -38,13 +38,13 @@ def concise(value: float, sd: float) -> str:
 
 @dataclass(frozen=True)
 class View:
-    """What is shown of a result.
+    """The description of a result that is shown.
 
     Attributes:
-        title: what it is, in one line.
-        columns: heads, units included.
+        title: description of the result, in one line.
+        columns: headings, with units.
         rows: cells by column.
-        most: rows that are shown.
+        most: largest number of rows shown.
     """
 
     title: str
@@ -53,7 +53,7 @@ class View:
     most: int = ROWS
 
     def text(self) -> str:
-        """A few lines for a terminal."""
+        """Format a few lines for a terminal."""
         if not self.rows:
             return self.title
         cells = [list(self.columns), *([_told(cell) for cell in row] for row in self.rows[: self.most])]
@@ -65,7 +65,7 @@ class View:
         return "\n".join([*lines, *self._rest()])
 
     def html(self) -> str:
-        """A table for a notebook; what comes from files is escaped."""
+        """Format a table for a notebook; text from files is escaped."""
         if not self.rows:
             return f"<p>{escape(self.title)}</p>"
         head = "".join(f"<th>{escape(column)}</th>" for column in self.columns)
@@ -82,16 +82,16 @@ class View:
 
 
 class Shown(ABC):
-    """Base of results: shows `shown()` wherever Python shows a value.
+    """Base of results: Python displays `shown()` in place of the value.
 
-    A dataclass of this base is declared with `repr=False`, or its own `repr` would list every array.
+    A dataclass with this base is declared with `repr=False`; else its own `repr` would list every array.
     """
 
     __slots__ = ()
 
     @abstractmethod
     def shown(self) -> View:
-        """What is shown of it."""
+        """Return the description that is shown."""
 
     def __repr__(self) -> str:
         """The view as text."""
@@ -101,7 +101,7 @@ class Shown(ABC):
         return self.shown().html()
 
     def to_dataframe(self) -> pd.DataFrame:
-        """All rows of the view as a pandas table.
+        """Return all rows of the view as a pandas table.
 
         Raises:
             ImportError: pandas is not installed.
@@ -113,7 +113,7 @@ class Shown(ABC):
 
 
 def _told(cell: Cell) -> str:
-    """A cell as text: numbers to six digits, nothing as a dash, control characters of files as question marks."""
+    """Format a cell: numbers with six digits, nothing as a dash, control characters from files as question marks."""
     if cell is None:
         return "-"
     if isinstance(cell, str):

@@ -1,6 +1,6 @@
-"""What a user did wrong or must know: error classes with their exit codes, and text that is safe to quote.
+"""Errors and warnings for the user: error classes with their exit codes, and text that is safe to quote.
 
-An error says where, what was found, what is allowed and what to do; text from files is escaped before it is shown.
+An error states the place, the value found, the allowed values and the remedy; text from files is escaped when shown.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from functools import partial
 
 
 class TvsError(Exception):
-    """An error that a user can act on; the command line turns it into an exit code.
+    """An error that the user can correct; the command line turns it into an exit code.
 
     Attributes:
         code: short stable identifier, e.g. "number", "unknown-key".
-        exit_code: what the process returns.
-        file: name of the file as the user knows it, or None.
+        exit_code: exit code of the process.
+        file: name of the file as the user gave it, or None.
         line: line number, 1-based, or None.
         column: name of the column or dotted key, or None.
-        found: what stood there, shortened, control characters escaped.
-        allowed: what may stand there.
+        found: the value found, shortened, control characters escaped.
+        allowed: the allowed values.
         remedy: what the user can do now.
     """
 
@@ -51,7 +51,7 @@ class TvsError(Exception):
         self.remedy = remedy
 
     def __reduce__(self):
-        # Exceptions are pickled by their positional arguments alone; a worker process of a pool has to tell ours whole.
+        # Pickle passes positional arguments alone; a worker process of a pool must return the complete error.
         named = ("file", "line", "column", "found", "allowed", "remedy")
         return partial(type(self), **{name: getattr(self, name) for name in named}), (self.code, self.message)
 
@@ -63,7 +63,7 @@ class InputError(TvsError):
 
 
 class NothingToEstimate(TvsError):
-    """The data are readable but hold nothing to estimate from (exit 3)."""
+    """The data are readable but contain nothing from which to estimate (exit 3)."""
 
     exit_code = 3
 
@@ -72,7 +72,7 @@ MISFIT_REMEDY = (
     "see what `tvsbayes check` warns of: a camera that was knocked, rows shifted by one, counters; without warnings "
     "check for swapped cameras, or state the extrinsics better in [rig.prior]"
 )
-"""Where no beam of the model passes the spots."""
+"""Remedy where no beam of the model passes the spots."""
 
 
 class NotConverged(TvsError):
@@ -82,7 +82,7 @@ class NotConverged(TvsError):
 
     @classmethod
     def of(cls, problems: Iterable[str], remedy: str) -> NotConverged:
-        """Of a fit that ended with these problems, in sentences."""
+        """The error of a fit that ended with these problems, in sentences."""
         return cls("not-converged", "NOT CONVERGED: " + "; ".join(problems), remedy=remedy)
 
 
@@ -93,7 +93,7 @@ class DeviceFault(TvsError):
 
 
 def fault(code: str, found: str, remedy: str) -> DeviceFault:
-    """The `DeviceFault` whose message says what was found and what to do."""
+    """Build the `DeviceFault` whose message states the fault and the remedy."""
     return DeviceFault(code, f"{found}; {remedy}", found=found, remedy=remedy)
 
 
@@ -102,13 +102,13 @@ CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 def escaped(text: str, limit: int = 60) -> str:
-    """Text from a file made fit to print: what is not printable is escaped, what is long is cut."""
+    """Make text from a file fit to print: escape characters that are not printable, cut long text."""
     cut = text if len(text) <= limit else text[:limit] + "..."
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
 
 
 def shown(value: object) -> str:
-    """A value as an error message quotes it."""
+    """Format a value as an error message quotes it."""
     if isinstance(value, str):
         return f'"{escaped(value)}"'
     if isinstance(value, dict):
@@ -117,7 +117,7 @@ def shown(value: object) -> str:
         return f"a list of {len(value)}"
     if isinstance(value, bool):
         return str(value).lower()
-    # An integer beyond Python's limit of digits cannot be printed at all.
+    # Python refuses to print an integer beyond its limit of digits.
     huge = isinstance(value, int) and abs(value) >= 10**60
     return "an integer of more than 60 digits" if huge else escaped(str(value))
 
@@ -125,20 +125,20 @@ def shown(value: object) -> str:
 def refusal(
     code: str, *, file: str, found: str, allowed: str, remedy: str, line: int | None = None, column: str | None = None
 ) -> InputError:
-    """Builds the `InputError` whose message says where, what was found, what is allowed and what to do."""
+    """Build the `InputError` whose message states the place, the value found, the allowed values and the remedy."""
     where = file + (f" line {line}" if line else "") + (f", {escaped(column)}" if column else "")
     message = f"{where}: found {found}; allowed: {allowed}; {remedy}"
     return InputError(code, message, file=file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
 
 
 def entry_refusal(code: str, table: str, key: str, found: str, allowed: str, remedy: str) -> InputError:
-    """The same of an entry in a table of the rig file."""
+    """Build the `InputError` of an entry in a table of the rig file."""
     message = f"[{table}] {key}: found {found}; allowed: {allowed}; {remedy}"
     return InputError(code, message, column=f"{table}.{key}", found=found, allowed=allowed, remedy=remedy)
 
 
 def all_of(refused: Sequence[InputError], most: int = 5) -> InputError:
-    """One refusal for several files, so that nobody meets one a run: the first whole, the others by name."""
+    """Join the errors of several files, so that one run reports them all: the first in full, the others by name."""
     first, others = refused[0], [error.file or error.message for error in refused[1:]]
     if not others:
         return first
@@ -150,38 +150,38 @@ def all_of(refused: Sequence[InputError], most: int = 5) -> InputError:
 
 
 def require_kind(given: object, has: str, wanted: str) -> None:
-    """Refuse an argument of another kind, which lacks an attribute, before it fails somewhere inside.
+    """Refuse an argument of another type, recognised by a missing attribute, before it fails deep in the code.
 
     Raises:
-        TypeError: it does, with what was found and where the right one comes from.
+        TypeError: the argument lacks the attribute; states its type and the source of the right one.
     """
     if not hasattr(given, has):
         raise TypeError(f"found {type(given).__name__}; wanted {wanted}")
 
 
 CLOSE = 0.6
-"""Similarity (difflib) from which a word may be another one misspelt: "comment" and "point" have 0.5."""
+"""Similarity (difflib) from which a word counts as a misspelling of another: "comment" and "point" have 0.5."""
 
 
 def closest(name: str, names: Iterable[str], otherwise: str = "remove it, or correct the spelling") -> str:
-    """The remedy for an unknown name: the nearest allowed one, where any is near."""
+    """The remedy for an unknown name: the nearest allowed name, where one is near."""
     near = difflib.get_close_matches(name[:100], list(names), n=1, cutoff=CLOSE)
     return f"did you mean {near[0]}?" if near else otherwise
 
 
 def typed(word: object, limit: int = 200) -> str:
-    """A path or another word as it stands in a command that somebody is told to type: quoted where a shell needs it."""
+    """Quote a path or another word for a command that the user is asked to type, where a shell needs it."""
     return shlex.quote(escaped(str(word), limit))
 
 
 def listed(numbers: Sequence[object], most: int) -> str:
-    """The first of them, and how many more there are."""
+    """List the first numbers, and how many more there are."""
     more = f" and {len(numbers) - most} more" if len(numbers) > most else ""
     return ", ".join(map(str, numbers[:most])) + more
 
 
 def other_format(found: str, allowed: Iterable[str]) -> str | None:
-    """The remedy for a file of another kind or version of ours; None where it is neither."""
+    """The remedy for a file of another kind or version of this package's formats; None for any other file."""
     kind, _, number = found[:100].rpartition("/")
     known = {name.rpartition("/")[0] for name in allowed}
     if not (kind.startswith("tvsbayes-") and number.isdecimal()):

@@ -1,6 +1,6 @@
 """From a campaign to its results: fit, posterior, calibration and evidence, stored in `results/`.
 
-The interface of the commands and of Python callers. Units are those of the contract names; only fits load JAX.
+The commands and Python callers use this module. Units stand in the names; only fits load JAX.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ FITTING, SAMPLING, WRITING, SUMMARISING = "fit", "posterior", "writing posterior
 MAX_MINUTES = 10.0
 """Default time for sampling."""
 WRITING_SECONDS, SUMMARISING_SECONDS = 3.0, 1.5
-"""Expected durations of posterior.nc and of the results, for the progress."""
+"""Expected durations of writing posterior.nc and of summarising the results, for the progress display."""
 RESIDUALS_LISTED = 4096
-"""Largest number of stops in `fit.json`, evenly chosen: limits the file of a long campaign."""
+"""Largest number of stops in `fit.json`, evenly chosen: it limits the file of a long campaign."""
 FITTING_FIRST = "fitting first (Laplace approximation) ..."
 _SHOWN_LINES: set[str] = set()
 """Lines that `compile_for` has shown in this process: a command may call it several times."""
@@ -53,11 +53,11 @@ INPUT_NAMES = {"moves": "moves.csv", "spots": "spots.csv", "stereo": "stereo.jso
 
 
 def no_output(line: str) -> None:
-    """Ignores a line: for callers without output."""
+    """Ignore a line: for callers without output."""
 
 
 def compile_for(tell: Tell) -> None:
-    """Enables the compilation cache; shows once per process that the first compilation takes time."""
+    """Enable the compilation cache; show once per process that the first compilation takes time."""
     from tvsbayes.model.compilation_cache import own_cache_folder, use_compilation_cache
 
     empty, folder = use_compilation_cache(), own_cache_folder()
@@ -74,9 +74,9 @@ def compile_for(tell: Tell) -> None:
 
 
 def unusable(summary: FitSummary, causes: Sequence[Finding] = ()) -> TvsError | None:
-    """Why a finished fit must not be used: not converged (4) or nothing learned (3).
+    """Why a finished fit must not be used: it did not converge (exit 4) or learned nothing (exit 3).
 
-    `causes` explain a fit that did not converge, see `misfit_causes`.
+    `causes` explain a fit that did not converge; see `misfit_causes`.
     """
     if not summary.explained:
         return NotConverged.of(summary.problems, "; ".join(c.sentence for c in causes) or MISFIT_REMEDY)
@@ -96,10 +96,10 @@ class CampaignResults(Shown):
     Attributes:
         record: the content of `fit.json`.
         fit: mode and Laplace approximation.
-        posterior: its sample, None without sampling; the record ignores one that has not converged.
-        calibration: input of `locate`; None of a fit that did not converge.
-        draws: of the record.
-        error: why the results must not be used, None where they may.
+        posterior: its sample, None without sampling; the record ignores a sample that has not converged.
+        calibration: input of `locate`; None where the fit did not converge.
+        draws: the draws of the record.
+        error: why the results must not be used; None where they may.
         causes: explanations of a fit that did not converge; else empty.
         files: paths of written files, by kind: "draws", "fit", "posterior", "chain".
     """
@@ -114,7 +114,7 @@ class CampaignResults(Shown):
     causes: tuple[Finding, ...] = ()
 
     def shown(self) -> View:
-        """The summary of its record, and whether it may be used."""
+        """Show the summary of the record, and whether the results may be used."""
         view = self.record.summary.shown()
         usable = "" if self.error is None else f"; DO NOT USE: {self.error.message}"
         return replace(view, title=f"CampaignResults: {view.title}{usable}")
@@ -134,27 +134,27 @@ def calibrate(
     progress: Show | None = None,
     first: Callable[[FitSummary], None] | None = None,
 ) -> CampaignResults:
-    """Fits a campaign, samples its posterior, and summarises both, as the command `fit`.
+    """Fit a campaign, sample its posterior, and summarise both, as the command `fit` does.
 
     Args:
         campaign: from `read_campaign`.
-        folder: for `fit.json`, `draws.npz`, `posterior.nc` and `chain.npz`; None writes nothing. For `locate` and the
-            commands this is `results` in the campaign's folder.
+        folder: for `fit.json`, `draws.npz`, `posterior.nc` and `chain.npz`; None writes nothing. `locate` and the
+            commands read them from `results` in the campaign's folder.
         model: options beyond the rig's priors.
-        sampled: sample the posterior; else the Laplace approximation alone.
-        tier: "importance" for weighted draws alone, seconds, without `posterior.nc` and `chain.npz`; "emcee" for a
-            chain that must agree with them.
+        sampled: sample the posterior; else only the Laplace approximation is used.
+        tier: "importance" for weighted draws alone, which take seconds, without `posterior.nc` and `chain.npz`; "emcee"
+            for a chain that must agree with them.
         max_minutes: time for sampling.
         resume: continue the chain in the folder.
-        seed: of everything random.
+        seed: seed of all random numbers.
         tell: shows lines to the user.
         progress: shows the progress.
         first: shows the results of importance sampling before a chain starts.
 
     Raises:
-        InputError: as `fit` and `sample`, or the folder cannot be written.
+        InputError: for the reasons of `fit` and `sample`, or the folder cannot be written.
         NothingToEstimate: too few spots, or no free parameter.
-        NotConverged: the fit diverged. One that ended without a mode is in the results, with their `error`.
+        NotConverged: the fit diverged. A fit that ended without a mode is returned with `error` set.
     """
     from tvsbayes.assessment.summary import summarise, worth_sampling
     from tvsbayes.estimators.joint_fit import fit as fit_joint
@@ -167,7 +167,7 @@ def calibrate(
     with Job(fitting | _later_stages(sampled, tier, directory), progress) as job:
         joint = fit_joint(campaign, model=model, seed=seed, progress=job.part(FITTING))
         posterior, files = None, {}
-        # No sampling of a fit that must not be used.
+        # A fit that must not be used is not sampled.
         if sampled and worth_sampling(joint):
             from tvsbayes.posterior.sampling import sample
 
@@ -194,7 +194,7 @@ def calibrate(
 
 
 def _later_stages(sampled: bool, tier: Tier, folder: Path | None) -> dict[str, float]:
-    """Stages of `calibrate` after its fit, with expected seconds; 0 for omitted ones."""
+    """Stages of `calibrate` after its fit, with expected seconds; 0 for a stage left out."""
     from tvsbayes.posterior.sampling import sampling_stages
 
     sampling = sum(sampling_stages(tier).values()) if sampled else 0.0
@@ -203,7 +203,7 @@ def _later_stages(sampled: bool, tier: Tier, folder: Path | None) -> dict[str, f
 
 
 def _posterior_files(posterior: Posterior, folder: Path | None, tell: Tell) -> dict[str, str]:
-    """Writes a converged posterior for ArviZ; the chain is stored already."""
+    """Write a converged posterior for ArviZ; the chain is stored already."""
     if folder is None:
         return {}
     files = {}
@@ -219,7 +219,7 @@ def _posterior_files(posterior: Posterior, folder: Path | None, tell: Tell) -> d
 def _results(
     fit: JointFit, posterior: Posterior | None, seed: int, folder: Path | None, files: dict[str, str], tell: Tell
 ) -> CampaignResults:
-    """Summary, calibration and evidence of a fit and its sample, written where a folder is given.
+    """Compute summary, calibration and evidence of a fit and its sample; write them where a folder is given.
 
     A `posterior.nc` there that is not among `files` belongs to another fit and is removed.
     """
@@ -265,9 +265,9 @@ def evidence_of(
     calibration: Calibration | None,
     physical: np.ndarray,
 ) -> FitEvidence:
-    """Evidence for reports besides the estimates; without a calibration only residuals.
+    """Compute the evidence for reports besides the estimates; without a calibration this is the residuals alone.
 
-    `physical` are the draws, in the units of the names, of the calibration's inputs, row by row.
+    `physical` holds the draws of the calibration's inputs, one row per draw, in the units of their names.
     """
     from tvsbayes.assessment.causes import headline_budget, headline_causes
     from tvsbayes.assessment.residuals import residual_causes, stop_readings, stop_residuals
@@ -281,7 +281,7 @@ def evidence_of(
         return FitEvidence(stops_listed, causes)
     gaps = explain_gap(fit, posterior)
     causes_by_quantity = headline_causes(fit)
-    # Fixed quantities have no uncertainty to split.
+    # Fixed quantities have no uncertainty to divide.
     estimates = {q: e for q in causes_by_quantity.quantities if (e := summary.named[q]).sd > 0}
     budgets = tuple(headline_budget(causes_by_quantity, q, e) for q, e in estimates.items())
     axes = []
@@ -294,14 +294,14 @@ def evidence_of(
 
 @dataclass(frozen=True)
 class StoredOrFitted:
-    """Results of a campaign: stored ones in `results/` for the same data and priors; else those of a new fit.
+    """Results of a campaign: those stored in `results/` for the same data and priors, else those of a new fit.
 
-    Each part is looked up separately, since results of an older version may lack one; missing parts come from one fit
+    Each part is looked up separately, since results of an older version may lack one. Missing parts come from one fit
     (Laplace approximation), made when the first of them is needed.
 
     Attributes:
         campaign: from `read_campaign`.
-        tell: shows why a fit runs first.
+        tell: shows the reason for a new fit.
         progress: shows the progress.
     """
 
@@ -318,7 +318,7 @@ class StoredOrFitted:
 
     @cached_property
     def stored_fit(self) -> JointFit | None:
-        """The stored fit at its mode, None where `results/` lack it or another version named its parameters."""
+        """The stored fit at its mode; None where `results/` lack it or another version named its parameters."""
         from tvsbayes.results.stored_draws import stored_mode
 
         if (mode := stored_mode(self.campaign)) is None:
@@ -329,7 +329,7 @@ class StoredOrFitted:
 
     @cached_property
     def stored_record(self) -> FitRecord | None:
-        """The stored `fit.json`, None where it is not of these data."""
+        """The stored `fit.json`, None where it belongs to other data."""
         from tvsbayes.instrument.campaign import input_hashes
         from tvsbayes.results.fit_record import read_fit
 
@@ -350,7 +350,7 @@ class StoredOrFitted:
 
     @cached_property
     def calibration(self) -> Calibration:
-        """The calibration, stored or of a new fit."""
+        """The calibration, stored or from a new fit."""
         if self.stored_calibration is not None:
             return self.stored_calibration
         fit = self.fitted
@@ -366,7 +366,7 @@ class StoredOrFitted:
 
     @cached_property
     def record(self) -> FitRecord:
-        """`fit.json` with the evidence for reports; a new fit is stored in the campaign's folder.
+        """The content of `fit.json` with the evidence for reports; a new fit is stored in the campaign's folder.
 
         Raises:
             InputError: the folder cannot be written.
@@ -380,14 +380,14 @@ class StoredOrFitted:
 
 
 def read_campaign(folder: Path | str) -> Campaign | AxisCampaign:
-    """Reads and checks a campaign folder of any instrument, by the `format` line of its `campaign.toml`.
+    """Read and check a campaign folder of any instrument, by the `format` line of its `campaign.toml`.
 
     Returns:
-        A `Campaign` of a scanner, input of `fit`, `classic` and the plots; of an axis an `AxisCampaign`, input of
+        A `Campaign` for a scanner, input of `fit`, `classic` and the plots; for an axis an `AxisCampaign`, input of
         `fit_axis`.
 
     Raises:
-        InputError: anything that is missing, malformed or contradicts itself, with file, line and column.
+        InputError: missing, malformed or contradictory entries, with file, line and column.
     """
     from tvsbayes.instrument.campaign import read_campaign as read_scanner
     from tvsbayes.instrument.campaign_header import mechanism_of
@@ -409,15 +409,15 @@ def verify(
     tell: Tell = no_output,
     progress: Show | None = None,
 ) -> Verification:
-    """Whether an axis keeps the promise of its table, or a scanner that of its calibration.
+    """Test whether an axis keeps the promise of its table, or a scanner that of its calibration.
 
     Args:
-        folder: with the results of the table or the calibration in force.
-        fresh: of an axis readings with the table in force, commands before the correction; of a scanner looks whose
+        folder: holds the results with the table or the calibration in force.
+        fresh: for an axis readings with the table in force, commands before the correction; for a scanner looks whose
             moves have the counters of `steps_for` or of the header.
         made: table of an axis; None for the one in `results/compensation.json`.
         distance_mm: along the beam of a scanner, for errors of points.
-        seed: of everything random.
+        seed: seed of all random numbers.
         tell: shows lines to the user.
         progress: shows the progress.
 
@@ -447,7 +447,7 @@ def verify(
 
 
 def _why_not_stored(campaign: Campaign) -> str:
-    """Why `results/` cannot be used, in words: the user should know why a fit runs."""
+    """Why `results/` cannot be used, in words: the reason for a new fit."""
     from tvsbayes.instrument.campaign import input_hashes
     from tvsbayes.results.fit_record import provenance, read_fit
 
@@ -473,7 +473,7 @@ def _why_not_stored(campaign: Campaign) -> str:
 
 
 def _converged_fit(campaign: Campaign, tell: Tell, progress: Show | None) -> JointFit:
-    """A new fit for a command without stored results."""
+    """Make a new fit for a command without stored results."""
     tell(f"{_why_not_stored(campaign)}: {FITTING_FIRST}")
     from tvsbayes.estimators.joint_fit import fit as fit_joint
 

@@ -1,9 +1,9 @@
-"""How far a wait has come: what is being done, how far, time left; it never goes backwards.
+"""Progress of long work: the present task, the share done, and the time left; the share never decreases.
 
-A `Job` is a wait in named stages, each with the share of the time that it is expected to take. Anyone who does the work
-says where it stands, and a callback tells the user, in the thread that works. An exception of the callback
-passes through and so ends the work. Where nobody gave a callback and somebody types (a Python prompt, IPython, a
-notebook), a wait that has lasted two seconds shows itself in one line and takes it away at its end; scripts are silent.
+A `Job` is work in named stages, each with its expected share of the time. The function that works reports its state,
+and a callback shows it to the user, in the same thread. An exception of the callback passes through and so ends the
+work. Without a callback, in an interactive session (a Python prompt, IPython, a notebook), work that has lasted two
+seconds shows one line, which is removed at its end; scripts show nothing.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from types import TracebackType
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a wait stands.
+    """The state of long work.
 
     Attributes:
-        doing: what is being done, in words.
-        share: of the whole work, from 0 to 1; it never falls, and 1 is the end.
-        seconds: since the beginning.
-        seconds_left: expected; it rises by no more than has passed. None while too little is known.
+        doing: the present task, in words.
+        share: share of the whole work done, from 0 to 1; it never decreases, and 1 is the end.
+        seconds: time since the beginning.
+        seconds_left: expected; it increases by no more than the time passed. None while it cannot be predicted.
     """
 
     doing: str
@@ -34,30 +34,30 @@ class Progress:
 
 
 Show = Callable[[Progress], None]
-"""Takes the news of a wait."""
+"""Receives the state of long work."""
 Advance = Callable[[float], None]
-"""Takes the share of a stage that is done, from 0 to 1."""
+"""Receives the share of a stage that is done, from 0 to 1."""
 EXPECTED_SHARE, EXPECTED_SECONDS = 0.02, 0.5
-"""Share done and time passed from which the rest is predicted."""
+"""Share done and time passed from which the remaining time is predicted."""
 MEMORY = 0.2
-"""Part of the time passed over which the speed is averaged: stages are not equally well predicted."""
+"""Share of the time passed over which the speed is averaged: stages are not equally well predicted."""
 EXPECTED_LAST = 0.8
-"""Of what is left of a stage of unknown length, the share that ends at the length expected now: it may not suffice."""
+"""Share of the remaining part of a stage of unknown length that ends at the length expected now, which may be short."""
 
 
 SHOWN_AFTER_SECONDS = 2.0
-"""Of a wait that lasts so long is shown how it stands."""
+"""Work that lasts this long is shown."""
 
 
 def time_left(seconds: float | None) -> str:
-    """Time left in words; "" where it is not known."""
+    """Time left in words; "" where it is unknown."""
     if seconds is None:
         return ""
     return f"{seconds:.0f} s left" if seconds < 100 else f"{seconds / 60:.0f} min left"
 
 
 Write = Callable[[Progress | None], None]
-"""Replaces what a display shows of a wait; None takes it away."""
+"""Replaces the displayed state of long work; None removes it."""
 
 
 def _in_words(state: Progress | None) -> str:
@@ -67,7 +67,7 @@ def _in_words(state: Progress | None) -> str:
 
 
 def _line_writer() -> Write | None:
-    """What replaces the one line of a session; None where nobody types, or nobody would see it."""
+    """Make the writer of a session's progress line; None in a script, or where nobody would see the line."""
     if not hasattr(sys, "ps1"):
         return None
     if "ipykernel" in sys.modules:
@@ -86,15 +86,15 @@ def _line_writer() -> Write | None:
 
 
 class DelayedDisplay:
-    """The display of a wait; it appears after `SHOWN_AFTER_SECONDS`, also while nothing is told yet.
+    """The display of long work; it appears after `SHOWN_AFTER_SECONDS`, also before the first report.
 
     Args:
-        doing: what is being done, until something is told.
-        writer: makes what writes, called when the display appears.
+        doing: the present task, until something is reported.
+        writer: makes the writer, called when the display appears.
     """
 
     _shown = threading.Lock()
-    """Of one wait at a time: jobs inside a job are its own affair."""
+    """Held by one display at a time: a job inside a job shows nothing."""
 
     def __init__(self, doing: str, writer: Callable[[], Write | None] = _line_writer):
         self._state, self._writer = Progress(doing, 0.0, 0.0, None), writer
@@ -107,13 +107,13 @@ class DelayedDisplay:
             self._timer.start()
 
     def show(self, state: Progress) -> None:
-        """Takes the news."""
+        """Receive the state."""
         with self._lock:
             self._state = state
             self._update()
 
     def close(self) -> None:
-        """Take the display away."""
+        """Remove the display."""
         self._timer.cancel()
         with self._lock:
             if self._write is not None:
@@ -125,7 +125,7 @@ class DelayedDisplay:
 
     def _open(self) -> None:
         with self._lock:
-            # The timer may fire while the wait ends.
+            # The timer may fire while the work ends.
             if self._mine:
                 self._write = self._writer()
                 self._update()
@@ -136,19 +136,19 @@ class DelayedDisplay:
 
 
 def unshown(share: float) -> None:
-    """For callers that show no progress."""
+    """Ignore progress: for callers that show none."""
 
 
 class Job:
-    """A wait in named stages, a context manager: the end is told where its block ends well.
+    """Work in named stages, as a context manager; the end is reported where its block ends without an error.
 
     Args:
-        stages: expected share of the time by what is done, in order, in any unit; those with 0 are not taken.
-        show: told how it stands; None for nobody but the line of a session.
+        stages: expected share of the time by task, in order, in any unit; stages with 0 are left out.
+        show: receives the state; None shows it only in an interactive session.
         clock: seconds.
 
     Raises:
-        ValueError: no stage takes any time, or one takes less than none.
+        ValueError: all times are zero, or one is negative.
     """
 
     def __init__(
@@ -184,15 +184,15 @@ class Job:
             self._tell(self._told.doing, 1.0)
 
     def begin(self, doing: str) -> None:
-        """Begin a stage; those before it are done, or were not needed. `KeyError` where there is no such stage."""
+        """Begin a stage; those before it are done, or were not needed. An unknown stage raises `KeyError`."""
         before, done = self._ends[self._stage]
-        # What was passed over, or had nothing to tell, took no time by which the rest could be predicted.
+        # Stages that were left out, or that reported nothing, give no speed for a prediction.
         self._skipped += max(self._ends[doing][0] - (before if self._silent else done), 0.0)
         self._stage = doing
         self.at(0.0)
 
     def at(self, share: float, detail: str = "") -> None:
-        """Say how much of the present stage is done, with a detail in words; less than before changes no share."""
+        """Report the share of the present stage that is done, with a detail in words; the share never decreases."""
         first, end = self._ends[self._stage]
         self._silent = False
         if end > first:
@@ -200,7 +200,7 @@ class Job:
             self._tell(doing, first + min(max(share, 0.0), 1.0) * (end - first))
 
     def part(self, doing: str) -> Show | None:
-        """Begin a stage that is a job of its own: its callback, None where nobody is told."""
+        """Begin a stage that is a job of its own; returns its callback, None where nothing is shown."""
         self.begin(doing)
         self._silent = True
         return None if self._show is None else lambda state: self.at(state.share, state.doing)
@@ -214,7 +214,7 @@ class Job:
         self._show(self._told)
 
     def _left(self, share: float, seconds: float) -> float | None:
-        """Seconds left, by the speed so far, averaged."""
+        """Predict the seconds left by the averaged speed so far."""
         if share >= 1:
             return 0.0
         before, passed = self._told.seconds_left, seconds - self._told.seconds
@@ -230,13 +230,13 @@ class Job:
 
 
 class OpenEnded:
-    """The share of a stage whose length is expected anew as it goes on: it nears its end without reaching it early."""
+    """The share of a stage whose expected length changes as it goes on: it approaches 1 without reaching it early."""
 
     def __init__(self) -> None:
         self._since, self._share, self._expected = 0.0, 0.0, 0.0
 
     def share(self, done: float, expected: float) -> float:
-        """How much is done, after `done` of the `expected` steps or rounds; never falls while `done` does not."""
+        """The share after `done` of the `expected` steps or rounds; it does not decrease while `done` does not."""
         if expected > self._expected:
             self._share = self._of(done)
             self._since, self._expected = done, expected

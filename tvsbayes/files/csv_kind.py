@@ -1,7 +1,7 @@
-"""Kinds of CSV files: a dataclass whose fields say what their columns hold.
+"""Kinds of CSV files: a dataclass whose fields declare the columns.
 
-One declaration is reader, writer, the table in the documentation and the comment in a template. Name, type and default
-are those of the field; its `Column` holds the rest: `aperture_deg: Annotated[float | None, Column(...)] = None`.
+One declaration gives reader, writer, the table in the documentation and the comment in a template. Name, type and
+default are those of the field; its `Column` holds the rest: `x_deg: Annotated[float | None, Column(...)] = None`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from tvsbayes.files.csv_table import Table, csv_bytes, parse_table
 from tvsbayes.files.disk import shipped_data
 
 ID_MAX = 10**9
-"""Of numbers of rows."""
+"""Largest number of a row."""
 COMMENT_CHARS = 120
-"""Of a line in a template."""
+"""Length of a comment line in a template."""
 Values = Mapping[str, Sequence[Any]]
-"""Cells of a table by column, each as its type."""
+"""Cells of a table by column, converted to the column's type."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class Column:
     """A column of a table, as the field of a row declares it.
 
     Attributes:
-        meaning: what it holds, in Markdown; "" where it shares the words of the column before.
+        meaning: description of its content, in Markdown; "" where it shares the words of the column before.
         low, high: limits of a number; both of the type of the column.
-        chars_max: of a text.
+        chars_max: largest length of a text.
         filled: an empty text is refused. An empty number is refused where the field has no default.
-        group: columns of one group may be missing; they are written together, where one of them is not at its default.
-        rule: refuses what is wrong with the column once all cells of the table are read.
-        names: words in the names that other people give it, lower case, without accents, with spaces between.
-        name, kind, words, default: of the field; `words` are those of a `Literal`, which its rule must check;
+        group: columns of one group may be missing; they are written together where one of them is not at its default.
+        rule: check of the column after all cells of the table are read; raises its error.
+        names: words of its name in foreign tables, lower case, without accents, separated by spaces.
+        name, kind, words, default: taken from the field; `words` are those of a `Literal`, which its rule must check;
             the default is MISSING where there is none.
     """
 
@@ -59,7 +59,7 @@ class Column:
         return self.default is not MISSING
 
     def values(self, table: Table) -> Sequence[Any]:
-        """The checked cells of a table; defaults where it does not have the column."""
+        """The checked cells of a table; defaults where the column is missing."""
         if self.name not in table.columns:
             return [self.default] * len(table)
         if self.words:
@@ -82,8 +82,8 @@ class CsvKind[Row]:
     Attributes:
         row: dataclass of a row.
         file: name of the file.
-        about: what a row stands for, as the comment of a template says it.
-        no_rows: what is allowed instead of a table without rows, and what to do; None where that is legal.
+        about: what a row stands for, in the words of a template's comment.
+        no_rows: allowed content and remedy for a table without rows; None where no rows are allowed.
         template: rows of the file that `new` writes.
         columns: by name, in the order in which they are written.
     """
@@ -126,7 +126,7 @@ class CsvKind[Row]:
         """The checked cells of a table by column.
 
         Raises:
-            InputError: a cell that is no value of its column, or that a rule of its column refuses.
+            InputError: a cell is no value of its column, or its rule refuses it.
         """
         values = {name: column.values(table) for name, column in self.columns.items()}
         for column in self.columns.values():
@@ -140,10 +140,10 @@ class CsvKind[Row]:
         Args:
             data: its bytes.
             file: its name, for errors.
-            checks: further checks, of more than one column.
+            checks: further checks, on more than one column.
 
         Raises:
-            InputError: what `parse_table`, `values` and `checks` refuse, or no rows where some are required.
+            InputError: from `parse_table`, `values` and `checks`, or a required row is missing.
         """
         table = parse_table(data, file, self.required, self.optional)
         if self.no_rows and not len(table):
@@ -156,7 +156,7 @@ class CsvKind[Row]:
         return tuple(row(**dict(zip(values, cells, strict=True))) for cells in zip(*values.values(), strict=True))
 
     def content(self, rows: Iterable[Row]) -> bytes:
-        """The content of a file; columns of a group only where one of them is not at its default."""
+        """The content of a file; columns of a group are written only where one of them is not at its default."""
         rows = list(rows)
         groups = {
             c.group for c in self.columns.values() if c.group and any(getattr(r, c.name) != c.default for r in rows)
@@ -165,12 +165,12 @@ class CsvKind[Row]:
         return csv_bytes(names, ([getattr(row, name) for name in names] for row in rows))
 
     def _meanings(self) -> list[tuple[list[str], str]]:
-        """Columns that share a meaning, with it."""
+        """Columns that share a meaning, with the meaning."""
         groups = groupby(self.columns.values(), key=lambda column: column.meaning)
         return [([column.name for column in columns], meaning) for meaning, columns in groups]
 
     def markdown(self) -> str:
-        """The columns as a table of the page of campaign files."""
+        """The columns as a table for the page on campaign files."""
         lines = [f"| column of `{self.file}` | content |", "|---|---|"]
         lines += [f"| {', '.join(f'`{name}`' for name in names)} | {meaning} |" for names, meaning in self._meanings()]
         return "\n".join(lines) + "\n"
@@ -185,7 +185,7 @@ class CsvKind[Row]:
 
 
 def templates(folder: str, *kinds: CsvKind[Any]) -> dict[str, bytes]:
-    """The commented files that `new` writes: shipped ones, with a line `# {moves.csv}` replaced by its comment."""
+    """The commented files that `new` writes: shipped files, with a line `# {moves.csv}` replaced by its comment."""
     files = {path.name: path.read_bytes() for path in (shipped_data() / folder).iterdir()}
     for kind in kinds:
         line = f"# {{{kind.file}}}".encode()
@@ -194,19 +194,19 @@ def templates(folder: str, *kinds: CsvKind[Any]) -> dict[str, bytes]:
 
 
 def counted(table: Table, column: Column, values: Values) -> None:
-    """Refuses a column that does not count 0, 1, 2 ..."""
+    """Refuse a column that does not count 0, 1, 2 ..."""
     for row, value in enumerate(values[column.name]):
         if value != row:
             raise table.refuse(row, column.name, "order", f"{row}", "number the rows 0, 1, 2 ... in time order")
 
 
 def unique(table: Table, column: Column, values: Values) -> None:
-    """Refuses a repeated number."""
+    """Refuse a repeated number."""
     refuse_repeated(table, column.name, values[column.name], "unique ids")
 
 
 def refuse_repeated(table: Table, column: str, values: Iterable[object], allowed: str) -> None:
-    """Refuses a repeated value; None does not count."""
+    """Refuse a repeated value; None is ignored."""
     first_rows: dict[object, int] = {}
     for row, value in enumerate(values):
         if value is not None and first_rows.setdefault(value, row) != row:
@@ -215,7 +215,7 @@ def refuse_repeated(table: Table, column: str, values: Iterable[object], allowed
 
 
 def segments_in_time(table: Table, column: Column, values: Values) -> None:
-    """Refuses segments that do not count from 0 by one at most, and a `time_s` that goes back."""
+    """Refuse segments that do not begin at 0 or grow by more than one, and a `time_s` that decreases."""
     segments, times_s = values[column.name], values["time_s"]
     for row, (segment, time_s) in enumerate(zip(segments, times_s, strict=True)):
         previous = segments[row - 1] if row else -1
@@ -228,7 +228,7 @@ def segments_in_time(table: Table, column: Column, values: Values) -> None:
 
 
 def first_of_segment(table: Table, column: Column, values: Values) -> None:
-    """Refuses anything but one of the column's words in the first row of a segment, and nothing in the others."""
+    """Refuse anything but one of the column's words in the first row of a segment, and nothing in the others."""
     segments = values["segment"]
     for row, word in enumerate(values[column.name]):
         begins = row == 0 or segments[row] != segments[row - 1]
@@ -255,7 +255,7 @@ def filled_where_ok(
 
 
 def follows_a_move(moves: int, what: str) -> Callable[[Table, Values], None]:
-    """The check that `move` names one of the `moves` rows of moves.csv, the last before `what`."""
+    """The check that `move` names one of the `moves` rows of moves.csv: the last move before `what`."""
 
     def check(table: Table, values: Values) -> None:
         for row, move in enumerate(values["move"]):

@@ -22,7 +22,7 @@ from tvsbayes.progress import Advance, unshown
 
 CSV_BYTES_MAX = 64 * 1024 * 1024
 CSV_ROWS_MAX = 200_000
-"""At these caps a table of spots takes 0.6 GB and 6 s of processor time to read (experiments/robustness/hostile.md)."""
+"""With this limit a table of spots takes 0.6 GB and 6 s of CPU time to read (experiments/robustness/hostile.md)."""
 CSV_LINE_CHARS_MAX = 16_384
 NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _DATE = re.compile(
@@ -33,11 +33,11 @@ _CSV_LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")
 
 
 FOREIGN = "`tvsbayes import FILE --to NEW` reads it"
-"""Remedy for a table in the format of another program."""
+"""Remedy for a table in another program's format."""
 
 
 def number_remedy(cell: str, *, whole: bool = False) -> str:
-    """What to do about a cell that is no plain number, or no plain whole number."""
+    """The remedy for a cell that is no plain number, or no plain whole number."""
     if cell.startswith(("=", "@")):
         return "save the value, not the formula"
     if cell.strip().lower().lstrip("+-") in ("nan", "inf", "infinity"):
@@ -56,8 +56,8 @@ def number_remedy(cell: str, *, whole: bool = False) -> str:
 
 
 def _plain_numbers[N: (int, float)](cells: Sequence[str], kind: type[N], low: float, high: float) -> list[N] | None:
-    """The numbers of a column of valid cells, fast; None where any cell needs a closer check."""
-    # Of what these characters can spell, float() and int() take exactly NUMBER and INTEGER.
+    """Convert a column of valid cells to numbers, fast; None where any cell needs a closer check."""
+    # Of all strings of these characters, float() and int() accept exactly NUMBER and INTEGER.
     if not cells or not set().union(*cells) <= set("0123456789+-" if kind is int else "0123456789+-.eE"):
         return None
     try:
@@ -87,7 +87,7 @@ class Table:
     ) -> InputError:
         """The error of one cell; `found` defaults to its content."""
         if not any(cells[row] for cells in self.columns.values()):
-            # A spreadsheet ends with rows that hold separators alone.
+            # Spreadsheets append rows that hold separators alone.
             found, remedy = "a line without any value", "delete the line"
         if found is None:
             found = shown(self.columns[column][row]) if self.columns[column][row] else "an empty cell"
@@ -97,7 +97,7 @@ class Table:
     def numbers[N: (int, float)](
         self, column: str, kind: type[N], low: float, high: float, empty: bool = False
     ) -> Sequence[N | None]:
-        """Finite numbers in [low, high], whole ones of the kind int; None for an empty cell where `empty` allows it."""
+        """Finite numbers in [low, high], integers for the kind int; None for an empty cell where `empty` allows it."""
         if (plain := _plain_numbers(self.columns[column], kind, low, high)) is not None:
             return plain
         values: list[N | None] = []
@@ -115,7 +115,7 @@ class Table:
     def _number_refusal(
         self, row: int, column: str, kind: type[int] | type[float], low: float, high: float, empty: bool
     ) -> InputError:
-        """The error of a cell that is no number of a kind and range."""
+        """The error of a cell that is no number of this kind and range."""
         cell = self.columns[column][row]
         is_decimal = NUMBER.fullmatch(cell) is not None
         if kind is int:
@@ -129,7 +129,7 @@ class Table:
         return self.refuse(row, column, code, allowed + ", or an empty cell" * empty, remedy)
 
     def texts(self, column: str, chars_max: int = 100, empty: bool = True) -> list[str]:
-        """Printable text that a spreadsheet does not take for a formula."""
+        """Printable texts that a spreadsheet does not take for a formula."""
         allowed = f"printable text of at most {chars_max} characters that does not begin with = + - @"
         for row, cell in enumerate(self.columns[column]):
             if len(cell) > chars_max or not cell.isprintable() or cell.startswith(("=", "+", "-", "@")):
@@ -168,7 +168,7 @@ def _csv_rows(text: str, file: str, skipped: int) -> Iterator[tuple[int, list[st
 
 
 def table_blocks(path: Path, columns: Sequence[str], rows: int, advance: Advance = unshown) -> Iterator[Table]:
-    """A CSV table with exactly `columns`, of any length, `rows` lines of it at a time.
+    """A CSV table with exactly `columns`, of any length, in blocks of `rows` lines.
 
     Args:
         path: the file.
@@ -177,7 +177,7 @@ def table_blocks(path: Path, columns: Sequence[str], rows: int, advance: Advance
         advance: called with the share of the file that is read.
 
     Raises:
-        InputError: as `parse_table`, when it comes to that block.
+        InputError: as `parse_table`, when the block is read.
     """
     file, skipped = escaped(path.name), 0
     with opened(path, "a readable file") as stream:
@@ -199,12 +199,12 @@ def parse_table(
     Args:
         data: the header's line and rows.
         file: name of the file.
-        columns: that must be there.
-        optional: that may.
+        columns: required columns.
+        optional: columns that may be missing.
         skipped: number of lines of the file between the header and these rows.
 
     Raises:
-        InputError: not UTF-8, control characters, no or a wrong header, rows of another length than it.
+        InputError: not UTF-8, control characters, a missing or wrong header, rows of another length than the header.
     """
     refuse = partial(refusal, file=file)
     for marks, found in (((b"PK\x03\x04",), "a workbook (XLSX)"), ((b"\xff\xfe", b"\xfe\xff"), "UTF-16")):
@@ -264,14 +264,14 @@ def csv_bytes(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes
 
 
 HEAD_MAX = 1 << 16
-"""Bytes that the first line of such a table may have."""
+"""Largest length of the first line of such a table, bytes."""
 
 
 def append_line(path: Path, columns: Sequence[str], row: Sequence[object]) -> None:
-    """Add a line to a table, durably, or leave the table as it was; a new table begins with its columns.
+    """Append a line to a table, durably, or leave the table unchanged; a new table begins with its columns.
 
-    One write to the end: jobs that run side by side keep each other's lines. A table without a newline at its end gets
-    one first.
+    The line is one write at the end, so that jobs that run side by side keep each other's lines. A table without a
+    newline at its end gets one first.
 
     Args:
         path: of the table.
@@ -279,7 +279,7 @@ def append_line(path: Path, columns: Sequence[str], row: Sequence[object]) -> No
         row: one cell per column; None is empty.
 
     Raises:
-        InputError: a table with other columns, or a disk that is full or not writable.
+        InputError: the table has other columns, or the disk is full or not writable.
     """
     file, data = escaped(str(path), 200), csv_bytes(columns, [row])
     header = data[: len(csv_bytes(columns, []))]
@@ -310,7 +310,7 @@ def append_line(path: Path, columns: Sequence[str], row: Sequence[object]) -> No
 
 
 def _write_all(descriptor: int, data: bytes, size: int) -> None:
-    """All of the bytes or, on a full disk, none of them."""
+    """Write all bytes or, on a full disk, none of them."""
     try:
         written = os.write(descriptor, data)
         if written < len(data):

@@ -1,8 +1,8 @@
-"""Bytes and arrays read under a cap, and files written whole or not at all.
+"""Read bytes and arrays under a size limit, and write files completely or not at all.
 
-A reader returns what a regular file inside its folder holds, or raises `InputError` with file, line, what was found,
-what is allowed and what to do. Sizes are capped before anything is read or unpacked. No knowledge of what a campaign
-is; lines count from 1.
+A reader returns the content of a regular file inside its folder, or raises `InputError` with file, line, the value
+found, the allowed values and the remedy. Sizes are checked before anything is read or unpacked. The module does not
+depend on the content of campaigns; lines count from 1.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ if TYPE_CHECKING:
     import numpy as np
 
 FLUSHES_NO_FOLDER = frozenset({errno.EINVAL, errno.ENOTSUP})
-"""Errors of a file system (some network shares) that flushes files only, fsync(2): no folder can be flushed there."""
+"""Errors of file systems (some network shares) that flush files only, fsync(2); folders cannot be flushed there."""
 RESULTS_BYTES_MAX = 128 * 1024 * 1024
-"""Of a file of results, and of its arrays unpacked."""
+"""Largest size of a file of results, and of its unpacked arrays."""
 ARRAYS_MAX = 256
 _NPY_HEADER = re.compile(
     rb"\x93NUMPY\x01\x00(?P<length>..)\{'descr': '(?P<kind>[<>|][biufU][0-9]{1,8})', 'fortran_order': "
     rb"(?P<fortran>True|False), 'shape': \((?P<shape>[0-9, ]{0,100})\),? ?\} *\n",
     re.DOTALL,
 )
-"""Version 1.0 of the header (NEP 1) as NumPy writes it; no code is evaluated to read it, as NumPy itself does."""
+"""Version 1.0 of the header (NEP 1) as NumPy writes it; the pattern reads it without evaluating code."""
 
 
 def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
-    """Reads a regular file of at most `cap` bytes.
+    """Read a regular file of at most `cap` bytes.
 
     Args:
         path: the file.
@@ -58,7 +58,7 @@ def read_bytes(path: Path, cap: int, folder: Path | None = None) -> bytes:
         size = os.fstat(stream.fileno()).st_size
         if size > cap:
             raise _too_large(path, f"{size} bytes", allowed)
-        # As much as there is: a read of the cap would allocate the cap for every file.
+        # The cap itself as size of the read would be allocated for every file.
         data = stream.read(size + 1)
         if len(data) > size:
             data += stream.read(cap + 1 - len(data))
@@ -74,15 +74,15 @@ def _too_large(path: Path, found: str, allowed: str) -> InputError:
 
 @contextmanager
 def opened(path: Path, allowed: str, folder: Path | None = None) -> Iterator[BinaryIO]:
-    """A regular file to be read.
+    """Open a regular file for reading.
 
     Args:
         path: the file.
-        allowed: what may stand there, for messages.
+        allowed: the allowed files, for messages.
         folder: where given, the file must lie inside it after following links.
 
     Raises:
-        InputError: missing, unreadable, not a regular file, outside `folder`; also where reading it fails.
+        InputError: missing, unreadable, not a regular file, outside `folder`, or reading it fails.
     """
     path = Path(path)
     file = escaped(path.name) or escaped(str(path))
@@ -94,7 +94,7 @@ def opened(path: Path, allowed: str, folder: Path | None = None) -> Iterator[Bin
         real = path.resolve(strict=True)
         if folder is not None and not real.is_relative_to(Path(folder).resolve()):
             raise refuse("path", "a link that leaves the folder", "put the file itself into the folder")
-        # Without O_NONBLOCK the opening of a pipe would wait for a writer for ever.
+        # Without O_NONBLOCK the opening of a pipe would wait for a writer without end.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0)
         descriptor = os.open(real, flags | getattr(os, "O_BINARY", 0))
         try:
@@ -118,20 +118,20 @@ def opened(path: Path, allowed: str, folder: Path | None = None) -> Iterator[Bin
 
 
 def line_in_file(number: int, skipped: int) -> int:
-    """The line in a file of line `number` of a text without the `skipped` lines after the first."""
+    """Line number in a file of line `number` of a text from which `skipped` lines after the first were left out."""
     return number + (skipped if number > 1 else 0)
 
 
 def decode(data: bytes, file: str, skipped: int = 0) -> str:
-    """UTF-8 text with or without BOM; refuses other encodings, NUL and other control characters.
+    """Decode UTF-8 text with or without BOM; refuse other encodings, NUL and other control characters.
 
     Args:
-        data: the text, or its first line and the lines after some that were left out.
+        data: the text, or its first line and the lines after those left out.
         file: its name, for errors.
-        skipped: how many lines were left out after the first.
+        skipped: number of lines left out after the first.
 
     Raises:
-        InputError: with the line in the file.
+        InputError: names the line in the file.
     """
     refuse = partial(refusal, file=file)
     utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
@@ -163,11 +163,11 @@ class Flushing(Protocol):
 
 
 def flush_folder(folder: Path, disk: Flushing = os) -> None:
-    """Make the names in a folder durable, where the system can: only POSIX flushes folders.
+    """Make the names in a folder durable, where the system allows it: only POSIX flushes folders.
 
     Args:
-        folder: which.
-        disk: its calls.
+        folder: the folder.
+        disk: calls of the operating system.
 
     Raises:
         OSError: the disk failed.
@@ -185,7 +185,7 @@ def flush_folder(folder: Path, disk: Flushing = os) -> None:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Replaces `path` by `data` so that a reader, or a crash, sees the old file or the new, never a part.
+    """Replace `path` by `data` so that a reader, or a crash, leaves the old file or the new one, never a part.
 
     Raises:
         InputError: as `written_whole`.
@@ -196,11 +196,11 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[BinaryIO]:
-    """A stream that replaces `path` when its block ends without an error; else `path` stays as it was.
+    """Open a stream that replaces `path` when its block ends without an error; else `path` stays unchanged.
 
     Raises:
-        InputError: the folder is missing, full or not writable; `path` is the old file then, or the new one where
-            only the flush of the folder failed.
+        InputError: the folder is missing, full or not writable; `path` is then the old file, or the new one where only
+            the flush of the folder failed.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
@@ -214,7 +214,7 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
-        # The new name itself is durable only once its folder is.
+        # The new name is durable only once its folder is flushed.
         flush_folder(path.parent)
     except OSError as error:
         found, allowed = escaped(error.strerror or str(error)), "a writable folder with free space"
@@ -223,9 +223,9 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
 
 
 def remove_unfinished(folder: Path, names: Iterable[str]) -> list[str]:
-    """Removes temporary files of these names that a killed `write_atomically` left behind.
+    """Remove temporary files of these names that a killed `write_atomically` left behind.
 
-    Only for a folder that nobody else writes these files into.
+    Use it only for a folder into which no other process writes these files.
 
     Returns:
         Names of the temporary files that were removed.
@@ -239,14 +239,14 @@ def remove_unfinished(folder: Path, names: Iterable[str]) -> list[str]:
 
 
 def make_folder(folder: Path, *, empty: bool = False) -> None:
-    """Create a folder and those above it.
+    """Create a folder and its parents.
 
     Args:
-        folder: where to.
-        empty: refuse a folder that holds anything: nothing is overwritten.
+        folder: the folder.
+        empty: refuse a folder that is not empty, so that nothing is overwritten.
 
     Raises:
-        InputError: it cannot be created, or holds something.
+        InputError: the folder cannot be created, or is not empty.
     """
     shown_path = escaped(str(folder), 200)
     try:
@@ -261,10 +261,10 @@ def make_folder(folder: Path, *, empty: bool = False) -> None:
 
 
 def require_writable(folder: Path) -> None:
-    """Refuse a folder for results that cannot be written, before the work; the trial leaves no file.
+    """Refuse a folder for results that cannot be written, before the work starts; the test leaves no file.
 
     Args:
-        folder: where to; if it is missing, its nearest parent is tried.
+        folder: the folder; if it is missing, its nearest existing parent is tested.
 
     Raises:
         InputError: no file can be written there.
@@ -281,10 +281,10 @@ def require_writable(folder: Path) -> None:
 
 
 def output_place(folder: Path, *names: str) -> Path:
-    """`folder / names`, a place for output that no link leads out of the folder.
+    """Return `folder / names`, checked: no link leads out of the folder.
 
     Raises:
-        InputError: a link inside the folder leads elsewhere: a stranger's folder must not choose where to write.
+        InputError: a link inside the folder leads elsewhere: a foreign folder must not choose where files are written.
     """
     path = Path(folder).joinpath(*names)
     try:
@@ -299,16 +299,16 @@ def output_place(folder: Path, *names: str) -> Path:
 
 
 def shipped_data() -> Path:
-    """The folder of twins, rigs, templates and reference values that travels with the package.
+    """The folder of twins, rigs, templates and reference values that is shipped with the package.
 
-    In a wheel it lies inside the package; in a checkout (also an editable install) beside it.
+    In a wheel it lies inside the package; in a checkout or an editable install beside the package.
     """
     packaged = Path(str(resources.files("tvsbayes") / "data"))
     return packaged if packaged.is_dir() else Path(str(resources.files("tvsbayes"))).resolve().parent / "data"
 
 
 def _array_of(content: bytes, name: str) -> np.ndarray:
-    """The array of an .npy; ValueError for anything but numbers and text of exactly the size that its header states."""
+    """Read the array of an .npy; anything but numbers and text of exactly the header's size raises ValueError."""
     import numpy as np
 
     match = _NPY_HEADER.match(content)
@@ -326,14 +326,15 @@ def _array_of(content: bytes, name: str) -> np.ndarray:
 
 
 def read_arrays(path: Path, bytes_max: int) -> dict[str, np.ndarray]:
-    """The arrays of an .npz, by name; every size is checked against the header before anything is allocated.
+    """Read the arrays of an .npz, by name; every size is checked against the header before memory is allocated.
 
-    `numpy.load` alone turns 0.5 kB into gigabytes: by entries of no width, and by bzip2 members, which zipfile
+    `numpy.load` alone can expand 0.5 kB to gigabytes: by entries of no width, and by bzip2 members, which zipfile
     unpacks without a limit whatever size they state (experiments/robustness/hostile.md).
 
     Raises:
-        InputError: what `read_bytes` refuses.
-        ValueError: no .npz of plain numbers and text as NumPy writes it, or more than `bytes_max` bytes, packed or not.
+        InputError: as `read_bytes`.
+        ValueError: not an .npz of plain numbers and text as NumPy writes it, or more than `bytes_max` bytes, packed or
+            unpacked.
     """
     data = read_bytes(path, bytes_max)
     arrays = {}

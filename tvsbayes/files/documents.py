@@ -1,8 +1,8 @@
 """Strict TOML and JSON: values read key by key, each error with its line and dotted key; and TOML written.
 
-A TOML file of 40 kB with one key of 20 000 dotted parts holds `tomllib` for seconds and deep brackets exhaust the
-stack (CPython gh-149231), so both formats are scanned in linear time before they are parsed. No knowledge of what a
-campaign is; lines count from 1.
+A TOML file of 40 kB with one key of 20 000 dotted parts occupies `tomllib` for seconds, and deep brackets exhaust the
+stack (CPython gh-149231), so both formats are scanned in linear time before they are parsed. The module does not depend
+on the content of campaigns; lines count from 1.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from tvsbayes.files.disk import decode
 TOML_BYTES_MAX = 65_536
 JSON_BYTES_MAX = 4 * 1024 * 1024
 LINES_CHARS_MAX = 1024 * 1024
-"""Characters that are searched for lines of keys: a refusal takes less than a second, whatever the file."""
+"""Number of characters searched for the lines of keys: an error takes less than a second for any file."""
 DOTTED_PARTS_MAX = 8
 NESTING_MAX = 16
 # Both patterns always match from an opening quote to its end or the end of the line (or file), never
-# backtracking: a scan is linear whatever a stranger writes.
+# backtracking: the scan is linear for any content.
 _JSON_STRING = re.compile(r'"(?:\\.|[^"\\])*+"?', re.DOTALL)
 _TOML_STRING_OR_COMMENT = re.compile(
     r'"""(?:\\.|[^\\])*?(?:"""|\Z)|\'\'\'.*?(?:\'\'\'|\Z)|"(?:\\[^\n]|[^"\\\n])*+"?|\'[^\'\n]*+\'?|#[^\n]*+',
     re.DOTALL,
 )
 _TOKEN = re.compile(rf"{_TOML_STRING_OR_COMMENT.pattern}|[\[\]{{}}=:,.\n]|[^\s\[\]{{}}=:,.\"'#]++", re.DOTALL)
-"""Tokens by which keys are located: whole strings and comments, marks, and words between them."""
+"""Tokens by which keys are located: strings and comments, marks, and the words between them."""
 
 
 def _refusal(file: str, code: str, found: str, allowed: str, remedy: str, line: int | None = None) -> InputError:
@@ -41,7 +41,7 @@ def _refusal(file: str, code: str, found: str, allowed: str, remedy: str, line: 
 
 
 def _check_nesting(bare: str, file: str) -> None:
-    """Refuses brackets nested too deeply for a recursive parser; `bare` is text without its strings."""
+    """Refuse brackets nested too deeply for a recursive parser; `bare` is text without its strings."""
     depth = 0
     for bracket in re.finditer(r"[\[\]{}]", bare):
         depth = depth + 1 if bracket.group() in "[{" else max(depth - 1, 0)
@@ -52,14 +52,14 @@ def _check_nesting(bare: str, file: str) -> None:
 
 
 def _key_lines(text: str) -> dict[str, int]:
-    """The first line of every key and table of a valid TOML or JSON text, by dotted path.
+    """Find the first line of every key and table of a valid TOML or JSON text, by dotted path.
 
-    Paths have no indices of lists. Comments and the content of values are no keys.
+    Paths contain no list indices. Comments and the content of values are not keys.
     """
     explicit: dict[str, int] = {}
     implied: dict[str, int] = {}
     in_value = text.lstrip().startswith("{")
-    # Open brackets with the path of their content; "" is the top of a TOML file, where a line ends a value.
+    # Open brackets with the path of their content; "" is the top level of a TOML file, where a line ends a value.
     brackets: list[tuple[str, tuple[str, ...]]] = [("[" if in_value else "", ())]
     key_parts: list[str] = []
     key_line, line = 1, 1
@@ -106,15 +106,15 @@ def _unquoted(key: str) -> str:
     try:
         return str(json.loads(key))
     except ValueError:
-        # An escape that only TOML has.
+        # The escape exists only in TOML.
         return key.strip('"')
 
 
 class Keys:
-    """One table of a TOML or JSON file, read key by key; its errors know file, line and dotted key."""
+    """One table of a TOML or JSON file, read key by key; its errors state file, line and dotted key."""
 
     def __init__(self, values: dict[str, object], file: str, text: str, path: tuple[str, ...] = ()):
-        """`values` as parsed from `text`; `path` leads from the top of the file to this table."""
+        """`values` as parsed from `text`; `path` is the path from the top of the file to this table."""
         self.values, self.file, self.text, self.path = values, file, text, path
 
     def __contains__(self, key: str) -> bool:
@@ -129,13 +129,13 @@ class Keys:
         return refusal(code, file=self.file, line=line, column=column, found=found, allowed=allowed, remedy=remedy)
 
     def _line(self, keys: tuple[str, ...]) -> int | None:
-        """The line of the innermost of `keys` that is in the text."""
+        """The line of the innermost of `keys` that occurs in the text."""
         lines = _key_lines(self.text)
         paths = (".".join(keys[:count]) for count in range(len(keys), 0, -1))
         return next((lines[path] for path in paths if path in lines), None)
 
     def only(self, names: Iterable[str]) -> None:
-        """Refuses keys outside `names`."""
+        """Refuse keys outside `names`."""
         names = tuple(names)
         for key in self.values:
             if key not in names:
@@ -148,7 +148,7 @@ class Keys:
         return self.values[key]
 
     def number(self, key: str, low: float, high: float) -> float:
-        """A finite number in [low, high]; booleans are none."""
+        """A finite number in [low, high]; booleans are refused."""
         allowed = f"a finite number from {low:g} to {high:g}" if low < high else f"exactly {low:g}"
         value = self._get(key, allowed)
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
@@ -164,7 +164,7 @@ class Keys:
         return value
 
     def text_value(self, key: str, chars_max: int = 200) -> str:
-        """Printable text without line breaks; `notes`-like fields raise `chars_max` and may hold breaks."""
+        """Printable text without line breaks; fields such as `notes` have a larger `chars_max` and may have breaks."""
         allowed = f"printable text of at most {chars_max} characters"
         value = self._get(key, allowed)
         breaks = "\n\t" if chars_max > 200 else ""
@@ -175,7 +175,7 @@ class Keys:
         return value
 
     def flag(self, key: str) -> bool:
-        """Whether the switch is on."""
+        """The boolean under `key`."""
         value = self._get(key, "true or false")
         if not isinstance(value, bool):
             raise self.refuse(key, "boolean", "true or false", "write true or false without quotes")
@@ -191,7 +191,7 @@ class Keys:
         return str(value)
 
     def numbers(self, key: str, low: float, high: float, most: int) -> tuple[float, ...]:
-        """One number in [low, high], or a list of 1 to `most` different ones."""
+        """One number in [low, high], or a list of 1 to `most` different numbers."""
         allowed = f"a number from {low:g} to {high:g}, or a list of up to {most} different ones"
         value = self._get(key, allowed)
         entries = value if isinstance(value, list) else [value]
@@ -203,7 +203,7 @@ class Keys:
         return tuple(values)
 
     def table(self, key: str) -> Keys:
-        """The table under `key`; an absent one is empty."""
+        """The table under `key`; empty if it is absent."""
         value = self.values.get(key, {})
         if not isinstance(value, dict):
             path = escaped(".".join((*self.path, key)))
@@ -221,7 +221,7 @@ class Keys:
 
 
 def parse_toml(data: bytes, file: str) -> Keys:
-    """The top table of a TOML file; size, nesting and dotted keys are capped before parsing."""
+    """Parse the top table of a TOML file; size, nesting and dotted keys are capped before parsing."""
     refuse = partial(_refusal, file)
     if len(data) > TOML_BYTES_MAX:
         raise refuse("size", f"{len(data)} bytes", f"at most {TOML_BYTES_MAX} bytes", "shorten it")
@@ -250,7 +250,7 @@ def parse_toml(data: bytes, file: str) -> Keys:
 
 
 def parse_json(data: bytes, file: str) -> Keys:
-    """The top object of a JSON file: capped, no duplicate keys, finite numbers only."""
+    """Parse the top object of a JSON file: limited size, no duplicate keys, finite numbers only."""
     refuse = partial(_refusal, file)
     if len(data) > JSON_BYTES_MAX:
         raise refuse("size", f"{len(data)} bytes", f"at most {JSON_BYTES_MAX} bytes", "shorten it")
@@ -294,10 +294,10 @@ def parse_json(data: bytes, file: str) -> Keys:
 
 
 def toml_value(value: object) -> str:
-    """One value in TOML; a dictionary becomes an inline table, a list or tuple an array.
+    """Format a value in TOML; a dictionary becomes an inline table, a list or tuple an array.
 
     Raises:
-        TypeError: for what no campaign or rig file holds.
+        TypeError: a type that no campaign or rig file contains.
     """
     if isinstance(value, bool):
         return str(value).lower()
@@ -317,6 +317,6 @@ def toml_value(value: object) -> str:
 
 
 def toml_line(key: str, value: object) -> str:
-    """`key = value`, the key quoted where TOML asks for it."""
+    """Format `key = value`, the key quoted where TOML requires it."""
     bare = re.fullmatch(r"[A-Za-z0-9_-]+", key)
     return f"{key if bare else json.dumps(key, ensure_ascii=False)} = {toml_value(value)}"

@@ -1,7 +1,7 @@
-"""Tables that other programs wrote, as text cells: CSV of any usual kind, lines of "name: value", sheets of XLSX files.
+"""Tables of other programs, as text cells: CSV of any usual kind, lines of "name: value", sheets of XLSX files.
 
-Detected and described: encoding, separator of cells, decimal commas, lines above the names of columns.
-Numbers get decimal points; nothing else of a cell changes. Rows count from 1 as in the file; sizes are capped
+The reader detects and describes encoding, separator, decimal commas and lines above the column names.
+Numbers get decimal points; cells are otherwise unchanged. Rows count from 1 as in the file; sizes are limited
 before anything is unpacked.
 """
 
@@ -25,22 +25,22 @@ from tvsbayes.files.disk import read_bytes
 
 COLUMNS_MAX = 200
 UNPACKED_BYTES_MAX = 512 * 1024 * 1024
-"""Sum of the sizes that the parts of an XLSX file state."""
+"""Largest sum of the sizes that the parts of an XLSX file state."""
 CELL_CHARS_MAX = 1000
 CELLS_MAX = 10_000_000
-"""Of a sheet, empty ones before the last of each row included."""
+"""Largest number of cells of a sheet, with empty ones before the last of each row."""
 SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "spaces"}
-"""In the order in which they are tried: a decimal comma must not pass for a separator."""
+"""Separators in the order in which they are tried: a decimal comma must not be taken for one."""
 ROWS_TRIED = 50
 ABOVE_MAX = 50
-"""Lines that may stand above the names of columns: serial number, date, operator."""
+"""Largest number of lines above the names of columns: serial number, date, operator."""
 PAIRED_SHARE = 0.6
-"""Share of "name: value" lines that makes a file of pairs; the others are messages at a program's start."""
+"""Least share of "name: value" lines in a file of pairs; the others are messages at a program's start."""
 _WIDE = {
     SEPARATORS[","]: "decimal commas beside commas between cells? export with semicolons, or with decimal points",
     SEPARATORS[" "]: "dates or texts with spaces? export with semicolons or tabs between cells",
 }
-"""Why rows may have more cells than there are names, and what to do, by separator."""
+"""Why rows may have more cells than names, with the remedy, by separator."""
 _MARKS = (
     (b"\xff\xfe\x00\x00", "utf-32", "UTF-32"),
     (b"\x00\x00\xfe\xff", "utf-32", "UTF-32"),
@@ -54,7 +54,7 @@ _PAIR = re.compile(
     r"(?P<name>[^\W\d][^:=,;|\t]*?)\s*[:=]\s*(?P<value>[+-]?(?:\d+[.,]\d+|\d+\.?|\.\d+)(?:[eE][+-]?\d+)?)"
     r"(?:\s*(?P<unit>\u00b0|mm|um|\u00b5m|deg|rad|counts|steps|ms|us|s)(?![\w:]))?\s*(?:[,;|\t]\s*|\s+|$)"
 )
-"""One of "Step: 200, Angle: 12.5 deg"."""
+"""One pair of "Step: 200, Angle: 12.5 deg"."""
 _CLOCK = re.compile(r"\[?(\d{1,2}):(\d{2}):(\d{2}(?:\.\d+)?)\]?\s*(?:->|>)?\s*")
 """Time of day that a serial monitor puts before a line."""
 DAY_S = 86400.0
@@ -67,8 +67,8 @@ class ForeignTable:
 
     Attributes:
         file: its name, for messages.
-        kind: what was detected, in words.
-        lines: row of the file of each row.
+        kind: the detected format, in words.
+        lines: row in the file of each row.
         columns: cells by name of column; "column 1" ... where the file has no names.
         first_line: row of the file with the names, or the first row where there are none.
     """
@@ -83,10 +83,10 @@ class ForeignTable:
         return len(self.lines)
 
     def require_rows(self) -> None:
-        """Refuse a table of names alone.
+        """Refuse a table without rows.
 
         Raises:
-            InputError: there is no row.
+            InputError: the table has no row.
         """
         if not self.lines:
             found, remedy = "no rows below the names of the columns", "name the sheet or file with the data"
@@ -101,7 +101,7 @@ class ForeignTable:
 
 
 def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
-    """The table in a file.
+    """Read the table in a file.
 
     Args:
         path: a CSV or XLSX file of at most 64 MiB and 200 000 rows.

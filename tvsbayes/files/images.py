@@ -1,8 +1,8 @@
-"""PNG and JPEG: their size before anything is decoded, their pixels, and PNG written.
+"""PNG and JPEG: the size before decoding, the pixels, and the writing of PNG.
 
-Pictures are (height, width, 3), blue, green, red (OpenCV's order), uint8 or, from PNG of 16 bits, uint16 as the file
-has them; pixel coordinates those of the sensor. The size in a header is checked against a cap first: a small file
-can ask for gigabytes.
+Pictures are (height, width, 3), blue, green, red (OpenCV's order), uint8 or, from PNG of 16 bits, uint16 as in the
+file; pixel coordinates are those of the sensor. The size in a header is checked against a limit first: a small file
+can state gigabytes.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 IMAGE_BYTES_MAX = 64 * 1024 * 1024
 IMAGE_PIXELS_MAX = 50_000_000
-"""A PNG of 0.9 MB can ask for 30000 x 30000 pixels: 4 s and 1.8 GB in the decoder."""
+"""A PNG of 0.9 MB can state 30000 x 30000 pixels: 4 s and 1.8 GB in the decoder."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
-"""The last chunk with its checksum: decoders accept its loss, but a copy cut short has lost more."""
+"""The last chunk with its checksum: decoders accept its absence, but a truncated file lacks more."""
 _PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 6: (8, 16)}
 """Accepted bit depths by colour type of a PNG: grey, RGB, palette, RGBA (PNG specification 3, 11.2.1)."""
 _JPEG_MAGIC = b"\xff\xd8\xff"
@@ -42,11 +42,11 @@ WINDOW_PX = 48
 """Side of the cut-out around a spot on a page, pixels of the camera."""
 JPEG_QUALITY = 80
 WHITE_BITS = (8, 10, 12, 14, 16)
-"""Bits of cameras' converters; a file of 16 bits holds the values of any of them."""
+"""Bits of cameras' converters; a file of 16 bits can hold the values of each of them."""
 
 
 def image_size(data: bytes, file: str) -> tuple[int, int]:
-    """Width and height in pixels that a PNG or JPEG announces, before anything is decoded.
+    """Width and height in pixels from the header of a PNG or JPEG, before decoding.
 
     Raises:
         InputError: neither PNG nor JPEG, an unusual kind, or too many pixels.
@@ -74,7 +74,7 @@ def image_size(data: bytes, file: str) -> tuple[int, int]:
 
 
 def is_deep(data: bytes) -> bool:
-    """Whether a PNG with a whole header has 16 bits per channel."""
+    """Whether a PNG with a complete header has 16 bits per channel."""
     return data.startswith(PNG_SIGNATURE) and data[24] == _PNG_DEEP
 
 
@@ -101,12 +101,12 @@ def _jpeg_size(data: bytes, refuse: Callable[[str, str, str], InputError]) -> tu
 
 
 def decode_image(data: bytes, file: str) -> np.ndarray:
-    """The picture in `data` as (height, width, 3) uint8 or uint16, channels blue, green, red (OpenCV's order).
+    """Decode the picture in `data` as (height, width, 3) uint8 or uint16, channels blue, green, red (OpenCV's order).
 
     The orientation tag of a JPEG is ignored: pixel coordinates are those of the sensor.
 
     Raises:
-        InputError: what `image_size` refuses, and data that the decoder cannot read.
+        InputError: as `image_size`, or the decoder cannot read the data.
     """
     width, height = image_size(data, file)
     import cv2
@@ -124,13 +124,13 @@ def decode_image(data: bytes, file: str) -> np.ndarray:
 
 
 def read_image(path: Path, folder: Path | None = None) -> np.ndarray:
-    """A PNG or JPEG as (height, width, 3) uint8 or uint16, blue, green, red; inside `folder` where given.
+    """Read a PNG or JPEG as (height, width, 3) uint8 or uint16, blue, green, red; inside `folder` where given.
 
-    PNG is what the package writes: its checksum finds every damaged byte, a JPEG's damage shows only as wrong
+    The package writes PNG: its checksum detects every damaged byte, whereas damage of a JPEG appears only as wrong
     pixels.
 
     Raises:
-        InputError: what `read_bytes` and `decode_image` refuse.
+        InputError: as `read_bytes` and `decode_image`.
     """
     return decode_image(read_bytes(path, IMAGE_BYTES_MAX, folder), escaped(Path(path).name))
 
@@ -149,16 +149,16 @@ def png_bytes(image: np.ndarray) -> bytes:
 
 
 def white_level(largest: int) -> int:
-    """Full scale of the smallest usual converter that can give `largest`: 4095 for 3000."""
+    """Full scale of the smallest usual converter whose range contains `largest`: 4095 for 3000."""
     return next((2**bits - 1 for bits in WHITE_BITS if largest < 2**bits), 2 ** WHITE_BITS[-1] - 1)
 
 
 def in_grey_levels(image: np.ndarray, white: int | None = None) -> np.ndarray:
-    """Pixels in grey levels of 8 bits (DN): uint8 as they are, uint16 as float32 with `white` at 255, nothing rounded.
+    """Pixels in grey levels of 8 bits (DN): uint8 unchanged, uint16 as float32 with `white` at 255, not rounded.
 
     Args:
         image: uint8 or uint16 of any shape.
-        white: the largest value that the camera gives; by default that of the picture.
+        white: the camera's full scale; by default estimated from the picture.
     """
     import numpy as np
 
@@ -175,7 +175,7 @@ def small_picture(image: np.ndarray, centre_px: tuple[float, float] | None = Non
     Args:
         image: from `decode_image`.
         centre_px: (u, v) of a spot in it.
-        width_px: of a whole picture.
+        width_px: largest width of a whole picture.
 
     Raises:
         ValueError: the centre lies outside the picture.

@@ -1,8 +1,8 @@
-"""A folder that only its user can have written, with sealed files that a program may run again.
+"""A folder that only its user can have written, with sealed files that may be executed later.
 
-A file begins with a magic and the SHA-256 of what follows. It is read only where file and folder belong to the user
-who runs this and neither may be written by anybody else (POSIX; Windows keeps a user's folders apart by itself). A
-cache that cannot be read or written is no error: the caller makes its content anew.
+A file begins with a magic number and the SHA-256 of its content. It is read only where file and folder belong to the
+user of this process and nobody else may write them (POSIX; Windows separates users' folders by itself). A cache that
+cannot be read or written is no error: the caller computes its content again.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class OwnFolder:
 
     Attributes:
         path: of the folder; `make` creates it.
-        file_bytes_max: a larger file is not read.
-        bytes_max: of all files together; `write` removes those used longest ago.
+        file_bytes_max: larger files are not read.
+        bytes_max: largest total size; `write` removes the files used longest ago.
     """
 
     path: Path
@@ -51,7 +51,7 @@ class OwnFolder:
         return "others may write into it" if _others_may_change(status) else ""
 
     def make(self) -> str:
-        """Create the folder for this user alone where there is none; the answer is that of `fault`."""
+        """Create the folder for this user alone where it is missing; returns `fault`."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self.path.mkdir(mode=0o700, exist_ok=True)
@@ -60,7 +60,7 @@ class OwnFolder:
         return self.fault()
 
     def read(self, name: str) -> bytes | None:
-        """The content of a sealed file, None where it is missing, damaged, too large or perhaps written by another."""
+        """The content of a sealed file; None where it is missing, damaged, too large or perhaps of another user."""
         if self.fault():
             return None
         try:
@@ -80,7 +80,7 @@ class OwnFolder:
         return content if intact else None
 
     def write(self, name: str, content: bytes) -> bool:
-        """Seal a content under a name, whole or not at all; True where it was written."""
+        """Write a sealed file, completely or not at all; True where it was written."""
         data = MAGIC + hashlib.sha256(content).digest() + content
         if self.make() or len(data) > self.file_bytes_max:
             return False
@@ -96,7 +96,7 @@ class OwnFolder:
         return True
 
     def _prune(self) -> None:
-        """Remove the files used longest ago, as many as are too many."""
+        """Remove the files used longest ago until the rest fits `bytes_max`."""
         try:
             files = [(entry.stat(), Path(entry.path)) for entry in os.scandir(self.path) if entry.is_file()]
             total = sum(status.st_size for status, _ in files)

@@ -1,6 +1,6 @@
 """Pan and tilt: names, directions of motion and their signs, sides of approach, constants of an axis.
 
-A counter counts up when pan turns left and tilt goes up. A side of approach is the direction of the last move.
+A counter increases when pan turns left and tilt goes up. A side of approach is the direction of the last move.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ PanApproach = Literal["left", "right", "unknown"]
 TiltApproach = Literal["up", "down", "unknown"]
 
 SENSES: dict[Axis, tuple[str, str]] = {"pan": ("left", "right"), "tilt": ("up", "down")}
-"""Direction of positive and of negative motion of an axis; every other table of axes follows from this one."""
+"""Direction of positive and of negative motion of an axis; all other tables of axes follow from it."""
 AXES: tuple[Axis, Axis] = ("pan", "tilt")
 DIRECTIONS = (*SENSES["pan"], *SENSES["tilt"])
 SIDES: dict[str, tuple[str, str]] = {axis: (negative, positive) for axis, (positive, negative) in SENSES.items()}
@@ -26,7 +26,7 @@ DIRECTION_SIGNS: dict[str, tuple[Axis, int]] = {
 APPROACH_SIGN = {**{direction: sign for direction, (_, sign) in DIRECTION_SIGNS.items()}, "unknown": 0}
 """Sense of motion of an approach (formulation 2)."""
 HOME_APPROACH: tuple[PanApproach, TiltApproach] = ("left", "up")
-"""Side from which homing ends, per axis, by default."""
+"""Default side from which homing ends, per axis."""
 FULL_TURN_DEG = 360.0
 """Period of the wheel (the output member); a shorter one is the pinion's."""
 HOME_SD_DEG = 0.05
@@ -39,7 +39,7 @@ def direction_of(axis: str, change: float) -> str:
 
 
 def bad_approach(axis: str, name: object, allowed: tuple[str, ...]) -> InputError:
-    """The error of an approach that is not allowed for the axis."""
+    """The error for an approach that the axis does not allow."""
     return InputError(
         "approach",
         f"{axis} approach {escaped(str(name))!r}; allowed: {', '.join(allowed)}",

@@ -52,12 +52,12 @@ NO_PIXELS = (None, None, None, None)
 UNDETECTED = "undetected"
 """Status of a look whose pictures wait for `detect`."""
 PIXEL_SD_MIN, PIXEL_SD_MAX = 1e-4, 100.0
-"""Of a standard uncertainty of a centre, px."""
+"""Limits of the standard uncertainty of a centre, px."""
 TEMPERATURE_MAX = 1000.0
-"""Of a machine, degC, either sign."""
+"""Largest absolute temperature of a machine, degC."""
 APERTURE_MAX_DEG = 360.0
-"""Of a reading of the aperture, either sign."""
-# How far outside the image a centroid may lie, in image sizes: half a spot at the edge, not a wrong file.
+"""Largest absolute aperture reading."""
+# Distance outside the image allowed for a centroid, in image sizes: half a spot at the edge, not a wrong file.
 _IMAGE_MARGIN = 0.1
 _SIDES = "approach side from anfahrt seite von lado desde aproximacion cote approche depuis"
 _WHERE_OK = filled_where_ok("give the value or a refusal reason")
@@ -67,7 +67,7 @@ _PIXEL = Column(
     rule=_WHERE_OK,
 )
 _PIXEL_SD = Column("their standard uncertainties, px", PIXEL_SD_MIN, PIXEL_SD_MAX, rule=_WHERE_OK)
-# At a correlation of 1 the two coordinates of a centroid would be one.
+# At a correlation of 1 the two coordinates of a centroid would be the same.
 _CORRELATION = Column(
     "optional: correlation of u and v",
     *(-0.999999, 0.999999),
@@ -157,8 +157,7 @@ class Move:
 class Spot:
     """A row of `spots.csv`: raw centroids and their standard uncertainties, px.
 
-    All eight are numbers where `status` is "ok"; any of them may be None elsewhere, and no estimator
-    reads the pixels of a spot that is not "ok".
+    All eight are numbers where `status` is "ok"; else any of them may be None, and no estimator reads them.
     """
 
     spot: Annotated[
@@ -215,7 +214,7 @@ class Spot:
     ruv_right: Annotated[float, _CORRELATION] = 0.0
 
     def renumbered(self, number: int, move: int) -> Spot:
-        """The same with another id, after another move, of no experiment."""
+        """The spot with another id, after another move, without experiment."""
         return replace(self, spot=number, move=move, experiment=None, point=None)
 
 
@@ -230,13 +229,13 @@ SPOTS = CsvKind(Spot, "spots.csv", "a row for every look, in any order")
 
 
 NAME_ACQUIRED = "acquired campaign"
-"""Of a run whose rig file has no name."""
+"""Name of a run whose rig file has none."""
 NAMES_BY_DEFAULT = (NAME_ACQUIRED, "my rig", "my axis", "my campaign")
-"""Names of templates, the last of earlier versions; a campaign with one of them counts as unnamed."""
+"""Names in templates, the last from earlier versions; a campaign with one of them counts as unnamed."""
 
 
 def title_of(header: Mapping[str, object], path: Path | None) -> str:
-    """The name in the header unless it is a template's, else the folder's, without line breaks."""
+    """The name in the header, or the folder's where the header has a template's name; without line breaks."""
     name = str(header.get("name") or "").strip()
     if name and name not in NAMES_BY_DEFAULT:
         return name
@@ -248,7 +247,7 @@ def title_of(header: Mapping[str, object], path: Path | None) -> str:
 class Campaign(Shown):
     """A campaign folder, checked. `header` holds the keys of `campaign.toml` outside `[rig]`.
 
-    `spots` are sightings, and `stereo` is `NO_STEREO`, where the mechanism says so.
+    `spots` are sightings, and `stereo` is `NO_STEREO`, where the mechanism has sightings.
     """
 
     moves: tuple[Move, ...]
@@ -262,7 +261,7 @@ class Campaign(Shown):
     def points_mm(self) -> np.ndarray:
         """Each spot triangulated by the stated cameras, frame S, shape (n, 3); computed once, read-only.
 
-        NaN where there is no spot, and outside the range of the lens model.
+        NaN where a look has no spot, and outside the range of the lens model.
         """
         points = np.full((len(self.spots), 3), np.nan)
         usable = np.array([spot.status == "ok" for spot in self.spots], dtype=bool)
@@ -281,7 +280,7 @@ class Campaign(Shown):
         return title_of(self.header, self.path)
 
     def shown(self) -> View:
-        """Counts, and the looks with the counters behind them."""
+        """Counts, and the looks with their counters."""
         ok = sum(spot.status == "ok" for spot in self.spots)
         kind, word = (SIGHTINGS, "sightings") if self.rig.mechanism.sightings else (SPOTS, "spots")
         title = f"Campaign {self.title!r}: {len(self.moves)} moves, {len(self.spots)} {word} ({ok} ok)"
@@ -306,7 +305,7 @@ def with_pixels(
     sds_px: Sequence[float | None] = NO_PIXELS,
     correlations: Sequence[float] = (0.0, 0.0),
 ) -> Spot:
-    """The row with another result of a detector.
+    """The row with a new result of the detector.
 
     Args:
         spot: the row.
@@ -348,7 +347,7 @@ def parse_moves(data: bytes, file: str = MOVES.file) -> tuple[Move, ...]:
 def check_experiments(
     table: Table, experiments: Sequence[int | None], points: Sequence[int | None], usable: Sequence[bool]
 ) -> None:
-    """Refuses an experiment without point or the reverse, and twice the same point of an experiment that counts."""
+    """Refuse an experiment without point or the reverse, and a point that usable looks of an experiment repeat."""
     pairs = list(zip(experiments, points, strict=True))
     for row, (experiment, point) in enumerate(pairs):
         if (experiment is None) != (point is None):
@@ -372,12 +371,12 @@ def parse_spots(data: bytes, file: str, moves: int, stereo: Stereo) -> tuple[Spo
 
 
 def _points_once(table: Table, values: Values) -> None:
-    """Refuses a point of an experiment that was seen twice; a look that found no spot may be taken again."""
+    """Refuse a point of an experiment that was seen twice; a look without a spot may be repeated."""
     check_experiments(table, values["experiment"], values["point"], [status == "ok" for status in values["status"]])
 
 
 def _in_image(table: Table, values: Values, stereo: Stereo) -> None:
-    """Refuses a centroid outside the image."""
+    """Refuse a centroid outside the image."""
     statuses, pixels = values["status"], [values[column] for column in PIXELS]
     for column, centres in zip(PIXELS, pixels, strict=True):
         extent = float(stereo.image_width if column[0] == "u" else stereo.image_height)
@@ -389,7 +388,7 @@ def _in_image(table: Table, values: Values, stereo: Stereo) -> None:
 
 
 def _outside_remedy(values: Sequence[float | None], extent: float, exchanged: bool) -> str:
-    """The remedy of pixels outside the image: correct a column, a cell, or the size of the pictures."""
+    """The remedy for pixels outside the image: correct a column, a cell, or the size of the pictures."""
     if exchanged:
         return "u and v are exchanged: u counts columns to the right, v rows down"
     outside = sum(value is not None and not -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN for value in values)
@@ -410,7 +409,7 @@ def _exchanged(pixels: Sequence[Sequence[float | None]], statuses: Sequence[str]
     return all(value is None or -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN for value, extent in cells)
 
 
-# campaign.toml is written last: a folder without it is unfinished.
+# campaign.toml is written last: a folder without it is incomplete.
 _FILES = {
     "stereo.json": JSON_BYTES_MAX,
     "moves.csv": CSV_BYTES_MAX,
@@ -451,10 +450,10 @@ def sighted_campaign(
 
 
 def read_campaign(folder: Path | str) -> Campaign:
-    """Reads and checks a campaign folder (data/docs/campaign-files.md). Never `truth.json`, frames or results.
+    """Read and check a campaign folder (data/docs/campaign-files.md), without `truth.json`, frames and results.
 
     Args:
-        folder: contains `campaign.toml`, `stereo.json`, `moves.csv` and `spots.csv`; that of a head with sightings
+        folder: contains `campaign.toml`, `stereo.json`, `moves.csv` and `spots.csv`; for a head with sightings
             `campaign.toml`, `moves.csv` and `sightings.csv`.
 
     Returns:
@@ -462,7 +461,7 @@ def read_campaign(folder: Path | str) -> Campaign:
         `classic` and the plots.
 
     Raises:
-        InputError: anything that is missing, malformed or contradicts itself, with file, line and column.
+        InputError: missing, malformed or contradictory entries, with file, line and column.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -483,7 +482,7 @@ def read_campaign(folder: Path | str) -> Campaign:
 
 
 def _no_campaign(folder: Path) -> InputError:
-    """The error of a folder without campaign.toml; it names subfolders that have one."""
+    """The error of a folder without campaign.toml; it lists subfolders that contain one."""
     campaigns = sorted(path.parent.name for path in folder.glob("*/campaign.toml"))
     remedy = "`tvsbayes new OUT` begins a campaign"
     if campaigns:
@@ -503,7 +502,7 @@ def campaign_templates() -> dict[str, bytes]:
 def head_templates(sightings: bool) -> dict[str, bytes]:
     """The commented files of an empty campaign of a pan-tilt head, with its rig file."""
     files = templates("head_templates", MOVES, SIGHTINGS if sightings else SPOTS)
-    # Lines that begin with #sightings or #spots belong to heads of that kind alone.
+    # Lines that begin with #sightings or #spots apply only to heads of that kind.
     prefix, other_prefix = (b"#sightings ", b"#spots ") if sightings else (b"#spots ", b"#sightings ")
     return {
         name: b"".join(
@@ -524,7 +523,7 @@ def spots_bytes(spots: Iterable[Spot]) -> bytes:
 
 
 def looks_file(campaign: Campaign) -> str:
-    """Name of the table of its looks."""
+    """Name of the file with the campaign's looks."""
     return SIGHTINGS.file if campaign.rig.mechanism.sightings else SPOTS.file
 
 
@@ -546,7 +545,7 @@ def campaign_toml(campaign: Campaign) -> bytes:
 
 
 def campaign_bytes(campaign: Campaign) -> dict[str, bytes]:
-    """The four files of a campaign in the order of writing; reading them gives the same campaign.
+    """The four files of a campaign in the order of writing; reading them returns the same campaign.
 
     Raises:
         InputError: `read_campaign` would refuse the files.
@@ -561,7 +560,7 @@ def campaign_bytes(campaign: Campaign) -> dict[str, bytes]:
 
 
 def write_campaign(campaign: Campaign, folder: Path) -> None:
-    """Writes the four files of a campaign into a new or empty folder.
+    """Write the four files of a campaign into a new or empty folder.
 
     Raises:
         InputError: the folder is not empty or cannot be written; `campaign_bytes` refuses (then nothing is written).
@@ -575,8 +574,8 @@ def write_campaign(campaign: Campaign, folder: Path) -> None:
 def input_hashes(campaign: Campaign) -> dict[str, str]:
     """SHA-256 of the inputs of an estimate, by "moves", "spots", "stereo" and "rig".
 
-    Taken over the values in canonical text, spots in order of id: line endings, digits beyond double
-    precision, the order of columns, the campaign's name and its notes do not count.
+    Taken over the values in canonical text, spots in order of id: line endings, digits beyond double precision, the
+    order of columns, the campaign's name and its notes do not affect them.
     """
     contents = {
         "moves": moves_bytes(campaign.moves),
@@ -588,11 +587,11 @@ def input_hashes(campaign: Campaign) -> dict[str, str]:
 
 
 def ordered_spots(campaign: Campaign) -> list[Spot]:
-    """Spots, or sightings, with status ok in the order of the filter."""
+    """Spots, or sightings, with status ok in the order in which the filter takes them."""
     ok = [s for s in campaign.spots if s.status == "ok"]
     return sorted(ok, key=lambda s: (s.move, s.spot))
 
 
 def pixels_of(spots: Iterable[Spot]) -> np.ndarray:
-    """`PIXELS` of the spots, shape (spots, 4); NaN where there are none."""
+    """`PIXELS` of the spots, shape (spots, 4); NaN for missing values."""
     return np.array([[getattr(spot, name) for name in PIXELS] for spot in spots], dtype=float).reshape(-1, 4)

@@ -1,4 +1,4 @@
-"""The header of `campaign.toml`: object, time, operator and conditions of a measurement; all keys outside `[rig]`."""
+"""The header of `campaign.toml`: object, time, operator and conditions of a measurement; all keys but `[rig]`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _HEADER_KEYS = (
 
 
 def _header_value(keys: Keys, key: str) -> object:
-    """One checked value outside `[rig]`, by the kind its key asks for."""
+    """One checked value outside `[rig]`, by the type that its key requires."""
     if key in _TEXT_CHARS:
         return keys.text_value(key, _TEXT_CHARS[key])
     if key in _QUANTITIES:
@@ -53,7 +53,7 @@ def _header_value(keys: Keys, key: str) -> object:
 
 
 def parse_header(keys: Keys) -> dict[str, object]:
-    """The keys of `campaign.toml` outside `[rig]`, checked; their list is closed."""
+    """The keys of `campaign.toml` outside `[rig]`, checked; other keys are refused."""
     keys.word("format", ("tvsbayes-campaign/1",))
     keys.only(_HEADER_KEYS)
     plain_keys = [key for key in keys.values if key not in ("format", "rig", *_HEADER_TABLES)]
@@ -70,8 +70,8 @@ def parse_header(keys: Keys) -> dict[str, object]:
 def mechanism_of(folder: Path) -> str:
     """The instrument of a campaign folder, by `format` and `[rig] mechanism` of its `campaign.toml`.
 
-    A file `sightings.csv` means a head with sightings in place of spots. An unreadable folder counts as a scanner's,
-    whose reader reports the fault.
+    A file `sightings.csv` means a head with sightings in place of spots. An unreadable folder counts as a scanner's:
+    the scanner's reader then reports the fault.
     """
     values = header_values(folder)
     format_name = str(values.get("format", "")).partition("/")[0].removeprefix("tvsbayes-")

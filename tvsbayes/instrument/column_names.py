@@ -1,4 +1,4 @@
-"""Which column of a foreign table is which field of `moves.csv` and `spots.csv`, by the words in its name.
+"""Assign columns of a foreign table to fields of `moves.csv` and `spots.csv`, by the words in their names.
 
 A name is split into words ("xLeft (px)" is x, left, px); a rule is a set of words that it must contain. Units in the
 name are read too. A field that two columns match is ambiguous until the user names the column.
@@ -19,9 +19,9 @@ from tvsbayes.instrument.campaign import MOVES, PIXELS, SPOTS
 
 _COLUMNS = {**SPOTS.columns, **MOVES.columns}
 FIELDS = tuple(dict.fromkeys((*MOVES.columns, *SPOTS.columns)))
-"""All that a table can give, by the columns of our files."""
+"""All fields that a table can give, by the columns of this package's files."""
 COUNTERS = ("pan_steps", "tilt_steps")
-# English, German, Spanish, French; without accents, as `words_of` takes names apart.
+# English, German, Spanish, French; without accents, as `words_of` splits names.
 _SIDES = {
     "left": {"left", "l", "links", "linke", "linker", "izq", "izquierda", "izquierdo", "gauche", "cam1", "1"},
     "right": {"right", "r", "rechts", "rechte", "rechter", "der", "derecha", "derecho", "droite", "droit", "cam2", "2"},
@@ -35,17 +35,17 @@ SPREAD = {
     *("desviacion", "incertidumbre", "ecart", "incertitude"),
 }
 """Words of standard uncertainties."""
-# A word of an approach is one beside a word of its axis alone.
+# A word of an approach counts only beside a word of its axis.
 _NAMED = [column for name, column in _COLUMNS.items() if not name.endswith("_approach")]
 SECONDS = {"us": 1e-6, "ms": 1e-3, "min": 60.0, "h": 3600.0}
-"""Units of times that a name may say, in s."""
+"""Units of time that a name may state, in s."""
 DEGREES = {
     **{"deg": 1.0, "rad": math.degrees(1.0), "mrad": math.degrees(1e-3), "urad": math.degrees(1e-6)},
     **{"arcmin": 1 / 60, "arcsec": 1 / 3600, "gon": 0.9},
 }
-"""Units of angles that a name may say, in deg."""
+"""Units of angle that a name may state, in deg."""
 READING_UNITS = (*DEGREES, "mm", "um", "nm", "thou", "counts", "inch")
-"""Units of readings that a name may say."""
+"""Units of readings that a name may state."""
 _UNITS = {
     "us": {"us", "usec", "micros", "microseconds", "mikrosekunden", "microsegundos", "microsecondes"},
     "ms": {"ms", "msec", "millis", "milliseconds", "millisekunden", "milisegundos", "millisecondes"},
@@ -63,19 +63,19 @@ _UNITS = {
     "um": {"um", "micron", "microns", "micrometer", "micrometers", "mikrometer", "micrometros", "micrometres"},
     "nm": {"nm", "nanometer", "nanometers", "nanometros", "nanometres"},
     "counts": {"counts", "count", "ticks", "inkremente"},
-    # Last in `READING_UNITS`: "in" is a word too.
+    # Last in `READING_UNITS`, because "in" is also a word.
     "inch": {"in", "inch", "inches", "zoll", "pulgadas", "pouces"},
 }
 
 
 @dataclass(frozen=True)
 class ColumnMapping:
-    """Columns of a table by the field that they give.
+    """Columns of a table by the field to which they belong.
 
     Attributes:
         columns: column by field.
-        ambiguous: fields that several columns could give, with these.
-        unused: columns that give nothing.
+        ambiguous: fields that several columns match, with these columns.
+        unused: columns that match no field.
     """
 
     columns: dict[str, str]
@@ -85,27 +85,27 @@ class ColumnMapping:
 
 def words_of(name: str) -> list[str]:
     """The words of a column's name in small letters without accents: "xLeft_px", "X left [px]" and "XL" alike."""
-    # "Winkel [\u00b0]", but no temperature, and no number as in "N\u00b0".
+    # "Winkel [\u00b0]" is an angle; a temperature ("\u00b0C") and "N\u00b0" are not.
     name = re.sub("(?<![A-Za-z])\u00b0(?![ ]*[CF])", " deg ", name)
-    # Of microseconds, and of all other millionths, the ascii letters alone would be another unit.
+    # The ASCII letters alone of microseconds, and of all other millionths, would be another unit.
     plain = re.sub("\u03bc(?=[A-Za-z])", "u", unicodedata.normalize("NFKD", name)).encode("ascii", "ignore").decode()
     words = []
     for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+", plain):
         word = part.lower()
-        # XL, ur, su: an axis and a camera written together.
+        # XL, ur, su: axis and camera written together.
         joined = re.fullmatch(r"(s?)([xyuv])([lr])|([lr])([xyuv])|(s)([xyuv])", word)
         words += [piece for piece in joined.groups() if piece] if joined else [word]
     return words
 
 
 def unit_of_name(name: str, units: Iterable[str]) -> str | None:
-    """The first of `units` that the name says, of `SECONDS`, `DEGREES` or `READING_UNITS`; "h" is no angle."""
+    """The first of `units` that the name states, of `SECONDS`, `DEGREES` or `READING_UNITS`; "h" is no angle."""
     words = set(words_of(name))
     return next((unit for unit in units if words & _UNITS[unit]), None)
 
 
 def _field_of(name: str) -> str | None:
-    """The field that a column's name means."""
+    """The field to which a column belongs by its name."""
     listed = words_of(name)
     word_set = set(listed)
     axes = [axis for axis, spellings in _IMAGE_AXES.items() if word_set & spellings]
@@ -120,7 +120,7 @@ def _field_of(name: str) -> str | None:
 
 
 def field_by_word(words: Sequence[str], columns: Iterable[Column]) -> str | None:
-    """The column that the first known word is a name of: "sheet_id" is of the sheet, "id of sheet" of the id."""
+    """The column named by the first known word: "sheet_id" names the sheet, "id of sheet" the id."""
     known = {word: column.name for column in columns for word in column.names.split()}
     return next((known[word] for word in words if word in known), None)
 
@@ -135,9 +135,9 @@ def map_columns(
 
     Args:
         columns: their names.
-        stated: column by field, as the user states it; an empty column: the table has none.
+        stated: column by field, as the user states it; "" where the table has no such column.
         fields: all fields.
-        field_of: returns the field that a name means.
+        field_of: returns the field of a name.
 
     Raises:
         InputError: a field or column that does not exist.
@@ -166,10 +166,10 @@ def map_columns(
 
 
 def missing(columns: Iterable[str], moves_known: bool) -> list[str]:
-    """Fields without which a table makes no campaign.
+    """Fields that a campaign requires and the table lacks.
 
     Args:
-        columns: fields that it gives.
+        columns: fields in the table.
         moves_known: whether moves are listed elsewhere already.
     """
     given = set(columns)

@@ -1,6 +1,6 @@
 """Conditions of each move: time since the machine was switched on, and its temperature.
 
-Times in s on the clock of `time_s`, whose zero is `created` of campaign.toml; degC. Of scanner and axis. No JAX.
+Times in s on the clock of `time_s`, whose zero is `created` of campaign.toml; degC. For scanner and axis. No JAX.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ class TimedMove(Protocol):
 
 
 def check_power(keys: Keys, header: Mapping[str, object]) -> None:
-    """Refuses a `powered_on` that cannot be related to the clock of the moves.
+    """Refuse a `powered_on` that cannot be placed on the clock of the moves.
 
     Raises:
-        InputError: it or `created` is no time, only one has a time zone, or `created` is earlier.
+        InputError: `powered_on` or `created` is no time, only one has a time zone, or `created` is earlier.
     """
     if "powered_on" not in header:
         return
@@ -79,7 +79,7 @@ def kelvin_at(moves: Sequence[TimedMove], times: np.ndarray, clock: np.ndarray) 
 
     Args:
         moves: with their temperatures.
-        times: shape (n,), on the same clock as the next.
+        times: shape (n,), on the same clock as `clock`.
         clock: times of the moves.
     """
     readings = [(recorded_at, move.temperature_degC) for recorded_at, move in zip(clock, moves, strict=True)]
@@ -98,10 +98,10 @@ def interpolated(moves: Sequence[TimedMove]) -> int:
 
 
 def unseen_shifts(moves: Sequence[TimedMove], priors: Mapping[str, Prior]) -> tuple[str, ...]:
-    """Parameters of shifts of a scanner's zeros that its moves cannot determine.
+    """Parameters of the shifts of a scanner's zeros that its moves cannot determine.
 
-    Moves without times do not determine the creep, those at one temperature no thermal shift, and zeros without creep
-    no time constant.
+    Moves without times do not determine the creep, moves at one temperature do not determine the thermal shift, and
+    zeros without creep do not determine the time constant.
     """
     no_creep = all(priors[name].value == 0 == priors[name].u for name in names_of("creep_deg"))
     names = CREEP_NAMES if not warm_minutes(moves).any() else names_of("creep_minutes") if no_creep else ()

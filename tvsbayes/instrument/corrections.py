@@ -1,7 +1,7 @@
-"""Corrections of whole tables that `check` names: the other sign of a counter, rows shifted, cameras exchanged.
+"""Corrections of whole tables that `check` suggests: opposite sign of a counter, shifted rows, exchanged cameras.
 
-Moves and spots in, moves and spots out; steps and px. An approach is the observed direction of the beam's motion: it
-does not change with the sign of a counter.
+Input and output are moves and spots; steps and px. An approach is the observed direction of the beam's motion: it does
+not change with the sign of a counter.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Correction:
     """Changes to be made in the tables of a scanner.
 
     Attributes:
-        flipped: axes whose counter gets the other sign.
+        flipped: axes whose counter changes its sign.
         shifts: numbers to be added to the moves of looks.
         swapped: left and right centres are exchanged.
         pixels_from: coordinate of the centre of the first pixel so far; it becomes 0.
@@ -90,12 +90,12 @@ def shift_of(text: str) -> Shift:
 def corrected(
     moves: Sequence[Move] | None, spots: Sequence[Spot] | None, correction: Correction, count: int | None = None
 ) -> CorrectedTables:
-    """Tables with a correction applied.
+    """Apply a correction to tables.
 
     Args:
-        moves: rows of `moves.csv`; None where there are none to write.
-        spots: rows of `spots.csv`, in the order of the file; likewise.
-        correction: what is to be changed.
+        moves: rows of `moves.csv`; None where they are not to be written.
+        spots: rows of `spots.csv`, in the order of the file; None where they are not to be written.
+        correction: the changes.
         count: number of moves, where `moves` is None.
 
     Raises:
@@ -143,7 +143,7 @@ _COUNTERS = tuple(f"{axis}_steps" for axis in AXES)
 
 
 def _shifted(spots: tuple[Spot, ...], shift: Shift, count: int | None) -> tuple[tuple[Spot, ...], str]:
-    """Looks with other moves; one whose move is not listed keeps its number and is left out by its status."""
+    """Assign looks to other moves; a look whose new move is missing keeps its number and is excluded by its status."""
     first_key = (-1, -1)
     if shift.spot is not None:
         keys = [(spot.move, spot.spot) for spot in spots if spot.spot == shift.spot]
@@ -166,7 +166,7 @@ def _shifted(spots: tuple[Spot, ...], shift: Shift, count: int | None) -> tuple[
 
 
 def _swapped(spot: Spot) -> Spot:
-    """A look with the centres of both cameras exchanged, with their uncertainties and correlations."""
+    """Exchange the centres of both cameras in a look, with their uncertainties and correlations."""
     left, right = CAMERAS
     names = [f.name for f in fields(Spot) if f"_{left}" in f.name]
     right_of = {name: name.replace(f"_{left}", f"_{right}") for name in names}
@@ -175,7 +175,7 @@ def _swapped(spot: Spot) -> Spot:
 
 
 def _from_zero(spot: Spot, first: int) -> Spot:
-    """A look with centres counted from 0."""
+    """Count the centres of a look from 0."""
     centre = {name: getattr(spot, name) for name in PIXELS}
     shifted: dict[str, Any] = {name: None if value is None else value - first for name, value in centre.items()}
     return replace(spot, **shifted)

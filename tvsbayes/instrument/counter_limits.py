@@ -16,7 +16,7 @@ HOME_KEYS = {axis: f"{axis}_home_steps" for axis in AXES}
 
 
 def unseen(counters: Sequence[float], ranges: Iterable[Sequence[float]]) -> str:
-    """Which counters (pan, tilt) lie outside the lowest and highest ones seen, in words; "" where none does."""
+    """Which counters (pan, tilt) lie outside the lowest and highest ones seen, in words; "" if none."""
     outside = [
         f"{axis} {counter:g} lies outside {low:g} to {high:g}"
         for axis, counter, (low, high) in zip(AXES, counters, ranges, strict=True)
@@ -33,7 +33,7 @@ class CounterLimits:
 
     @classmethod
     def of(cls, positioner: Mapping[str, object]) -> CounterLimits:
-        """The limits among the entries of `[positioner]`, which its reader has checked."""
+        """The limits among the entries of `[positioner]`, which the reader has checked."""
         limits = {key: value for key, value in positioner.items() if isinstance(value, int)}
         return cls({axis: (limits.get(low), limits.get(high)) for axis, (low, high) in LIMIT_KEYS.items()})
 
@@ -50,7 +50,7 @@ class CounterLimits:
     def within[Number: (int, float)](
         self, widest: Mapping[str, tuple[Number, Number]]
     ) -> dict[str, tuple[int | Number, int | Number]]:
-        """Lowest and highest counter by axis, those of `widest` where none is stated."""
+        """Lowest and highest counter by axis, the limits of `widest` where none are stated."""
         return {
             axis: (widest[axis][0] if low is None else low, widest[axis][1] if high is None else high)
             for axis, (low, high) in self.steps.items()

@@ -1,6 +1,6 @@
 """Cells of a foreign table by field: numbers in any notation, times, homings, words of a status.
 
-Numbers may be degrees, minutes and seconds, have fractions or carry a unit. Assumptions about what the table does not
+Numbers may be degrees, minutes and seconds, have fractions or include a unit. Assumptions about what the table does not
 state are listed in words.
 """
 
@@ -33,16 +33,16 @@ BAD = {
 }
 """Words of a status, in lower case without accents."""
 WORDS_SHOWN = 5
-"""Words of a status in a message about excluded rows."""
+"""Largest number of status words in a message about excluded rows."""
 NO_NUMBER = {"nan", "n/a", "#n/a", "null"}
-"""What programs write into a cell that has no number, in lower case."""
+"""Entries of programs in a cell without a number, in lower case."""
 EPOCH_SCALES = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3}
-"""Seconds of a unit by the least number that counts it since 1970; smaller ones are seconds."""
+"""Seconds per unit by the least number that counts this unit since 1970; smaller numbers are seconds."""
 _FLAGS = {"": False, "0": False, "false": False, "1": True, "true": True}
 """Cells of a column that marks homings, in lower case."""
 _CLOCK = re.compile(r"[0-9]{1,2}:[0-9]{2}:[0-9]{2}(?:\.[0-9]{1,6})?")
 _DOTTED_DATE = re.compile(r"([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})[ ,T]+")
-"""Day, month and year: the only order with dots."""
+"""Day, month and year: the only order written with dots."""
 _SEXAGESIMAL = re.compile(
     r"(?P<sign>[+-]?)\s*(?P<d>\d+)\s*(?:\u00b0|deg|d|:|\s)\s*(?P<m>\d{1,2}(?:\.\d+)?)\s*(?:['\u2032m:]|\s|$)\s*"
     r"(?:(?P<s>\d{1,2}(?:\.\d+)?)\s*(?:\"|''|\u2033|s)?)?"
@@ -56,9 +56,9 @@ class PlainColumn:
     """A column of numbers.
 
     Attributes:
-        cells: as plain decimal numbers; those without a number are unchanged.
-        unit: stated in the cells.
-        remark: their notation, "" where they were plain.
+        cells: plain decimal numbers; cells without a number are unchanged.
+        unit: the unit stated in the cells.
+        remark: the notation of the cells, "" where they were plain.
     """
 
     cells: tuple[str, ...]
@@ -67,7 +67,7 @@ class PlainColumn:
 
 
 def plain_column(name: str, cells: Sequence[str]) -> PlainColumn:
-    """A column whose cells may be in degrees, minutes and seconds, have fractions or carry one unit."""
+    """A column whose cells may be in degrees, minutes and seconds, have fractions or include one unit."""
     filled = [cell for cell in cells if cell]
     if all(NUMBER.fullmatch(cell) for cell in filled):
         return PlainColumn(tuple(cells), None, "")
@@ -93,7 +93,7 @@ def _in(
 
 
 def _one_unit(name: str, cells: Sequence[str]) -> PlainColumn | None:
-    """A column whose cells carry one unit each, all the same."""
+    """A column whose cells all include the same unit."""
     matches = [_WITH_UNIT.fullmatch(cell) if cell else None for cell in cells]
     units = {match["unit"].strip() for match in matches if match}
     if len(units) != 1 or any(match is None and cell for match, cell in zip(matches, cells, strict=True)):
@@ -107,7 +107,7 @@ def _one_unit(name: str, cells: Sequence[str]) -> PlainColumn | None:
 
 
 def _degrees(cell: str) -> float | None:
-    """Decimal degrees; the sign applies to the sum, also of -0 deg 12 min."""
+    """Decimal degrees; the sign applies to the sum, also for -0 deg 12 min."""
     match = _SEXAGESIMAL.fullmatch(cell)
     if match is None or NUMBER.fullmatch(cell):
         return None
@@ -118,7 +118,7 @@ def _degrees(cell: str) -> float | None:
 
 
 def _fraction(cell: str) -> float | None:
-    """A number with a common fraction, of inches: 1 3/8; plain numbers in the same column are allowed."""
+    """A number with a common fraction, used for inches: 1 3/8; plain numbers in the same column are allowed."""
     text = cell.removesuffix('"').removesuffix("in").strip()
     if NUMBER.fullmatch(text):
         return float(text)
@@ -141,16 +141,16 @@ class FieldCells:
         return field in self.columns
 
     def text(self, field: str) -> list[str]:
-        """Cells of a field; empty ones where no column gives it."""
+        """Cells of a field; empty where the table has no column for it."""
         return list(self.table.columns[self.columns[field]]) if field in self else [""] * len(self.table)
 
     def read(self, column: Column, low: float | None = None, high: float | None = None, optional: bool = False) -> list:
-        """Values of a column of our files; an empty cell is the default, or None where `optional` allows it.
+        """Values of a column of this package's files; an empty cell is the default, or None where `optional` allows it.
 
         Args:
             column: its limits apply where no others are given; "200.0" is a whole number.
-            low: in place of the column's.
-            high: in place of the column's.
+            low: replaces the column's limit.
+            high: replaces the column's limit.
             optional: whether a cell may be empty although the column has no default.
         """
         field, optional = column.name, optional or column.may_be_empty
@@ -192,10 +192,10 @@ def temperatures_of(cells: FieldCells, assumed: list[str]) -> list[float | None]
 
 
 def homings_of(cells: FieldCells, assumed: list[str]) -> list[bool]:
-    """Whether the axes homed before each row but the first, which begins a segment anyway.
+    """Whether the axes homed before each row but the first, which always begins a segment.
 
     Numbers of segments change at a homing. Where all cells are 0 or 1 and a 0 follows a 1, they are marks instead: each
-    1 is a homing, and the 0 after it is none.
+    1 is a homing, a 0 is none.
     """
     if "segment" not in cells:
         return [False] * len(cells.table)
@@ -239,7 +239,7 @@ def seconds_of(cells: FieldCells, assumed: list[str]) -> list[float] | None:
                     seconds.append(day_s + DAY_S * ((seconds[-1] // DAY_S if seconds else 0) + bool(next_day)))
                     continue
                 date_time = datetime.datetime.fromisoformat(_DOTTED_DATE.sub(_iso_date, cell, count=1))
-                # Without a zone as UTC: this machine's summer time is not the logger's.
+                # A time without zone is UTC: this computer's daylight saving time is not the logger's.
                 seconds.append((date_time if date_time.tzinfo else date_time.replace(tzinfo=datetime.UTC)).timestamp())
             except ValueError as error:
                 allowed = "seconds, or a date and time such as 2026-01-15T10:00:00 or 15.01.2026 10:00:00"
@@ -260,7 +260,7 @@ def word_of(status: str) -> str:
 
 
 def left_out(cells: FieldCells, statuses: Iterable[str], noun: str) -> list[str]:
-    """A sentence on the rows that a column of statuses excludes: an unknown word may mean that the row is good."""
+    """A sentence on the rows excluded by a column of statuses: an unknown word may mean that the row is good."""
     counts = Counter(escaped(text, 24) for text in statuses if text.strip() and word_of(text) not in GOOD)
     if not counts:
         return []
@@ -273,13 +273,13 @@ def left_out(cells: FieldCells, statuses: Iterable[str], noun: str) -> list[str]
 
 
 def status_of(cells: FieldCells, row: int, values: Mapping[str, float | None], noun: str) -> str:
-    """The word "ok", or why a row cannot be used, as our tables allow it.
+    """The status "ok", or the reason why a row cannot be used, as this package's tables allow it.
 
     Args:
-        cells: of the table.
-        row: of it.
+        cells: cells of the table.
+        row: number of the row.
         values: by field; a row that is ok has all of them.
-        noun: noun for a row.
+        noun: word for a row.
     """
     text = cells.text("status")[row]
     if (word := word_of(text)) in GOOD or not word:
@@ -292,12 +292,12 @@ def status_of(cells: FieldCells, row: int, values: Mapping[str, float | None], n
 
 
 def readable(text: str, prefix: str, chars_max: int) -> str:
-    """A cell's text as our tables allow it: printable, on one line, no formula of a spreadsheet.
+    """A cell's text as this package's tables allow it: printable, on one line, not a spreadsheet formula.
 
     Args:
         text: of the cell.
-        prefix: put before a text that begins with = + - or @: without the signs "-50" and "50" would be equal.
-        chars_max: longer ones are cut.
+        prefix: put before a text that begins with = + - or @; removing the signs would make "-50" and "50" equal.
+        chars_max: longer texts are cut.
     """
     printable = "".join(c if c.isprintable() else " " for c in text)
     printable = " ".join(printable.split())

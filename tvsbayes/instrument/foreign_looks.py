@@ -1,7 +1,7 @@
-"""Moves and looks of a foreign table: counters, pixels, times and angles converted to those of our files.
+"""Moves and looks of a foreign table: counters, pixels, times and angles converted to those of this package's files.
 
 One row is one look, one move, or both; successive rows at the same counters are looks after one move. Assumptions about
-what the table does not state are listed in words. Px with the integer at the centre of a pixel, (0, 0) the first.
+what the table does not state are listed in words. Px with the integer at the centre of a pixel, (0, 0) the first pixel.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from tvsbayes.instrument.foreign_cells import (
 SD_PX = 0.1
 """Standard uncertainty of a centroid where a table states none; the fit estimates its scale."""
 FOUR_POINT = ("experiment", "point")
-"""Fields of the four-point method: both or neither."""
+"""Fields of the four-point method; a table has both or neither."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Notation:
 
     Attributes:
         pixels_from: coordinate of the centre of the first pixel: 0, or 1 as in MATLAB.
-        angle_unit: "deg" or "rad" of aperture readings; None: by the name of the column, else degrees.
+        angle_unit: "deg" or "rad" of aperture readings; None: the unit in the column's name, else degrees.
         sd_px: standard uncertainty of a centroid where no column states it.
         relative: counters are the steps of each move instead of absolute ones.
         approach: side from which pan and tilt came to the first row; "unknown" where it was not recorded.
@@ -70,7 +70,7 @@ class ForeignLooks:
     Attributes:
         moves: rows of `moves.csv`; None where the table has no counters.
         spots: rows of `spots.csv`; None where it has no pixels.
-        assumed: assumptions about what it does not state, in words.
+        assumed: assumptions about what the table does not state, in words.
     """
 
     moves: tuple[Move, ...] | None
@@ -87,7 +87,7 @@ def looks_of(
         table: the foreign table.
         columns: its columns by field; see `column_names`.
         notation: conventions of its numbers.
-        known_moves: present moves, for a table of looks alone.
+        known_moves: existing moves, for a table of looks alone.
 
     Raises:
         InputError: a cell that is no value of its field; looks whose moves are unknown.
@@ -107,7 +107,7 @@ def looks_of(
 
 
 def _listed_moves(cells: FieldCells, known_moves: Sequence[Move]) -> list[int]:
-    """The move of every row of a table without counters."""
+    """Number of the move of every row of a table without counters."""
     table, count = cells.table, len(cells.table)
     if "move" not in cells:
         if len(known_moves) != count:
@@ -125,14 +125,14 @@ def _listed_moves(cells: FieldCells, known_moves: Sequence[Move]) -> list[int]:
 
 @dataclass(frozen=True)
 class RowMoves:
-    """Moves of a table, and the number of the move of every row."""
+    """Moves of a table, and the move number of every row."""
 
     moves: tuple[Move, ...]
     move_of_row: tuple[int, ...]
 
 
 def moves_of_rows(cells: FieldCells, notation: Notation, assumed: list[str]) -> RowMoves:
-    """The moves of a table with counters; adds its assumptions to `assumed`.
+    """Derive the moves of a table with counters; assumptions are appended to `assumed`.
 
     Raises:
         InputError: a cell that is no value of its field.
@@ -180,7 +180,7 @@ def moves_of_rows(cells: FieldCells, notation: Notation, assumed: list[str]) -> 
 
 
 def _renumbered(cells: FieldCells, move_of_row: Sequence[int]) -> list[str]:
-    """A note where a table without pixels numbers its moves otherwise than `moves.csv`, which pairs the pictures."""
+    """A note where a table without pixels numbers its moves differently from `moves.csv`, by which pictures pair."""
     field = "move" if "move" in cells else "spot"
     if field not in cells or any(name in cells for name in PIXELS):
         return []
@@ -196,7 +196,7 @@ def _renumbered(cells: FieldCells, move_of_row: Sequence[int]) -> list[str]:
 
 
 def _approaches(cells: FieldCells, axis: Axis, default: str) -> list[str]:
-    """The side from which an axis came, of every row."""
+    """The approach side of an axis, for every row."""
     field, allowed = f"{axis}_approach", (*SENSES[axis], "unknown")
     words = [word.lower() or default for word in cells.text(field)]
     for row, word in enumerate(words):
@@ -226,7 +226,7 @@ def _spots(cells: FieldCells, move_of_row: Sequence[int], notation: Notation, as
         assumed.append("spot: numbers are missing or repeated, so looks are numbered by their rows")
     four_point = [field for field in FOUR_POINT if field in cells]
     if len(four_point) == 1:
-        # "Point 1 ... 200" counts looks.
+        # A column "point" with 1 ... 200 counts looks.
         column = escaped(cells.columns[four_point[0]])
         assumed.append(f"column {column} is left out: no column gives the other of {' and '.join(FOUR_POINT)}")
     experiments, points = (

@@ -1,7 +1,7 @@
-"""Unrecorded homing sides as a few hypotheses that data can distinguish (formulation 3.1).
+"""Unrecorded homing sides as a few hypotheses that the data can distinguish (formulation 3.1).
 
-Homing ends always at one side, always at the other, or anywhere each time; one hypothesis ("way") for each axis whose
-first rows all say `unknown`. A single unknown among recorded homings stays "anywhere".
+Homing ends always at one side, always at the other, or anywhere each time; each axis whose first rows all say `unknown`
+has one such hypothesis ("way"). A single unknown among recorded homings stays "anywhere".
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def prior_chance(sides: Sides) -> float:
 
 
 def homed(campaign: Campaign, sides: Sides) -> Campaign:
-    """The campaign with these homing sides in place of unknown ones."""
+    """The campaign with these homing sides in place of unknown sides."""
     stated = {f"{axis}_approach": side for axis, side in sides.items() if side != ANYWHERE}
     if not stated:
         return campaign

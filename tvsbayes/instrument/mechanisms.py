@@ -1,4 +1,4 @@
-"""The list of instruments with two axes: mechanism of the beam, kind of observation, names of the geometry.
+"""List of the instruments with two axes: mechanism of the beam, kind of observation, names of the geometry.
 
 Vectors of parameters have one layout (`parameters.NAMES`). A mechanism other than the scanner uses the coordinates of
 the mirrors for its own terms: the gears' coordinates, and every array, are the same.
@@ -29,11 +29,11 @@ class Mechanism:
 
     Attributes:
         key: its name in the program.
-        word: in rig and campaign files.
-        sightings: looks are sightings; else a stereo pair sees its spots.
-        terms: of its geometry, by the scanner's parameter whose coordinate they use.
-        fixed: values of parameters that do not apply to it; documents do not name them.
-        own_priors: priors other than the registry's.
+        word: its name in rig and campaign files.
+        sightings: looks are sightings; else spots seen by a stereo pair.
+        terms: terms of its geometry, by the scanner's parameter whose coordinate they use.
+        fixed: values of parameters that do not apply to it; documents omit them.
+        own_priors: priors that replace the registry's.
     """
 
     key: str
@@ -44,7 +44,7 @@ class Mechanism:
     own_priors: Mapping[str, Prior] = field(default_factory=dict)
 
     def __reduce__(self) -> tuple[Callable[[str], Mechanism], tuple[str]]:
-        """A copy, also in another process, is the entry of the list: mechanisms are compared by identity."""
+        """Copying, also to another process, returns the entry of the list: mechanisms are compared by identity."""
         return mechanism_by_key, (self.key,)
 
     @cached_property
@@ -54,11 +54,11 @@ class Mechanism:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of all coordinates."""
+        """Names of all coordinates."""
         return tuple(self.parameters)
 
     def named(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Its names of the coordinates that the scanner has under these names; other names are unchanged."""
+        """The mechanism's names for the scanner's coordinates of these names; other names are unchanged."""
         return tuple(self.terms[name].name if name in self.terms else name for name in names)
 
     @cached_property
@@ -72,7 +72,7 @@ class Mechanism:
 
     @cached_property
     def rig_names(self) -> tuple[str, ...]:
-        """Names of coordinates with a prior in `[rig]`, which are the first."""
+        """Names of coordinates with a prior in `[rig]`, which come first."""
         return self.names[: len(RIG_NAMES)]
 
     @cached_property
@@ -82,7 +82,7 @@ class Mechanism:
 
     @cached_property
     def priors(self) -> dict[str, Prior]:
-        """Defaults; parameters that do not apply are fixed."""
+        """Default priors; parameters that do not apply are fixed."""
 
         def prior(name: str) -> Prior:
             stated = self.own_priors.get(name, self.parameters[name].prior)
@@ -113,9 +113,9 @@ SIGHTING_HEAD = Mechanism(
     {"flexure_deg": Prior(0.0, 0.1)},
 )
 MECHANISMS: dict[str, Mechanism] = {mechanism.key: mechanism for mechanism in (TWO_MIRROR, HEAD, SIGHTING_HEAD)}
-"""By key."""
+"""Mechanisms by key."""
 WORDS: tuple[str, ...] = tuple(dict.fromkeys(mechanism.word for mechanism in MECHANISMS.values()))
-"""Of the key `mechanism` in files, the default first."""
+"""Values of the key `mechanism` in files, the default first."""
 
 
 def mechanism_by_key(key: str) -> Mechanism:
@@ -124,5 +124,5 @@ def mechanism_by_key(key: str) -> Mechanism:
 
 
 def mechanism_of(word: str, sightings: bool) -> Mechanism:
-    """By its word in files, and whether there are sightings instead of spots; the scanner has none."""
+    """The mechanism by its word in files and the kind of looks; the scanner has no sightings."""
     return next(m for m in MECHANISMS.values() if (m.word, m.sightings) == (word, sightings))

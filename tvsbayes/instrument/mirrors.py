@@ -1,10 +1,10 @@
-"""The laser over the plane mirrors of the positioner, once for Python floats, NumPy and JAX (formulation 3.2).
+"""Trace the laser over the positioner's plane mirrors, with Python floats, NumPy or JAX (formulation 3.2).
 
 Lengths in mm, angles in rad. Frame P: z along the pan axis, up; x along the nominal beam at pan angle 0; y left; origin
 where the nominal laser meets mirror 1. Frame Q is P turned by the pan angle: the mirrors are fixed there. Many vectors
-are three arrays, one for each of x, y, z (`Vectors`): loops of XLA over one wide array are several times faster than
-over an axis of three. Named tuples are trees of arrays for JAX without importing it. `functions` is `math` for floats,
-`numpy` for arrays (also complex, for derivatives) or `jax.numpy`.
+are stored as three arrays, for x, y and z (`Vectors`): XLA's loops over one wide array are several times faster than
+over an axis of length three. JAX handles named tuples as trees of arrays without an import here. `functions` is `math`
+for floats, `numpy` for arrays (also complex, for derivatives) or `jax.numpy`.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 type Numbers = Any
-"""A float, or an array of NumPy or JAX; all of a call broadcast."""
+"""A float, or an array of NumPy or JAX; all arguments of a call broadcast."""
 type Materialise = Callable[[Any], Any]
-"""Makes the compiler compute a tree of arrays once, see `model.geometry.materialise`."""
+"""Makes the compiler compute a tree of arrays once; see `model.geometry.materialise`."""
 
 
 def unchanged(tree: Any) -> Any:
-    """The tree itself, without a compiler."""
+    """Return the tree itself, where nothing is compiled."""
     return tree
 
 
@@ -37,7 +37,7 @@ class Vectors(NamedTuple):
         return cls(stacked[0], stacked[1], stacked[2])
 
     def stacked(self) -> Numbers:
-        """One array of shape (3, ...) whose first axis is x, y, z, by the functions of the components' own kind."""
+        """One array of shape (3, ...) whose first axis is x, y, z, by the array functions of the components' type."""
         functions = self.x.__array_namespace__()
         return functions.stack(functions.broadcast_arrays(*self))
 
@@ -50,11 +50,11 @@ class Vectors(NamedTuple):
         return Vectors(self.x - other.x, self.y - other.y, self.z - other.z)
 
     def __mul__(self, factor: Numbers) -> Vectors:
-        """Longer by a factor."""
+        """Scaled by a factor."""
         return Vectors(self.x * factor, self.y * factor, self.z * factor)
 
     def __rmul__(self, factor: Numbers) -> Vectors:
-        """The same with the factor on the left; a plain tuple would be repeated."""
+        """Scaled by a factor on the left; a plain tuple would be repeated."""
         return self * factor
 
     def dot(self, other: Vectors) -> Numbers:
@@ -68,7 +68,7 @@ class Vectors(NamedTuple):
         return Vectors(x, y, self.x * other.y - self.y * other.x)
 
 
-# NumPy's arrays leave a product with `Vectors` to this class; they would convert the tuple to an array.
+# Makes NumPy arrays leave products with `Vectors` to this class; else they would convert the tuple to an array.
 Vectors.__array_ufunc__ = None  # type: ignore[attr-defined]
 
 
@@ -88,7 +88,7 @@ class Turn(NamedTuple):
         return Vectors(self.cosine * v.x - self.sine * v.y, self.sine * v.x + self.cosine * v.y, v.z)
 
     def back(self, v: Vectors) -> Vectors:
-        """Vectors turned the other way."""
+        """Vectors turned in the opposite sense."""
         return Vectors(self.cosine * v.x + self.sine * v.y, self.cosine * v.y - self.sine * v.x, v.z)
 
 
@@ -126,7 +126,7 @@ class Optics(NamedTuple):
 
     @classmethod
     def of(cls, block: Callable[[str], Numbers]) -> Optics:
-        """From the values, in mm and rad, of a block of `instrument.parameters` by its name."""
+        """Build from `block`, which returns the values of a block of `instrument.parameters` in mm and rad."""
         return cls(*(block(field.replace("_rad", "_deg")) for field in cls._fields))
 
     def leaving(
@@ -156,7 +156,7 @@ def intersect_plane(origin: Vectors, direction: Vectors, point: Vectors, normal:
 
 
 def reflected(ray: Ray, mirrors: Iterable[Mirror], materialise: Materialise = unchanged) -> tuple[Ray, ...]:
-    """The ray after each mirror in order: it starts where the previous ray meets the mirror."""
+    """The ray after each mirror in order: each starts where the previous ray meets the mirror."""
     rays = []
     for mirror in mirrors:
         hit_mm = intersect_plane(*ray, *mirror)
@@ -166,7 +166,7 @@ def reflected(ray: Ray, mirrors: Iterable[Mirror], materialise: Materialise = un
 
 
 def laser_of(optics: Optics, functions: ModuleType) -> Ray:
-    """The laser, at rest in P."""
+    """The laser, fixed in P."""
     tangent_x, tangent_y = (functions.tan(tilt) for tilt in optics.laser_tilt_rad)
     shorter = 1 / functions.sqrt(1 + tangent_x**2 + tangent_y**2)
     x_mm, y_mm = optics.laser_offset_mm
@@ -178,7 +178,7 @@ def mirrors_of(optics: Optics, tilt: Turn, functions: ModuleType) -> tuple[Mirro
 
     Args:
         optics: laser and mirrors.
-        tilt: of the tilt stage by beta, from its zero about the tilt axis.
+        tilt: turn of the tilt stage about the tilt axis by beta, from its zero.
         functions: see the module.
     """
     cos, sin = functions.cos, functions.sin
@@ -203,7 +203,7 @@ def beam_path(
     functions: ModuleType,
     materialise: Materialise = unchanged,
 ) -> BeamPath:
-    """Traces the laser over all mirrors; the signs are part of the contract.
+    """Traces the laser over all mirrors; the signs are documented in the conventions.
 
     Args:
         optics: laser and mirrors.

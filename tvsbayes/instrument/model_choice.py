@@ -1,4 +1,4 @@
-"""The model of a fit: gears simpler or richer than the rig file states, exclusion of spots."""
+"""Choice of the model of a fit: simpler or more general gears than the rig file states, exclusion of spots."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.rig import RigTable
 
 HARMONIC_SD_DEG = 0.1
-"""Prior standard deviation of every part of a freed transmission error."""
+"""Prior standard deviation of every component of a freed transmission error."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class ModelChoice:
 
     Attributes:
         robust: downweight and exclude outliers (Huber weights and a gate on leave-one-out residuals).
-        per_axis: one ratio per axis, the contrasts of left and right, up and down fixed at 0.
+        per_axis: one ratio per axis, with the contrasts of left and right, up and down fixed at 0.
         harmonics: free the transmission error of every axis with a stated period, N(0, 0.1 deg) each, where
             `[rig.prior]` states no other prior; a harmonic stated as exactly 0 counts as unstated.
         no_backlash: gears without play, both backlashes fixed at 0.
@@ -39,7 +39,7 @@ class ModelChoice:
         """The rig with the chosen priors of the gears.
 
         Raises:
-            InputError: `harmonics`, and no axis states the period of its error.
+            InputError: `harmonics` is set, but no axis states the period of its error.
         """
         changed: dict[str, Prior] = {}
         if self.per_axis:
@@ -51,7 +51,7 @@ class ModelChoice:
         if self.perfect_gears:
             error_names = names_of("transmission_error_deg", "drift_deg_per_root_hour", "harmonic_amplitude_deg")
             changed |= dict.fromkeys(error_names, Prior(0.0, 0.0, "half-normal"))
-            # The length of a zero error is not estimated.
+            # The correlation length of an error fixed at zero is not estimated.
             for name in names_of("transmission_error_length_deg"):
                 changed[name] = Prior(stated.priors[name].value, 0.0, "log-normal")
         if self.harmonics:

@@ -1,6 +1,6 @@
-"""The one registry of parameters: name, unit, prior, range and block of each, in the order of all vectors and files.
+"""Registry of parameters: name, unit, prior, range and block of each, in the order of all vectors and files.
 
-Units are those of the names: degrees where one says `deg`, radians where it says `rad`, mm, px; "1" has none.
+Units are those of the names: degrees where a name says `deg`, radians where it says `rad`, mm, px; "1" has none.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ Distribution = Literal["normal", "half-normal", "log-normal"]
 KINDS: tuple[Distribution, ...] = get_args(Distribution)
 Place = Literal["rig", "rig.prior", "stereo"]
 HARMONIC_ORDERS = (1, 2)
-"""Of a transmission error with a stated shape: turns per period."""
+"""Orders of a transmission error with a stated shape, in turns per period."""
 PERIODS_MAX = 3
-"""Of the transmission error of one axis: of its wheel, its pinion, its teeth."""
+"""Largest number of periods of one axis' transmission error: those of wheel, pinion and teeth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +44,10 @@ class Parameter(Quantity):
 
     Attributes:
         place: the table `[rig]` or `[rig.prior]` of a file, or the stereo calibration.
-        prior: default; that of the cameras is the covariance of their calibration.
+        prior: default prior; the cameras' prior is the covariance of their calibration.
         low, high, u_max: lowest and highest value and highest standard uncertainty that a file may state. Wide: they
             detect a wrong unit or a typing error, not an unusual instrument.
-        noise: a scale of noise: the point estimate alternates it with geometry and stereo.
+        noise: a scale of noise: the point estimate alternates between noise scales and geometry with stereo.
         receiver: observable only through aperture readings.
     """
 
@@ -78,7 +78,7 @@ def _block(
     place: Place = "rig.prior",
     **fields: Any,
 ) -> list[Parameter]:
-    """Parameters that differ only in their parts; limits are `low`, `high` and `u_max`."""
+    """Make parameters that differ only in their parts; limits are `low`, `high` and `u_max`."""
     fields |= {"unit": unit, "prior": prior, "words": words, "label": label, "place": place}
     return Parameter.many(block, parts, **fields, **dict(zip(("low", "high", "u_max"), limits, strict=True)))
 
@@ -137,7 +137,7 @@ _PARAMETERS = (
             "the aperture's zero", place="rig", receiver=True),
     *_block("aperture_sd_deg", (), "deg", Prior(0.02, 0.0, "log-normal"), _SD,
             "the scatter of aperture readings", place="rig", noise=True, receiver=True),
-    # No transmission error unless a rig states one or an option of the fit frees it.
+    # The transmission error is zero unless a rig states it or an option of the fit frees it.
     *_block("harmonic_deg", _HARMONICS, "deg", UNSTATED, (-10.0, 10.0, 10.0), "the periodic error of the gears"),
     *_block("transmission_error_deg", AXES, "deg", Prior(0.0, 0.05, "half-normal"), _SCALE,
             "the transmission error, sd", "transmission error sd, {0}", noise=True),
@@ -178,7 +178,7 @@ _TERMS = (
     *_block("tangent_flexure_deg", (), "deg", UNSTATED, _ANGLE,
             "the flexure with cot(elevation)", "flexure, cot(elevation)"),
 )  # fmt: skip
-"""Of a pan-tilt head. TPOINT's terms: elevation_zero IE, azimuth_zero -IA, azimuth_axis_tilt north AN and east -AW,
+"""Terms of a head, with TPOINT's names: elevation_zero IE, azimuth_zero -IA, azimuth_axis_tilt north AN and east -AW,
 axes_not_square NPAE, beam_not_square CA, flexure TF, tangent_flexure TX."""
 _many = Quantity.many
 _LINES = (
@@ -205,11 +205,11 @@ HEAD_TERMS: dict[str, Parameter] = dict(zip(_HEAD_SLOTS, _TERMS, strict=True))
 _OF_HEADS = {term.name: term for term in _TERMS}
 INDEX: dict[str, int] = {name: index for index, name in enumerate(NAMES)}
 COLUMNS: dict[str, int] = INDEX | {term.name: INDEX[name] for name, term in HEAD_TERMS.items()}
-"""Coordinates of parameters, those of heads among them."""
+"""Coordinates of parameters, including those of heads."""
 BLOCKS = REGISTRY.blocks
-"""Names by block; the parameters of a block follow each other."""
+"""Names by block; the parameters of a block are consecutive."""
 RIG_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place != "stereo")
-"""Parameters with a prior in `[rig]`; they are the first."""
+"""Parameters with a prior in `[rig]`; they come first."""
 RIG_PRIORS: dict[str, Prior] = {name: REGISTRY[name].prior for name in RIG_NAMES}
 STEREO_PARAMETER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.place == "stereo")
 """The 24 stereo parameters in the order of `parameter_covariance` of a stereo file."""
@@ -228,18 +228,18 @@ GEAR_ERROR_NAMES: tuple[str, ...] = (
 LOOK_SCATTER_NAMES: tuple[str, ...] = BLOCKS["look_scatter_deg"]
 """Sds of the deviation of the beam's angle at a look from the angle of the axis."""
 CREEP_NAMES: tuple[str, ...] = (*BLOCKS["creep_deg"], *BLOCKS["creep_minutes"])
-"""How far the zeros creep while the machine warms up, and the time constant of both."""
+"""Creep of the zeros during warm-up, and its time constant, which both zeros share."""
 ZERO_SHIFT_NAMES: tuple[str, ...] = (*CREEP_NAMES, *BLOCKS["thermal_deg_per_K"])
 """Shifts of the zeros in time and with the temperature."""
 LATE_NAMES: tuple[str, ...] = (*LOOK_SCATTER_NAMES, *ZERO_SHIFT_NAMES)
-"""Parameters that earlier versions did not have: files omit them at their defaults."""
+"""Parameters that earlier versions did not have: files omit them where they have their defaults."""
 NOISE_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.noise)
 RECEIVER_NAMES: tuple[str, ...] = tuple(p.name for p in _PARAMETERS if p.receiver)
 QUANTITIES: Quantities[Quantity] = Quantities(*_LINES, *_PARAMETERS, *_TERMS, *_DERIVED)
-"""Quantities of scanner and head: parameters and derived ones. `HEADLINES` and `TARGETS` have this order."""
+"""Quantities of scanner and head: parameters and derived quantities. `HEADLINES` and `TARGETS` have this order."""
 HEADLINES = tuple(quantity for quantity in QUANTITIES.values() if quantity.headline)
 TARGETS = {quantity.target: quantity for quantity in HEADLINES if quantity.target}
-"""Headlines that plans and studies may target, by their names there."""
+"""Headlines that plans and studies may target, by their target names."""
 TARGET_ROWS = {target: row for row, target in enumerate(TARGETS)}
 
 

@@ -1,8 +1,8 @@
 """Places of the gears: counters at which errors that repeat by position are estimated. NumPy.
 
-A few counters are their own places, exactly. For many, the processes live on regular places over the observed range,
-and each counter has a share in the four nearest (cubic interpolation): places 2.7 deg apart represent an error that
-changes over 8 deg within 4 % of its sd, a thousandth of its variance.
+With a few counters, each is exactly a place of its own. With many, the processes are defined at regular places over the
+observed range, and each counter has shares in the four nearest (cubic interpolation): places 2.7 deg apart represent an
+error of correlation length 8 deg within 4 % of its sd, a thousandth of its variance.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from tvsbayes.instrument.rig import RigTable
 from tvsbayes.instrument.stops import rests_of
 
 OWN_PLACES_MAX = 12
-"""Largest number of counters of an axis that are their own places; for more, regular places replace them: as many, or
-..."""
+"""Largest number of counters of an axis that are places of their own; for more counters, the number of regular places
+is at least this, ..."""
 SPACING_DEG, PLACES_MAX = 2.7, 24
-"""... one for so many degrees of the output, but at most this number."""
+"""... or one per this angle of the output, up to this maximum."""
 NEAREST = 4
 LEAST_ERROR_RAD = 1e-9
-"""No transmission error below this can be measured: floor of their covariance."""
+"""A smaller transmission error cannot be measured: floor of the covariance."""
 FEW_COUNTERS = 3
-"""With so many observed counters or fewer, transmission error and ratio of an axis are hardly separable."""
+"""With this number of observed counters or fewer, transmission error and ratio of an axis are hardly separable."""
 
 
 def gears_vary(table: RigTable) -> bool:
@@ -38,13 +38,14 @@ def gears_vary(table: RigTable) -> bool:
 
 @dataclass(frozen=True)
 class SeenPlaces:
-    """Places of both axes, pan's first, and the shares of the looks in them.
+    """Places of both axes, pan's first, and the shares of the looks in these places.
 
     Attributes:
         steps: counters, shape (c,).
         on_tilt: places of the tilt axis, shape (c,).
         error_share: share of each look in the transmission error at each place, shape (looks, c).
-        play_share: likewise of the play: half of it with the sign against the side from which the axis came.
+        play_share: share of each look in the play at each place: half of it, with the sign opposite to the side of
+            approach.
     """
 
     steps: np.ndarray

@@ -1,8 +1,8 @@
-"""A plan: its steps and their file, what following it does, how long it takes, and the same in words.
+"""A plan: its steps and their file, the moves and looks that it produces, its duration, and its description in words.
 
-This module alone defines the actions: `home` sets the counters, 0 where its cells are empty, and both axes are then on
-the side from which homing ends; `place` asks for a target; `move` goes to absolute counters, an empty cell leaves the
-axis as it is; `look` observes. A plan that does not begin with `home` begins as homed at 0, 0. Counters in steps.
+This module alone defines the actions. `home` sets the counters, 0 where its cells are empty, and leaves both axes on
+the side from which homing ends. `place` asks for a target. `move` goes to absolute counters; an empty cell leaves the
+axis unchanged. `look` observes. A plan that does not begin with `home` begins homed at 0, 0. Counters in steps.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import rests_of
 
 LOOKS_PER_EXPERIMENT = 4
-"""The paper counts four spots as one experiment; all curves of plans do the same for looks of any kind."""
+"""The paper counts four spots as one experiment; all curves of plans use this number for looks of any kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class PlanStep:
     point: Annotated[int | None, Column("", 1, 4)] = None
 
     def counters(self, start: tuple[int, int]) -> tuple[int, int]:
-        """Counters (pan, tilt) after this step, where the axes stood at `start` before it."""
+        """Counters (pan, tilt) after this step, for axes at `start` before it."""
         if self.action not in ("home", "move"):
             return start
         pan, tilt = (0, 0) if self.action == "home" else start
@@ -54,7 +54,7 @@ class PlanStep:
 
 
 PLANS = CsvKind(PlanStep, "plan.csv", no_rows=("at least one step", "begin with step 0, action home"))
-# Columns that an action must fill, and those it must leave empty; the others are optional.
+# Columns that an action must fill, and columns that it must leave empty; the others are optional.
 _PLAN_ACTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "home": ((), ("target", "experiment", "point")),
     "place": (("target",), ("pan_steps", "tilt_steps", "experiment", "point")),
@@ -64,7 +64,7 @@ _PLAN_ACTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def _check_actions(table: Table, values: Values, sheets: bool = True) -> None:
-    """Refuses an action without its columns or with another's, and a look before a place where there are sheets."""
+    """Refuse an action without its columns or with another's, and a look before a placement where sheets are used."""
     check_experiments(table, values["experiment"], values["point"], [True] * len(table))
     targets, sheet = values["target"], ""
     for row, action in enumerate(values["action"]):
@@ -93,20 +93,20 @@ def parse_plan(data: bytes, file: str = PLANS.file, sheets: bool = True) -> tupl
 
 
 def read_plan(path: Path, sheets: bool = True) -> tuple[PlanStep, ...]:
-    """Reads `plan.csv`: home (counters default to 0), place, move and look steps in order.
+    """Read `plan.csv`: home (counters default to 0), place, move and look steps in order.
 
     Args:
         path: of the file.
-        sheets: looks are at sheets, which must be placed; a head with sightings has none.
+        sheets: looks need placed sheets; a head with sightings has no sheets.
 
     Raises:
-        InputError: wrong order, an action without its columns or with another's, a look before a place.
+        InputError: wrong order, an action without its columns or with another's, a look before a placement.
     """
     return parse_plan(read_bytes(path, CSV_BYTES_MAX), escaped(Path(path).name), sheets)
 
 
 def write_plan(steps: Sequence[PlanStep], path: Path, sheets: bool = True) -> None:
-    """Writes `plan.csv` atomically; refuses what `read_plan` would refuse."""
+    """Write `plan.csv` atomically; refuse steps that `read_plan` would refuse."""
     data = PLANS.content(steps)
     parse_plan(data, escaped(Path(path).name), sheets)
     write_atomically(path, data)
@@ -114,7 +114,7 @@ def write_plan(steps: Sequence[PlanStep], path: Path, sheets: bool = True) -> No
 
 @dataclass
 class PlanBuilder:
-    """Plan steps under construction, and the counters (pan, tilt) they lead to."""
+    """Plan steps under construction, and the counters (pan, tilt) after them."""
 
     steps: list[PlanStep] = field(default_factory=list)
     at: tuple[int, int] = (0, 0)
@@ -125,12 +125,12 @@ class PlanBuilder:
         self.steps.append(PlanStep(len(self.steps), "home", pan, tilt))
 
     def place(self, target: str) -> None:
-        """Ask for a target; one without a name needs no placement."""
+        """Ask for a target; a target without a name needs no placement."""
         if target:
             self.steps.append(PlanStep(len(self.steps), "place", target=target))
 
     def move(self, pan: int | None = None, tilt: int | None = None) -> None:
-        """Move to absolute counters; no step where they are reached already."""
+        """Move to absolute counters; adds no step where the axes are there already."""
         previous, self.at = self.at, PlanStep(0, "move", pan, tilt).counters(self.at)
         if self.at != previous:
             self.steps.append(PlanStep(len(self.steps), "move", *self.at))
@@ -140,18 +140,18 @@ class PlanBuilder:
         self.steps.append(PlanStep(len(self.steps), "look", experiment=experiment, point=point))
 
     def reach(self, axis: Axis, counter: int, sign: int, overshoot: int) -> None:
-        """Arrive at a counter by a move of the given sign, by way of an overshoot where needed."""
+        """Arrive at a counter by a move of the given sign, with an overshoot first where needed."""
         if (counter - self.at[AXES.index(axis)]) * sign <= 0:
             self.move(**{axis: counter - sign * overshoot})
         self.move(**{axis: counter})
 
 
 COST_KEYS = {"home": "move_s", "place": "placement_s", "move": "move_s", "look": "look_s"}
-"""Entry of `[costs]` that each action of a plan takes; a homing counts as a move."""
+"""Entry of `[costs]` for each action of a plan; a homing counts as a move."""
 
 
 def action_seconds(rig: Rig, actions: Mapping[str, int]) -> float:
-    """Duration by `[costs]` of so many actions of each kind, s; an unstated one takes no time."""
+    """Duration by `[costs]` of the given numbers of actions, s; an action without entry takes no time."""
     return sum(count * float(rig.costs_s.get(COST_KEYS[action], 0.0)) for action, count in actions.items())
 
 
@@ -162,7 +162,7 @@ def plan_seconds(rig: Rig, plan: Iterable[PlanStep]) -> float:
 
 @dataclass(frozen=True)
 class PlannedLook:
-    """A look of a plan: its step, the number of the move it follows, and the number of the placement it looks at."""
+    """A look of a plan: its step, the number of the preceding move, and the number of the observed placement."""
 
     step: PlanStep
     move: int
@@ -171,7 +171,7 @@ class PlannedLook:
 
 @dataclass
 class PlanLog:
-    """What a plan does: its moves with their times by `[costs]`, its looks, and the targets placed, in order."""
+    """The moves of a plan with their times by `[costs]`, its looks, and the targets placed, in order."""
 
     moves: list[Move] = field(default_factory=list)
     looks: list[PlannedLook] = field(default_factory=list)
@@ -179,7 +179,7 @@ class PlanLog:
 
     @property
     def at(self) -> tuple[int, int]:
-        """Counters (pan, tilt) at its end."""
+        """Counters (pan, tilt) at the end of the plan."""
         return (self.moves[-1].pan_steps, self.moves[-1].tilt_steps) if self.moves else (0, 0)
 
     @property
@@ -191,7 +191,7 @@ class PlanLog:
 def run_plan(
     plan: Iterable[PlanStep], rig: Rig, home_approach: tuple[PanApproach, TiltApproach] = HOME_APPROACH
 ) -> PlanLog:
-    """Turn plan steps into moves, placements and looks.
+    """Convert plan steps to moves, placements and looks.
 
     Raises:
         InputError: a look before a target is placed, or a target that the rig does not have.
@@ -262,6 +262,6 @@ def describe_looks(rig: Rig, steps: Sequence[PlanStep], previous: Sequence[PlanS
 
 
 def step_json(step: PlanStep) -> dict[str, object]:
-    """An action of a plan in a document."""
+    """The entry of a plan's action in a document."""
     filled = {"pan_steps": step.pan_steps, "tilt_steps": step.tilt_steps, "target": step.target or None}
     return {"action": step.action, **{k: v for k, v in filled.items() if v is not None}}

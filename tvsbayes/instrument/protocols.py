@@ -1,8 +1,8 @@
 """The standard plans: the paper's four-point experiments, mixtures of them, and grids of poses. Counters in steps.
 
-A start is `reversed` when it is reached by a move against the experiment's direction (play opens within the
-experiment), `cleared` when it is reached by a move along it (play already taken up), and `direct` when it is reached
-from wherever the axis stands.
+A start is `reversed` when it is reached by a move against the experiment's direction (the experiment crosses the play),
+`cleared` when it is reached by a move along it (play already taken up), and `direct` when it is reached from the axis'
+present position.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ def four_point_protocol(
 ) -> tuple[PlanStep, ...]:
     """The paper's four-point experiments, in its order: point 1 at d1, 2 at d2, move N, 3 at d2, 4 at d1.
 
-    Left and right at mid tilt, then up and down at mid pan. Positive moves start from the low end of the
+    Left and right are at mid tilt, then up and down at mid pan. Positive moves start from the low end of the
     range, negative ones from the high end.
 
     Args:
         repeats: experiments per direction.
         steps: |N| of the experiments, taken in turn.
         approaches: direction -> "reversed", "cleared" or "direct" of its experiments, taken in turn;
-            default: all direct, which is plain go and return.
+            default: all direct, i.e. plain go and return.
         targets: names of the near and the far sheet.
         pan_range_steps: lowest and highest pan counter.
         tilt_range_steps: lowest and highest tilt counter.
@@ -71,22 +71,22 @@ def four_point_protocol(
 def paper_protocol(repeats: int = 24, targets: tuple[str, str] = ("d1", "d2")) -> tuple[PlanStep, ...]:
     """The paper's protocol as published: one |N| = 200, plain go and return.
 
-    Every start but the first, right after homing, is then reversed.
+    Every start is then reversed, but for the first after homing.
     """
     return four_point_protocol(repeats, targets=targets)
 
 
 def twin_protocol(repeats: int = 24) -> tuple[PlanStep, ...]:
-    """The history under which one backlash per axis gives Table 1: left, down reversed; right, up cleared.
+    """The move history for which one backlash per axis gives Table 1: left, down reversed; right, up cleared.
 
-    The paper does not state how its starts were reached: this is our assumption.
+    The paper does not state how its starts were reached: this history is an assumption.
     """
     history = {"left": "reversed", "right": "cleared", "up": "cleared", "down": "reversed"}
     return four_point_protocol(repeats, approaches={name: (kind,) for name, kind in history.items()})
 
 
 def mixed_protocol(repeats: int = 24, targets: tuple[str, str] = ("d1", "d2")) -> tuple[PlanStep, ...]:
-    """The paper's experiments with |N| = 100 and 200 in turn, and two in six from cleared starts."""
+    """The paper's experiments with |N| = 100 and 200 in turn, and two of every six from cleared starts."""
     turns = ("reversed", "reversed", "reversed", "cleared", "cleared", "reversed")
     approaches = dict.fromkeys(DIRECTION_SIGNS, turns)
     return four_point_protocol(repeats, steps=(100, 200), approaches=approaches, targets=targets)
@@ -99,8 +99,8 @@ def grid_protocol(
 ) -> tuple[PlanStep, ...]:
     """A grid of poses at every sheet, each pose seen once from either side of both axes.
 
-    Rows of tilt upwards, then downwards, each axis taken up before the row's first look; rows alternate
-    between left and right, and the way down takes each row the other way. One placement per sheet.
+    Rows of tilt are taken upwards, then downwards, with the play of each axis taken up before the row's first look.
+    Rows alternate between left and right; on the way down each takes the opposite sense. One placement per sheet.
     """
     plan = PlanBuilder()
     plan.home()
@@ -132,4 +132,4 @@ UNSTATED_STEPS = {
     "pan": (min(GRID_PAN_STEPS) - OVERSHOOT_STEPS, max(GRID_PAN_STEPS) + OVERSHOOT_STEPS),
     "tilt": (min(GRID_TILT_STEPS) - OVERSHOOT_STEPS, max(GRID_TILT_STEPS) + OVERSHOOT_STEPS),
 }
-"""Counters used where `[positioner]` states no limits: those of the grid protocol."""
+"""Counters used where `[positioner]` states no limits: the ranges of the grid protocol."""

@@ -1,7 +1,7 @@
 """Quantities of any instrument: one entry has name, unit, words, purpose and where it applies.
 
-Every instrument has its own list. The model computes a quantity from draws, the twin from a true instrument, both under
-the name of the entry.
+Every instrument has its own list. The model computes a quantity from draws, the twin from a true instrument, each under
+the entry's name.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ class Quantity:
     Attributes:
         name: in JSON, draws, `posterior.nc` and tables.
         block: the name without its part; quantities that differ only in the part share it.
-        unit: of its values; one unit only where all instruments of the kind have it.
-        words: of the block, in a sentence.
-        label: in tables.
-        headline: a main result of a fit: a posterior is judged by it.
-        target: name of a headline that plans and studies may target.
+        unit: unit of its values; a single unit only where all instruments of the kind share it.
+        words: name of the block in a sentence.
+        label: name in tables.
+        headline: a main result of a fit; the posterior's convergence is assessed by it.
+        target: name under which plans and studies may target it.
         judged: a headline whose budget, leverage and sensitivity to priors are reported.
-        ratio: degrees of the beam per step; only of directions that moved.
-        stated: the parameter whose stated value studies compare it with; 0 where there is none.
+        ratio: degrees of the beam per step; only for directions in which the axis moved.
+        stated: the parameter whose stated value studies compare with it; 0 if none.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Quantity:
 
     @property
     def axis(self) -> Axis | None:
-        """Its axis; None where it has none or both."""
+        """Its axis; None where it belongs to no axis or to both."""
         return next((axis for axis in AXES if {axis, *SENSES[axis]} & set(self.parts)), None)
 
     @property
@@ -66,13 +66,13 @@ class Quantity:
         return () if self.axis is None else SENSES[self.axis]
 
     def applies(self, moved: Collection[str]) -> bool:
-        """Whether a campaign that moved in these directions has it."""
+        """Whether a campaign with moves in these directions has the quantity."""
         directions = set(self.sides).intersection(self.parts) or set(self.sides)
         return not self.ratio or directions <= set(moved)
 
     @classmethod
     def many(cls, block: str, parts: Collection[str], **fields: Any) -> list[Self]:
-        """Quantities that differ only in their parts; a scalar has none.
+        """Make quantities that differ only in their parts; a scalar has no parts.
 
         Texts may name parts as {0}, {1} ..., the axis as {axis}, and both of its directions as {sides}.
         """

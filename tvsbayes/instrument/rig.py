@@ -1,4 +1,4 @@
-"""The instrument as declared: the `[rig]` table with its priors, and rig files (data/docs/campaign-files.md).
+"""The declared instrument: the `[rig]` table with its priors, and rig files (data/docs/campaign-files.md).
 
 Units are those of the names: mm, degrees, radians, px, s; counters in steps. No JAX.
 """
@@ -35,20 +35,20 @@ SPOT_SD_PX = 0.08
 SIGHTING_SD_DEG = 0.005
 """Default standard uncertainty of a sighting."""
 PERIODIC_NAMES = (*HARMONIC_NAMES, *AMPLITUDE_NAMES)
-"""Parameters that do not apply to an axis without their period."""
+"""Parameters that apply only to an axis with a stated period."""
 Setting = str | int | float
-"""A value of `[positioner]` or `[cameras]`, by the kind that its key asks for."""
+"""A value of `[positioner]` or `[cameras]`, of the type that its key requires."""
 
 
 @dataclass(frozen=True)
 class RigTable:
-    """The `[rig]` table of a campaign or rig file: every prior the estimators use.
+    """The `[rig]` table of a campaign or rig file: every prior of the estimators.
 
-    `priors` maps every name of the mechanism's `priors` to its `Prior`; names left out take the default. Where the
-    axis lacks the period that a name needs, its default is 0, fixed.
+    `priors` maps every name of the mechanism's `priors` to its `Prior`; omitted names take the default. Where an axis
+    does not state the period that a name needs, its default is 0, fixed.
     `harmonic_period_deg` maps "pan" and "tilt", where declared, to the periods of the transmission error in
     degrees of the output, 1 to `PERIODS_MAX` different ones: `FULL_TURN_DEG` for the wheel, less for pinion and teeth.
-    `harmonic_deg` is an error of the first one's, `harmonic_amplitude_deg.<axis>.<number>` of each.
+    `harmonic_deg` belongs to the first period, `harmonic_amplitude_deg.<axis>.<number>` to each.
 
     Raises:
         InputError: harmonics or amplitudes of an axis without their period.
@@ -75,13 +75,13 @@ class RigTable:
 
 @dataclass(frozen=True)
 class Rig:
-    """A rig file: the declared rig, its stereo calibration and how it is driven.
+    """A rig file: the declared rig, its stereo calibration, and the drivers of the hardware.
 
-    `truth` is the distribution from which `simulate` and `study` draw true rigs (complete: names absent
-    from `[truth]` take the prior). `sheets_mm` gives the nominal X of each named target in frame S.
-    `positioner`, `cameras`, `costs_s` are the remaining tables, checked but otherwise as written (defaults
-    filled in for `cameras["spot_sd_px"]`, the standard uncertainty stated for simulated spots, and for the
-    costs). `header` holds name and notes.
+    `truth` is the distribution from which `simulate` and `study` draw true rigs; names absent from `[truth]` take the
+    prior. `sheets_mm` gives the nominal X of each named target in frame S.
+    `positioner`, `cameras`, `costs_s` are the remaining tables, checked but otherwise as written. Defaults are filled
+    in for `cameras["spot_sd_px"]`, the standard uncertainty stated for simulated spots, and for the costs. `header`
+    holds name and notes.
     """
 
     table: RigTable
@@ -128,12 +128,12 @@ _GROUPS = {
 
 
 def _names_at(place: Place, mechanism: Mechanism) -> tuple[str, ...]:
-    """Names allowed in a table of a mechanism's file."""
+    """Parameter names allowed in a table of a mechanism's file."""
     return tuple(p.name for p in mechanism.parameters.values() if p.place == place and p.name in mechanism.documented)
 
 
 def _period_number(name: str) -> int:
-    """Number of the period of a periodic parameter, from 1: the first, or that of an amplitude."""
+    """Number of the period of a periodic parameter, from 1: the first, or the amplitude's own."""
     return int(name.rpartition(".")[2]) if name in AMPLITUDE_NAMES else 1
 
 
@@ -162,10 +162,10 @@ def _period_remedy(name: str) -> str:
 
 
 def require_periods(priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> None:
-    """Refuse harmonics and amplitudes whose period is unknown: they would be an error at no known angle.
+    """Refuse harmonics and amplitudes without a stated period: their error would have no known angle.
 
     Raises:
-        InputError: one with a value or u other than 0 on an axis without its period.
+        InputError: a value or u other than 0 on an axis without the period.
     """
     name = _without_period(priors, period_deg)
     if name is not None:
@@ -174,7 +174,7 @@ def require_periods(priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[
 
 
 def _explanation(name: str, allowed: tuple[str, ...]) -> str:
-    """The remedy of a name that is not allowed in its table."""
+    """The remedy for a name that is not allowed in its table."""
     stem, _, last = name.partition(".")
     if name in _PERIOD_NAMES:
         return "it belongs in [rig] itself: tooth counts fix it, so it has no prior and no other truth"
@@ -194,7 +194,7 @@ def _explanation(name: str, allowed: tuple[str, ...]) -> str:
 
 
 def _entries(table: Keys, prefix: str = "") -> Iterator[tuple[Keys, str, str]]:
-    """Every entry as (its table, its key there, its full name), quoted or dotted keys alike."""
+    """Every entry as (its table, its key there, its full name), for quoted and dotted keys."""
     for key, value in table.values.items():
         name = prefix + key
         if isinstance(value, dict) and value and name in _GROUPS and not {"value", "u"} & set(value):
@@ -204,7 +204,7 @@ def _entries(table: Keys, prefix: str = "") -> Iterator[tuple[Keys, str, str]]:
 
 
 def _in_blocks(names: Iterable[str]) -> str:
-    """Short list of names: those of a block in one word, as `harmonic_deg.pan|tilt.1|2.cos|sin`."""
+    """Short list of names: one word for those of a block, as `harmonic_deg.pan|tilt.1|2.cos|sin`."""
     blocks: dict[str, list[list[str]]] = {}
     for name in names:
         parameter = parameter_of(name)
@@ -217,11 +217,11 @@ def _in_blocks(names: Iterable[str]) -> str:
 
 
 def _named_entries(table: Keys, allowed: tuple[str, ...]) -> dict[str, tuple[Keys, str]]:
-    """Where mechanism name of a table stands; `allowed` lists those that may."""
+    """Location of each parameter name in a table; `allowed` lists the permitted names."""
     entries: dict[str, tuple[Keys, str]] = {}
     for keys, key, name in _entries(table):
         if name not in allowed:
-            # Keys of [rig] itself that are no priors have been read before.
+            # Keys of [rig] that are not priors were read before.
             own_keys = () if "rig" not in table.path or "prior" in table.path else _OWN_KEYS
             names = "only " + _in_blocks((*allowed, *own_keys))
             found = f"the name {escaped(name)}"
@@ -248,7 +248,7 @@ def _parse_priors(entries: Mapping[str, tuple[Keys, str]]) -> dict[str, Prior]:
 
 
 def _parse_periods(keys: Keys, key: str) -> tuple[float, ...]:
-    """Periods in degrees of the output, bare or as { value, u }; exact, since they follow from tooth counts."""
+    """Periods in degrees of the output, bare or as { value, u }; exact, since tooth counts determine them."""
     value = keys.values[key]
     if isinstance(value, dict):
         allowed = "{ value = period or list of periods, u = 0.0 }, both and nothing else"
@@ -262,7 +262,7 @@ def _parse_periods(keys: Keys, key: str) -> tuple[float, ...]:
 
 
 def _check_periods(table: Keys, priors: Mapping[str, Prior], period_deg: Mapping[str, tuple[float, ...]]) -> None:
-    """`require_periods` with the place in the file."""
+    """Check as `require_periods`, with the location in the file."""
     name = _without_period(priors, period_deg)
     if name is not None:
         allowed = "harmonics and amplitudes of an axis whose periods are stated"
@@ -289,7 +289,7 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
 
     Args:
         table: of a campaign or rig file.
-        sightings: of a head with sightings: there are no spots and no stereo pair.
+        sightings: for a head with sightings, which has no spots and no stereo pair.
 
     Raises:
         InputError: unknown or misplaced names, entries that are not { value, u }, values out of range,
@@ -304,7 +304,7 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
         axis: _parse_periods(*own_entries.pop(n)) for n, axis in _PERIOD_NAMES.items() if n in own_entries
     }
     declared = _parse_priors(own_entries)
-    # Any parameter may stand in [rig.prior], also one that has its place in [rig].
+    # Any parameter may stand in [rig.prior], also one that belongs to [rig].
     prior = _parse_priors(_named_entries(table.table("prior"), (*prior_names, *declared_names)))
     for name in declared:
         if name in prior:
@@ -319,10 +319,10 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
 
 
 def rig_table_toml(table: RigTable) -> str:
-    """`[rig]` and `[rig.prior]` with every entry, also those at their defaults: the file is complete.
+    """`[rig]` and `[rig.prior]` with every entry, including defaults, so that the file is complete.
 
-    Harmonics and amplitudes appear only where they apply: on an axis with their period. The scatter of looks and shifts
-    of the zeros appear where they are not the defaults, so that campaigns of earlier versions keep their text and hash.
+    Harmonics and amplitudes appear only where they apply: on an axis with a stated period. The scatter of looks and the
+    shifts of the zeros appear only where they differ from the defaults: earlier campaigns keep their text and hash.
     """
 
     def entry(name: str) -> str:
@@ -361,7 +361,7 @@ _NUMBERS = {
 
 
 def _parse_options(table: Keys) -> dict[str, Setting]:
-    """The table `options` of a driver, which checks it itself: entries as `options.NAME`."""
+    """The table `options` of a driver, as entries `options.NAME`; the driver checks them."""
     if "options" not in table:
         return {}
     options = table.table("options")
@@ -383,7 +383,7 @@ def driver_options(table: Mapping[str, Setting], section: str, known: Iterable[s
     """The options of a driver by name, of `[positioner]` or `[cameras]`.
 
     Raises:
-        InputError: one that is not `known`.
+        InputError: an option that is not `known`.
     """
     options = {key.removeprefix("options."): value for key, value in table.items() if key.startswith("options.")}
     for name, value in options.items():
@@ -397,7 +397,7 @@ def _parse_positioner(table: Keys) -> dict[str, Setting]:
     keys = [key for pair in LIMIT_KEYS.values() for key in pair] + list(HOME_KEYS.values())
     table.only(("driver", "port", "baud", *keys, *_NUMBERS, "options"))
     values: dict[str, Setting] = {key: table.text_value(key) for key in ("driver", "port") if key in table}
-    # Serial libraries interpret addresses: one of them writes a file that the address names.
+    # Serial libraries interpret addresses: one kind of address writes a file of that name.
     if "://" in str(values.get("port", "")):
         remedy = "give a port's name, such as /dev/ttyACM0 or COM3; `tvsbayes doctor` lists those there are"
         raise table.refuse("port", "port", "the name of a serial port, no address", remedy)
@@ -447,7 +447,7 @@ def _file_beside(keys: Keys, key: str, folder: Path) -> Path:
 
 
 def read_rig(path: Path) -> Rig:
-    """Reads a rig file (format tvsbayes-rig/1) and the stereo file it names.
+    """Read a rig file (format tvsbayes-rig/1) and the stereo file it names.
 
     Raises:
         InputError: either file unreadable, unknown keys, values out of range, a stereo path that leaves

@@ -1,8 +1,8 @@
-"""Sightings: directions of a head on two axes, observed by its camera or telescope.
+"""Sightings: directions of a head with two axes, observed by its camera or telescope.
 
-Azimuth grows where pan counts up, elevation where tilt does; deg. Directions are unit vectors (x, y, z) of the frame in
-which the user states them: x at azimuth 0, y at azimuth 90 deg, z up. Refraction is the user's: azimuth and elevation
-are those of the light as it arrives. No JAX.
+Azimuth grows with the pan counter, elevation with the tilt counter; deg. Directions are unit vectors (x, y, z) of the
+frame in which the user states them: x at azimuth 0, y at azimuth 90 deg, z up. The user corrects for refraction:
+azimuth and elevation are those of the arriving light. No JAX.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Sighting:
 
     @property
     def spot(self) -> int:
-        """Its id, under the name that all looks share."""
+        """Its id, under the name used for all looks."""
         return self.sighting
 
     @property
@@ -64,12 +64,12 @@ class Sighting:
         """As `experiment`."""
 
     def renumbered(self, number: int, move: int) -> Sighting:
-        """The same with another id, after another move."""
+        """The sighting with another id, after another move."""
         return replace(self, sighting=number, move=move)
 
     @property
     def aperture_deg(self) -> None:
-        """There is no receiver."""
+        """None: a head has no receiver."""
 
 
 SIGHTINGS = CsvKind(Sighting, "sightings.csv", "a row for every sighting, in any order")
@@ -86,7 +86,7 @@ def sightings_of(looks: Sequence[object]) -> list[Sighting]:
 
 
 def sighted_deg(sightings: Sequence[Sighting]) -> np.ndarray:
-    """Azimuth and elevation, shape (n, 2), deg; NaN where there are none."""
+    """Azimuth and elevation, shape (n, 2), deg; NaN for missing values."""
     return np.array([(s.azimuth_deg, s.elevation_deg) for s in sightings], dtype=float).reshape(-1, 2)
 
 

@@ -21,7 +21,7 @@ from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
 
 UNDISTORT_ITERATIONS = 200
 UNDISTORT_TOLERANCE_PX = 1e-9
-"""Largest error of re-distorting an undistorted pixel: 10^4 times the rounding of 1000 px in float64."""
+"""Largest error of distorting an undistorted pixel again: 10^4 times the rounding of 1000 px in float64."""
 
 
 def distort(normalised: np.ndarray, distortion: np.ndarray) -> np.ndarray:
@@ -44,7 +44,7 @@ def undistort(pixels: np.ndarray, camera: np.ndarray, distortion: np.ndarray) ->
     import cv2
 
     pixels = np.ascontiguousarray(pixels, float).reshape(-1, 2)
-    # OpenCV compares the re-distorted point in px: 1e-12 is rounding of the coordinate itself.
+    # OpenCV compares the re-distorted point in px: 1e-12 is the rounding of the coordinate.
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, UNDISTORT_ITERATIONS, 1e-12)
     coefficients = np.asarray(distortion, float).reshape(1, 5)
     if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4: undistortPoints takes no criteria in Python
@@ -84,7 +84,7 @@ def triangulate(stereo: Stereo, pixels: np.ndarray, focal_scale: float = 1.0) ->
 
 
 def project_pair(stereo: Stereo, points_S_mm: np.ndarray) -> np.ndarray:
-    """Raw pixels (n, 4: u_left, v_left, u_right, v_right) of points (n, 3) in frame S, mm: `triangulate` back."""
+    """Raw pixels (n, 4: u_left, v_left, u_right, v_right) of points (n, 3) in frame S, mm: inverse of `triangulate`."""
     points = np.asarray(points_S_mm, float).reshape(-1, 3)
     left = np.column_stack((-points[:, 1], -points[:, 2], points[:, 0]))
     pixels = []
@@ -95,11 +95,11 @@ def project_pair(stereo: Stereo, points_S_mm: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Stereo:
-    """A stereo calibration in OpenCV's convention: x_right = R x_left + T (formulation 3.3).
+    """A stereo calibration in OpenCV's convention, x_right = R x_left + T (formulation 3.3).
 
     `D1`, `D2` are k1 k2 p1 p2 k3. `parameter_covariance` orders the 24 parameters as
     `STEREO_PARAMETER_NAMES` (rotation as Rodrigues vector, rad; translation in mm).
-    Where it is `assumed`, `assumed_from` states the basis. Where the right camera's pictures have another size, it is
+    Where the covariance is `assumed`, `assumed_from` states its basis. Another size of the right camera's pictures is
     `right_image_size`, width and height; its parameters and pixels are those of pictures scaled to the left one's size.
     """
 
@@ -119,7 +119,7 @@ class Stereo:
 
     @property
     def image_sizes(self) -> dict[str, tuple[int, int]]:
-        """Width and height of the pictures of the left and of the right camera, as they are recorded."""
+        """Width and height of the pictures of the left and of the right camera, as recorded."""
         size = self.image_width, self.image_height
         return {"left": size, "right": self.right_image_size or size}
 
@@ -172,11 +172,11 @@ def rotation_matrix(rotation_vector_rad: np.ndarray) -> np.ndarray:
 def rotation_vector(matrix: np.ndarray) -> np.ndarray:
     """The Rodrigues vector, rad, shape (3,), norm at most pi, of the rotation nearest to `matrix` (3, 3).
 
-    Through the unit quaternion's largest component, so it is accurate at 0 and at pi alike.
+    Computed from the unit quaternion's largest component, which is accurate near 0 and near pi.
     """
     u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=float))
     r = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    # Rows of 4 q q^T (w, x, y, z): the one with the largest diagonal is far from cancellation.
+    # Rows of 4 q q^T (w, x, y, z): the row with the largest diagonal avoids cancellation.
     products = np.array(
         [
             [1 + r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
@@ -200,38 +200,38 @@ ASSUMED_REMEDY = (
     "calibrate from pictures (`tvsbayes stereo FOLDER`), or import again with --rms-px, --views, --board, --pitch-mm, "
     "--joint or --fixed-intrinsics, or with --u-focal-percent, --u-principal-px, --u-rotation-mrad, --u-baseline-mm"
 )
-"""Remedy of a pair whose covariance is assumed."""
+"""Remedy for a pair whose covariance is assumed."""
 _ENTRY_MAX = 1e12
 _ROTATION_TOLERANCE = 1e-6
 _EIGENVALUE_TOLERANCE = 1e-8
 BESIDE_SHARE = 0.5
 """Least share of the baseline of two cameras side by side that lies along the columns of the first."""
 PRINCIPAL_SHARE_MAX = 0.25
-"""Share of the image's width or height by which a principal point may miss its middle without a remark."""
+"""Largest distance of a principal point from the image centre without a remark, as a share of width or height."""
 ASPECT_SHARE_MAX = 0.05
-"""The same for the deviation of fx / fy from 1: pixels of present sensors are square."""
+"""Largest deviation of fx / fy from 1 without a remark: pixels of present sensors are square."""
 VIEW_DEG_MIN, VIEW_DEG_MAX, TURN_DEG_MAX = 2.0, 150.0, 20.0
-"""Field of view of a lens described by five coefficients; angle between two cameras of one scene."""
+"""Field of view of a lens described by five coefficients; largest angle between two cameras of one scene."""
 SHAPE_SHARE_MAX = 0.005
-"""Allowed difference of the proportions of two picture sizes: rounding to whole pixels."""
+"""Largest relative difference of the aspect ratios of two picture sizes: rounding to whole pixels."""
 FOCAL_TIMES_MAX = 1.5
 """Largest ratio of the focal lengths of two cameras of one kind."""
 TANGENTIAL_MAX = 0.01
 """Largest p1 and p2: decentring of real lenses is about 1e-3."""
 SHORTEST_BASELINE_MM, LONGEST_BASELINE_MM = 2.0, 10_000.0
-"""Two lenses cannot be closer, and the longest baseline of a stereo pair as a number of metres is smaller; no cameras
-on one rig are farther apart, and the shortest baseline in mm, taken for metres, is longer."""
+"""Least and largest baseline. Two lenses cannot be closer, nor cameras on one rig farther apart. The longest baseline
+in m is a smaller number than the least, and the shortest baseline in mm, read as m, is longer than the largest."""
 
 
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether pictures of two sizes, width and height, have one proportion."""
+    """Whether pictures of two sizes, width and height, have the same aspect ratio."""
     return min(other) > 0 and abs(size[0] * other[1] / (size[1] * other[0]) - 1.0) <= SHAPE_SHARE_MAX
 
 
 def scaled_px(pixels: np.ndarray, size: tuple[int, int], to: tuple[int, int]) -> np.ndarray:
-    """Pixels (..., 2) of pictures of one size as those of the same pictures scaled to another one.
+    """Convert pixels (..., 2) of pictures of one size to pixels of the same pictures scaled to another size.
 
-    The integer is at a pixel's centre, so that pictures begin at -1/2.
+    The integer is at the centre of a pixel, so pictures begin at -1/2.
     """
     return (pixels + 0.5) * (to[0] / size[0]) - 0.5
 
@@ -268,7 +268,7 @@ def _camera_matrix(keys: Keys, key: str) -> np.ndarray:
 
 
 def _check_covariance(keys: Keys, key: str, covariance: np.ndarray) -> None:
-    """Symmetric and positive semi-definite after scaling each row by its standard deviation."""
+    """Require a symmetric, positive semi-definite matrix after scaling each row by its standard deviation."""
     allowed = "a symmetric positive semi-definite 24x24 matrix; a zero row fixes a parameter"
 
     def refusal(found: str) -> InputError:
@@ -336,14 +336,14 @@ def parse_stereo(data: bytes, file: str) -> Stereo:
 
 
 def read_stereo(path: Path, folder: Path | None = None) -> Stereo:
-    """Reads `stereo.json` (format tvsbayes-stereo/1).
+    """Read `stereo.json` (format tvsbayes-stereo/1).
 
     Args:
         path: the file.
         folder: where given, the file must lie inside it after following links.
 
     Raises:
-        InputError: unreadable, wrong shapes, no rotation, a covariance that is none, unknown keys.
+        InputError: unreadable, wrong shapes, R is no rotation, an invalid covariance, unknown keys.
     """
     return parse_stereo(read_bytes(path, JSON_BYTES_MAX, folder), escaped(Path(path).name))
 
@@ -352,7 +352,7 @@ def stereo_bytes(stereo: Stereo) -> bytes:
     """The content of `stereo.json`, one matrix row per line, every digit kept.
 
     Raises:
-        InputError: `stereo` holds what `read_stereo` would refuse.
+        InputError: `read_stereo` would refuse the pair.
     """
     lines = []
     for key in _STEREO_KEYS:
@@ -371,12 +371,12 @@ def stereo_bytes(stereo: Stereo) -> bytes:
 
 
 def write_stereo(stereo: Stereo, path: Path) -> None:
-    """Writes `stereo.json` atomically; `read_stereo` gives back the same numbers."""
+    """Write `stereo.json` atomically; `read_stereo` returns the same numbers."""
     write_atomically(path, stereo_bytes(stereo))
 
 
 def baseline_doubt(stereo: Stereo, place: str = "T of stereo.json") -> str | None:
-    """That T, from a place in words, is in another unit; None where its length in mm can be that of a pair."""
+    """The doubt that T (`place`, in words) is in another unit; None where its length in mm is possible for a pair."""
     baseline_mm = float(np.linalg.norm(stereo.T))
     if baseline_mm < SHORTEST_BASELINE_MM:
         return f"{place} is {baseline_mm:.3g} mm long: is it in metres? Lengths are mm"
@@ -387,7 +387,7 @@ def baseline_doubt(stereo: Stereo, place: str = "T of stereo.json") -> str | Non
 
 
 def fold_radius(distortion: np.ndarray) -> float:
-    """Tangent of the angle off the axis at which the radial distortion turns back; infinite where it never does.
+    """Tangent of the angle off the axis from which the radial distortion is not monotonic; infinite if it is.
 
     Smallest positive root of d/dr of r (1 + k1 r^2 + k2 r^4 + k3 r^6).
     """
@@ -400,7 +400,7 @@ def fold_radius(distortion: np.ndarray) -> float:
 def _lens_doubts(
     matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[int, int], matrix_place: str, distortion_place: str
 ) -> list[str]:
-    """Doubts about properties that no lens has."""
+    """Doubts about a camera whose numbers do not fit any usual lens."""
     doubts = []
     view_deg = 2 * math.degrees(math.atan(size_px[0] / 2 / matrix[0, 0]))
     if view_deg > VIEW_DEG_MAX:
@@ -427,21 +427,21 @@ def _lens_doubts(
 
 
 def pair_doubts(stereo: Stereo, places: Mapping[str, str] | None = None) -> tuple[str, ...]:
-    """What contradicts two cameras side by side with one scene, in words; empty where nothing does.
+    """Contradictions to two cameras side by side with one scene, in words; empty if none.
 
-    No refusal: mirrors, cropped images and lenses off their axes exist. Detected are exchanged cameras, the image size
-    of other pictures, pixels far from square, views near 180 deg, distortion that folds, T in another unit.
+    They are doubts, not errors: mirrors, cropped images and lenses off their axes exist. Detected are exchanged
+    cameras, a wrong image size, pixels far from square, views near 180 deg, distortion that folds, T in another unit.
 
     Args:
         stereo: the pair.
-        places: file and key of M1, D1, M2, D2, R, T, in words; those of `stereo.json` where absent.
+        places: file and key of M1, D1, M2, D2, R, T, in words; where absent, those of `stereo.json`.
     """
     place = {name: f"{name} of stereo.json" for name in ("M1", "D1", "M2", "D2", "R", "T")} | dict(places or {})
     doubts = [text] if (text := baseline_doubt(stereo, place["T"])) is not None else []
     turn_deg = math.degrees(float(np.linalg.norm(rotation_vector(stereo.R))))
     if turn_deg > TURN_DEG_MAX:
         doubts.append(f"{place['R']} turns by {turn_deg:.0f} deg: do both cameras look at one scene?")
-    # Position of the second camera in axes of the first: x to the right, as columns of a picture grow.
+    # Position of the second camera in axes of the first: x to the right, as picture columns increase.
     right_mm = -float(stereo.R[:, 0] @ stereo.T)
     if right_mm < 0:
         doubts.append(
@@ -465,7 +465,7 @@ def pair_doubts(stereo: Stereo, places: Mapping[str, str] | None = None) -> tupl
     for side, matrix in (("left", stereo.M1), ("right", stereo.M2)):
         centre_px = float(matrix[0, 2]), float(matrix[1, 2])
         point = f"the {side} principal point ({centre_px[0]:.0f}, {centre_px[1]:.0f}) px"
-        # Integer = centre of a pixel: the image reaches from -0.5 to its size - 0.5.
+        # Integer = centre of a pixel: the image extends from -0.5 to its size - 0.5.
         if not all(-0.5 <= c <= n - 0.5 for c, n in zip(centre_px, size_px, strict=True)):
             doubts.append(f"{point} lies outside the image of {size_px[0]} x {size_px[1]} px: is that its size?")
         elif any(abs(c - (n - 1) / 2) > PRINCIPAL_SHARE_MAX * n for c, n in zip(centre_px, size_px, strict=True)):

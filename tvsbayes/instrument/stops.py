@@ -1,7 +1,7 @@
-"""Rests of an axis between its moves, and what its stops can determine before any fit.
+"""Rests of an axis between its moves, and the parameters that its stops can determine before any fit.
 
 Counters in steps; signs +1 left or up, -1 right or down. An axis rests until its own counter changes or a homing sets
-it; looks in between share its stop error, also when the other axis moves.
+it; looks during one rest share its stop error, also when the other axis moves.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SECONDS_PER_HOUR = 3600.0
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A rest of one axis at which a usable spot was seen; `sign` is the sense of the move that led there."""
+    """A rest of one axis at which a usable spot was seen; `sign` is the sense of the preceding move."""
 
     segment: int
     steps: int
@@ -31,13 +31,13 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class Rest(Stop):
-    """The position of an axis after a move, and how it was reached.
+    """The position of an axis after a move, and the approach to it.
 
     Attributes:
-        move: number of the move that led there.
+        move: number of the move that reached it.
         homing: number of the homing from which its counter counts.
         distance: steps of that move with their sign, 0 after homing.
-        leg: steps since the sense of motion last changed, infinite after homing: they have taken up the play.
+        leg: steps since the sense of motion last changed, infinite after homing, which takes up the play.
     """
 
     move: int
@@ -47,7 +47,7 @@ class Rest(Stop):
 
 
 def rests_of(moves: Sequence[Move], axis: str) -> list[Rest]:
-    """The rest of an axis after every move: a new one whenever its counter changed (formulation 3.1).
+    """The rest of an axis after every move: a new rest whenever its counter changed (formulation 3.1).
 
     Args:
         moves: all moves in order, the first after a homing.
@@ -62,7 +62,7 @@ def rests_of(moves: Sequence[Move], axis: str) -> list[Rest]:
             previous = rests[-1]
             distance = steps - previous.steps
             sign = 1 if distance > 0 else -1
-            # Further moves in the same sense keep the play taken up.
+            # Further moves in the same sense leave the play taken up.
             leg = abs(distance) + (previous.leg if previous.sign == sign else 0.0)
             rest = Rest(move.segment, steps, sign, move.move, previous.homing, distance, leg)
         else:
@@ -72,7 +72,7 @@ def rests_of(moves: Sequence[Move], axis: str) -> list[Rest]:
 
 
 def legs_of(moves: Sequence[Move]) -> dict[str, list[int]]:
-    """Lengths of the moves in each direction, steps, in order; directions never moved in are absent."""
+    """Lengths of the moves in each direction, steps, in order; directions without moves are absent."""
     legs: dict[str, list[int]] = {}
     for axis in AXES:
         for rest in dict.fromkeys(rests_of(moves, axis)):
@@ -95,7 +95,7 @@ def observed_stops(moves: Sequence[Move], observed: Collection[int], axis: str) 
 
 
 FEW_STOPS = 12
-"""With fewer, their scatter is so uncertain that 1.96 standard deviations contain less than 93 % (Student's t)."""
+"""With fewer stops, the scatter is so uncertain that 1.96 standard deviations contain less than 93 % (Student's t)."""
 
 
 def too_few(stops: Mapping[str, int]) -> dict[str, int]:
@@ -104,28 +104,28 @@ def too_few(stops: Mapping[str, int]) -> dict[str, int]:
 
 
 def few_stops(moves: Sequence[Move], observed: Collection[int]) -> dict[str, int]:
-    """Directions moved in with too few observed stops, and their number; see `observed_stops`."""
+    """Directions of moves with too few observed stops, and their number; see `observed_stops`."""
     counts = Counter(direction_of(axis, stop.sign) for axis in AXES for stop in observed_stops(moves, observed, axis))
     legs = legs_of(moves)
     return too_few({direction: counts[direction] for direction in DIRECTIONS if direction in legs})
 
 
 INSEPARABLE = 0.5
-"""Correlation of an effective ratio and its backlash, in a fit or expected of a plan, from which a quarter of the
-ratio's variance is exchange with the backlash."""
+"""Correlation of an effective ratio and its backlash, in a fit or predicted for a plan: from here on they share a
+quarter of the ratio's variance."""
 ALONE, ALONE_ONE_LENGTH = 0.9, 0.7
-"""The same in the moves alone, where neither cameras nor priors add to the ratio's variance and the correlation is
-larger: what is called inseparable here is so in the fit. Equal numbers of cleared and reversed legs of one length give
-0.55."""
+"""Thresholds of the correlation from the moves alone. Cameras and priors do not add to the ratio's variance there, so
+that the correlation is larger: a pair inseparable here is inseparable in the fit. Equal numbers of cleared and reversed
+legs of one length give 0.55."""
 
 
 def inseparable(correlation: float) -> bool:
-    """Whether a ratio and its backlash are hard to separate, by their correlation in a fit or expected of a plan."""
+    """Whether a ratio and its backlash are hard to separate, by their correlation in a fit or predicted for a plan."""
     return abs(correlation) >= INSEPARABLE
 
 
 def one_sided(stops: Sequence[Stop], axis: str) -> str | None:
-    """Which stops are missing to separate a ratio from its backlash, in words; None if none are."""
+    """The stops still needed to separate a ratio from its backlash, in words; None if none."""
     if len({stop.steps for stop in stops}) < 2:
         return f"the {axis} axis was seen at one counter only; look before and after moves of that axis"
     if not {1, -1} <= {stop.sign for stop in stops}:
@@ -134,10 +134,10 @@ def one_sided(stops: Sequence[Stop], axis: str) -> str | None:
 
 
 def separation(stops: Sequence[Stop], axis: str) -> str | None:
-    """Why a ratio and its backlash cannot be separated well, and the smallest remedy.
+    """Why a ratio and its backlash cannot be separated well, and the simplest remedy.
 
-    With equal errors at every stop the angle is zero(segment) + k n - b sign / 2: the correlation of k and b in
-    this straight line tells before any fit whether the stops separate them.
+    With equal errors at every stop the angle is zero(segment) + k n - b sign / 2: the correlation of k and b in this
+    straight line predicts, before any fit, whether the stops separate them.
 
     Returns:
         A sentence, or None if they can.
@@ -156,7 +156,7 @@ def separation(stops: Sequence[Stop], axis: str) -> str | None:
     else:
         covariance = np.linalg.inv(information)
         correlation = abs(covariance[0, 1]) / np.sqrt(covariance[0, 0] * covariance[1, 1])
-    # No leg leads from one segment to the next: the counter was set by homing.
+    # No leg connects two segments: homing set the counter.
     legs = [(a, b) for a, b in pairwise(stops) if a.segment == b.segment and a.steps != b.steps]
     lengths = Counter(abs(b.steps - a.steps) for a, b in legs)
     if not lengths:
@@ -173,12 +173,12 @@ class Redraws:
     """Which errors are new at each look since the previous look, arrays over looks; fields as in `SpotArrays`.
 
     Attributes:
-        redraw: the stop error of (pan, tilt), shape (n, 2).
-        redraw_mix: share of the variance of (negative, positive) direction in it, shape (n, 2, 2); one half each where
+        redraw: whether the stop error of (pan, tilt) is new, shape (n, 2).
+        redraw_mix: shares of the (negative, positive) direction in its variance, shape (n, 2, 2); one half each where
             the direction is unknown.
-        new_segment: there was a homing, shape (n,).
-        homed: one whose home offset is unknown, shape (n,).
-        hours: since the previous look, or since a homing after it, shape (n,).
+        new_segment: whether the axes homed, shape (n,).
+        homed: whether they homed with an unknown home offset, shape (n,).
+        hours: time since the previous look, or since a homing after it, shape (n,).
     """
 
     redraw: np.ndarray
@@ -189,7 +189,7 @@ class Redraws:
 
 
 def redraws(moves: Sequence[Move], looks: Sequence[int], homed_from: int = 1) -> Redraws:
-    """An axis' stop error is new once its own counter has changed or was set by homing (formulation 3.1).
+    """Mark new stop errors: an axis draws one when its own counter changes or homing sets it (formulation 3.1).
 
     Args:
         moves: all moves in order.
