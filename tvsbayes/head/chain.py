@@ -1,9 +1,10 @@
-"""The line of sight of a head on two geared axes, once for Python floats, NumPy and JAX, by exact rotations.
+"""The line of sight of a head with two geared axes by exact rotations, for Python floats, NumPy and JAX.
 
-Lengths in mm, angles in rad. The frame is P of `instrument.mirrors`: z up, azimuth counted from x towards y, as pan
-counts. The azimuth axis stands in it as two small angles say; elevation axis and beam depend on it. To first order what
-is added to the angles of the axes are TPOINT's terms (P. T. Wallace, TPOINT - Telescope Pointing Analysis System,
-terms IA IE AN AW NPAE CA TF TX), with their signs, A the azimuth from north (x) through east (y) and E the elevation:
+Lengths in mm, angles in rad. The frame is P of `instrument.mirrors`: z up, azimuth counted from x towards y, as the pan
+counter. Two small angles give the direction of the azimuth axis in it; elevation axis and beam depend on that axis. To
+first order the additions to the axes' angles are TPOINT's terms (P. T. Wallace, TPOINT - Telescope Pointing Analysis
+System, terms IA IE AN AW NPAE CA TF TX), with their signs, A the azimuth from north (x) through east (y) and E the
+elevation:
 
     dA = -IA - AN sin A tan E - AW cos A tan E - CA sec E - NPAE tan E
     dE = IE - AN cos A + AW sin A - TF cos E - TX cot E
@@ -22,13 +23,13 @@ from tvsbayes.instrument.mirrors import Materialise, Numbers, Ray, Turn, Vectors
 from tvsbayes.instrument.parameters import HEAD_TERMS
 
 LEAST_ELEVATION = 1e-3
-"""Sine of the elevation below which the cotangent is held: nothing near the horizon follows a law in tan z."""
+"""Sine of the elevation below which the cotangent is limited: a law in tan z does not hold near the horizon."""
 
 
 class HeadOptics(NamedTuple):
-    """What the line of sight of a head differs by from two angles; fields are the names of its terms, in rad and mm.
+    """Deviations of a head's line of sight from its two angles; fields are the names of the terms, in rad and mm.
 
-    The zero of elevation is not among them: it belongs to the angle of that axis, as the scanner's tilt zero does.
+    The zero of elevation is not among them: it is part of that axis' angle, as is the scanner's tilt zero.
     """
 
     elevation_axis_offset_mm: Numbers
@@ -42,7 +43,7 @@ class HeadOptics(NamedTuple):
 
     @classmethod
     def of(cls, value: Callable[[str], Numbers]) -> HeadOptics:
-        """From the value, in mm and rad, of each term by its name; those of two parts become pairs."""
+        """Build from `value`, which returns each term by its name in mm and rad; terms of two parts become pairs."""
         terms: dict[str, tuple[Numbers, ...]] = {}
         for term in list(HEAD_TERMS.values())[1:]:
             terms[term.block] = (*terms.get(term.block, ()), value(term.name))
@@ -61,7 +62,7 @@ class HeadOptics(NamedTuple):
         """
         cos, sin = functions.cos, functions.sin
         above = sin(tilt_rad)
-        # No branch: one cotangent for all, held where it would outgrow every telescope.
+        # Without a branch: one limited cotangent for all elevations, finite at the horizon.
         held = above / (above * above + LEAST_ELEVATION**2)
         bent = tilt_rad - self.flexure_rad * cos(tilt_rad) - self.tangent_flexure_rad * cos(tilt_rad) * held
         azimuth, elevation = materialise(
@@ -78,10 +79,10 @@ class HeadOptics(NamedTuple):
         return Ray(*materialise(tuple(self._leaning(azimuth.forward(v), functions) for v in (origin, sight))))
 
     def _leaning(self, v: Vectors, functions: ModuleType) -> Vectors:
-        """Turned about the horizontal axis about which z leans as far as the azimuth axis does (Rodrigues)."""
+        """Vectors turned about the horizontal axis that tilts z to the azimuth axis (Rodrigues)."""
         north, east = self.azimuth_axis_tilt_rad
         square = north * north + east * east
-        # sin(a)/a and (1 - cos a)/a^2 by their series: an axis that leans by 30 degrees keeps 11 digits.
+        # sin(a)/a and (1 - cos a)/a^2 by their series: accurate to 11 digits for an axis tilted by 30 degrees.
         sinc = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72 * (1 - square / 110))))
         versine = 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90 * (1 - square / 132))))
         axis = Vectors(-east, north, 0.0)

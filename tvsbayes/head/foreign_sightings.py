@@ -1,7 +1,7 @@
-"""Moves and sightings of somebody's table of a head: counters or angles of encoders, and where it was found to point.
+"""Moves and sightings from a foreign table of a head: counters or encoder angles, and the observed directions.
 
-One row is a move, a sighting, or both. Angles of an encoder become counters of `STEP_DEG`. What a table does not say is
-assumed and listed in words. Degrees, u standard.
+One row is a move, a sighting, or both. Encoder angles become counters of `STEP_DEG`. Assumptions about what the table
+does not state are listed in words. Degrees; u are standard uncertainties.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, sightings_of
 
 STEP_DEG = 1e-5
-"""Of a counter: encoders are read in degrees, and 0.04 arcsec is far below what a telescope is pointed to."""
+"""Size of a counter step: encoders are read in degrees, and 0.04 arcsec is far below telescopes' pointing errors."""
 U_DEG = 0.01
-"""Standard uncertainty of a sighting where a table states none; the fit scales it by what the sightings show."""
+"""Standard uncertainty of a sighting where a table states none; the fit estimates its scale."""
 ENCODER_U, LINE_U, CONTRAST_U = 0.01, 0.1, 0.003
-"""Relative u of a ratio: of an encoder's scale, and of a line through the table; and of a contrast of directions."""
+"""Relative u of a ratio from an encoder's scale, from a line through the table, and of a contrast of directions."""
 ZERO_U_DEG, FAR_ZERO_DEG = 10.0, 20.0
-"""Of the angle at counter 0 by that line, and from where on it is stated: nearer ones lie within the default prior."""
+"""u of the angle at counter 0 by that line, and the least stated angle: smaller ones are within the default prior."""
 OFF_LINE_DEG = 10.0
-"""Median distance of sightings from the line over their counters, above which it says no ratio."""
+"""Median distance of sightings from the line over their counters, above which the line gives no ratio."""
 BY_LINE = "by a line through the table; correct it in [rig.prior]"
 ANGLES = ("azimuth_deg", "elevation_deg")
 SIGHTING_FIELDS = (*MOVES.columns, *ANGLES, "u_deg", "status")
-"""All that a table of sightings can give."""
+"""All fields that a table of sightings can have."""
 NEEDED = (*COUNTERS, *ANGLES)
 _AXIS_WORDS = (
     {"azimuth", "az", "azm", "azi", "azimut", "acimut", "pan", "yaw", "horizontal", "horiz", "hor", "schwenk"},
@@ -48,15 +48,15 @@ _OF_COUNTERS = {
     *("pan", "tilt", "yaw", "pitch", "step", "steps", "count", "counts", "counter", "ticks", "encoder", "enc", "joint"),
     *("motor", "axis", "raw", "command", "commanded", "cmd", "demand", "schritte", "zahler", "achse", "pasos", "pas"),
 }
-"""Words that tell what an axis was sent to, or read, from where it was found to point."""
+"""Words that distinguish commanded or encoder angles of an axis from observed directions."""
 _OTHERS = [*(MOVES[name] for name in ("move", "segment", "time_s", "temperature_degC")), SPOTS["status"]]
 
 
 def sighting_field(name: str) -> str | None:
-    """The field that a column's name tells of."""
+    """The field to which a column belongs by its name."""
     listed = words_of(name)
     words = set(listed)
-    # "s" is of seconds here.
+    # "s" stands for seconds here.
     of_axis = [k for k, spellings in enumerate(_AXIS_WORDS) if words & spellings]
     if words & (SPREAD - {"s"}) or words == {"u"} or (words & {"u"} and len(of_axis) != 1):
         return "u_deg"
@@ -69,14 +69,14 @@ def sighting_field(name: str) -> str | None:
 
 @dataclass(frozen=True)
 class ForeignSightings:
-    """What a table gives.
+    """Moves and sightings of a table.
 
     Attributes:
         moves: rows of `moves.csv`.
         sightings: rows of `sightings.csv`.
-        priors: of ratios and zeros, by their names, as encoders or a line through the table say them.
+        priors: priors of ratios and zeros by their names, from encoders or a line through the table.
         encoders: axes whose counters are angles of an encoder.
-        assumed: what it does not say, in words.
+        assumed: assumptions about what the table does not state, in words.
     """
 
     moves: tuple[Move, ...]
@@ -94,18 +94,18 @@ def sightings_of_table(
     u_deg: float | None = None,
     falling: Collection[Axis] = (),
 ) -> ForeignSightings:
-    """Moves and sightings of a table.
+    """Derive moves and sightings from a table.
 
     Args:
-        table: as it was read.
+        table: the foreign table.
         columns: its columns by field, `NEEDED` among them.
-        notation: how its numbers are meant; `angle_unit` where names of columns say none.
-        correction: of moves and sightings.
-        u_deg: of a sighting where no column has it.
-        falling: axes whose joint falls where azimuth or elevation grows; angles that do so are those of the joint.
+        notation: conventions of its numbers; `angle_unit` applies where column names state none.
+        correction: applied to moves and sightings.
+        u_deg: standard uncertainty of a sighting where no column states it.
+        falling: axes whose joint angle decreases where azimuth or elevation grows; such angles are joint angles.
 
     Raises:
-        InputError: a cell that is no value of its field, or no row.
+        InputError: a cell that is no value of its field, or the table has no row.
     """
     table.require_rows()
     assumed: list[str] = []
@@ -149,14 +149,14 @@ def sightings_of_table(
 
 @dataclass(frozen=True)
 class _PlainTable:
-    """A table of plain numbers, and the units of its angles by field; counters that are whole have none."""
+    """A table of plain numbers, and the units of its angles by field; whole counters have none."""
 
     table: ForeignTable
     units: dict[str, str]
 
 
 def _plain_numbers(table: ForeignTable, columns: dict[str, str], notation: Notation, assumed: list[str]) -> _PlainTable:
-    """A table with plain numbers, and encoders' angles as counters."""
+    """Convert a table to plain numbers, with encoder angles as counters."""
     units: dict[str, str] = {}
     for field in (name for name in (*NEEDED, "u_deg") if name in columns):
         plain = plain_column(columns[field], table.columns[columns[field]])
@@ -182,7 +182,7 @@ def _plain_numbers(table: ForeignTable, columns: dict[str, str], notation: Notat
 def _priors(
     moves: Sequence[Move], sightings: Sequence[Sighting], encoders: frozenset[Axis], assumed: list[str]
 ) -> dict[str, Prior]:
-    """Ratios and contrasts of encoders' steps, and of counters by a line through what was sighted there; far zeros."""
+    """Priors of ratios and contrasts from encoders' steps, or from a line through the sightings; zeros far from 0."""
     priors: dict[str, Prior] = {}
     for axis, field, angle in zip(AXES, COUNTERS, ANGLES, strict=True):
         line = _line(moves, sightings, axis)
@@ -205,7 +205,7 @@ def _priors(
 
 
 def _line(moves: Sequence[Move], sightings: Sequence[Sighting], axis: Axis) -> Line | None:
-    """`line_of` what was sighted over the counters of an axis."""
+    """`line_of` the sighted angles over the counters of an axis."""
     field, angle = COUNTERS[AXES.index(axis)], ANGLES[AXES.index(axis)]
     ok = [s for s in sightings if s.status == "ok"]
     counters = np.array([getattr(moves[s.move], field) for s in ok], float)
@@ -213,26 +213,26 @@ def _line(moves: Sequence[Move], sightings: Sequence[Sighting], axis: Axis) -> L
 
 
 def _falls(moves: Sequence[Move], sightings: Sequence[Sighting], axis: Axis) -> bool:
-    """Whether counters certainly fall where the angle grows."""
+    """Whether counters clearly decrease where the angle grows."""
     line = _line(moves, sightings, axis)
     return line is not None and line.slope_deg < 0
 
 
 def _is_whole(cell: str) -> bool:
-    """Whether a cell is empty, no number, or a whole one."""
+    """Whether a cell is empty, no number, or a whole number."""
     return NUMBER.fullmatch(cell) is None or float(cell).is_integer()
 
 
 @dataclass(frozen=True)
 class Line:
-    """Of angles over counters: degrees a step, and the angle at counter 0, -180 to 180."""
+    """A line of angles over counters: degrees per step, and the angle at counter 0, -180 to 180."""
 
     slope_deg: float
     zero_deg: float
 
 
 def line_of(counters: np.ndarray, angles_deg: np.ndarray) -> Line | None:
-    """A line through angles of any turn, shape (n,) each; None where there is none."""
+    """Fit a line to angles known up to full turns, shape (n,) each; None where no line fits."""
     order = np.argsort(counters, kind="stable")
     steps, angles = counters[order], np.unwrap(angles_deg[order], period=360.0)
     if len(np.unique(steps)) < 3:

@@ -1,6 +1,6 @@
-"""The classic estimator of a head: a pointing model by least squares, ratios and terms, gears without any error.
+"""The classic estimator of a head: a pointing model by least squares, with ratios and terms and gears without error.
 
-Every sighting counts alike; its two residuals are angles on the sphere. Degrees, degrees a step. No JAX.
+All sightings have equal weight; the two residuals of each are angles on the sphere. Degrees, deg/step. No JAX.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, sighted_deg, sigh
 
 STEPS_MAX = 50
 SETTLED = 1e-9
-"""Change of every parameter, in its standard errors or as a share of itself, at which Gauss and Newton's steps end."""
+"""Change of every parameter, in its standard errors or as a share of itself, at which the Gauss-Newton steps end."""
 COMPLEX_STEP = 1e-20
 RATIO_KNOWN = 1e-4
-"""Relative u of a ratio that is held: of an encoder on the axis. Elevation zero and both flexures bend like a ratio."""
+"""Relative u below which a ratio is held fixed (encoder on the axis); elevation zero and both flexures act alike."""
 RATIOS = tuple(f"degrees_per_step.{axis}" for axis in AXES)
 
 
 @dataclass(frozen=True, repr=False)
 class PointingModel(Shown):
-    """What least squares say of a head.
+    """The least-squares estimate of a head's pointing model.
 
     Attributes:
-        names: of ratios and terms that priors leave open.
-        value: of them, units of the names.
-        standard_error: of each, by the residuals' own scatter.
-        residual_deg: seen less predicted along azimuth and elevation on the sphere, shape (n, 2), in order of time.
-        known: ratios and terms that were held.
+        names: ratios and terms that the priors do not fix.
+        value: their estimates, in the units of the names.
+        standard_error: from the scatter of the residuals.
+        residual_deg: observed minus predicted along azimuth and elevation on the sphere, shape (n, 2), in time order.
+        known: ratios and terms that were held fixed.
     """
 
     names: tuple[str, ...]
@@ -47,17 +47,17 @@ class PointingModel(Shown):
 
     @property
     def rms_deg(self) -> float:
-        """Of the distance on the sphere."""
+        """Root mean square distance on the sphere."""
         return float(np.sqrt(np.mean(np.sum(self.residual_deg**2, axis=1))))
 
     def shown(self) -> View:
-        """Ratios and terms."""
+        """Show ratios and terms."""
         title = f"Pointing model by least squares, {len(self.residual_deg)} sightings, RMS {self.rms_deg:.3g} deg"
         rows = zip(self.names, self.value.tolist(), self.standard_error.tolist(), strict=True)
         return View(title, ("term", "value", "standard error"), list(rows))
 
     def off_deg(self, campaign: Campaign, rows: Sequence[Sighting]) -> np.ndarray:
-        """Seen less predicted of any sightings, shape (n, 2)."""
+        """Observed minus predicted for any sightings, shape (n, 2)."""
         values = self.known | dict(zip(self.names, self.value.tolist(), strict=True))
         return _off_deg(values, _steps(campaign, rows), tangent_frames(sighted_deg(rows))).real
 
@@ -76,13 +76,13 @@ def _steps(campaign: Campaign, rows: Sequence[Sighting]) -> np.ndarray:
 
 
 def _off_deg(values: dict[str, float | complex], steps: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Seen less predicted on the sphere, shape (n, 2); complex where a value is."""
+    """Observed minus predicted on the sphere, shape (n, 2); complex where a value is."""
     pan, tilt = (np.radians(1.0) * values[name] * steps[:, k] for k, name in enumerate(RATIOS))
     optics = HeadOptics.of(lambda name: values[name] * np.radians(1.0))
     sight = optics.leaving(pan, tilt + np.radians(1.0) * values["elevation_zero_deg"], np).direction
     sighted = np.stack(np.broadcast_arrays(*sight), axis=1)
     across, above, along = (np.sum(frames[:, k] * sighted, axis=1) for k in range(3))
-    # Of small angles tangent and angle are one; far away the tangent plane keeps the way home.
+    # For small angles tangent and angle agree; for large ones the tangent plane still gives the direction.
     return -np.degrees(1.0) * np.stack([across, above], axis=1) / np.maximum(along.real, 0.5)[:, None]
 
 
@@ -90,10 +90,10 @@ def pointing_model(campaign: Campaign) -> PointingModel:
     """Fit ratios and terms by least squares.
 
     Args:
-        campaign: of a head, with sightings.
+        campaign: campaign of a head, with sightings.
 
     Raises:
-        InputError: a campaign without sightings.
+        InputError: the campaign has no sightings.
         NothingToEstimate: fewer residuals than unknowns.
     """
     mechanism, priors = campaign.rig.mechanism, campaign.rig.priors
@@ -111,7 +111,7 @@ def pointing_model(campaign: Campaign) -> PointingModel:
     values: dict[str, float | complex] = {name: priors[name].value for name in (*RATIOS, *terms)}
     names = tuple(n for n in values if priors[n].u > (RATIO_KNOWN * abs(priors[n].value) if n in RATIOS else 0.0))
     steps, angles = _steps(campaign, rows), sighted_deg(rows)
-    # One counter of an axis tells its zero and no ratio.
+    # A single counter of an axis determines its zero but no ratio.
     names = tuple(n for n in names if n not in RATIOS or np.ptp(steps[:, RATIOS.index(n)]) > 0)
     if 2 * len(rows) <= len(names):
         raise NothingToEstimate(
@@ -122,7 +122,7 @@ def pointing_model(campaign: Campaign) -> PointingModel:
         )
     frames = tangent_frames(angles)
     if "azimuth_zero_deg" in names:
-        # On the turn that is nearest to the prior.
+        # Start on the turn nearest to the prior.
         zero = priors["azimuth_zero_deg"].value
         ahead = np.exp(1j * np.radians(angles[:, 0] - priors[RATIOS[0]].value * steps[:, 0] - zero))
         values["azimuth_zero_deg"] = zero + float(np.degrees(np.angle(ahead.mean())))
@@ -133,7 +133,7 @@ def pointing_model(campaign: Campaign) -> PointingModel:
             [_off_deg(values | {n: values[n] + 1j * COMPLEX_STEP}, steps, frames).imag.ravel() for n in names], axis=1
         )
         slope = slope / COMPLEX_STEP
-        # Scaled: a ratio turns by thousands of steps, a term by its own angle.
+        # Columns are scaled: a ratio acts over thousands of steps, a term by its own angle.
         size = np.linalg.norm(slope, axis=0)
         change = np.linalg.lstsq(slope / size, -off, rcond=None)[0]
         change = change / size

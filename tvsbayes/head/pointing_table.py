@@ -1,8 +1,8 @@
-"""Pointing tables of telescopes: blocks of lines a star, with what both encoders read and where the star stood.
+"""Pointing tables of telescopes: one block of lines per star, with both encoder readings and the star's direction.
 
-A block begins with `CAT:`. `RAA:` holds elevation and azimuth of the encoders, `TAA:` those of the star as computed
-from catalogue and time; degrees, azimuth as 180 deg less what counts from north through east. `LST:` is the local
-sidereal time, the only clock. Other lines are not used.
+A block begins with `CAT:`. `RAA:` holds elevation and azimuth of the encoders, `TAA:` those of the star computed from
+catalogue and time; degrees, azimuth as 180 deg minus the azimuth from north through east. `LST:` is the local sidereal
+time, the only clock. Other lines are ignored.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from tvsbayes.instrument.sightings import Sighting
 
 ARCSEC = 1 / 3600
 U_ARCSEC = 0.5
-"""Stated for a star's place where nobody names one: what is left is estimated as the scatter of stops."""
+"""Default u of a star's direction; the remaining errors are estimated as the scatter of stops."""
 SIDEREAL_S = 86164.0905 / 86400
-"""Of mean solar time in a second of sidereal time (IERS conventions)."""
+"""Seconds of mean solar time per second of sidereal time (IERS conventions)."""
 DAY_S = 86400.0
 AZIMUTH_FROM_DEG = 180.0
 NEEDED = {"RAA", "TAA", "LST"}
-"""Tags of a block that is a pointing."""
+"""Tags that a pointing's block must have."""
 
 
 def encoder_priors() -> dict[str, Prior]:
-    """What is believed of a telescope whose encoders stand on its axes: no gears but what bearings may do."""
+    """Priors of a telescope with encoders on its axes: no gear errors, only those of bearings."""
     halves = names_of("transmission_error_deg", "play_variation_deg", "look_scatter_deg")
     return {
         **dict.fromkeys(names_of("degrees_per_step"), Prior(STEP_DEG, 1e-6 * STEP_DEG)),
@@ -55,7 +55,7 @@ def encoder_priors() -> dict[str, Prior]:
 
 @dataclass(frozen=True)
 class Star:
-    """One pointing: elevation and azimuth, deg, by the encoders and of the star, and the sidereal time, s."""
+    """One pointing: elevation and azimuth of encoders and star, deg, and the sidereal time, s."""
 
     encoder_deg: tuple[float, float]
     true_deg: tuple[float, float]
@@ -63,7 +63,7 @@ class Star:
 
 
 def _blocks(text: str) -> Iterator[tuple[int, dict[str, str]]]:
-    """Lines of each star by their tags, with the number of the line that begins it."""
+    """Lines of each star by their tags, with the number of its first line."""
     block: dict[str, str] = {}
     begin = 0
     for number, line in enumerate(text.splitlines(), 1):
@@ -78,7 +78,7 @@ def _blocks(text: str) -> Iterator[tuple[int, dict[str, str]]]:
 
 
 def _numbers(text: str, count: int) -> tuple[float, ...]:
-    """So many finite numbers of a line."""
+    """Read `count` finite numbers from a line."""
     numbers = tuple(map(float, text.replace(":", " ").split()))
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise ValueError(f"{len(numbers)} numbers where {count} are expected")
@@ -87,17 +87,17 @@ def _numbers(text: str, count: int) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class PointingTable:
-    """The stars of a table, in its order, and how many blocks were left out: pointings that were broken off."""
+    """The stars of a table, in its order, and the number of blocks left out as aborted pointings."""
 
     stars: tuple[Star, ...]
     left_out: int
 
 
 def read_stars(path: Path) -> PointingTable:
-    """A pointing table.
+    """Read a pointing table.
 
     Raises:
-        InputError: a file that is none, with the line where it fails.
+        InputError: not a pointing table; with the first line that does not fit.
     """
     text = read_bytes(path, CSV_BYTES_MAX).decode("utf-8", "replace")
     blocks, stars = list(_blocks(text)), []
@@ -120,9 +120,9 @@ def read_stars(path: Path) -> PointingTable:
 
 
 def campaign_of(stars: tuple[Star, ...], name: str, u_arcsec: float = U_ARCSEC) -> Campaign:
-    """The campaign of a night: encoders as counters of `STEP_DEG`, stars as sightings.
+    """Make the campaign of a night: encoder angles as counters of `STEP_DEG`, stars as sightings.
 
-    An encoder tells no whole turns; the azimuth axis is taken to be on the turn of the star's azimuth, as stated.
+    An encoder does not resolve whole turns: the azimuth axis is assumed on the turn of the star's stated azimuth.
     """
     elevation, azimuth = np.array([star.encoder_deg for star in stars]).T
     stated = np.array([star.true_deg[1] for star in stars])

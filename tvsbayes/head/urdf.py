@@ -1,8 +1,8 @@
-"""A head in a URDF: nominal terms from two of its joints, and the same file with what was estimated.
+"""A head in a URDF: nominal terms from two of its joints, and the same file with the estimated terms.
 
 The base is the parent link of the pan joint, z up; the beam is x of the child link of the tilt joint (REP 103). Joints
 turn by the right-hand rule about their axes: a tilt joint about +y lowers the beam. URDF: m and rad, `rpy` about fixed
-axes; terms in mm and degrees. Text outside what changes is kept byte for byte.
+axes; terms in mm and degrees. Text that does not change is kept byte for byte.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 URDF_BYTES_MAX = 32 * 1024 * 1024
 MOVING = ("revolute", "continuous")
 WORDS = {"pan": ("pan", "yaw", "azimuth"), "tilt": ("tilt", "pitch", "elevation")}
-"""Parts of names by which joints are taken where nobody names them."""
+"""Parts of names by which joints are found where the user names none."""
 LEAN_MAX_DEG = 30.0
 PARALLEL_DEG = 45.0
-"""Angle of both axes, and of beam and tilt axis, below which these are no head."""
+"""Least angle between both axes, and between beam and tilt axis, of a head."""
 SAME = 1e-12
-"""Change of a number below which it is kept as it stands."""
+"""Change of a number below which its text is kept."""
 CORRECTS = "head_corrects"
 PROPERTY = "xacro:property"
 DEPTH_MAX, LISTED = 100, 20
@@ -39,7 +39,7 @@ _LEAN = "azimuth_axis_tilt_deg"
 
 @dataclass
 class _Tag:
-    """An element: its start tag and text with their places in the file, and what stands in it."""
+    """An element: its start tag and text with their positions in the file, and its child elements."""
 
     name: str
     attributes: Mapping[str, str]
@@ -50,17 +50,17 @@ class _Tag:
     text_begin: int = 0
 
     def first(self, name: str) -> _Tag | None:
-        """The first element of this name in it, at any depth."""
+        """The first descendant with this name."""
         tags = (child if child.name == name else child.first(name) for child in self.children)
         return next((tag for tag in tags if tag is not None), None)
 
     def named(self, part: str, attribute: str) -> str:
-        """A text attribute of an element in it, "" without it."""
+        """A text attribute of a descendant, "" if absent."""
         tag = self.first(part)
         return "" if tag is None else tag.attributes.get(attribute, "")
 
     def numbers(self, part: str, attribute: str, default: tuple[float, ...]) -> np.ndarray:
-        """Numbers of an attribute of an element in it."""
+        """Numbers in an attribute of a descendant."""
         tag = self.first(part)
         text = None if tag is None else tag.attributes.get(attribute)
         values = default if text is None else tuple(map(float, text.split()))
@@ -70,24 +70,24 @@ class _Tag:
 
     @property
     def type(self) -> str:
-        """Of a joint."""
+        """Type of a joint."""
         return self.attributes.get("type", "no type")
 
     @property
     def rotation(self) -> Rotation:
-        """Of a joint's origin."""
+        """Rotation of a joint's origin."""
         from scipy.spatial.transform import Rotation
 
         return Rotation.from_euler("xyz", self.numbers("origin", "rpy", (0.0, 0.0, 0.0)))
 
     @property
     def shift_m(self) -> np.ndarray:
-        """Of a joint's origin, shape (3,)."""
+        """Translation of a joint's origin, shape (3,)."""
         return self.numbers("origin", "xyz", (0.0, 0.0, 0.0))
 
     @property
     def axis(self) -> np.ndarray:
-        """A unit vector in the joint's frame, shape (3,)."""
+        """Axis of a joint: unit vector in its frame, shape (3,)."""
         axis = self.numbers("axis", "xyz", (1.0, 0.0, 0.0))
         if not np.linalg.norm(axis) > 0:
             raise ValueError("axis 0 0 0")
@@ -96,13 +96,13 @@ class _Tag:
 
 @dataclass(frozen=True)
 class Urdf:
-    """A URDF that was read: its bytes, and its element `robot`."""
+    """A parsed URDF: its bytes, and its element `robot`."""
 
     data: bytes
     root: _Tag
 
     def listed(self, kind: str) -> dict[str, _Tag]:
-        """Elements of a kind right below `robot`, by name."""
+        """Elements of a kind directly below `robot`, by name."""
         return {tag.attributes.get("name", ""): tag for tag in self.root.children if tag.name == kind}
 
     def reduction(self, joint: str) -> _Tag | None:
@@ -112,10 +112,10 @@ class Urdf:
 
 
 def read_urdf(data: bytes, file: str) -> Urdf:
-    """The elements of a URDF.
+    """Parse a URDF.
 
     Raises:
-        InputError: no XML, a document type, no robot, or a xacro that was not expanded.
+        InputError: not XML, a document type declaration, no robot, or an unexpanded xacro.
     """
     parser = expat.ParserCreate()
     path = [_Tag("", {}, 0, 0)]
@@ -126,7 +126,7 @@ def read_urdf(data: bytes, file: str) -> Urdf:
 
     def begin(name: str, attributes: dict[str, str]) -> None:
         at = parser.CurrentByteIndex
-        # A ">" inside quotes is none of the tag's.
+        # A ">" inside quotes does not end the tag.
         close = re.compile(rb"""(?:[^>"']|"[^"]*"|'[^']*')*>""").match(data, at)
         foreign = name.startswith("xacro:") and name != PROPERTY
         if foreign or any("${" in v or "$(" in v for v in attributes.values()):
@@ -157,7 +157,7 @@ def read_urdf(data: bytes, file: str) -> Urdf:
 
 @dataclass(frozen=True)
 class _Frames:
-    """Of a head at zero of both joints, in the base: the stage that pans, the beam's link, and the tilt axis (3,)."""
+    """Frames of a head with both joints at zero, in the base: pan stage, the beam's link, and the tilt axis (3,)."""
 
     stage: Rotation
     link: Rotation
@@ -165,7 +165,7 @@ class _Frames:
 
     @classmethod
     def of(cls, terms: Mapping[str, float]) -> _Frames:
-        """By terms in degrees: the chain of `head.chain` without flexure; x of the link is the beam."""
+        """Build from terms in degrees: the chain of `head.chain` without flexure; x of the link is the beam."""
         from scipy.spatial.transform import Rotation
 
         rad = {name: math.radians(value) for name, value in terms.items()}
@@ -182,10 +182,10 @@ class HeadJoints:
 
     Attributes:
         urdf: the file.
-        names: of the joints, by axis.
-        terms: nominal, by the names of the head's terms; mm, degrees.
-        sign: of a joint's motion where azimuth or elevation grows, by axis.
-        height_m: of the tilt axis over the pan joint, along the pan axis.
+        names: names of the joints, by axis.
+        terms: nominal values, by the names of the head's terms; mm, degrees.
+        sign: sense of a joint's motion where azimuth or elevation grows, by axis.
+        height_m: distance of the tilt axis from the pan joint, along the pan axis.
         between: rotation and shift (m) from the child link of the pan joint to the parent link of the tilt joint.
     """
 
@@ -197,7 +197,7 @@ class HeadJoints:
     between: tuple[Rotation, np.ndarray]
 
     def joint(self, axis: str) -> _Tag:
-        """Of an axis."""
+        """The joint of an axis."""
         return self.urdf.listed("joint")[self.names[axis]]
 
     def reduction(self, axis: str) -> float | None:
@@ -206,7 +206,7 @@ class HeadJoints:
         return None if tag is None else float(tag.text)
 
     def limits_deg(self, axis: str) -> tuple[float, float] | None:
-        """Lowest and highest angle from the joint's zero, where azimuth or elevation grows; None without limits."""
+        """Lowest and highest angle from the joint's zero, in the sense of azimuth or elevation; None without limits."""
         joint = self.joint(axis)
         if joint.type == "continuous" or joint.first("limit") is None:
             return None
@@ -216,16 +216,16 @@ class HeadJoints:
 
 
 def head_joints(data: bytes, file: str, names: Mapping[str, str | None]) -> HeadJoints:
-    """Two joints as a head.
+    """Read two joints as a head.
 
     Args:
         data: the URDF.
         file: its name.
-        names: of the joints by axis, None where the file is to say it.
+        names: names of the joints by axis, None to find them in the file.
 
     Raises:
-        InputError: a joint that is missing, does not turn, or is not mounted on the other; axes that are parallel, or
-            no pan axis upwards.
+        InputError: a joint is missing, does not turn, or is not mounted on the other; the axes are parallel, or the pan
+            axis does not point upwards.
     """
     urdf = read_urdf(data, file)
     try:
@@ -265,7 +265,7 @@ def _head_joints(urdf: Urdf, file: str, names: Mapping[str, str | None]) -> Head
     north, east = (lean * up[k] / level if level > 0 else 0.0 for k in (0, 1))
     upright = Rotation.from_rotvec([-east, north, 0.0]).inv()
     across, sight = upright.apply(tilt_axis), upright.apply(beam)
-    # Of both ways to count, the one in which the beam looks ahead at zero.
+    # The sense of counting in which the beam points forward at zero.
     sense = 1 if sight[0] * across[1] - sight[1] * across[0] >= 0 else -1
     x, y, z = sense * across
     azimuth, skew = math.atan2(-x, y), math.asin(max(-1.0, min(1.0, z)))
@@ -287,12 +287,12 @@ def _head_joints(urdf: Urdf, file: str, names: Mapping[str, str | None]) -> Head
 
 
 def _refused(file: str, found: str, allowed: str, remedy: str) -> InputError:
-    """The error of joints that are no head's."""
+    """The error for joints that do not form a head."""
     return refusal("urdf-joint", file=file, found=found, allowed=allowed, remedy=remedy)
 
 
 def _named(urdf: Urdf, names: Mapping[str, str | None], file: str) -> dict[str, str]:
-    """The joints by axis: as they were named, else by parts of their names, else the only two that turn."""
+    """The joints by axis: as the user names them, else by parts of their names, else the only two revolute joints."""
     joints = urdf.listed("joint")
     turning = [name for name, joint in joints.items() if joint.type in MOVING]
     shown = "joints that turn: " + (escaped(listed(turning, LISTED), 400) or "none")
@@ -318,7 +318,7 @@ def _named(urdf: Urdf, names: Mapping[str, str | None], file: str) -> dict[str, 
 
 
 def _between(joints: Mapping[str, _Tag], pan: _Tag, tilt: _Tag, file: str) -> tuple[Rotation, np.ndarray]:
-    """From the child link of the pan joint to the parent link of the tilt joint, over joints that are fixed."""
+    """Transform from the child link of the pan joint to the parent link of the tilt joint, over fixed joints."""
     from scipy.spatial.transform import Rotation
 
     above = {joint.named("child", "link"): joint for joint in joints.values()}
@@ -336,13 +336,13 @@ def _between(joints: Mapping[str, _Tag], pan: _Tag, tilt: _Tag, file: str) -> tu
 
 
 def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[str, float], block: str) -> bytes:
-    """The URDF with estimated terms; what is not estimated stays as it stands.
+    """The URDF with estimated terms; all else is unchanged.
 
     Args:
         head: its joints.
-        terms: estimated, by name, mm and degrees; those left out are nominal.
-        reductions: of transmissions, by axis, where they change.
-        block: lines that go behind the start of `robot`, in place of those of an earlier correction.
+        terms: estimates by name, mm and degrees; terms left out are nominal.
+        reductions: new reductions of transmissions, by axis.
+        block: lines inserted after the start tag of `robot`, in place of those of an earlier correction.
     """
     after = {**head.terms, **{name: value for name, value in terms.items() if name in head.terms}}
     old, new = _Frames.of(head.terms), _Frames.of(after)
@@ -356,7 +356,7 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
     edits: list[tuple[int, int, bytes]] = []
     edits += _origin(head.urdf, pan, first, pan.shift_m)
     edits += _origin(head.urdf, tilt, base.inv() * link, turn.inv().apply(first.inv().apply(place) - shift))
-    # The sense in which the joint counts stays.
+    # The joint keeps its sense of counting.
     axis = link.inv().apply(new.axis * -head.sign["tilt"])
     if np.max(np.abs(axis - tilt.axis)) > SAME:
         edits += _element(head.urdf, tilt, "axis", {"xyz": axis})
@@ -379,7 +379,7 @@ def corrected(head: HeadJoints, terms: Mapping[str, float], reductions: Mapping[
 
 
 def _attribute(text: bytes, name: str, values: np.ndarray) -> bytes:
-    """A start tag with other numbers in an attribute."""
+    """A start tag with new numbers in an attribute."""
     words = " ".join(f"{0.0 if abs(value) < SAME else value:.12g}" for value in values.tolist()).encode()
     pattern = re.compile(rb"(\b" + name.encode() + rb"\s*=\s*)(\"[^\"]*\"|'[^']*')")
     written, count = pattern.subn(rb'\1"' + words + b'"', text)
@@ -390,7 +390,7 @@ def _attribute(text: bytes, name: str, values: np.ndarray) -> bytes:
 
 
 def _element(urdf: Urdf, joint: _Tag, name: str, values: Mapping[str, np.ndarray]) -> list[tuple[int, int, bytes]]:
-    """An element of a joint with other numbers; put in where the joint has none."""
+    """An element of a joint with new numbers; inserted where the joint has none."""
     tag = joint.first(name)
     begin, end = (joint.end, joint.end) if tag is None else (tag.begin, tag.end)
     text = f"\n    <{name}/>".encode() if tag is None else urdf.data[begin:end]
@@ -400,7 +400,7 @@ def _element(urdf: Urdf, joint: _Tag, name: str, values: Mapping[str, np.ndarray
 
 
 def _origin(urdf: Urdf, joint: _Tag, turn: Rotation, shift_m: np.ndarray) -> list[tuple[int, int, bytes]]:
-    """What changes of a joint's origin."""
+    """Edits of a joint's origin."""
     values: dict[str, np.ndarray] = {}
     if np.max(np.abs(shift_m - joint.shift_m)) > SAME:
         values["xyz"] = shift_m
@@ -410,7 +410,7 @@ def _origin(urdf: Urdf, joint: _Tag, turn: Rotation, shift_m: np.ndarray) -> lis
 
 
 def ratios_of(head: HeadJoints, steps_per_turn: float) -> dict[str, float]:
-    """Nominal degrees per step, by transmissions and the counts of a turn of the motors."""
+    """Nominal degrees per step, from the transmissions and the motors' steps per turn."""
     return {
         f"degrees_per_step.{axis}": FULL_TURN_DEG / (steps_per_turn * abs(head.reduction(axis) or 1.0)) for axis in AXES
     }
@@ -424,15 +424,15 @@ UNSAID = (
 
 @dataclass(frozen=True)
 class HeadModel:
-    """What a fit says of a head, for a model of a robot.
+    """Results of a head's fit, for the model of a robot.
 
     Attributes:
-        names: of `values`, those of the head's parameters.
+        names: names of `values`, those of the head's parameters.
         values: estimates, units of the names, shape (n,).
-        covariance: of them, shape (n, n).
-        origin: what made them, in a line.
-        data_sha256: of the data.
-        steps_per_turn: of the motors, None where not stated.
+        covariance: covariance of `values`, shape (n, n).
+        origin: program and data of the estimate, in one line.
+        data_sha256: hash of the data.
+        steps_per_turn: steps per turn of the motors, None where not stated.
     """
 
     names: tuple[str, ...]
@@ -444,7 +444,7 @@ class HeadModel:
 
     @property
     def by_name(self) -> dict[str, float]:
-        """Estimates."""
+        """Estimates by name."""
         return dict(zip(self.names, self.values.tolist(), strict=True))
 
     def steps_per_rad(self, head: HeadJoints | None) -> dict[str, float]:
@@ -453,7 +453,7 @@ class HeadModel:
         return {axis: sign[axis] * math.degrees(1.0) / self.by_name[f"degrees_per_step.{axis}"] for axis in AXES}
 
     def properties(self, head: HeadJoints | None) -> dict[str, str]:
-        """By name: estimates with their u, and counters per radian of each joint."""
+        """Properties by name: estimates with their u, and counters per radian of each joint."""
         properties = {CORRECTS: self.data_sha256}
         properties |= {f"head_{axis}_steps_per_rad": f"{n:.12g}" for axis, n in self.steps_per_rad(head).items()}
         for (name, value), u in zip(self.by_name.items(), np.sqrt(np.diag(self.covariance)), strict=True):
@@ -462,10 +462,10 @@ class HeadModel:
         return properties
 
     def urdf(self, head: HeadJoints | None) -> bytes:
-        """The URDF with what was estimated, or where none is known a file of xacro properties.
+        """The URDF with the estimated terms, or without a URDF a file of xacro properties.
 
         Raises:
-            InputError: the URDF has these data's correction already.
+            InputError: the URDF already contains the correction from these data.
         """
         lines = [f'  <{PROPERTY} name="{name}" value="{text}"/>\n' for name, text in self.properties(head).items()]
         if head is None:
@@ -484,7 +484,7 @@ class HeadModel:
         return corrected(head, self.by_name, reductions, "".join(lines))
 
     def document(self, head: HeadJoints | None) -> dict[str, Any]:
-        """The same for programs, with the covariance; units of the names."""
+        """The estimates for programs, with their covariance; units of the names."""
         joints = {
             axis: {"name": axis if head is None else head.names[axis], "steps_per_rad": float(f"{n:.12g}")}
             for axis, n in self.steps_per_rad(head).items()

@@ -1,4 +1,4 @@
-"""Classic against joint and one date against another, as results; `results/compare.json` written and read.
+"""Results of comparing classic with joint and one date with another; reads and writes `results/compare.json`.
 
 Ratios and their gaps in deg/step, angles in deg.
 """
@@ -27,7 +27,7 @@ BETTER_CLASSIC, BETTER_JOINT, CANNOT_TELL = "classic predicts better", "joint pr
 
 
 class GapTerm(ClosedRecord, frozen=True):
-    """A part of (classic mean - effective ratio), deg/step: mean or mode, standard deviation, 95 % interval."""
+    """A term of (classic mean - effective ratio), deg/step: mean or mode, standard deviation, 95 % interval."""
 
     name: str
     value: float
@@ -36,13 +36,13 @@ class GapTerm(ClosedRecord, frozen=True):
 
 
 class Gap(ClosedRecord, frozen=True):
-    """Why the classic mean of one direction is not the effective ratio; all in deg/step.
+    """Why the classic mean of one direction differs from the effective ratio; all in deg/step.
 
     Attributes:
         classic: the classic estimator's mean.
         joint: effective ratio.
         total: classic - joint.
-        terms: its parts, which add up to `total`.
+        terms: its terms, which sum to `total`.
     """
 
     classic: float
@@ -52,10 +52,10 @@ class Gap(ClosedRecord, frozen=True):
 
 
 class Prediction(Record, frozen=True):
-    """The four-point angle of one experiment as others predicted it, deg.
+    """The four-point angle of one experiment, predicted from other experiments, deg.
 
-    `classic_u_deg` rests on the scatter of few experiments and has `classic_dof` degrees of freedom; `joint_u_deg` is
-    the spread of many predictive draws.
+    `classic_u_deg` is estimated from the scatter of few experiments, with `classic_dof` degrees of freedom;
+    `joint_u_deg` is the spread of many predictive draws.
     """
 
     experiment: int
@@ -71,11 +71,11 @@ class Prediction(Record, frozen=True):
 
 
 class Score(Record, frozen=True):
-    """How well one estimator predicted the angles.
+    """Accuracy of one estimator's predicted angles.
 
     Attributes:
         rms_deg: root mean square error.
-        rms_block_deg: of the mean errors of the blocks (fold and direction): the part that repeats do not average.
+        rms_block_deg: root mean square of the mean errors of blocks (fold and direction), which repeats do not average.
         coverage: share of angles inside the 95 % predictive intervals: Student's t for the classic, whose scatter is
             estimated from few experiments (GUM G.3.2), normal for the joint.
         log_density: mean log predictive density of the same distributions, per deg.
@@ -88,19 +88,19 @@ class Score(Record, frozen=True):
 
 
 class HoldOut(Shown, Record, frozen=True):
-    """Classic against joint on experiments that neither had seen.
+    """Classic against joint on held-out experiments.
 
     Attributes:
         by: "steps" (a whole |N| left out) or "regions" (a part of the range of start counters).
-        predictions: of every experiment that could be predicted by both.
-        classic: score.
-        joint: score.
+        predictions: one for every experiment that both could predict.
+        classic: score of the classic estimator.
+        joint: score of the joint estimate.
         ratio: rms_block_deg of the classic / that of the joint.
-        interval95: of the ratio, for errors that go together (Pitman, Biometrika 31 (1939) 9; Morgan, ibid. 13;
+        interval95: of the ratio, for correlated errors (Pitman, Biometrika 31 (1939) 9; Morgan, ibid. 13;
             about zero, blocks as independent normal pairs); None with fewer than `BLOCKS_MIN` blocks.
-        verdict: who predicts better, or "cannot tell".
-        reason: of the verdict.
-        unseen: standard uncertainty of each ratio that is common to all experiments, and so in no residual: stereo
+        verdict: which estimator predicts better, or "cannot tell".
+        reason: reason for the verdict.
+        unseen: standard uncertainty of each ratio common to all experiments, and therefore in no residual: stereo
             calibration and focal scale, deg/step.
     """
 
@@ -127,14 +127,14 @@ class HoldOut(Shown, Record, frozen=True):
 
 
 class HeldOutPosition(Record, frozen=True, kw_only=True):
-    """One position from one side, predicted by all others: of two axes mirror angles in deg, of one in its unit.
+    """One position from one side, predicted from all others: mirror angles in deg for two axes, else the axis' unit.
 
     Attributes:
-        position: command, steps of two axes.
-        direction: of the move to it, such as "left", "forward" or "unknown".
-        n: looks or readings in the mean.
-        mean: of what was seen or read.
-        predicted, u: of that mean; stop errors and noise of its looks or readings in u.
+        position: command, or counter in steps of two axes.
+        direction: direction of the preceding move, such as "left", "forward" or "unknown".
+        n: number of looks or readings in the mean.
+        mean: mean of the observed values.
+        predicted, u: prediction of that mean; u includes stop errors and noise of its looks or readings.
     """
 
     position: float
@@ -146,7 +146,7 @@ class HeldOutPosition(Record, frozen=True, kw_only=True):
 
     @property
     def z(self) -> float:
-        """How far off the prediction is, in u."""
+        """Deviation of the mean from its prediction, in u."""
         return (self.mean - self.predicted) / self.u
 
 
@@ -160,9 +160,9 @@ class HeldOutReadings(HeldOutPosition, frozen=True, kw_only=True):
     """A position of one axis.
 
     Attributes:
-        rows, inside: moves in it, and how many of their readings lie within 95 % of what was predicted of each.
-        classic_predicted, classic_u: by the least-squares line with one reversal and independent stops.
-        end: whether nothing was read beyond it on one side.
+        rows, inside: number of moves, and of their readings within the predicted 95 % intervals.
+        classic_predicted, classic_u: from the least-squares line with one reversal and independent stops.
+        end: whether it is the first or last position read.
     """
 
     rows: int
@@ -173,18 +173,18 @@ class HeldOutReadings(HeldOutPosition, frozen=True, kw_only=True):
 
     @property
     def classic_z(self) -> float:
-        """How far off the classic's prediction is, in its u."""
+        """Deviation of the mean from the classic prediction, in its u."""
         return (self.mean - self.classic_predicted) / max(self.classic_u, 1e-300)
 
 
 class PositionHoldOut(Record, frozen=True, kw_only=True):
-    """All positions predicted.
+    """Hold-out of all positions.
 
     Attributes:
         by: "positions".
-        positions: each from each side.
+        positions: every position from each side.
         rms_z: root mean square of (mean - predicted) / u; None where nothing could be predicted.
-        warnings: sentences on what could not.
+        warnings: sentences on positions that could not be predicted.
     """
 
     by: str = "positions"
@@ -194,11 +194,11 @@ class PositionHoldOut(Record, frozen=True, kw_only=True):
 
 
 class AxisHoldOut(Shown, Record, frozen=True, kw_only=True):
-    """All positions of one axis predicted; as of two axes, and the classic beside it.
+    """Hold-out of all positions of one axis, as for two axes, with the classic predictions.
 
     Attributes:
-        classic_rms_z: of the classic line; 0 where nothing could be predicted, as `rms_z`.
-        inside_share: of the readings left out, in their 95 % intervals.
+        classic_rms_z: `rms_z` of the classic line; 0 where nothing could be predicted.
+        inside_share: share of held-out readings within their 95 % intervals.
     """
 
     by: str = "positions"
@@ -209,7 +209,7 @@ class AxisHoldOut(Shown, Record, frozen=True, kw_only=True):
     warnings: tuple[str, ...]
 
     def shown(self) -> View:
-        """Every position beside what was predicted of it."""
+        """Every position with its prediction."""
         names = ("position", "direction", "n", "mean", "predicted", "u", "classic_predicted", "classic_u")
         rows = [tuple(getattr(position, name) for name in names) for position in self.positions]
         title = f"AxisHoldOut: RMS z {self.rms_z:.2f}, classic {self.classic_rms_z:.2f}"
@@ -217,7 +217,7 @@ class AxisHoldOut(Shown, Record, frozen=True, kw_only=True):
 
 
 def hold_out_document(held: PositionHoldOut | AxisHoldOut, unit: str) -> dict[str, object]:
-    """The document of `compare --by positions --json`, without what the caller adds (`files`)."""
+    """The document of `compare --by positions --json`, without the key that the caller adds (`files`)."""
     return {"kind": "positions left out", "unit": unit, "hold_out": held.as_json()}
 
 
@@ -225,13 +225,13 @@ class Change(Record, frozen=True):
     """One quantity of two calibrations.
 
     Attributes:
-        quantity: as JSON has it; what it calls an effective ratio is the local one at the pose of the comparison.
+        quantity: its key in JSON; an effective ratio there is the local ratio at the pose of the comparison.
         unit: of the values.
         first, second: estimates of A and B.
         difference: second - first.
-        u: its standard uncertainty; what both calibrations share is not in it.
+        u: its standard uncertainty; errors that both calibrations share are not in it.
         normalised: difference / u; None where both calibrations hold the quantity fixed.
-        significant: |normalised| beyond the limit at which chance alone passes in 1 of 20 comparisons (all
+        significant: |normalised| beyond the limit that chance alone exceeds in 1 of 20 comparisons (all
             quantities together, Sidak).
     """
 
@@ -246,7 +246,7 @@ class Change(Record, frozen=True):
 
     @property
     def told(self) -> str:
-        """The contract name of what was compared."""
+        """The documented name of the quantity."""
         return self.quantity.replace("effective_deg_per_step", "local_deg_per_step")
 
 
@@ -254,12 +254,12 @@ class Comparison(Shown, Record, frozen=True, tag_field="kind", tag="two calibrat
     """Two calibrations of one instrument at one pose.
 
     Attributes:
-        reference_pose_deg: (pan, tilt) of A, at which both are compared.
-        changes: of the local ratios at that pose and the backlashes.
+        reference_pose_deg: pose (pan, tilt) of A at which both are compared.
+        changes: changes of the local ratios at that pose and of the backlashes.
         shared_cameras: both campaigns state the same stereo calibration; its error is common.
-        days: from A to B where both state when they were made.
-        limit: of |normalised|.
-        verdict: in words.
+        days: time from A to B where both state their date.
+        limit: limit of |normalised|.
+        verdict: conclusion, in words.
     """
 
     reference_pose_deg: tuple[float, float]
@@ -270,7 +270,7 @@ class Comparison(Shown, Record, frozen=True, tag_field="kind", tag="two calibrat
     verdict: str
 
     def shown(self) -> View:
-        """What has changed."""
+        """Show the changes."""
         columns = ("quantity", "unit", "A", "B", "B - A", "u", "normalised", "significant")
         rows = [
             (c.told, c.unit, c.first, c.second, c.difference, c.u, c.normalised, c.significant) for c in self.changes
@@ -279,14 +279,14 @@ class Comparison(Shown, Record, frozen=True, tag_field="kind", tag="two calibrat
 
 
 class ComparisonRecord(Shown, Record, frozen=True, kw_only=True, tag_field="kind", tag="classic against joint"):
-    """Classic against joint, as `results/compare.json` holds it.
+    """Classic against joint, the content of `results/compare.json`.
 
     Attributes:
-        estimator: of the joint model.
+        estimator: estimator of the joint model.
         directions: why both differ, by direction; None without complete experiments.
-        held_out: how both predict what neither had seen.
-        inputs: hashes of what the campaign's estimates depend on.
-        seed: of the predictive draws.
+        held_out: predictions of held-out experiments by both.
+        inputs: hashes of the inputs of the campaign's estimates.
+        seed: seed of the predictive draws.
     """
 
     format: str = COMPARISON_FORMAT
@@ -297,15 +297,15 @@ class ComparisonRecord(Shown, Record, frozen=True, kw_only=True, tag_field="kind
     seed: int
 
     def shown(self) -> View:
-        """How both estimators predict what neither had seen."""
+        """Show how both estimators predict held-out experiments."""
         return self.held_out.shown()
 
 
 def stored_hold_out(campaign: Campaign, inputs: Mapping[str, str]) -> HoldOut | None:
-    """What `compare` found of held-out angles, if it was made from the data and priors with these hashes.
+    """The stored hold-out of `compare`, if it was made from the data and priors with these hashes.
 
     Raises:
-        InputError: it is damaged or of another version, with the key.
+        InputError: the file is damaged or of another version, with the key.
     """
     keys = stored_document(campaign, "compare.json", (COMPARISON_FORMAT,), inputs)
     if keys is None:

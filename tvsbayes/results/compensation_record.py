@@ -1,6 +1,6 @@
-"""A compensation and its promise, and whether a machine keeps it: `results/compensation.json`, `verify --json`.
+"""A compensation with its promise, and its test on a machine: `results/compensation.json`, `verify --json`.
 
-Commands as the campaign counts them; readings, errors and uncertainties in its unit.
+Commands in the campaign's counts; readings, errors and uncertainties in its unit.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ CANNOT_TELL: Verdict = "CANNOT TELL"
 APPLIED, NOT_APPLIED, TWICE, WRONG_SIGN = "applied", "not applied", "applied twice", "wrong sign"
 OTHER_MACHINE = "another machine"
 WORLDS = (APPLIED, NOT_APPLIED, TWICE, WRONG_SIGN, OTHER_MACHINE)
-"""What may have become of a table; the last also stands for a machine that changed."""
+"""Hypotheses on a table in use; the last also stands for a machine that changed."""
 CAUSES = ("table", "format", "stops", "homing", "drift", "readings")
-"""Of what is left after applying: uncertainty of the table itself, what the format cannot hold, scatter of stops, of
-homings, the walk of the zero since the last one, scatter of the readings that verify it."""
+"""Causes of the errors that remain after applying: uncertainty of the table, resolution of the format, scatter of stops
+and of homings, the walk of the zero since the last homing, scatter of the readings that verify it."""
 
 
 class TableRow(Record, frozen=True):
-    """A command and what is expected there.
+    """A command and the readings expected there.
 
     Attributes:
-        command: asked for.
+        command: the commanded position.
         forward, backward: reading expected without compensation, arriving by a rising or a falling command.
         u_forward, u_backward: standard uncertainty of a single arrival.
-        add_forward, add_backward: what the format adds to the command.
+        add_forward, add_backward: corrections that the format adds to the command.
     """
 
     command: float
@@ -61,14 +61,14 @@ class TableRow(Record, frozen=True):
 
 
 class SidePromise(Record, frozen=True):
-    """What is left after applying, of readings of one side within the range.
+    """Errors that remain after applying, for readings from one side within the range.
 
     Attributes:
-        error95: 95 % of errors are at most so large, either sign.
-        rms: root mean square of the errors expected.
-        without95: `error95` if nothing is applied.
-        causes: what each cause alone would leave, 95 %.
-        shift_free95: `error95` of errors but for one shift common to all, as within one homing; None in older
+        error95: 95 % of errors are at most this size, either sign.
+        rms: root mean square of the expected errors.
+        without95: `error95` without compensation.
+        causes: error that each cause alone would leave, 95 %.
+        shift_free95: `error95` of errors after removing one common shift, as within one homing; None in older
             files.
     """
 
@@ -83,25 +83,25 @@ type Sides = Annotated[dict[str, SidePromise], Meta(extra_json_schema={"required
 
 
 class Compensation(Shown, Record, frozen=True, kw_only=True):
-    """A two-sided table for one controller, and the promise of what is left after applying it.
+    """A two-sided table for one controller, and the promised bound of the errors that remain after applying it.
 
     Attributes:
-        target: format, as `--to` has it.
-        machine: name or serial number, as `campaign.toml` has it.
-        unit: of readings.
-        applied_by: who adds the corrections: the controller by itself, or the program that commands it.
-        per_command, offset: the line that is aimed at: reading = offset + per_command x command.
-        zero_free: the format leaves the zero open: errors count but for one shift, common to all.
-        range_command: the promise holds between these commands.
+        target: format, as in `--to`.
+        machine: name or serial number, as in `campaign.toml`.
+        unit: unit of the readings.
+        applied_by: what adds the corrections: the controller itself, or the program that commands it.
+        per_command, offset: the target line: reading = offset + per_command x command.
+        zero_free: the format leaves the zero open: one shift, common to all errors, does not count.
+        range_command: commands between which the promise holds.
         resolution: least command that the controller carries out; 0 where it is fine.
-        reversal_command: travel, in commands, that arrives on a side whatever came before.
-        hours, travel_command: since homing, for which the promise holds: the campaign's longest segment.
-        homings: in the campaign; of one alone, the scatter of homings is known by its prior.
-        table: by rising command.
+        reversal_command: travel, in commands, after which an arrival is on one side whatever came before.
+        hours, travel_command: limits since homing for which the promise holds: the campaign's longest segment.
+        homings: number in the campaign; with a single one, the prior alone determines the scatter of homings.
+        table: rows by increasing command.
         settings: numbers of formats that hold no table, by name.
-        promise: by side.
-        unsaid: what the format cannot say, in words.
-        text: content of the file; no part of the document.
+        promise: promised errors, by side.
+        unsaid: corrections that the format cannot express, in words.
+        text: content of the file; not part of the document.
     """
 
     target: str
@@ -126,23 +126,23 @@ class Compensation(Shown, Record, frozen=True, kw_only=True):
 
     @property
     def digest(self) -> str:
-        """Of table and promise, so that a verification knows of which it is."""
+        """Hash of table and promise, by which a verification identifies them."""
         return hashlib.sha256(json.dumps(self.as_json(), sort_keys=True).encode()).hexdigest()
 
     @property
     def in_motion(self) -> bool:
-        """Whether it is of a drive at constant rate, which never turns back: a table of one period."""
+        """Whether the table is one period of a drive at constant rate, which never reverses."""
         return self.reversal_command == 0 and "period_command" in self.settings
 
     @property
     def shown_by(self) -> str:
-        """What shows whether the promise is kept."""
+        """The readings that test whether the promise is kept."""
         if self.in_motion:
             return "log again and run tvsbayes fit: its wave of this period is what is left"
         return "take fresh readings and run tvsbayes verify"
 
     def shown(self) -> View:
-        """The table."""
+        """Show the table."""
         rows = [(r.command, r.forward, r.backward, r.u_forward, r.u_backward) for r in self.table]
         left = ", ".join(f"{side} {self.promise[side].error95:.3g}" for side in ("forward", "backward"))
         title = f"Compensation for {self.target}: left after applying, 95 %: {left} {self.unit}"
@@ -160,7 +160,7 @@ class Millimetres(Record, frozen=True):
     """Errors of the points of a scanner, at a distance along the beam.
 
     Attributes:
-        distance_mm: along the beam.
+        distance_mm: distance along the beam.
         before, after, promised95: as in the verification, mm across all directions.
     """
 
@@ -171,21 +171,21 @@ class Millimetres(Record, frozen=True):
 
 
 class Verification(Shown, Record, frozen=True, kw_only=True):
-    """Fresh readings of an axis under a table in force, or fresh looks of a scanner that its calibration aimed.
+    """Test of a promise by fresh readings of an axis with its table in force, or fresh looks aimed by a calibration.
 
     Attributes:
         verdict: `KEPT`, `BROKEN` or `CANNOT_TELL`.
-        p: probability of readings this far off, if the table was applied to this machine as promised.
-        worlds: probability of each of `WORLDS`.
-        before: errors that the same stops would have without the table, as the campaign expects them.
+        p: probability of deviations this large if the table was applied to this machine as promised.
+        worlds: probability of each hypothesis of `WORLDS`.
+        before: errors of the same stops without the table, as predicted from the campaign.
         after: errors of the fresh readings.
-        promised95: 95 % of errors are at most so large, of these stops, by the promise.
-        readings: how many were used; of a scanner looks, each of which shows both axes.
-        millimetres: the same of points; of a scanner alone.
-        unit: of errors; with `needed`, `remarks` and `looks` no part of the document.
-        needed: readings that would tell; None where no number does, 0 where these do.
-        remarks: what else is to be said, in sentences.
-        looks: these are looks of two axes that a calibration aimed.
+        promised95: 95 % of errors of these stops are at most this size, by the promise.
+        readings: number used; for a scanner looks, each of which shows both axes.
+        millimetres: the same for points; only for a scanner.
+        unit: unit of errors; with `needed`, `remarks` and `looks` not part of the document.
+        needed: readings needed for a verdict; None where no number suffices, 0 where these do.
+        remarks: further remarks, in sentences.
+        looks: whether these are looks of two axes aimed by a calibration.
     """
 
     verdict: Verdict
@@ -208,26 +208,26 @@ class Verification(Shown, Record, frozen=True, kw_only=True):
 
     @property
     def world(self) -> str:
-        """The most probable one."""
+        """The most probable hypothesis."""
         return max(self.worlds, key=lambda name: self.worlds[name])
 
     def shown(self) -> View:
-        """Probabilities of the worlds."""
+        """Show the probabilities of the hypotheses."""
         title = f"Verification: {self.verdict}, p = {self.p:.3g}"
         return View(title, ("world", "probability"), list(self.worlds.items()))
 
 
 def stored_verification(campaign: HasFolder, inputs: Mapping[str, str], table: str, unit: str) -> Verification | None:
-    """What `verify` said last; None where it has not, or of other data or another table.
+    """The last result of `verify`; None without one, or where it belongs to other data or another table.
 
     Args:
-        campaign: whose folder it lies in.
-        inputs: hashes of its data.
+        campaign: campaign whose folder contains it.
+        inputs: hashes of the campaign's data.
         table: digest of the table or calibration in force.
-        unit: of errors.
+        unit: unit of errors.
 
     Raises:
-        InputError: it is damaged.
+        InputError: the file is damaged.
     """
     keys = stored_document(campaign, "verification.json", (VERIFICATION_FORMAT,), inputs)
     if keys is None or keys.values.get("table") != table:

@@ -1,6 +1,6 @@
-"""Whether a sampled posterior may be used: its diagnosis by quantity, and what `fit.json` says of it under `sampling`.
+"""Whether a sampled posterior may be used: its diagnosis by quantity, and the part `sampling` of `fit.json`.
 
-Lengths in steps of the sampler; effective draws and R-hat by contract name.
+Lengths in steps of the sampler; effective draws and R-hat by quantity name.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from tvsbayes.results.records import AnswerKind, Count, FromOne, NotNegative, Ti
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 MEAN_ERROR_MAX, END_ERROR_MAX = 0.1, 0.2
-"""Monte Carlo standard error of a headline's mean and of the ends of its 95 % interval, in its sd, with which an answer
-is accepted: the first widens the interval by 0.5 %, the second moves an end by a digit that is not printed."""
+"""Largest accepted Monte Carlo standard errors of a headline's mean and of the ends of its 95 % interval, in its sd:
+the first widens the interval by 0.5 %, the second moves an end by a digit that is not printed."""
 ROUGH_MEAN_ERROR_MAX, ROUGH_END_ERROR_MAX = 0.3, 0.6
-"""The same of a rough answer: the first widens an interval by 4 %, the second misses an end by a third of its distance
-from the mean, but seldom."""
+"""Largest errors of a rough answer: the first widens an interval by 4 %, the second moves an end by a third of its
+distance from the mean, but rarely."""
 
 
 @dataclass(frozen=True)
 class NamedValue:
-    """The extreme of a diagnosis, and the quantity that has it."""
+    """Extreme value of a diagnosis, with its quantity."""
 
     quantity: str
     value: float
@@ -32,49 +32,49 @@ class NamedValue:
 
 @dataclass(frozen=True)
 class MonteCarloError:
-    """How far sampling alone may have moved what is said of a quantity, standard errors in its posterior sd.
+    """Monte Carlo standard errors of a quantity's summary, in its posterior sd.
 
     Attributes:
-        mean: of its mean.
-        interval95: of the ends of its 95 % interval, low and high.
+        mean: error of its mean.
+        interval95: errors of the ends of its 95 % interval, low and high.
     """
 
     mean: NotNegative
     interval95: tuple[NotNegative, NotNegative]
 
     def within(self, mean: float, end: float) -> bool:
-        """Whether neither the mean nor an end has a larger error; an error that is no number is too large."""
+        """Whether neither the mean nor an end has a larger error; NaN counts as too large."""
         return self.mean <= mean and all(each <= end for each in self.interval95)
 
     @property
     def roughly_known(self) -> bool:
-        """Whether the errors leave a rough answer."""
+        """Whether the errors allow a rough answer."""
         return self.within(ROUGH_MEAN_ERROR_MAX, ROUGH_END_ERROR_MAX)
 
     @property
     def rounds_factor(self) -> float:
-        """How many times as many draws an accepted answer takes."""
+        """Factor on the number of draws that an accepted answer needs."""
         return max(self.mean / MEAN_ERROR_MAX, *(each / END_ERROR_MAX for each in self.interval95)) ** 2
 
 
 @dataclass(frozen=True)
 class Importance:
-    """Importance sampling: draws and what their weights are worth.
+    """Diagnosis of importance sampling: its draws and their weights.
 
     Attributes:
-        accepted: its intervals may be used.
+        accepted: whether its intervals may be used.
         missing: sentences on why not.
-        rounds, draws: how many were made.
-        effective_share: equal draws that the weights are worth, over the draws.
-        least_ess: least effective draws of a headline's mean, sd or interval ends.
+        rounds, draws: number of each.
+        effective_share: number of equally weighted draws equivalent to the weighted ones, over the draws.
+        least_ess: least effective number of draws of a headline's mean, sd or interval ends.
         pareto_k: tail index of the weights.
         worst_pareto_k: largest tail index of a headline's squared deviations times weights.
-        heaviest_share: of the weight, in one draw.
-        log_evidence: log of the integral of likelihood and prior; likelihoods have the constants of
+        heaviest_share: largest share of the weight in one draw.
+        log_evidence: log of the integral of likelihood and prior; likelihoods include the constants of
             `estimators.campaign_arrays.spot_constants`, and ranges are flat in image displacement.
         log_evidence_mcse: its Monte Carlo standard error.
-        invalid_evaluations: draws whose density has no value.
-        answer: what the draws are good for.
+        invalid_evaluations: draws whose density is not finite.
+        answer: use that the draws allow.
     """
 
     accepted: bool
@@ -94,11 +94,11 @@ class Importance:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Whether a chain and importance sampling say the same of every headline.
+    """Whether a chain and importance sampling agree on every headline.
 
     Attributes:
         agrees: `worst` lies below `limit`.
-        limit: in Monte Carlo standard errors of both.
+        limit: largest allowed difference, in Monte Carlo standard errors of both.
         worst: largest difference of a headline's mean or interval end, in the same unit.
     """
 
@@ -109,13 +109,13 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Sampling:
-    """The diagnosis of a posterior in brief; fields of a chain as in `Convergence`, None where there is no chain.
+    """Summary of a posterior's diagnosis; fields of a chain as in `Convergence`, None without a chain.
 
     Attributes:
-        missing: sentences on what is not reached.
+        missing: sentences on the criteria that are not met.
         acceptance: mean over walkers.
-        least_acceptance: of the worst walker.
-        agreement: None where importance sampling was not accepted, or alone.
+        least_acceptance: acceptance of the worst walker.
+        agreement: None where importance sampling was not accepted, or no chain ran.
     """
 
     converged: bool
@@ -145,12 +145,12 @@ def extreme(of: dict[str, float], chosen: Callable[..., str]) -> NamedValue:
 
 @dataclass(frozen=True)
 class Reweighted:
-    """Whether weighted draws may be used alone.
+    """Diagnosis of weighted draws without a chain.
 
     Attributes:
         importance: their diagnosis.
-        ess_bulk, ess_tail: effective draws of the mean and of the worse end of the interval, by contract name.
-        monte_carlo_error: of every headline.
+        ess_bulk, ess_tail: effective draws of the mean and of the worse end of the interval, by quantity name.
+        monte_carlo_error: errors of every headline.
     """
 
     tier: ClassVar[Tier] = IMPORTANCE
@@ -161,27 +161,27 @@ class Reweighted:
 
     @property
     def answer(self) -> AnswerKind:
-        """What the draws are good for: their intervals, these roughly, or nothing."""
+        """Use that the draws allow: intervals, rough intervals, or none."""
         return self.importance.answer or "laplace"
 
     @property
     def rhat(self) -> dict[str, float]:
-        """Independent draws have none."""
+        """Empty: independent draws have no R-hat."""
         return {}
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Sentences on what is not reached; empty when accepted."""
+        """Sentences on the criteria that are not met; empty when accepted."""
         return self.importance.missing
 
     @property
     def converged(self) -> bool:
-        """There is a sampled answer, accepted or rough."""
+        """Whether there is a sampled answer, accepted or rough."""
         return self.answer != "laplace"
 
     @property
     def sampling(self) -> Sampling:
-        """What is said of the draws."""
+        """Summary of the draws' diagnosis."""
         return Sampling(
             converged=self.converged,
             missing=self.missing,
@@ -204,22 +204,22 @@ class Reweighted:
 
 @dataclass(frozen=True)
 class Convergence:
-    """Whether a chain may be used, and why not.
+    """Diagnosis of a chain: whether it may be used, or why not.
 
     Attributes:
-        steps: length of the chain; discarded: first steps left out; thin: one in so many is stored.
+        steps: length of the chain; discarded: first steps left out; thin: interval of the stored steps.
         tau_steps: longest integrated autocorrelation time.
-        rhat: over groups of walkers, by contract name, of every sampled or derived quantity.
+        rhat: R-hat over groups of walkers, of every sampled or derived quantity by name.
         ess_bulk, ess_tail: effective draws, likewise.
         acceptance: share of accepted moves by walker.
-        stuck_walkers: walkers that hardly moved or live at another density.
-        invalid: evaluations that gave no number.
-        missing: sentences on what is not reached; empty when accepted.
-        importance: diagnosis of the draws that the chain started from.
-        agreement: with them; None where they were not accepted.
-        monte_carlo_error: of every headline.
-        rough: what is missing leaves a rough answer.
-        tier: what ran the chain.
+        stuck_walkers: walkers that hardly moved or stay at another density.
+        invalid: evaluations that returned no number.
+        missing: sentences on the criteria that are not met; empty when accepted.
+        importance: diagnosis of the draws from which the chain started.
+        agreement: agreement with these draws; None where they were not accepted.
+        monte_carlo_error: errors of every headline.
+        rough: whether the unmet criteria allow a rough answer.
+        tier: sampler of the chain.
     """
 
     steps: int
@@ -241,17 +241,17 @@ class Convergence:
 
     @property
     def answer(self) -> AnswerKind:
-        """What the draws are good for: their intervals, these roughly, or nothing."""
+        """Use that the draws allow: intervals, rough intervals, or none."""
         return "accepted" if not self.missing else "rough" if self.rough else "laplace"
 
     @property
     def converged(self) -> bool:
-        """There is a sampled answer, accepted or rough."""
+        """Whether there is a sampled answer, accepted or rough."""
         return self.answer != "laplace"
 
     @property
     def sampling(self) -> Sampling:
-        """What is said of the chain."""
+        """Summary of the chain's diagnosis."""
         return Sampling(
             converged=self.converged,
             missing=self.missing,

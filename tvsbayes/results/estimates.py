@@ -1,6 +1,6 @@
-"""What a fit says and how it was examined: estimates, what they depend on, tests and residuals of its model.
+"""Results of a fit: estimates, their dependence on data and priors, tests and residuals of the model.
 
-Values in the units of the contract names: deg, deg/step, mm, rad, px; time in s, counters in steps.
+Values in the units of the names: deg, deg/step, mm, rad, px; time in s, counters in steps.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from tvsbayes.results.records import (
 )
 
 CONTRACTION_LIMIT = 0.1
-"""1 - (posterior sd / prior sd)^2 below which a value is called set by the prior."""
+"""1 - (posterior sd / prior sd)^2 below which a value counts as set by the prior."""
 CONFLICT_LIMIT = 4.0
-"""Prior standard deviations; of fifty parameters one lies beyond it in 3 of 1000 honest campaigns."""
+"""Limit in prior sds; in 3 of 1000 campaigns with correct priors one of fifty parameters exceeds it."""
 CONFLICT_REMEDY = "check the sign of the counters and the unit, or state the prior wider"
 
 
 def conflict_sentence(quantity: str, distance: float, centre: str = "", remedy: str = CONFLICT_REMEDY) -> str:
-    """A prior that the data contradict, in words.
+    """Describe a prior that the data contradict.
 
     Args:
         quantity: name and value.
-        distance: of the value from the prior's centre, in prior sds; infinite where the prior holds it exactly.
-        centre: what the prior says, where it is worth saying.
-        remedy: what to do.
+        distance: distance of the value from the prior's centre, in prior sds; infinite where the prior fixes it.
+        centre: centre of the prior, where it should be stated.
+        remedy: the remedy.
     """
     far = f"{distance:.1f} prior sds" if np.isfinite(distance) else "beyond every bound"
     return f"{quantity} lies {far} from its prior's centre{centre and f', {centre}'}: {remedy}"
@@ -62,7 +62,7 @@ ALWAYS_ESTIMATED = (
     *("degrees_per_step.pan", "degrees_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
     "pixel_scale",
 )
-"""Parameters that every `fit.json` holds."""
+"""Parameters that every `fit.json` contains."""
 
 
 class Estimate(ClosedRecord, frozen=True):
@@ -74,7 +74,7 @@ class Estimate(ClosedRecord, frozen=True):
         interval95: equal-tailed.
         prior_sd: standard deviation of the prior; None where nothing is estimated.
         contraction: 1 - var_post / var_prior; None where nothing is estimated.
-        rhat, ess_bulk, ess_tail: of a sampler; None where none ran.
+        rhat, ess_bulk, ess_tail: diagnosis of a sampler; None where none ran.
     """
 
     value: float
@@ -94,14 +94,14 @@ class Estimate(ClosedRecord, frozen=True):
 
 
 class WeakDirection(ClosedRecord, frozen=True):
-    """A mixture of parameters that the data leave to the prior; loadings are in prior sds."""
+    """A combination of parameters that the data do not constrain beyond the prior; loadings are in prior sds."""
 
     text: str
     loadings: dict[str, float]
 
 
 class Leverage(ClosedRecord, frozen=True):
-    """A stop without which the sd of `quantity` would grow by `factor` (None: beyond all bounds)."""
+    """A stop without which the sd of `quantity` would grow by `factor` (None: without bound)."""
 
     move: Count
     spots: tuple[Count, ...]
@@ -111,7 +111,7 @@ class Leverage(ClosedRecord, frozen=True):
 
 
 class PriorSensitivity(ClosedRecord, frozen=True):
-    """What a headline would do if the u of one prior were multiplied by `factor`.
+    """Change of a headline if the u of one prior were multiplied by `factor`.
 
     Attributes:
         shift_sd: change of the value in its present sds.
@@ -126,17 +126,17 @@ class PriorSensitivity(ClosedRecord, frozen=True):
 
 
 class ValidationTest(ClosedRecord, frozen=True):
-    """One question to the residuals of a fit: is there a trace of this defect?
+    """One test of a fit's residuals for a defect.
 
     Attributes:
-        name: defect.
+        name: the defect.
         where: most suspicious place or period, in words.
         chi2: score statistic there, distributed as chi-square with `dof` if the model holds.
-        dof: sizes of the defect that the fit would not swallow.
-        places: how many places or periods were asked about.
-        p: probability of such a statistic in a clean campaign, any place.
+        dof: number of independent amplitudes of the defect that the fit's parameters do not absorb.
+        places: number of places or periods tested.
+        p: probability of a statistic this large in a campaign without defects, at any place.
         failed: whether p is too small, all tests taken together.
-        shift_sd: most that the defect, in the size seen, would move a ratio or backlash, in their sds.
+        shift_sd: largest shift of a ratio or backlash by the defect at its estimated size, in their sds.
     """
 
     name: str
@@ -150,14 +150,14 @@ class ValidationTest(ClosedRecord, frozen=True):
 
 
 class Validation(ClosedRecord, frozen=True):
-    """Whether the residuals of a fit look as its model says.
+    """Whether the residuals of a fit agree with its model.
 
     Attributes:
         passed: no test failed.
-        level: probability with which a clean campaign does not pass.
+        level: probability that a campaign without defects does not pass.
         cause: the defect that explains the residuals best, in words; empty where all passed.
         inflation: factor on every standard uncertainty; 1 where all passed.
-        tests: every question that the campaign can answer.
+        tests: every test that the campaign allows.
     """
 
     passed: bool
@@ -168,7 +168,7 @@ class Validation(ClosedRecord, frozen=True):
 
     @property
     def widens(self) -> bool:
-        """Whether the factor differs from 1.00: what single spots do to results is in none."""
+        """Whether the factor differs from 1.00; it covers no effects of single spots."""
         return f"{self.inflation:.2f}" != "1.00"
 
 
@@ -181,7 +181,7 @@ class RatioAt(ClosedRecord, frozen=True):
 
 
 class CurvePoint(ClosedRecord, frozen=True):
-    """Local ratios at one pose of the mirrors; a direction that never moved is left out."""
+    """Local ratios at one pose of the mirrors; directions without moves are left out."""
 
     pan_deg: float
     tilt_deg: float
@@ -192,13 +192,13 @@ class CurvePoint(ClosedRecord, frozen=True):
 
     @property
     def ratios(self) -> dict[str, RatioAt]:
-        """Those of the directions that moved."""
+        """Local ratios of the directions with moves."""
         values = {direction: getattr(self, direction) for direction in DIRECTIONS}
         return {direction: ratio for direction, ratio in values.items() if ratio is not UNSET}
 
 
 class LostMotion(ClosedRecord, frozen=True):
-    """What a reversal takes from so many steps, deg."""
+    """Lost motion of a reversal over a number of steps, deg."""
 
     steps: Count
     value_deg: NotNegative
@@ -207,11 +207,11 @@ class LostMotion(ClosedRecord, frozen=True):
 
 
 class Curves(ClosedRecord, frozen=True, rename={"ratios": "effective_deg_per_step"}):
-    """What a posterior says of other poses and step counts.
+    """Predictions of a posterior for other poses and step counts.
 
     Attributes:
-        ratios: local ratios along the angles of each axis that were seen.
-        lost_motion: by direction, for the step counts that were used.
+        ratios: local ratios along the observed angles of each axis.
+        lost_motion: by direction, for the step counts used.
     """
 
     ratios: BothAxes[tuple[CurvePoint, ...]]
@@ -219,7 +219,7 @@ class Curves(ClosedRecord, frozen=True, rename={"ratios": "effective_deg_per_ste
 
 
 class Measured(Record, frozen=True):
-    """A quantity by its draws.
+    """Summary of a quantity's draws.
 
     Attributes:
         value, sd, interval95: mean, standard uncertainty, central interval.
@@ -231,15 +231,15 @@ class Measured(Record, frozen=True):
 
 
 class PeriodEstimate(Record, frozen=True):
-    """One wave. Where more than one period explains the data, value and sd are of the likeliest, intervals of all.
+    """One wave. Where several periods explain the data, value and sd are those of the most likely, intervals of all.
 
     Attributes:
-        period: of an axis in the unit of the readings, or s; of a scanner deg of the output.
-        amplitude: of the first harmonic, in the unit of the output; half of what it makes from crest to trough.
+        period: for an axis in the unit of the readings, or s; for a scanner in deg of the output.
+        amplitude: of the first harmonic, in the unit of the output; half the difference from crest to trough.
         phase_deg: the wave is highest where 360 x / period is the phase; x is |unit per command| x command, `time_s`,
-            or the reading for a wave of the encoder. About its circular mean: an interval may leave -180 to 180.
+            or the reading for a wave of the encoder. About its circular mean: intervals may leave -180 to 180.
         source: whether the period was stated or inferred.
-        probability: that there is such a wave.
+        probability: probability that the wave exists.
     """
 
     period: Measured
@@ -256,12 +256,12 @@ class GearPeriod(PeriodEstimate, frozen=True):
 
 
 class FitNoise(ClosedRecord, frozen=True):
-    """How well the model fits, and the noise that it found.
+    """Goodness of fit, and the estimated noise.
 
     Attributes:
-        chi2: squared standardised innovations.
-        dof: their number less the parameters they determine.
-        pixel_scale: pixel noise over the stated one.
+        chi2: sum of squared standardised innovations.
+        dof: their number minus the parameters that they determine.
+        pixel_scale: estimated pixel noise over the stated one.
         stop_sd_deg: standard deviation of the stops, by direction of arrival.
         look_scatter_deg: standard deviation of single looks, by axis; absent from results of 0.2.0 and before.
     """
@@ -274,9 +274,9 @@ class FitNoise(ClosedRecord, frozen=True):
 
 
 def fit_noise(chi2: float, dof: float, parameters: Mapping[str, Estimate]) -> FitNoise:
-    """Of a fit with these estimates."""
+    """The noise of a fit with these estimates."""
     stops = {direction: parameters[f"stop_sd_deg.{direction}"].value for direction in DIRECTIONS}
-    # Where a rig states that looks do not scatter, there is no such parameter.
+    # The parameter is absent where a rig states that looks do not scatter.
     scatters = {axis: parameters.get(f"look_scatter_deg.{axis}") for axis in AXES}
     looks: dict[str, float] = {axis: 0.0 if scatter is None else scatter.value for axis, scatter in scatters.items()}
     return FitNoise(chi2, dof, parameters["pixel_scale"].value, stops, looks)
@@ -292,38 +292,38 @@ _LONG_KEYS = {
 
 
 class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
-    """A joint fit in the contract's terms.
+    """Summary of a joint fit, with the documented names.
 
     Attributes:
-        estimator: "posterior" if a converged sample stands behind the numbers, else "laplace".
-        tier: what made a posterior's draws, weighted draws or a chain; None of a Laplace approximation.
-        converged: the mode was reached and explains the data, and what was sampled has an answer.
-        answer: "accepted" or "rough" of a posterior, "laplace" of the approximation at the mode; None in results of
+        estimator: "posterior" if the numbers come from a converged sample, else "laplace".
+        tier: method of a posterior's draws, weighted draws or a chain; None for a Laplace approximation.
+        converged: the mode was reached and explains the data, and sampling, if any, gave an answer.
+        answer: "accepted" or "rough" for a posterior, "laplace" for the approximation at the mode; None in results of
             0.2.0 and before.
-        monte_carlo_error: of every headline of a sampled posterior.
-        problems: sentences on what failed.
+        monte_carlo_error: errors of every headline of a sampled posterior.
+        problems: sentences on failures.
         effective: left, right, up, down in deg/step, slopes of the lines through the looks used; None for a direction
-            that was never moved.
+            without moves.
         contrasts: effective left - right and up - down, deg/step.
         local: gear ratio times the slope of the mirrors at the reference pose, without transmission error; deg/step.
-        range_steps: lowest and highest counter of each axis that the looks used saw: where the effective ratios hold.
-        homing_side: of an axis whose homing sides nobody recorded: probability of each way of homing.
+        range_steps: lowest and highest counter of each axis in the looks used: the range of the effective ratios.
+        homing_side: probability of each way of homing, for an axis without recorded homing sides.
         reference_pose_deg: mean mirror angles, pan and tilt, of the looks used.
-        jacobian: d(azimuth, elevation)/d(pan, tilt) there.
+        jacobian: d(azimuth, elevation)/d(pan, tilt) at that pose.
         parameters: every estimated or derived parameter by its name.
-        noise: how well the model fits, and the noise that it found.
-        weak_directions: what the campaign cannot separate, in words.
-        leverage: stops on which a headline hangs.
-        classic_predicted: what the classic estimator should report if the model is right, per direction.
+        noise: goodness of fit, and the estimated noise.
+        weak_directions: combinations that the campaign cannot separate, in words.
+        leverage: stops on which a headline depends strongly.
+        classic_predicted: the classic estimate that the model predicts, per direction.
         excluded_spots: left out by the robust option.
-        suspect_spots: used, but in disagreement with all others.
-        prior_conflicts: parameters that the data pull far from what was stated, in words.
+        suspect_spots: used, but inconsistent with all others.
+        prior_conflicts: parameters that the data move far from the stated value, in words.
         prior_sensitivity: priors that would move a headline if they were twice or half as wide.
         sampling: diagnosis of the draws, None where nothing was sampled.
         curves: local ratios over the range and lost motion against steps; only from a posterior.
-        validation: whether the residuals look as the model says; None where nobody asked.
-        few_stops: directions in which so few stops were seen that their scatter is poorly known, with the number.
-        periods: waves of the periods that the rig states, given that they are there; only from a posterior.
+        validation: whether the residuals agree with the model; None where it was not tested.
+        few_stops: directions with so few observed stops that their scatter is poorly known, with the number.
+        periods: waves of the periods that the rig states, given that they exist; only from a posterior.
     """
 
     estimator: EstimatorName
@@ -355,7 +355,7 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
     periods: tuple[GearPeriod, ...] = ()
 
     def shown(self) -> View:
-        """Every estimate but the cameras' parameters."""
+        """Show every estimate but the cameras' parameters."""
         kind = {"laplace": "Laplace approximation", "posterior": "posterior"}[self.estimator]
         title = f"FitSummary, {kind}, {'converged' if self.converged else 'NOT CONVERGED'}"
         if self.validation is not None and not self.validation.passed:
@@ -370,13 +370,13 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
 
     @property
     def named(self) -> dict[str, Estimate]:
-        """Effective ratios of directions that moved, then parameters, by contract name."""
+        """Effective ratios of directions with moves, then parameters, by name."""
         ratios = {f"effective_deg_per_step.{d}": e for d, e in self.effective.items() if e is not None}
         return ratios | self.parameters
 
     @property
     def explained(self) -> bool:
-        """There is a mode that explains the data: only then is anything sampled."""
+        """Whether a mode explains the data; only then is the posterior sampled."""
         return self.converged or self.sampling is not None
 
     @property
@@ -386,21 +386,21 @@ class FitSummary(Shown, Record, frozen=True, kw_only=True, rename=_LONG_KEYS):
 
 
 class StopResidual(ClosedRecord, frozen=True):
-    """How far one rest of one axis lay from where the fitted model puts it.
+    """Deviation of one rest of one axis from the fitted model.
 
     Attributes:
         axis: "pan" or "tilt".
-        spots: ids of the spots that saw it.
+        spots: ids of the spots observed during it.
         steps: counter.
-        direction: of the move that led there; "" where the approach is unknown.
+        direction: direction of the preceding move; "" where the approach is unknown.
         leg_steps: length of that move, 0 for a homing.
         depth_mm: X of its spots in frame S, by the stated cameras.
-        within: per spot, how far it lies from the mean of the rest's spots gone through before it, in standard
-            deviations of that difference by pixel noise; None for the first, empty for a single spot. Every second
-            rest is gone through backwards, so that no place in a rest is always the one the others are held against.
-        time_s: of the move after which it was first seen.
+        within: for each spot, its deviation from the mean of the rest's preceding spots, in standard deviations of that
+            difference by pixel noise; None for the first, empty for a single spot. Every second rest is taken in
+            reverse order, so that no position within a rest is always the reference.
+        time_s: time of the move after which it was first observed.
         deviation_deg: observed - fitted mirror angle, stop error included.
-        u_deg: its standard deviation as the fitted noise has it (pixel noise and stop error).
+        u_deg: its standard deviation by the fitted noise (pixel noise and stop error).
     """
 
     axis: AxisName
@@ -425,9 +425,9 @@ class CauseGroup(ClosedRecord, frozen=True):
 
 
 class Cause(ClosedRecord, frozen=True):
-    """Whether the deviations of one axis depend on one thing.
+    """Whether the deviations of one axis depend on one cause.
 
-    `p` is the probability of group means as different as these if nothing depends on it (one-way analysis of
+    `p` is the probability of group means as different as these if they do not depend on it (one-way analysis of
     variance), None with fewer than two groups of two.
     """
 
@@ -440,18 +440,18 @@ class Cause(ClosedRecord, frozen=True):
 
 @dataclass(frozen=True)
 class HeadlineCauses:
-    """What the uncertainty of each headline consists of: rows of a GUM budget.
+    """Components of the uncertainty of each headline: rows of a GUM budget.
 
     Attributes:
-        quantities: contract names: `effective_deg_per_step.left` ... of directions that moved, `backlash_deg.pan|tilt`.
+        quantities: names: `effective_deg_per_step.left` ... of directions with moves, `backlash_deg.pan|tilt`.
         names: causes: pixel noise, stop errors, the stereo calibration, and every prior by its parameter's name.
-        contribution: shape (quantities, causes), deg/step or deg. Of a prior: what one u of its centre does, signed;
-            of the others: the root of their part of the variance.
-        u: of the priors in the unit of the parameter (of a log-normal: of the logarithm), shape (causes,); NaN for the
-            others, which are no single quantity.
-        centre: mean of the prior (of a log-normal: of the logarithm), shape (causes,); NaN likewise.
-        distribution: of each cause.
-        dof: degrees of freedom behind u, shape (quantities, causes); infinite for what was stated (GUM G.4.3).
+        contribution: shape (quantities, causes), deg/step or deg. For a prior: signed effect of one u of its centre;
+            for other causes: the root of their part of the variance.
+        u: u of the priors in the unit of the parameter (log-normal: of the logarithm), shape (causes,); NaN for other
+            causes, which are no single quantity.
+        centre: mean of the prior (log-normal: of the logarithm), shape (causes,); NaN likewise.
+        distribution: kind of distribution of each cause.
+        dof: degrees of freedom behind u, shape (quantities, causes); infinite for stated values (GUM G.4.3).
     """
 
     quantities: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""`results/fit.json` as one record: what a fit says, why it can be believed, and what it was made from and by.
+"""`results/fit.json` as one record: the estimates of a fit, the evidence for them, and their provenance.
 
 Written from the record and read into it; its JSON form is a contract (`data/schemas/fit-1.schema.json`: keys may be
 added within a version, never removed or given another meaning). Units stand in the names.
@@ -45,24 +45,24 @@ FIT_FORMATS = (FIT_FORMAT,)
 """Versions of `results/fit.json` that can be read; the schema of each is in `data/schemas`."""
 type Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 PACKAGES = (*("tvsbayes", "jax", "optimistix", "equinox", CHAIN, "arviz", "numpy", "scipy"), "opencv-python-headless")
-"""Whose versions a result states."""
+"""Packages whose versions a result states."""
 AGAIN = "run `tvsbayes fit` again"
 
 
 class NamedCovariance(ClosedRecord, frozen=True):
-    """Of the draws behind the values; rows and columns of `matrix`, shape (n, n), are `names`, in their units."""
+    """Covariance of the draws behind the values; rows and columns of `matrix`, shape (n, n), are `names`."""
 
     names: Annotated[tuple[str, ...], Meta(min_length=1)]
     matrix: Matrix
 
 
 class FitEvidence(Record, frozen=True):
-    """What reports show of a fit besides its estimates.
+    """Evidence of a fit that reports show besides its estimates.
 
     Attributes:
-        residuals: stops against the fitted model; some where there are very many.
+        residuals: stops against the fitted model; a selection where there are very many.
         residual_causes: whether their deviations depend on depth, direction, N, step phase or time.
-        gap: classic minus joint by its terms, deg/step; None without an experiment that tells it.
+        gap: classic minus joint by its terms, deg/step; None without an experiment that determines it.
         budgets: GUM budgets of ratios and backlashes.
         positioning: ISO 230-2-style tables of both axes; empty where the fit must not be used.
     """
@@ -75,13 +75,13 @@ class FitEvidence(Record, frozen=True):
 
 
 class Provenance(Record, frozen=True):
-    """What results were made from and by.
+    """Provenance of results.
 
     Attributes:
-        inputs: SHA-256 of what the estimate depends on, by file.
-        versions: of Python and `PACKAGES`.
-        seed: of everything random.
-        command: as it was typed.
+        inputs: SHA-256 of the inputs of the estimate, by file.
+        versions: versions of Python and `PACKAGES`.
+        seed: seed of all random numbers.
+        command: the command as typed.
     """
 
     inputs: dict[str, Sha256]
@@ -91,25 +91,25 @@ class Provenance(Record, frozen=True):
 
 
 def provenance(inputs: Mapping[str, str], seed: int) -> Provenance:
-    """Of results that this process makes."""
+    """The provenance of results that this process makes."""
     versions = {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}}
     return Provenance(dict(inputs), versions, seed, shlex.join(["tvsbayes", *sys.argv[1:]]))
 
 
 def covariance_of_draws(names: Sequence[str], physical: np.ndarray, told: Mapping[str, object]) -> NamedCovariance:
-    """Of the columns that were told of; `physical` has shape (draws, names), in the units of the names."""
+    """Covariance of the columns in `told`; `physical` has shape (draws, names), in the units of the names."""
     told_of = [index for index, name in enumerate(names) if name in told]
     return NamedCovariance(tuple(names[i] for i in told_of), np.cov(physical[:, told_of], rowvar=False))
 
 
 @dataclass(frozen=True, repr=False)
 class FitRecord(Shown):
-    """Everything that `results/fit.json` holds.
+    """The content of `results/fit.json`.
 
     Attributes:
         summary: estimates and diagnostics.
-        covariance: of the parameters' draws.
-        evidence: what reports show besides; None in documents without.
+        covariance: covariance of the parameters' draws.
+        evidence: evidence for reports; None in documents without.
         provenance: inputs, versions, seed, command.
     """
 
@@ -119,7 +119,7 @@ class FitRecord(Shown):
     provenance: Provenance
 
     def shown(self) -> View:
-        """Its summary, and the number of the results."""
+        """Show the summary and the number of the results."""
         return replace(self.summary.shown(), title=f"FitRecord {self.results_id}: {self.summary.shown().title}")
 
     def as_json(self) -> dict[str, object]:
@@ -130,24 +130,24 @@ class FitRecord(Shown):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of what the results say, from what and by what: the identity of everything made from them."""
+        """SHA-256 of the results and their provenance: it identifies everything made from them."""
         content = plain([self.summary.estimator, self.summary.effective, self.summary.parameters])
         made = [self.provenance.inputs, self.provenance.versions, self.provenance.seed]
         return hashlib.sha256(json.dumps([content, made], sort_keys=True).encode()).hexdigest()
 
     @property
     def results_id(self) -> str:
-        """Number of these results, the same in every report of them: twelve hexadecimal digits."""
+        """Number of these results, the same in all their reports: twelve hexadecimal digits."""
         return self.digest[:12].upper()
 
     def certificate_id(self, issued: datetime.date, besides: Sequence[str | None]) -> str:
-        """Of a certificate of these results that says so much besides: `tvsbayes-` and 32 hexadecimal digits."""
+        """Number of a certificate of these results with further entries: `tvsbayes-` and 32 hexadecimal digits."""
         text = json.dumps([self.digest, issued.isoformat(), *besides])
         return f"tvsbayes-{hashlib.sha256(text.encode()).hexdigest()[:32]}"
 
 
 class FitInputs(ClosedRecord, frozen=True):
-    """SHA-256 of what a fit depends on."""
+    """SHA-256 of the inputs of a fit."""
 
     moves: Sha256
     spots: Sha256
@@ -164,17 +164,17 @@ def fit_schema() -> dict[str, Any]:
 
 
 def _check_agreement(keys: Keys) -> None:
-    """What no schema can say: sizes that belong together, names that others stand for."""
+    """Check what a schema cannot express: sizes that must match, names that must refer to others."""
     covariance = keys.table("covariance")
     names, matrix = covariance.values["names"], covariance.values["matrix"]
-    # The schema has them as lists.
+    # The schema declares them as lists.
     assert isinstance(names, list) and isinstance(matrix, list)
     if any(len(row) != len(names) for row in [matrix, *matrix]):
         raise covariance.refuse("matrix", "shape", f"{len(names)} rows of {len(names)} numbers", AGAIN)
 
 
 def read_fit(path: Path | str) -> FitRecord:
-    """Read `results/fit.json` of any version: what reports and certificates are written from, held to its schema.
+    """Read `results/fit.json` of any version, checked against its schema: the source of reports and certificates.
 
     Raises:
         InputError: missing, damaged or of an unknown version, with the key.
@@ -183,7 +183,7 @@ def read_fit(path: Path | str) -> FitRecord:
     keys.word("format", FIT_FORMATS)
     hold_to_schema(keys, fit_schema(), AGAIN)
     _check_agreement(keys)
-    # Documents of the first tvsbayes hold none; a part of it is none.
+    # Documents of the first tvsbayes have no evidence; an incomplete one counts as none.
     shown_besides = set(FitEvidence.__struct_fields__) <= set(keys.values)
     record = FitRecord(
         read_record(FitSummary, keys, AGAIN, held=True),
@@ -201,7 +201,7 @@ def read_fit(path: Path | str) -> FitRecord:
 
 
 def write_files(folder: Path, draws: bytes, document: Mapping[str, object]) -> dict[str, str]:
-    """Write `draws.npz` and the document `fit.json`, each whole or not at all; their paths by "draws" and "fit".
+    """Write `draws.npz` and the document `fit.json`, each completely or not at all; return both paths.
 
     Raises:
         InputError: the folder cannot be written.

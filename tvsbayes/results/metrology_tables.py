@@ -1,7 +1,7 @@
-"""Tables that a metrologist signs under, as `fit.json` and certificates hold them: GUM budgets, ISO 230-2 figures.
+"""Tables of `fit.json` and certificates that a metrologist signs: GUM budgets, ISO 230-2 figures.
 
 Angles in deg, counters in steps; a budget names its own unit. `metrology` fills them. GUM = JCGM 100:2008; clause
-numbers of ISO 230-2:2006 stand where its figures are computed.
+numbers of ISO 230-2:2006 are given where its figures are computed.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ class BudgetRow(ClosedRecord, frozen=True):
     """A line of a budget; fields as in `Source`, None where a line sums up several or is the correlation row.
 
     Attributes:
-        dof: degrees of freedom; None of what was stated, whose are infinite (GUM G.4.3).
+        dof: degrees of freedom; None for stated values, which have infinitely many (GUM G.4.3).
         contribution: sensitivity times u, signed, in the unit of the result.
-        share: of the combined variance; negative where correlations take variance away.
+        share: share of the combined variance; negative where correlations reduce it.
     """
 
     quantity: str
@@ -36,15 +36,15 @@ class BudgetTable(ClosedRecord, frozen=True):
     """A GUM uncertainty budget.
 
     Attributes:
-        quantity, unit: of the result.
+        quantity, unit: name and unit of the result.
         estimate: the result.
         rows: largest contribution first; the last one is `CORRELATIONS`, so that the shares sum to 1.
         u: combined standard uncertainty (GUM 5.1.2, 5.2.2).
-        dof: effective degrees of freedom (GUM eq. G.2b); None where no input's are finite.
+        dof: effective degrees of freedom (GUM eq. G.2b); None where those of all inputs are infinite.
         coverage_factor: k = t_p(dof) (GUM G.4.1).
         probability: coverage probability p.
         expanded: U = k u.
-        notes: what the reader must know.
+        notes: remarks for the reader.
     """
 
     quantity: str
@@ -73,17 +73,17 @@ FIGURES: dict[str, tuple[str, str]] = {
     "accuracy_down_deg": ("A down", "unidirectional accuracy, down"),
     "accuracy_deg": ("A", "bidirectional accuracy"),
 }
-"""Fields of `Positioning` that are one number per test: symbol and term of ISO 230-2."""
+"""Fields of `Positioning` with one number per test: symbol and term of ISO 230-2."""
 
 
 class Positioning(ClosedRecord, frozen=True):
-    """ISO 230-2 figures of one axis. Any leading axes (...) are tests; m targets.
+    """ISO 230-2 figures of one axis. Leading array axes (...) are tests; m is the number of targets.
 
     Attributes:
         mean_up_deg, mean_down_deg: mean deviation per target and side, shape (..., m).
         sd_up_deg, sd_down_deg: their standard deviations (n - 1), shape (..., m).
         reversal_at_deg: B_i, up minus down, signed, shape (..., m).
-        reversal_deg: B = max |B_i|, shape (...), as all that follow.
+        reversal_deg: B = max |B_i|, shape (...), as for all fields below.
         mean_reversal_deg: mean of B_i, signed.
         repeatability_deg: R.
         repeatability_up_deg, repeatability_down_deg: R of one side.
@@ -125,18 +125,18 @@ class AxisPositioning(ClosedRecord, frozen=True):
 
     Attributes:
         axis: pan or tilt.
-        deg_per_step: targets are this times the counter.
-        predicted: field of `FIGURES` -> median and interval over tests simulated from the draws; None if the axis
-            never moved.
+        deg_per_step: target angle per counter step.
+        predicted: field of `FIGURES` -> median and interval over tests simulated from the draws; None if the axis has
+            no moves.
         target_steps: targets of the simulated tests.
         runs: simulated runs per target and side.
-        estimator: "posterior" or "laplace": where the draws come from.
-        plug_in: figures of the campaign's own stops, no leading axis; None where `missing` says why.
+        estimator: "posterior" or "laplace": source of the draws.
+        plug_in: figures of the campaign's own stops, no leading axis; None for the reason in `missing`.
         plug_in_steps: counters of its targets.
         plug_in_runs: runs (up, down) at each of them.
         reading_u_deg: root mean square standard uncertainty of one reading from pixel noise, which is in every s.
         missing: why there is no plug-in table.
-        notes: that it is indirect, what it rests on and what it does not cover.
+        notes: remarks: the test is indirect, its assumptions, and effects that it does not cover.
     """
 
     axis: AxisName

@@ -1,4 +1,4 @@
-"""What `plan` says of going on, and `results/plan.json`, from which a report shows what to measure next.
+"""Advice of `plan` for further measurement, and `results/plan.json`, from which reports show the next experiments.
 
 Values and gains in the unit of the target, times in minutes.
 """
@@ -18,7 +18,7 @@ PLAN_FORMAT = "tvsbayes-plan/1"
 
 @dataclass(frozen=True)
 class Batch:
-    """A possible next experiment: four looks at one sheet and what they bring; read back without its actions."""
+    """A possible next experiment: four looks at one sheet and their expected gain; read back without its actions."""
 
     actions: tuple[PlanStep, ...]
     minutes: float
@@ -29,7 +29,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Advice:
-    """Whether to stop measuring, and the rule."""
+    """Whether to stop measuring, with the rule."""
 
     now: bool
     reason: str
@@ -37,26 +37,26 @@ class Advice:
 
 
 class StatedTarget(Record, frozen=True):
-    """What was wanted, in words, and the unit of its value."""
+    """The target, in words, with the unit of its value."""
 
     text: str
     unit: str
 
 
 class Obstacle(Record, frozen=True):
-    """In words, the input uncertainty that would bring the target into reach; None where no input is in the way."""
+    """The input uncertainty that would make the target attainable, in words; None where no input limits it."""
 
     needed: str | None = None
 
 
 class PlanRecord(Record, frozen=True):
-    """What reports show of a plan that goes on from a campaign.
+    """A plan that continues a campaign, as reports show it.
 
     Attributes:
-        target: what was wanted.
-        now: its value by the campaign alone.
-        stop: whether to go on.
-        limited_by: what stands in the way.
+        target: the target.
+        now: its value from the campaign alone.
+        stop: whether to stop measuring.
+        limited_by: the input that limits the target.
         next: possible next experiments, best first.
     """
 
@@ -68,15 +68,15 @@ class PlanRecord(Record, frozen=True):
 
 
 def plan_document(plan: Mapping[str, object], inputs: Mapping[str, str]) -> dict[str, object]:
-    """The content of `results/plan.json`: the document of `plan --json` and the hashes of what it goes on from."""
+    """The content of `results/plan.json`: the document of `plan --json` with the hashes of the campaign's inputs."""
     return {"format": PLAN_FORMAT, "inputs": dict(inputs), **plan}
 
 
 def stored_plan(campaign: Campaign, inputs: Mapping[str, str]) -> PlanRecord | None:
-    """What `plan --given` left in `results/`, if it was made from the data and priors with these hashes.
+    """The plan of `plan --given` in `results/`, if it was made from the data and priors with these hashes.
 
     Raises:
-        InputError: it is damaged or of another version, with the key.
+        InputError: the file is damaged or of another version, with the key.
     """
     keys = stored_document(campaign, "plan.json", (PLAN_FORMAT,), inputs)
     if keys is None:
@@ -86,6 +86,6 @@ def stored_plan(campaign: Campaign, inputs: Mapping[str, str]) -> PlanRecord | N
     if not isinstance(batches, list) or not all(isinstance(batch, dict) for batch in batches):
         raise keys.refuse("next", "list", "a list of tables", again)
     keys.number("now", 0.0, 1e6)
-    # Steps of the experiments are for who runs them; reports show their words.
+    # Reports show the experiments in words, without their steps.
     shown = {**keys.values, "next": [{**batch, "actions": []} for batch in batches]}
     return read_record(PlanRecord, Keys(shown, keys.file, keys.text), again)

@@ -1,8 +1,8 @@
-"""What a record of results is: one declaration that is the class, its JSON document, its reader and its schema.
+"""Records of results: one declaration gives the class, its JSON document, its reader and its schema.
 
 A record is a frozen msgspec struct. Its fields are the keys of the document, in their order; a field with a default may
-be missing in a document of an older version. The docstrings say in the schema what the keys mean. Numbers are finite
-and keep their unit, which stands in the field's name.
+be missing in a document of an older version. The schema takes the meaning of the keys from the docstrings. Numbers are
+finite and have the unit in the field's name.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ type FromOne = Annotated[int, Meta(ge=1)]
 type AxisName = Annotated[str, Meta(extra_json_schema={"enum": AXES})]
 type Direction = Annotated[str, Meta(extra_json_schema={"enum": DIRECTIONS})]
 type ByAxis[T] = dict[AxisName, T]
-"""For some axes."""
+"""Values for some axes."""
 type ByDirection[T] = dict[Direction, T]
-"""For some directions."""
+"""Values for some directions."""
 type BothAxes[T] = Annotated[dict[AxisName, T], Meta(extra_json_schema={"required": AXES})]
 type AllDirections[T] = Annotated[dict[Direction, T], Meta(extra_json_schema={"required": DIRECTIONS})]
 type EstimatorName = Annotated[str, Meta(extra_json_schema={"enum": ("laplace", "posterior")})]
@@ -48,16 +48,16 @@ type Tier = Annotated[str, Meta(extra_json_schema={"enum": TIERS})]
 type AnswerKind = Annotated[str, Meta(extra_json_schema={"enum": ("accepted", "rough", "laplace")})]
 
 TEXT_CHARS_MAX = 20_000
-"""Of one text in a document that tvsbayes wrote."""
+"""Largest length of one text in a document that tvsbayes wrote."""
 SCHEMA_PROBLEMS = 20
-"""Among which the one to name is chosen: a document of another making has thousands."""
+"""Number of problems among which the reported one is chosen: a foreign document has thousands."""
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _ROW = {"type": "array", "minItems": 1, "items": {"type": "number"}}
 type Matrix = Annotated[np.ndarray, Meta(extra_json_schema={"type": "array", "minItems": 1, "items": _ROW})]
 
 
 class HasFolder(Protocol):
-    """A campaign of any kind; `path` is None of one that was never written."""
+    """A campaign of any kind; `path` is None for one that was never written."""
 
     @property
     def path(self) -> Path | None:
@@ -65,14 +65,14 @@ class HasFolder(Protocol):
 
 
 class _RecordType(StructMeta, ABCMeta):
-    """Lets a record have abstract bases, as `display.Shown` is."""
+    """Allows a record abstract bases such as `display.Shown`."""
 
 
 class Record(Struct, frozen=True, metaclass=_RecordType):
-    """Base of records; keys that it does not know are passed over.
+    """Base of records; unknown keys are ignored.
 
-    `always` names fields that every document holds though the class has defaults for them, `beside` fields that are no
-    part of the document.
+    `always` names fields that every document contains although the class has defaults for them; `beside` names fields
+    that are not part of the document.
     """
 
     always: ClassVar[tuple[str, ...]] = ()
@@ -84,7 +84,7 @@ class Record(Struct, frozen=True, metaclass=_RecordType):
 
 
 class ClosedRecord(Record, frozen=True, forbid_unknown_fields=True):
-    """A record whose document holds its keys and no other."""
+    """A record whose document contains its keys and no others."""
 
 
 def _encoded(value: object) -> object:
@@ -94,14 +94,14 @@ def _encoded(value: object) -> object:
 
 
 def _lists(value: Any) -> Any:
-    """JSON has lists, no tuples."""
+    """Convert tuples to lists, since JSON has no tuples."""
     if isinstance(value, dict):
         return {key: _lists(inner) for key, inner in value.items()}
     return [_lists(inner) for inner in value] if isinstance(value, tuple | list) else value
 
 
 def plain(value: object) -> Any:
-    """Records, dataclasses and dictionaries as dictionaries, tuples and arrays as lists, all else as it is."""
+    """Convert records and dataclasses to dictionaries, tuples and arrays to lists, all else unchanged."""
     return _lists(msgspec.to_builtins(value, enc_hook=_encoded))
 
 
@@ -117,17 +117,17 @@ def _decoded(kind: type, value: object) -> object:
 def _array_schema(kind: type) -> dict[str, object]:
     if kind is not np.ndarray:
         raise NotImplementedError
-    # Of any number of axes; without one it is a number.
+    # Arrays have any number of axes; one without axes is a number.
     return {"type": ["number", "array"]}
 
 
 def _meanings(docstring: str) -> tuple[str, dict[str, str]]:
-    """What a docstring says of a class, and what its section "Attributes" says of each field."""
+    """A docstring's description of the class, and of each field by its section "Attributes"."""
     text, _, attributes = docstring.partition("\n\nAttributes:\n")
     meanings = {}
     for entry in re.split(r"\n(?! )", inspect.cleandoc(attributes)):
         names, _, meaning = entry.partition(": ")
-        # What is None in Python is null in JSON.
+        # Python's None is JSON's null.
         meanings.update(dict.fromkeys(names.split(", "), re.sub(r"\bNone\b", "null", " ".join(meaning.split()))))
     return " ".join(text.split()), meanings
 
@@ -142,7 +142,7 @@ def _records() -> dict[str, type[Record]]:
 
 
 def _alike(schema: Any) -> Any:
-    """A schema in which the items of a list of fixed length are said once, where all are of one type."""
+    """A schema that states the items of a list of fixed length once, where all have one type."""
     if isinstance(schema, list):
         return [_alike(inner) for inner in schema]
     if not isinstance(schema, dict):
@@ -156,7 +156,7 @@ def _alike(schema: Any) -> Any:
 
 
 def _described(component: dict[str, Any], kind: type[Record] | None) -> dict[str, Any]:
-    """A schema with what the declaration says besides the types of the fields; `kind` is None of a dataclass."""
+    """A schema completed by the declaration's descriptions and constraints; `kind` is None for a dataclass."""
     text, meanings = _meanings(component.get("description", ""))
     keys = {} if kind is None else {field.name: field.encode_name for field in msgspec.structs.fields(kind)}
     for name, meaning in meanings.items():
@@ -167,12 +167,12 @@ def _described(component: dict[str, Any], kind: type[Record] | None) -> dict[str
 
 
 def schema_of(*kinds: type[Record], closed: bool = False, **keys: Any) -> dict[str, Any]:
-    """The JSON schema of a document, as the declarations have it.
+    """The JSON schema of a document, from the declarations.
 
     Args:
         kinds: records whose fields stand side by side in the document.
-        closed: whether it, and every record in it, holds no other key.
-        keys: further keys of the document, or what a field of `kinds` is in this one: a record, or a schema.
+        closed: whether the document, and every record in it, contains no other keys.
+        keys: further keys of the document, or the type of a field of `kinds` in this document: a record or a schema.
     """
     named = {key: kind for key, kind in keys.items() if isinstance(kind, type)}
     references, components = msgspec.json.schema_components((*kinds, *named.values()), schema_hook=_array_schema)
@@ -204,7 +204,7 @@ def _validator(schema: Mapping[str, Any]) -> Draft202012Validator:
 
 
 def _schema_problem(values: object, schema: Mapping[str, Any]) -> tuple[list[str | int], str] | None:
-    """The place that most likely breaks the schema, as keys and list indices, and what is allowed."""
+    """The place that most likely violates the schema, as keys and list indices, and the allowed values."""
     from jsonschema.exceptions import best_match
 
     error = best_match(islice(_validator(schema).iter_errors(values), SCHEMA_PROBLEMS))
@@ -212,7 +212,7 @@ def _schema_problem(values: object, schema: Mapping[str, Any]) -> tuple[list[str
         return None
     place, rule = list(error.absolute_path), error.validator_value
     if "propertyNames" in error.absolute_schema_path:
-        # jsonschema gives the place of the table whose key is wrong.
+        # jsonschema reports the table whose key is wrong.
         place.append(error.instance)
     match error.validator:
         case "required":
@@ -231,7 +231,7 @@ def _schema_problem(values: object, schema: Mapping[str, Any]) -> tuple[list[str
 
 
 def _unfit_value(value: object, place: tuple[str, ...] = ()) -> tuple[tuple[str, ...], str] | None:
-    """The place of a text that cannot be printed or of a number that is not finite, and what is allowed there."""
+    """The place of a text that cannot be printed or of a number that is not finite, and the allowed values."""
     if isinstance(value, str):
         if len(value) > TEXT_CHARS_MAX or not all(c.isprintable() or c in "\n\t" for c in value):
             return place, "printable text"
@@ -246,10 +246,10 @@ def _unfit_value(value: object, place: tuple[str, ...] = ()) -> tuple[tuple[str,
 
 
 def hold_to_schema(keys: Keys, schema: Mapping[str, Any], remedy: str) -> None:
-    """Refuses a document that breaks its schema, or that holds what cannot be printed; by its key.
+    """Refuse a document that violates its schema or contains text that cannot be printed; the error names the key.
 
     Raises:
-        InputError: with the key; an entry of a list is named by the key of the list.
+        InputError: names the key; an entry of a list is named by the key of the list.
     """
     problem = _schema_problem(keys.values, schema) or _unfit_value(keys.values)
     if problem is None:
@@ -266,13 +266,13 @@ def hold_to_schema(keys: Keys, schema: Mapping[str, Any], remedy: str) -> None:
 
 
 def read_record[T: Record](kind: type[T], keys: Keys, remedy: str, *, held: bool = False) -> T:
-    """A record from a table of a document; defaults may be missing.
+    """Read a record from a table of a document; keys with defaults may be missing.
 
     Args:
-        kind: of the record.
+        kind: class of the record.
         keys: the table.
-        remedy: what to do where it cannot be read.
-        held: whether the table was held to a schema before.
+        remedy: the remedy where it cannot be read.
+        held: whether the table was checked against a schema before.
 
     Raises:
         InputError: a key is missing or of another type, with its name.
@@ -282,17 +282,17 @@ def read_record[T: Record](kind: type[T], keys: Keys, remedy: str, *, held: bool
     try:
         return msgspec.convert(keys.values, kind, dec_hook=_decoded)
     except msgspec.ValidationError as error:
-        # What JSON schema does not tell apart: 3.0 for a whole number, rows of an array that differ in length.
+        # JSON schema does not detect 3.0 for a whole number, or array rows of different lengths.
         message, _, place = str(error).partition(" - at ")
         *path, key = re.findall(r"\.(\w+)", place) or [""]
         raise Keys({}, keys.file, keys.text, (*keys.path, *path)).refuse(key, "schema", message, remedy, "") from error
 
 
 def stored_document(campaign: HasFolder, name: str, formats: tuple[str, ...], inputs: Mapping[str, str]) -> Keys | None:
-    """A document in `results/` that was made from the data and priors with these hashes; None where there is none.
+    """A document in `results/` made from the data and priors with these hashes; None if there is none.
 
     Raises:
-        InputError: it is damaged, or of a version that cannot be read.
+        InputError: the file is damaged, or of a version that cannot be read.
     """
     path = None if campaign.path is None else campaign.path / "results" / name
     if path is None or not path.exists():

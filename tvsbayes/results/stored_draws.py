@@ -1,6 +1,6 @@
-"""`results/draws.npz`: draws behind `fit.json`, the calibration that `locate` reads, and where the fit ended.
+"""`results/draws.npz`: draws behind `fit.json`, the calibration that `locate` reads, and the fit's mode.
 
-Draws in the units of the contract names, ratios in deg/step, pose in rad; mode and covariance in prior coordinates.
+Draws in the units of the names, ratios in deg/step, pose in rad; mode and covariance in prior coordinates.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from tvsbayes.results.fit_record import FitRecord, write_files
 
 @dataclass(frozen=True)
 class StoredMode:
-    """Where a fit ended, as `draws.npz` keeps it: enough to go on without fitting again.
+    """The mode of a fit in `draws.npz`, sufficient to continue without a new fit.
 
     Attributes:
         names: parameters, in the order of the coordinates.
         z, covariance: mode and Laplace covariance in prior coordinates, shapes (p,) and (p, p).
-        log_density: at the mode.
+        log_density: log density at the mode.
         prior: value and u of every parameter of the rig that the fit used, shape (2, r).
         valid, weight: whether each spot, in the order of the fit, was used, and its weight; shape (spots,).
-        sides: how pan and tilt came home, as the fit has it; "" where the campaign recorded it.
+        sides: homing sides of pan and tilt assumed by the fit; "" where the campaign recorded them.
     """
 
     names: tuple[str, ...]
@@ -49,14 +49,14 @@ class StoredMode:
 
 @dataclass(frozen=True)
 class ResultDraws:
-    """Draws behind a record, of a posterior or of the Laplace approximation.
+    """Draws behind a record, from a posterior or the Laplace approximation.
 
     Attributes:
         names: columns of `physical`.
         physical: shape (draws, names), in the units of the names.
         effective_deg_per_step: left, right, up, down, slopes of the lines through the looks, shape (draws, 4).
         reference_pose_rad: mean mirror angles (pan, tilt) of the looks used, shape (2,).
-        derived_names: columns of `derived`, quantities that are no parameters.
+        derived_names: columns of `derived`, quantities that are not parameters.
         derived: shape (draws, derived names), in the units of the names.
     """
 
@@ -74,7 +74,7 @@ _MODE_ARRAYS = ("z", "covariance", "prior", "valid", "weight")
 def _draws_bytes(
     draws: ResultDraws, estimator: str, calibration: Calibration | None = None, mode: StoredMode | None = None
 ) -> bytes:
-    """The content of `draws.npz`; without a calibration it holds draws that nothing must be calculated from."""
+    """The content of `draws.npz`; without a calibration the draws must not be used for calculations."""
     arrays = {**vars(draws), "names": np.array(draws.names), "derived_names": np.array(draws.derived_names)}
     if calibration is None:
         buffer = io.BytesIO()
@@ -94,14 +94,14 @@ def write_results(
     calibration: Calibration | None = None,
     mode: StoredMode | None = None,
 ) -> dict[str, str]:
-    """Write `fit.json` and `draws.npz`, each whole or not at all.
+    """Write `fit.json` and `draws.npz`, each completely or not at all.
 
     Args:
-        folder: is made where it does not exist.
-        record: what is said of the fit.
-        draws: behind it.
-        calibration: what `locate` and `steps-for` read back; None for a fit that must not be used.
-        mode: from which `compare` and `plan` go on.
+        folder: is created where it does not exist.
+        record: the results of the fit.
+        draws: the draws behind the record.
+        calibration: read by `locate` and `steps-for`; None for a fit that must not be used.
+        mode: starting point of `compare` and `plan`.
 
     Returns:
         Paths by "draws" and "fit".
@@ -114,10 +114,10 @@ def write_results(
 
 
 def stored_mode(campaign: Campaign) -> StoredMode | None:
-    """Where the fit in `results/` ended, if it was made from exactly these data and priors, and converged.
+    """The mode of the fit in `results/`, if it converged and was made from exactly these data and priors.
 
     Raises:
-        InputError: there are results, but damaged.
+        InputError: the results are damaged.
     """
     if campaign.path is None or stored_calibration(campaign) is None:
         return None

@@ -1,4 +1,4 @@
-"""What makes the draws of a posterior, by name. No library is loaded: commands name them before they run."""
+"""Names of the methods that draw from a posterior; loads no library, since commands need the names before they run."""
 
 IMPORTANCE, CHAIN = TIERS = ("importance", "emcee")
 """Weighted independent draws, or a chain, named by the library that runs it."""

@@ -1,4 +1,4 @@
-"""Whether a calibration still holds, as a result: verdict, what moved and by how much, what the looks can see.
+"""Result of the test whether a calibration still holds: verdict, detected changes, power of the looks.
 
 Lengths in mm, angles in deg, ratios in % of themselves.
 """
@@ -20,11 +20,11 @@ CANNOT_TELL: Verdict = "CANNOT TELL"
 type Unit = Annotated[str, Meta(extra_json_schema={"enum": ("deg", "mm", "%")})]
 type Looks = Annotated[int, Meta(ge=4)]
 LOOKS_MAX = 384
-"""Of a plan for `watch`; a need beyond is told, not planned."""
+"""Largest number of looks in a plan for `watch`; a larger need is reported, not planned."""
 
 
 class MovedPart(Record, frozen=True):
-    """Something that moved: what, by how much, standard uncertainty and unit of both."""
+    """A part that moved: its name, the change, its standard uncertainty, and the unit of both."""
 
     what: str
     value: float
@@ -33,13 +33,13 @@ class MovedPart(Record, frozen=True):
 
 
 class SeenChange(Record, frozen=True):
-    """What the looks can see of one change.
+    """Power of the looks for one change, and its test.
 
     Attributes:
         what: the change.
-        size: that the looks should notice, in `unit`.
-        power: probability with which they notice it, over all directions that it may have.
-        p: of this change's own test.
+        size: size that the looks should detect, in `unit`.
+        power: probability of detecting it, averaged over all directions that it may have.
+        p: p-value of this change's own test.
     """
 
     what: str
@@ -54,13 +54,13 @@ class Watch(Shown, Record, frozen=True):
 
     Attributes:
         verdict: `OK`, `MOVED` or `CANNOT_TELL`.
-        p: probability of a departure like the largest one if nothing has moved, all changes together.
+        p: probability of a largest deviation at least this large if nothing has moved, for all changes together.
         false_alarm_rate: probability of `MOVED` if nothing has moved.
-        moved: what moved, the best explanation first; empty unless `MOVED`.
+        moved: detected changes, the best explanation first; empty unless `MOVED`.
         looks: usable new looks.
         p_all: probability of residuals this large at the fitted noise; it raises no alarm.
-        changes: every change that is asked about.
-        same_cameras: the new looks state the stereo calibration of the campaign.
+        changes: every change that is tested.
+        same_cameras: whether the new looks state the campaign's stereo calibration.
     """
 
     verdict: Verdict
@@ -73,26 +73,26 @@ class Watch(Shown, Record, frozen=True):
     same_cameras: bool
 
     def unseen(self, power: float) -> tuple[SeenChange, ...]:
-        """Changes that the looks notice less often than this."""
+        """Changes that the looks detect with less than this power."""
         return tuple(change for change in self.changes if change.power < power)
 
     def shown(self) -> View:
-        """What was asked, and what was found."""
+        """Show the tests and their results."""
         rows = [(c.what, c.size, c.unit, c.power, c.p) for c in self.changes]
         return View(f"Watch: {self.verdict}, p = {self.p:.3g}", ("change", "size", "unit", "power", "p"), rows)
 
 
 class PlannedChange(Record, frozen=True):
-    """What planned looks will see of one change.
+    """Power of planned looks for one change.
 
     Attributes:
         what: the change.
-        size: that should be noticed, in `unit`.
-        power: probability with which the plan notices it.
-        looks_needed: of the fewest looks that notice it as often as wanted, None where no number of looks does.
-        homings_needed: of these.
-        minutes_needed: their duration.
-        looks_to_add: where no number does: looks to add to the campaign, and to take at every watch.
+        size: size that should be detected, in `unit`.
+        power: probability that the plan detects it.
+        looks_needed: fewest looks that reach the wanted power, None where no number of looks does.
+        homings_needed: homings of these looks.
+        minutes_needed: duration of these looks.
+        looks_to_add: where no number suffices: looks to add to the campaign, and to take at every watch.
     """
 
     what: str
@@ -110,13 +110,13 @@ class WatchPlan(Shown, Record, frozen=True, kw_only=True):
 
     Attributes:
         looks, homings, minutes: size of the plan.
-        minutes_allowed: what it may take.
-        power_wanted: of every change.
-        false_alarm_rate: of all tests together.
-        met: whether every change is noticed as often as wanted.
-        changes: what it will notice.
-        plan: where its steps were written.
-        steps: the plan; no part of the document.
+        minutes_allowed: largest allowed duration.
+        power_wanted: power required for every change.
+        false_alarm_rate: rate of all tests together.
+        met: whether every change reaches the required power.
+        changes: power for each change.
+        plan: file of its steps.
+        steps: the plan; not part of the document.
     """
 
     looks: Looks
@@ -132,7 +132,7 @@ class WatchPlan(Shown, Record, frozen=True, kw_only=True):
     beside: ClassVar = ("steps",)
 
     def shown(self) -> View:
-        """What will be noticed."""
+        """Show the power for each change."""
         rows = [(c.what, c.size, c.unit, c.power, c.looks_needed) for c in self.changes]
         title = f"WatchPlan: {self.looks} looks, {self.homings} homings, {self.minutes:.1f} minutes"
         return View(title, ("change", "size", "unit", "power", "looks needed"), rows)
