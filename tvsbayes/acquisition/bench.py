@@ -1,8 +1,8 @@
-"""Everything a run needs beside its plan and its journal: the bench of a rig file, or its twin on a virtual clock.
+"""The devices of a run: the bench of a rig file, or its twin on a virtual clock.
 
-A simulated bench draws its true rig from the seed; what its cameras see comes from the twin as centroids, or, with a
-`renderer`, as pictures that the same detector searches as on the bench. Its time continues from the end of the last run
-in its journal.
+A simulated bench draws its true rig from the seed; the twin gives centroids, or, with a
+`renderer`, pictures that are searched by the detector of the real bench. Its time continues from the end of the last
+run in its journal.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Vision:
     """How pictures are made and searched for spots.
 
     Attributes:
-        detector: finds spots in pictures; by default they wait as `undetected`.
+        detector: finds spots in pictures; by default looks stay `undetected`.
         renderer: makes the twin's pictures; without one a simulation states centroids.
     """
 
@@ -55,16 +55,16 @@ class Vision:
 
 @dataclass(frozen=True)
 class Bench:
-    """An instrument at work.
+    """The devices and services of a run.
 
     Attributes:
         positioner: connected.
         observer: takes the looks.
-        operator: is asked before the laser and for every sheet.
-        clock: for settling.
+        operator: asked before the laser comes on and for every sheet.
+        clock: clock for settling.
         utc: the time of day, for `time_s`.
-        details: of device and cameras, for the event `start`.
-        annotate: further entries of every motion's event (the twin's true angles).
+        details: entries on device and cameras, for the event `start`.
+        annotate: returns further entries of every motion's event (the twin's true angles).
         conclude: called with the campaign folder once the run has ended.
         warnings: shown before the run begins.
     """
@@ -82,10 +82,10 @@ class Bench:
 
 @contextmanager
 def hardware(rig: Rig, detector: Detector, operator: Operator) -> Iterator[Bench]:
-    """Positioner and cameras of a rig file; closed in the end.
+    """Positioner and cameras of a rig file; closed at the end.
 
     Raises:
-        InputError: the rig file names none.
+        InputError: the rig file names no device.
         DeviceFault: they cannot be opened or set.
     """
     positioner = positioner_of(rig)
@@ -115,9 +115,9 @@ def simulated(
 
     Args:
         rig: the declared rig.
-        seed: of everything random.
+        seed: seed of all random numbers.
         record: earlier runs, from the journal.
-        vision: how its pictures are made and searched.
+        vision: how pictures are made and searched.
         board: runs the firmware itself, in real time, instead of its model.
     """
     starts = record.starts
@@ -148,12 +148,12 @@ def simulated(
 
 
 def write_truth(folder: Path, instrument: Instrument) -> None:
-    """Writes `truth.json`: the true rig, and the true angles of the moves that the journal holds."""
+    """Writes `truth.json`: the true rig, and the true angles of the moves in the journal."""
     if not (folder / LOG).is_file():
         return
     reading = read_journal(folder)
     record = recorded(reading.records)
-    # As in `recorded`: motions after a gap are no rows of moves.csv.
+    # As in `recorded`: motions after a gap are not rows of moves.csv.
     counted = [r for r in reading.records if r.line not in set(record.ignored_lines)]
     events = [event_of(r, Homed) or event_of(r, Moved) for r in counted]
     motions = [event.twin for event in events if event is not None and event.twin is not UNSET]

@@ -1,7 +1,7 @@
-"""The campaign files beside a journal: derived from it at any time, copied where they were edited, repaired with it.
+"""The campaign files beside a journal: derived from it at any time, copied if edited, and repaired with it.
 
 `moves.csv` and `spots.csv` follow `log.jsonl` and can be derived again; `campaign.toml` and `stereo.json` are written
-once a homing is logged. A reader finds a whole campaign at any moment.
+once a homing is logged. A reader finds a complete campaign at any moment.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def campaign_of(record: Recorded, settings: Campaign) -> Campaign:
 
 
 def write_derived(campaign: Campaign, folder: Path, tables_only: bool = False) -> None:
-    """Writes the four campaign files, or the tables that grow, so that the folder is readable at any moment.
+    """Writes the four campaign files, or only the growing tables, so that the folder is readable at any moment.
 
-    Moves are written before spots: a spot never names a move that is missing. Spots that `detect` has found since then
-    in waiting frames keep its result. A file that is up to date is not written again.
+    Moves are written before spots: a spot never names a missing move. Spots that `detect` has found in pending frames
+    keep that result. A file that is up to date is not written again.
 
     Raises:
         InputError: the folder cannot be written.
@@ -77,10 +77,10 @@ def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[
 
 
 def keep_edited(campaign: Campaign, folder: Path) -> dict[str, Path]:
-    """Copies campaign files that hold more than the journal, before they are written again.
+    """Copies campaign files with more content than the journal, before they are written again.
 
-    Spots may have been refused, readings or priors added by hand. Tables that only lack the latest rows are not copied:
-    the run itself leaves them so.
+    A user may have refused spots or added readings or priors. Tables that only lack the latest rows are not copied:
+    a run leaves them in this state.
 
     Args:
         campaign: from the journal.
@@ -110,7 +110,7 @@ def keep_edited(campaign: Campaign, folder: Path) -> dict[str, Path]:
 def _extra_rows(campaign: Campaign, folder: Path) -> dict[str, int]:
     """Number of additional rows of tables that have all rows of the journal and more, by name.
 
-    The journal knows at the end of a segment whether steps were lost: a status may be older or newer.
+    The journal records lost steps only at the end of a segment, so that a status may be older or newer.
     """
     try:
         present = read_campaign(folder)
@@ -129,7 +129,7 @@ def _extra_rows(campaign: Campaign, folder: Path) -> dict[str, int]:
 
 
 def _same_look(row: Spot, journal: Spot) -> bool:
-    """Whether a row of spots.csv is the journal's look, whatever `detect` or a homing has changed since."""
+    """Whether a row of spots.csv is the journal's look, regardless of later changes by `detect` or a homing."""
     if journal.status == UNDETECTED and row.spot == journal.spot:
         return True
     lost = LOST_STEPS in (row.status, journal.status)
@@ -137,7 +137,7 @@ def _same_look(row: Spot, journal: Spot) -> bool:
 
 
 def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
-    """Spots that wait in the journal and that `detect` has found since, from the present spots.csv."""
+    """Spots that are undetected in the journal and that `detect` has found since, from the present spots.csv."""
     if not (folder / "spots.csv").is_file() or all(spot.status != UNDETECTED for spot in campaign.spots):
         return {}
     waiting = {spot.spot: spot for spot in campaign.spots if spot.status == UNDETECTED}
@@ -156,7 +156,7 @@ def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
 def check_journal(folder: Path) -> dict[str, object]:
     """Verifies the journal of a campaign folder and compares the campaign files with it.
 
-    `moves` and `looks` of the document count what the journal holds; without a move there is no campaign yet.
+    `moves` and `looks` of the document count the journal's entries; without a move there is no campaign yet.
 
     Raises:
         InputError: damage, with line number.
@@ -193,7 +193,7 @@ def check_journal(folder: Path) -> dict[str, object]:
 
 
 def _compared(record: Recorded, present: Campaign, empty: bool) -> list[str]:
-    """Warnings of rows that the tables of a campaign lack, or its journal."""
+    """Warnings of rows that are missing in the tables of a campaign or in its journal."""
     moves, looks = len(record.moves) - len(present.moves), len(record.spots) - len(present.spots)
     warnings = []
     if moves > 0 or looks > 0:
@@ -212,9 +212,9 @@ def _compared(record: Recorded, present: Campaign, empty: bool) -> list[str]:
 
 
 def behind_journal(folder: Path, present: Campaign) -> str:
-    """A message about looks that spots.csv lacks and the journal has; "" for none or without a journal.
+    """A message about looks of the journal that spots.csv lacks; "" for none or without a journal.
 
-    A damaged journal is left to `check_journal`.
+    `check_journal` reports a damaged journal.
     """
     try:
         require_journal(folder, "")
@@ -232,7 +232,7 @@ def behind_journal(folder: Path, present: Campaign) -> str:
 def repair_campaign(folder: Path, to: Path) -> dict[str, object]:
     """Copies the intact lines of a journal into a new folder, and writes their campaign there.
 
-    Moves and looks after a gap without a new homing stay in the journal, do not count, and are counted separately.
+    Moves and looks after a gap without a new homing stay in the journal, are not used, and are counted separately.
 
     Raises:
         InputError: no journal, no intact line, a folder that is not empty, or campaign files that are damaged too.

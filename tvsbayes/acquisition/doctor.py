@@ -1,7 +1,7 @@
-"""Whether the instrument is fit for a campaign: a series of checks, each with its remedy.
+"""Checks of an instrument before a campaign, each with its remedy.
 
-Nothing moves but in `contract`. The laser stays off unless the caller asks for the laser check, and is then on for one
-picture; a positioner that is not homed refuses it. Seconds where a name says `_s`; grey levels 0 to 255.
+Nothing moves except in `contract`. The laser stays off unless the caller requests the laser check, and is then on for
+one picture; a positioner that is not homed refuses it. Seconds where a name says `_s`; grey levels 0 to 255.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from tvsbayes.positioner.serial_port import serial_ports
 ON_PORTS = ("serial", "grbl")
 """Drivers of a board on a serial port."""
 DISK_FREE_BYTES = 5 * 10**9
-"""Room for about 700 looks of four PNG of 1280 x 720 px, 1.8 MB each."""
+"""Free space for about 700 looks of four PNG of 1280 x 720 px, 1.8 MB each."""
 FLUSH_SLOW_S = 0.1
 """A flush takes about 4 ms on a solid-state disk; five of them per look at this rate cost half a second."""
 ROUND_TRIP_SLOW_S = 0.05
@@ -42,7 +42,7 @@ ROUND_TRIPS = 20
 CLIPPED_SHARE_MAX = 0.001
 DARK_MEAN_MIN = 2.0
 BRIGHT_MEAN_MAX = 150.0
-"""Mean grey level without laser: below, the cap may be on; above, the spot drowns in the room's light."""
+"""Range of the mean grey level without laser: below, the cap may be on; above, ambient light hides the spot."""
 SHARPNESS_MIN = 3.0
 """Variance of the Laplacian, grey levels squared; a picture out of focus has only the sensor's noise."""
 
@@ -58,7 +58,7 @@ class Check:
 
     @classmethod
     def judged(cls, name: str, found: str, remedy: str) -> Check:
-        """A warning where there is a remedy, else "ok"."""
+        """Make a warning where there is a remedy, else "ok"."""
         return cls(name, "warning" if remedy else "ok", found, remedy)
 
 
@@ -77,9 +77,9 @@ def examine(
         rig: the rig file.
         folder: where campaigns will be written.
         laser: whether the laser may be switched on for one picture; the caller has stated the hazard.
-        open_positioner: in place of the rig file's.
-        open_camera: in place of the rig file's cameras.
-        clock: of the timings.
+        open_positioner: replaces the rig file's positioner.
+        open_camera: replaces the rig file's cameras.
+        clock: clock of the timings.
     """
     checks = [_rig(rig), *_disk(folder, clock)]
     positioner: Positioner | None = None
@@ -126,7 +126,7 @@ def contract(
     beyond = b + 1, quarter[1]
     stop = StopKey()
     broken: dict[str, list[str]] = {}
-    # No look is to be finished: the first Ctrl-C interrupts, and the driver is closed.
+    # There is no look to finish: the first Ctrl-C interrupts, and the driver is closed.
     stop.requested = True
     size = rig.stereo.image_width, rig.stereo.image_height
     try:
@@ -159,7 +159,7 @@ def _rig(rig: Rig) -> Check:
 
 
 def _disk(folder: Path, clock: Clock) -> list[Check]:
-    """Room, and the time that a flush takes."""
+    """Check free space and the duration of a flush."""
     while not folder.is_dir() and folder != folder.parent:
         folder = folder.parent
     try:
@@ -203,7 +203,7 @@ def _failed(name: str, error: TvsError) -> Check:
 
 
 def _positioner(open_positioner: Callable[[], Positioner], clock: Clock) -> tuple[Positioner | None, list[Check]]:
-    """Firmware, state and round trip."""
+    """Check firmware, state and round-trip time."""
     try:
         positioner = open_positioner()
     except TvsError as error:
@@ -237,7 +237,7 @@ def _positioner(open_positioner: Callable[[], Positioner], clock: Clock) -> tupl
 
 
 def _switches(state: DeviceState) -> Check:
-    """Home and limit switches: pressed by hand, they show their wiring before anything moves."""
+    """Report home and limit switches: pressed by hand, they show their wiring before any motion."""
     pairs = zip(AXES, state.home_pressed, state.limit_open, strict=True)
     states = (
         f"{axis}: home {'pressed' if home else 'free'}, limit {'open' if limit else 'closed'}"
@@ -250,7 +250,7 @@ def _switches(state: DeviceState) -> Check:
 def _camera(
     rig: Rig, open_camera: Callable[[], StereoCamera] | None, positioner: Positioner | None, clock: Clock
 ) -> tuple[StereoCamera | None, list[Check]]:
-    """Opening, settings, time of a fresh pair, exposure and focus."""
+    """Check opening, settings, time of a new pair, exposure and focus."""
     size = rig.stereo.image_width, rig.stereo.image_height
     try:
         camera = open_camera() if open_camera is not None else cameras_of(rig)
@@ -275,7 +275,7 @@ def _camera(
 
 
 def _picture(side: str, picture: np.ndarray, white: int) -> list[Check]:
-    """Exposure and focus of a picture without laser, from a camera whose full pixels have the value `white`."""
+    """Check exposure and focus of a picture without laser; `white` is the camera's full scale."""
     import cv2
 
     grey = cv2.cvtColor(in_grey_levels(picture, white), cv2.COLOR_BGR2GRAY)
@@ -295,13 +295,13 @@ def _picture(side: str, picture: np.ndarray, white: int) -> list[Check]:
 
 
 def _laser(positioner: Positioner | None, camera: StereoCamera | None, requested: bool) -> Check:
-    """Whether both cameras see the spot; the laser is off afterwards, whatever happens."""
+    """Check whether both cameras see the spot; the laser is off afterwards, whatever happens."""
     if positioner is None or camera is None:
         return Check("laser", "skipped", "needs positioner and cameras", "correct the faults above first")
     if not requested:
         return Check("laser", "skipped", "not requested", "run doctor with --laser, goggles on")
     stop = StopKey()
-    # No look is to be finished: the first Ctrl-C interrupts.
+    # There is no look to finish: the first Ctrl-C interrupts.
     stop.requested = True
     try:
         with stop:

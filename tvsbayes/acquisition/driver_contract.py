@@ -1,8 +1,8 @@
-"""A test of what every driver of a positioner or of cameras must do, our own and those of others.
+"""Test the promises that every driver of a positioner or of cameras must keep, own and foreign.
 
-`positioner_violations` moves the motors and switches the laser on: on real hardware goggles on, nothing in the way. A
-reset, an unplugging or a blocked axis cannot be tested here; data/docs/instrument.md, "Your own hardware", has their
-promises. Counters in motor steps.
+`positioner_violations` moves the motors and switches the laser on: on real hardware wear goggles and clear the way. A
+reset, an unplugging or a blocked axis cannot be tested here; data/docs/instrument.md, "Your own hardware", states the
+promises for these cases. Counters in motor steps.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tvsbayes.positioner.protocol import DeviceState
 def positioner_violations(
     positioner: Positioner, targets: Sequence[tuple[int, int]], forbidden: tuple[int, int]
 ) -> list[str]:
-    """Which promises of `Positioner` a driver breaks, in sentences; closed afterwards.
+    """List the promises of `Positioner` that a driver breaks, in sentences; close it afterwards.
 
     Args:
         positioner: connected, not homed yet.
@@ -65,12 +65,12 @@ def positioner_violations(
 
 
 def camera_violations(camera: StereoCamera, width: int, height: int) -> list[str]:
-    """Which promises of `StereoCamera` a driver breaks, in sentences; closed afterwards.
+    """List the promises of `StereoCamera` that a driver breaks, in sentences; close it afterwards.
 
     Args:
         camera: open.
-        width: of one picture, px.
-        height: px.
+        width: width of one picture, px.
+        height: height of one picture, px.
     """
     broken: list[str] = []
     try:

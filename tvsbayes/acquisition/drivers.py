@@ -1,8 +1,8 @@
-"""Positioners and cameras by the name of their driver in the rig file, our own and those of other packages.
+"""Positioners and cameras by the name of their driver in the rig file, from this package and from others.
 
 A driver is an entry point of the group `tvsbayes.positioners` or `tvsbayes.cameras`: a function that takes the `Rig`
-and returns a connected `Positioner` or an open `StereoCamera` (data/docs/instrument.md, "Your own hardware"). Our own
-need none, so that a source tree without an installation has them.
+and returns a connected `Positioner` or an open `StereoCamera` (data/docs/instrument.md, "Your own hardware"). Drivers
+of this package need no entry point, so that a source tree without an installation has them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ OWN: Mapping[str, Mapping[str, str]] = {
         "simulated": "tvsbayes.acquisition.simulated_drivers:simulated_cameras",
     },
 }
-"""Our own drivers by the group of entry points: "module:function" by name."""
+"""Drivers of this package by the group of entry points: "module:function" by name."""
 _TABLES = {POSITIONERS: "positioner", CAMERAS: "cameras"}
 
 
@@ -40,7 +40,7 @@ def positioner_of(rig: Rig) -> Positioner:
     """The positioner that `[positioner]` of a rig file names, connected.
 
     Raises:
-        InputError: no such driver, or one that cannot work with what the rig file states.
+        InputError: no such driver, or it does not support the settings of the rig file.
         DeviceFault: it cannot be reached.
     """
     positioner: Positioner = _connected(POSITIONERS, str(rig.positioner.get("driver", DEFAULT_DRIVER)), rig)
@@ -51,7 +51,7 @@ def cameras_of(rig: Rig) -> StereoCamera:
     """The cameras that `[cameras]` of a rig file names, open.
 
     Raises:
-        InputError: no such driver, or one that cannot work with what the rig file states.
+        InputError: no such driver, or it does not support the settings of the rig file.
         DeviceFault: they cannot be opened or set.
     """
     camera: StereoCamera = _connected(CAMERAS, str(rig.cameras.get("driver", DEFAULT_CAMERAS)), rig)
@@ -73,13 +73,13 @@ def connect_trigger(positioner: Positioner, camera: StereoCamera) -> None:
 
 
 def known(group: str) -> dict[str, str]:
-    """Drivers of a group, ours first, as "module:function" by name; no other package replaces one of ours."""
+    """Drivers of a group as "module:function" by name; those of this package come first and cannot be replaced."""
     installed = {entry.name: entry.value for entry in metadata.entry_points(group=group)}
     return {**OWN[group], **{name: value for name, value in installed.items() if name not in OWN[group]}}
 
 
 def _connected(group: str, name: str, rig: Rig) -> Any:
-    """The device that a driver makes from a rig file; the driver's errors become faults with its name."""
+    """Make a device from a rig file by its driver, whose errors become faults with its name."""
     factory = _factory(group, name)
     try:
         return factory(rig)

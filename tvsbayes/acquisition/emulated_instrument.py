@@ -1,7 +1,7 @@
-"""The digital twin driven by the real firmware on an emulated processor, in the time of this computer.
+"""The digital twin driven by the real firmware on an emulated processor, in real time.
 
-What the firmware does to its motors and its laser line moves the twin's gears and its light, so a rehearsal runs
-driver, protocol and firmware as the bench will. Only the mechanics and the pictures are simulated.
+The firmware's motor and laser signals drive the twin's gears and light, so that a rehearsal runs the driver, protocol
+and firmware of the bench. Only the mechanics and the pictures are simulated.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class EmulatedInstrument(Instrument):
         return _BoardPositioner(self)
 
     def at_rest(self, homed: bool = False) -> None:
-        """Both axes stand; `homed`: each at its home switch, the counters set."""
+        """Record that both axes stand; `homed`: each at its home switch, with the counters set."""
         self.board.drain()
         for axis in (0, 1):
             self.mechanics.flush(axis)
@@ -76,7 +76,7 @@ class _BoardLink:
 
 
 class _BoardPositioner(SerialPositioner):
-    """The shipped driver, whose motions end in the twin as well."""
+    """The shipped driver, which reports the end of its motions to the twin."""
 
     def __init__(self, instrument: EmulatedInstrument):
         self._instrument, board = instrument, instrument.board

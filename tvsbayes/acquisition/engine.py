@@ -1,9 +1,9 @@
-"""The engine that runs a plan on an instrument: home, place, move, look, each on the disk before the next.
+"""The engine that runs a plan on an instrument: home, place, move, look, each recorded on the disk before the next.
 
-A plan describes, the engine does. Whatever ends a run (the plan's end, Ctrl-C, a fault of device, camera or disk), the
-laser is switched off, the end is written down, and the folder is a readable campaign as soon as the first homing is
-logged. `recorded` derives from the journal what is done; a resumed run homes into a new segment, asks for the sheet,
-repeats reference looks and goes on with the first step that is not done.
+However a run ends (the plan's end, Ctrl-C, a fault of device, camera or disk), the laser is switched off, the end is
+recorded, and the folder is a readable campaign as soon as the first homing is logged. `recorded` derives the completed
+steps from the journal; a resumed run homes into a new segment, asks for the sheet, repeats reference looks and
+continues with the first step that is not done.
 
 Counters in motor steps, seconds where a name says `_s`, raw px.
 """
@@ -39,18 +39,18 @@ from tvsbayes.instrument.stereo_pair import triangulate
 
 ATTEMPTS_PER_LOOK = 3
 PLACEMENTS_MAX = 3
-"""How often the operator is asked for the same sheet before the run stops."""
+"""Number of requests to place the same sheet before the run stops."""
 REFERENCE_LOOKS = 3
 REFERENCE_SHIFT_MAX_PX = 20.0
-"""Change of a reference spot after a resume that is worth a warning. A stop error and a home offset of 0.1 degrees
-together move it by 2 px, a sheet put back within 1 mm by as much (f 700 px, 85 mm baseline, 175 mm)."""
+"""Change of a reference spot after a resume above which the run warns. A stop error and a home offset of 0.1 degrees
+together move it by 2 px, a sheet replaced within 1 mm moves it as much (f 700 px, 85 mm baseline, 175 mm)."""
 SETTLE_S = 0.3
-"""Rest between motion and picture where the rig file states none: a light mechanism rings for about 0.1 s."""
+"""Rest between motion and picture where the rig file states none: a light mechanism vibrates for about 0.1 s."""
 CLEARED_STEPS = 20
-"""Fewer steps than these after homing may leave play: then the approach is unknown. 20 steps are 1.2 degrees at 0.06
+"""Fewer steps after homing may leave play, so that the approach is unknown. 20 steps are 1.2 degrees at 0.06
 degrees per step, against 0.5 degrees of lost motion in the paper."""
 DEPTH_SHARE = 0.25
-"""Share of the distance to the next target by which a sheet may be off before it counts as misplaced."""
+"""Share of the distance to the next target beyond which the error of a sheet's position counts as misplaced."""
 
 
 class _Stopped(Exception):
@@ -62,7 +62,7 @@ class _Scene:
     """Sheet and counters at a step of a plan.
 
     Attributes:
-        target: where the sheet stands, "" before the first placement.
+        target: position of the sheet, "" before the first placement.
         placement: its number in the plan, from 0; -1 before the first.
         counters: (pan, tilt) of the last two motions, fewer at the beginning.
     """
@@ -73,17 +73,17 @@ class _Scene:
 
 
 class Acquisition:
-    """One run of a plan, from its first step or from where an earlier run ended.
+    """One run of a plan, from its first step or from the end of an earlier run.
 
     Args:
         rig: the rig.
         plan: checked by `check_plan`.
-        journal: from `begin`; closed in the end.
-        bench: what it runs on; its positioner is closed in the end.
-        stop: the stop key, in force while `run` runs.
+        journal: from `begin`; closed at the end.
+        bench: the devices; its positioner is closed at the end.
+        stop: the stop key, active while `run` runs.
         show: called with the progress.
         estimate: the running estimate; a run that meets its target ends.
-        live: where the run is published, and its requests; by default not shown.
+        live: publishes the run and receives requests; by default the run is not shown.
         place_command: a program that places the sheet before the operator is asked; by default there is none.
     """
 
@@ -116,10 +116,10 @@ class Acquisition:
         """Runs the plan to its end, or to the stop key.
 
         Raises:
-            DeviceFault: device, camera or disk failed; the journal says so too.
+            DeviceFault: device, camera or disk failed; the journal records it.
             KeyboardInterrupt: interrupted twice, or ended from outside; laser off, journal closed.
         """
-        # For the journal, where an error of the program itself ends the run.
+        # Recorded in the journal where an error of the program itself ends the run.
         reason, exit_code, fault = "crashed", 1, None
         with self._stop:
             try:
@@ -137,9 +137,9 @@ class Acquisition:
                     reason, exit_code = error.code, error.exit_code
                 raise
             finally:
-                # An assignment, no call: no signal handler runs before it takes effect.
+                # An assignment, not a call: no signal handler runs before it takes effect.
                 self._stop.closing = True
-                # The positioner is closed first: light matters more than the log.
+                # The positioner is closed first: switching the laser off has priority over the log.
                 try:
                     self.bench.positioner.close()
                 finally:
@@ -154,7 +154,7 @@ class Acquisition:
         setup = setup_entries(self.rig, bool(self.journal.records[0].data.get("synthetic")))
         self._log.write(Start(utc=self._log.utc_text(), setup=setup, **self.bench.details))
         resumed = self._log.recorder.result()
-        # Before the first homing nothing counts, placements included.
+        # Events before the first homing do not count, including placements.
         next_row = resumed.next_step if resumed.moves else 0
         self._log.keep_edited()
         self._restore(resumed, next_row)
@@ -180,7 +180,7 @@ class Acquisition:
         return "done"
 
     def _update_estimate(self, row: int, estimate: RunningEstimate) -> bool:
-        """Takes the result of the fits after the look before `row`; whether the target is met."""
+        """Take the result of the fits after the look before `row`; return whether the target is met."""
         met = estimate.update(self._log.ok_looks)
         if not isinstance(estimate, Replanning):
             self._live.estimated(estimate.latest)
@@ -200,7 +200,7 @@ class Acquisition:
         return plan_seconds(self.rig, self.plan[:row]) / 60
 
     def _adapt(self, row: int, proposal: Proposal | None) -> None:
-        """Replaces the remaining looks by proposed ones; the journal has the change before it takes effect."""
+        """Replaces the remaining looks by proposed ones; the journal records the change before it takes effect."""
         if proposal is None:
             return
         steps = proposal.continued(row, self._log.recorder.state.target)
@@ -305,13 +305,13 @@ class Acquisition:
         return {"reference_of": reference.spot, "shift_px": shift_px}
 
     def _observe(self) -> Observation:
-        """A look, repeated while it finds no spot; the last one counts."""
+        """Take a look, repeated while no spot is found; the last one counts."""
         attempt = 0
         while True:
             try:
                 observation = self.bench.observer.observe(self.bench.positioner, self._spot)
             except LightRefused:
-                # Laser off was requested in mid-look: the look is repeated once the run goes on.
+                # Laser off was requested during the look: it is repeated once the run continues.
                 self._heed_stop()
                 continue
             attempt += 1
@@ -322,7 +322,7 @@ class Acquisition:
             self._live.remarked(f"look {self._spot}: {status}; taken again")
 
     def _misplaced(self, observation: Observation) -> str | None:
-        """Why the sheet seems misplaced, by the first spot after its placement; None where it does not."""
+        """Why the sheet seems misplaced, judged by the first spot after its placement; None if it does not."""
         pixels = observation.sighting.pixels_px
         if not self._check_depth or observation.sighting.status != "ok" or pixels is None:
             return None
@@ -337,7 +337,7 @@ class Acquisition:
         return None
 
     def _scene(self, row: int) -> _Scene:
-        """Sheet and counters at the beginning of the step in this row, by the plan."""
+        """Sheet and counters at the beginning of the step in this row, from the plan."""
         run = run_plan(self.plan[:row], self.rig)
         counters = tuple((move.pan_steps, move.tilt_steps) for move in run.moves[-2:])
         return _Scene(run.sheet, len(run.targets) - 1, counters)
@@ -345,7 +345,7 @@ class Acquisition:
     def _restore(self, record: Recorded, next_row: int) -> None:
         """Restores the state of the plan: the sheet, a new segment with reference looks, and looks that a repair lost.
 
-        That state comes from the plan: the last event of the journal may be of an interrupted reference look.
+        The plan gives that state: the last event of the journal may belong to an interrupted reference look.
         """
         remaining, scene = self.plan[next_row:], self._scene(next_row)
         lost = [s for s in self.plan[:next_row] if s.action == "look" and s.step not in record.looked_steps]
@@ -383,7 +383,7 @@ class Acquisition:
         self._report(step)
         scene = self._scene(step.step)
         self._put_sheet(scene, "for a look that was lost")
-        # From the previous counters: the same sense, so the same side of the play.
+        # Moves start from the previous counters, for the same sense and the same side of the play.
         for counters in scene.counters:
             self._move(*counters, None)
         self._look(step.step, step.experiment, step.point)

@@ -1,10 +1,10 @@
-"""The journal of an acquisition, `log.jsonl`: append-only, a CRC on every line, chained, on the disk before it counts.
+"""The journal of an acquisition, `log.jsonl`: append-only, chained CRC per line, flushed before an event counts.
 
 One event per line: `CRC32 NUMBER PREVIOUS-CRC32 JSON`. The first CRC, in eight lower-case hexadecimal digits, covers
-the rest of the line; the second is the first one of the line before, so that a missing, swapped or repeated line is
-detected. Frames are files of their own, written under a temporary name, flushed to the disk, renamed, their folder
-flushed; only then is the line with their SHA-256 appended and flushed; only then has the event happened. So a crash or
-a power cut at any moment leaves every acknowledged event whole, and at most one torn line at the end.
+the rest of the line; the second repeats the first CRC of the line before, so that a missing, swapped or repeated line
+is detected. Frames are files of their own: written under a temporary name, flushed to the disk, renamed, their folder
+flushed. Only then is the line with their SHA-256 appended and flushed, and the event counts. A crash or a power cut at
+any moment therefore leaves every acknowledged event complete, and at most one incomplete line at the end.
 
 Times in the events: UTC for people, `time_s` for the campaign (seconds since the first start, never decreasing).
 """
@@ -36,7 +36,7 @@ LINE_BYTES_MAX = 16_384
 LOG_BYTES_MAX = 64 * 1024 * 1024
 LOG_EVENTS_MAX = 100_000
 LOG_ENTRIES_MAX = 5_000_000
-"""Commas and opening brackets: short entries take up to 40 times their text in memory.
+"""Largest number of commas and opening brackets: short entries take up to 40 times their text in memory.
 
 Source: `experiments/robustness/hostile.md`.
 """
@@ -50,7 +50,7 @@ REPAIR_REMEDY = "copy the intact part to a new folder: tvsbayes check FOLDER --r
 
 
 class Disk:
-    """The calls through which a journal reaches the disk, so that tests can fail and replay each of them."""
+    """The calls through which a journal reaches the disk, so that tests can make each of them fail and replay them."""
 
     def open(self, path: Path, flags: int) -> int:
         """`os.open` for a file, or a folder to be flushed."""
@@ -75,12 +75,12 @@ class Disk:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A whole line of a journal.
+    """A complete line of a journal.
 
     Attributes:
-        number: of the event, from 0.
+        number: number of the event, from 0.
         event, data: its kind and its entries.
-        line: in the file, from 1.
+        line: number of the line in the file, from 1.
         previous, crc: CRC of the line before and its own.
     """
 
@@ -100,7 +100,7 @@ def refused(record: Record, found: object) -> InputError:
 
 
 def kind_of(event: type[Event]) -> str:
-    """How a journal names events of a class."""
+    """A journal's name for events of a class."""
     return str(event.__struct_config__.tag)
 
 
@@ -121,13 +121,13 @@ def event_of[E: Event](record: Record, *kinds: type[E]) -> E | None:
 
 @dataclass(frozen=True)
 class Reading:
-    """A journal as it stands on the disk.
+    """The present content of a journal on the disk.
 
     Attributes:
-        records: the whole lines, in order.
-        torn: bytes of an unfinished last line, empty for none.
-        size: bytes of the whole lines.
-        crc: CRC of the last one, 0 for none.
+        records: the complete lines, in order.
+        torn: bytes of an incomplete last line, empty for none.
+        size: bytes of the complete lines.
+        crc: CRC of the last complete line, 0 for none.
     """
 
     records: tuple[Record, ...]
@@ -140,7 +140,7 @@ def encode(number: int, previous: int, event: str, data: dict[str, object]) -> b
     """A line of the journal with its line feed.
 
     Raises:
-        ValueError: too long, or data that JSON cannot hold (NaN and infinity included).
+        ValueError: too long, or data that JSON cannot represent (such as NaN and infinity).
     """
     content = json.dumps({"event": event, **data}, allow_nan=False, ensure_ascii=True, separators=(",", ":"))
     body = b"%d %08x %s" % (number, previous, content.encode("ascii"))
@@ -151,7 +151,7 @@ def encode(number: int, previous: int, event: str, data: dict[str, object]) -> b
 
 
 def parse_line(line: bytes, line_number: int) -> Record | str:
-    """The line of a file, without its line feed, or its fault; the lines before it do not matter."""
+    """Parse a line of a file, without its line feed, independently of earlier lines; returns its fault if damaged."""
     match = LOG_LINE.fullmatch(line) if len(line) < LINE_BYTES_MAX else None
     if match is None:
         return "no event"
@@ -179,16 +179,16 @@ def _following(line: bytes, number: int, previous: int) -> Record | str:
 
 
 def _is_torn(tail: bytes, number: int, previous: int) -> bool:
-    """Whether a bad end of the file can be an append that a crash cut short, and nothing else.
+    """Whether an invalid end of the file can only be an append that a crash cut short.
 
-    An append begins at a line's start and ends with its line feed; power loss may leave any part of it, and blocks of
-    zero bytes for what was not written. A whole line with one wrong byte is no such append.
+    An append begins at a line's start and ends with its line feed; power loss may leave any part of it, with blocks of
+    zero bytes in place of unwritten data. A complete line with one wrong byte is not such an append.
     """
     if tail.endswith(b"\n"):
         return b"\x00\x00" in tail
     if len(tail) > LINE_BYTES_MAX or b"\n" in tail:
         return False
-    # A whole event whose line feed became another byte was acknowledged once.
+    # A complete event whose line feed became another byte was acknowledged.
     return isinstance(_following(tail[:-1], number, previous), str)
 
 
@@ -200,7 +200,7 @@ def require_journal(folder: Path, remedy: str) -> None:
 
 
 def read_log(folder: Path) -> bytes:
-    """The bytes of `log.jsonl`, capped in size, events and entries before anything is parsed."""
+    """The bytes of `log.jsonl`, limited in size, events and entries before parsing."""
     data = read_bytes(folder / LOG, LOG_BYTES_MAX, folder)
     counts = {
         "events": (data.count(b"\n"), LOG_EVENTS_MAX),
@@ -214,7 +214,7 @@ def read_log(folder: Path) -> bytes:
 
 
 def read_journal(folder: Path) -> Reading:
-    """Reads `log.jsonl`; a torn last line is set apart, other damage is refused with its line.
+    """Reads `log.jsonl`; an incomplete last line is returned separately, other damage is refused with its line.
 
     Raises:
         InputError: missing, damaged, or not a journal of this format.
@@ -245,7 +245,7 @@ def read_journal(folder: Path) -> Reading:
 class Journal:
     """A journal open for appending; one writer at a time.
 
-    After a failure nothing more is written: a failed flush may have dropped its data, and a second try would
+    After a failure nothing more is written: a failed flush may have lost its data, and a second attempt would
     acknowledge an event that is not on the disk.
     """
 
@@ -253,17 +253,17 @@ class Journal:
         self.folder = Path(folder)
         self.records = list(reading.records)
         self.torn = reading.torn
-        """Bytes that were cut off when this journal was opened; a separate file keeps them."""
+        """Bytes cut off when this journal was opened; a separate file keeps them."""
         self._descriptor: int | None = descriptor
         self._crc, self._size, self._disk = reading.crc, reading.size, disk
         self._dirty: set[Path] = set()
 
     @classmethod
     def create(cls, folder: Path, disk: Disk | None = None, /, **data: object) -> Journal:
-        """A new journal in a folder that has none; `data` goes into its first event, `created`.
+        """Create a journal in a folder that has none; `data` are the entries of its first event, `created`.
 
         Raises:
-            InputError: there is one already, or the folder cannot be written.
+            InputError: there is already a journal, or the folder cannot be written.
         """
         disk = disk or Disk()
         folder = Path(folder)
@@ -276,13 +276,13 @@ class Journal:
         except OSError as error:
             raise _disk_fault(error) from error
         journal = cls(folder, descriptor, Reading((), b"", 0, 0), disk)
-        # The name of the log, and that of the folder itself.
+        # Flush the name of the log, and that of the folder itself.
         journal._dirty |= {folder, folder.absolute().parent}
         try:
             _lock(descriptor)
             journal.append("created", format=FORMAT, **data)
         except BaseException:
-            # Nothing was acknowledged: without its file the folder can be tried again.
+            # Nothing was acknowledged: after removing the file the folder can be used again.
             journal.close()
             with contextlib.suppress(OSError):
                 (folder / LOG).unlink()
@@ -291,10 +291,10 @@ class Journal:
 
     @classmethod
     def open(cls, folder: Path, disk: Disk | None = None) -> Journal:
-        """An existing journal, to be continued; a torn last line is cut off and kept, an unfinished frame removed.
+        """Open an existing journal to continue it; cut off and keep an incomplete last line, remove unfinished frames.
 
         Raises:
-            InputError: damaged, or another program writes it.
+            InputError: the journal is damaged, or another program writes it.
             DeviceFault: the disk refuses.
         """
         disk = disk or Disk()
@@ -316,7 +316,7 @@ class Journal:
                     "journal", file=LOG, found="no event", allowed="at least the event created", remedy=EMPTY_REMEDY
                 )
             for name in FRAME_FOLDERS:
-                # This program holds the lock: no other one writes frames.
+                # This program holds the lock: no other program writes frames.
                 for unfinished in (folder / name).glob(".*.png.tmp"):
                     unfinished.unlink(missing_ok=True)
         except OSError as error:
@@ -328,7 +328,7 @@ class Journal:
         return cls(folder, descriptor, reading, disk)
 
     def store(self, name: str, data: bytes) -> Frame:
-        """Writes a frame; it counts once an event that names it is appended.
+        """Writes a frame; it counts once an event naming it is appended.
 
         Raises:
             ValueError: not the name of a frame.
@@ -354,7 +354,7 @@ class Journal:
         return Frame(name, hashlib.sha256(data).hexdigest(), len(data))
 
     def append(self, event: str, /, **data: object) -> Record:
-        """Appends an event and returns once it is on the disk, behind the frames stored before it.
+        """Appends an event and returns once it is on the disk, after the frames stored before it.
 
         Raises:
             DeviceFault: the disk refuses; the journal is closed.
@@ -375,14 +375,14 @@ class Journal:
         return record
 
     def close(self) -> None:
-        """Closes the journal; everything appended is on the disk already."""
+        """Closes the journal; all appended events are on the disk already."""
         if self._descriptor is not None:
             descriptor, self._descriptor = self._descriptor, None
             os.close(descriptor)
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[int]:
-        """The descriptor; the first error closes the journal for good, one of the disk becomes a `DeviceFault`."""
+        """The descriptor; the first error closes the journal permanently, and a disk error becomes a `DeviceFault`."""
         if self._descriptor is None:
             raise DeviceFault("disk", "the journal is closed after a disk error", remedy="go on with --resume")
         try:
@@ -406,12 +406,12 @@ def _disk_fault(error: OSError) -> DeviceFault:
 
 
 def _lock(descriptor: int) -> None:
-    """Refuses a second writer; the lock ends with the process, however it ends."""
+    """Refuses a second writer; the lock ends with the process in every case."""
     try:
         if sys.platform == "win32":
             import msvcrt
 
-            # Far behind the end, so that readers are not locked out.
+            # The lock lies far beyond the end, so that readers are not locked out.
             os.lseek(descriptor, LOG_BYTES_MAX + 1, os.SEEK_SET)
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
         else:
@@ -419,7 +419,7 @@ def _lock(descriptor: int) -> None:
 
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        # Errors of flock(2) and _locking for a lock that is held; any other is a disk without locks.
+        # Errors of flock(2) and _locking for a held lock; any other error means a disk without locks.
         if error.errno not in (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK):
             found, allowed = escaped(error.strerror or str(error)), "a disk that can lock files"
             raise refusal("lock", file=LOG, found=found, allowed=allowed, remedy="use a local disk") from error

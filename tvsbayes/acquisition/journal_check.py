@@ -1,7 +1,7 @@
 """Checks a journal and its frames, and copies the intact lines of a damaged one.
 
-CRC and chain find accidents; they do not prevent forgery. A missing end leaves no trace in the lines: a run that ended
-by itself has a `stop` event, and frames without an event are listed.
+CRC and chain detect accidents; they do not prevent forgery. A missing end leaves no trace in the lines; but a run that
+ended by itself has a `stop` event, and frames without an event are listed.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Verification:
     Attributes:
         records: number of events.
         frames: number of frames whose SHA-256 was compared.
-        orphans: frames without an event: of a look that a crash interrupted.
-        torn_bytes: length of an unfinished last line.
+        orphans: frames without an event, from a look that a crash interrupted.
+        torn_bytes: length of an incomplete last line.
         stopped: reason of the last `stop`, None where the run did not end by itself.
     """
 
@@ -68,7 +68,7 @@ def frames_of(record: Record) -> list[Frame]:
     """The frames that an event names.
 
     Raises:
-        InputError: entries that no journal of this program has.
+        InputError: entries that this program never writes.
     """
     try:
         return msgspec.convert(record.data.get("frames", []), list[Frame])
@@ -107,7 +107,7 @@ def verify(folder: Path) -> Verification:
     count = 0
     for record in reading.records:
         for frame in frames_of(record):
-            # Each frame is read once: thousands of lines that name one large file would take hours.
+            # Each frame is read once: thousands of lines naming one large file would take hours.
             problem = "a frame that an event before it names" if frame.name in names else _frame_problem(folder, frame)
             names.add(frame.name)
             if problem is not None:
@@ -128,12 +128,12 @@ def verify(folder: Path) -> Verification:
 
 @dataclass
 class Repair:
-    """What a repair kept and lost.
+    """The result of a repair: copied events and losses.
 
     Attributes:
         kept: events copied.
         lost_lines: damaged lines of the old journal.
-        lost_frames: frames that are missing or changed; their looks stay, without these frames.
+        lost_frames: frames that are missing or changed; their looks are kept without these frames.
         torn_bytes: length of an unfinished last line, which is not copied.
     """
 
@@ -144,7 +144,7 @@ class Repair:
 
 
 IN_MOTION, ENDS_OF_MOTION = {"created", "gap", "intent", "verified"}, {"homed", "moved", "verified"}
-"""Events after which, and before which, a single lost line may be part of a motion: one has two lines at least."""
+"""Events after and before which a single lost line may belong to a motion, which has at least two lines."""
 
 
 def _in_written_order(records: list[Record]) -> list[Record]:
@@ -154,11 +154,11 @@ def _in_written_order(records: list[Record]) -> list[Record]:
 
 
 def repair(folder: Path, to: Path) -> Repair:
-    """Copies the intact lines into a new folder; the old one stays as it is.
+    """Copies the intact lines into a new folder; the old folder is unchanged.
 
-    Intact lines are sorted into the order in which they were written. A `gap` event replaces missing lines: events
-    after it do not count until a new homing, because an unknown motion may be missing, unless it states that no motion
-    was lost. Frames that differ from their event are left out and listed.
+    Intact lines are sorted by the order of writing. A `gap` event replaces missing lines: events
+    after it do not count until a new homing, because an unknown motion may be missing, unless the event states that no
+    motion was lost. Frames that differ from their event are left out and listed.
 
     Raises:
         InputError: no intact line, or `to` is not empty.

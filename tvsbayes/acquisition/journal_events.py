@@ -1,13 +1,13 @@
-"""The events of a run's journal, as their JSON objects stand in `log.jsonl`: structs, distinguished by the key `event`.
+"""The events of a run's journal, the JSON objects in `log.jsonl`: structs, distinguished by the key `event`.
 
-`created` opens a journal. An `intent` precedes every motion of the plan, and an order has an event once it is done:
+`created` opens a journal. An `intent` precedes every motion of the plan, and every completed order has an event:
 `homed`, `placed`, `moved`, `looked`. `place_command` is a run of a program that places the sheet. `adapted` changes the
-plan, `confirmed` says whether the posterior meets the target, `asked` is a request from the live page, `verified`
-closes a segment, `start` and `stop` enclose a run, `gap` stands where a repair lost lines. Counters in motor steps, raw
-px, degrees and seconds by suffix; `utc` and `created` are ISO 8601. Fields stand in the order in which they are
-written; those that are UNSET by default may be missing.
+plan, `confirmed` states whether the posterior meets the target, `asked` is a request from the live page, `verified`
+closes a segment, `start` and `stop` enclose a run, `gap` replaces lines lost in a repair. Counters in motor steps, raw
+px, degrees and seconds by suffix; `utc` and `created` are ISO 8601. Fields have the order in which they are written;
+fields that are UNSET by default may be missing.
 
-A checksum finds accidents, not forgery: `journal.event_of` checks the entries of an event against its declaration.
+A checksum detects accidents, not forgery: `journal.event_of` checks the entries of an event against its declaration.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class Event(Struct, frozen=True, kw_only=True, tag_field="event", tag=str.lower)
 
 
 class Created(Event, frozen=True):
-    """The first event: whose journal it is; a plan is known by its SHA-256, a rig by the entries that may not change.
+    """The first event: it identifies a plan by its SHA-256, a rig by the entries that may not change.
 
-    Earlier journals know the rig by a SHA-256 too.
+    Earlier journals identify the rig by a SHA-256 too.
     """
 
     format: str
@@ -68,9 +68,9 @@ class Placed(Event, frozen=True):
 
 
 class PlaceCommanded(Event, frozen=True, kw_only=True, tag="place_command"):
-    """A program has placed the sheet (`exit_code` 0) or failed to; None where it had to be ended. `words`: its output.
+    """A program has placed the sheet (`exit_code` 0) or failed; None where it had to be ended. `words`: its output.
 
-    `placement` counts the placements of the plan from 0. `placed` follows where it has worked.
+    `placement` counts the placements of the plan from 0. `placed` follows after success.
     """
 
     time_s: float | UnsetType = UNSET
@@ -94,7 +94,7 @@ class TrueAngles(Struct, frozen=True):
 class Motion(Event, frozen=True):
     """A motion has ended at these counters, `time_s` after the campaign was created.
 
-    `step` is that of the plan, None for motions of a resumed run.
+    `step` is the step of the plan, None for motions of a resumed run.
     """
 
     step: int | None
@@ -104,14 +104,14 @@ class Motion(Event, frozen=True):
 
 
 class Moved(Motion, frozen=True):
-    """An order to move is done; `twin` is what a simulation knows of the mirrors."""
+    """A move is completed; `twin` holds the true mirror angles of a simulation."""
 
     reference: bool | UnsetType = UNSET
     twin: TrueAngles | UnsetType = UNSET
 
 
 class Homed(Motion, frozen=True):
-    """A homing and the way to its counters: boot id of the device, the side of arrival of pan and tilt."""
+    """A homing and the motion to its counters: boot id of the device, side of arrival of pan and tilt."""
 
     boot: int
     approach: tuple[str, str]
@@ -126,7 +126,7 @@ class Verified(Event, frozen=True):
 
 
 FRAME_NAME = re.compile(r"(?:frames|dark)/[0-9]{6}_(?:left|right)\.png")
-"""As `instrument.campaign.frame_name` makes them."""
+"""Names made by `instrument.campaign.frame_name`."""
 
 
 class Frame(Struct, frozen=True, forbid_unknown_fields=True, rename={"size": "bytes"}):
@@ -137,14 +137,14 @@ class Frame(Struct, frozen=True, forbid_unknown_fields=True, rename={"size": "by
     size: int
 
     def as_json(self) -> dict[str, Any]:
-        """As a look's event holds it."""
+        """The entry in a look's event."""
         return to_builtins(self)
 
 
 class Looked(Event, frozen=True):
-    """A look and what a detector found in it.
+    """A look and the detector's result.
 
-    `reference_of` names the spot that a look of a resumed run compares itself with, `shift_px` the largest change.
+    `reference_of` is the spot with which a look of a resumed run is compared, `shift_px` the largest change.
     """
 
     step: int | None
@@ -164,7 +164,7 @@ class Looked(Event, frozen=True):
 
 
 class Adapted(Event, frozen=True):
-    """A change of plan: the steps that stand from row `row` on, and why they were chosen.
+    """A change of plan: the new steps from row `row` on, and the reason for them.
 
     Each look has the expected target value before and after it; `looks` is the number behind the estimate.
     """
@@ -178,7 +178,7 @@ class Adapted(Event, frozen=True):
 class Confirmed(Event, frozen=True):
     """Whether the posterior, sampled where the Laplace approximation met the target, meets it too.
 
-    Of so many `looks`; worst u of the directions by both, deg/step; `accepted`: whether the weighted draws may be used.
+    From `looks` looks; worst u of the directions by both, deg/step; `accepted`: whether the weighted draws may be used.
     """
 
     looks: int
@@ -202,7 +202,7 @@ class AskedDevice(Struct, frozen=True):
 class Asked(Event, frozen=True, kw_only=True):
     """A request to a run in progress (pause, resume, stop, laser off), once the device has answered.
 
-    `control passed on`: another browser controls, because the one before was silent for a while. `number` counts the
+    `control passed on`: another browser controls, because the previous one was silent for a while. `number` counts the
     requests of a run from 1; `time_s` is the time of the device's answer since the campaign was created.
     """
 
@@ -223,7 +223,7 @@ class Stop(Event, frozen=True):
 class Gap(Event, frozen=True):
     """Lines were lost before a line of the journal that was repaired.
 
-    `motion_lost` is false where the missing lines held no motion: what follows counts.
+    `motion_lost` is false where the missing lines contained no motion: later events then count.
     """
 
     before_line: int

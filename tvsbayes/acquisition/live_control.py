@@ -1,13 +1,13 @@
-"""Requests to a run: served between two looks, and for the laser at every exchange with the device.
+"""Requests to a run: served between two looks; laser off is served at every exchange with the device.
 
 Requests wait in a short queue between a page's thread and the engine's: the page never waits for the engine, and the
 engine reads the queue between two looks; only a paused run waits for the next request.
 
 Each request goes to the device first: it is acknowledged once the device has answered and the journal holds an `asked`
-event. Pause, stop and laser off switch the laser off, whatever its state. Laser off is served in the middle of a look
-as well: the look is broken off, the run pauses, and the look is taken again after resume. A pause ends by resume, stop
-or Ctrl-C only: if the page is gone, the laser stays off until a person resumes, and nothing moves after the step under
-way. Seconds where a name says `_s`.
+event. Pause, stop and laser off switch the laser off, whatever its state. Laser off is also served during a look: the
+look is aborted, the run pauses, and the look is repeated after resume. Only resume, stop or Ctrl-C end a pause: if the
+page is gone, the laser stays off until a person resumes, and nothing moves after the present step. Seconds where a name
+says `_s`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from tvsbayes.positioner.protocol import DeviceState
 PAUSE, RESUME, STOP, LASER_OFF = "pause", "resume", "stop", "laser off"
 REQUESTS = (PAUSE, RESUME, STOP, LASER_OFF)
 CONTROL_PASSED = "control passed on"
-"""No request but an entry for the journal: another browser controls."""
+"""An entry for the journal rather than a request: another browser controls."""
 KEPT_MAX = 20
-"""Settled requests that are still listed."""
+"""Largest number of settled requests listed."""
 REQUESTED, ACKNOWLEDGED, FAILED = "requested", "acknowledged", "failed"
 PAUSE_POLL_S = 0.2
-"""How often a paused run checks for Ctrl-C."""
+"""Interval at which a paused run checks for Ctrl-C."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class Request:
     Attributes:
         number: from 1, in the order in which they came.
         what: one of `REQUESTS`, or `CONTROL_PASSED`.
-        asked_s: its time, by this computer's steady clock.
+        asked_s: its time on this computer's monotonic clock.
         state: requested, acknowledged (the device has answered and the journal holds it), or failed.
         waited_s: from the request to the answer, None while it waits.
-        answer: the device's answer, or why there is none.
+        answer: the device's answer, or the reason why there is none.
     """
 
     number: int
@@ -64,10 +64,10 @@ class Requests:
         self._closed = False
 
     def ask(self, what: str) -> Request | None:
-        """A new request, or the waiting one of the same kind. None once the run has ended.
+        """Make a request, or return the waiting one of the same kind; None once the run has ended.
 
-        A request that stops the run or its light withdraws a waiting resume: the later one counts, and laser off goes
-        before all others.
+        A request to stop the run or switch its laser off withdraws a waiting resume: the later request counts, and
+        laser off precedes all others.
 
         Raises:
             ValueError: neither one of `REQUESTS` nor `CONTROL_PASSED`.
@@ -96,7 +96,7 @@ class Requests:
         return tuple(request for request in self._all if request.state == REQUESTED)
 
     def next(self, what: str | None = None) -> Request | None:
-        """The oldest waiting request, of kind `what` where given; laser off goes before all others."""
+        """The oldest waiting request, of kind `what` where given; laser off precedes all others."""
         waiting = [request for request in self._waiting() if what in (None, request.what)]
         return min(waiting, key=lambda request: (request.what != LASER_OFF, request.number), default=None)
 
@@ -108,14 +108,14 @@ class Requests:
         return settled
 
     def close(self, answer: str) -> None:
-        """The run has ended: waiting requests fail, and no new ones are accepted."""
+        """End the run's requests: waiting requests fail, and no new ones are accepted."""
         with self._changed:
             self._closed = True
             for request in self._waiting():
                 self.settle(request, FAILED, answer)
 
     def recent(self) -> tuple[Request, ...]:
-        """The last ones, oldest first."""
+        """The last requests, oldest first."""
         return self._all
 
     def wait(self, longest_s: float) -> None:
@@ -126,22 +126,22 @@ class Requests:
 
 
 class LightRefused(Exception):
-    """Laser off was requested: the look under way is broken off."""
+    """Laser off was requested: the present look is aborted."""
 
 
 class Control:
     """Carries requests out.
 
     Args:
-        requests: of the run.
+        requests: requests to the run.
         positioner: the device itself.
         stop: the stop key, which a request to stop presses.
         write: appends the event to the journal, with its time.
         changed: called when a pause begins or ends, and after every exchange with the device.
 
     Attributes:
-        paused: whether the run stands still.
-        device: its last state, None before the first exchange.
+        paused: whether the run is paused.
+        device: its last known state, None before the first exchange.
     """
 
     def __init__(
@@ -158,7 +158,7 @@ class Control:
         self._write, self._changed = write, changed
 
     def heed(self) -> None:
-        """Between two steps: carries requests out; returns once the run may go on, or the stop key is pressed.
+        """Carries out requests between two steps; returns once the run may continue, or the stop key is pressed.
 
         Raises:
             DeviceFault: the device does not answer, or the disk refuses.
@@ -169,7 +169,7 @@ class Control:
             self._carry_out_all()
 
     def meanwhile(self) -> bool:
-        """While the run waits for a computation: carries requests out; whether the run is to go on afterwards.
+        """Carries out requests while the run waits for a computation; returns whether the run continues afterwards.
 
         Raises:
             DeviceFault: as `heed`.
@@ -178,7 +178,7 @@ class Control:
         return not self._stop.requested
 
     def darken(self) -> bool:
-        """Within a step: carries out a request for laser off; whether the laser must stay off."""
+        """Carries out a request for laser off within a step; returns whether the laser must stay off."""
         request = self._requests.next(LASER_OFF)
         if request is not None:
             self._carry_out(request)
@@ -222,7 +222,7 @@ class HeedingPositioner:
 
     Args:
         inner: the device.
-        control: of the run.
+        control: control of the run.
     """
 
     def __init__(self, inner: Positioner, control: Control):
@@ -254,7 +254,7 @@ class HeedingPositioner:
         """See `Positioner.laser`.
 
         Raises:
-            LightRefused: it should come on, but laser off was requested.
+            LightRefused: the laser should be switched on, but laser off was requested.
         """
         if self._control.darken() and on:
             raise LightRefused

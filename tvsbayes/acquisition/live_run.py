@@ -1,8 +1,8 @@
 """A run in progress as its readers see it: the engine publishes snapshots, readers take the latest and send requests.
 
-Publication is one assignment: slow, many or dead readers cost the engine nothing, and miss what they do not read. The
-only way back is the queue of `live_control`. The reader scales pictures down. Snapshots are frozen, and bounded
-whatever the length of a run: the last look with its pictures, the last centres, estimates and remarks. Raw px, counters
+Publication is one assignment: slow, many or dead readers cost the engine nothing, and miss unread snapshots. Requests
+return only through the queue of `live_control`. The reader scales pictures down. Snapshots are frozen, and bounded for
+a run of any length: the last look with its pictures, the last centres, estimates and remarks. Raw px, counters
 in motor steps, degrees per step, seconds where a name says `_s`.
 """
 
@@ -22,11 +22,11 @@ from tvsbayes.instrument.campaign import CAMERAS, frame_name
 from tvsbayes.positioner.protocol import DeviceState
 
 TRAIL_MAX = 60
-"""Centres of earlier looks that are still shown."""
+"""Largest number of centres of earlier looks that are shown."""
 ESTIMATES_MAX = 100
 REMARKS_MAX = 20
 COMING_MAX = 6
-"""Steps of the plan that are announced."""
+"""Number of coming steps of the plan that are shown."""
 RUNNING, PAUSED, ENDED = "running", "paused", "ended"
 
 
@@ -37,7 +37,7 @@ class SeenLook:
     Attributes:
         spot: its number.
         status: "ok", "undetected", or the reason of refusal.
-        target: where the sheet stood.
+        target: position of the sheet.
         pixels_px: u_left, v_left, u_right, v_right; None where no spot was found.
         sds_px: their standard uncertainties.
         pictures: PNG by name, with the laser on; empty where none were made.
@@ -66,21 +66,21 @@ class Snapshot:
 
     Attributes:
         number: grows with every snapshot.
-        name: of the campaign.
-        image_px: width and height of both cameras.
-        simulated: whether it is the twin.
+        name: name of the campaign.
+        image_px: width and height of the pictures of both cameras.
+        simulated: whether the instrument is the twin.
         state: running, paused or ended.
         progress: None before the first step.
         coming: the next steps, in words.
         device: its last state.
-        look: the last one.
+        look: the last look.
         trail: centres of the last looks that count.
         estimates: oldest first.
-        aim: of the estimates.
+        aim: aim of the estimates.
         remarks: events outside the plan, newest last.
         warnings: for the user.
-        fault: what ended the run.
-        reason: why it ended, "" before.
+        fault: fault that ended the run.
+        reason: reason of the end, "" before.
     """
 
     number: int = 0
@@ -103,15 +103,15 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Temperature:
-    """How far an estimate has moved by its latest looks, measured by how far they should move it.
+    """Change of an estimate by its latest looks, relative to its expected size.
 
-    The second fit holds the looks of the first, so their difference has the variance that the new looks removed:
-    u_before^2 - u_after^2 (Hausman, Econometrica 46, 1251, 1978). A drift, a knocked camera or lost steps show as
-    differences of many of these.
+    The second fit contains the looks of the first, so their difference has the variance that the new looks removed:
+    u_before^2 - u_after^2 (Hausman, Econometrica 46, 1251, 1978). A drift, a moved camera or lost steps appear as
+    differences of many such standard deviations.
 
     Attributes:
         moved: by direction, the difference over that standard deviation; None where the uncertainty did not shrink.
-        rms: over the directions that have one, None for none; about 1 for looks that agree with each other.
+        rms: over these directions, None without any; about 1 for looks that agree with each other.
     """
 
     moved: dict[str, float | None]
@@ -119,7 +119,7 @@ class Temperature:
 
 
 def temperature(estimates: Sequence[Estimate]) -> Temperature | None:
-    """Of the newest estimate against the last one of fewer looks and the same kind; None where there is none."""
+    """The temperature of the newest estimate against the last of the same kind with fewer looks; None without one."""
     latest = estimates[-1] if estimates else None
     earlier = [e for e in estimates if latest is not None and e.tier == latest.tier and e.looks < latest.looks]
     if latest is None or not earlier:
@@ -135,17 +135,17 @@ def temperature(estimates: Sequence[Estimate]) -> Temperature | None:
 
 
 KINDS = ("whole", "spot")
-"""Of pictures: the whole picture scaled down, or the surroundings of the spot in full size."""
+"""Kinds of pictures: the whole picture scaled down, or the region around the spot at full resolution."""
 
 
 class LiveRun:
-    """One run: snapshots out, requests in.
+    """Publishes the snapshots of one run and receives its requests.
 
     Args:
         begun: called once when the run begins.
 
     Attributes:
-        requests: to the run.
+        requests: requests to the run.
         latest: the newest snapshot; replaced as a whole.
     """
 
@@ -159,26 +159,26 @@ class LiveRun:
         self.latest = replace(self.latest, number=self.latest.number + 1, **changes)
 
     def looked(self, look: SeenLook) -> None:
-        """A look was taken."""
+        """Publish a look."""
         counts = look.status == "ok" and look.pixels_px is not None
         trail = (*self.latest.trail, look.pixels_px)[-TRAIL_MAX:] if counts else self.latest.trail
         self.publish(look=look, trail=trail)
 
     def estimated(self, estimate: Estimate | None) -> None:
-        """The latest estimate; a repeated one is ignored."""
+        """Publish an estimate; a repeated one is ignored."""
         estimates = self.latest.estimates
         if estimate is not None and (not estimates or estimates[-1] is not estimate):
             self.publish(estimates=(*estimates, estimate)[-ESTIMATES_MAX:])
 
     def remarked(self, remark: str) -> None:
-        """A remark for the user."""
+        """Publish a remark for the user."""
         self.publish(remarks=(*self.latest.remarks, remark)[-REMARKS_MAX:])
 
     def ended(self, reason: str, error: BaseException | None = None) -> None:
-        """The run is over, after a fault where there was one."""
+        """Publish the end of the run, with its fault where there was one."""
         fault, answer = None, "the run has ended, its last order was laser off"
         if error is not None:
-            # Whether the last order has arrived is unknown.
+            # It is unknown whether the last order arrived.
             answer = "the run has ended in a fault: cut the laser's supply, it may be on"
             code, remedy = getattr(error, "code", type(error).__name__), getattr(error, "remedy", None)
             fault = Fault(str(code), str(error) or str(code), remedy or "")
@@ -200,7 +200,7 @@ class LiveRun:
         self.requests.ask(CONTROL_PASSED)
 
     def document(self) -> dict[str, Any]:
-        """The newest snapshot and the requests, as JSON holds them."""
+        """The newest snapshot and the requests as a JSON document."""
         snapshot = self.latest
         fields = asdict(replace(snapshot, look=None, trail=()))
         look = None
@@ -217,7 +217,7 @@ class LiveRun:
         }
 
     def picture(self, spot: int, camera: str, kind: str) -> bytes | None:
-        """JPEG of the last look, if it is this one and has pictures."""
+        """JPEG of look `spot`, if it is the last one and has pictures."""
         look = self.latest.look
         if look is None or look.spot != spot or camera not in CAMERAS or kind not in KINDS:
             return None

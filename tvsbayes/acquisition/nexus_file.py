@@ -1,11 +1,11 @@
 """A campaign as one NeXus file (HDF5), for programs that read this format.
 
-`/entry/looks` is the default plot: centroids with their uncertainties over the looks, with the counters behind each;
+`/entry/looks` is the default plot: centroids with their uncertainties over the looks, with their counters;
 `/entry/moves` has the counters over time, `/entry/instrument` axes and cameras. The campaign's files and the journal
-are in `/entry/files` byte for byte; of pictures only the names and SHA-256 that the journal has.
+are in `/entry/files` byte for byte; of pictures only the journal's names and SHA-256.
 
 Counters in steps, px with the integer at the centre of a pixel, mm, degrees, seconds since `/entry/start_time`; every
-number carries its unit. Source: NeXus base classes, https://manual.nexusformat.org.
+number has its unit. Source: NeXus base classes, https://manual.nexusformat.org.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.campaign import CAMERAS, MOVES, PIXEL_SDS, SPOTS, Campaign, Move, Spot, read_campaign
 
 NOTHING = -1
-"""For a look without experiment or point."""
+"""Value for a look without experiment or point."""
 _FILES = {
     "campaign.toml": TOML_BYTES_MAX,
     "stereo.json": JSON_BYTES_MAX,
@@ -42,7 +42,7 @@ _FILES = {
     LOG: LOG_BYTES_MAX,
 }
 _UNITS = ("s", "steps", "px", "deg")
-"""Suffixes of the names of columns."""
+"""Units as suffixes of column names."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,11 @@ class NexusSummary:
 
 
 def write_nexus(folder: Path, path: Path) -> NexusSummary:
-    """Writes a campaign, with its journal where it has one, as a new NeXus file; whole or not at all.
+    """Writes a campaign, with its journal where it has one, as a new NeXus file; completely or not at all.
 
     Args:
-        folder: of the campaign.
-        path: the file.
+        folder: folder of the campaign.
+        path: the file to write.
 
     Raises:
         InputError: an unreadable campaign or journal, an existing file, a folder that cannot be written.

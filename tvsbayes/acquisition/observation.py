@@ -1,12 +1,12 @@
-"""One look: a picture without laser light, one with it, and the spot that a detector finds in them.
+"""One look: a picture without laser light, one with it, and the spot found in them by a detector.
 
-The laser is on only between the two pictures, and off again whatever happens. Light also proves that no picture is
-older than the look, however deep the buffers are: pictures come in the order of their exposure, so a look waits after
-laser-on for the spot to appear and after laser-off for it to vanish. The next look then begins with no lit picture in
-the buffers, and a picture with a spot was exposed in it. A spot that vanishes also shows that the laser is off; one
-that was there before laser-on is a fault.
+The laser is on only between the two pictures, and off afterwards in every case. Light also proves that no picture is
+older than the look, for buffers of any depth: pictures arrive in the order of exposure, so a look waits for the spot to
+appear after laser-on and to vanish after laser-off. The next look then begins with no lit picture in the buffers, and a
+picture with a spot was exposed during it. A vanished spot also shows that the laser is off; a spot before laser-on is a
+fault.
 
-Raw px with the integer at the centre of a pixel; grey levels 0 to 255, also of pictures of 16 bits, kept as they are.
+Raw px with the integer at the centre of a pixel; grey levels 0 to 255, also for pictures of 16 bits, stored unchanged.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from tvsbayes.twin.physics import Light, cameras_of
 from tvsbayes.twin.spot_pictures import Scene, Sensor, render_spots
 
 CHANGE_DN = 40
-"""Grey levels by which a pixel must change to count as lit, or as another scene: noise and JPEG stay below 10."""
+"""Change of a pixel, in grey levels, that counts as lit or as another scene: noise and JPEG stay below 10."""
 WAIT_GRABS = 20
-"""Grabs after which a spot that has not appeared never will: each takes at least three frames, and no driver or stream
-holds back sixty."""
+"""Number of grabs after which a missing spot counts as absent: each takes at least three frames, and no driver or
+stream buffers sixty."""
 SAME_PLACE_PX = 2.0
-"""A spot moves by less between two pictures of a scene at rest."""
+"""Upper bound of a spot's motion between two pictures of a scene at rest."""
 UNSTEADY = "unsteady"
-"""Status of a look whose background changed: a person in the picture, or the light in the room."""
+"""Status of a look whose background changed: by a person in the picture, or by ambient light."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Observation:
-    """A sighting and the pictures behind it, PNG by name relative to the campaign's folder."""
+    """A sighting with its pictures, PNG by name relative to the campaign's folder."""
 
     sighting: Sighting
     pictures: dict[str, bytes] = field(default_factory=dict)
@@ -73,14 +73,14 @@ class Detector(Protocol):
     """Finds the spot in a pair of pictures."""
 
     def __call__(self, lit: StereoImage, dark: StereoImage) -> Sighting:
-        """`lit` with the laser on, `dark` just before without it; both state their full scale."""
+        """Find the spot: `lit` has the laser on, `dark` was taken just before; both state their full scale."""
 
 
 class Observer(Protocol):
     """Takes a look with a positioner at rest."""
 
     def observe(self, positioner: Positioner, spot: int) -> Observation:
-        """Look number `spot`; the laser is off before and after."""
+        """Take look number `spot`; the laser is off before and after."""
 
 
 def wait_for_detection(lit: StereoImage, dark: StereoImage) -> Sighting:
@@ -90,7 +90,7 @@ def wait_for_detection(lit: StereoImage, dark: StereoImage) -> Sighting:
 
 @dataclass
 class CameraObserver:
-    """Looks with cameras.
+    """Takes looks with cameras.
 
     Attributes:
         camera: the pair.
@@ -107,7 +107,7 @@ class CameraObserver:
         """See `Observer.observe`.
 
         Raises:
-            DeviceFault: a camera repeats one picture, or the laser went off during the exposure, stayed on, or was on
+            DeviceFault: a camera repeats a picture, or the laser went off during the exposure, stayed on, or was on
                 before.
             LightRefused: laser off was requested; it is off.
         """
@@ -140,25 +140,25 @@ class CameraObserver:
         return Observation(sighting, pictures)
 
     def _grab(self) -> StereoImage:
-        """A pair with its full scale: that of its driver, else by the brightest pixel so far.
+        """Grab a pair with its full scale, from the driver or else from the brightest pixel so far.
 
-        Two dark pictures of 12 bits alone would pass for 8 bits, and their noise for light.
+        Two dark pictures of 12 bits alone would be taken for 8 bits, and their noise for light.
         """
         pair = self.camera.grab()
         self._white = max(self._white, pair.full_scale)
         return replace(pair, white=self._white)
 
     def _lit(self, positioner: Positioner, dark: StereoImage) -> tuple[StereoImage, bool]:
-        """A picture exposed with the laser on, and whether the laser was on to its end."""
+        """Take a picture with the laser on; also return whether the laser was on to the end of its exposure."""
         for number in range(WAIT_GRABS):
             lit = self._grab()
-            # Sensor noise makes two exposures differ, whatever they show.
+            # Sensor noise makes any two exposures differ.
             if np.array_equal(lit.left, dark.left) or np.array_equal(lit.right, dark.right):
                 remedy = "unplug the camera and plug it in again, then go on with --resume"
                 raise fault("frozen", "a camera delivers the same picture again and again", remedy)
             if min(rises_dn(dark, lit)) > CHANGE_DN:
                 if number:
-                    # The laser came on during the first lit exposure, or in an older one: take a whole one.
+                    # The laser came on during the first lit exposure, or an older one: take a fully lit one.
                     lit = self._grab()
                 break
             if not positioner.state().laser_on:
@@ -166,7 +166,7 @@ class CameraObserver:
         return lit, positioner.state().laser_on
 
     def _require_new(self, sighting: Sighting, dark: StereoImage) -> None:
-        """Refuses a spot that the picture without laser light shows as well: a laser that is always on, or a lamp."""
+        """Refuses a spot that the picture without laser light also shows: a laser that is always on, or a lamp."""
         dark_px = self.detector(dark, dark).pixels_px
         if dark_px is None or sighting.pixels_px is None:
             return
@@ -194,10 +194,10 @@ def rises_dn(before: StereoImage, after: StereoImage) -> tuple[int, int]:
 
 @dataclass
 class TwinObserver:
-    """Looks at the digital twin without pictures: the centroids that a detector would state, noise included.
+    """Takes looks of the digital twin without pictures: the centroids of a detector, with noise.
 
     Attributes:
-        instrument: the simulated one.
+        instrument: the simulated instrument.
         sd_px: standard uncertainty stated for every coordinate.
     """
 
@@ -218,9 +218,9 @@ class TwinObserver:
 
 
 def live_detector(stereo: Stereo) -> Detector:
-    """Finds spots by the method `fit`, with the noise that a campaign's `detect` would begin with.
+    """Make a detector by the method `fit`, with the noise with which `detect` starts.
 
-    `tvsbayes detect` learns the cameras' noise from all looks afterwards and is the better judge of their sds.
+    `tvsbayes detect` later estimates the cameras' noise from all looks and gives more reliable sds.
 
     Args:
         stereo: the calibration, for the epipolar check.
@@ -247,11 +247,11 @@ def live_detector(stereo: Stereo) -> Detector:
 
 
 def twin_renderer(rig: Rig, seed: int) -> Renderer:
-    """Pictures of the true rig that a simulation with this seed draws.
+    """Make the renderer of the true rig drawn by a simulation with this seed.
 
     Args:
         rig: the declared rig.
-        seed: of the simulation.
+        seed: seed of the simulation.
     """
     truth = Instrument(rig, seed).truth
     cameras = cameras_of(truth.stereo, truth.parameters["focal_scale"])

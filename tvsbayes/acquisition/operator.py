@@ -1,7 +1,7 @@
 """The operator of a run, the key that stops it, and its progress display.
 
-The hazard is shown before the laser can come on; without a terminal the laser class is required. Ctrl-C ends a run in
-an orderly way; signals that end the process become an interrupt, so that the laser goes off.
+The hazard is shown before the laser can be switched on; without a terminal the laser class is required. Ctrl-C ends a
+run in an orderly way; signals that end the process become an interrupt, so that the laser is switched off.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Before you go on: goggles rated for 808 nm on everybody in the room; beam path s
 door sign and key switch in place. The laser is on only while a picture is taken. Ctrl-C stops: once after the
 present look, twice at once. The firmware's watchdog is a last resort, no interlock."""
 LASER_CLASSES = ("1", "1M", "2", "2M", "3R", "3B", "4")
-"""Classes of IEC 60825-1 that a user may state instead of answering the question."""
+"""Classes of IEC 60825-1 that a user may state in place of an answer."""
 _Handler = Callable[[int, FrameType | None], object] | int | signal.Handlers
 _TERMINATIONS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
 """SIGHUP exists on POSIX only, SIGBREAK on Windows only."""
@@ -32,7 +32,7 @@ class Operator(Protocol):
     """The person at the instrument."""
 
     def accept(self, hazard: str) -> bool:
-        """Whether the hazard has been read and the run may begin."""
+        """Return whether the hazard has been read and the run may begin."""
 
     def place(self, target: str, x_mm: float, placement: int, remark: str) -> bool:
         """Put the sheet at a target (nominal X in frame S); False stops the run.
@@ -46,7 +46,7 @@ class Operator(Protocol):
 class Progress:
     """Progress of a run.
 
-    Steps of the plan and looks, done and in all; refused and repeated looks, seconds left, the present step in words,
+    Steps of the plan and looks, done and in total; refused and repeated looks, seconds left, the present step in words,
     and the running estimate, "" for none.
     """
 
@@ -71,9 +71,9 @@ class StopKey:
     def __init__(self, tell: Callable[[str], None] = lambda text: None):
         self.requested = False
         self.at_prompt = False
-        """During a question there is no look to finish: the first Ctrl-C interrupts it."""
+        """Whether a question is open: there is no look to finish, and the first Ctrl-C interrupts it."""
         self.closing = False
-        """While laser and journal are closed nothing interrupts: a third Ctrl-C would leave the laser on."""
+        """Whether laser and journal are being closed: nothing interrupts then, else the laser could stay on."""
         self._tell = tell
         self._before: dict[int, _Handler] = {}
 
@@ -81,7 +81,7 @@ class StopKey:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, *_TERMINATIONS):
                 handler = signal.getsignal(number)
-                # nohup ignores SIGHUP so that the run outlives its terminal.
+                # nohup ignores SIGHUP so that the run continues after its terminal closes.
                 if number == signal.SIGINT or handler is not signal.SIG_IGN:
                     self._before[number] = signal.SIG_DFL if handler is None else handler
                     signal.signal(number, self._interrupt)
@@ -103,13 +103,13 @@ class StopKey:
             self._tell("finishing the present look; Ctrl-C again stops at once")
         except (RuntimeError, OSError):
             # The interrupted code was writing to the same stream, or the same key has ended the `tee` that reads it:
-            # the request to stop counts all the same.
+            # the request to stop counts nevertheless.
             pass
 
 
 @dataclass(frozen=True)
 class Terminal:
-    """How a run talks to its user: lines to `say`, progress to `show`, and questions to `ask`, which are answered."""
+    """Output to the user of a run: `say` prints lines, `show` progress, and `ask` returns answers to questions."""
 
     say: Callable[[str], None] = lambda text: None
     show: Callable[[Progress], None] = lambda progress: None
@@ -122,9 +122,9 @@ class TerminalOperator:
 
     Attributes:
         stop: the stop key, which may interrupt a question.
-        terminal: where.
-        laser_class: stated on the command line: the hazard is shown without a question.
-        places: whether a person places the sheet; else a program has placed it.
+        terminal: the terminal.
+        laser_class: stated on the command line: the hazard is then shown without a question.
+        places: whether a person places the sheet; else a program does.
     """
 
     stop: StopKey
@@ -172,7 +172,7 @@ class SimulatedOperator:
     instrument: Instrument
 
     def accept(self, hazard: str) -> bool:
-        """A simulated laser hurts nobody."""
+        """Accept: a simulated laser is no hazard."""
         return True
 
     def place(self, target: str, x_mm: float, placement: int, remark: str) -> bool:
@@ -188,14 +188,14 @@ def check_hazard(laser_class: str | None, simulate: bool) -> None:
         raise InputError(
             "usage", f"laser class {escaped(laser_class)}", allowed=", ".join(LASER_CLASSES), remedy=remedy
         )
-    # A closed standard input is None.
+    # A closed standard input is represented by None.
     if not simulate and laser_class is None and not (sys.stdin and sys.stdin.isatty()):
         remedy = "run it in a terminal, or state --laser-class"
         raise InputError("usage", "the question about the laser hazard cannot be asked", remedy=remedy)
 
 
 class LiveLine:
-    """A line that shows progress on a terminal, plain lines at every tenth elsewhere; a context manager."""
+    """A progress line on a terminal, or plain lines at every tenth of the run elsewhere; a context manager."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -228,7 +228,7 @@ class LiveLine:
             self._console.print(f"{10 * tenths} %: {note}", highlight=False)
 
     def ask(self, question: str) -> str:
-        """`input` with the progress line stopped; the question goes to stderr, because stdout has the result."""
+        """Call `input` with the progress line stopped; the question goes to stderr, because stdout has the result."""
         self._bar.stop()
         try:
             self._console.print(question, end="", markup=False, highlight=False)

@@ -1,7 +1,7 @@
-"""Placements by a program: a robot that drives the rig to the wall, a linear stage under the sheet.
+"""Placements by a program, such as a robot that moves the rig, or a linear stage under the sheet.
 
-The program is started with three more arguments: the target, its nominal X in mm in frame S, and the number of the
-placement in the plan, from 0. Exit code 0 means that the sheet is there. Seconds where a name says `_s`.
+The program gets three more arguments: the target, its nominal X in mm in frame S, and the number of the
+placement in the plan, from 0. Exit code 0 means that the sheet is in place. Seconds where a name says `_s`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from tvsbayes.errors import InputError, escaped, fault
 LIMIT_S = 600.0
 """Default longest time of one placement."""
 POLL_S = 0.1
-"""Interval at which requests to the run are served meanwhile."""
+"""Interval at which requests to the run are served during a placement."""
 GRACE_S = 5.0
 """Time between SIGTERM, after which a program can stop its motion, and SIGKILL."""
 WORDS_MAX = 2000
-"""Last characters of its output that are kept."""
+"""Number of last characters of its output that are kept."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class PlaceCommand:
 
     @classmethod
     def parsed(cls, line: str, limit_s: float | None) -> PlaceCommand:
-        """The command of a line, split as by a shell; no shell runs it.
+        """Split a line as a shell would; no shell runs the command.
 
         Raises:
             InputError: no such program.
@@ -57,10 +57,10 @@ class PlaceCommand:
         return cls(command, LIMIT_S if limit_s is None else limit_s)
 
     def run(self, target: str, x_mm: float, placement: int, meanwhile: Callable[[], bool]) -> PlaceCommanded:
-        """Run it; the event of the placement, also of a failed one.
+        """Run the program; returns the event of the placement, also of a failed one.
 
         Args:
-            target: of the sheet.
+            target: target of the sheet.
             x_mm: nominal X of the target in frame S.
             placement: its number in the plan, from 0.
             meanwhile: called repeatedly; False ends the program.
@@ -69,7 +69,7 @@ class PlaceCommand:
         with tempfile.TemporaryFile() as output:
             arguments = [*self.command, target, f"{x_mm:.3f}", str(placement)]
             try:
-                # A new session: the Ctrl-C that ends the run does not reach it.
+                # The program gets a session of its own: the Ctrl-C that ends the run does not reach it.
                 with subprocess.Popen(
                     arguments, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
                 ) as process:
@@ -89,7 +89,7 @@ class PlaceCommand:
         )
 
     def _exit_code(self, process: subprocess.Popen[bytes], start_s: float, meanwhile: Callable[[], bool]) -> int | None:
-        """The exit code; None of a program that had to be ended."""
+        """The exit code; None for a program that had to be ended."""
         try:
             while meanwhile() and time.monotonic() - start_s < self.limit_s:
                 try:

@@ -1,4 +1,4 @@
-"""The campaign that the events of a journal hold, at any time.
+"""The campaign in the events of a journal, at any time.
 
 A segment begins with a homing and ends with the next one, which shows whether steps were lost in between: then no spot
 of the segment counts. After a gap that may have lost a motion, nothing counts until the next homing. Counters in motor
@@ -19,28 +19,28 @@ from tvsbayes.instrument.axes import PanApproach, TiltApproach
 from tvsbayes.instrument.campaign import NO_PIXELS, Move, Spot, next_move, with_pixels
 
 HOME_TOLERANCE_STEPS = 2
-"""Scatter of a home switch between homings; larger deviations are lost steps."""
+"""Scatter of a home switch between homings; larger deviations mean lost steps."""
 LOST_STEPS = "lost-steps"
 """Status of a spot in whose segment steps were lost."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """The campaign that a journal holds so far.
+    """The campaign in a journal so far.
 
     Attributes:
         moves: rows of moves.csv; empty before the first homing.
         spots: rows of spots.csv.
-        next_step: first step of the plan behind the last one that is done.
-        looked_steps: steps of the plan with a look; after a repair some before `next_step` may be missing.
+        next_step: first step of the plan after the last completed one.
+        looked_steps: completed looks of the plan; after a repair some before `next_step` may be missing.
         references: looks outside the plan, by which resumed runs checked earlier spots.
-        target: where the sheet stands, "" before the first placement.
-        starts: how often the acquisition was started.
+        target: position of the sheet, "" before the first placement.
+        starts: number of starts of the acquisition.
         boot: boot id of the device at its last homing, None before.
         home_steps: counters that the last `home` of the plan asked for.
         lost: segments in which steps were lost, with the deviation found.
         unverified: segments whose closing homing had no result, or did not take place.
-        ignored_lines: lines after a gap that cannot be trusted.
+        ignored_lines: lines after a gap that do not count.
         ended: the reason of the last `stop`, None while running or after a crash.
     """
 
@@ -65,7 +65,7 @@ class Recorder:
     Attributes:
         moves: rows of moves.csv so far.
         spots: rows of spots.csv so far, before it is known whether steps were lost.
-        state: the fields of `Recorded` that the last event determines; those that grow are empty.
+        state: the fields of `Recorded` that the last event determines; the growing fields are empty.
     """
 
     def __init__(self) -> None:
@@ -79,10 +79,10 @@ class Recorder:
         self._trusted = True
 
     def add(self, record: Record) -> None:
-        """Takes the next event.
+        """Adds the next event.
 
         Raises:
-            InputError: an event that contradicts those before, with its line.
+            InputError: the event contradicts earlier events, with its line.
         """
         event = event_of(record, Gap, Start, Stop, Placed, Verified, Homed, Moved, Looked)
         if isinstance(event, Moved | Looked):
@@ -115,7 +115,7 @@ class Recorder:
 
     def _verified(self, event: Verified) -> None:
         if event.deviation_steps is None:
-            # A device that was restarted meanwhile has no counters to compare with.
+            # A device that was restarted has no counters for a comparison.
             return
         self._closed.add(event.segment)
         if max(map(abs, event.deviation_steps)) > HOME_TOLERANCE_STEPS:
@@ -125,7 +125,7 @@ class Recorder:
         self._trusted = True
         segment = self.moves[-1].segment + 1 if self.moves else 0
         pan, tilt = event.approach
-        # The words are checked where the tables are written.
+        # The words are checked when the tables are written.
         approach = cast("PanApproach", pan), cast("TiltApproach", tilt)
         self._moved(event, segment, approach)
         # Only a homing of the plan states counters; one of a resumed run repeats them.
@@ -151,7 +151,7 @@ class Recorder:
         """The campaign so far."""
         segment_of = [move.segment for move in self.moves]
         spots = tuple(
-            # Refused and undetected ones too: `detect` may yet find them in their frames.
+            # Refused and undetected spots too: `detect` may still find them in their frames.
             replace(spot, status=LOST_STEPS) if segment_of[spot.move] in self._lost else spot
             for spot in self.spots
         )

@@ -1,10 +1,10 @@
-"""`acquire --adapt`: the remaining looks are chosen anew from the running estimate, until target or time is reached.
+"""`acquire --adapt`: the remaining looks are replanned from the running estimate, until target or time is reached.
 
-The result of `plan --given --next` is computed beside the instrument like the running estimate: one process fits the
-campaign on the disk and proposes the next looks. A proposal that leaves the rig's limits is not followed. Where the
-Laplace approximation meets the target the same process samples the posterior, and only that ends the run: with few
-looks the scales of the noise are rough, and Laplace's sds too short. Every change of plan is an event of the journal,
-so that a resumed run has the same plan as the one that was interrupted.
+The result of `plan --given --next` is computed in another process, as is the running estimate: one process fits the
+campaign on the disk and proposes the next looks. A proposal outside the rig's limits is ignored. Where the Laplace
+approximation meets the target, the same process samples the posterior, and only that ends the run: with few looks the
+scales of the noise are uncertain, and Laplace's sds too small. Every change of plan is an event of the journal, so that
+a resumed run has the same plan as the interrupted one.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.protocol import LIMIT_SETTINGS, SETTINGS
 
 NEXT_SHARE, NEXT_LEAST, NEXT_MOST = 0.3, 8, 80
-"""Looks of a proposal: a share of the looks so far, which lasts beyond the next fit, with its least and most.
+"""Looks of a proposal: a share of the looks so far, which suffices until the next fit, with its minimum and maximum.
 
-More would not fit into a line of the journal (120 to 160 bytes a look); where they run out before the next fit, the run
-waits for it.
+More would not fit into a line of the journal (120 to 160 bytes a look); where they are used up before the next fit, the
+run waits for it.
 """
 
 
 def looks_next(looks: int) -> int:
-    """How many looks to propose after `looks`."""
+    """Number of looks to propose after `looks`."""
     return min(NEXT_MOST, max(NEXT_LEAST, math.ceil(NEXT_SHARE * looks)))
 
 
 def check_plan(rig: Rig, plan: Sequence[PlanStep]) -> None:
-    """Refuses a plan that this rig cannot run, before anything moves.
+    """Refuses a plan that this rig cannot run, before any motion.
 
     Raises:
         InputError: targets without a sheet position, counters outside the limits.
@@ -71,8 +71,8 @@ class Proposal:
         steps: placements, moves and looks, numbered from 0; the first is a placement.
         after_each: the target's value after each look, deg/step.
         now: its value before them.
-        looks: number behind the estimate.
-        why: in words.
+        looks: number of looks behind the estimate.
+        why: reason, in words.
     """
 
     steps: tuple[PlanStep, ...]
@@ -82,16 +82,16 @@ class Proposal:
     why: str
 
     def continued(self, row: int, sheet: str) -> tuple[PlanStep, ...]:
-        """The steps as rows of a plan from `row` on, with `sheet` in place already."""
+        """The steps as rows of a plan from `row` on, with `sheet` already in place."""
         steps = self.steps[1:] if self.steps[0].target == sheet else self.steps
         return tuple(replace(step, step=row + number) for number, step in enumerate(steps))
 
 
 @dataclass(frozen=True)
 class Ahead:
-    """Result of a fit beside the run: its estimate, that of the sampled posterior where there is one, the next looks.
+    """Result of a fit during the run: its estimate, the sampled posterior's where there is one, and the next looks.
 
-    `accepted` is whether the weighted draws behind `sampled` may be used.
+    `accepted` states whether the weighted draws behind `sampled` may be used.
     """
 
     laplace: Estimate
@@ -105,9 +105,9 @@ class AdaptOptions:
     """Options of a run whose looks are chosen while it runs.
 
     Attributes:
-        ahead: from a campaign folder, its number of looks, the target u, how many looks to propose and the Laplace u
-            at which to sample; another process must be able to import it.
-        minutes: by `[costs]`, that the whole run may take; None: as long as its plan.
+        ahead: computes an `Ahead` from a campaign folder, its number of looks, the target u, the number of looks to
+            propose and the Laplace u at which to sample; another process must be able to import it.
+        minutes: duration allowed for the whole run, by `[costs]`; None: that of its plan.
     """
 
     ahead: Callable[[Path, int, float, int, float], Ahead]
@@ -119,9 +119,9 @@ class Replanning(RunningEstimate):
 
     Args:
         folder: the campaign folder.
-        ahead: as of `AdaptOptions`.
-        target_u_deg_per_step: of the effective ratios of all directions.
-        minutes: that the run may take.
+        ahead: as in `AdaptOptions`.
+        target_u_deg_per_step: target u of the effective ratios of all directions.
+        minutes: duration allowed for the run.
         wait: whether to wait for every proposal.
     """
 
@@ -142,7 +142,7 @@ class Replanning(RunningEstimate):
 
     @property
     def met(self) -> bool:
-        """Whether the sampled posterior meets the target in every direction."""
+        """Return whether the sampled posterior meets the target in every direction."""
         return self.latest is not None and self.latest.tier == "importance" and super().met
 
     @property
@@ -154,7 +154,7 @@ class Replanning(RunningEstimate):
         return self.folder, looks, self.target, looks_next(looks), self.confirm_below
 
     def _read(self, result: Ahead) -> Estimate:
-        """The sampled posterior where it can be used, else Laplace; the event has both."""
+        """The estimate of the sampled posterior where it can be used, else Laplace's; the event has both."""
         self._proposal, laplace, sampled, target = result.proposal, result.laplace, result.sampled, self.target or 0.0
         if sampled is None:
             return laplace
@@ -182,7 +182,7 @@ class Replanning(RunningEstimate):
         return newest
 
     def last(self, looks: int) -> bool:
-        """At the end of the plan: waits for one more estimate, of all looks; whether the target is met."""
+        """Waits at the end of the plan for one more estimate, from all looks; returns whether the target is met."""
         self._wait_for_fit()
         if self._proposal is None and looks > self._looks:
             self._begin(looks)
@@ -209,7 +209,7 @@ def adapted_entries(proposal: Proposal, row: int, steps: Sequence[PlanStep]) -> 
         entry = step_json(step)
         if step.action == "look":
             u_after = next(looks)
-            # The gain of this look after those before it.
+            # The gain of this look, given the looks before it.
             entry |= {"u_before_deg_per_step": u_before, "u_after_deg_per_step": u_after}
             u_before = u_after
         entries.append(entry)

@@ -1,14 +1,14 @@
-"""The settings that must stay the same for an interrupted run to go on, and those that may change.
+"""Settings that must not change between two runs of a campaign, and settings that may.
 
-A campaign has one rig: the meaning of its rows must not change between two of its runs. That is the content of its
-files ([rig], the stereo calibration) and the meaning of a counter (the driver with its options, the counters at the
-home switches); of a simulated campaign also what the twin is made of ([truth], sheets, the sd of its spots). The
-journal's first event has it entry by entry, so that a refusal can name the one that changed.
+A campaign has one rig: the meaning of its rows must not change between two of its runs. This concerns the content of
+its files ([rig], the stereo calibration) and the meaning of a counter (the driver with its options, the counters at the
+home switches); for a simulated campaign also the definition of the twin ([truth], sheets, the sd of its spots). The
+journal's first event lists these entries, so that a refusal can name the changed one.
 
-Everything else is only how the instrument is connected and driven: port, baud, devices of the cameras, exposure,
-limits, speeds, settling, watchdog, on the bench the nominal places of the sheets, which no estimate uses. It is logged
-at every start and may change. Every resumed run begins a new segment, and its closing homing shows whether a higher
-speed has lost steps. Costs are the planner's.
+Everything else concerns how the instrument is connected and driven: port, baud, devices of the cameras, exposure,
+limits, speeds, settling, watchdog, on the bench also the nominal positions of the sheets, which no estimate uses. It is
+logged at every start and may change. Every resumed run begins a new segment, and its closing homing shows whether a
+higher speed has lost steps. Costs concern only the planner.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from tvsbayes.instrument.stereo_pair import stereo_bytes
 from tvsbayes.positioner.interface import DEFAULT_DRIVER
 
 ENTRIES_BYTES_MAX = 12_000
-"""More would not fit into a line of the journal, which then has only their SHA-256."""
+"""Largest size of the entries in a line of the journal; larger entries are replaced by their SHA-256."""
 Entries = dict[str, object]
-"""Entries of a rig file as JSON holds them, by table and key: "positioner.port"."""
+"""Entries of a rig file as JSON values, by table and key: "positioner.port"."""
 
 
 def data_entries(rig: Rig, synthetic: bool) -> Entries:
@@ -38,7 +38,7 @@ def data_entries(rig: Rig, synthetic: bool) -> Entries:
 
     Args:
         rig: the rig.
-        synthetic: whether the twin stands in for the instrument.
+        synthetic: whether the twin replaces the instrument.
     """
     table = rig.table
     entries: Entries = {f"rig.{name}": [prior.value, prior.u] for name, prior in table.priors.items()}
@@ -78,7 +78,7 @@ def _fitted_to_line(entries: Entries) -> Entries:
 
 
 def plan_sha256(plan: Sequence[PlanStep]) -> str:
-    """SHA-256 of the steps of a plan, whatever its file."""
+    """SHA-256 of the steps of a plan, independent of its file."""
     rows = [(s.step, s.action, s.pan_steps, s.tilt_steps, s.target, s.experiment, s.point) for s in plan]
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
@@ -89,16 +89,16 @@ def identity(rig: Rig, plan: Sequence[PlanStep], synthetic: bool) -> dict[str, o
 
 
 def check_same(created: Mapping[str, object], rig: Rig, plan: Sequence[PlanStep], header: Mapping[str, object]) -> None:
-    """Refuses to go on with another plan, rig, seed or kind of instrument than the journal began with.
+    """Refuses to continue with another plan, rig, seed or kind of instrument than at the journal's start.
 
     Args:
-        created: data of the journal's first event.
-        rig: the rig now.
-        plan: the plan now.
-        header: `synthetic` and `seed` now, as `Created` has them.
+        created: entries of the journal's first event.
+        rig: the present rig.
+        plan: the present plan.
+        header: the present `synthetic` and `seed`, as in `Created`.
 
     Raises:
-        InputError: what changed, from what to what, and what to do.
+        InputError: the changed entry, with old value, new value and remedy.
     """
     for name in ("synthetic", "seed"):
         if created.get(name) != header.get(name):
@@ -113,7 +113,7 @@ def check_same(created: Mapping[str, object], rig: Rig, plan: Sequence[PlanStep]
         _check_earlier(created, rig)
         return
     present = data_entries(rig, bool(header.get("synthetic")))
-    # Journals without the scatter of looks and the shift of zeros: their twins had none.
+    # Journals may lack the scatter of looks and the shift of zeros, which their twins did not have.
     for name in LATE_NAMES:
         prior = RIG_PRIORS[name]
         silent = {f"rig.{name}": [prior.value, prior.u], f"truth.{name}": [prior.value, 0.0]}
@@ -129,9 +129,9 @@ def check_same(created: Mapping[str, object], rig: Rig, plan: Sequence[PlanStep]
 
 
 def _check_earlier(created: Mapping[str, object], rig: Rig) -> None:
-    """The same for a journal with one SHA-256 of its rig, port and cameras included."""
+    """As `check_same`, for a journal with one SHA-256 of its rig, which includes port and cameras."""
     tables = json.dumps([rig.sheets_mm, rig.positioner, rig.cameras], sort_keys=True)
-    # The errors of the gears came later, with defaults.
+    # Later versions added the errors of the gears, with defaults.
     later = tuple(f'"{name}" = ' for name in GEAR_ERROR_NAMES)
     lines = rig_table_toml(rig.table).splitlines(keepends=True)
     table = "".join(line for line in lines if not line.startswith(later))
@@ -143,7 +143,7 @@ def _check_earlier(created: Mapping[str, object], rig: Rig) -> None:
 
 
 def changes(before: Mapping[str, object], now: Mapping[str, object]) -> dict[str, tuple[object, object]]:
-    """Entries that differ, old and new value; None for a missing one."""
+    """Entries that differ, with old and new value; None for a missing one."""
     keys = [*before, *(key for key in now if key not in before)]
     return {key: (before.get(key), now.get(key)) for key in keys if before.get(key) != now.get(key)}
 
@@ -166,7 +166,7 @@ def _key_name(key: str) -> str:
 
 
 def _quoted(value: object) -> str:
-    """An entry as a message quotes it."""
+    """Format an entry for a message."""
     if value is None:
         return "not stated"
     if isinstance(value, list) and len(value) == 2:

@@ -1,4 +1,4 @@
-"""The records of a run: the journal, the campaign that follows from it, its files, and the outcome.
+"""The records of a run: the journal, the campaign derived from it, its files, and the outcome.
 
 Seconds where a name says `_s`, since the campaign was created; UTC for people.
 """
@@ -27,15 +27,15 @@ from tvsbayes.results.records import plain
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended.
+    """The end of a run.
 
     Attributes:
         reason: "done", "target met", "time over", "interrupted" or "declined".
-        looks: looks of this campaign, of all its runs.
-        ok: how many of them count.
-        refused: how many found no usable spot.
-        references: how many of `looks` are not in the plan: resumed runs look again at earlier spots. They count as
-            any other.
+        looks: number of looks of this campaign, in all its runs.
+        ok: number of looks that count.
+        refused: number of looks without a usable spot.
+        references: number of `looks` outside the plan: resumed runs repeat looks at earlier spots. They count as
+            all others.
         retries: looks repeated in this run.
         lost_segments: segments in which steps were lost.
         warnings: for the user.
@@ -58,12 +58,12 @@ class Outcome:
 
 
 DERIVED_EVERY = 100
-"""Up to this many spots the campaign files are written after every look, then ever more rarely: at least 99 % of the
-looks are in them at any time, all of them in the journal."""
+"""Up to this number of spots the campaign files are written after every look, then at growing intervals: at least 99 %
+of the looks are in them at any time, all of them in the journal."""
 
 
 class RunLog:
-    """Journal, recorder and campaign files in step.
+    """Keeps journal, recorder and campaign files consistent.
 
     Args:
         journal: from `begin`; closed by `end`.
@@ -72,7 +72,7 @@ class RunLog:
 
     Attributes:
         recorder: the campaign so far, of all runs.
-        behind: why the campaign files are behind the journal, "" where they are not.
+        behind: why the campaign files lag the journal, "" where they do not.
         warnings: for the user.
     """
 
@@ -87,11 +87,11 @@ class RunLog:
 
     @property
     def ok_looks(self) -> int:
-        """How many looks count so far."""
+        """Number of looks that count so far."""
         return sum(spot.status == "ok" for spot in self.recorder.spots)
 
     def write(self, event: Event) -> None:
-        """Appends an event; after a homing the campaign files are written anew.
+        """Appends an event; after a homing the campaign files are rewritten.
 
         Raises:
             DeviceFault: the disk refuses.
@@ -101,7 +101,7 @@ class RunLog:
             self.derive(always=True)
 
     def now_s(self) -> float:
-        """Seconds since the campaign was created, never going back, whatever the clock of the computer does."""
+        """Seconds since the campaign was created, never decreasing, even if the computer's clock is set back."""
         start = datetime.datetime.fromisoformat(str(self._journal.records[0].data.get("created")))
         self._time_s = max(self._time_s, round((self._utc() - start).total_seconds(), 3))
         return self._time_s
@@ -111,7 +111,7 @@ class RunLog:
         return self._utc().isoformat(timespec="milliseconds")
 
     def next_spot(self) -> int:
-        """The first number that neither an event nor a frame of an interrupted look has."""
+        """The first number used neither by an event nor by a frame of an interrupted look."""
         used = [spot.spot for spot in self.recorder.spots]
         names = orphans(self._journal.folder, tuple(self._journal.records))
         # Other pictures in these folders have no number.
@@ -119,7 +119,7 @@ class RunLog:
         return max(used, default=-1) + 1
 
     def close_segment(self, report: HomeReport) -> None:
-        """Logs what a homing shows of the segment that it ends."""
+        """Logs the result of a homing for the segment that it ends."""
         if not self.recorder.moves:
             return
         comparable = report.known or (report.compared and report.state.boot == self.recorder.state.boot)
@@ -136,7 +136,7 @@ class RunLog:
         try:
             self.write(Stop(reason=reason, exit_code=exit_code, utc=self.utc_text()))
         except DeviceFault:
-            # A broken disk ended the run, and is reported already.
+            # A disk fault ended the run, and is reported already.
             pass
         finally:
             self._journal.close()
@@ -145,7 +145,7 @@ class RunLog:
             self.warnings.append(f"the campaign files are behind the journal: {self.behind}")
 
     def derive(self, always: bool = False) -> None:
-        """Writes the campaign files anew, where they are due (see `DERIVED_EVERY`)."""
+        """Rewrites the campaign files where they are due (see `DERIVED_EVERY`)."""
         count = len(self.recorder.spots)
         if not self.recorder.moves or (not always and count > DERIVED_EVERY and count % (count // DERIVED_EVERY)):
             return
@@ -153,12 +153,12 @@ class RunLog:
             write_derived(self._campaign(), self._journal.folder, tables_only=not always)
             self.behind = ""
         except TvsError as error:
-            # A table may be open in another program. The journal has everything, and the next look tries again; after
-            # the last one --resume does.
+            # A table may be open in another program. The journal is complete, and the next look tries again, or
+            # --resume after the last one.
             self.behind = error.message
 
     def keep_edited(self) -> None:
-        """Copies files that hold more than the journal, before they are written anew, and warns of each.
+        """Copies files with more content than the journal before they are rewritten, and warns of each.
 
         Unfinished files of killed runs are removed.
         """

@@ -1,10 +1,10 @@
-"""The running estimate of an acquisition: fits in another process, beside the instrument.
+"""The running estimate of an acquisition: fits in another process during the run.
 
-The campaign folder is readable at any time, so a fit takes it as it stands, one fit at a time. The acquisition neither
-waits for it nor shares memory with it: a compiler at work must not delay a laser switch. The process stays for the next
-fit, so libraries are imported and functions compiled once a run. The figures are the effective degrees per step of the
-beam with their standard uncertainty from the Laplace approximation (formulation 3.2 and 4.2), of the looks at the
-beginning of the fit.
+The campaign folder is readable at any time, so a fit reads its present state, one fit at a time. The acquisition
+neither waits for the fit nor shares memory with it: a compiler at work must not delay a laser switch. The process stays
+for the next fit, so that libraries are imported and functions compiled once per run. The results are the effective
+degrees per step of the beam with their standard uncertainty from the Laplace approximation (formulation 3.2 and 4.2),
+from the looks at the beginning of the fit.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from typing import Any
 from tvsbayes.display import concise
 
 FIRST_LOOKS = 12
-"""Three experiments of four points: fewer looks determine next to nothing."""
+"""Three experiments of four points: fewer looks determine almost nothing."""
 GROWTH = 1.2
 """Ratio of looks between two fits: all fits together cost as much as a few of the last."""
 FIT_MAX_S = 3600.0
-"""Longest wait for a fit; one takes a minute or less."""
+"""Longest wait for a fit; a fit takes a minute or less."""
 FIT_POLL_S = 0.1
 """Interval at which requests to the run are served while it waits for a fit."""
 
@@ -45,23 +45,23 @@ class Estimate:
 
     @property
     def text(self) -> str:
-        """For the live line."""
+        """Text for the live line."""
         return ", ".join(f"{name} {concise(v, self.u_deg_per_step[name])}" for name, v in self.deg_per_step.items())
 
     def as_json(self) -> dict[str, object]:
-        """As part of the document of `acquire`."""
+        """Entries in the document of `acquire`."""
         ratios = {d: {"value": self.deg_per_step[d], "sd": self.u_deg_per_step[d]} for d in self.deg_per_step}
         return {"tier": self.tier, "looks": self.looks, "effective_deg_per_step": ratios}
 
 
 @dataclass(frozen=True)
 class EstimateOptions:
-    """Whether a run is fitted while it runs, and its target.
+    """Options of the running estimate, with its target.
 
     Attributes:
-        fit: the estimate from a campaign folder and its number of looks; another process must be able to import it.
+        fit: estimates from a campaign folder and its number of looks; another process must be able to import it.
         target_u_deg_per_step: ends the run once the effective ratios of all directions of its plan reach this u.
-        enabled: whether to fit; None: on hardware, and for a target.
+        enabled: whether to fit; None: only on hardware, or with a target.
     """
 
     fit: Callable[[Path, int], Estimate]
@@ -69,7 +69,7 @@ class EstimateOptions:
     enabled: bool | None = None
 
     def holds(self, simulate: bool) -> bool:
-        """Whether a run, simulated or not, is to be fitted."""
+        """Whether to fit a run, simulated or not."""
         return self.target_u_deg_per_step is not None or (not simulate if self.enabled is None else self.enabled)
 
 
@@ -85,10 +85,10 @@ class Worker:
     """Calls a function in another process, one call at a time; the first call starts the process.
 
     Args:
-        function: importable by a new process. A call that raises or dies returns None.
+        function: importable by a new process. A call that raises or crashes returns None.
 
     Attributes:
-        busy: whether a call has begun whose result was not taken yet.
+        busy: whether a call has begun whose result is still to be taken.
     """
 
     def __init__(self, function: Callable[..., Any]):
@@ -97,7 +97,7 @@ class Worker:
         self._pipe: Connection | None = None
 
     def begin(self, *arguments: object) -> None:
-        """Begin a call; there is none where no process can be started."""
+        """Begin a call, unless no process can be started."""
         try:
             if self._process is None or self._pipe is None:
                 context = multiprocessing.get_context("spawn")
@@ -120,12 +120,12 @@ class Worker:
         try:
             return None if self._pipe is None else self._pipe.recv()
         except (EOFError, OSError):
-            # The process is gone: the next call starts another.
+            # The process has ended: the next call starts another.
             self.end()
             return None
 
     def end(self) -> None:
-        """Kill the process, whatever it does."""
+        """Kill the process in any state."""
         if self._process is not None and self._process.pid is not None:
             self._process.kill()
             self._process.join()
@@ -135,7 +135,7 @@ class Worker:
 
 
 def _work(pipe: Connection, function: Callable[..., Any]) -> None:
-    """In the process: answers calls until the other end is closed."""
+    """Runs in the process: answers calls until the other end is closed."""
     if hasattr(os, "setsid"):
         # The Ctrl-C that ends the run after its look must not end the fit.
         os.setsid()
@@ -151,7 +151,7 @@ def _work(pipe: Connection, function: Callable[..., Any]) -> None:
         try:
             result = function(*arguments)
         except Exception:
-            # A failed fit has no result: the next one has more looks.
+            # A failed fit has no result; the next fit has more looks.
             result = None
         try:
             pipe.send(result)
@@ -160,18 +160,18 @@ def _work(pipe: Connection, function: Callable[..., Any]) -> None:
 
 
 class RunningEstimate:
-    """Fits the folder of a running acquisition again and again.
+    """Fits the folder of a running acquisition repeatedly.
 
     Args:
         folder: the campaign folder.
         fit: called with `_arguments`; `_read` takes its result.
         target_u_deg_per_step: target u of every direction; None is never met.
-        directions: that must meet it.
-        wait: whether to wait for every fit, as in a simulation, whose time stands still meanwhile.
+        directions: directions that must meet it.
+        wait: whether to wait for every fit, as in a simulation, whose time stands still during the fit.
 
     Attributes:
         latest: the newest estimate.
-        meanwhile: called repeatedly during the wait for a fit; False ends wait and fit.
+        meanwhile: called repeatedly while waiting for a fit; False ends both.
     """
 
     def __init__(
@@ -208,7 +208,7 @@ class RunningEstimate:
         return bool(self.directions) and all(u.get(name, float("inf")) <= self.target for name in self.directions)
 
     def update(self, looks: int) -> bool:
-        """Takes a finished fit, begins the next one where it is due; whether the target is met."""
+        """Take a finished fit, begin the next where it is due; return whether the target is met."""
         if self._worker.done():
             self._take()
         if not self._worker.busy and looks >= max(FIRST_LOOKS, GROWTH * self._looks):
@@ -222,12 +222,12 @@ class RunningEstimate:
         return self.folder, looks
 
     def _begin(self, looks: int) -> None:
-        """Starts a fit; where none can be started the run goes on without an estimate."""
+        """Starts a fit; if that fails, the run continues without an estimate."""
         self._looks = looks
         self._worker.begin(*self._arguments(looks))
 
     def _wait_for_fit(self) -> None:
-        """Waits for the fit; one that takes too long is killed, as is that of a run that is to end."""
+        """Waits for the fit; a fit that takes too long, or of a run that is to end, is killed."""
         deadline_s = time.monotonic() + FIT_MAX_S
         while self._worker.busy and not self._worker.done(FIT_POLL_S):
             if time.monotonic() > deadline_s or not self.meanwhile():
@@ -236,7 +236,7 @@ class RunningEstimate:
             self._take()
 
     def _take(self) -> None:
-        """Takes the result of a fit; a failed one has none."""
+        """Takes the result of a fit; a failed fit has none."""
         result = self._worker.take()
         if result is not None:
             self.latest = self._read(result)

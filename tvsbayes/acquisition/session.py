@@ -1,6 +1,6 @@
-"""From a rig file and a plan to a finished run: the plan is checked, the journal begun or continued, the bench run.
+"""From a rig file and a plan to a finished run: check the plan, begin or continue the journal, run the bench.
 
-`acquire` is what the command of that name does, on the bench or on its twin.
+`acquire` implements the command of that name, on the bench or on its twin.
 """
 
 from __future__ import annotations
@@ -52,19 +52,19 @@ def acquire(
         plan: its steps.
         folder: new or empty; with `resume` the folder of the interrupted run.
         simulate: the twin instead of hardware; `truth.json` is written beside the campaign.
-        emulate: of a simulation: the firmware runs on an emulated processor, in real time.
-        resume: go on with an interrupted run.
+        emulate: for a simulation: run the firmware on an emulated processor, in real time.
+        resume: continue an interrupted run.
         laser_class: states that the hazard is known; without it the operator must confirm.
-        seed: of a simulation.
+        seed: seed of a simulation.
         estimate: whether the looks so far are fitted while it runs. A simulation waits for every fit.
         adapt: chooses the remaining looks from that fit; `estimate` must have a target.
-        vision: how pictures are made and searched; by default they wait for `detect`, a simulation states centroids.
+        vision: how pictures are made and searched; by default left to `detect`, and a simulation gives centroids.
         terminal: for messages and questions; by default nothing is shown.
-        live: where the run is published, and its requests.
+        live: publishes the run and receives requests.
         place_command: a program that places the sheet instead of a person.
 
     Raises:
-        InputError: a plan this rig cannot run, another plan than before, no operator, no emulator.
+        InputError: a plan that this rig cannot run, another plan than before, no operator, no emulator.
         DeviceFault: device, camera or disk failed.
     """
     folder, vision, terminal = Path(folder), vision or Vision(), terminal or Terminal()
@@ -114,7 +114,7 @@ def _running(
     adapt: AdaptOptions | None,
     simulate: bool,
 ) -> RunningEstimate | None:
-    """The fits beside a run, if it is to have any."""
+    """The running estimate of a run, None without one."""
     target = None if estimate is None else estimate.target_u_deg_per_step
     if adapt is not None and target is not None:
         minutes = plan_seconds(rig, plan) / 60 if adapt.minutes is None else adapt.minutes
@@ -138,7 +138,7 @@ def _earlier_runs(folder: Path) -> Recorded:
 
 
 def _header(rig: Rig, seed: int | None) -> dict[str, object]:
-    """Header entries of a campaign in its journal; `seed` of a simulation."""
+    """Header entries of a campaign in its journal; `seed` is that of a simulation."""
     header: dict[str, object] = {"name": str(rig.header.get("name", NAME_ACQUIRED))}
     if seed is not None:
         header |= {"created": SIMULATED_START.isoformat(), "synthetic": True, "seed": int(seed)}
@@ -146,7 +146,7 @@ def _header(rig: Rig, seed: int | None) -> dict[str, object]:
 
 
 def begin(folder: Path, rig: Rig, plan: Sequence[PlanStep], resume: bool, header: Mapping[str, object]) -> Journal:
-    """The journal to write: a new one, or the one to continue.
+    """Open the journal to write: a new one, or the one to continue.
 
     Raises:
         InputError: no journal to continue, another plan or rig than before, or a folder that has a journal.

@@ -1,8 +1,8 @@
 """The twin as drivers: `driver = "simulated"` in `[positioner]` and `[cameras]` of a rig file.
 
-For `doctor`, for trials of code that drives an instrument, and as an example for drivers of other hardware. Positioner
+They serve `doctor`, tests of code that drives an instrument, and as an example for other drivers. Positioner
 and cameras of one rig file and seed (`options.seed`) share one twin, with the first sheet of `[sheets]` in front of its
-cameras. A whole run is rehearsed by `tvsbayes acquire --simulate`, where sheets change places.
+cameras. `tvsbayes acquire --simulate` rehearses a whole run, in which sheets change places.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ _TWINS: WeakValueDictionary[tuple[str, int], Instrument] = WeakValueDictionary()
 
 
 def simulated_positioner(rig: Rig) -> SerialPositioner:
-    """Our driver on the device model with a clock of its own: homing takes no time."""
+    """The package's driver on the device model, with its own virtual clock: homing takes no real time."""
     return _twin(rig, rig.positioner, "positioner").positioner()
 
 
 def simulated_cameras(rig: Rig) -> SimulatedCamera:
-    """What the twin's cameras see."""
+    """The twin's cameras."""
     instrument = _twin(rig, rig.cameras, "cameras")
     return SimulatedCamera(instrument, twin_renderer(rig, instrument.seed))
 

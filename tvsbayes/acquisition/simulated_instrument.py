@@ -1,11 +1,11 @@
-"""The digital twin at the end of the cable: gears, mirrors, sheet and laser behind a simulated device.
+"""The digital twin as a device: gears, mirrors, sheet and laser behind a simulated controller.
 
-The firmware model drives `Mechanics`; every stretch of its motion goes through ratio, play and stop error of a true
-rig, homing included. So the light follows the motors, not the plan: lost steps, resets and repeated moves show in the
-pictures as on the bench. Physics of `tvsbayes.twin`, no estimator's formula. Frame S, mm; degrees where a name says
-`_deg`; the time of a virtual clock.
+The firmware model drives `Mechanics`; every stretch of its motion, including homing, passes through ratio, play and
+stop error of a true rig. The light therefore follows the motors, not the plan: lost steps, resets and repeated moves
+appear in the pictures as on the bench. The physics is that of `tvsbayes.twin`, not an estimator's formula. Frame S, mm;
+degrees where a name says `_deg`; the time of a virtual clock.
 
-Everything random follows from the seed: sheets by the number of their placement, stops by the number of the start, so
+The seed determines all random numbers: sheets by the number of their placement, stops by the number of the start, so
 that a resumed run has the same rig and sheet, and new stop errors.
 """
 
@@ -34,7 +34,7 @@ from tvsbayes.twin.true_rig import Truth, draw_truth
 
 _STREAMS = {"truth": 0, "stops": 1, "homes": 2, "sheets": 3, "pixels": 4, "gears": 5, "drift": 6, "looks": 7}
 LATENCY_US = 300
-"""One way of a request or an answer over USB; a round trip measured on a pseudo-terminal took 0.64 ms."""
+"""Latency of a request or an answer over USB; a round trip measured on a pseudo-terminal took 0.64 ms."""
 
 
 class VirtualClock:
@@ -48,18 +48,18 @@ class VirtualClock:
         return self.now_us / 1e6
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass at once; at least a microsecond, so that waiting always ends."""
+        """Advance the time at once, by at least a microsecond, so that waiting always ends."""
         self.now_us += max(round(seconds * 1e6), 1)
 
 
 class SimulatedDevice:
-    """A device that can be power-cycled: mechanics that stay, a firmware that starts anew.
+    """A device that can be power-cycled: the mechanics stay, the firmware restarts.
 
     Attributes:
         clock: its time.
         mechanics: motors, switches and laser.
         model: the running firmware.
-        starts: how often it was started; the boot id counts on from `first_boot`.
+        starts: number of starts; the boot id counts from `first_boot`.
     """
 
     def __init__(self, clock: VirtualClock, mechanics: Mechanics, first_boot: int = 1):
@@ -69,14 +69,14 @@ class SimulatedDevice:
         self.power_on()
 
     def power_on(self) -> None:
-        """A start, also in mid-motion: counters, homing and settings are lost, the laser goes off."""
+        """Start the device, also during a motion: counters, homing and settings are lost, the laser is switched off."""
         for axis in (0, 1):
             self.mechanics.flush(axis)
         self.starts += 1
         self.model = DeviceModel(self.mechanics, self.first_boot + self.starts - 1, self.clock.now_us, self._send)
 
     def _send(self, line: bytes) -> None:
-        # Without a host the line is dropped, as by the firmware.
+        # Without a host the line is dropped, as in the firmware.
         if self.listener is not None:
             self.listener(line)
 
@@ -84,7 +84,7 @@ class SimulatedDevice:
 class ModelLink:
     """A `Link` to a simulated device; subclasses change bytes in `to_device` and `to_host`.
 
-    Bytes arrive at the device at their due time, whatever advances the clock next.
+    Bytes arrive at the device at their due time, however the clock advances.
     """
 
     def __init__(self, device: SimulatedDevice):
@@ -116,11 +116,11 @@ class ModelLink:
         self.device.listener = None
 
     def to_device(self, data: bytes) -> None:
-        """Bytes that the host has written."""
+        """Receive bytes written by the host."""
         self.deliver(data, True, LATENCY_US)
 
     def to_host(self, data: bytes) -> None:
-        """Bytes that the device has written."""
+        """Receive bytes written by the device."""
         self.deliver(data, False, LATENCY_US)
 
     def deliver(self, data: bytes, device: bool, delay_us: int) -> None:
@@ -129,13 +129,13 @@ class ModelLink:
         heapq.heappush(self._queue, (self.clock.now_us + delay_us, self._number, device, data))
 
     def settle(self) -> None:
-        """Let everything happen that is due by now."""
+        """Process everything that is due by now."""
         now_us = self.clock.now_us
         while self._queue and self._queue[0][0] <= now_us:
             due_us, _, device, data = heapq.heappop(self._queue)
             if device:
                 self.device.model.advance(due_us)
-                # The device answers at the time of the bytes, which may be before the clock's.
+                # The device answers at the time of the bytes, which may be earlier than the clock's.
                 self.clock.now_us = due_us
                 self.device.model.receive(data, due_us)
                 self.clock.now_us = now_us
@@ -145,10 +145,10 @@ class ModelLink:
 
 
 class Renderer(Protocol):
-    """Pictures of a spot: what the true cameras see of a `Light`."""
+    """Pictures of a spot: the true cameras' view of a `Light`."""
 
     def __call__(self, light: Light, look: int, frame: int) -> StereoImage:
-        """Both pictures; `look` numbers the look (same speckle), `frame` the exposure (new noise)."""
+        """Render both pictures; `look` numbers the look (same speckle), `frame` the exposure (new noise)."""
 
 
 class Instrument:
@@ -156,7 +156,7 @@ class Instrument:
 
     Args:
         rig: the declared rig; the true one is drawn from its `truth`.
-        seed: of everything random.
+        seed: seed of all random numbers.
         start: number of earlier starts of this campaign; stop errors differ between starts.
         truth: the true rig; None draws one, the same for every start of a seed.
     """
@@ -175,7 +175,7 @@ class Instrument:
         p = self.truth.parameters
         self._backlash = [p[f"backlash_deg.{axis}"] for axis in AXES]
         self._q = [0.0, 0.0]
-        # Mean ratio x counter without lost steps: the place of errors that repeat.
+        # Mean ratio x counter without lost steps: the position of repeatable errors.
         self._place_deg = [0.0, 0.0]
         self._drift_deg, self._drifted_us = [0.0, 0.0], [0, 0]
         self._y = [b * self._stops.uniform(-0.5, 0.5) for b in self._backlash]
@@ -183,10 +183,10 @@ class Instrument:
         settings = device_settings(rig.positioner)
         home = settings.get("hp", SETTINGS["hp"][2]), settings.get("ht", SETTINGS["ht"][2])
         self.mechanics = Mechanics(home_steps=home, moved=self._moved, found_home=self._found_home)
-        # A boot id of its own for every start: a simulated device does not outlive its process.
+        # Every start has its own boot id: a simulated device ends with its process.
         self.device = SimulatedDevice(self.clock, self.mechanics, first_boot=1 + 1000 * start)
         self.motions = 0
-        """Stretches of motion so far; between two of them the scene stands still."""
+        """Number of stretches of motion so far; between two of them the scene is at rest."""
         self._sheet = Sheet(np.array(np.nan), np.array([1.0, 0.0, 0.0]))
 
     def _stream(self, name: str, *numbers: int) -> np.random.Generator:
@@ -197,15 +197,15 @@ class Instrument:
         return SerialPositioner(lambda: ModelLink(self.device), device_settings(self.rig.positioner), self.clock)
 
     def place(self, target: str, placement: int) -> None:
-        """Put the sheet at a target; the same placement number puts it at the same place again."""
+        """Put the sheet at a target; the same placement number gives the same position again."""
         draws = self._stream("sheets", placement).standard_normal(3)
         self._sheet = placed_sheet(self.rig.sheets_mm[target], draws)
 
     def _moved(self, axis: int, steps: int) -> None:
-        """A stretch of motion: ratio of its sense, play, a new stop error (formulation 3.1)."""
+        """Apply a stretch of motion: ratio of its sense, play, a new stop error (formulation 3.1)."""
         self.motions += 1
         p, sense = self.truth.parameters, SIDES[AXES[axis]][steps > 0]
-        # The first row of a segment stands at mean ratio x counters, whatever the way there from the switch.
+        # The first row of a segment is at mean ratio x counters, however the axis came there from the switch.
         ratio = AXES[axis] if self._from_switch[axis] else sense
         self._from_switch[axis] = False
         self._q[axis] += steps * p[f"degrees_per_step.{ratio}"]
@@ -215,7 +215,7 @@ class Instrument:
         self._eta[axis] = p[f"stop_sd_deg.{sense}"] * self._stops.standard_normal()
 
     def _found_home(self, axis: int) -> None:
-        """Counters are set: from here on the angle is ratio x counters + home offset, 0 in the first segment."""
+        """Set the counters: from here on the angle is ratio x counters + home offset, 0 in the first segment."""
         offset = 0.0 if self._first_home[axis] else HOME_SD_DEG * self._homes.standard_normal()
         self._first_home[axis], self._from_switch[axis] = False, True
         ratio = self.truth.parameters[f"degrees_per_step.{AXES[axis]}"]
@@ -232,7 +232,7 @@ class Instrument:
         self._y[axis] = take_up(self._y[axis], driving, float(width))
 
     def _drift(self, axis: int) -> None:
-        """Let the zero drift over the time since the last call; cameras must not call it."""
+        """Apply the drift of the zero over the time since the last call; cameras must not call it."""
         before_us, now_us = self._drifted_us[axis], self.clock.now_us
         self._drifted_us[axis] = now_us
         scale = self.truth.parameters.get(f"drift_deg_per_root_hour.{AXES[axis]}", 0.0)
@@ -241,7 +241,7 @@ class Instrument:
         self._drift_deg[axis] += float(step + np.diff(self._errors[axis].warming_deg(hours))[0])
 
     def _repeated_deg(self, axis: int) -> float:
-        """Error of the output's angle at its place, and the drift and the creep of the zero."""
+        """Error of the output's angle at its position, with the drift and the creep of the zero."""
         warm = np.array(self.clock.now_us / 60e6)
         crept = float(zero_shift_deg(self.truth.parameters, AXES[axis], warm))
         return float(self._errors[axis].error_deg(np.array(self._place_deg[axis]))) + self._drift_deg[axis] + crept
@@ -254,9 +254,9 @@ class Instrument:
         return float(wobble_deg(angle_deg, harmonics_deg(self.truth.parameters, AXES[axis]), period))
 
     def state_deg(self) -> TrueAngles:
-        """True angles for a row of moves.csv.
+        """Return the true angles for a row of moves.csv.
 
-        Ends the way from the home switch: to be called once per motion, by the engine.
+        Ends the motion from the home switch: the engine calls it once per motion.
         """
         self._from_switch = [False, False]
         return TrueAngles(self._mirror_angles_deg(), (self._eta[0], self._eta[1]))
@@ -283,13 +283,13 @@ class Instrument:
         return project(self.light().points_mm[None], self.truth.stereo, self.truth.parameters["focal_scale"])[0]
 
     def noisy_centroid_px(self, sd_px: float) -> np.ndarray:
-        """A centroid as a detector that states `sd_px` would give it: pixel scale x sd_px of noise."""
+        """The centroid of a detector that states `sd_px`: its noise is pixel scale x sd_px."""
         noise = self.truth.parameters["pixel_scale"] * sd_px * self._pixels.standard_normal(4)
         return self.centroid_px() + noise
 
 
 def reference_pose_deg(looks: Sequence[TrueAngles]) -> tuple[float, float] | None:
-    """Mean mirror angles without stop errors over `state_deg` of the looks used (formulation 3.2); None for none."""
+    """Mean mirror angles without stop errors over `state_deg` of the looks used (formulation 3.2); None if none."""
     if not looks:
         return None
     resting = np.array([np.subtract(look.mirror_angles_deg, look.stop_errors_deg) for look in looks])

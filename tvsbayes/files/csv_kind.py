@@ -83,7 +83,7 @@ class CsvKind[Row]:
         row: dataclass of a row.
         file: name of the file.
         about: what a row stands for, in the words of a template's comment.
-        no_rows: allowed content and remedy for a table without rows; None where no rows are allowed.
+        no_rows: allowed content and remedy for a table without rows; None where a table without rows is allowed.
         template: rows of the file that `new` writes.
         columns: by name, in the order in which they are written.
     """

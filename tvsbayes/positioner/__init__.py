@@ -1,9 +1,9 @@
-"""The motors: the serial protocol, its driver and the firmware on the other end."""
+"""The motors: the serial protocol, its driver, and the device's firmware."""
 
 from importlib import resources
 from pathlib import Path
 
 
 def firmware_folder() -> Path:
-    """Where the firmware's sources and its README with flashing instructions lie."""
+    """The folder of the firmware's sources and its README with flashing instructions."""
     return Path(str(resources.files("tvsbayes.positioner") / "firmware"))

@@ -1,10 +1,10 @@
-"""Host side of the positioner: one request at a time, safe repeats, resynchronisation, replugging.
+"""Host side of the positioner: one request at a time, safe repeats, resynchronisation, reconnection.
 
-`move_to` and `home` return only after the device has reported, in a frame with a good CRC, that this very motion
-reached its target, at the counters ordered, without a reset in between (same boot id). Everything else ends in a
-`DeviceFault` within a bounded time. After a time-out the same line is sent again; that is safe, because the device
-executes a sequence number once. A device that was reset has lost its counters: that is a `PositionLost`, never a
-silent continuation.
+`move_to` and `home` return only after the device has reported, in a frame with a good CRC, that this motion reached its
+target, at the ordered counters, without a reset in between (same boot id). Everything else ends in a `DeviceFault`
+within a bounded time. After a time-out the same line is sent again; that is safe, because the device executes a
+sequence number once. A device that was reset has lost its counters: that is a `PositionLost`, never a silent
+continuation.
 
 Counters are absolute motor steps (pan, tilt); seconds where a name says `_s`. Time comes from a `Clock`, bytes from
 a `Link`: tests drive both without hardware and without waiting.
@@ -34,25 +34,25 @@ from tvsbayes.positioner.protocol import (
 from tvsbayes.positioner.silence import HEARD_BYTES_MAX, explained
 
 ATTEMPTS = 6
-"""How often a request is sent before the device counts as dead."""
+"""Number of attempts at a request before the device counts as dead."""
 CLOSING_ATTEMPTS = 3
-"""The same while closing."""
+"""Number of attempts while closing."""
 REPLY_S = 0.5
 """Silence after which a request is sent again. A clean round trip takes about 1 ms on USB, 0.2 s at 9600 baud."""
 NAK_S = 0.05
-"""The same after a negative acknowledgement."""
+"""Silence after a negative acknowledgement after which a request is sent again."""
 REPLY_MAX_S = 3.0
 """Longest wait for one answer while bytes keep arriving: a slow line, or noise."""
 DRAIN_S, DRAIN_MAX_S = 0.05, 1.0
 """Silence that ends the draining of a line just opened, and the longest draining."""
 POLL_S = 0.05
-"""Time between two looks at a motion; far below the laser watchdog of the device."""
+"""Time between two status requests during a motion; far below the laser watchdog of the device."""
 TRIGGER_PULSE_US = 1_000
-"""Long enough for every camera's input, opto-coupled ones included."""
+"""Long enough for every camera's input, including opto-coupled inputs."""
 HOME_S = 300.0
-"""Longest homing: 20 000 steps per axis at 200 steps/s are 200 s."""
+"""Longest duration of a homing: 20 000 steps per axis at 200 steps/s are 200 s."""
 RECONNECT_S = 10.0
-"""How long an unplugged device may stay away."""
+"""Longest wait for an unplugged device."""
 _REFUSALS = {
     "limit": "the target lies outside the soft limits: correct the plan or [positioner] in the rig file",
     "unhomed": "home first",
@@ -73,10 +73,10 @@ class SerialPositioner:
     Args:
         open_link: opens the line, also after an unplugging; raises OSError while there is none.
         settings: device settings by protocol name (`protocol.SETTINGS`), set and read back.
-        clock: where time comes from.
+        clock: source of time.
 
     Raises:
-        DeviceFault: nothing answers, or what answers is another firmware.
+        DeviceFault: nothing answers, or another firmware answers.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class SerialPositioner:
         self._sequence, self._boot = 0, -1
         self._homed_here, self._device_homed, self._lit = False, False, False
         self.repeats = 0
-        """Requests sent again so far: the quality of the line."""
+        """Number of requests sent again so far: a measure of the line's quality."""
         self._received = bytearray()
         self._link = opened(open_link)
         try:
@@ -110,7 +110,7 @@ class SerialPositioner:
     def home(self) -> HomeReport:
         """See `Positioner.home`."""
         known, compared = self._homed_here, self._device_homed
-        # A homing that is broken off leaves no counters to compare with.
+        # An aborted homing leaves no counters for a comparison.
         self._homed_here = self._device_homed = False
         state = self._wait_for_motion(self._command("HOME"), HOME_S)
         self._homed_here = self._device_homed = True
@@ -124,7 +124,7 @@ class SerialPositioner:
         """See `Positioner.move_to`.
 
         Raises:
-            DeviceFault: refused, stopped, in alarm, too late, or not where it should be.
+            DeviceFault: refused, stopped, in alarm, too late, or at other counters than ordered.
         """
         if self._lit:
             self.laser(False)
@@ -132,7 +132,7 @@ class SerialPositioner:
         reply = self._command("MA", *target)
         start = reply.state
         distance_steps = max(abs(target[0] - start.pan_steps), abs(target[1] - start.tilt_steps))
-        # Twice the whole way at the speed before any ramp, and two full ramps; 5 s for the line.
+        # Twice the whole distance at the starting speed, and two full ramps; 5 s for the line.
         speed, acceleration = self._limits["vmax"], self._limits["amax"]
         timeout_s = 5.0 + 2.0 * (distance_steps / min(speed, START_SPEED) + 2.0 * speed / acceleration)
         state = self._wait_for_motion(reply, timeout_s)
@@ -144,7 +144,7 @@ class SerialPositioner:
 
     def laser(self, on: bool) -> DeviceState:
         """See `Positioner.laser`."""
-        # Before the order: an interruption does not say whether it has arrived.
+        # Set before the order: after an interruption it is unknown whether the order arrived.
         self._lit = self._lit or on
         state = self._command("L", int(on)).state
         if state.laser_on != on:
@@ -171,7 +171,7 @@ class SerialPositioner:
             if self._boot >= 0:
                 self._switch_off()
             else:
-                # Not identified yet, but an earlier run may have left its laser on.
+                # The device is not identified yet, but an earlier run may have left its laser on.
                 self._link.write(b"\n" + request(0, "L", 0))
                 self._link.read(NAK_S)
         except (DeviceFault, OSError):
@@ -184,10 +184,10 @@ class SerialPositioner:
     def _switch_off(self) -> None:
         """Laser off and motors at rest, with few attempts."""
         exchange = partial(self._exchange, attempts=CLOSING_ATTEMPTS, reconnect=False)
-        # Unnumbered: it is accepted even if another program has used later numbers.
+        # Unnumbered, so that it is accepted even if another program has used later numbers.
         if exchange("L", 0, sequence=0).state.status == "moving":
             # Interrupted in a motion: a blocked axis must not be driven on unattended. Numbered, so that the motion of
-            # another program goes on.
+            # another program continues.
             exchange("STOP")
 
     def _drain(self) -> None:
@@ -257,7 +257,7 @@ class SerialPositioner:
         state = reply.state
         while not (state.status == "idle" and state.done_sequence == reply.sequence):
             if state.status != "moving":
-                # The cached answer to a repeated request may be older than the motion.
+                # The cached answer to a repeated request may be older than the motion's end.
                 state = self._command("?").state
                 if state.status == "idle" and state.done_sequence == reply.sequence:
                     break
@@ -275,7 +275,7 @@ class SerialPositioner:
     def _exchange(
         self, *words: object, sequence: int | None = None, attempts: int = ATTEMPTS, reconnect: bool = True
     ) -> Reply:
-        """One request and its answer, repeated while it is unanswered and reconnected when the line is gone."""
+        """Send one request until it is answered, and reconnect when the line is lost."""
         if sequence is None:
             if self._sequence == SEQUENCE_MAX:
                 raise _sequence_exhausted(self._sequence)
@@ -320,7 +320,7 @@ class SerialPositioner:
                     if answer.sequence == sequence:
                         return answer
                 elif answer.kind == "nak":
-                    # Noise may draw many of them, and the answer may still follow.
+                    # Noise may cause many of them, and the answer may still follow.
                     deadline = min(deadline, self._clock.monotonic() + NAK_S)
             left_s = deadline - self._clock.monotonic()
             if left_s <= 0 or self._link is None:
@@ -332,11 +332,11 @@ class SerialPositioner:
                 self._keep_received(data)
 
     def _keep_received(self, data: bytes) -> None:
-        """Keep the first bytes received before an answer: they show why there is none."""
+        """Keep the first bytes received before an answer: they show why the answer is missing."""
         self._received += data[: max(HEARD_BYTES_MAX - len(self._received), 0)]
 
     def _next_line(self) -> bytes | None:
-        """A complete line from the buffer; one that is too long for an answer is dropped."""
+        """A complete line from the buffer; a line too long for an answer is dropped."""
         while (end := self._buffer.find(b"\n")) >= 0:
             line = bytes(self._buffer[:end])
             del self._buffer[: end + 1]
@@ -349,7 +349,7 @@ class SerialPositioner:
         return None
 
     def _reconnect(self, cause: OSError) -> None:
-        """Wait for the device to come back, and check that it is the same one and was not reset."""
+        """Wait until the device is connected again; check that it is the same device and was not reset."""
         if self._link is not None:
             self._link.close()
             self._link = None

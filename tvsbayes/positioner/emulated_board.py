@@ -1,9 +1,9 @@
-"""The shipped firmware on an emulated processor: QEMU's Cortex-M7 board with motors and switches behind its pins.
+"""The shipped firmware on an emulated processor: QEMU's Cortex-M7 board with motors and switches at its pins.
 
 The unchanged sketch is cross-compiled with `firmware/emulated` and run; the host reaches it through a serial port like
-any other. Guest time follows this computer's clock; it may fall behind, never run ahead. Orders of a "hand at the
-bench" break wires and hold motors, as `firmware/emulated/board.cpp` lists. The laser pin is read from outside the
-processor, so that its level is known after a crash too.
+any other. Guest time follows this computer's clock; it may lag, never lead. Orders of a "hand at the bench" break wires
+and hold motors, as `firmware/emulated/board.cpp` lists. The laser pin is read from outside the processor, so that its
+level is known after a crash too.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tvsbayes.positioner import firmware_folder
 
 COMPILER, EMULATOR = "arm-none-eabi-g++", "qemu-system-arm"
 PACKAGES = "qemu-system-arm gcc-arm-none-eabi libstdc++-arm-none-eabi-newlib"
-"""Debian's and Ubuntu's packages of both."""
+"""Packages of compiler and emulator in Debian and Ubuntu."""
 PROCESSOR = ("-mcpu=cortex-m7", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv5-d16")
 CODE = ("-std=gnu++17", "-Os", "-fno-exceptions", "-fno-rtti", "-ffunction-sections", "-Wl,--gc-sections")
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion")
@@ -42,16 +42,16 @@ def missing_tools() -> list[str]:
 
 
 def core_sources() -> list[Path]:
-    """The C++ of the firmware's core."""
+    """The C++ files of the firmware's core."""
     return sorted((firmware_folder() / "tvs_positioner").glob("tvs_*.cpp"))
 
 
 def cross_compile(program: Path, sources: Sequence[Path], *options: str) -> subprocess.CompletedProcess[str]:
-    """Compiles and links for the emulated board, with every warning asked for; the compiler's result.
+    """Compile and link for the emulated board with all warnings enabled; return the compiler's result.
 
     Args:
         program: the file to write.
-        sources: beside the board's start-up, which is always linked; an `.ino` counts as C++.
+        sources: sources besides the board's start-up, which is always linked; an `.ino` counts as C++.
         options: further options, such as newlib's `--specs`.
     """
     firmware = firmware_folder()
@@ -63,7 +63,7 @@ def cross_compile(program: Path, sources: Sequence[Path], *options: str) -> subp
 
 
 def build_sketch(program: Path) -> subprocess.CompletedProcess[str]:
-    """The sketch, its core and the board's pins, as `cross_compile`."""
+    """Compile the sketch, its core and the board's pins, as `cross_compile`."""
     firmware = firmware_folder()
     sketch = firmware / "tvs_positioner" / "tvs_positioner.ino"
     sources = [sketch, firmware / "emulated" / "board.cpp", *core_sources()]
@@ -74,12 +74,12 @@ class EmulatedBoard:
     """A running board; a context manager that ends it.
 
     Args:
-        on_step: called by `drain` with axis and sense (+1, -1) of every step that a motor did.
+        on_step: called by `drain` with axis and sense (+1, -1) of every step of a motor.
         on_laser: called by `drain` with the state of the laser line after every change.
 
     Attributes:
         port: the serial port of the host's line.
-        starts: starts of the firmware that `drain` has seen.
+        starts: number of starts of the firmware that `drain` has read.
 
     Raises:
         InputError: compiler or emulator are not installed, or do not work.
@@ -112,7 +112,7 @@ class EmulatedBoard:
         self.close()
 
     def close(self) -> None:
-        """Ends the emulator and removes its files."""
+        """End the emulator and remove its files."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -124,11 +124,11 @@ class EmulatedBoard:
         self._folder.cleanup()
 
     def order(self, text: str) -> None:
-        """An order of the hand at the bench, such as "k 0 7": see `firmware/emulated/board.cpp`."""
+        """Send an order of the "hand at the bench", such as "k 0 7"; see `firmware/emulated/board.cpp`."""
         os.write(self._files[1], text.encode("ascii") + b"\n")
 
     def drain(self) -> None:
-        """Reports to the listeners what happened since the last call, at least all before the host's last answer."""
+        """Report events since the last call to the listeners, at least all before the host's last answer."""
         while True:
             try:
                 data = os.read(self._files[0], 65_536)
@@ -161,7 +161,7 @@ class EmulatedBoard:
             raise InputError("emulator", f"the firmware does not compile: {compilation.stderr[-300:]}", remedy=remedy)
         for suffix in (".in", ".out"):
             os.mkfifo(f"{hand}{suffix}")
-        # 256 ns an instruction: a few percent of a core, so that a busy computer is fast enough.
+        # 256 ns per instruction takes a few percent of a core, so that a busy computer is fast enough.
         # A pipe buffers unread bytes without delaying the board; a socket delays it at every byte.
         self._process = subprocess.Popen(
             [
@@ -198,7 +198,7 @@ class EmulatedBoard:
             time.sleep(0.02)
 
     def _ask(self, command: str, **arguments: str) -> Any:
-        """An order to the emulator itself, and its answer; events in between are ignored."""
+        """Send an order to the emulator itself and return its answer; events in between are ignored."""
         self._monitor.write(json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n")
         while True:
             reply = json.loads(self._monitor.readline() or '{"error": "ended"}')

@@ -1,9 +1,9 @@
-"""A positioner in software: the firmware's state machine.
+"""Software model of a positioner: the firmware's state machine.
 
-`DeviceModel` answers the same bytes at the same microseconds as the C++ core in firmware/tvs_positioner; differential
-tests drive both. What moves is `mechanics.Mechanics`.
+`DeviceModel` answers with the same bytes at the same microseconds as the C++ core in firmware/tvs_positioner;
+differential tests drive both. The moving parts are `mechanics.Mechanics`.
 
-Times are microseconds since start, positions motor steps (pan, tilt). Nothing here sleeps or reads a clock.
+Times are microseconds since start, positions motor steps (pan, tilt). The module neither sleeps nor reads a clock.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from tvsbayes.positioner.protocol import (
 HOME_SLOW_SPEED = 50
 """Speed of the last approach to a home switch, steps/s."""
 HOME_CLEAR_STEPS = 20
-"""Steps beyond the release of a home switch."""
+"""Steps taken beyond the release of a home switch."""
 HOME_TRAVEL_MAX_STEPS = 20_000
-"""The most that one axis may travel while homing."""
+"""Largest travel of one axis while homing."""
 HOME_OPEN_MAX_STEPS = 200
-"""The most of it with a limit switch open from the start: enough to leave the switch, not to hit the stop."""
+"""Largest travel with a limit switch open from the start: it leaves the switch without reaching the end stop."""
 HOME_READS, HOME_READ_US = 4, 500
-"""Readings of a home switch after the first that must agree with it, and the time between them: spikes are no zeros."""
+"""Number of further readings of a home switch that must agree with the first, and their interval; rejects spikes."""
 LIMIT_OPEN_US = 5_000
-"""How long a limit switch that opens at rest must stay open to count."""
+"""Time for which a limit switch that opens at rest must stay open to count."""
 _NEVER = 2**63
 
 
@@ -60,11 +60,11 @@ class DeviceModel:
     """The firmware's core in Python.
 
     Args:
-        mechanics: the motors and switches it drives.
+        mechanics: the motors and switches that it drives.
         boot: boot id of this start.
         now_us: time of this start.
         write: called with every line the device sends.
-        protocol: protocol version it claims, for tests of a wrong one.
+        protocol: protocol version that it reports, for tests of a wrong one.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class DeviceModel:
 
     @property
     def state(self) -> DeviceState:
-        """What every reply carries."""
+        """The state that every reply contains."""
         pan, tilt = self._axes
         return DeviceState(
             self._boot,
@@ -115,7 +115,7 @@ class DeviceModel:
         )
 
     def receive(self, data: bytes, now_us: int) -> None:
-        """Takes bytes from the host, all at one time; `advance` to that time first."""
+        """Receive bytes from the host, all at one time; call `advance` to that time first."""
         for byte in data:
             if byte == 0x0A:
                 self._take_line(bytes(self._line), now_us)
@@ -127,17 +127,17 @@ class DeviceModel:
                 self._overlong = True
 
     def advance(self, now_us: int) -> None:
-        """Lets time pass for a main loop that is never late: everything happens when it is due."""
+        """Advance the time for a main loop that is never late: every action occurs when it is due."""
         while (due_us := self.next_us()) <= now_us:
             self.loop(due_us)
         self.loop(now_us)
 
     def next_us(self) -> int:
-        """When `loop` is due next, if no request arrives before."""
+        """Time at which `loop` is due next, if no request arrives before."""
         return min(self._step_us()[0], self._laser_off_us(), self._trigger_off_us, self._limit_due_us)
 
     def loop(self, now_us: int) -> None:
-        """Does what is due by now: one step of an axis at most, laser and trigger off."""
+        """Perform the actions due by now: at most one step of an axis, laser and trigger off."""
         if self._trigger_off_us <= now_us:
             self._trigger_off_us = _NEVER
             self.mechanics.trigger_on = False
@@ -155,7 +155,7 @@ class DeviceModel:
         self._watch_limits(now_us)
 
     def darkened(self) -> None:
-        """The board has switched the laser off by itself, because `loop` was late."""
+        """Record that the board has switched the laser off because `loop` was late."""
         if self.mechanics.laser_on:
             self._set_laser(False)
             self._error = "stall"
@@ -164,7 +164,7 @@ class DeviceModel:
         return self._heard_us + self._settings["wd"] * 1000 if self.mechanics.laser_on else _NEVER
 
     def _step_us(self) -> tuple[int, int]:
-        """When the next step is due, and of which axis."""
+        """Time of the next step, and its axis."""
         if self._homing:
             return self._home_due_us, self._home_axis
         due_us, index = _NEVER, self._home_axis
@@ -216,7 +216,7 @@ class DeviceModel:
         self._last_sequence, self._last_request = sequence, line
         refused, extra = self._command(sequence, words[1:], now_us)
         self._refused = refused is not None
-        # Only new, accepted requests keep the laser on.
+        # Only new, accepted requests feed the laser watchdog.
         self._heard_us = self._heard_us if self._refused else now_us
         self._last_reply = self._reply(sequence, refused, extra)
         return self._write(self._last_reply)
@@ -228,7 +228,7 @@ class DeviceModel:
         return frame(f"<{sequence} {'ok' if error is None else 'err ' + error} {state_text(self.state)}{extra}")
 
     def _command(self, sequence: int, words: list[str], now_us: int) -> tuple[str | None, str]:
-        """Executes one command: the reason of refusal or None, and further fields of the reply."""
+        """Execute one command; return the reason of refusal or None, and further fields of the reply."""
         name, arguments = words[0], words[1:]
         counts = {"ID": 0, "?": 0, "MA": 2, "HOME": 0, "STOP": 0, "ABORT": 0, "L": 1, "TRIG": 1, "GET": 1, "SET": 2}
         if name not in counts:
@@ -329,9 +329,9 @@ class DeviceModel:
         if remaining == 0:
             axis.direction = 0
             return self._finish_if_at_rest()
-        # A motor whose step is late has stopped: it starts the ramp again.
+        # A motor whose step is late has stopped: the ramp restarts.
         stalled = now_us - axis.due_us > self._delay_us(0)
-        # Slow down so that the last step is done at the starting speed.
+        # Decelerate so that the last step is done at the starting speed.
         axis.level = min(0 if stalled else axis.level + 1, self._top_level(), remaining - 1)
         axis.due_us = now_us + self._delay_us(axis.level)
         return None
@@ -397,8 +397,8 @@ class DeviceModel:
         self.mechanics.step(self._home_axis, 1 if positive else -1)
         axis.position += 1 if positive else -1
         axis.target = axis.position
-        # Homing may begin behind an open limit switch and leave it; one that opens on the way means that the home
-        # switch was missed.
+        # Homing may begin behind an open limit switch and leave it; a limit switch that opens on the way means that
+        # the home switch was missed.
         limit = self.mechanics.limit_switch(self._home_axis)
         self._home_travel += 1
         if limit and (not self._home_limit or self._home_travel > HOME_OPEN_MAX_STEPS):
@@ -418,7 +418,7 @@ class DeviceModel:
         return None
 
     def _home_read(self, now_us: int) -> None:
-        """Whether the home switch is still pressed, the motor at rest."""
+        """Read whether the home switch is still pressed with the motor at rest."""
         if not self.mechanics.home_switch(self._home_axis):
             self._home_reads = 0
             self._home_due_us = now_us + self._home_delay_us()
@@ -430,7 +430,7 @@ class DeviceModel:
         return self._enter_phase("back", now_us) if self._home_phase == "fast" else self._home_found(now_us)
 
     def _home_found(self, now_us: int) -> None:
-        # The home switch is never behind an open limit: a wire is broken, or the wrong switch was found.
+        # The home switch is never beyond an open limit: a wire is broken, or the wrong switch was found.
         if self._limit_open() if self._home_axis else self.mechanics.limit_switch(0):
             return self._halt("alarm", "limit")
         axis = self._axes[self._home_axis]

@@ -1,10 +1,10 @@
 """A positioner on a GRBL board: pan is X, tilt is Y, spindle or coolant output switches the laser (`driver = "grbl"`).
 
-Counters are motor steps: machine position times `$100` (`$101`). Zero is where the board's homing puts it. GRBL 1.1 has
-no checksum, no sequence numbers and no boot id, so it promises less than our firmware: lost steps are not found at the
-next homing, and a computer that dies leaves the laser on, because no watchdog of the board switches it off. What it
-does report is used: every order waits for its `ok`, arrival is read back, a greeting in mid-run is a reset that has
-lost the counters, an alarm ends the run, and the laser's mode is read back by `$G`.
+Counters are motor steps: machine position times `$100` (`$101`). The board's homing defines zero. GRBL 1.1 has no
+checksum, no sequence numbers and no boot id, so it promises less than this package's firmware: lost steps are not found
+at the next homing, and a computer that dies leaves the laser on, because no watchdog of the board switches it off. The
+driver uses all that GRBL reports: every order waits for its `ok`, arrival is read back, a greeting in mid-run is a
+reset that has lost the counters, an alarm ends the run, and the laser's mode is read back by `$G`.
 
 Counters in motor steps; seconds where a name says `_s`. Time from a `Clock`, bytes from a `Link`.
 """
@@ -44,17 +44,17 @@ from tvsbayes.positioner.silence import HEARD_BYTES_MAX, explained
 GREETING_S, GREETING_ATTEMPTS = 1.5, 4
 """An Arduino stays in its boot loader for about a second after its port is opened, and reads nothing."""
 REPLY_S = 2.0
-"""Longest wait for the answer to an order that moves nothing."""
+"""Longest wait for the answer to an order without motion."""
 POLL_S = 0.1
 """Time between two status reports; GRBL's manual asks for 5 Hz to 10 Hz."""
 HOME_S = 300.0
 LINE_CHARS_MAX = 256
 NO_WATCHDOG = "a GRBL board has no watchdog: when this computer fails the laser stays on, unless something else cuts it"
 COUNTERS_MAX = 2_000_000
-"""GRBL computes in single precision: beyond this a position is off by more than an eighth of a step."""
+"""GRBL computes in single precision: beyond this the error of a position exceeds an eighth of a step."""
 OPTIONS = ("laser", "laser_power", "unwatched_laser")
 FOREIGN_KEYS = ("pan_home_steps", "tilt_home_steps", "acceleration_steps_per_s2", "laser_watchdog_s")
-"""Entries of `[positioner]` that are settings of the board here ($23, $27, $120), or that it does not have."""
+"""Entries of `[positioner]` that are settings of the board here ($23, $27, $120), or do not exist on it."""
 UNLIMITED = CounterLimits({axis: (None, None) for axis in AXES})
 _MOVING = ("Run", "Home", "Jog", "Hold")
 _refused = partial(entry_refusal, "positioner", "positioner")
@@ -62,14 +62,14 @@ _refused = partial(entry_refusal, "positioner", "positioner")
 
 @dataclass(frozen=True)
 class GrblSettings:
-    """What the rig file states.
+    """Settings of a GRBL board in the rig file.
 
     Attributes:
         laser: the order that switches it on.
         laser_power: `S` of a spindle order, None for the board's full power.
         unwatched: whether the user accepts that the laser may stay on when the computer dies.
-        limits: soft limits, held here.
-        speed_steps_per_s: of the faster axis, None for the board's own.
+        limits: soft limits, enforced by this driver.
+        speed_steps_per_s: speed of the faster axis, None for the board's own.
     """
 
     laser: str = "M3"
@@ -80,7 +80,7 @@ class GrblSettings:
 
     @classmethod
     def of(cls, table: Mapping[str, str | int | float]) -> GrblSettings:
-        """Those of `[positioner]`.
+        """The settings in `[positioner]`.
 
         Raises:
             InputError: an entry or option that does not belong to a GRBL board.
@@ -95,7 +95,7 @@ class GrblSettings:
             remedy = "name what switches the laser: M3 the spindle, M7 mist, M8 flood coolant"
             raise _refused("options.laser", escaped(laser), ", ".join(LASER_ORDERS), remedy)
         speed, unwatched = table.get("speed_steps_per_s"), options.get("unwatched_laser", 0)
-        # Any text is true in Python, also "false" and "no": it would permit the laser without consent.
+        # Any text is true in Python, also "false" and "no": it would enable the laser without consent.
         if unwatched not in (0, 1):
             remedy = (
                 "write true, without quotes, once something else cuts the light when the computer fails; else false"
@@ -115,11 +115,11 @@ class GrblPositioner:
 
     Args:
         open_link: opens the line; raises OSError while there is none.
-        stated: what the rig file states.
-        clock: where time comes from.
+        stated: settings from the rig file.
+        clock: source of time.
 
     Raises:
-        DeviceFault: nothing answers, or something else does.
+        DeviceFault: nothing answers, or another device does.
         InputError: a setting of the board that does not fit, or more laser power than it has.
     """
 
@@ -131,7 +131,7 @@ class GrblPositioner:
         self._target: tuple[int, int] = (0, 0)
         self._status: Status | None = None
         self.repeats = 0
-        """Status reports asked for again."""
+        """Number of status reports requested again."""
         self.warnings = (NO_WATCHDOG,)
         """Warnings about this kind of board."""
         self._link = opened(open_link)
@@ -141,7 +141,7 @@ class GrblPositioner:
             self._order("$$", REPLY_S, lambda line: values.update([entry]) if (entry := parse_setting(line)) else None)
             self._board = BoardSettings.of(values, self._settings.laser)
             if (power := self._settings.laser_power or 0.0) > self._board.power_max:
-                # The board would take it for full power.
+                # The board would apply full power.
                 found, allowed = f"{power:g}", f"at most {self._board.power_max:g}, the board's $30"
                 raise _refused("options.laser_power", found, allowed, "lower it, or leave it out for full power")
             self.identity |= {f"${number}": f"{values[number]:g}" for number in (100, 101, 110, 111)}
@@ -150,7 +150,7 @@ class GrblPositioner:
             raise
 
     def home(self) -> HomeReport:
-        """See `Positioner.home`; the board reports neither steps lost before nor the sense in which $23 lets it end."""
+        """See `Positioner.home`; the board reports neither lost steps nor the sense in which homing ends ($23)."""
         self._homed = False
         # A reset ends an alarm and switches the laser off.
         self._greeting()
@@ -177,7 +177,7 @@ class GrblPositioner:
         self._target = target
         order, motion_s = self._motion_order(self._board.counters(start.position_mm), target)
         self._order(order, REPLY_S)
-        # Its `ok` comes once everything before it is done.
+        # The board sends its `ok` after completing all earlier orders.
         self._order("G4 P0.01", 5.0 + 2.0 * (motion_s + self._board.ramps_s))
         status = self._status_report()
         if status.state != "Idle":
@@ -199,14 +199,14 @@ class GrblPositioner:
                     "a GRBL board leaves the laser on when this computer fails",
                     "have something else cut it, then write unwatched_laser = true into [positioner.options]",
                 )
-        # Before the order: an interruption does not say whether it has arrived.
+        # Set before the order: after an interruption it is unknown whether the order arrived.
         self._lit = self._lit or on
         try:
             self._order(self._laser_order(on), REPLY_S)
             state = self.state()
         except DeviceFault:
             if not on:
-                # A reset switches it off; at rest it keeps the position.
+                # A reset switches the laser off; at rest the board keeps the position.
                 self._write(RESET)
             raise
         if state.laser_on != on:
@@ -222,22 +222,22 @@ class GrblPositioner:
         return self._state(status, laser_on=self._laser_on())
 
     def close(self) -> None:
-        """See `Positioner.close`: a soft reset, which ends motion and light at once."""
+        """See `Positioner.close`; a soft reset ends motion and light at once."""
         try:
             self._link.write(RESET)
             self._link.read(POLL_S)
         except OSError:
-            # The board is unplugged: nothing reaches it any more.
+            # The board is unplugged: no order reaches it.
             pass
         finally:
             self._link.close()
 
     def _greeting(self) -> str:
-        """Resets the board, which ends motion and light, and reads its name."""
+        """Reset the board, which ends motion and light, and read its name."""
         self._greeted, self._pending = False, 0
         self._received.clear()
         for attempt in range(GREETING_ATTEMPTS):
-            # The empty line makes other firmware answer too.
+            # The empty line makes other firmware answer as well.
             self._write(RESET + b"\n" if attempt else RESET)
             deadline = self._clock.monotonic() + GREETING_S
             while (line := self._next_line(deadline)) is not None:
@@ -284,7 +284,7 @@ class GrblPositioner:
     def _require_dark(self, state: DeviceState) -> DeviceState:
         """The state after a motion; a laser that is on is a fault."""
         if state.laser_on:
-            # At rest a reset keeps the position.
+            # At rest the board keeps its position over a reset.
             self._write(RESET)
             raise fault("laser", "the laser is on after a motion", "cut the laser's supply and check the board")
         return state
@@ -299,7 +299,7 @@ class GrblPositioner:
         if status.state == "Idle":
             word = "idle" if self._homed else "unhomed"
         error = "none" if word != "alarm" else escaped(status.state).lower()
-        # GRBL homes onto its limit switches: a pressed switch and a broken wire look the same.
+        # GRBL homes onto its limit switches: a pressed switch cannot be distinguished from a broken wire.
         pressed = int("X" in status.pins), int("Y" in status.pins)
         return DeviceState(0, word, pan, tilt, *self._target, self._done, laser_on, 0, 0, error, *pressed)
 
@@ -312,7 +312,7 @@ class GrblPositioner:
         return self._settings.laser in reports[-1]
 
     def _status_report(self) -> Status:
-        """A status report."""
+        """Request a status report."""
         self._status = None
         for attempt in range(3):
             self.repeats += attempt > 0
@@ -325,7 +325,7 @@ class GrblPositioner:
         raise self._no_answer("?")
 
     def _order(self, order: str, timeout_s: float, on_line: Callable[[str], object] = lambda line: None) -> None:
-        """Sends one line and waits for its `ok`; lines in between go to `on_line`."""
+        """Send one line and wait for its `ok`; lines in between go to `on_line`."""
         self._resynchronise()
         self._write(order.encode("ascii") + b"\n")
         self._pending = 1
@@ -351,7 +351,7 @@ class GrblPositioner:
                 on_line(line)
 
     def _resynchronise(self) -> None:
-        """Waits for the answer to an interrupted order."""
+        """Wait for the answer to an interrupted order."""
         deadline = self._clock.monotonic() + REPLY_S
         while self._pending and (line := self._next_line(deadline)) is not None:
             if line == "ok" or number_of(line, "error") is not None:
@@ -379,11 +379,11 @@ class GrblPositioner:
         return fault("unplugged", f"the board is gone: {reason(error)}", remedy)
 
     def _darkness_first(self, remedy: str) -> str:
-        """A remedy for a board that cannot be reached: it has no watchdog that ends the light."""
+        """A remedy for a board that cannot be reached: it has no watchdog that switches the laser off."""
         return f"cut the laser's supply, it may be on; {remedy}" if self._lit else remedy
 
     def _handle_line(self, line: str) -> None:
-        """Takes a status report; raises for an alarm and for a greeting, which means a reset."""
+        """Store a status report; raise for an alarm and for a greeting, which means a reset."""
         status, alarm = parse_status(line), number_of(line, "ALARM")
         if status is not None:
             self._status = status

@@ -1,11 +1,11 @@
-r"""What a GRBL board sends: status reports, modes, settings, errors and alarms of GRBL 1.1, as text.
+r"""Messages of a GRBL board: status reports, modes, settings, errors and alarms of GRBL 1.1, as text.
 
 Lines end in CR LF; an order is answered by `ok` or `error:N`, `?` by `<State|MPos:x,y,z|...>`, and `ALARM:N` or a
-greeting comes unasked. There is no checksum. Positions are millimetres of machine coordinates with three decimals, or
-whatever unit the board's user calls a millimetre; settings `$n=value`.
+greeting is sent without a request. There is no checksum. Positions are millimetres of machine coordinates with three
+decimals, or the unit that the user's settings call a millimetre; settings are `$n=value`.
 
-Source: https://github.com/gnea/grbl/wiki (Grbl v1.1 Interface, Configuration, Commands). No state, no input or output
-here.
+Source: https://github.com/gnea/grbl/wiki (Grbl v1.1 Interface, Configuration, Commands). The module has no state, input
+or output.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from tvsbayes.errors import InputError
 
 RESET = b"\x18"
-"""Ctrl-X, taken out of the stream at once: motion ends, spindle and coolant off. At rest the position is kept."""
+"""Ctrl-X, acted on as soon as it arrives: motion ends, spindle and coolant off. At rest the position is kept."""
 HOLD = b"!"
 ASK = b"?"
 STEPS_PER_MM_MAX = 500.0
-"""Positions are reported to 0.0005 mm: beyond this a quarter of a step and more."""
+"""Positions are reported to 0.0005 mm: beyond this limit that is a quarter of a step and more."""
 LASER_ORDERS = {"M3": "M5", "M4": "M5", "M7": "M9", "M8": "M9"}
-"""What switches a laser on and off again: spindle or coolant."""
+"""Orders that switch a laser on, with those that switch it off: spindle or coolant."""
 _STATUS = re.compile(r"<([A-Za-z]+)(?::\d+)?\|(.*)>")
 _SETTING = re.compile(r"\$(\d{1,3})=(-?\d+(?:\.\d+)?)")
 _MODES = re.compile(r"\[GC:(.*)\]")
@@ -53,9 +53,9 @@ class Status:
     """A status report.
 
     Attributes:
-        state: as the board calls it: "Idle", "Run", "Alarm".
+        state: name of the state on the board: "Idle", "Run", "Alarm".
         position_mm: machine position (x, y).
-        pins: letters of inputs that are active, "XY" the limit switches of both axes.
+        pins: letters of active inputs; "XY" are the limit switches of both axes.
     """
 
     state: str
@@ -83,7 +83,7 @@ def parse_setting(line: str) -> tuple[int, float] | None:
 
 
 def parse_modes(line: str) -> frozenset[str] | None:
-    """The modes in force, such as "G90" or "M5", of the answer to `$G`; None for any other line."""
+    """The modes in force, such as "G90" or "M5", from the answer to `$G`; None for any other line."""
     match = _MODES.fullmatch(line)
     return None if match is None else frozenset(match[1].split())
 
@@ -102,13 +102,13 @@ def number_of(line: str, kind: str) -> int | None:
 
 @dataclass(frozen=True)
 class BoardSettings:
-    """The settings of `$$` that this package relies on.
+    """The settings of `$$` on which this package depends.
 
     Attributes:
         steps_per_mm: of pan (X) and tilt (Y).
-        rate_mm_per_min: top speeds.
+        rate_mm_per_min: top speeds of both axes.
         power_max: `S` of full spindle power.
-        ramps_s: time to reach full speed and to stop again, of the slower axis.
+        ramps_s: time of the slower axis to reach full speed and to stop again.
     """
 
     steps_per_mm: tuple[float, float]
@@ -118,14 +118,14 @@ class BoardSettings:
 
     @classmethod
     def of(cls, values: Mapping[int, float], laser: str) -> BoardSettings:
-        """Checked against what positioning and the laser need.
+        """Build from settings, checked against the requirements of positioning and laser.
 
         Args:
             values: settings by number.
             laser: the order that switches it on.
 
         Raises:
-            InputError: a setting that does not fit, with the value required.
+            InputError: an unsuitable setting, with the required value.
         """
         required = {
             1: (255.0, "motors hold their place at rest"),

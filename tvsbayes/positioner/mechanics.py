@@ -1,6 +1,6 @@
-"""What a positioner's firmware cannot see: the true positions of motors and switches, and broken wires.
+"""State hidden from a positioner's firmware: the true positions of motors and switches, and broken wires.
 
-`Mechanics` can lose steps, and reports to a listener every stretch of motion in one sense, which drives the twin's
+`Mechanics` can lose steps. It reports every stretch of motion in one sense to a listener, which drives the twin's
 gears. Positions are motor steps (pan, tilt).
 """
 
@@ -21,8 +21,8 @@ class Mechanics:
         home_dead: whether the wire of an axis' home switch is broken: it never reads as pressed.
         wrong_reads: next readings of an axis' home switch that are wrong: bounce, or a spike.
         true_steps: positions of the motors; they start at 0, whatever the counters.
-        missing_steps: next steps that the motors will not do.
-        laser_on: whether light comes out.
+        missing_steps: number of next steps that the motors lose.
+        laser_on: whether the laser emits.
         lit: how often the laser was switched on.
         trigger_on: whether the cameras' trigger line is high.
         moved: called with axis and signed steps after every stretch of motion in one sense.
@@ -44,7 +44,7 @@ class Mechanics:
     _stretch: list[int] = field(default_factory=lambda: [0, 0])
 
     def switch_laser(self, on: bool) -> None:
-        """The laser's line goes high or low, or stays as it is."""
+        """Set the laser's line high or low."""
         self.lit += on and not self.laser_on
         self.laser_on = on
 
@@ -59,7 +59,7 @@ class Mechanics:
         self._stretch[axis] += sense
 
     def flush(self, axis: int) -> None:
-        """Report the stretch of motion so far to the listener."""
+        """Report the present stretch of motion to the listener."""
         stretch, self._stretch[axis] = self._stretch[axis], 0
         if stretch and self.moved is not None:
             self.moved(axis, stretch)

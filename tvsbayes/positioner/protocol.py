@@ -8,17 +8,17 @@ One text line per message, so that it can be typed, logged and searched:
 
 CRC is CRC-16/CCITT-FALSE over everything before `*`, four upper-case hexadecimal digits. SEQ is an unsigned 32 bit
 number. A request with the sequence of the last one and the same bytes is answered from the cached reply and not
-executed again; a lower sequence, or the same one with other content, is refused. All moves are absolute. So a host
-may repeat a request whose answer it did not get, as often as it wants. Four requests come with sequence 0, without a
-place in the sequence, and are accepted at any time: `>0 ID` reads the device's last number, from which a host goes on
-counting; `>0 L 0`, `>0 STOP` and `>0 ABORT` need no number that a host may have lost. Light stays on while requests
-that have a place are accepted; what is refused or unnumbered is no sign of life.
+executed again; a lower sequence, or the same one with other content, is refused. All moves are absolute. A host may
+therefore repeat an unanswered request any number of times. Four requests have sequence 0, outside the numbering, and
+are accepted at any time: `>0 ID` reads the device's last number, from which a host continues counting; `>0 L 0`,
+`>0 STOP` and `>0 ABORT` need no number, which a host may have lost. The laser stays on while numbered requests are
+accepted; refused and unnumbered requests do not feed its watchdog.
 
-Every reply carries the state: b boot id, st status, p counters, t targets, d sequence of the last motion that
-reached its target, l laser, h home deviation, s switches (1 home pressed + 2 limit open), e last error. A motion is
-done when d is its sequence, never by time.
+Every reply contains the state: b boot id, st status, p counters, t targets, d sequence of the last motion that
+reached its target, l laser, h home deviation, s switches (1 home pressed + 2 limit open), e last error. The end of a
+motion is recognised by its sequence in d, never by time.
 
-Counters are absolute motor steps (pan, tilt). No state, no input or output here.
+Counters are absolute motor steps (pan, tilt). The module has no state, input or output.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from typing import Literal, cast
 from tvsbayes.instrument.counter_limits import HOME_KEYS, CounterLimits
 
 VERSION = 2
-"""Version of this protocol; a device with another one is refused."""
+"""Version of this protocol; a device with another version is refused."""
 FIRMWARE_VERSION = "1.1.0"
 """Version of the firmware shipped with this package, which the device model reports too."""
 START_SPEED = 200
-"""Speed at which that firmware's motors start and stop without a ramp, and that of homing, steps/s."""
+"""Speed of homing, and at which that firmware's motors start and stop without a ramp, steps/s."""
 REQUEST_CHARS_MAX = 96
 """Longest request line without its line feed; a longer one is dropped up to the next line feed."""
 REPLY_CHARS_MAX = 192
@@ -61,14 +61,14 @@ SETTINGS: dict[str, tuple[int, int, int]] = {
 TRIGGER_US = (10, 1_000_000)
 """Shortest and longest pulse on the trigger line, microseconds."""
 UNNUMBERED = frozenset({("ID",), ("L", "0"), ("STOP",), ("ABORT",)})
-"""Commands, as words, that come with sequence 0."""
+"""Commands, as words, that have sequence 0."""
 LIMIT_SETTINGS = {"pan": ("pmin", "pmax"), "tilt": ("tmin", "tmax")}
 """Soft limits of an axis, lowest first, by their names in the protocol."""
 OTHER_SETTINGS = (
     *(("hp", HOME_KEYS["pan"], 1.0), ("ht", HOME_KEYS["tilt"], 1.0)),
     *(("amax", "acceleration_steps_per_s2", 1.0), ("wd", "laser_watchdog_s", 1e-3)),
 )
-"""Other settings: name in the protocol, entry of `[positioner]`, the protocol's unit in that of the entry."""
+"""Other settings: name in the protocol, entry of `[positioner]`, the protocol's unit in the unit of the entry."""
 _INTEGER = re.compile(r"0|-?[1-9][0-9]{0,9}")
 _UNSIGNED = re.compile(r"0|[1-9][0-9]{0,9}")
 _FRAME = re.compile(rb"([><!][ -)+-~]*)\*([0-9A-F]{4})")
@@ -80,7 +80,7 @@ _OF_STATE = frozenset((*_STATE_KEYS, _SWITCHES_KEY))
 
 
 class FrameError(ValueError):
-    """A line that is no message; `kind` is "frame", "crc" or "parse"."""
+    """A line that is not a valid message; `kind` is "frame", "crc" or "parse"."""
 
     def __init__(self, kind: Literal["frame", "crc", "parse"]):
         super().__init__(kind)
@@ -89,17 +89,17 @@ class FrameError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class DeviceState:
-    """The state of a device, as every reply carries it.
+    """The state of a device, as contained in every reply.
 
     Attributes:
-        boot: number drawn at every start; a new one means that counters are lost.
+        boot: number drawn at every start; a new number means that the counters are lost.
         status: "unhomed", "idle", "moving" (also while homing) or "alarm".
         pan_steps, tilt_steps: counters now.
         pan_target_steps, tilt_target_steps: target of the last motion.
         done_sequence: sequence of the last motion that reached its target, 0 for none.
         laser_on: whether the laser line is on.
-        pan_home_deviation_steps, tilt_home_deviation_steps: at the last homing, counter where the switch was found
-            minus where it should have been: not zero after lost steps.
+        pan_home_deviation_steps, tilt_home_deviation_steps: counter at which the switch was found at the last homing
+            minus its expected counter: not zero after lost steps.
         last_error: "none" or a word.
         pan_switches, tilt_switches: 1 where the home switch is pressed, plus 2 where the limit circuit is open.
     """
@@ -131,7 +131,7 @@ class DeviceState:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """An answer: `error` is None for ok, else the reason of refusal; `extra` holds fields beside the state."""
+    """An answer: `error` is None for ok, else the reason of refusal; `extra` has the fields besides the state."""
 
     sequence: int
     error: str | None
@@ -141,7 +141,7 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Unasked:
-    """A line that answers nothing: "boot" after a start, "nak" for a frame that could not be read."""
+    """A line that is no answer: "boot" after a start, "nak" for a frame that could not be read."""
 
     kind: str
     text: str
@@ -162,7 +162,7 @@ def unframe(line: bytes) -> str:
     """The body of a line (without its line feed), CRC checked.
 
     Raises:
-        FrameError: "frame" for what is no message at all, "crc" for a damaged one.
+        FrameError: "frame" for a line that is no message, "crc" for a damaged one.
     """
     match = _FRAME.fullmatch(line)
     if match is None:
@@ -190,12 +190,12 @@ def unsigned(text: str) -> int | None:
 
 
 def signed(text: str) -> int | None:
-    """A number from -2^31 to 2^31 - 1 without leading zeros, else None; "-0" is none."""
+    """A number from -2^31 to 2^31 - 1 without leading zeros, else None; "-0" is not allowed."""
     return value if _INTEGER.fullmatch(text) and STEPS_MIN <= (value := int(text)) <= STEPS_MAX else None
 
 
 def state_text(state: DeviceState) -> str:
-    """The fields of a state as every reply carries them."""
+    """The fields of a state as contained in every reply."""
     return (
         f"b={state.boot} st={state.status} p={state.pan_steps},{state.tilt_steps} "
         f"t={state.pan_target_steps},{state.tilt_target_steps} d={state.done_sequence} l={int(state.laser_on)} "
@@ -205,10 +205,10 @@ def state_text(state: DeviceState) -> str:
 
 
 def parse_answer(line: bytes) -> Reply | Unasked:
-    """Reads a line (without its line feed) that a device sent.
+    """Parse a line (without its line feed) from a device.
 
     Raises:
-        FrameError: no message, a damaged one, or one whose fields are not those of this protocol.
+        FrameError: no message, a damaged message, or other fields than those of this protocol.
     """
     body = unframe(line)
     if body.startswith("!"):
@@ -246,7 +246,7 @@ def _state(fields: dict[str, str]) -> DeviceState:
     valid = fields["st"] in STATUSES and fields["l"] in ("0", "1") and _WORD.fullmatch(fields["e"])
     if boot is None or done_sequence is None or not valid:
         raise FrameError("parse")
-    # Firmware of protocol 1 reports no switches; it is refused where its version is read.
+    # Firmware of protocol 1 reports no switches; it is refused when its version is read.
     switches = _pair(fields.get(_SWITCHES_KEY, "0,0"))
     if not all(0 <= value <= 3 for value in switches):
         raise FrameError("parse")

@@ -1,4 +1,4 @@
-"""Serial ports: those of this computer, and one of them as the driver's `Link`.
+"""Serial ports: the list of this computer's ports, and a port as the driver's `Link`.
 
 A port is opened by name and exclusively; after an unplugging the same USB device is found again, also under another
 name. Seconds where a name says `_s`.
@@ -17,7 +17,7 @@ from tvsbayes.positioner.interface import Link
 from tvsbayes.positioner.protocol import device_settings
 
 BAUD = 115_200
-"""Of a rig file that states none; a USB device ignores it."""
+"""Default baud rate; a USB device ignores it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,15 +45,15 @@ def serial_ports() -> list[Port]:
 
 
 def _ports_of(device: Port) -> list[str]:
-    """Names of all ports of the USB device that has this port."""
+    """Names of all ports of the USB device to which this port belongs."""
     usb_id = (device.vid, device.pid, device.serial_number)
     return [p.name for p in serial_ports() if (p.vid, p.pid, p.serial_number) == usb_id]
 
 
 def serial_opener(port: str, baud: int) -> Callable[[], Link]:
-    """Opens a port by name; after an unplugging, the same USB device under its new name."""
+    """Return a function that opens a port by name, or after an unplugging the same USB device under its new name."""
     device = next((p for p in serial_ports() if p.name == port and p.serial_number), None)
-    # A device may have several ports; the order of their names stays.
+    # A device may have several ports; their names keep their order.
     index = 0 if device is None else _ports_of(device).index(port)
 
     def open_link() -> Link:
@@ -98,13 +98,13 @@ def _opener_of(rig: Rig) -> Callable[[], Link]:
 
 
 class _SerialLink:
-    """pyserial as a `Link`."""
+    """A port of pyserial as a `Link`."""
 
     def __init__(self, port: str, baud: int):
         import serial
 
-        # Exclusive: a second program on the line would read our answers. Without a write time-out a stalled peer would
-        # block this program. Not `serial_for_url`, whose addresses run other code, one of which writes files.
+        # Exclusive: a second program on the line would read this program's answers. Without a write time-out a stalled
+        # peer would block this program. `serial_for_url` is avoided: some of its addresses write files.
         self._serial = serial.Serial(None, baud, timeout=0.1, write_timeout=1.0)
         if hasattr(self._serial, "exclusive"):
             self._serial.exclusive = True
@@ -112,7 +112,7 @@ class _SerialLink:
         try:
             self._serial.open()
         except ValueError as error:
-            # A name or speed that the system cannot even try, such as one with a NUL.
+            # The system cannot even try the name or speed, such as a name with a NUL.
             raise OSError(str(error)) from error
 
     def write(self, data: bytes) -> None:

@@ -1,6 +1,6 @@
-"""Why a device does not answer: what was received instead, and the remedy.
+"""Why a device does not answer: the bytes received instead, and the remedy.
 
-The bytes that did arrive distinguish most causes; they are quoted. No input or output here.
+The received bytes distinguish most causes and are quoted. The module has no input or output.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from tvsbayes.errors import escaped
 from tvsbayes.positioner.protocol import FrameError, parse_answer
 
 HEARD_BYTES_MAX = 400
-"""Received bytes that are kept, from the beginning: greetings and first errors are there."""
+"""Number of received bytes kept from the beginning, where greetings and first errors stand."""
 QUOTED_CHARS_MAX = 80
 UNREADABLE_SHARE = 0.3
-"""Share of bytes that are no text above which the baud rate counts as wrong; texts of boards have none."""
+"""Share of non-text bytes above which the baud rate counts as wrong; boards send text only."""
 Cause = Literal["silence", "grbl", "marlin", "cr-lf", "nak", "unreadable", "other"]
 _GRBL = re.compile(rb"Grbl |ALARM:\d|error:\d|\[MSG:|<(?:Idle|Alarm|Run|Home|Hold|Door|Check|Sleep)[|,]")
 _MARLIN = re.compile(rb"Marlin|echo:|Unknown command|^start\r?$|\bT:\d", re.MULTILINE)
@@ -39,12 +39,12 @@ _BOARDS: tuple[tuple[Cause, re.Pattern[bytes], str, str], ...] = (
 
 @dataclass(frozen=True)
 class Heard:
-    """What was received instead of an answer.
+    """Explanation of bytes received instead of an answer.
 
     Attributes:
-        cause: in a word.
-        found: in words, with the quotation.
-        remedy: what to do.
+        cause: the cause, in one word.
+        found: description, with the quotation.
+        remedy: the remedy.
     """
 
     cause: Cause
@@ -53,7 +53,7 @@ class Heard:
 
 
 def explained(heard: bytes) -> Heard:
-    """The cause, from the bytes that arrived before the time-out; lines may be incomplete."""
+    """Determine the cause from the bytes that arrived before the time-out; lines may be incomplete."""
     quote = _quoted(heard)
     if not heard:
         remedy = "check the device's supply, the cable and [positioner] port; flash the firmware if it is a new board"
