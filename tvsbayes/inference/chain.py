@@ -1,4 +1,4 @@
-"""A chain of an ensemble: all that continues it bit for bit. Arrays are ordered (step, walker, ...)."""
+"""The state of an ensemble chain, from which it continues bit for bit. Arrays are ordered (step, walker, ...)."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Chain:
-    """Everything a run has done: enough to continue it bit for bit.
+    """A chain so far, with all that is needed to continue it bit for bit.
 
     Attributes:
         w: positions, shape (steps, walkers, d); log_density: relative to the mode, shape (steps, walkers).
         accepted: accepted moves by walker.
-        random_state: NumPy's legacy generator after the last step.
-        invalid: evaluations that gave no number.
-        seconds: spent so far, importance sampling included.
-        goal: steps at which convergence is looked at next.
+        random_state: state of NumPy's legacy generator after the last step.
+        invalid: number of evaluations without a finite value.
+        seconds: time spent so far, importance sampling included.
+        goal: number of steps at which convergence is tested next.
     """
 
     w: np.ndarray

@@ -1,6 +1,6 @@
-"""What inference needs of an instrument: a log density in few coordinates, and draws of what was integrated out.
+"""Interface of an instrument to inference: a log density in few coordinates, and draws of quantities integrated out.
 
-Coordinates w (n, d) of many points at once; arrays are NumPy's, whatever computes them.
+Coordinates w (n, d) hold many points at once; arrays are NumPy's.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Points:
-    """Points with what a density says of them.
+    """Points with their log densities.
 
     Attributes:
         w: coordinates, shape (n, d).
         log_target: log density there, -inf where it has no value, shape (n,).
-        parts: what else the density keeps of every point, by name, shapes (n, ...): what it was mapped to, a draw of
-            what was integrated out.
+        parts: further arrays of the density for every point, by name, shapes (n, ...): mapped coordinates, draws of
+            quantities integrated out.
     """
 
     w: np.ndarray
@@ -32,14 +32,14 @@ class Points:
         return len(self.w)
 
     def taken(self, places: np.ndarray | slice) -> Points:
-        """Those at places."""
+        """Return the points at these indices."""
         return Points(
             self.w[places], self.log_target[places], {name: part[places] for name, part in self.parts.items()}
         )
 
     @classmethod
     def joined(cls, several: Iterable[Points]) -> Points:
-        """One after the other; the empty ones have no parts."""
+        """Concatenate sets of points, skipping empty ones, which have no parts."""
         each = [points for points in several if len(points)]
         return cls(
             np.concatenate([points.w for points in each]),
@@ -49,15 +49,15 @@ class Points:
 
 
 class Density(Protocol):
-    """A posterior as samplers see it.
+    """A posterior as samplers use it.
 
     Attributes:
         dimension: d.
-        headlines: names of the quantities that a sample is judged by.
-        fixed: quantities that are held, whatever rounding makes of them.
-        walkers: in an ensemble.
-        log_constant: what the log of the integral of exp(log density) lacks to the model evidence.
-        invalid: evaluations so far without a value.
+        headlines: names of the quantities by which a sample is judged.
+        fixed: quantities that are constant but for rounding.
+        walkers: number of walkers in an ensemble.
+        log_constant: log model evidence less the log of the integral of exp(log density).
+        invalid: number of evaluations so far without a value.
     """
 
     @property
@@ -74,28 +74,28 @@ class Density(Protocol):
     def invalid(self) -> int: ...  # noqa: D102
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
-        """Log density of w (n, d) up to a constant, -inf where it has no value."""
+        """Compute the log density of w (n, d) up to a constant, -inf where it has no value."""
         ...
 
     def valued(self, w: np.ndarray, generator: np.random.Generator) -> Points:
-        """The same, with draws of what was integrated out."""
+        """Compute the same, with draws of the quantities integrated out."""
         ...
 
     def log_density(self, points: Points) -> np.ndarray:
-        """Log density in the coordinates that are reported, shape (n,)."""
+        """Return the log density in the reported coordinates, shape (n,)."""
         ...
 
     def quantities(self, points: Points) -> Mapping[str, np.ndarray]:
-        """Everything that is said of a point, by name, shapes (n,)."""
+        """Compute all reported quantities by name, shapes (n,)."""
         ...
 
     def first_proposal(self) -> Proposal:
-        """Where draws are proposed before any was made."""
+        """Return the proposal to use before any draw exists."""
         ...
 
 
 class Proposal(Protocol):
-    """A density that draws come from and that learns from them."""
+    """A proposal density, which can be fitted to its draws."""
 
     def draw(self, count: int, generator: np.random.RandomState) -> np.ndarray:
         """Independent draws, shape (count, d)."""
@@ -106,7 +106,7 @@ class Proposal(Protocol):
         ...
 
     def fitted(self, w: np.ndarray, log_target: np.ndarray, log_weights: np.ndarray) -> Proposal:
-        """Nearer to the target as weighted draws show it."""
+        """Return a proposal fitted to weighted draws of the target."""
         ...
 
     @property
@@ -124,6 +124,6 @@ class Step(Protocol):
 
 
 def columns_of(density: Density, points: Points) -> dict[str, np.ndarray]:
-    """Draws of every quantity that is not the same in all of them, and `log_density`."""
+    """Return draws of every quantity that varies, and `log_density`."""
     every = {**density.quantities(points), "log_density": density.log_density(points)}
     return {name: column for name, column in every.items() if name not in density.fixed and np.ptp(column) > 0}

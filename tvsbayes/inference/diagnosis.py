@@ -1,7 +1,7 @@
 """Whether a chain may be used: R-hat over groups of walkers, effective draws, stuck walkers, agreement with tier 1.
 
-Judged on the stored draws, so that what ArviZ computes from `posterior.nc` is what was judged. Draws are ordered
-(chain, draw, ...); a chain is a walker.
+The stored draws are judged, so that ArviZ computes the same figures from `posterior.nc`. Draws are ordered (chain,
+draw, ...); a chain is a walker.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from tvsbayes.results.tiers import CHAIN
 from tvsbayes.statistics.streams import Stream, random_stream
 
 GROUPS = 4
-"""Of walkers that share no partners: chains that know nothing of each other, for R-hat."""
+"""Number of groups of walkers that share no partners: independent chains for R-hat."""
 RHAT_LIMIT = 1.01
 ESS_LIMIT = 400
 TAU_LIMIT = 50
-"""Limits of formulation 4.3: rank R-hat by group; bulk and tail effective draws, which make R-hat and the errors sound
-(Vehtari et al., Bayesian Analysis 16 (2021) 667); steps in autocorrelation times. How well headlines are known is asked
-of their Monte Carlo errors, as of importance sampling."""
+"""Limits of formulation 4.3: rank R-hat by group; bulk and tail effective draws, which make R-hat and the errors
+reliable (Vehtari et al., Bayesian Analysis 16 (2021) 667); steps in autocorrelation times. Monte Carlo errors of
+headlines have limits of their own, as in importance sampling."""
 ROUGH_RHAT = 1.05
-"""From which groups of walkers do not say the same, not even roughly."""
+"""R-hat above which groups of walkers do not agree even roughly."""
 AGREEMENT_LIMIT = 4.0
-"""Monte Carlo errors by which a headline's mean or interval end may differ from importance sampling's. Of some thirty
-comparisons one lies farther out in two of a thousand fits."""
+"""Monte Carlo errors by which a headline's mean or interval end may differ from importance sampling's. In two of a
+thousand fits one of some thirty comparisons differs more by chance."""
 STUCK_ACCEPTANCE = 0.25
 """A walker is stuck that accepts less than this share of what the median walker accepts ..."""
 STUCK_DEVIATION = 8.0
 """... or whose mean log density lies this many median absolute deviations, and a standard deviation of a single draw,
-off the others': the means of long chains spread so little that one rare excursion would fail the first alone."""
+off the others': means of long chains scatter so little that a rare excursion exceeds the first limit."""
 WARM_UP = 10
-"""One step of so many is left out: with the autocorrelation times that are asked of the rest, more than five."""
+"""The first 1/10 of the steps is discarded: more than five autocorrelation times at `TAU_LIMIT`."""
 STORED_DRAWS = 48
-"""Draws stored per walker: from this many to twice as many, some four thousand in all."""
+"""Draws stored per walker: this many to twice as many, some four thousand in all."""
 
 
 @dataclass(frozen=True)
 class ChainQuality:
-    """Numbers behind the verdict: of the columns `names`, of which some are headlines, and of the walkers."""
+    """Numbers behind the verdict, for the columns `names` (some are headlines) and for the walkers."""
 
     names: tuple[str, ...]
     rhat: np.ndarray
@@ -58,7 +58,7 @@ class ChainQuality:
 
     @property
     def missing(self) -> list[str]:
-        """Which limits are not met, in sentences; NaN meets none."""
+        """Say in sentences which limits are not met; NaN meets none."""
         missing = []
         if not np.max(self.rhat) <= RHAT_LIMIT:
             worst = self.names[int(np.nanargmax(self.rhat))]
@@ -75,15 +75,15 @@ class ChainQuality:
         return missing
 
     def by_name(self, values: np.ndarray) -> dict[str, float]:
-        """One of the arrays by the names of its columns."""
+        """Return one of the arrays as a mapping from column name to value."""
         return dict(zip(self.names, map(float, values), strict=True))
 
 
 def autocorrelation_steps(w: np.ndarray) -> float:
-    """Longest integrated autocorrelation time of positions (steps, walkers, d), steps.
+    """Compute the longest integrated autocorrelation time of positions (steps, walkers, d), in steps.
 
-    A walker that kept its value of a coordinate has no autocorrelation there; one that hardly moves is found by its
-    acceptance. Infinite where no walker moved along some coordinate.
+    A walker that never changed a coordinate has no autocorrelation there; one that hardly moves is found by its
+    acceptance. The time is infinite where no walker moved along some coordinate.
     """
     moved = np.ptp(w, axis=0) > 0
     if not moved.any(axis=0).all():
@@ -93,20 +93,20 @@ def autocorrelation_steps(w: np.ndarray) -> float:
 
 
 def steps_wanted(chain: Chain) -> float:
-    """How many steps its autocorrelation times so far ask of a chain; infinite if no walker moved."""
+    """Estimate from the autocorrelation times so far how many steps a chain needs; infinite if no walker moved."""
     discarded = len(chain.w) // WARM_UP
     return TAU_LIMIT * autocorrelation_steps(chain.w[discarded:]) * len(chain.w) / (len(chain.w) - discarded)
 
 
 def grouped(values: np.ndarray) -> np.ndarray:
-    """Draws (walker, draw, ...) as those of `GROUPS` groups of neighbours (group, draws, ...), in order of time."""
+    """Join draws (walker, draw, ...) of neighbouring walkers into groups (group, draws, ...), in order of time."""
     walkers, draws, *rest = values.shape
     parts = values.reshape(GROUPS, walkers // GROUPS, draws, *rest)
     return np.swapaxes(parts, 1, 2).reshape(GROUPS, -1, *rest)
 
 
 def stuck_walkers(chain: Chain, discarded: int) -> np.ndarray:
-    """Walkers that hardly move, or live at another density than most, shape (walkers,)."""
+    """Find walkers that hardly move, or whose density differs from most, shape (walkers,)."""
     acceptance = chain.accepted / len(chain.w)
     means = chain.log_density[discarded:].mean(axis=0)
     deviation = np.abs(means - np.median(means))
@@ -117,13 +117,13 @@ def stuck_walkers(chain: Chain, discarded: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Of a chain with the weighted draws: mean, lower and upper end of the columns `names`, shape (3, n).
+    """Comparison of a chain with the weighted draws: mean, lower and upper end of the columns `names`, shape (3, n).
 
     Attributes:
-        names: of quantities.
+        names: names of quantities.
         gap: difference.
         error: its Monte Carlo standard error.
-        sd: of the posterior, shape (n,).
+        sd: standard deviations of the posterior, shape (n,).
     """
 
     names: tuple[str, ...]
@@ -133,14 +133,14 @@ class Comparison:
 
     @property
     def agreement(self) -> Agreement:
-        """By the largest difference in its errors."""
+        """Judge the agreement by the largest difference over its error."""
         labels = [f"{name}, {what}" for what in ("mean", "lower end", "upper end") for name in self.names]
         worst = extreme(dict(zip(labels, (self.gap / self.error).ravel().tolist(), strict=True)), max)
         return Agreement(worst.value < AGREEMENT_LIMIT, AGREEMENT_LIMIT, worst)
 
     @property
     def gaps(self) -> dict[str, MonteCarloError]:
-        """Differences in posterior sds: where they are no chance, what sampling may have moved."""
+        """Return the differences in posterior sds: possible errors of sampling where they are not chance."""
         rows = zip(*(self.gap / self.sd).tolist(), strict=True)
         return {name: MonteCarloError(mean, (*ends,)) for name, (mean, *ends) in zip(self.names, rows, strict=True)}
 
@@ -148,10 +148,10 @@ class Comparison:
 def compared(
     first: Sample, quantities: Mapping[str, np.ndarray], shape: tuple[int, int], names: tuple[str, ...]
 ) -> Comparison:
-    """Draws (chain, draw) with the weighted ones, by the columns of those names that vary; by all if none does."""
+    """Compare draws (chain, draw) with the weighted draws, by the named columns that vary; by all if none does."""
     theirs = first.quantities
     varying = [name for name in quantities if np.ptp(quantities[name]) > 0 and np.ptp(theirs[name]) > 0]
-    # Where nothing that a fit is for is left open, everything else stands for it.
+    # Where no headline varies, all other quantities are compared.
     names = tuple(name for name in names if name in varying) or tuple(varying)
     ours = propagated(np.stack([quantities[name].reshape(shape) for name in names], axis=-1))
     weighted = first.summarised(np.stack([theirs[name].reshape(first.weights.shape) for name in names], axis=-1))
@@ -161,8 +161,8 @@ def compared(
 
 
 def quality_of(chain: Chain, discarded: int, columns: Mapping[str, np.ndarray], shape: tuple[int, int]) -> ChainQuality:
-    """By columns of the stored draws (walker, draw)."""
-    # It puts a module of JAX's name among those that are loaded.
+    """Compute the quality of a chain from columns of the stored draws (walker, draw)."""
+    # Imported here: it loads a module named as JAX.
     from arviz_stats.base import array_stats
 
     values = np.stack([column.reshape(shape) for column in columns.values()], axis=2)
@@ -181,7 +181,7 @@ def quality_of(chain: Chain, discarded: int, columns: Mapping[str, np.ndarray], 
 def chain_errors(
     headlines: tuple[str, ...], quantities: Mapping[str, np.ndarray], shape: tuple[int, int]
 ) -> dict[str, MonteCarloError]:
-    """Of the headlines that vary, by draws (walker, draw) of a chain."""
+    """Compute Monte Carlo errors of the headlines that vary, from draws (walker, draw) of a chain."""
     names = [name for name in headlines if np.ptp(quantities[name]) > 0]
     if not names:
         return {}
@@ -189,7 +189,7 @@ def chain_errors(
 
 
 def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
-    """Leave out the warm-up, thin, draw what was integrated out, and judge what is left."""
+    """Discard the warm-up, thin, draw the quantities integrated out, and judge the remaining chain."""
     density, first = start.density, start.sample
     discarded = len(chain.w) // WARM_UP
     thin = max(1, (len(chain.w) - discarded) // STORED_DRAWS)
@@ -205,7 +205,7 @@ def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
     if not missing and first.convergence.answer == "accepted":
         beside = compared(first, quantities, shape, density.headlines)
         same = beside.agreement
-        # What two samplers do not agree on is known no better than they agree.
+        # Where two samplers disagree, their difference is the error.
         errors = errors if same.agrees else errors | beside.gaps
     if same is not None and not same.agrees:
         gap = f"by {same.worst.value:.1f} Monte Carlo errors, wanted below {AGREEMENT_LIMIT:g}"

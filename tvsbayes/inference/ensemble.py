@@ -22,13 +22,13 @@ from tvsbayes.results.convergence import Convergence, Reweighted
 
 FIRST_CHECK = 200
 GROWTH_RANGE = 1.1, 1.6
-"""Steps at the first look at convergence; least and largest growth of the chain from one look to the next."""
+"""Steps at the first test of convergence; least and largest growth of the chain from one test to the next."""
 LENGTHENING_RANGE = 1.05, 1.6
-"""The same where only autocorrelation times were looked at, which takes little."""
+"""Growth where only autocorrelation times were computed, which takes little time."""
 MARGIN = 1.1
-"""On the steps that a look says are needed."""
+"""Factor on the steps that a test of convergence predicts to be needed."""
 SETTLED = 4
-"""Times the effective draws that are wanted, with which a chain that still disagrees will not come to agree."""
+"""A chain with this many times the required effective draws that still disagrees will not come to agree."""
 BLOCK = 50
 CHECKPOINT_SECONDS = 20.0
 
@@ -41,14 +41,14 @@ class GroupEvolution(emcee.moves.DEMove):
     """
 
     def __init__(self):
-        # Fewer walkers than twice the dimension let differential evolution explore a subspace only; all other moves
+        # With fewer walkers than twice the dimension, differential evolution explores a subspace only; all other moves
         # leave it.
         super().__init__(randomize_split=False, live_dangerously=True)
 
     def get_proposal(
         self, s: np.ndarray, c: list[np.ndarray], random: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The protocol of `emcee.moves.RedBlueMove`: new places for the half s, given the other."""
+        """Propose new positions for the half s, given the other, as `emcee.moves.RedBlueMove` requires."""
         others = np.split(np.concatenate(c), GROUPS)
         moved = [
             super(GroupEvolution, self).get_proposal(half, [other], random)[0]
@@ -58,7 +58,7 @@ class GroupEvolution(emcee.moves.DEMove):
 
 
 def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
-    """The proposal's steps and, for the rest, differential evolution, which needs no proposal.
+    """Return the proposal's steps and, for the remaining share, differential evolution, which needs no proposal.
 
     Never emcee 3.1.6's snooker or full-covariance Gaussian: both are biased.
     """
@@ -68,7 +68,7 @@ def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
 
 
 def lengthening(convergence: Convergence) -> float:
-    """How many times longer a chain must be to have the autocorrelation times and effective draws that are wanted."""
+    """Estimate the factor in length by which a chain meets the limits of autocorrelation times and effective draws."""
     wanted = TAU_LIMIT * convergence.tau_steps / (convergence.steps - convergence.discarded)
     for ess in (convergence.ess_bulk, convergence.ess_tail):
         wanted = max(wanted, ESS_LIMIT / min(ess.values()))
@@ -76,15 +76,15 @@ def lengthening(convergence: Convergence) -> float:
 
 
 def next_look(chain: Chain, convergence: Convergence) -> int:
-    """Steps at which a chain that has not converged is worth another look; depends on the chain alone."""
+    """Choose the number of steps at which to test convergence again; it depends on the chain alone."""
     wanted = lengthening(convergence)
-    # Where length is not what it lacks, a little more will not help either.
+    # Where the chain is long enough but fails otherwise, a little more length will not help.
     growth = np.clip(MARGIN * wanted if 1 < wanted < np.inf else np.inf, *GROWTH_RANGE)
     return int(np.ceil(len(chain.w) * growth))
 
 
 class Run[D: Density]:
-    """One call of a sampler: steps in blocks, looks on a schedule that depends on the chain alone."""
+    """One call of a sampler: steps in blocks, tests of convergence on a schedule that depends on the chain alone."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class Run[D: Density]:
         self.sampler.log_prob_fn = density
 
     def chain(self) -> Chain:
-        """All steps so far, earlier runs included."""
+        """Return all steps so far, earlier runs included."""
         seconds = self.before.seconds + time.monotonic() - self.began
         if self.sampler.iteration == 0:
             return Chain(**{**vars(self.before), "goal": self.goal})
@@ -131,7 +131,7 @@ class Run[D: Density]:
         self.saved_at = time.monotonic()
 
     def advance(self, steps: int) -> None:
-        """Continue from the last whole step; the generator goes on where it stood."""
+        """Continue from the last whole step, with the generator's state there."""
         if self.sampler.iteration:
             state = self.sampler.get_last_sample()
         elif len(self.before.w):
@@ -144,7 +144,7 @@ class Run[D: Density]:
             pass
 
     def look(self) -> tuple[Sample, bool]:
-        """The sample so far, and whether it is the last word; else the next look is set."""
+        """Diagnose the sample so far and say whether it is final; else set the next test."""
         chain = self.chain()
         sample = diagnose(self.start, chain)
         convergence = sample.convergence
@@ -156,7 +156,7 @@ class Run[D: Density]:
         return sample, False
 
     def too_short(self) -> bool:
-        """Whether autocorrelation times alone ask for more steps; then the next look is set."""
+        """Whether autocorrelation times alone require more steps; then the next test is set."""
         chain = self.chain()
         growth = steps_wanted(chain) / len(chain.w)
         if growth <= 1:
@@ -165,9 +165,9 @@ class Run[D: Density]:
         return True
 
     def until_converged(self, seconds: float) -> Sample:
-        """Extend, look, extend."""
+        """Extend the chain and test its convergence, until it has converged or the time is over."""
         done, towards = len(self.before.w), OpenEnded()
-        # An interrupted chain is first brought to its next look: it ends where an unbroken run ends.
+        # An interrupted chain is first extended to its next test, so that it ends where an uninterrupted run ends.
         if done >= self.goal and not self.too_short():
             sample, ended = self.look()
             if ended:
@@ -193,20 +193,20 @@ class Run[D: Density]:
 
 
 def hopeless(convergence: Convergence) -> bool:
-    """Whether nothing but the agreement with importance sampling is missing of a chain far longer than wanted."""
+    """Whether a chain far longer than required fails by its disagreement with importance sampling alone."""
     disagrees = convergence.agreement is not None and not convergence.agreement.agrees
     return disagrees and len(convergence.missing) == 1 and SETTLED * lengthening(convergence) <= 1
 
 
 class Judged(Protocol):
-    """What has an answer."""
+    """A result with a convergence record."""
 
     @property
     def convergence(self) -> Convergence | Reweighted: ...  # noqa: D102
 
 
 def better[J: Judged](early: J, walked: J) -> J:
-    """Of weighted draws and a chain the one with the better answer, the chain of two that are as good.
+    """Choose weighted draws or a chain by the better answer, the chain where both are equally good.
 
     A chain that contradicts the weighted draws leaves neither accepted.
     """

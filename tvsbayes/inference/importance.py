@@ -1,11 +1,11 @@
-"""The posterior by importance sampling: independent draws from a proposal that follows it, weighted (formulation 4.3).
+"""The posterior by importance sampling: weighted independent draws from a proposal close to it (formulation 4.3).
 
-Where the draws of a proposal would take too long to be accepted, they teach the next one, and take no part in the
-posterior: a proposal fitted to a draw is high where that draw is, whose weight would come out too small (Marin, Pudlo
-and Sedki, Bernoulli 25 (2019) 1977). Pilot rounds teach the proposal of a density of its own kind before the first of
-these draws: pooled, each weighted by the target over the mixture of all proposals that made them, the balance
-heuristic (Veach and Guibas, SIGGRAPH 95, 419; Owen and Zhou, J. Am. Stat. Assoc. 95 (2000) 135), so that a poor first
-round costs little.
+Where the draws of a proposal would take too long to be accepted, the next proposal is fitted to them, and they are left
+out of the posterior. A proposal fitted to a draw is high at that draw, whose weight would then be too small (Marin,
+Pudlo and Sedki, Bernoulli 25 (2019) 1977). For densities that the first proposal fits badly, pilot rounds adapt it
+before. Their draws are pooled, each weighted by the target over the mixture of all proposals, the balance heuristic
+(Veach and Guibas, SIGGRAPH 95, 419; Owen and Zhou, J. Am. Stat. Assoc. 95 (2000) 135), so that a poor first round costs
+little.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ from tvsbayes.statistics.weighted_draws import (
 
 ROUND = 1024
 PILOT_ROUNDS = 2
-"""Pilot rounds, at least, where there are any; after each of them the proposal is fitted to all draws so far."""
+"""Least number of pilot rounds, where there are any; after each the proposal is fitted to all draws so far."""
 PILOT_EFFECTIVE = 200.0
-"""Draws that weighted pilot draws must be worth."""
+"""Effective sample size that the pilot draws must reach."""
 ROUNDS_MAX = 64
-"""All rounds of all proposals: the budget."""
+"""Largest number of rounds of all proposals."""
 ROUNDS_LEAST = 3
-"""Of fewer rounds nobody knows how many effective draws they have."""
+"""Least number of rounds: fewer do not determine their effective sample size."""
 PATIENCE = 3
-"""A proposal is fitted anew if it would take more than this many times the rounds that it has had."""
+"""A new proposal is fitted if the present one would need more than this many times its rounds so far."""
 K_MAX = 0.7
 """Tail index from which weighted means cannot be trusted, however many the draws ..."""
 ROUGH_K_MAX = 1.0
@@ -64,11 +64,11 @@ HEAVIEST_MAX, ROUGH_HEAVIEST_MAX = 0.05, 0.2
 
 @dataclass(frozen=True)
 class Pool:
-    """Weighted draws and what they were drawn from.
+    """Weighted draws and the proposals that they were drawn from.
 
     Attributes:
         points: draws, round by round; None before the first.
-        proposals: that made them; counts: how many each, in order.
+        proposals: proposals of the draws; counts: draws of each, in order.
         next_proposal: fitted to all of them.
         invalid: draws whose density has no value.
     """
@@ -81,32 +81,32 @@ class Pool:
 
     @classmethod
     def empty(cls, proposal: Proposal, invalid: int = 0) -> Pool:
-        """Before the first round."""
+        """Return a pool before its first round."""
         return cls(None, (), (), proposal, invalid)
 
     @property
     def drawn(self) -> Points:
-        """The draws, of which there must be some."""
+        """Return the draws; there must be some."""
         assert self.points is not None
         return self.points
 
     @property
     def log_weights(self) -> np.ndarray:
-        """Log (target / mixture of the proposals), shape (n,)."""
+        """Compute log (target / mixture of the proposals), shape (n,)."""
         each = np.stack([proposal.log_density(self.drawn.w) for proposal in self.proposals])
         share = np.log(np.array(self.counts) / len(self.drawn))
         return self.drawn.log_target - np.logaddexp.reduce(each + share[:, None], axis=0)
 
     @property
     def refitted(self) -> Proposal:
-        """The next proposal fitted to all draws."""
+        """Fit the next proposal to all draws."""
         return self.next_proposal.fitted(self.drawn.w, self.drawn.log_target, self.log_weights)
 
     def extended(self, density: Density, generator: np.random.RandomState, fitted: bool) -> Pool:
-        """With another round; the proposal is fitted again if `fitted`."""
+        """Add another round; fit the proposal to all draws if `fitted`."""
         proposal, before = self.next_proposal, density.invalid
         w = proposal.draw(ROUND, generator)
-        # A stream of its own: what was integrated out leaves the draws of w as they are.
+        # A separate stream: drawing the quantities integrated out must not change the draws of w.
         valued = density.valued(w, random_stream(0 if self.points is None else len(self.points), Stream.POOLED_ROUNDS))
         proposals, counts = self.proposals, self.counts
         if proposals and proposals[-1] is proposal:
@@ -123,10 +123,10 @@ class Pool:
 
 
 def piloted(density: Density, generator: np.random.RandomState, rounds_max: int) -> Pool:
-    """Without draws, from the proposal that the pilot rounds arrive at.
+    """Return an empty pool with the proposal fitted in pilot rounds.
 
-    Every round is fitted to all before it. They go on up to `rounds_max` until their weights are worth
-    `PILOT_EFFECTIVE` draws: a density of its own kind, which the first proposal does not know, is learnt in many.
+    The proposal of a round is fitted to all rounds before it. Rounds continue until their effective sample size is
+    `PILOT_EFFECTIVE`, at most `rounds_max`: a density far from the first proposal needs many.
     """
     pilot = Pool.empty(density.first_proposal())
     for number in range(1, rounds_max + 1):
@@ -148,10 +148,10 @@ class Sample:
 
     Attributes:
         points: draws, chains joined.
-        quantities: of all draws, by name, shapes (n,).
+        quantities: quantities of all draws by name, shapes (n,).
         weights: of the draws, sum 1, shape (chain, draw).
         convergence: the diagnosis.
-        seconds: spent on it.
+        seconds: time spent on it.
     """
 
     points: Points
@@ -162,24 +162,24 @@ class Sample:
 
     @property
     def tier(self) -> Tier:
-        """What made the draws: weighted independent draws, or the equal ones of a chain."""
+        """Return the tier of the draws: weighted independent draws, or equally weighted ones of a chain."""
         return self.convergence.tier
 
     def summarised(self, values: np.ndarray) -> Propagated:
-        """Mean, sd, interval and errors of values (chain, draw, ...), one for every draw."""
+        """Compute mean, sd, interval and errors of values (chain, draw, ...), one for every draw."""
         return reweighted(values, self.weights) if self.tier == IMPORTANCE else propagated(values)
 
     def equal(self, count: int, generator: np.random.Generator) -> np.ndarray:
-        """Coordinates (count, d) of draws that weigh the same, in random order."""
+        """Resample coordinates (count, d) with equal weights, in random order."""
         return self.points.w[generator.permutation(systematic(self.weights.ravel(), count, generator.random()))]
 
 
 @dataclass(frozen=True)
 class Weighing:
-    """A pool by the weights of its draws: whether they may be used, which a look at the headlines says, and for what.
+    """A pool with the weights of its draws, and whether these meet the limits for the headlines.
 
     Attributes:
-        density: whose posterior it is.
+        density: density of the posterior.
         pool: the draws.
     """
 
@@ -188,52 +188,52 @@ class Weighing:
 
     @cached_property
     def log_weights(self) -> np.ndarray:
-        """Of all draws, shape (n,)."""
+        """Compute log weights of all draws, shape (n,)."""
         return self.pool.log_weights
 
     @cached_property
     def finite(self) -> np.ndarray:
-        """Draws whose density has a value, shape (n,); only these have weights."""
+        """Mark draws whose density has a value, shape (n,); only these have weights."""
         return np.isfinite(self.log_weights)
 
     @cached_property
     def smoothed(self) -> SmoothedWeights:
-        """Weights, and their tail index."""
+        """Compute smoothed weights and their tail index."""
         return smoothed_weights(self.log_weights[self.finite])
 
     @cached_property
     def points(self) -> Points:
-        """The draws that have weights."""
+        """Return the draws that have weights."""
         return self.pool.drawn.taken(self.finite)
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:
-        """Draws of every quantity that is not the same in all of them."""
+        """Return draws of every quantity that varies."""
         return columns_of(self.density, self.points)
 
     def summary(self, names: Sequence[str]) -> WeightedSummary:
-        """Of the columns of those names."""
+        """Summarise the columns of these names."""
         return weighted_summary(np.stack([self.columns[name] for name in names], axis=1), self.smoothed.weights)
 
     @cached_property
     def headlines(self) -> tuple[str, ...]:
-        """What the draws are judged by; all quantities where no headline is left open."""
+        """Return the headlines by which the draws are judged; all quantities where no headline varies."""
         return tuple(name for name in self.density.headlines if name in self.columns) or tuple(self.columns)
 
     @cached_property
     def monte_carlo_error(self) -> dict[str, MonteCarloError]:
-        """Of every headline."""
+        """Compute the Monte Carlo error of every headline."""
         return monte_carlo_errors(self.headlines, self.summary(self.headlines))
 
     @property
     def log_evidence(self) -> float:
-        """Log of the integral of likelihood times prior: the mean weight, and the constants of the density."""
+        """Compute the log of the integral of likelihood times prior, by the mean weight and the density's constants."""
         highest = np.max(self.log_weights)
         return float(highest + np.log(np.mean(np.exp(self.log_weights - highest))) + self.density.log_constant)
 
     @cached_property
     def importance(self) -> Importance:
-        """The weights judged by the headlines."""
+        """Judge the weights by the headlines."""
         summary = self.summary(self.headlines)
         raw = np.exp(self.log_weights - np.max(self.log_weights))
         kish, count = effective_draws(raw), len(self.log_weights)
@@ -263,13 +263,13 @@ class Weighing:
 
     @property
     def rounds_wanted(self) -> float:
-        """How many rounds of the same proposal an accepted answer takes, as far as the draws say."""
+        """Estimate from the draws how many rounds of the same proposal an accepted answer needs."""
         importance = self.importance
         factor = max(e.rounds_factor for e in self.monte_carlo_error.values())
         return importance.rounds * max(factor, importance.heaviest_share / HEAVIEST_MAX)
 
     def sample(self, seconds: float) -> Sample:
-        """All of them, on which `seconds` were spent."""
+        """Return all draws as a sample on which `seconds` were spent."""
         every = self.summary(list(self.columns))
         convergence = Reweighted(
             self.importance,
@@ -283,12 +283,12 @@ class Weighing:
 
 
 def k_max(draws: int) -> float:
-    """Largest tail index with which the smoothed weights of so many draws can be trusted (Vehtari et al. 2024, 3.2)."""
+    """Compute the largest tail index at which this many smoothed weights are reliable (Vehtari et al. 2024, 3.2)."""
     return min(1 - 1 / np.log10(draws), K_MAX)
 
 
 def lacking(pareto: float, heaviest: float, draws: int, errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
-    """What an accepted answer lacks, in sentences.
+    """Say in sentences which limits of an accepted answer are not met.
 
     Args:
         pareto: tail index of the weights.
@@ -306,7 +306,7 @@ def lacking(pareto: float, heaviest: float, draws: int, errors: Mapping[str, Mon
 
 
 def uncertain(errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
-    """The headline that sampling knows worst, in a sentence; none where all are known well enough."""
+    """Name in a sentence the headline of the largest Monte Carlo error; none where all errors are within limits."""
     bad = {name: e for name, e in errors.items() if not e.within(MEAN_ERROR_MAX, END_ERROR_MAX)}
     if not bad:
         return ()
@@ -318,7 +318,7 @@ def uncertain(errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ImportanceRun[D: Density]:
-    """What importance sampling leaves for a chain: the density, the pool of draws, and the posterior by them."""
+    """Result of importance sampling, from which a chain may start: density, pool of draws, sample."""
 
     density: D
     pool: Pool
@@ -326,7 +326,7 @@ class ImportanceRun[D: Density]:
     seed: int
 
     def extended(self, rounds: int) -> ImportanceRun[D]:
-        """With so many rounds in all, the further ones from the same proposal."""
+        """Extend to so many rounds in all, the further ones from the same proposal."""
         began, pool = time.monotonic(), self.pool
         generator = np.random.RandomState([self.seed, len(pool.drawn)])
         for _ in range(rounds - len(pool.drawn) // ROUND):
@@ -336,11 +336,11 @@ class ImportanceRun[D: Density]:
 
     @cached_property
     def proposal(self) -> Proposal:
-        """Fitted to all draws: a chain that starts from them is right whatever it is proposed."""
+        """Fit the proposal to all draws; a chain is valid for any proposal."""
         return self.pool.refitted
 
     def starts(self, count: int) -> np.ndarray:
-        """Weighted draws of w without replacement, shape (count, d)."""
+        """Draw starts w by weight without replacement, shape (count, d)."""
         log_weights = self.pool.log_weights
         generator = np.random.RandomState(self.seed)
         # Gumbel's trick: the largest perturbed weights are a weighted sample without replacement.
@@ -356,14 +356,14 @@ def weighted_run[D: Density](
     rounds_least: int | None = None,
     pilots_max: int = 0,
 ) -> ImportanceRun[D]:
-    """Draw rounds until the answer is accepted; where that would take too long, from a proposal fitted anew.
+    """Draw rounds until the answer is accepted; where that would take too long, from a newly fitted proposal.
 
     Args:
-        density: about a mode.
+        density: density about a mode.
         seed: of the draws.
-        advance: told how far it is.
-        rounds_max: of all proposals together, by default `ROUNDS_MAX`.
-        rounds_least: of the proposal that gives the answer, by default `ROUNDS_LEAST`.
+        advance: called with the share that is done.
+        rounds_max: rounds of all proposals together, by default `ROUNDS_MAX`.
+        rounds_least: rounds of the proposal that gives the answer, by default `ROUNDS_LEAST`.
         pilots_max: pilot rounds at most, as in `piloted`.
 
     Raises:
@@ -387,11 +387,11 @@ def weighted_run[D: Density](
                 return ImportanceRun(density, pool, weighed.sample(time.monotonic() - began), seed)
             needed = weighed.rounds_wanted
             if needed > patience and left >= 2 * rounds:
-                # These draws teach the next proposal, which is allowed twice as many.
+                # The next proposal is fitted to these draws and may use twice as many.
                 pool = Pool.empty(pool.refitted, pool.invalid)
                 rounds, wanted, patience = 0, rounds, 2 * patience
             else:
-                # Few draws do not say well how many more it takes: half of them, and another look.
+                # Few draws predict the rounds needed poorly: draw about half of them, then judge again.
                 more = max(rounds + 1, rounds * 9 // 8, int(min(np.ceil(0.5 * (rounds + 1.1 * needed)), 2 * rounds)))
                 wanted = min(rounds + left, more)
     except FloatingPointError as error:

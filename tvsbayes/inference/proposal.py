@@ -1,4 +1,4 @@
-"""A proposal for many coordinates that are nearly standard normal: each by itself, some by tables, turned and led.
+"""A proposal for many nearly standard normal coordinates, some tabulated, with linear and pairwise dependence.
 
 Coordinates w (n, d); log densities are exact.
 """
@@ -16,51 +16,51 @@ from tvsbayes.inference.density import Step
 from tvsbayes.inference.tables import CUT_NODES, LEADER_NODES, NODES, Followers, Tables, between_cuts
 
 HEAVY_DOF = 5.0
-"""Of all t distributions but the one of the coupled coordinates."""
+"""Degrees of freedom of all t distributions except that of the coupled coordinates."""
 OWN_SHARE = 0.1
-"""Share of the proposals of a tabulated coordinate from a t of its mean and sd: the table is a cut, not a marginal."""
+"""Share of draws of a tabulated coordinate from a t of its mean and sd: the table is a conditional, not a marginal."""
 HEAVY_SHARE = 0.05
-"""Share of the proposals from a multivariate t: it bounds the ratio target / proposal in the tails. In fifty
-dimensions a t alone puts most draws off the shell where the target lives: effective draws fell threefold."""
+"""Share of draws from a multivariate t, which bounds the ratio target / proposal in the tails. In fifty dimensions a t
+alone puts most draws off the target's typical set: effective draws fell to a third."""
 COUPLED_SHARE, COUPLED_DOF, COUPLED_WIDTH = 0.2, 10.0, 1.2
-"""Share of the proposals whose coupled coordinates come from a multivariate t of so many times their sds. Without them
-single draws of the paper's protocol carried so much weight that half as many again were needed."""
+"""Share of draws whose coupled coordinates come from a multivariate t, its degrees of freedom and factor on their sds.
+Without them single draws of the paper's protocol had so much weight that 50 % more draws were needed."""
 INFLATION = 1.03
-"""Factor on the proposal's sds: one lighter than the target lets single draws weigh much, and walkers freeze."""
+"""Factor on the proposal's sds: under a narrower proposal single draws have large weights and walkers get stuck."""
 SHARES = 0.6, 0.35
-"""Of a chain's steps: all coordinates anew from the proposal, some of them.
+"""Shares of a chain's steps that draw all coordinates from the proposal, and some of them.
 
-Where the proposal is too thin a walker stays for as many steps as its weight says, and effective draws of the tails are
-lost: new values of some coordinates lead out of there."""
+Where the proposal is too low, a walker stays for as many steps as its weight, and effective draws of the tails are
+lost. New values of some coordinates move it."""
 RENEWED_RANGE = 0.1, 0.6
-"""Share of its coordinates of which a walker asks for new values, where not for all: uniform between these. A draw of
-great weight is left soon: what made it rare is mostly a few coordinates."""
+"""Range of the uniform share of coordinates that a walker renews, where not all. It soon leaves a draw of large weight,
+which is mostly due to a few coordinates."""
 VARIANCE_RANGE = 0.8, 1.7
-"""Of a normal coordinate of the proposal, relative to the Laplace approximation's."""
+"""Limits of the variance of a normal coordinate, relative to the Laplace approximation's."""
 TURN_RANGE = 0.4, 2.5
-"""Of the precisions along the principal axes by which one fit turns normal coordinates, 1 where it does not."""
+"""Limits of the precisions along principal axes by which one fit rotates normal coordinates; 1 is no rotation."""
 LEAN_LIMIT = 0.5
 """Largest step of a tabulated coordinate, in its sds, for a step of one sd of another, by one fit."""
 PAIR_T = 3.2
-"""Coefficient over its standard error from which the product of two coordinates is taken into a regression: of 2000
-products of independent coordinates three get there by chance."""
+"""Coefficient over its standard error above which the product of two coordinates enters a regression: three of 2000
+products of independent coordinates exceed it by chance."""
 PAIR_SEARCHES = 3
-"""How often products are looked for in what the regression leaves: large ones hide small ones."""
+"""Number of searches for products in the residuals of the regression: large ones hide small ones."""
 PAIR_DRAWS = 16
-"""Draws for each product, at least."""
+"""Least number of draws for each product."""
 TILT_LIMITS = 0.5, 0.2
 """Largest slope and curvature by which one fit changes a tabulated log density, per sd and its square."""
 REACH = 4.0
-"""Sds within which a fit's tilt of a table grows; beyond, it stays."""
+"""Sds within which a fit's change of a table grows; beyond, it is constant."""
 CORNER, INTERPLAY_LEAST, EDGES_MAX = 1.5, 1.0, 10
-"""Place of the corners, in w, at which two coordinates are asked how they depend on each other; the sum of what the log
-density says beyond each of them from which one follows the other; and how many do, at most."""
+"""Corners, in w, at which the dependence of two coordinates is computed; the sum of interactions of the log density
+above which one follows the other; the largest number of followers."""
 MATTERS = 12.0
-"""Draws whose log weight lies farther below the largest tell nothing of the target's shape."""
+"""Draws whose log weight lies farther below the largest carry no information on the target's shape."""
 
 
 def log_t(distance2: np.ndarray, dimension: int, dof: float = HEAVY_DOF) -> np.ndarray:
-    """Log density of a multivariate t of unit scale at squared distances."""
+    """Compute the log density of a multivariate t of unit scale at squared distances."""
     constant = special.gammaln(0.5 * (dof + dimension)) - special.gammaln(0.5 * dof)
     constant -= 0.5 * dimension * np.log(dof * np.pi)
     return constant - 0.5 * (dof + dimension) * np.log1p(distance2 / dof)
@@ -68,11 +68,11 @@ def log_t(distance2: np.ndarray, dimension: int, dof: float = HEAVY_DOF) -> np.n
 
 @dataclass(frozen=True)
 class Regression:
-    """Of the log of a ratio of densities on coordinates (d), their squares, and those products that tell something.
+    """Regression of a log ratio of densities on coordinates (d), their squares and significant products.
 
     Attributes:
         slope, square: coefficients, shape (d,).
-        cross: of products, symmetric, zero where none was taken, shape (d, d).
+        cross: coefficients of products, symmetric, zero where not taken, shape (d, d).
     """
 
     slope: np.ndarray
@@ -81,9 +81,9 @@ class Regression:
 
 
 def regression(x: np.ndarray, log_ratio: np.ndarray) -> Regression:
-    """Products are taken where what the others leave asks for them (forward selection).
+    """Regress a log ratio of densities on coordinates, taking products by forward selection on the residuals.
 
-    All d (d - 1) / 2 of them would add more scatter than they explain.
+    All d (d - 1) / 2 products would add more scatter than they explain.
 
     Args:
         x: coordinates in units of their sds, shape (n, d).
@@ -115,19 +115,19 @@ def regression(x: np.ndarray, log_ratio: np.ndarray) -> Regression:
 
 @dataclass(frozen=True)
 class Independence:
-    """Independent draws of coordinates that are normal or tabulated, a share of them with a heavier part.
+    """An independence proposal: coordinates normal or tabulated, mixed with heavier-tailed parts.
 
-    The mixture: every coordinate on its own; the coupled ones together from a multivariate t; all of them from another.
-    It is a step of a chain too (`density.Step`).
+    Parts of the mixture: every coordinate by itself; the coupled ones from a multivariate t; all from another t. It is
+    a step of a chain too (`density.Step`).
 
     Attributes:
-        mean, sd: of every coordinate, shape (d,).
+        mean, sd: moments of every coordinate, shape (d,).
         places: tabulated coordinates, shape (h,).
         tables: their densities.
         coupled: places of the coupled coordinates, shape (c,).
-        followers: those of them that depend on another; their tables stand for means and sds alone.
-        origin, turn: w = origin + turn v, shapes (d,) and (d, d). Independent are the coordinates v; means, sds and
-            tables are theirs.
+        followers: tabulated coordinates that depend on another; their `tables` serve for means and sds alone.
+        origin, turn: w = origin + turn v, shapes (d,) and (d, d). The coordinates v are independent; means, sds and
+            tables are those of v.
     """
 
     mean: np.ndarray
@@ -140,17 +140,17 @@ class Independence:
     turn: np.ndarray
 
     def moved(self, mean: np.ndarray, sd: np.ndarray, tables: Tables, followers: Followers) -> Independence:
-        """Of other means, sds and tables; those of tabulated coordinates are as their tables have them."""
+        """Return a copy with other means, sds and tables; moments of tabulated coordinates come from the tables."""
         mean, sd = mean.copy(), sd.copy()
         mean[self.places], sd[self.places] = tables.moments
         sd[self.places] *= INFLATION
         return replace(self, mean=mean, sd=sd, tables=tables, followers=followers)
 
     def turned(self, cross: np.ndarray) -> Independence:
-        """With products of coordinates in its log density.
+        """Return a copy with products of coordinates in its log density.
 
-        Normal coordinates get the covariance that belongs to their products, and lean on tabulated ones; of two
-        tabulated ones the later leans on the earlier.
+        Normal coordinates get the covariance of their products and depend linearly on tabulated ones; of two tabulated
+        ones the later depends on the earlier.
 
         Args:
             cross: coefficients of products of (v - mean) / sd, symmetric, shape (d, d).
@@ -178,15 +178,15 @@ class Independence:
         return float(np.linalg.slogdet(self.turn)[1])
 
     def to_v(self, w: np.ndarray) -> np.ndarray:
-        """From w (n, d) to v."""
+        """Map w (n, d) to v."""
         return (w - self.origin) @ self._back.T
 
     def to_w(self, v: np.ndarray) -> np.ndarray:
-        """From v (n, d) to w."""
+        """Map v (n, d) to w."""
         return self.origin + v @ self.turn.T
 
     def _each(self, v: np.ndarray) -> np.ndarray:
-        """Log densities of the coordinates v one by one, shape (n, d)."""
+        """Compute the log density of each coordinate v, shape (n, d)."""
         distance2 = ((v - self.mean) / self.sd) ** 2
         log_density = -0.5 * np.log(2 * np.pi) - 0.5 * distance2 - np.log(self.sd)
         single = log_t(distance2[:, self.places], 1) - np.log(self.sd[self.places])
@@ -233,15 +233,15 @@ class Independence:
         chances: np.ndarray,
         before: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Coordinates v, each from its own density, of numbers that are already random.
+        """Map given random numbers to coordinates v, each by its own density.
 
         Args:
-            new: which are drawn, shape (n, d); the others stay as they are in `before`.
+            new: coordinates to draw, shape (n, d); the others keep their values of `before`.
             normal: standard normal, shape (n, d).
-            narrowed: what divides a tabulated coordinate's normal number where its t is asked, else NaN, shape (n, h).
-            share: uniform, of the tables, shape (n, h).
-            chances: likewise, of the followers, shape (n, f).
-            before: the points so far, shape (n, d); None where all are drawn.
+            narrowed: divisor of a tabulated coordinate's normal number where its t is drawn, else NaN, shape (n, h).
+            share: uniform numbers for the tables, shape (n, h).
+            chances: uniform numbers for the followers, shape (n, f).
+            before: present points, shape (n, d); None where all are drawn.
         """
         v = self.mean + self.sd * normal
         if before is not None:
@@ -265,7 +265,7 @@ class Independence:
         return tuple(zip((self, self.renewed), SHARES, strict=True))
 
     def renewed(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """The same protocol, with new values of some coordinates of every point, each from its own density."""
+        """Propose new values of some coordinates of every point, each from its own density, as a `density.Step`."""
         before, per_place = self.to_v(w), (len(w), len(self.places))
         new = generator.uniform(size=before.shape) < generator.uniform(*RENEWED_RANGE, size=(len(w), 1))
         normal = generator.standard_normal(before.shape)
@@ -276,16 +276,16 @@ class Independence:
         return self.to_w(after), np.where(new, self._each(before) - self._each(after), 0.0).sum(axis=1)
 
     def fitted(self, w: np.ndarray, log_target: np.ndarray, log_weights: np.ndarray) -> Independence:
-        """Nearer to the target, as weighted draws show it; the same where too few of them matter.
+        """Fit the proposal to weighted draws of the target; return it unchanged where too few have weight.
 
-        Where the target is the proposal but for means and covariance, the log of their ratio is linear in v and the
-        products of its coordinates: the coefficients give both, and tilt the tables. A regression on the draws that
-        matter is far steadier than weighted moments.
+        Where the target differs from the proposal in means and covariance only, the log of their ratio is linear in v
+        and the products of its coordinates. The coefficients give both and change the tables. A regression on the draws
+        with weight scatters far less than weighted moments.
 
         Args:
             w: draws, shape (n, d).
             log_target: their log densities, shape (n,).
-            log_weights: log (target / what they were drawn from), shape (n,).
+            log_weights: log (target / their proposal), shape (n,).
         """
         matters = np.isfinite(log_weights) & (log_weights > np.max(log_weights) - MATTERS)
         if matters.sum() <= 8 * len(self.mean):
@@ -312,14 +312,14 @@ class Independence:
 
 
 def forest(target: Callable[[np.ndarray], np.ndarray], places: np.ndarray, dimension: int) -> list[tuple[int, int]]:
-    """Pairs of tabulated coordinates that depend on each other most, as a forest, leaders before their followers.
+    """Choose the most dependent pairs of tabulated coordinates, as a forest, leaders before their followers.
 
-    What a log density says of two coordinates beyond what it says of each is asked at the corners of a square. The
-    forest is the one of the largest sum (as Chow and Liu, IEEE Trans. Inf. Theory 14 (1968) 462, choose a tree).
+    The interaction of two coordinates in the log density is computed at the corners of a square. The forest has the
+    largest sum of interactions (as Chow and Liu, IEEE Trans. Inf. Theory 14 (1968) 462, choose a tree).
 
     Args:
         target: log density of points (n, d).
-        places: of the tabulated coordinates, shape (h,).
+        places: tabulated coordinates, shape (h,).
         dimension: d.
 
     Returns:
@@ -364,15 +364,15 @@ def forest(target: Callable[[np.ndarray], np.ndarray], places: np.ndarray, dimen
 
 
 def _at_each(target: Callable[[np.ndarray], np.ndarray], points: np.ndarray) -> np.ndarray:
-    """Log densities of points (..., d), shape (...,)."""
+    """Compute log densities of points (..., d), shape (...,)."""
     return (target(points.reshape(-1, points.shape[-1])) if points.size else np.zeros(0)).reshape(points.shape[:-1])
 
 
 def _planes(target: Callable[[np.ndarray], np.ndarray], pairs: np.ndarray, dimension: int) -> np.ndarray:
-    """Log densities on the planes of leaders and followers, shape (pairs, leader nodes, nodes).
+    """Compute log densities on the planes of leaders and followers, shape (pairs, leader nodes, nodes).
 
-    Of several that follow one leader the later ones see the earlier where these are most probable: two that mend the
-    same misfit are not counted twice.
+    Of several followers of one leader, the later are evaluated with the earlier at their most probable values, so that
+    two that explain the same misfit are not counted twice.
 
     Args:
         target: log density of points (n, d).
@@ -398,17 +398,17 @@ def _planes(target: Callable[[np.ndarray], np.ndarray], pairs: np.ndarray, dimen
 def first_proposal(
     target: Callable[[np.ndarray], np.ndarray], dimension: int, heavy: np.ndarray, coupled: np.ndarray
 ) -> Independence:
-    """Standard normal but for the heavy coordinates, whose densities are the target's along each of them.
+    """Build a standard normal proposal, in which the density of each heavy coordinate is the target's along it.
 
-    In w, where everything else is measured from its mean at a coordinate's value and by its width there, a cut through
-    the mode is the marginal density but for what the others' curvature does. Of those that depend on each other most,
-    a cut through the plane of both makes one follow the other (`forest`).
+    In w the other coordinates are centred and scaled by their conditional mean and width at a coordinate's value. A cut
+    of the target through the mode is therefore the marginal density, up to the others' curvature. For the most
+    dependent pairs (`forest`), a cut through the plane of both gives the density of the follower given the leader.
 
     Args:
         target: log density of points (n, d).
         dimension: d.
-        heavy: coordinates to be tabulated, shape (d,), boolean.
-        coupled: those of which a share is drawn together, likewise.
+        heavy: coordinates to tabulate, shape (d,), boolean.
+        coupled: coordinates of which a share is drawn together, shape (d,), boolean.
     """
     places = np.flatnonzero(heavy)
     pairs = forest(target, places, dimension)
@@ -419,8 +419,8 @@ def first_proposal(
     rows, alone, gains = planes.copy(), lines.copy(), np.zeros_like(lines)
     for k in reversed(range(len(pairs))):
         leader, follower = pairs[k]
-        # What both say together, as the leader's own density and the follower's whatever the leader is; what the
-        # follower leads in turn belongs to it.
+        # The joint density of both as the leader's marginal and the follower's conditional; the follower's includes its
+        # own followers.
         rows[k] = np.where(np.isfinite(rows[k]), rows[k], -np.inf) + gains[follower]
         with np.errstate(invalid="ignore"):
             gain = special.logsumexp(rows[k], axis=1) - planes[k][:, NODES == 0.0][:, 0]

@@ -1,6 +1,6 @@
-"""A posterior read back from `results/`, of any instrument: draws by name, carried into any quantity.
+"""A posterior read from `results/`, of any instrument: draws by name, propagated into any quantity.
 
-No model, no fit, no JAX. `fit.json` says what the draws are, `draws.npz` holds them.
+Needs no model, no fit and no JAX. `fit.json` states what the draws are, `draws.npz` holds them.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 AGAIN = "run `tvsbayes fit` on the folder again"
 FORMAT, OLDER = re.compile(r"tvsbayes-(?:[a-z]+-)?fit/1"), re.compile(r"tvsbayes-(?:[a-z]+-)?fit/[0-9]+")
-"""Formats of `fit.json` whose draws can be read, of whatever instrument; formats of any version."""
+"""Formats of `fit.json` whose draws can be read, of any instrument; formats of any version."""
 ANSWERS: tuple[AnswerKind, ...] = ("accepted", "rough", "laplace")
 COLUMNS = (("names", "physical"), ("names", "draws"), ("derived_names", "derived"))
-"""Arrays of `draws.npz`: names, and the draws whose columns they name."""
+"""Arrays of `draws.npz`: names of columns, and the draws."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,9 +37,9 @@ class StoredPosterior(Shown):
     """Draws of a posterior from `results/`.
 
     Attributes:
-        by_name: draws of every quantity, each of shape (n,), in the unit that its name says; of an axis in the unit of
-            its readings.
-        weights: of the draws, sum 1, shape (n,). Draws that are repeats of one are one here, with their weight.
+        by_name: draws of every quantity, each of shape (n,), in the unit of its name; for an axis in the unit of its
+            readings.
+        weights: weights of the draws, sum 1, shape (n,). Repeats of a draw are merged, with the sum of their weights.
         answer: "accepted"; with `anyway` also "rough", or "laplace" for the approximation at the mode.
     """
 
@@ -48,7 +48,7 @@ class StoredPosterior(Shown):
     answer: AnswerKind
 
     def shown(self) -> View:
-        """Means, sds and 95 % intervals."""
+        """Show means, sds and 95 % intervals."""
         propagated = self.propagate(lambda p: np.stack(list(p.values()), axis=1))
         columns = (each.tolist() for each in (propagated.mean, propagated.sd, *propagated.interval95))
         rows = list(zip(self.by_name, *columns, strict=True))
@@ -56,17 +56,17 @@ class StoredPosterior(Shown):
         return View(title, ("quantity", "mean", "sd", "2.5 %", "97.5 %"), rows)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """All draws by name, one row each, with their `weight` (sum 1)."""
+        """Return all draws by name, one row each, with their `weight` (sum 1)."""
         import pandas as pd
 
         return pd.DataFrame({**self.by_name, "weight": self.weights})
 
     def propagate(self, function: Callable[[Mapping[str, np.ndarray]], np.ndarray]) -> Propagated:
-        """Carry the posterior into a quantity of your own, as `Posterior.propagate` does.
+        """Propagate the posterior into a quantity of your own, as `Posterior.propagate` does.
 
         Args:
-            function: is called once with all draws, a mapping from name to an array (n,), and returns one value per
-                draw: an array (n,) or (n, ...).
+            function: called once with all draws, a mapping from name to an array (n,); returns one value per draw, an
+                array (n,) or (n, ...).
 
         Returns:
             Mean, sd, interval and their Monte Carlo errors, which take the stored draws as independent; `draws` and
@@ -80,15 +80,15 @@ class StoredPosterior(Shown):
 
 
 def load_posterior(folder: Path | str, *, anyway: bool = False) -> StoredPosterior:
-    """Draws of the fit in a folder's `results/`, of any instrument, without JAX.
+    """Load the draws of a fit from a folder's `results/`, of any instrument, without JAX.
 
     Args:
-        folder: of a campaign after `tvsbayes fit`, or its `results`.
-        anyway: also a rough answer or the Laplace approximation.
+        folder: folder of a campaign after `tvsbayes fit`, or its `results`.
+        anyway: accept a rough answer or the Laplace approximation too.
 
     Returns:
-        Named draws with weights, `.propagate(f)` for quantities of them. Whether the campaign was changed since the fit
-        is not asked.
+        Named draws with weights, `.propagate(f)` for quantities of them. Changes of the campaign since the fit are not
+        checked.
 
     Raises:
         InputError: there are no results, they are damaged or of a version that cannot be read.
@@ -117,10 +117,10 @@ def load_posterior(folder: Path | str, *, anyway: bool = False) -> StoredPosteri
 
 
 def _answer(keys: Keys) -> AnswerKind:
-    """What the draws are.
+    """Return the answer that the draws represent.
 
     Raises:
-        NotConverged: they are of no mode that explains the data.
+        NotConverged: the fit found no mode that explains the data.
     """
     if not keys.flag("converged"):
         remedy = "see the message of `tvsbayes fit`, correct the fault and fit again"
@@ -128,7 +128,7 @@ def _answer(keys: Keys) -> AnswerKind:
             "not-converged", "results/fit.json: the fit has not converged: no draw of it counts", remedy=remedy
         )
     if keys.values.get("answer") is None:
-        # 0.2.0 and before: a sample that had converged was accepted.
+        # Up to 0.2.0 a converged sample was accepted.
         return "accepted" if keys.word("estimator", ("posterior", "laplace")) == "posterior" else "laplace"
     return ANSWERS[ANSWERS.index(keys.word("answer", ANSWERS))]
 
@@ -153,7 +153,7 @@ def _draws(path: Path) -> dict[str, np.ndarray]:
 
 
 def _merged(by_name: dict[str, np.ndarray], answer: AnswerKind) -> StoredPosterior:
-    """Of draws that weigh the same: repeats, which systematic resampling leaves beside each other, are one."""
+    """Merge repeated draws of equal weight, which systematic resampling leaves adjacent."""
     rows = np.stack(list(by_name.values()), axis=1)
     first = np.flatnonzero(np.r_[True, np.any(rows[1:] != rows[:-1], axis=1)])
     weights = np.diff(np.r_[first, len(rows)]) / len(rows)

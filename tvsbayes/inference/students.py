@@ -1,6 +1,6 @@
-"""A mixture of Student distributions as proposal: for few coordinates, whose posterior may bend, split and reach far.
+"""A mixture of Student distributions as proposal, for few coordinates: curved, bimodal or long-tailed posteriors.
 
-Means and covariances follow the weighted draws; a part of its own stands in the tail.
+Means and covariances are fitted to weighted draws; one part covers the tail.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from tvsbayes.inference.proposal import log_t
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
 DEGREES, INFLATION, WIDE = 5.0, 1.25, 6.0
-"""Of the Student distributions: freedom, and variances over those of the draws."""
+"""Degrees of freedom of the Student distributions, and factors on the variances of the draws."""
 FLOOR = 1e-6
-"""Least variance of weighted draws, of that along the axes: never flatter than rounding."""
+"""Variance added to that of weighted draws along each axis, as a share: it keeps the covariance positive definite."""
 FAR_SHARE, FAR_DRAWS, FAR_EFFECTIVE = 0.3, 50, 20.0
-"""Of the weight in the tail that has a part of its own, and draws that it takes."""
+"""Share of the weight in the tail part, and the least numbers of draws and of effective draws in it."""
 SHARE = 0.6
-"""Of a chain's steps that draw from it; the others walk. Both ask the density of all walkers at once."""
+"""Share of a chain's steps drawn from the mixture; the others are a random walk. Both evaluate all walkers at once."""
 STRIDE = 2.38
-"""Of a random walk, over the root of the dimension (Gelman, Roberts and Gilks, Bayesian Statistics 5 (1996) 599)."""
+"""Step of a random walk times the dimension's root (Gelman, Roberts and Gilks, Bayesian Statistics 5 (1996) 599)."""
 
 
 @dataclass(frozen=True)
 class StudentMixture:
-    """Shares of Student distributions.
+    """A mixture of Student distributions.
 
     Attributes:
         means: shape (k, d); roots: Cholesky factors of their covariances, shape (k, d, d); shares: sum 1, shape (k,).
-        width: covariance about a point where nothing is known, shape (d, d).
+        width: covariance used about a point where draws give none, shape (d, d).
     """
 
     means: np.ndarray
@@ -41,12 +41,12 @@ class StudentMixture:
 
     @classmethod
     def about(cls, mode: np.ndarray, covariance: np.ndarray) -> StudentMixture:
-        """About a mode (d,) with its Laplace covariance (d, d)."""
+        """Build a mixture about a mode (d,) from its Laplace covariance (d, d)."""
         return cls.of(covariance, (mode, INFLATION * covariance, 0.7), (mode, 4.0 * covariance, 0.3))
 
     @classmethod
     def of(cls, width: np.ndarray, *parts: tuple[np.ndarray, np.ndarray, float]) -> StudentMixture:
-        """Of means, covariances and shares."""
+        """Build a mixture from means, covariances and shares."""
         means, covariances, shares = (np.array(each) for each in zip(*parts, strict=True))
         return cls(means, np.linalg.cholesky(covariances), shares, width)
 
@@ -77,12 +77,12 @@ class StudentMixture:
         return (self, SHARE), (self.walked, 1 - SHARE)
 
     def walked(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """The same protocol: a random walk with the covariance of the last part."""
+        """Propose a random walk with the covariance of the last part, as a `density.Step`."""
         root = self.roots[-1] * STRIDE / np.sqrt(INFLATION * w.shape[1])
         return w + generator.standard_normal(w.shape) @ root.T, np.zeros(len(w))
 
     def fitted(self, w: np.ndarray, log_target: np.ndarray, log_weights: np.ndarray) -> StudentMixture:
-        """By the moments of weighted draws; where so few count that they have none, about the best of them."""
+        """Fit the moments of weighted draws; where too few have weight, centre on the best draw."""
         smooth = np.zeros(len(w))
         some = np.isfinite(log_weights)
         smooth[some] = smoothed_weights(log_weights[some]).weights
@@ -95,7 +95,7 @@ class StudentMixture:
 
 
 def _moments(w: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (d,) and covariance (d, d)."""
+    """Compute weighted mean (d,) and covariance (d, d)."""
     mean = weights @ w
     off = w - mean
     covariance = (weights[:, None] * off).T @ off
@@ -105,7 +105,7 @@ def _moments(w: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _tail(
     w: np.ndarray, weights: np.ndarray, mean: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of the farther part of the posterior, along the direction in which it is most skewed."""
+    """Compute mean and covariance of the posterior's tail along its direction of largest skewness."""
     off = (w - mean) / np.sqrt(np.diag(covariance))
     along = off @ (weights @ off**3)
     order = np.argsort(-along)

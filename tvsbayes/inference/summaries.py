@@ -17,10 +17,10 @@ from tvsbayes.statistics.weighted_draws import TAILS, WeightedSummary, weighted_
 
 @dataclass(frozen=True, repr=False)
 class Propagated(Shown):
-    """A quantity under the posterior; every field but the last two has the quantity's own shape.
+    """A quantity under the posterior; every field but the last two has the shape of the quantity.
 
     Attributes:
-        mean, sd: of the posterior.
+        mean, sd: moments of the posterior.
         interval95: equal-tailed, first axis (low, high).
         mcse_mean, mcse_sd, mcse_interval95: Monte Carlo standard errors of the above.
         ess: effective draws behind the mean.
@@ -39,7 +39,7 @@ class Propagated(Shown):
     weights: np.ndarray
 
     def shown(self) -> View:
-        """Mean, sd and interval; of arrays, element by element."""
+        """Show mean, sd and interval; of arrays, element by element."""
         low, high = np.atleast_1d(self.interval95[0]).ravel(), np.atleast_1d(self.interval95[1]).ravel()
         mean, sd, error = (np.atleast_1d(each).ravel().tolist() for each in (self.mean, self.sd, self.mcse_mean))
         columns = zip(mean, sd, low.tolist(), high.tolist(), error, strict=True)
@@ -50,10 +50,10 @@ class Propagated(Shown):
 def carried(
     function: Callable[[Mapping[str, np.ndarray]], np.ndarray], by_name: Mapping[str, np.ndarray], count: int
 ) -> np.ndarray:
-    """Values (count, ...) that a function makes of all draws by name, one a draw.
+    """Evaluate a function of all draws by name; values (count, ...), one for each draw.
 
     Raises:
-        ValueError: another number of rows, or values that are not finite.
+        ValueError: the number of rows is wrong, or values are not finite.
     """
     values = np.asarray(function(by_name), dtype=float)
     if values.ndim == 0 or len(values) != count:
@@ -68,7 +68,7 @@ def carried(
 
 
 def reweighted(values: np.ndarray, weights: np.ndarray) -> Propagated:
-    """Summary of independent draws (chain, draw, ...) with weights (chain, draw)."""
+    """Summarise independent draws (chain, draw, ...) with weights (chain, draw)."""
     summary = weighted_summary(values.reshape(-1, *values.shape[2:]), weights.ravel())
     return Propagated(
         mean=summary.mean,
@@ -84,13 +84,13 @@ def reweighted(values: np.ndarray, weights: np.ndarray) -> Propagated:
 
 
 def propagated(values: np.ndarray) -> Propagated:
-    """Summary of draws (chain, draw, ...) of chains with memory, which weigh the same."""
-    # Loading it takes as long as a fit of stored functions: only who asks for a chain waits.
+    """Summarise autocorrelated draws (chain, draw, ...) of equal weight."""
+    # Imported here: loading takes as long as a fit with stored traces, and only chains need it.
     from arviz_stats.base import array_stats
 
     flat = values.reshape(*values.shape[:2], -1)
     weights = np.full(values.shape[:2], 1 / (values.shape[0] * values.shape[1]))
-    # A quantity that no draw changes has no effective number of draws and no Monte Carlo error.
+    # A quantity that is equal in all draws has no effective number of draws and no Monte Carlo error.
     moving = np.ptp(flat, axis=(0, 1)) > 0
 
     def each(statistic: Callable[..., np.ndarray], otherwise: float, **options) -> np.ndarray:
@@ -114,7 +114,7 @@ def propagated(values: np.ndarray) -> Propagated:
 
 
 def monte_carlo_errors(names: Sequence[str], propagated: Propagated | WeightedSummary) -> dict[str, MonteCarloError]:
-    """Of quantities, the last axis of a summary, in their posterior sds; a quantity that no draw changes has none."""
+    """Return Monte Carlo errors by quantity, the last axis of a summary, in posterior sds; 0 for constants."""
     sd = np.where(propagated.sd > 0, propagated.sd, 1.0)
     parts = propagated.mcse_mean / sd, *(propagated.mcse_interval95 / sd)
     rows = zip(*(np.reshape(part, len(names)).tolist() for part in parts), strict=True)

@@ -1,6 +1,6 @@
-"""Densities of single coordinates by tables, and of coordinates that follow another: exact densities, exact draws.
+"""Tabulated densities of single coordinates and of coordinates given another, with exact draws.
 
-Coordinates w, nearly standard normal; a table is a broken line through the logarithm at `NODES`.
+Coordinates w are nearly standard normal; a table is a piecewise linear log density with nodes at `NODES`.
 """
 
 from __future__ import annotations
@@ -11,32 +11,32 @@ from functools import cached_property
 import numpy as np
 
 NODES = np.linspace(-8.0, 12.0, 41)
-"""Of the tabulated densities, in w. Noise scales have their long tail above."""
+"""Nodes of the tabulated densities, in w. Noise scales have a long upper tail."""
 CUT_NODES = np.array([-8.0, -5.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0])
-"""Where the target is cut, places of `NODES`: its logarithm is smooth, and far out little is drawn."""
+"""Nodes at which the target is evaluated, a subset of `NODES`: its log is smooth, and few draws lie far out."""
 STEP = float(NODES[1] - NODES[0])
 FLOOR = -40.0
-"""Of a tabulated log density below its largest: what lies lower is never drawn, and zero has no logarithm."""
+"""Least tabulated log density relative to its largest: lower values are never drawn, and zero has no logarithm."""
 CUT_FLOOR = -1e5
-"""Of a cut below its largest value. SciPy takes slopes that differ by less than 1e-9 of the largest difference as
-equal: beside a fall by 1e15, which a cut may have, that is all of them."""
+"""Least value of a cut relative to its largest. SciPy takes slopes that differ by less than 1e-9 of the largest
+difference as equal: beside a fall by 1e15, which a cut may have, all are equal then."""
 
 
 def _filled(values: np.ndarray) -> np.ndarray:
-    """Valleys (..., cuts) filled to the lower of the heights beside them.
+    """Fill valleys (..., cuts) to the lower of the maxima on either side.
 
-    A target may fall by 1e5 where the map's steps diverge: a cubic through such a hole rises as far beside it, and what
-    follows a leader would fill the leader's hole, each follower anew.
+    A target may fall by 1e5 where the map's steps diverge. A cubic through such a hole overshoots as far beside it, and
+    each follower would add that to its leader's density.
     """
     before, behind = values, values[..., ::-1]
     return np.minimum(np.maximum.accumulate(before, axis=-1), np.maximum.accumulate(behind, axis=-1)[..., ::-1])
 
 
 def between_cuts(log_density: np.ndarray) -> np.ndarray:
-    """Log densities at `NODES` from those at `CUT_NODES` (..., cuts); -inf beside where none is, no valley.
+    """Interpolate log densities at `NODES` from those at `CUT_NODES` (..., cuts), valleys filled; -inf beside gaps.
 
-    By Akima's (1970) cubics, exact for parabolas where cuts are evenly spaced, to 0.2 elsewhere. They are
-    local: the map's own tables bend at nodes.
+    Akima's (1970) cubics are exact for parabolas where cuts are evenly spaced, to 0.2 elsewhere. They are local, since
+    the map's own tables have kinks at nodes.
     """
     from scipy.interpolate import Akima1DInterpolator
 
@@ -51,27 +51,27 @@ def between_cuts(log_density: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Tables:
-    """Densities of h coordinates whose logarithm is a broken line through `NODES`, shape (h, nodes), zero outside."""
+    """Densities of h coordinates, piecewise linear in the log between `NODES`, shape (h, nodes), zero outside."""
 
     log_density: np.ndarray
 
     @classmethod
     def normalised(cls, log_density: np.ndarray) -> Tables:
-        """From log densities up to a constant each, -inf and NaN where there is none."""
+        """Normalise log densities given up to a constant each, -inf or NaN where undefined."""
         finite = np.where(np.isfinite(log_density), log_density, -np.inf)
         finite = np.maximum(finite - finite.max(axis=1, keepdims=True), FLOOR)
         return cls(finite - np.log(cls(finite).masses.sum(axis=1, keepdims=True)))
 
     @cached_property
     def masses(self) -> np.ndarray:
-        """Probability between neighbouring nodes, shape (h, nodes - 1)."""
+        """Compute the probability between neighbouring nodes, shape (h, nodes - 1)."""
         low, rise = self.log_density[:, :-1], np.diff(self.log_density)
         steep = np.abs(rise) > 1e-9
         return STEP * np.exp(low) * np.where(steep, np.expm1(rise) / np.where(steep, rise, 1.0), 1.0)
 
     @cached_property
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Means and sds, shape (h,) each, by the trapezoid rule on ten points a step."""
+        """Compute means and sds, shape (h,) each, by the trapezoid rule with ten points per step."""
         x = np.linspace(NODES[0], NODES[-1], 10 * (len(NODES) - 1) + 1)
         lines = np.array([np.interp(x, NODES, each) for each in self.log_density])
         density = np.exp(lines.reshape(len(self.log_density), len(x)))
@@ -81,20 +81,20 @@ class Tables:
 
     @cached_property
     def reached(self) -> np.ndarray:
-        """Probability below each node but the last, shape (h, nodes - 1)."""
+        """Compute the probability below each node but the last, shape (h, nodes - 1)."""
         return np.concatenate([np.zeros((len(self.masses), 1)), np.cumsum(self.masses, axis=1)[:, :-1]], axis=1)
 
     def at(self, w: np.ndarray) -> np.ndarray:
-        """Log densities of w (n, h)."""
+        """Compute log densities of w (n, h)."""
         return _line_at(w, self.log_density)
 
     def draw(self, share: np.ndarray) -> np.ndarray:
-        """Points (n, h) below which these shares (n, h) of the densities lie."""
+        """Compute the quantiles (n, h) of these shares (n, h)."""
         return _point_below(share, self.log_density, self.reached)
 
 
 def _line_at(w: np.ndarray, lines: np.ndarray) -> np.ndarray:
-    """Values of broken lines (..., h, nodes) at w (n, h), -inf outside the nodes."""
+    """Interpolate piecewise linear functions (..., h, nodes) at w (n, h), -inf outside the nodes."""
     place = (w - NODES[0]) / STEP
     node = np.clip(np.nan_to_num(place).astype(int), 0, len(NODES) - 2)
     low, high = (_at_node(lines, node + k) for k in (0, 1))
@@ -103,12 +103,12 @@ def _line_at(w: np.ndarray, lines: np.ndarray) -> np.ndarray:
 
 
 def _at_node(rows: np.ndarray, node: np.ndarray) -> np.ndarray:
-    """Entries `node` (n, h) of rows (..., h, nodes)."""
+    """Take the entries `node` (n, h) of rows (..., h, nodes)."""
     return np.take_along_axis(np.broadcast_to(rows, (*node.shape, rows.shape[-1])), node[..., None], axis=-1)[..., 0]
 
 
 def _point_below(share: np.ndarray, lines: np.ndarray, reached: np.ndarray) -> np.ndarray:
-    """Points below which shares (n, h) lie of densities by their log (..., h, nodes), `reached` below each node."""
+    """Compute quantiles of shares (n, h) from log densities (..., h, nodes) and cumulative probabilities `reached`."""
     node = np.sum(share[..., None] >= reached, axis=-1) - 1
     low, above = _at_node(lines, node), _at_node(lines, node + 1)
     slope = (above - low) / STEP
@@ -119,18 +119,18 @@ def _point_below(share: np.ndarray, lines: np.ndarray, reached: np.ndarray) -> n
 
 
 LEADER_NODES = np.linspace(-4.0, 4.0, 7)
-"""Places of a leader, in w, at which its follower has tables of its own."""
+"""Values of a leader, in w, at which its follower has a table each."""
 
 
 @dataclass(frozen=True)
 class Followers:
-    """Coordinates whose density depends on another: of two scales that explain the same scatter one may be large.
+    """Coordinates whose density depends on another: of two scales that explain the same scatter only one can be large.
 
-    Between a leader's nodes the two tables are mixed. A follower has one leader and may lead others: a forest.
+    Between two nodes of the leader the density is a mixture of their tables. A follower has one leader and may be one.
 
     Attributes:
-        leader, follower: their rows among the tabulated coordinates, leaders before their followers, shape (f,) each.
-        log_density: of the follower at `NODES`, by the leader's node, shape (f, leader nodes, nodes).
+        leader, follower: rows among the tabulated coordinates, leaders before their followers, shape (f,) each.
+        log_density: log density of the follower at `NODES`, by the leader's node, shape (f, leader nodes, nodes).
     """
 
     leader: np.ndarray
@@ -138,18 +138,18 @@ class Followers:
     log_density: np.ndarray
 
     def share(self, leaders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Node below leaders (n,) and the share of the node above."""
+        """Return the node below leaders (n,) and the share of the node above."""
         at = np.clip((leaders - LEADER_NODES[0]) / (LEADER_NODES[1] - LEADER_NODES[0]), 0, len(LEADER_NODES) - 1)
         node = np.minimum(at.astype(int), len(LEADER_NODES) - 2)
         return node, at - node
 
     @cached_property
     def tables(self) -> list[Tables]:
-        """Of each follower, a row for every node of its leader."""
+        """Return the tables of each follower, a row for every node of its leader."""
         return [Tables(rows) for rows in self.log_density]
 
     def at(self, w: np.ndarray) -> np.ndarray:
-        """Log densities of the followers, shape (n, f), of tabulated coordinates w (n, h)."""
+        """Compute log densities of the followers, shape (n, f), at tabulated coordinates w (n, h)."""
         log_density = np.empty((len(w), len(self.leader)))
         for k, (leader, follower) in enumerate(zip(self.leader, self.follower, strict=True)):
             node, above = self.share(w[:, leader])
@@ -159,12 +159,12 @@ class Followers:
         return log_density
 
     def drawn(self, w: np.ndarray, share: np.ndarray, chance: np.ndarray, kept: np.ndarray) -> np.ndarray:
-        """Tabulated coordinates (n, h) with their followers drawn anew but those kept.
+        """Draw followers again, except those kept; tabulated coordinates (n, h).
 
         Args:
-            w: leaders are as they are here.
-            share: uniform numbers of the densities, shape (n, h).
-            chance: uniform numbers of the mixtures, shape (n, f).
+            w: coordinates; leaders keep these values.
+            share: uniform numbers for the densities, shape (n, h).
+            chance: uniform numbers for the mixtures, shape (n, f).
             kept: shape (n, h), boolean.
         """
         result = w.copy()

@@ -1,6 +1,6 @@
-"""The folder in which compiled functions and their traces are kept, and whether it does its work.
+"""The cache folder of compiled functions and their traces, and a test whether it works.
 
-What lies there is code that later processes run: the folder must be the user's own, and nobody else's to write.
+Later processes run the code stored there, so only the user may be able to write to the folder.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from tvsbayes.model.compiled import Traces, compiled
 
 VARIABLE = "TVSBAYES_CACHE"
 TRIAL_SECONDS_MAX = 120.0
-"""For a process that compiles one small function; longer, and something else is wrong."""
+"""Time limit of a process that compiles one small function."""
 REJECTED = "Machine type used for XLA:CPU compilation doesn't match"
-"""What XLA logs when it refuses its own code on the machine that made it."""
+"""XLA's log message when it refuses its own code on the machine that compiled it."""
 
 
 def cache_folder() -> Path:
-    """The user's cache folder, or `TVSBAYES_CACHE`."""
+    """Return the user's cache folder, or `TVSBAYES_CACHE`."""
     return Path(os.environ.get(VARIABLE) or user_cache_path("tvsbayes") / "jax")
 
 
 def own_cache_folder() -> OwnFolder:
-    """`cache_folder`, created for this user alone where there is none; look at its `fault`."""
+    """Return `cache_folder`, created for this user alone where missing; the caller checks its `fault`."""
     folder = OwnFolder(cache_folder())
     if not os.environ.get(VARIABLE):
-        # Its place is ours to decide, its mode too; a folder that the user has named stays as it is.
+        # The mode of the default folder is set; a folder that the user has named keeps its mode.
         with suppress(OSError):
             folder.path.chmod(0o700)
     folder.make()
@@ -48,17 +48,16 @@ def own_cache_folder() -> OwnFolder:
 def use_compilation_cache() -> bool:
     """Keep traces and compiled functions in `cache_folder`, unless others may write into it.
 
-    For programs such as the command line, which own their process: it changes a global setting of JAX, so
-    only commands and worker processes call it.
+    It changes a global setting of JAX, so only commands and worker processes call it.
 
     Returns:
-        Whether there is nothing to take from it: the model has to be compiled first, half a minute to two minutes.
+        Whether the cache is empty or unusable: the model must be compiled first, half a minute to two minutes.
     """
     folder = own_cache_folder()
     if folder.fault():
         return True
     jax.config.update("jax_compilation_cache_dir", str(folder.path))
-    # Small functions too: a process of a command compiles some dozens, and their sum is seconds.
+    # Small functions are cached too: a command compiles some dozens, which takes seconds in all.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     Traces.used = Traces(folder.path / "traced")
@@ -67,7 +66,7 @@ def use_compilation_cache() -> bool:
 
 @dataclass(frozen=True)
 class CacheState:
-    """Whether the folder does its work: `used`, what was found, and what to do ("" where all is well)."""
+    """Result of the cache test: whether it is used, what was found, and the remedy ("" where it works)."""
 
     used: bool
     found: str
@@ -76,12 +75,12 @@ class CacheState:
 
 @compiled(jax.Array)
 def _trial(values: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Small, yet compiled to code of its own."""
+    """Evaluate a small function that is compiled to code of its own."""
     return jnp.cumsum(jnp.sin(values)) / jnp.exp(values)
 
 
 def trial() -> None:
-    """Run one small function as commands do, and print how it was come by: for a process of `cache_state`."""
+    """Run one small function as commands do, and print traces and cache hits, for `cache_state`."""
     events: list[str] = []
     jax.monitoring.register_event_listener(lambda event, **_: events.append(event.rsplit("/")[-1]))
     use_compilation_cache()
@@ -90,10 +89,10 @@ def trial() -> None:
 
 
 def _tried() -> subprocess.CompletedProcess[str]:
-    """`trial` in a process of its own, with what XLA has to say."""
+    """Run `trial` in a process of its own, with XLA's messages."""
     code = f"from {__name__} import trial; trial()"
     return subprocess.run(
-        # Without -P a file json.py of the folder one works in, a campaign of others perhaps, would be run.
+        # Without -P a file json.py in the working directory, perhaps somebody else's campaign, would be run.
         [sys.executable, "-P", "-c", code],
         check=True,
         capture_output=True,
@@ -104,7 +103,7 @@ def _tried() -> subprocess.CompletedProcess[str]:
 
 
 def cache_state() -> CacheState:
-    """Whether a second process takes from the folder what a first one has left there; two seconds."""
+    """Test whether a second process reads from the folder what a first one has written; two seconds."""
     folder = own_cache_folder()
     place = folder.path
     if fault := folder.fault():

@@ -1,10 +1,10 @@
-"""Functions of arrays that are traced once for all processes.
+"""Functions of arrays whose traces are stored and shared by processes.
 
-Tracing a large function takes JAX seconds in every process, and its compilation cache saves none of them. A `compiled`
-function is traced once for every shape of its arguments; where a program has asked for a cache folder, what the trace
-gave (StableHLO, by `jax.export`) is kept there and run by later processes, which neither trace nor compile. A stored
-trace belongs to one state of the sources that it was traced through, one version of the libraries that took part, and
-one shape of the arguments; it is code, and read only as `files.own_folder` allows.
+JAX takes seconds to trace a large function in every process, which its compilation cache does not save. A `compiled`
+function is traced once for every shape of its arguments. Where a program has set a cache folder, the trace (StableHLO,
+by `jax.export`) is stored there; later processes run it without tracing or compiling. A stored trace is valid for one
+state of the sources that it was traced through, one version of the libraries, and one shape of the arguments. It is
+code, and read only as `files.own_folder` allows.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from jax.typing import ArrayLike
 from tvsbayes.files.own_folder import OwnFolder
 
 LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
-"""Whose versions decide what a trace gives."""
+"""Libraries whose versions determine a trace."""
 BATCH = 32
-"""Points per call of a function of many: half an ensemble of 64, the calls of a differential-evolution step."""
+"""Points per call of a function of many points: half an ensemble of 64, as a differential-evolution step calls it."""
 KEPT_SHARE = 0.1
-"""Of the time of a first call, where another process has left trace and code: what progress predicts with."""
+"""Share of the time of a first call that remains where another process has stored trace and code; for progress bars."""
 PACKAGE = Path(__file__).resolve().parents[1]
 LOADED_TIME_S = time.time()
-"""When this process read its code, seconds since the epoch: source written later is not what it runs."""
+"""Time at which this process read its code, seconds since the epoch; source written later does not match it."""
 
 
 IMPORTS = re.compile(rb"^[ \t]*(?:from|import)[ \t]+(tvsbayes[\w.]*)(?:[ \t]+import[ \t]+(\w+))?", re.MULTILINE)
@@ -43,14 +43,13 @@ IMPORTS = re.compile(rb"^[ \t]*(?:from|import)[ \t]+(tvsbayes[\w.]*)(?:[ \t]+imp
 
 @functools.cache
 def sources_of(module: str, package: Path) -> dict[Path, bytes]:
-    """Files of a package, with their contents, that a function of a module may be traced through, sorted.
+    """Collect the files of a package, with contents, that a function of a module may be traced through, sorted.
 
-    Its own and those that it imports, and so on: what else the package says changes no trace. Of a module that is not
-    in the package every file.
+    These are the module's own file and those of its imports, recursively; for a module outside the package every file.
 
     Args:
-        module: its name.
-        package: folder.
+        module: name of the module.
+        package: folder of the package.
     """
     sources: dict[Path, bytes] = {}
     start = _file_of(module, package)
@@ -75,8 +74,8 @@ def _file_of(module: str, package: Path) -> Path | None:
 class Traces:
     """Traces of one state of the code in a cache folder.
 
-    `used` is the folder of this process, None until a program asks for one: who imports the package as a library has
-    nothing written.
+    `used` is the folder of this process, None until a program sets one: importing the package as a library writes
+    nothing.
     """
 
     used: Traces | None = None
@@ -85,14 +84,14 @@ class Traces:
         self.folder = OwnFolder(folder)
 
     def code(self, module: str) -> bytes:
-        """Hash of the sources that a function of a module is traced through, and of the versions of the libraries."""
+        """Hash the sources that a function of a module is traced through and the versions of the libraries."""
         digest = hashlib.sha256(" ".join(version(library) for library in LIBRARIES).encode())
         for path, content in sources_of(module, PACKAGE).items():
             digest.update(f"{path.relative_to(PACKAGE)} {len(content)}\n".encode() + content)
         return digest.digest()
 
     def name(self, key: str, module: str = "") -> str:
-        """The file of a trace; "" where its source has changed since this process read it, or cannot be read."""
+        """Return a trace's file name; "" where its source has changed since this process read it, or cannot be read."""
         try:
             if any(path.stat().st_mtime > LOADED_TIME_S for path in sources_of(module, PACKAGE)):
                 return ""
@@ -102,30 +101,30 @@ class Traces:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing is kept there."""
+        """Whether no trace is stored."""
         try:
             return next(self.folder.path.iterdir(), None) is None
         except OSError:
             return True
 
     def load(self, name: str) -> export.Exported | None:
-        """A stored trace."""
+        """Load a stored trace, None where there is none that can be read."""
         content = self.folder.read(name)
         if content is None:
             return None
         try:
             return export.deserialize(bytearray(content))
         except Exception:
-            # Whatever a reader of a foreign format raises, flatbuffers missing among it: it is traced anew.
+            # A reader of a foreign format may raise anything, also without flatbuffers; the function is traced again.
             return None
 
     def store(self, name: str, function: Callable, leaves: Iterable[Any]) -> export.Exported | None:
-        """Trace a function of arrays and keep that; None where it cannot be exported."""
+        """Trace a function of arrays and store the trace; None where it cannot be exported."""
         try:
             exported = export.export(jax.jit(function))(*leaves)
             self.folder.write(name, bytes(exported.serialize()))
         except (ImportError, ValueError, NotImplementedError):
-            # Without flatbuffers nothing is written, and a call into a library may have no stable form.
+            # Flatbuffers may be missing, and a call into a library may have no stable form.
             return None
         return exported
 
@@ -139,10 +138,10 @@ class Kind:
 
 
 def _as_array(leaf: Any) -> np.ndarray | jax.Array:
-    """An array of a type of its own, bound to no device.
+    """Convert to an array of fixed type, bound to no device.
 
-    Python's numbers, and what JAX took from them, would fit in with any type. Results of a stored trace are bound to
-    their device: for them as arguments JAX would compile the same function once more.
+    Python's numbers, and arrays that JAX made of them, have weak types. Results of a stored trace are bound to their
+    device: with them as arguments JAX would compile the same function again.
     """
     free = isinstance(leaf, jax.Array) and not leaf.weak_type and not leaf.committed
     array = leaf if free else np.asarray(leaf)
@@ -154,12 +153,12 @@ def _as_array(leaf: Any) -> np.ndarray | jax.Array:
 class Compiled[**P, Result]:
     """A function of arrays, or of trees of arrays, whose result is one array or a flat `eqx.Module` of arrays.
 
-    Called inside another function that JAX traces it is that plain function; else its arguments and results are
-    float64 whatever the process has set, and it is traced for every new shape only. Threads may call it.
+    Inside another function that JAX traces, it acts as the plain function. Otherwise arguments and results are float64,
+    whatever the process has set, and it is traced for new shapes only. It is thread-safe.
 
     Attributes:
-        plain: the function as it was written.
-        traces: how often this process had to trace it.
+        plain: the undecorated function.
+        traces: number of times that this process traced it.
     """
 
     def __init__(self, plain: Callable[P, Result], result: type[Result]) -> None:
@@ -170,13 +169,13 @@ class Compiled[**P, Result]:
         functools.update_wrapper(self, plain)
 
     def wait(self, seconds: float) -> float:
-        """What to expect of the next call beyond its work, where tracing and compiling take `seconds`; 0 once ready."""
+        """Predict the overhead of the next call, where tracing and compiling take `seconds`; 0 once ready."""
         if self._ready:
             return 0.0
         return seconds if Traces.used is None or Traces.used.empty else KEPT_SHARE * seconds
 
     def __call__(self, *args: Any, **kwargs: Any) -> Result:
-        """Run it on arrays of JAX or NumPy or numbers; `TypeError` for anything else."""
+        """Run the function on arrays of JAX or NumPy or on numbers; raise `TypeError` for anything else."""
         leaves, structure = jax.tree.flatten((args, kwargs))
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return self.plain(*args, **kwargs)
@@ -187,7 +186,7 @@ class Compiled[**P, Result]:
             return self._whole(self._first(key, structure, arrays) if run is None else run(*arrays))
 
     def _first(self, key: Any, structure: Any, arrays: list) -> Any:
-        """Make what runs these shapes, and run it: another thread waits instead of compiling the same."""
+        """Make the function for these shapes and run it; other threads wait instead of compiling the same."""
         with self._lock:
             run = self._ready.get(key)
             run = self._made(structure, arrays) if run is None else run
@@ -219,12 +218,12 @@ class Compiled[**P, Result]:
         return jax.jit(flat if exported is None else exported.call)
 
     def _fits(self, exported: export.Exported, kinds: list[Kind], backend: str) -> bool:
-        """Whether a stored trace takes these arguments and gives such a result."""
+        """Whether a stored trace has these arguments and this kind of result."""
         taken = [Kind(aval.shape, np.dtype(aval.dtype)) for aval in exported.in_avals]
         return taken == kinds and len(exported.out_avals) == len(self._fields()) and backend in exported.platforms
 
     def _fields(self) -> tuple:
-        """Of the result; one array is its own only field."""
+        """Return the fields of the result; a single array is its only field."""
         return (self._result,) if self._result is jax.Array else fields(cast(Any, self._result))
 
     @functools.cached_property
@@ -240,14 +239,14 @@ class Compiled[**P, Result]:
 
 
 def compiled[**P, Result](result: type[Result]) -> Callable[[Callable[P, Result]], Compiled[P, Result]]:
-    """Decorator of a function that returns `result`: one array (`jax.Array`) or a flat `eqx.Module`; see `Compiled`."""
+    """Decorate a function that returns `result`: one array (`jax.Array`) or a flat `eqx.Module`; see `Compiled`."""
     return lambda plain: Compiled(plain, result)
 
 
 def in_batches[Result](function: Callable[..., Result], *points: np.ndarray, size: int = BATCH) -> Result:
     """Call a compiled function on blocks of one size of each of `points` and join the results along the first axis.
 
-    The last block is filled up with its last row, so that nothing is compiled for a rest.
+    The last block is filled with its last row, so that no other size is compiled.
     """
     blocks, total = [], len(points[0])
     for start in range(0, total, size):
@@ -258,6 +257,6 @@ def in_batches[Result](function: Callable[..., Result], *points: np.ndarray, siz
 
 
 def placed(values: ArrayLike) -> jax.Array:
-    """A NumPy array as JAX's, in its own precision: without `jnp.asarray`, which compiles anew for every shape."""
+    """Convert a NumPy array to JAX in its own precision, without `jnp.asarray`, which compiles for every shape."""
     with jax.enable_x64(True):
         return jax.device_put(np.asarray(values), may_alias=False)

@@ -1,8 +1,7 @@
-"""Levenberg-Marquardt by optimistix, a compiled step at a time, on residuals that the caller linearises.
+"""Levenberg-Marquardt by optimistix, one compiled step at a time, on residuals that the caller linearises.
 
-A loop that JAX compiles around the residuals would compile them once more, and anew for every number of them: here
-optimistix sees p + 1 numbers of the same length, slope and normal equations, whatever they were made of. Coordinates
-(p,) and residuals have no unit.
+A loop compiled around the residuals would compile them again for every number of residuals. Here optimistix gets p + 1
+residuals with the same sum of squares, gradient and normal equations. Coordinates (p,) and residuals have no unit.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ if TYPE_CHECKING:
 
 
 class Linear(eqx.Module):
-    """A linear model: residuals at a point, and their Jacobian there."""
+    """A linear model: residuals at a point and their Jacobian."""
 
     point: Float[Array | np.ndarray, " parameters"]
     value: Float[Array | np.ndarray, " residuals"]
     jacobian: Float[Array | np.ndarray, "residuals parameters"]
 
     def __call__(self, at: Float[Array, " parameters"]) -> Float[Array, " residuals"]:
-        """Residuals as it has them elsewhere."""
+        """Compute the residuals of the linear model at another point."""
         return jnp.asarray(self.value + self.jacobian @ (at - self.point))
 
 
 class Search(eqx.Module):
-    """The best point so far, the next one to try, whether the search has ended, and what optimistix keeps besides."""
+    """State of a search: the best point, the next one to try, whether the search has ended, optimistix' own state."""
 
     value: Float[Array, " parameters"]
     trial: Float[Array, " parameters"]
@@ -48,23 +47,23 @@ class Search(eqx.Module):
 
 @dataclass(frozen=True)
 class Descent:
-    """Where a descent ended, shape (p,), and what else came of the residuals there."""
+    """End of a descent, shape (p,), and further results of the residuals there."""
 
     value: np.ndarray
     also: Any
 
 
 def _solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
-    """Levenberg-Marquardt whose damping falls tenfold after every step that the linear model predicted well.
+    """Build a Levenberg-Marquardt solver whose damping falls tenfold after every well predicted step.
 
-    By default optimistix asks for 99 % agreement and divides by 3.5: in directions that only a prior holds, where the
-    damping is as large as the curvature, it then creeps. Normal equations by Cholesky: a stored trace may hold them.
+    By default optimistix requires 99 % agreement and divides by 3.5. That is slow in directions constrained by a prior
+    only, where the damping is as large as the curvature. Normal equations by Cholesky can be stored in a trace.
     """
-    # Here: a process that takes the step from its stored trace needs neither.
+    # Imported here: a process with a stored trace of the step needs neither.
     import lineax as lx
     import optimistix as optx
 
-    # A traced tolerance, so that every stage shares the compilation, is a float to all of optimistix.
+    # The tolerance is traced, so that all stages share one compilation; optimistix' types expect a float.
     limit = cast(float, tolerance)
     solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(limit, limit, linear_solver=lx.Normal(lx.Cholesky()))
     trust: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
@@ -85,7 +84,7 @@ def _initial(linear: Linear, tolerance: Float[Array, ""]) -> Any:
 
 @compiled(Search)
 def begun(linear: Linear, tolerance: Float[Array, ""]) -> Search:
-    """The search before its first step, which is to the point itself."""
+    """Start a search; its first step is to the point itself."""
     state = _initial(linear, tolerance)
     packed = ravel_pytree(eqx.filter(state, eqx.is_array))[0]
     return Search(jnp.asarray(linear.point), state.y_eval, jnp.zeros((), bool), packed)
@@ -93,7 +92,7 @@ def begun(linear: Linear, tolerance: Float[Array, ""]) -> Search:
 
 @compiled(Search)
 def advanced(search: Search, linear: Linear, tolerance: Float[Array, ""]) -> Search:
-    """One step: the residuals at the point that was to be tried, linearised, decide about it and about the next."""
+    """Take one step: accept or reject the trial point by its linearised residuals, and propose the next."""
     arrays, rest = eqx.partition(_initial(linear, tolerance), eqx.is_array)
     state = eqx.combine(ravel_pytree(arrays)[1](search.state), rest)
     solver = _solver(tolerance)
@@ -103,7 +102,7 @@ def advanced(search: Search, linear: Linear, tolerance: Float[Array, ""]) -> Sea
 
 
 def _reduced(point: np.ndarray, at: LinearResidual) -> Linear:
-    """As few residuals as have the same sum of squares, slope and normal equations: p + 1."""
+    """Reduce to p + 1 residuals of the same sum of squares, gradient and normal equations."""
     value, jacobian = np.asarray(at.value), np.asarray(at.jacobian)
     root = np.linalg.qr(np.column_stack([jacobian, value]), mode="r")
     filled = np.zeros((point.size + 1, point.size + 1))
@@ -114,13 +113,13 @@ def _reduced(point: np.ndarray, at: LinearResidual) -> Linear:
 def descend(
     linearised: Callable[[np.ndarray], LinearResidual], start: np.ndarray, tolerance: float, max_steps: int
 ) -> Descent:
-    """Where optimistix' Levenberg-Marquardt ends.
+    """Descend by optimistix' Levenberg-Marquardt.
 
     Args:
         linearised: residuals and their Jacobian at a point (p,); called once a step.
         start: shape (p,).
-        tolerance: relative and absolute, of the last step and of what it changed in the sum of squares.
-        max_steps: points at most.
+        tolerance: relative and absolute tolerance of the last step and of its change in the sum of squares.
+        max_steps: largest number of points.
     """
     best = at = linearised(start)
     search = begun(linear := _reduced(start, at), tolerance)

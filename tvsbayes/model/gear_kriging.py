@@ -1,8 +1,8 @@
-"""Errors of gears that repeat by position: what those at some counters say of those at others. NumPy.
+"""Prediction of the gears' repeating errors at other counters from those at some counters (kriging). NumPy.
 
-The factor of the joint covariance of both has it all: the rows of the other counters are their shares of the known
-errors, in units in which these are N(0, 1) a priori, and what is left open (kriging; Rasmussen and Williams, Gaussian
-Processes for Machine Learning, MIT Press 2006, 2.2). Counters in steps, angles in rad.
+The factor of the joint covariance gives the prediction. The rows of the other counters hold the weights of the known
+errors, in units in which these are N(0, 1) a priori, and the conditional sd (Rasmussen and Williams, Gaussian Processes
+for Machine Learning, MIT Press 2006, 2.2). Counters in steps, angles in rad.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tvsbayes.model.gear_processes import GearScales, place_root
 
 
 def scales_at(physical: np.ndarray, harmonic_period_deg: np.ndarray) -> GearScales:
-    """Scales among the values of all parameters, of one point (p,) or of many (n, p); periods of shape (2, 3)."""
+    """Extract the gear scales from all parameter values, of one point (p,) or many (n, p); periods of shape (2, 3)."""
     leading = physical.shape[:-1]
 
     def block(name: str) -> np.ndarray:
@@ -35,11 +35,11 @@ def scales_at(physical: np.ndarray, harmonic_period_deg: np.ndarray) -> GearScal
 
 @dataclass(frozen=True)
 class Between:
-    """Errors at other counters (m,), from those at the places in their units.
+    """Prediction of errors at other counters (m,) from those at the places, in units of these.
 
     Attributes:
-        error, play: shares of the places, rad, shapes (m, c).
-        error_rest, play_rest: sd of what the places leave open, rad, shapes (m,).
+        error, play: weights of the places, rad, shapes (m, c).
+        error_rest, play_rest: conditional sd given the places, rad, shapes (m,).
     """
 
     error: np.ndarray
@@ -50,13 +50,13 @@ class Between:
 
 @dataclass(frozen=True)
 class KnownPlaces:
-    """Places of both axes, c of them, at which the errors are known or asked about.
+    """The c places of both axes at which the errors are known.
 
     Attributes:
         steps: counters, shape (c,).
-        on_tilt: places of the tilt axis, shape (c,).
+        on_tilt: whether a place is on the tilt axis, shape (c,).
         ratio_rad_per_step: mean ratios (pan, tilt), shape (2,).
-        scales: of the processes, NumPy; None where there is no place.
+        scales: scales of the processes, NumPy; None where there is no place.
     """
 
     steps: np.ndarray
@@ -66,12 +66,12 @@ class KnownPlaces:
 
     @property
     def size(self) -> int:
-        """Number of errors: transmission errors and plays."""
+        """Return the number of errors: transmission errors and plays."""
         return 2 * len(self.steps)
 
     @cached_property
     def root(self) -> np.ndarray:
-        """Lower triangular factor of the covariance of the errors, rad, shape (2 c, 2 c)."""
+        """Compute the lower triangular factor of the covariance of the errors, rad, shape (2 c, 2 c)."""
         return self._factor(self.steps, self.on_tilt)
 
     def _factor(self, steps: np.ndarray, on_tilt: np.ndarray) -> np.ndarray:
@@ -81,13 +81,13 @@ class KnownPlaces:
         return np.asarray(place_root(self.scales, angle_rad, on_tilt, np.ones(len(steps), dtype=bool), np))
 
     def factors_with(self, steps: np.ndarray, on_tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Factors of errors and of plays at the places and then at other counters, shapes (c + m, c + m), rad."""
+        """Compute factors of errors and of plays at the places, then at other counters, shapes (c + m, c + m), rad."""
         both = self._factor(np.append(self.steps, steps), np.append(self.on_tilt, on_tilt))
         half = len(both) // 2
         return both[:half, :half], both[half:, half:]
 
     def between(self, steps: np.ndarray, axis: int) -> Between:
-        """Errors of an axis at counters (m,)."""
+        """Predict errors of an axis at counters (m,)."""
         different, which = np.unique(steps, return_inverse=True)
         count = len(self.steps)
         error, play = (

@@ -1,6 +1,6 @@
 """Errors of gears that repeat by position: transmission error and play as Gaussian processes of the output's angle.
 
-Both are told apart at the counters where looks found the axes; rad. Arrays over axes are ordered (pan, tilt), arrays
+Looks identify both at the counters where they found the axes; rad. Arrays over axes are ordered (pan, tilt), arrays
 over places as `Places` lists them (formulation 3.1).
 """
 
@@ -20,19 +20,19 @@ from tvsbayes.instrument.parameters import PERIODS_MAX
 from tvsbayes.statistics.gaussian_process import JITTER, matern52, with_waves
 
 FLOOR_RAD2 = 1e-24
-"""Least variance of a place: below every angle that anybody measures, above zero."""
+"""Variance added at a place: above zero, yet below every measurable angle."""
 
 
 class GearScales(eqx.Module):
-    """How large repeating errors are, over what angle they change, and how the zero drifts.
+    """Scales of repeating errors: their sds, the angles over which they change, and the drift of the zero.
 
     Fields may have leading axes: many points at once.
 
     Attributes:
         error_rad: sd of the transmission error's aperiodic part, by axis.
-        length_rad: of its correlation and of the play's.
+        length_rad: correlation length of this part and of the play.
         play_rad: sd of the play over position.
-        drift_rad_per_root_hour: of the zero's random walk.
+        drift_rad_per_root_hour: sd of the zero's random walk.
         amplitude_rad: sd of the parts of stated period, by axis and number.
         period_rad: their periods, angle of the output.
     """
@@ -46,55 +46,55 @@ class GearScales(eqx.Module):
 
 
 class Places(eqx.Module):
-    """Counters of both axes, one list, at which the processes have values; padding is not valid."""
+    """Counters of both axes, in one list, at which the processes are evaluated; padding is not valid."""
 
     steps: Float[Array, " places"]
     on_tilt: Bool[Array, " places"]
     valid: Bool[Array, " places"]
 
     def by_axis(self, of_axis: Float[Array, "2"]) -> Float[Array, " places"]:
-        """The number of each place's axis."""
+        """Select for each place the number of its axis."""
         return jnp.where(self.on_tilt, of_axis[1], of_axis[0])
 
 
 def errors_at(errors: np.ndarray, places: int) -> np.ndarray:
-    """Transmission errors, then plays (n, e) at the first places, with those at all (n, 2 places); nothing behind."""
+    """Pad transmission errors, then plays (n, e) at the first places to all places (n, 2 places) by zeros."""
     errors_rad = np.zeros((len(errors), 2, places))
     errors_rad[:, :, : errors.shape[1] // 2] = np.reshape(errors, (len(errors), 2, -1))
     return errors_rad.reshape(len(errors), -1)
 
 
 def _by_axis(of_axis: Any, on_tilt: Any, functions: ModuleType) -> Any:
-    """Numbers (..., 2) of the axes at the places, shape (..., places)."""
+    """Select numbers (..., 2) of the axes for the places, shape (..., places)."""
     return functions.where(on_tilt, of_axis[..., 1:], of_axis[..., :1])
 
 
 class BlockRoot(eqx.Module):
-    """A lower triangular factor that is zero but in blocks along its diagonal, of many points; of one block for JAX."""
+    """A block-diagonal lower triangular factor, for many points; for JAX it has one block."""
 
     blocks: tuple[Float[Array | np.ndarray, "*batch _ _"], ...]
 
     @property
     def size(self) -> int:
-        """Number of its rows."""
+        """Return the number of rows."""
         return sum(block.shape[-1] for block in self.blocks)
 
     @property
     def spans(self) -> tuple[slice, ...]:
-        """Rows of each block."""
+        """Return the rows of each block."""
         ends = np.cumsum([0, *(block.shape[-1] for block in self.blocks)]).tolist()
         return tuple(slice(*pair) for pair in pairwise(ends))
 
     def times(self, x: Any) -> Any:
-        """R x of vectors (..., e)."""
+        """Compute R x for vectors (..., e)."""
         return _joined([(block @ x[..., span, None])[..., 0] for block, span in self._parts], -1)
 
     def transposed_times(self, x: Any) -> Any:
-        """R'X of matrices (..., e, c)."""
+        """Compute R'X for matrices (..., e, c)."""
         return _joined([block.swapaxes(-2, -1) @ x[..., span, :] for block, span in self._parts], -2)
 
     def congruent(self, x: Any) -> Any:
-        """R'X R of symmetric matrices (..., e, e)."""
+        """Compute R'X R for symmetric matrices (..., e, e)."""
         if len(self.blocks) == 1:
             return self.blocks[0].swapaxes(-2, -1) @ x @ self.blocks[0]
         result = np.empty(np.broadcast_shapes(x.shape, (*self.blocks[0].shape[:-2], 1, 1)))
@@ -120,20 +120,20 @@ def _roots(scales: GearScales, rows: Callable[[Any], Any], angle_rad: Any, toget
     amplitudes, periods = (
         [rows(x[..., k]) for k in range(PERIODS_MAX)] for x in (scales.amplitude_rad, scales.period_rad)
     )
-    # A traced amplitude may be zero at one point only.
+    # A traced amplitude may be zero at some points only, so it is always included.
     waves = [pair for pair in zip(amplitudes, periods, strict=True) if xp is not np or np.any(pair[0])]
     error, near = rows(scales.error_rad), matern52(distance, rows(scales.length_rad), xp)
     covariance = with_waves(error**2 * near, distance, waves, xp)
     floor = JITTER * sum((amplitude**2 for amplitude, _ in waves), error**2) + FLOOR_RAD2
     error_root = xp.linalg.cholesky(xp.where(together, covariance, error**2 * xp.eye(size)) + floor * xp.eye(size))
-    # Scaled after its factor: where there is no play its slope exists all the same.
+    # The play scales the factor, not the covariance: its derivative then exists at zero play too.
     near = xp.where(together, near, xp.eye(size))
     play_root = rows(scales.play_rad) * xp.linalg.cholesky(near + JITTER * xp.eye(size))
     return BlockRoot((error_root, play_root))
 
 
 def place_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray, valid: np.ndarray) -> BlockRoot:
-    """`place_root` by blocks: pan's places, then those of tilt, then padding, which do not know of each other; NumPy.
+    """Compute `place_root` in independent blocks: places of pan, then of tilt, then padding; NumPy.
 
     Args:
         scales: of the processes, fields with any leading axes.
@@ -159,9 +159,9 @@ def place_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray,
 def place_root(
     scales: GearScales, angle_rad: Any, on_tilt: Any, valid: Any, functions: ModuleType = jnp
 ) -> Float[Array | np.ndarray, "*batch errors errors"]:
-    """Lower triangular factor of the covariance of transmission errors, then plays, at places (formulation 3.1).
+    """Compute the lower triangular factor of the covariance of transmission errors, then plays (formulation 3.1).
 
-    Written for NumPy's and JAX's functions alike.
+    It works with NumPy and JAX.
 
     Args:
         scales: of the processes, fields with any leading axes.
@@ -171,7 +171,7 @@ def place_root(
         functions: jax.numpy or numpy.
 
     Returns:
-        Rad; zero but on the diagonal for padding.
+        Factor at the places, rad; diagonal for padding.
     """
     xp = functions
     together = (on_tilt[:, None] == on_tilt[None, :]) & valid[:, None] & valid[None, :]

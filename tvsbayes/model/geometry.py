@@ -1,10 +1,9 @@
-"""Rotations and cameras in JAX: what the pixels are made of.
+"""Rotations and cameras in JAX: from points to pixels.
 
-Many vectors are three arrays (`instrument.mirrors.Vectors`). Where one array is handed over its first axis is x, y, z.
-mm, rad. Frame S: origin in the left camera's centre, X depth, Y left, Z up; OpenCV's camera axes are x = -Y, y = -Z,
-z = X. Pinhole with
-Brown-Conrady distortion; the right camera sees x_right = R x_left + T. Image px with the integer at the centre of a
-pixel, ordered (u_left, v_left, u_right, v_right).
+Vectors in any number are three arrays (`instrument.mirrors.Vectors`). In a single array the first axis is x, y, z. mm,
+rad. Frame S: origin in the left camera's centre, X depth, Y left, Z up; OpenCV's camera axes are x = -Y, y = -Z, z = X.
+Pinhole with Brown-Conrady distortion; the right camera sees x_right = R x_left + T. Image px with the integer at the
+centre of a pixel, ordered (u_left, v_left, u_right, v_right).
 """
 
 from __future__ import annotations
@@ -26,24 +25,24 @@ CROSS[1, 0, 2], CROSS[2, 1, 0], CROSS[0, 2, 1] = 1.0, 1.0, 1.0
 CV_FROM_S = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """OpenCV's camera axes from frame S: x = -Y, y = -Z, z = X."""
 NEAREST_MM = 1.0
-"""Points nearer than this, or behind a camera, are projected as if they stood here: a solver that strays
-there gets a finite gradient back, and no spot is ever seen there."""
+"""Points nearer than this, or behind a camera, are projected as if at this depth: a solver gets a finite gradient
+there, and no spot is ever seen there."""
 WIDEST_TAN2 = 4.0
-"""Squared tangent (63 degrees) beyond which the distortion polynomial is held: it is fitted inside the image
-and folds outside it."""
+"""Squared tangent (63 degrees) beyond which the distortion polynomial is constant: it is fitted inside the image and
+not monotone outside."""
 
 
 def materialise(tree):
-    """Have XLA compute these arrays once.
+    """Make XLA compute these arrays once.
 
-    Its CPU backend otherwise fuses the whole optical chain into each of the many consumers of a derivative and
-    computes it again in every one.
+    Otherwise its CPU backend fuses the whole optical chain into each of the many terms of a derivative and computes it
+    again in each.
     """
     return jax.lax.optimization_barrier(tree)
 
 
 def rotation_matrix(rotation_rad: Vector) -> Float[Array, "3 3"]:
-    """Rodrigues' formula, with finite derivatives of every order at the zero rotation.
+    """Compute Rodrigues' formula, with finite derivatives of every order at zero rotation.
 
     Args:
         rotation_rad: rotation vector, rad.
@@ -64,7 +63,7 @@ def rotation_matrix(rotation_rad: Vector) -> Float[Array, "3 3"]:
 
 
 def transform(matrix: Float[Array | np.ndarray, "3 3"], vectors: Vectors) -> Vectors:
-    """Matrix times vectors."""
+    """Multiply a matrix and vectors."""
     return Vectors(*(row[0] * vectors.x + row[1] * vectors.y + row[2] * vectors.z for row in matrix))
 
 
@@ -91,7 +90,7 @@ class StereoCameras(eqx.Module):
 
 
 def image(cameras: StereoCameras, points_s_mm: Vectors) -> tuple[Float[Array, "..."], ...]:
-    """Pixels of points of frame S in both images: u_left, v_left, u_right, v_right, an array each, px."""
+    """Project points of frame S into both images: arrays u_left, v_left, u_right, v_right, px."""
     left = transform(CV_FROM_S, points_s_mm)
     right = transform(rotation_matrix(cameras.rotation_rad), left) + Vectors.of(cameras.translation_mm)
     pixels = []
@@ -110,7 +109,7 @@ def image(cameras: StereoCameras, points_s_mm: Vectors) -> tuple[Float[Array, ".
 
 
 def project(cameras: StereoCameras, points_s_mm: Float[Array, "3 *batch"]) -> Float[Array, "4 *batch"]:
-    """Pixels of points of frame S in both images.
+    """Project points of frame S into both images.
 
     Args:
         cameras: the stereo pair.

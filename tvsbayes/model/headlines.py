@@ -1,7 +1,7 @@
-"""Quantities of `instrument/parameters` at a point of parameter space and a pose: how each follows from the model.
+"""Formulas of the quantities of `instrument/parameters` at a point of parameter space and a pose.
 
 deg/step of the beam's azimuth and elevation in frame P; deg; mm. The pose is the pair of mirror angles (pan, tilt),
-rad. With derivatives by the coordinates for planning, or for many points at once for draws.
+rad. Planning uses derivatives by the coordinates, draws use many points at once.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ DEGREES = 180 / np.pi
 
 
 class Headlines(eqx.Module):
-    """Values of `TARGETS` and d/d(coordinates)."""
+    """Values of `TARGETS` and their derivatives by the coordinates."""
 
     value: Float[Array, " targets"]
     gradient: Float[Array, "targets parameters"]
 
 
 class AtPose(eqx.Module):
-    """A point of parameter space and a pose of the mirrors: what `FORMULAS` are of.
+    """A point of parameter space and a pose of the mirrors, the argument of `FORMULAS`.
 
     Attributes:
         model: gears, mirrors, cameras.
         mirrors: the beam at the pose.
-        effective: deg/step by direction: slopes of the lines through the looks, or those at the pose.
+        effective: effective ratios by direction, deg/step: slopes of the lines through the looks, or those at the pose.
     """
 
     model: Model
@@ -46,14 +46,14 @@ class AtPose(eqx.Module):
 
 
 def effective_deg_per_step(gears: Transmission, angles: BeamAngles) -> Float[Array, "4"]:
-    """Gear ratio of each direction times the slope of the mirrors at the pose of `angles`, ordered as `DIRECTIONS`."""
+    """Compute each direction's gear ratio times the slope of the mirrors at the pose, ordered as `DIRECTIONS`."""
     ratio, half = gears.ratio_rad_per_step, 0.5 * gears.contrast_rad_per_step
     slope = jnp.diagonal(angles.jacobian)
     return jnp.stack([(ratio + half) * slope, (ratio - half) * slope], axis=1).ravel() * DEGREES
 
 
 def _contrast(at: AtPose) -> Array:
-    """By parameters of its own: what priors hold fixed shall depend on nothing, not even by rounding."""
+    """Compute the contrast from its own parameters: where the prior fixes it, it must not vary even by rounding."""
     gears = at.model.transmission
     return gears.contrast_rad_per_step / gears.ratio_rad_per_step * (at.effective[::2] + at.effective[1::2]) / 2
 
@@ -65,22 +65,22 @@ FORMULAS: dict[str, Callable[[AtPose], Array]] = {
     "backlash_deg": lambda at: at.model.transmission.backlash_rad * DEGREES,
     "effective_mirror_offset_mm": lambda at: at.mirrors.effective_mirror_offset_mm,
 }
-"""Values of all quantities of a block."""
+"""Formulas for the values of all quantities of a block."""
 
 
 def values_of(at: AtPose, blocks: Iterable[str]) -> Float[Array, " quantities"]:
-    """Of quantities block by block."""
+    """Compute the values of quantities block by block."""
     return jnp.concatenate([jnp.ravel(FORMULAS[block](at)) for block in blocks])
 
 
 def target_values(at: AtPose) -> Float[Array, " targets"]:
-    """Of `TARGETS`, in their order."""
+    """Compute the values of `TARGETS`, in their order."""
     return values_of(at, dict.fromkeys(quantity.block for quantity in TARGETS.values()))
 
 
 @compiled(Headlines)
 def headlines(z: Float[Array, " parameters"], space: ParameterSpace, pose_rad: Float[Array, "2"]) -> Headlines:
-    """Headlines at one pose (formulation 3.2) with their derivatives."""
+    """Compute headlines at one pose (formulation 3.2) and their derivatives."""
 
     def values(z):
         model = space.model(z)
@@ -91,12 +91,12 @@ def headlines(z: Float[Array, " parameters"], space: ParameterSpace, pose_rad: F
 
 
 class SeenLine(eqx.Module):
-    """Where a campaign's looks stand on the counters of both axes: what its headlines are the slopes over.
+    """Counters of a campaign's looks on both axes, over which its headlines are slopes.
 
     Attributes:
         pose_rad: mean mirror angles (pan, tilt) over the looks used.
         places: counters.
-        share: of the value at each place in the slope of the least-squares line through the looks of its axis,
+        share: weight of the value at each place in the slope of the least-squares line through the looks of its axis,
             steps^-1.
     """
 
@@ -120,24 +120,24 @@ COMBINED: dict[str, Callable[[Derived, Quantity], np.ndarray]] = {
     "degrees_per_step": _by_direction,
     "effective_contrast_deg_per_step": _difference,
 }
-"""How quantities of a block follow from others."""
+"""Formulas of blocks whose quantities follow from others."""
 _MODELLED_BLOCKS = tuple(block for block in FORMULAS if block not in COMBINED and block not in BLOCKS)
 MODELLED = {name: k for k, name in enumerate(name for block in _MODELLED_BLOCKS for name in QUANTITIES.blocks[block])}
-"""Columns of what neither is a parameter nor follows from others."""
+"""Columns of quantities that are neither parameters nor follow from others."""
 DERIVED = tuple(
     name for name, of in QUANTITIES.items() if name not in INDEX and (name in MODELLED or of.block in COMBINED)
 )
-"""Everything but parameters that has draws."""
+"""All quantities with draws except parameters."""
 
 
 class Derived(eqx.Module):
-    """Quantities of one point of parameter space by name, in the units of data/docs/conventions.md.
+    """Quantities at points of parameter space by name, in the units of data/docs/conventions.md.
 
     Attributes:
-        physical: parameters.
+        physical: values of the parameters.
         modelled: quantities of the model at the reference pose, by the columns `MODELLED`.
         jacobian: d(azimuth, elevation)/d(pan, tilt) there.
-        place_errors_rad: transmission errors, then plays, at the places; empty where gears do not vary.
+        place_errors_rad: transmission errors, then plays, at the places; empty where gears have no errors by position.
     """
 
     physical: Float[Array | np.ndarray, "*draws parameters"]
@@ -146,7 +146,7 @@ class Derived(eqx.Module):
     place_errors_rad: Float[Array | np.ndarray, "*draws errors"]
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Of a parameter or of `DERIVED`, with the leading axes of the fields."""
+        """Return a parameter or one of `DERIVED`, with the leading axes of the fields."""
         if name in COLUMNS:
             return np.asarray(self.physical)[..., COLUMNS[name]]
         if name in MODELLED:
@@ -155,35 +155,35 @@ class Derived(eqx.Module):
         return COMBINED[quantity.block](self, quantity)
 
     def block(self, name: str) -> np.ndarray:
-        """Of all quantities of a block, along the last axis."""
+        """Return all quantities of a block, along the last axis."""
         return np.stack([self[each] for each in QUANTITIES.blocks[name]], axis=-1)
 
     @property
     def effective_deg_per_step(self) -> np.ndarray:
-        """Slopes of the lines through the looks by direction, transmission error included."""
+        """Return the slopes of the lines through the looks by direction, transmission error included."""
         return self.block("effective_deg_per_step")
 
     @property
     def local_deg_per_step(self) -> np.ndarray:
-        """Gear ratio times the slope of the mirrors at the reference pose by direction, without transmission error."""
+        """Return gear ratio times mirror slope at the reference pose by direction, without transmission error."""
         return self.block("local_deg_per_step")
 
 
 def line_deg_per_step(
     model: Model, seen: SeenLine, place_errors_rad: Float[Array, " errors"], mirrors: BeamAngles
 ) -> Float[Array, "4"]:
-    """Slopes of the beam's azimuth and elevation over the counters seen, by direction (formulation 3.2).
+    """Compute slopes of the beam's azimuth and elevation over the counters seen, by direction (formulation 3.2).
 
-    Through one counter there is no line: the slope is then that of `mirrors`, at the reference pose.
+    With one counter only, the slope is that of `mirrors` at the reference pose.
     """
     gears, places = model.transmission, seen.places
     zero = jnp.stack([jnp.zeros(()), model.tilt_zero_rad])
     counted = places.by_axis(gears.ratio_rad_per_step) * places.steps
-    # No play, no stop error, no drift: nothing but what the counter itself says.
+    # Play, stop error and drift are left out: the angle is a function of the counter alone.
     shaped = gears.harmonics.error_rad(jnp.stack([counted, counted], axis=1))
     error = jnp.where(places.on_tilt, shaped[:, 1], shaped[:, 0])
     count = len(place_errors_rad) // 2
-    # Both lists of places begin alike; padding ends them.
+    # Both lists of places start equally and end with padding.
     error = error + jnp.pad(place_errors_rad[:count], (0, max(len(error) - count, 0)))[: len(error)]
 
     def slope(turned: Float[Array, " places"]) -> Float[Array, "2"]:
@@ -191,11 +191,11 @@ def line_deg_per_step(
         tilt = jnp.where(places.on_tilt, turned, seen.pose_rad[1])
         beam = trace(model.optics, pan, tilt).direction
         azimuth, elevation = jnp.arctan2(beam.y, beam.x), jnp.arctan2(beam.z, jnp.hypot(beam.x, beam.y))
-        # An axis that goes through the zenith counts on.
+        # Beyond the zenith the elevation continues past 90 deg.
         beyond = jnp.cos(jnp.pi - elevation - turned) > jnp.cos(elevation - turned)
         elevation = jnp.where(beyond, jnp.pi - elevation, elevation)
         rest = jnp.where(places.on_tilt, elevation, azimuth) - turned
-        # The beam turns with the mirrors but for degrees and a constant: their mean tells on which turn it is.
+        # The beam follows the mirrors to within degrees and a constant; the mean difference fixes the turn.
         sine, cosine = (jnp.sum(jnp.where(used, part(rest), 0.0), axis=1) for part in (jnp.sin, jnp.cos))
         turns = jnp.round((rest - places.by_axis(jnp.arctan2(sine, cosine))) / (2 * jnp.pi))
         parts = seen.share * (turned + rest - turns * (2 * jnp.pi))
@@ -212,7 +212,7 @@ def line_deg_per_step(
 
 
 class _Modelled(eqx.Module):
-    """The fields of `Derived` that the model gives."""
+    """The fields of `Derived` that the model computes."""
 
     modelled: Float[Array, "*draws modelled"]
     jacobian: Float[Array, "*draws 2 2"]
@@ -240,13 +240,13 @@ def derived_quantities(
     space: ParameterSpace,
     seen: SeenLine,
 ) -> Derived:
-    """Headlines of many points at once (formulation 3.2), as NumPy arrays; every field has the leading axis `draws`.
+    """Compute headlines of many points (formulation 3.2) as NumPy arrays; every field has the leading axis `draws`.
 
     Args:
         z: coordinates, shape (draws, p).
         place_errors_rad: transmission errors, then plays, at the first of the places, shape (draws, e).
-        space: priors.
-        seen: lines.
+        space: space of the parameters.
+        seen: counters of the looks.
     """
     given, values = np.asarray(place_errors_rad), space.values(z)
     modelled = _modelled(values, errors_at(given, max(len(seen.places.steps), given.shape[1] // 2)), space, seen)

@@ -1,7 +1,7 @@
-"""The way of the laser: counters -> gears, play -> mirror angles -> beam. Differentiable (formulation 3.1 and 3.2).
+"""Path of the laser: counters -> gears, play -> mirror angles -> beam. Differentiable (formulation 3.1 and 3.2).
 
 Lengths in mm, angles in rad. Pan positive = left, tilt positive = up; arrays over axes are ordered (pan, tilt). Frame P
-and vectors by their components are those of `instrument.mirrors`.
+and vectors in components are as in `instrument.mirrors`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ UNIFORM_SD = 1 / 12**0.5
 """Standard deviation of a uniform distribution of unit width."""
 ORDERS = np.array(HARMONIC_ORDERS, dtype=float)
 STRETCH = 64
-"""Moves that are followed together: a campaign costs what its own moves need, not what it was padded to."""
+"""Moves computed together: the cost follows the campaign's own moves, not its padded length."""
 
 
 class Harmonics(eqx.Module):
@@ -32,8 +32,8 @@ class Harmonics(eqx.Module):
     Attributes:
         amplitude_rad: indices axis, order, (c, s).
         period_rad: P of each axis, angle of the output.
-        on_wheel: the wheel's error, a function of the output behind the play, instead of the pinion's, a function
-            of the input before it.
+        on_wheel: whether the error is the wheel's, a function of the output behind the play, or the pinion's, a
+            function of the input before it.
     """
 
     amplitude_rad: Float[Array, "2 2 2"]
@@ -41,14 +41,14 @@ class Harmonics(eqx.Module):
     on_wheel: Bool[Array, "2"]
 
     def error_rad(self, angle_rad: Float[Array, "*moves 2"]) -> Float[Array, "*moves 2"]:
-        """The error at one angle per axis."""
+        """Compute the error at one angle per axis."""
         phase = (2 * jnp.pi) * (angle_rad / self.period_rad)[..., None] * ORDERS
         cosine, sine = self.amplitude_rad[..., 0], self.amplitude_rad[..., 1]
         return jnp.sum(cosine * jnp.cos(phase) + sine * jnp.sin(phase), axis=-1)
 
 
 def no_harmonics() -> Harmonics:
-    """Perfect gears; a full turn stands for the period that nobody stated."""
+    """Return perfect gears; a full turn replaces a period that is not stated."""
     return Harmonics(jnp.zeros((2, 2, 2)), jnp.full(2, 2 * jnp.pi), jnp.ones(2, dtype=bool))
 
 
@@ -68,7 +68,7 @@ class ZeroShift(eqx.Module):
     def shift_rad(
         self, warm_minutes: Float[Array, " moves"], kelvin: Float[Array, " moves"]
     ) -> Float[Array, "moves 2"]:
-        """At times t since the machine was switched on and temperatures T - T_0."""
+        """Compute shifts at times t since the machine was switched on and temperatures T - T_0."""
         crept = -jnp.expm1(-warm_minutes / self.creep_minutes)
         return crept[:, None] * self.creep_rad + kelvin[:, None] * self.thermal_rad_per_K
 
@@ -76,7 +76,7 @@ class ZeroShift(eqx.Module):
 class Transmission(eqx.Module):
     """Gears of both axes: mean ratio, left-minus-right (up-minus-down) contrast, play and transmission error.
 
-    `zero_shift` is None where the zeros stay.
+    `zero_shift` is None where the zeros are constant.
     """
 
     ratio_rad_per_step: Float[Array, "2"]
@@ -89,8 +89,8 @@ class Transmission(eqx.Module):
 class MoveArrays(eqx.Module):
     """Moves of a campaign, padded; `approach` is +1 left/up, -1 right/down, 0 unknown, read at `first` rows.
 
-    `warm_minutes` have passed since the machine was switched on, `kelvin` is the temperature less that of the first
-    move; both None where the zeros are taken to stay.
+    `warm_minutes` is the time since the machine was switched on, `kelvin` the temperature less that of the first move;
+    both are None where the zeros are taken as constant.
     """
 
     steps: Float[Array, "moves 2"]
@@ -113,7 +113,7 @@ class MirrorAngles(eqx.Module):
 
 
 class Reached(eqx.Module):
-    """Where the moves before others end: ends of the play's band, counters, and the way since the segment began."""
+    """State at the end of earlier moves: ends of the play's band, counters, and distance since the segment began."""
 
     low_rad: Float[Array, "2"]
     high_rad: Float[Array, "2"]
@@ -122,12 +122,12 @@ class Reached(eqx.Module):
 
 
 def nowhere() -> Reached:
-    """Before the first move, which begins a segment."""
+    """Return the state before the first move, which begins a segment."""
     return Reached(*(jnp.zeros(2) for _ in range(4)))
 
 
 def way_steps(moves: MoveArrays, before: Reached | None = None) -> Float[Array, "moves 2"]:
-    """Steps that each axis has gone, forwards and backwards, since its segment began."""
+    """Count the steps that each axis has gone, forwards and backwards, since its segment began."""
     before = nowhere() if before is None else before
     gone = jnp.abs(jnp.diff(moves.steps, axis=0, prepend=before.steps[None]))
     total = before.way_steps + jnp.cumsum(jnp.where(moves.first[:, None], 0.0, gone), axis=0)
@@ -136,7 +136,7 @@ def way_steps(moves: MoveArrays, before: Reached | None = None) -> Float[Array, 
 
 
 class Stretch(eqx.Module):
-    """Some moves, followed: their angles, the number of the next move, and where it begins."""
+    """Result of some moves: their angles, the number of the next move, and the state before it."""
 
     angles: MirrorAngles
     next: Int[Array, ""]
@@ -144,11 +144,11 @@ class Stretch(eqx.Module):
 
 
 def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: MoveArrays) -> MirrorAngles:
-    """Follow the counters through gears, play and transmission error, and the zeros through time.
+    """Compute mirror angles from counters, through gears, play, transmission error and shifts of the zeros in time.
 
     Over a band of unknown play the wheel's error is taken at the band's middle, as a shift of the whole band. At an
-    amplitude of 0.1 deg and a play of 0.5 deg its curvature, left out, is worth 1e-6 deg and its slope 0.4 % of the
-    deviation. The filter likewise adds home offsets behind the gears, as if the error had no slope.
+    amplitude of 0.1 deg and a play of 0.5 deg the curvature left out is 1e-6 deg and the slope 0.4 % of the deviation.
+    The filter also adds home offsets behind the gears, as if the error had no slope.
 
     Args:
         transmission: gears of both axes.
@@ -164,19 +164,19 @@ def mirror_angles(transmission: Transmission, tilt_zero_rad: Scalar, moves: Move
 def followed(
     transmission: Transmission, tilt_zero_rad: Scalar, moves: MoveArrays, number: Int[Array, ""], before: Reached
 ) -> Stretch:
-    """`mirror_angles` of moves that follow others; `number` is that of the first of them."""
+    """Compute `mirror_angles` of moves after others; `number` is that of the first of them."""
     half = transmission.backlash_rad / 2
     harmonics = transmission.harmonics
-    # Since the segment began: k n + c/2 times the way gone, for k + c/2 forwards and k - c/2 backwards.
+    # k n + c/2 times the distance since the segment began: k + c/2 forwards and k - c/2 backwards.
     way = way_steps(moves, before)
     q = transmission.ratio_rad_per_step * moves.steps + 0.5 * transmission.contrast_rad_per_step * way
-    # The errors know no history: outside the scan they cost one vector operation.
+    # The errors do not depend on history, so they are computed outside the scan, in one vector operation.
     driven = q + jnp.where(harmonics.on_wheel, 0.0, harmonics.error_rad(q))
 
     def take_up(band, move):
         low, high = band
         q, first, approach = move
-        # Play is monotone in its state: the two ends of the band bound every history in between.
+        # Play is monotone in its state, so the two ends of the band bound all states between.
         low = jnp.where(first, jnp.where(approach < 0, q + half, q - half), jnp.clip(low, q - half, q + half))
         high = jnp.where(first, jnp.where(approach > 0, q - half, q + half), jnp.clip(high, q - half, q + half))
         return (low, high), (0.5 * (low + high), UNIFORM_SD * (high - low))
@@ -192,19 +192,19 @@ def followed(
 
 
 def no_moves(moves: MoveArrays) -> Stretch:
-    """Before the first stretch of moves."""
+    """Return an empty stretch before the first move."""
     none = jnp.zeros((stretch_size(moves), 2))
     return Stretch(MirrorAngles(none, none), jnp.zeros((), dtype=int), nowhere())
 
 
 def stretch_size(moves: MoveArrays) -> int:
-    """Moves that are followed together: `STRETCH`, or what divides the padded number evenly."""
+    """Return the number of moves computed together: `STRETCH`, or a divisor of the padded number."""
     count = len(moves.steps)
     return count if count <= STRETCH else math.gcd(count, STRETCH)
 
 
 class AnglesAt(eqx.Module):
-    """Mirror angles at the moves that were looked for, and the last stretch that was followed for them."""
+    """Mirror angles at the requested moves, and the last stretch computed for them."""
 
     angles: MirrorAngles
     stretch: Stretch
@@ -217,14 +217,14 @@ def angles_at(
     index: Int[Array, " looks"],
     so_far: Stretch,
 ) -> AnglesAt:
-    """`mirror_angles` at the moves before looks, of which only those up to the last look are followed.
+    """Compute `mirror_angles` at the moves before looks, following only the moves up to the last look.
 
     Args:
         transmission: gears of both axes.
         tilt_zero_rad: tilt mirror angle at mid-play and counter zero.
         moves: absolute counters in time order.
-        index: ascending; none lies before `so_far`.
-        so_far: `no_moves`, or from earlier looks.
+        index: moves of the looks, ascending; none lies before `so_far`.
+        so_far: `no_moves`, or the stretch of earlier looks.
     """
     size = stretch_size(moves)
 
@@ -245,7 +245,7 @@ def angles_at(
 
 
 def trace(optics: Optics | HeadOptics, pan_rad: Float[Array, "*batch"], tilt_rad: Float[Array, "*batch"]) -> Ray:
-    """Trace the beam to where it leaves (formulation 3.2; the signs are part of the contract).
+    """Trace the beam to where it leaves the instrument (formulation 3.2; the signs are part of the contract).
 
     Args:
         optics: laser and mirrors, or the terms of a head.
@@ -273,7 +273,7 @@ class BeamAngles(eqx.Module):
 
 
 def beam_angles(optics: Optics | HeadOptics, pan_rad: Scalar, tilt_rad: Scalar) -> BeamAngles:
-    """Direction of the beam and its local slope against the mirror angles at one pose (formulation 3.2)."""
+    """Compute the beam's direction and its slope by the mirror angles at one pose (formulation 3.2)."""
 
     def azimuth_elevation(angles):
         d = trace(optics, angles[0], angles[1]).direction

@@ -1,9 +1,9 @@
-"""Coordinates with standard-normal priors, and the model that a point of them stands for.
+"""Coordinates with standard normal priors, and the model at a point of them.
 
-Every parameter has a coordinate z with prior N(0, 1): normal priors are value + u z, half-normals
-u Phi^-1((1 + Phi(z)) / 2) (formulation 4.1: no boundary, no mirrored mode), log-normals value exp(u z); the 24 stereo
-parameters are mean + root z with root root^T their full covariance. u = 0 fixes a parameter whatever its z, so that
-one compiled function serves every choice of fixed parameters. Physical values have the units of their names.
+Every parameter has a coordinate z with prior N(0, 1): normal priors are value + u z, half-normals u Phi^-1((1 + Phi(z))
+/ 2) (formulation 4.1: no boundary, no mirrored mode), log-normals value exp(u z); the 24 stereo parameters are mean +
+root z with root root^T their full covariance. u = 0 fixes a parameter whatever its z, so that one compiled function
+works for every choice of fixed parameters. Physical values have the units of their names.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from tvsbayes.model.geometry import Scalar, StereoCameras, Vector, materialise
 from tvsbayes.model.laser_path import Harmonics, Transmission, ZeroShift
 
 NO_PERIOD_DEG = np.full((2, PERIODS_MAX), FULL_TURN_DEG)
-"""Stands for the periods of transmission errors that nobody stated; harmless, since those errors are 0."""
+"""Replaces periods of transmission errors that are not stated; it has no effect, since those errors are 0."""
 
 
 class Extrinsics(eqx.Module):
@@ -83,17 +83,17 @@ class Model(eqx.Module):
 
 
 HALF_NORMAL_MEAN, HALF_NORMAL_SD = math.sqrt(2 / math.pi), math.sqrt(1 - 2 / math.pi)
-"""Of |x|, x ~ N(0, 1)."""
+"""Mean and sd of |x|, x ~ N(0, 1)."""
 
 
 def half_normal[Number: (float, np.ndarray, jax.Array)](z: Number, functions: ModuleType = special) -> Number:
-    """A half-normal quantity of scale 1 by its coordinate, Phi^-1((1 + Phi(z)) / 2).
+    """Compute a half-normal quantity of scale 1 from its coordinate, Phi^-1((1 + Phi(z)) / 2).
 
-    1 - (1 + Phi(z)) / 2 = Phi(-z) / 2 keeps its digits where Phi(z) rounds to 1.
+    1 - (1 + Phi(z)) / 2 = Phi(-z) / 2 is accurate where Phi(z) rounds to 1.
 
     Args:
         z: coordinates, any shape.
-        functions: where `ndtr` and `ndtri` come from, SciPy's or JAX's.
+        functions: module of `ndtr` and `ndtri`, SciPy's or JAX's.
     """
     return -functions.ndtri(0.5 * functions.ndtr(-z))
 
@@ -101,14 +101,14 @@ def half_normal[Number: (float, np.ndarray, jax.Array)](z: Number, functions: Mo
 def half_normal_slope[Number: (float, np.ndarray, jax.Array)](
     z: Number, value: Number | None = None, functions: ModuleType = np
 ) -> Number:
-    """Its derivative by the coordinate, phi(z) / (2 phi(value)); the value is found where it is not given."""
+    """Compute its derivative by the coordinate, phi(z) / (2 phi(value)), and the value where not given."""
     value = half_normal(z) if value is None else value
     return 0.5 * functions.exp(0.5 * (value**2 - z**2))
 
 
 @jax.custom_jvp
 def _half_normal(z: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`half_normal` of JAX; its derivative needs nothing but its value, and compiles to a tenth of JAX's own."""
+    """Compute `half_normal` in JAX, with a derivative from its value, a tenth of the code of JAX's own."""
     return half_normal(z, jax.scipy.special)
 
 
@@ -121,16 +121,15 @@ def _half_normal_along(
 
 
 def half_normal_coordinate(value: np.ndarray) -> np.ndarray:
-    """The coordinate of a half-normal quantity of scale 1, by the tail that keeps its digits; values of any sign."""
+    """Compute the coordinate of a half-normal quantity of scale 1, from the more accurate tail; values of any sign."""
     near = special.ndtri(np.maximum(special.erf(np.maximum(value, 0.0) / np.sqrt(2)), 1e-16))
     return np.where(np.less(value, 0.5), near, -special.ndtri(2 * special.ndtr(-np.maximum(value, 0.5))))
 
 
 def half_normal_sd(mean: float, sd: float) -> float:
-    """Sd of a half-normal of scale 1 whose coordinate is N(mean, sd^2), by Gauss-Hermite quadrature.
+    """Compute the sd of a half-normal of scale 1 whose coordinate is N(mean, sd^2), by Gauss-Hermite quadrature.
 
-    Near zero the map from coordinate to quantity is flat on one side: a slope there would promise a certainty that
-    no fit has.
+    Near zero the map from coordinate to quantity is flat on one side: its slope would give too small an sd.
     """
     nodes, weights = np.polynomial.hermite_e.hermegauss(48)
     values = half_normal(mean + sd * nodes)
@@ -140,11 +139,11 @@ def half_normal_sd(mean: float, sd: float) -> float:
 
 
 FARTHEST_SD = 36.0
-"""Coordinates of half-normals beyond are taken for this."""
+"""Largest coordinate of a half-normal; larger ones are clipped."""
 
 
 class Point(eqx.Module):
-    """Coordinates, values in the units of `NAMES`, and d(value)/d(coordinate) of the rig's parameters."""
+    """A point: coordinates, values in the units of `NAMES`, and d(value)/d(coordinate) of the rig's parameters."""
 
     z: Float[Array | np.ndarray, " parameters"]
     values: Float[Array | np.ndarray, " parameters"]
@@ -154,8 +153,8 @@ class Point(eqx.Module):
 class ParameterSpace(eqx.Module):
     """Priors of one rig as arrays; an argument of the jitted functions, never a constant in them.
 
-    `harmonic_period_deg` holds the periods of the transmission errors of (pan, tilt), as `NO_PERIOD_DEG` where none
-    or fewer are stated. `key` is that of the mechanism in `MECHANISMS`.
+    `harmonic_period_deg` holds the periods of the transmission errors of (pan, tilt), those of `NO_PERIOD_DEG` where
+    not stated. `key` is the mechanism's key in `MECHANISMS`.
     """
 
     value: Float[Array, " rig"]
@@ -168,7 +167,7 @@ class ParameterSpace(eqx.Module):
 
     @property
     def mechanism(self) -> Mechanism:
-        """What the coordinates stand for."""
+        """Return the mechanism whose parameters these are."""
         return MECHANISMS[self.key]
 
     def physical(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
@@ -176,36 +175,36 @@ class ParameterSpace(eqx.Module):
         return _values(self, z, jnp, _half_normal)
 
     def values(self, z: Float[Array | np.ndarray, "*points parameters"]) -> np.ndarray:
-        """The same of many points (..., p), in NumPy."""
+        """Compute `physical` of many points (..., p), in NumPy."""
         with np.errstate(over="ignore", invalid="ignore"):
             return np.asarray(_values(jax.tree.map(np.asarray, self), np.asarray(z), np, half_normal))
 
     def point(self, z: Float[Array, " parameters"]) -> Point:
-        """A point by its coordinates."""
+        """Compute the point at these coordinates."""
         values = materialise(self.physical(z))
         return Point(z, values, _slopes(self, z, values, jnp))
 
     def known_point(self, z: np.ndarray) -> Point:
-        """The same in NumPy."""
+        """Compute `point` in NumPy."""
         known, values = jax.tree.map(np.asarray, self), self.values(z)
         with np.errstate(over="ignore", invalid="ignore"):
             return Point(z, values, np.asarray(_slopes(known, z, values, np)))
 
     def model(self, z: Float[Array, " parameters"]) -> Model:
-        """Coordinates -> model."""
+        """Compute the model at these coordinates."""
         return self.model_at(materialise(self.physical(z)))
 
     def model_at(self, physical: Float[Array, " parameters"]) -> Model:
-        """Values in the units of the names -> model."""
+        """Compute the model at these values, in the units of `NAMES`."""
         return model_of(physical, self.harmonic_period_deg, self.mechanism)
 
 
 def _values(space: ParameterSpace, z: Any, functions: ModuleType, half_normal: Callable[[Any], Any]) -> Any:
-    """Coordinates -> values in the units of `NAMES`, by functions of JAX or of NumPy."""
+    """Convert coordinates to values in the units of `NAMES`, by functions of JAX or NumPy."""
     rig_z, stereo_z = z[..., : len(RIG_NAMES)], z[..., len(RIG_NAMES) :]
     half, log = (space.kind == KINDS.index(kind) for kind in ("half-normal", "log-normal"))
-    # Unused branches are fed harmless numbers: `where` lets their infinities into the gradient.
-    # Beyond 37 sd Phi underflows and its inverse has no value: a fit may stray there, and must come back.
+    # Unused branches get harmless numbers, since `where` lets their infinities into the gradient. Beyond 37 sd Phi
+    # underflows and its inverse is infinite; a fit that goes there must be able to return.
     w = functions.where(half, functions.minimum(rig_z, FARTHEST_SD), 0.0)
     log_normal = space.value * functions.exp(functions.where(log, space.u, 0.0) * rig_z)
     other = functions.where(log, log_normal, space.value + space.u * rig_z)
@@ -214,7 +213,7 @@ def _values(space: ParameterSpace, z: Any, functions: ModuleType, half_normal: C
 
 
 def _slopes(space: ParameterSpace, z: Any, values: Any, functions: ModuleType) -> Any:
-    """Slopes of the rig's part of `_values`, of which every value has a coordinate of its own."""
+    """Compute the slopes of the rig's part of `_values`, where every value has its own coordinate."""
     rig_z, own = z[: len(RIG_NAMES)], values[: len(RIG_NAMES)]
     half, log = (space.kind == KINDS.index(kind) for kind in ("half-normal", "log-normal"))
     bent = half & (rig_z < FARTHEST_SD)
@@ -225,17 +224,18 @@ def _slopes(space: ParameterSpace, z: Any, values: Any, functions: ModuleType) -
 
 
 def scale_of(mechanism: Mechanism) -> np.ndarray:
-    """Contract units -> rad and mm, shape (p,)."""
+    """Return the factors from the units of `NAMES` to rad and mm, shape (p,)."""
     return np.array([np.pi / 180 if p.unit.startswith("deg") else 1.0 for p in mechanism.parameters.values()])
 
 
 STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{side}"] for side in SIDES[axis]] for axis in AXES])
 SCATTER_COLUMNS = np.array([INDEX[name] for name in LOOK_SCATTER_NAMES])
-"""Coordinates of the stop sds by axis and approach side, (right, left) and (down, up): shape (2, 2)."""
+"""Coordinates of the stop sds by axis and approach side, (right, left) and (down, up), shape (2, 2); of looks'
+scatter."""
 
 
 def _camera_columns(*parts: str) -> slice | np.ndarray:
-    """Columns of named intrinsics in a camera's block: a slice where they follow each other, which compiles to less."""
+    """Return columns of named intrinsics in a camera's block: a slice where adjacent, which compiles to less code."""
     columns = [BLOCKS["stereo.left"].index(f"stereo.left.{part}") for part in parts]
     first, last = columns[0], columns[-1]
     return slice(first, last + 1) if columns == list(range(first, last + 1)) else np.array(columns)
@@ -246,13 +246,13 @@ def model_of(
     harmonic_period_deg: Float[Array | np.ndarray, "2 3"] = NO_PERIOD_DEG,
     mechanism: Mechanism = TWO_MIRROR,
 ) -> Model:
-    """Assemble the model (deg -> rad happens here and nowhere else).
+    """Assemble the model (deg is converted to rad here only).
 
     Args:
         physical: values in the units of `NAMES`.
         harmonic_period_deg: periods of the transmission error by axis, see `ParameterSpace`; the first of each axis is
-            that of the harmonics of known shape.
-        mechanism: whose values they are.
+            the period of `harmonic_deg`.
+        mechanism: mechanism of these values.
 
     Returns:
         The model in rad and mm.
@@ -312,12 +312,12 @@ def model_of(
 
 
 def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
-    """Priors of `[rig]` and of the stereo calibration as arrays."""
+    """Build the arrays of the priors of `[rig]` and of the stereo calibration."""
     priors = [table.priors[name] for name in table.mechanism.rig_names]
     covariance = np.asarray(stereo.parameter_covariance, dtype=np.float64)
     scale = np.sqrt(np.diag(covariance))
-    # Standard deviations span 1e-5 (rad) to 1 (px): the root is taken of the correlation matrix. Zero rows
-    # (fixed parameters) stay zero.
+    # Standard deviations span 1e-5 (rad) to 1 (px): the root is that of the correlation matrix. Zero rows (fixed
+    # parameters) stay zero.
     safe = np.where(scale > 0, scale, 1.0)
     eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
     # The symmetric root keeps coordinate j closest to parameter j.
@@ -334,7 +334,7 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
 
 
 def _periods_deg(table: RigTable, axis: str) -> np.ndarray:
-    """Of the transmission error of an axis, as many as there may be."""
+    """Return the periods of an axis' transmission error, padded to the largest number."""
     stated = np.ravel(table.harmonic_period_deg.get(axis, ()))
     return np.append(stated, np.full(PERIODS_MAX - len(stated), FULL_TURN_DEG))
 
@@ -348,7 +348,7 @@ class Physical:
 
 
 def physical_at(z: np.ndarray, space: ParameterSpace) -> Physical:
-    """Values and slopes at a point (p,), in NumPy: nothing is compiled for one point."""
+    """Compute values and slopes at a point (p,), in NumPy: compiling does not pay for one point."""
     point = space.known_point(z)
     slope = np.zeros((len(z), len(z)))
     slope[: len(RIG_NAMES), : len(RIG_NAMES)] = np.diag(point.slopes)
@@ -357,10 +357,10 @@ def physical_at(z: np.ndarray, space: ParameterSpace) -> Physical:
 
 
 def coordinates_of(space: ParameterSpace, physical: np.ndarray) -> np.ndarray:
-    """Coordinates of values in the units of `NAMES`, the inverse of `ParameterSpace.physical`; shapes (..., p).
+    """Compute coordinates of values in the units of `NAMES`, the inverse of `ParameterSpace.physical`; shapes (..., p).
 
-    What priors hold fixed has coordinate 0, and so have directions in which the cameras are exactly known. Values
-    beyond 30 sds are taken for 30.
+    Parameters fixed by their priors have coordinate 0, and so have directions in which the cameras are exactly known.
+    Coordinates are clipped at 30.
     """
     value, u, kind = (np.asarray(x, dtype=float) for x in (space.value, space.u, space.kind))
     true, cameras = np.split(np.asarray(physical, dtype=float), [len(RIG_NAMES)], axis=-1)
@@ -376,7 +376,7 @@ def coordinates_of(space: ParameterSpace, physical: np.ndarray) -> np.ndarray:
 def free_mask(
     space: ParameterSpace, has_aperture: bool, unseen: Collection[str] = ()
 ) -> Bool[np.ndarray, " parameters"]:
-    """Parameters that are estimated: u > 0, the receiver's only where there are aperture readings, none `unseen`."""
+    """Mark estimated parameters: u > 0, the receiver's only with aperture readings, none `unseen`."""
     rig = np.asarray(space.u) > 0
     for name in (*unseen, *(() if has_aperture else RECEIVER_NAMES)):
         rig[INDEX[name]] = False

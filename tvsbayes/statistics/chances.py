@@ -1,6 +1,6 @@
-"""What chance alone does: probabilities of chi-squares, residuals one by one, shares of trials and their bounds.
+"""Probabilities under chance alone: chi-squares, residuals one by one, shares of trials and their bounds.
 
-Numbers without units; NumPy, and SciPy inside what needs it.
+Numbers have no units. NumPy; functions that need SciPy import it.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ import numpy as np
 LEVELS = (0.50, 0.68, 0.90, 0.95)
 """Probabilities of the intervals whose coverage is counted."""
 ASSURED = (0.8, 0.95)
-"""Assurances of which a plan states the number of experiments; it meets its target from the first on."""
+"""Assurances for which a plan states the number of experiments; at the first it counts as meeting its target."""
 BOUND = 1e-4
-"""Two-sided probability with which an honest study leaves its bounds."""
+"""Two-sided probability that a correct study leaves its bounds."""
 
 
 def recursive_residuals(values: np.ndarray, variances: np.ndarray, *, backwards: bool) -> tuple[float | None, ...]:
-    """Each value against the weighted mean of those before it, standardised.
+    """Standardise the difference of each value from the weighted mean of those before it.
 
-    Of independent values with one mean these are independent and N(0, 1) (Brown, Durbin and Evans, J. R. Stat. Soc. B
-    37, 1975, 149); distances from the mean of all are not: those of a pair are opposite.
+    For independent values with one mean, these residuals are independent and N(0, 1) (Brown, Durbin and Evans, J. R.
+    Stat. Soc. B 37, 1975, 149). Differences from the mean of all values are not: those of a pair are opposite.
 
     Args:
         values: shape (n,).
-        variances: of their noise, shape (n,).
-        backwards: begin with the last.
+        variances: variances of their noise, shape (n,).
+        backwards: begin with the last value.
 
     Returns:
-        n of them in the order of the values, None where there is nothing before; empty for fewer than two.
+        n residuals in the order of the values, None for the first in that order; empty for fewer than two values.
     """
     if len(values) < 2:
         return ()
@@ -46,15 +46,15 @@ def recursive_residuals(values: np.ndarray, variances: np.ndarray, *, backwards:
 
 
 FRACTION_TERMS = 400
-"""Of Legendre's continued fraction: where it is asked for ten times as many change no digit, up to 30 000 degrees of
+"""Terms of Legendre's continued fraction: where it is used, ten times as many change no digit, up to 30 000 degrees of
 freedom."""
 
 
 def log_chance(chi2: np.ndarray | float, dof: np.ndarray | float) -> np.ndarray:
-    """Log probability of a chi-square of at least this size, also where the probability itself underflows.
+    """Compute the log probability of a chi-square of at least this size, even where the probability itself underflows.
 
-    Far out Q(a, x) = Gamma(a, x) / Gamma(a) with Gamma(a, x) by Legendre's continued fraction (DLMF 8.9.2): two gross
-    defects must not tie at minus infinity, the worse one is the cause.
+    In the far tail Q(a, x) = Gamma(a, x) / Gamma(a), with Gamma(a, x) by Legendre's continued fraction (DLMF 8.9.2).
+    Two gross defects must not tie at minus infinity: the worse one is reported as the cause.
     """
     from scipy import special
 
@@ -74,14 +74,14 @@ def log_chance(chi2: np.ndarray | float, dof: np.ndarray | float) -> np.ndarray:
 
 
 def chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:
-    """Chi-square that a spot of three residuals and so many aperture readings exceeds with this probability."""
+    """Compute the chi-square that a spot's three residuals and aperture readings exceed with this probability."""
     from scipy import special
 
     return special.chdtri(3.0 + readings, probability)
 
 
 def student_log_density(errors: np.ndarray, dof: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Log density of Student's t with a scale, the normal's where the degrees of freedom are infinite; shapes alike."""
+    """Log density of a scaled Student's t, normal where the degrees of freedom are infinite; equal shapes."""
     from scipy import special
 
     ratio2 = (errors / scale) ** 2
@@ -93,10 +93,10 @@ def student_log_density(errors: np.ndarray, dof: np.ndarray, scale: np.ndarray) 
 
 
 def one_way_chance(groups: Sequence[np.ndarray]) -> float:
-    """Probability that groups of one mean and variance differ by so much: the F test of a one-way layout.
+    """Compute the p-value of the F test of a one-way layout: groups of one mean and variance differ at least this much.
 
     Args:
-        groups: at least two of shape (n,), n > 1, not all of their values equal.
+        groups: at least two groups of shape (n,), n > 1, whose values are not all equal.
     """
     from scipy import special
 
@@ -108,10 +108,10 @@ def one_way_chance(groups: Sequence[np.ndarray]) -> float:
 
 
 def share_error(share: float, draws: int) -> float:
-    """Monte Carlo standard error of a share: binomial, and where all draws agree that of Beta(1/2, draws + 1/2).
+    """Compute the Monte Carlo standard error of a share: binomial, or of Beta(1/2, draws + 1/2) where all draws agree.
 
-    No number of draws makes 0 or 1 certain, as sqrt(p (1 - p) / n) would have it there; the Beta distribution is the
-    posterior under Jeffreys' prior.
+    For a share of 0 or 1, sqrt(p (1 - p) / n) would be 0, although no number of draws makes it certain. The Beta
+    distribution is the posterior under Jeffreys' prior.
     """
     if 0 < share < 1:
         return math.sqrt(share * (1 - share) / draws)
@@ -119,8 +119,8 @@ def share_error(share: float, draws: int) -> float:
 
 
 def binomial_bounds(count: int, probability: float) -> tuple[float, float]:
-    """Share that an event of this probability keeps within in `count` trials, but for `BOUND`."""
-    # The only one that needs `scipy.stats`, which takes half a second to load: inverting a discrete distribution.
+    """Bound the share of `count` trials in which an event of this probability occurs; it lies outside with `BOUND`."""
+    # Only inverting a discrete distribution needs `scipy.stats`, which takes half a second to load.
     from scipy import stats
 
     low, high = stats.binom.ppf(BOUND / 2, count, probability), stats.binom.isf(BOUND / 2, count, probability)
@@ -128,7 +128,7 @@ def binomial_bounds(count: int, probability: float) -> tuple[float, float]:
 
 
 def rms_bounds(count: int) -> tuple[float, float]:
-    """RMS that `count` standard normal numbers keep within, but for `BOUND`."""
+    """Bound the RMS of `count` standard normal numbers; it lies outside with probability `BOUND`."""
     from scipy import special
 
     low, high = np.sqrt(2 * special.gammaincinv(0.5 * count, [BOUND / 2, 1 - BOUND / 2]) / count)
@@ -136,7 +136,7 @@ def rms_bounds(count: int) -> tuple[float, float]:
 
 
 def share_interval95(hits: int, count: int) -> tuple[float, float]:
-    """Clopper and Pearson's interval of a probability."""
+    """Compute Clopper and Pearson's 95 % interval of a probability."""
     from scipy import special
 
     low = 0.0 if hits == 0 else float(special.betaincinv(hits, count - hits + 1, 0.025))

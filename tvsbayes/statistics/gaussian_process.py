@@ -1,7 +1,7 @@
-"""Stationary Gaussian processes of one variable: the correlations that repeat errors of position are described by.
+"""Covariances of stationary Gaussian processes of one variable, which describe errors that repeat by position.
 
 Rasmussen and Williams, Gaussian Processes for Machine Learning, MIT Press 2006, 4.2. Distances, lengths and periods of
-a call share one unit. Written for NumPy's and JAX's functions alike.
+a call share one unit. The functions work with NumPy and JAX.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 
 JITTER = 1e-10
-"""Share of a process' variance added to every place, so that neighbours a step apart leave its covariance a Cholesky
-factor: a hundred readings that are known to a tenth of the process' sd see it as 1e-6 in a log density."""
+"""Share of a process' variance added at every place, so that the covariance of places one step apart has a Cholesky
+factor. A hundred readings known to a tenth of the process' sd change by 1e-6 in a log density."""
 
 
 def matern52[Numbers: Any](distance: Numbers, length: Numbers, functions: ModuleType = np) -> Numbers:
-    """Correlation of a Matern process of smoothness 5/2, twice differentiable, at distances of either sign (4.17)."""
+    """Correlate a Matern process of smoothness 5/2 (twice differentiable) at signed distances (4.17)."""
     scaled = np.sqrt(5.0) * functions.abs(distance) / length
     return (1 + scaled + scaled**2 / 3) * functions.exp(-scaled)
 
 
 def periodic[Numbers: Any](distance: Numbers, period: Numbers, functions: ModuleType = np) -> Numbers:
-    """Correlation of a cosine of random phase and normal amplitude at distances of either sign."""
+    """Compute the correlation of a cosine of random phase and normal amplitude at signed distances."""
     return functions.cos(2 * np.pi * distance / period)
 
 
@@ -35,12 +35,12 @@ def repeated[Numbers: Any](
     waves: Iterable[tuple[Numbers, Numbers | float]],
     functions: ModuleType = np,
 ) -> Numbers:
-    """Covariance of what repeats by position: a Matern process of this sd and cosines of stated periods.
+    """Compute the covariance of errors that repeat by position: a Matern process and cosines of stated periods.
 
     Args:
-        distance: of either sign, any shape; all others broadcast with it.
-        sd: of the process.
-        length: of its correlation.
+        distance: signed, of any shape; the other arguments broadcast with it.
+        sd: standard deviation of the process.
+        length: its correlation length.
         waves: sd and period of each cosine.
         functions: numpy or jax.numpy.
     """
@@ -53,7 +53,7 @@ def with_waves[Numbers: Any](
     waves: Iterable[tuple[Numbers, Numbers | float]],
     functions: ModuleType = np,
 ) -> Numbers:
-    """A covariance and that of cosines of these sds and periods."""
+    """Add the covariance of cosines of these sds and periods to a covariance."""
     for amplitude, period in waves:
         covariance = covariance + amplitude**2 * periodic(distance, period, functions)
     return covariance

@@ -16,8 +16,8 @@ NORMAL_95 = 1.959963984540054
 
 
 def coverage_factor(dof: float, probability: float = 0.95) -> float:
-    """Student's t_p for two-sided coverage (GUM G.3, G.4.1); fractional degrees of freedom are kept."""
-    # Loading it takes a twentieth of the time of a `locate`, which does not need it.
+    """Compute Student's t_p for two-sided coverage (GUM G.3, G.4.1), for fractional degrees of freedom too."""
+    # Imported here: loading SciPy takes a twentieth of the time of a `locate`, which does not need it.
     from scipy.special import ndtri, stdtrit
 
     upper = 0.5 * (1 + probability)
@@ -25,38 +25,38 @@ def coverage_factor(dof: float, probability: float = 0.95) -> float:
 
 
 def effective_dof(u: float, contributions: Sequence[float], dof: Sequence[float]) -> float:
-    """Effective degrees of freedom of a combined uncertainty, Welch-Satterthwaite (GUM G.4.1, eq. G.2b).
+    """Compute the effective degrees of freedom of a combined uncertainty, Welch-Satterthwaite (GUM G.4.1, eq. G.2b).
 
     Args:
         u: combined standard uncertainty of the result.
-        contributions: standard uncertainties of the result by each input.
-        dof: theirs, infinite where exactly known.
+        contributions: standard uncertainties of the result due to each input.
+        dof: degrees of freedom of each contribution, infinite where exactly known.
     """
     total = sum(c**4 / nu for c, nu in zip(contributions, dof, strict=True))
     return float(u**4 / total) if total > 0 else math.inf
 
 
 BLOCKS = 10
-"""Parts of the draws whose scatter gives the Monte Carlo error of an interval's end."""
+"""Blocks of draws whose scatter gives the Monte Carlo error of an interval's end."""
 BELIEVED = 4.0
-"""Monte Carlo errors from which on a departure of the inputs from normality counts. Ten blocks give the error, and two
-ends are looked at: at 2 errors, one exactly linear model in five would be called not validated, at 4 one in sixty."""
+"""Monte Carlo errors above which a departure of the inputs from normality counts. The error is from ten blocks and two
+ends are compared: at 2 errors one exactly linear model in five would fail validation, at 4 one in sixty."""
 
 
 def symmetric_interval(draws: np.ndarray, probability: float = 0.95) -> np.ndarray:
-    """Probabilistically symmetric coverage interval over the first axis (JCGM 101 7.7): first axis (low, high)."""
+    """Compute the probabilistically symmetric coverage interval over the first axis (JCGM 101 7.7), as (low, high)."""
     tail = 0.5 * (1 - probability)
     return np.quantile(draws, (tail, 1 - tail), axis=0)
 
 
 def interval95(draws: np.ndarray) -> tuple[float, float]:
-    """Equal-tailed 95 % interval of scalar draws (n,), as plain numbers."""
+    """Compute the equal-tailed 95 % interval of scalar draws (n,), as floats."""
     low, high = symmetric_interval(draws)
     return float(low), float(high)
 
 
 def absolute_bound95(mean: np.ndarray, sd: np.ndarray) -> float:
-    """What 95 % of errors do not exceed, either sign, of normal distributions (n,) of equal weight."""
+    """Compute the absolute value that 95 % of errors do not exceed, in a mixture of normals (n,) of equal weight."""
     from scipy.optimize import brentq
     from scipy.special import ndtr
 
@@ -70,19 +70,19 @@ def absolute_bound95(mean: np.ndarray, sd: np.ndarray) -> float:
 
 
 def rms(values: Sequence[float]) -> float:
-    """Root mean square; 0 of no values."""
+    """Compute the root mean square; 0 without values."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
 
 
 def phases_deg(cosine: np.ndarray, sine: np.ndarray) -> np.ndarray:
-    """Phases of waves with these parts (n,), each within half a turn of their circular mean, deg."""
+    """Compute phases of waves with these parts (n,), deg, each within half a turn of their circular mean."""
     phase = np.arctan2(sine, cosine)
     middle = np.angle(np.mean(np.exp(1j * phase)))
     return np.degrees(middle + np.angle(np.exp(1j * (phase - middle))))
 
 
 def numerical_tolerance(u: np.ndarray, digits: int) -> np.ndarray:
-    """Half a unit of the last of `digits` significant digits of a standard uncertainty (JCGM 101 7.9.2)."""
+    """Compute half a unit of the last of `digits` significant digits of a standard uncertainty (JCGM 101 7.9.2)."""
     u = np.asarray(u, dtype=float)
     safe = np.where(u > 0, u, 1.0)
     # Of the rounded u: 0.0996 has the two digits 10, whose last unit is 0.01.
@@ -93,7 +93,7 @@ def numerical_tolerance(u: np.ndarray, digits: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Validation:
-    """Does the law of propagation give the interval that the distribution has (JCGM 101 clause 8)?
+    """Validation of the law of propagation by comparing its interval with that of the draws (JCGM 101 clause 8).
 
     Fields have the shape of the quantity.
 
@@ -101,7 +101,7 @@ class Validation:
         digits: significant digits of u that are compared.
         tolerance: delta of JCGM 101 8.1.
         deviation: larger distance of the two interval ends, d_low and d_high.
-        error: its Monte Carlo standard error; that of a departure of the inputs too small to be seen is not in it.
+        error: its Monte Carlo standard error, without that of a departure of the inputs that did not count.
         validated: the deviation is not larger than the tolerance.
         decided: the deviation differs from the tolerance by more than twice its Monte Carlo error.
     """
@@ -114,7 +114,7 @@ class Validation:
     decided: np.ndarray
 
     def digits_held(self, u: np.ndarray) -> np.ndarray:
-        """Significant digits of u, `digits` at most, to which the law holds; 0 where not even one."""
+        """Count the significant digits of u, at most `digits`, to which the law holds; 0 where it holds to none."""
         held = np.zeros(np.shape(u), dtype=int)
         for digits in range(1, self.digits + 1):
             held = np.where(self.deviation <= numerical_tolerance(u, digits), digits, held)
@@ -133,18 +133,18 @@ def validate(
 ) -> Validation:
     """Compare value +- factor u with the interval of the draws.
 
-    A thousand draws know an interval's end to a twentieth of u, far coarser than the tolerance. Therefore the same
-    inputs are sent through the linearised model: the difference of the two intervals shows what linearisation does,
-    with little noise. What remains, the inputs' departure from the distribution behind `factor`, is the difference
-    of the linearised draws from value +- factor u; it counts where it exceeds `BELIEVED` Monte Carlo errors.
+    A thousand draws determine an interval's end to a twentieth of u, far coarser than the tolerance. Therefore the same
+    inputs are propagated through the linearised model: the difference of the two intervals is the effect of
+    linearisation, with little noise. The difference of the linearised draws from value +- factor u is the inputs'
+    departure from the distribution behind `factor`; it counts where it exceeds `BELIEVED` Monte Carlo errors.
 
     Args:
-        draws: of the quantity, shape (n, ...).
+        draws: draws of the quantity, shape (n, ...).
         linearised: value + J (input draws - estimates) for the same input draws, shape (n, ...).
         value: estimate by the law of propagation, shape (...).
         u: its standard uncertainty, shape (...).
         digits: significant digits of u to validate.
-        probability: of the interval.
+        probability: coverage probability of the interval.
         factor: coverage factor that belongs to the probability.
 
     Returns:
@@ -172,6 +172,6 @@ def validate(
 
 
 def _with_error(statistic: Callable[..., np.ndarray], *draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A statistic of draws and its Monte Carlo standard error from interleaved blocks."""
+    """Compute a statistic of draws and its Monte Carlo standard error from interleaved blocks."""
     blocks = [statistic(*(d[k::BLOCKS] for d in draws)) for k in range(BLOCKS)]
     return statistic(*draws), np.std(blocks, axis=0, ddof=1) / math.sqrt(BLOCKS)

@@ -1,9 +1,9 @@
-"""Minima of sums of squares and of negative log densities, with the covariance there; float64 throughout.
+"""Minima of sums of squares and of negative log densities, with the covariance at them; float64 throughout.
 
-optimistix' `LevenbergMarquardt` reports success on wrong answers at loose tolerances, so its flag decides nothing: the
-joint fit goes on with Newton steps on the density and judges the step that is left, the bundle adjustment judges the
-next step and a second descent. Residuals are dimensionless (divided by their standard deviations) or in the data's
-unit, as the caller chose; the covariance follows that choice.
+optimistix' `LevenbergMarquardt` reports success on wrong answers at loose tolerances, so its flag is ignored. The joint
+fit continues with Newton steps on the density and tests the size of the last step; the bundle adjustment tests the next
+step and a second descent. Residuals are dimensionless (divided by their standard deviations) or in the data's unit; the
+covariance follows.
 """
 
 from __future__ import annotations
@@ -20,33 +20,32 @@ from jaxtyping import Array, Float, PyTree
 from scipy import optimize
 
 DIFFERENCE_STEP = 2e-3
-"""Of central differences, in posterior standard deviations. Along a bent ridge third derivatives reach ten and fourth
-three hundred: slopes are off by 1e-5, rounding of a density of 1e4 (1e-11)
-makes 1e-8."""
+"""Step of central differences, in posterior standard deviations. Along a curved ridge third derivatives reach 10 and
+fourth 300: they make slopes wrong by 1e-5, rounding of a density of 1e4 (1e-11) by 1e-8."""
 PAIR_STEP = 3e-4
-"""Of second differences, one-sided for pairs of ways: a mixed third derivative of a few units is worth 1e-3 of the
-curvature, rounding of a density of 1e4 (1e-11) 2e-4; both are below the thousandth part of any sd that is reported."""
+"""Step of second differences, one-sided for pairs of directions. A mixed third derivative of a few units changes the
+curvature by 1e-3, rounding of a density of 1e4 (1e-11) by 2e-4; both change a reported sd by less than 0.1 %."""
 KINK_STEP = 0.25
-"""Newton step, in posterior sds, that may be left where the density falls nowhere along it: on a kink, where a move is
-as long as the play that it takes up, or where the rounding of a thousand looks hides the rest."""
+"""Largest Newton step, in posterior sds, that may remain where the density does not decrease along it. That is so on a
+kink, where a move is as long as the play that it takes up, or where rounding over a thousand looks is larger."""
 KINK_FALL = 1e-4
-"""Of the negative log density, by which steps fell that go to and fro about a kink: all of them are worth 0.014 sd."""
+"""Largest decrease of the negative log density by all steps that alternate about a kink; it corresponds to 0.014 sd."""
 KINK_CURVATURE = 4.0
-"""Largest curvature, by the expected one, that second differences may show there: beyond it they straddle the kink."""
+"""Largest ratio of second differences to the expected curvature at a kink; above it they straddle the kink."""
 NEWTON_SETTLED = 1e-8
 """Squared Newton step, in posterior sds, at which the mode is reached."""
 HESSIAN_KEPT = 2e-3
-"""The Hessian is taken anew if the mode moved farther than this many sds since it was computed: along a bent ridge it
-changes by 1 % then."""
+"""The Hessian is computed again if the mode has moved by more than this many sds; along a curved ridge it has changed
+by 1 % then."""
 QUASI_STEPS = 40
 LAPLACE_DRAWS = 2048
 Objective = Callable[[np.ndarray], np.ndarray]
-"""Negative log density of points (n, p), shape (n,); not finite where there is none."""
+"""Negative log density of points (n, p), shape (n,); not finite where it is undefined."""
 Residual = Callable[[Float[Array, " parameters"], PyTree], Float[Array, " residuals"]]
 
 
 class LinearResidual(eqx.Module):
-    """Residuals at a point, their Jacobian there, exact or good enough to descend by, and what else came of it."""
+    """Residuals at a point, their Jacobian, exact or approximate, and in `also` further results of the evaluation."""
 
     value: Float[Array | np.ndarray, " residuals"]
     jacobian: Float[Array | np.ndarray, "residuals parameters"]
@@ -54,7 +53,7 @@ class LinearResidual(eqx.Module):
 
 
 def linear_residual(residual: Residual, value: Float[Array, " parameters"], args: PyTree) -> LinearResidual:
-    """Residuals and their Jacobian, the tangents of all parameters pushed forward side by side."""
+    """Compute residuals and their Jacobian, by forward derivatives of all parameters at once."""
     residuals, push = jax.linearize(lambda x: residual(x, args), value)
     return LinearResidual(residuals, jax.vmap(push, out_axes=1)(jnp.eye(value.size)))
 
@@ -63,13 +62,13 @@ residuals_and_jacobian = eqx.filter_jit(linear_residual)
 
 
 NEIGHBOUR_STEPS, NEIGHBOUR_SETTLED = 20, 0.01
-"""Newton steps to a mode beside a known one, and the gain of log density of one after which they end: steps get
-shorter slowly where a scale is poorly known."""
+"""Largest number of Newton steps to a mode near a known one, and the gain in log density below which they end: steps
+shorten slowly where a scale is poorly determined."""
 
 
 @dataclass(frozen=True)
 class Mode:
-    """Outcome of the Newton steps: `covariance` is the inverse Hessian over all coordinates."""
+    """Result of the Newton steps; `covariance` is the inverse Hessian over all coordinates."""
 
     z: np.ndarray
     covariance: np.ndarray
@@ -79,26 +78,26 @@ class Mode:
 
 @dataclass(frozen=True)
 class _Surroundings:
-    """A negative log density about a point, along the columns of a matrix of ways."""
+    """A negative log density about a point, along the columns of `ways`, a matrix of directions."""
 
     objective: Objective
     z: np.ndarray
     ways: np.ndarray
 
     def at(self, steps: np.ndarray) -> np.ndarray:
-        """Values (n,) after steps (n, d) along the ways."""
+        """Compute values (n,) after steps (n, d) along the directions."""
         return self.objective(self.z + steps @ self.ways.T)
 
     def slope(self) -> np.ndarray:
-        """Central differences (d,)."""
+        """Compute the gradient by central differences (d,)."""
         steps = DIFFERENCE_STEP * np.eye(self.ways.shape[1])
         ahead, behind = np.split(self.at(np.concatenate([steps, -steps])), 2)
         return (ahead - behind) / (2 * DIFFERENCE_STEP)
 
     def curvature(self) -> np.ndarray:
-        """Second differences (d, d): central along each way; a pair of ways by one step along both.
+        """Compute the Hessian (d, d) by differences: central along each direction, one step along both for a pair.
 
-        Half the values that central differences would ask for.
+        This takes half the evaluations that central differences would need.
         """
         steps = PAIR_STEP * np.eye(self.ways.shape[1])
         first, second = np.triu_indices(len(steps), 1)
@@ -111,7 +110,7 @@ class _Surroundings:
 
 
 def _nearly_there(begin: _Surroundings) -> _Surroundings:
-    """Where quasi-Newton steps (BFGS) end: they cost slopes, of which a Hessian costs two dozen."""
+    """Descend by quasi-Newton steps (BFGS), which need gradients only; a Hessian costs two dozen gradients."""
     count = begin.ways.shape[1]
     around = DIFFERENCE_STEP * np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)])
 
@@ -127,7 +126,7 @@ def _nearly_there(begin: _Surroundings) -> _Surroundings:
 
 @dataclass(frozen=True)
 class _Descended:
-    """Where Newton steps ended, whether the next would be too short to matter, whether they went about a kink."""
+    """End of Newton steps: where, whether the next step is negligible, whether steps alternated at a kink."""
 
     here: _Surroundings
     settled: bool
@@ -135,7 +134,7 @@ class _Descended:
 
 
 def _descended(begin: _Surroundings, inverse: np.ndarray) -> _Descended:
-    """Newton steps with one inverse curvature; where they end whence they came, that place itself."""
+    """Take Newton steps with one inverse Hessian; steps that only alternate about a kink return the start."""
     point, first = begin, begin.at(np.zeros((1, len(inverse))))[0]
     value = first
     shortened = 0.5 ** np.arange(12)[:, None]
@@ -156,15 +155,15 @@ def _descended(begin: _Surroundings, inverse: np.ndarray) -> _Descended:
 
 
 def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curvature: np.ndarray) -> Mode:
-    """Newton steps to the minimum of a negative log density, whose derivatives are differences of many values at once.
+    """Minimise a negative log density by Newton steps, with derivatives by differences of many values at once.
 
     The differences are taken in coordinates whitened by `curvature`: the Hessian is near the identity there, and
-    directions that differ by eight orders of magnitude in stiffness are equally well resolved.
+    directions whose curvatures differ by eight orders of magnitude are equally well resolved.
 
     Args:
         objective: negative log density of many points.
         start: near the mode, shape (p,).
-        free: coordinates that move; the others keep their place and unit variance.
+        free: coordinates that move; the others keep their values and unit variance.
         curvature: positive definite guess of the Hessian, shape (p, p).
 
     Returns:
@@ -184,7 +183,7 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
         if not np.all(np.isfinite(hessian)):
             raise np.linalg.LinAlgError("the density is not finite about the mode")
         eigenvalues, vectors = np.linalg.eigh(hessian)
-        # Far from the mode the density may be flat or convex along a direction: step by the expected scale.
+        # Far from the mode the density may be flat or convex along a direction: the step has the expected scale then.
         descent = _descended(surroundings, (vectors / np.maximum(np.abs(eigenvalues), 0.1)) @ vectors.T)
         surroundings = descent.here
         if (
@@ -208,7 +207,7 @@ def newton_mode(objective: Objective, start: np.ndarray, free: np.ndarray, curva
 
 
 def neighbouring_mode(objective: Objective, known: Mode, free: np.ndarray) -> Mode | None:
-    """The mode of a density that differs little from one whose mode is known: Newton steps with the known covariance.
+    """Find the mode of a density near one of known mode, by Newton steps with the known covariance.
 
     Args:
         objective: negative log density of many points.
@@ -242,7 +241,7 @@ def neighbouring_mode(objective: Objective, known: Mode, free: np.ndarray) -> Mo
 
 
 def laplace_draws(z: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarray:
-    """Normal draws whose sample mean and covariance are exactly the given ones.
+    """Draw normal numbers whose sample mean and covariance are exactly those given.
 
     Antithetic pairs fix the mean, a Cholesky factor of the sample covariance fixes the rest: standard deviations of
     linear quantities then carry no Monte Carlo error.
@@ -254,7 +253,7 @@ def laplace_draws(z: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarra
 
 
 def least_squares_covariance(jacobian: np.ndarray) -> np.ndarray:
-    """(J^T J)^-1 by a singular value decomposition of the column-scaled Jacobian.
+    """Compute (J^T J)^-1 by a singular value decomposition of the column-scaled Jacobian.
 
     Args:
         jacobian: shape (n, p), of full column rank.

@@ -1,6 +1,6 @@
-"""Random streams of one seed: what is drawn for different purposes is independent, and each purpose has a name.
+"""Random streams of one seed, one for each named purpose, independent of each other.
 
-The numbers are part of what a seed means: another number draws other values. The twin's have places of their own.
+The numbers fix the draws of a seed: another number draws other values. The twin numbers its streams itself.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 @unique
 class Stream(IntEnum):
-    """Purposes of a scanner's or head's draws, and those that both instruments share."""
+    """Purposes of draws for a scanner or head, and those shared with an axis."""
 
     PREDICTED_MOVES = 1
     """Predictive draws of `posterior.nc`."""
@@ -20,23 +20,23 @@ class Stream(IntEnum):
     """Offset of systematic resampling."""
     ORDER_OF_DRAWS = 3
     POOLED_ROUNDS = 4
-    """Errors of the gears at places, of the rounds of importance sampling; its seed is the number of draws before."""
+    """Errors of the gears at places, for rounds of importance sampling; the seed is the number of draws before."""
     CALIBRATION_NOISE = 5
-    """Of a calibration: what a stop and an aperture reading scatter by."""
+    """Scatter of stops and aperture readings in a calibration."""
     LOOKS = 6
-    """Errors of the looks that are located."""
+    """Errors of looks to be located."""
     GEAR_TABLES = 7
     """Errors of the gears at counters without looks."""
     WAVES = 13
-    """Of stated period in the gears."""
+    """Errors of stated period in the gears."""
     CHAIN_PLACES = 14
-    """Errors of the gears at places, of the draws of a chain."""
+    """Errors of the gears at places, for the draws of a chain."""
     WATCHED_CHANGES = 15
-    """Directions of the changes that looks of `plan --watch` shall show."""
+    """Directions of the changes that looks of `plan --watch` should detect."""
     OTHER_HOMING = 16
-    """Errors of the gears at places, of draws weighted under another way of homing."""
+    """Errors of the gears at places, for draws weighted under another way of homing."""
     HELD_OUT = 17
-    """Looks predicted for experiments that were left out, fold by fold."""
+    """Looks predicted for held-out experiments, fold by fold."""
     PROMISE = 22
     WORLDS = 23
     """Replicates behind the p of `verify`."""
@@ -46,12 +46,12 @@ class Stream(IntEnum):
     INSTRUMENT_SCALES = 37
     CYCLE_COUNTERS = 230
     CYCLES = 2302
-    """Simulated cycles after ISO 230-2."""
+    """Simulated cycles of ISO 230-2."""
 
 
 @unique
 class AxisStream(IntEnum):
-    """Purposes of an axis' draws."""
+    """Purposes of draws for an axis."""
 
     RESAMPLING = 1
     LINEAR_TERMS = 3
@@ -63,5 +63,5 @@ class AxisStream(IntEnum):
 
 
 def random_stream(seed: int, stream: Stream | AxisStream, *part: int) -> np.random.Generator:
-    """The random numbers of one purpose, or of a numbered part of it."""
+    """Return the generator of random numbers of one purpose, or of a numbered part of it."""
     return np.random.default_rng([seed, stream.value, *part])

@@ -1,6 +1,6 @@
-"""Draws with weights: moments and intervals with their Monte Carlo errors, the tail of the weights, resampling.
+"""Weighted draws: moments and intervals with their Monte Carlo errors, the tail of the weights, resampling.
 
-Weights sum to one; the first axis of values is that of the draws. NumPy.
+Weights sum to one; the first axis of values is over the draws. NumPy.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ import numpy as np
 TAILS = (0.025, 0.975)
 """Probabilities of the ends of an equal-tailed 95 % interval."""
 TAIL_SHARE_MAX = 0.2
-"""Of the draws, at most, to which a generalised Pareto distribution is fitted."""
+"""Largest share of the draws to which a generalised Pareto distribution is fitted."""
 PRIOR_DRAWS, PRIOR_K = 10, 0.5
 """Weight and centre of the prior of k (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72, appendix G)."""
 
 
 @dataclass(frozen=True)
 class WeightedSummary:
-    """Quantities by weighted draws; every field has the quantities' own shape.
+    """Summary of quantities by weighted draws; every field has the shape of the quantities.
 
-    Errors are those of self-normalised importance sampling (Owen, Monte Carlo theory, methods and examples, 9.2); the
-    effective draws of a statistic are the equal, independent ones that would know it as well.
+    Errors are those of self-normalised importance sampling (Owen, Monte Carlo theory, methods and examples, 9.2). The
+    effective draws of a statistic are the number of equally weighted, independent draws with the same error.
 
     Attributes:
-        mean, sd: of the weighted draws.
+        mean, sd: moments of the weighted draws.
         interval95: equal-tailed, first axis (low, high).
         mcse_mean, mcse_sd, mcse_interval95: Monte Carlo standard errors of the above.
         ess_mean, ess_sd, ess_interval95: effective draws behind each of them.
@@ -44,29 +44,29 @@ class WeightedSummary:
 
     @property
     def ess_least(self) -> np.ndarray:
-        """Of the four statistics."""
+        """Return the smallest effective number of draws of the four statistics."""
         return np.min([self.ess_mean, self.ess_sd, *self.ess_interval95], axis=0)
 
 
 def effective_draws(weights: np.ndarray) -> float:
-    """Equal draws that weights (n,) are worth whatever is asked (Kish)."""
+    """Compute the effective sample size of weights (n,), for any quantity (Kish)."""
     return float(np.sum(weights) ** 2 / np.sum(weights**2))
 
 
 WEIGHTLESS = 1e-16
-"""Of the heaviest draw's weight: below it a draw changes no digit of any sum."""
+"""Share of the largest weight below which a draw changes no digit of any sum."""
 
 
 def weighted_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Mean over the first axis; that of equal numbers is the number."""
+    """Compute the mean over the first axis; it is exact for equal numbers."""
     return values[0] + np.tensordot(weights, values - values[0], axes=1)
 
 
 def weighted_quantiles(values: np.ndarray, weights: np.ndarray, probabilities: Sequence[float]) -> np.ndarray:
-    """Quantiles over the first axis, shape (probabilities, ...); NumPy's own (type 7) where weights are equal.
+    """Compute quantiles over the first axis, shape (probabilities, ...); NumPy's (type 7) where weights are equal.
 
-    The cumulative weight at each draw counts half of its own, stretched so that the least draw has probability 0 and
-    the largest 1; lines in between.
+    The cumulative weight at each draw includes half of its own. It is scaled so that the smallest draw has probability
+    0 and the largest 1, and interpolated linearly.
     """
     flat = values.reshape(len(values), -1)
     quantiles = np.empty((len(probabilities), flat.shape[1]))
@@ -74,16 +74,16 @@ def weighted_quantiles(values: np.ndarray, weights: np.ndarray, probabilities: S
         order = np.argsort(each, kind="stable")
         ordered = weights[order]
         middle = np.cumsum(ordered) - 0.5 * ordered
-        # One draw alone has no stretch, and is every quantile.
+        # A single draw needs no scaling and is every quantile.
         reach = middle[-1] - middle[0] or 1.0
         quantiles[:, column] = np.interp(probabilities, (middle - middle[0]) / reach, each[order])
     return quantiles.reshape(len(probabilities), *values.shape[1:])
 
 
 def weighted_summary(values: np.ndarray, weights: np.ndarray) -> WeightedSummary:
-    """Moments, interval, errors and effective draws of values (n, ...) with weights (n,)."""
+    """Compute moments, interval, errors and effective draws of values (n, ...) with weights (n,)."""
     shape = values.shape[1:]
-    # Where a proposal went astray a value may be beyond all numbers, and zero times that is none.
+    # A draw far out in the proposal may have a value that is infinite, and zero times infinity is not a number.
     counts = weights > WEIGHTLESS * weights.max()
     values, weights = values[counts], weights[counts]
     flat, square = values.reshape(len(values), -1), weights**2
@@ -92,7 +92,7 @@ def weighted_summary(values: np.ndarray, weights: np.ndarray) -> WeightedSummary
     variance = weights @ deviation2
     sd = np.sqrt(variance)
     spread2 = (deviation2 - variance) ** 2
-    # A quantity that no draw changes has no error; any draw knows it.
+    # A quantity that is equal in all draws has no error.
     moving = np.ptp(flat, axis=0) > 0
     safe = np.where(moving, variance, 1.0)
     error2, spread_error2 = square @ deviation2, square @ spread2
@@ -107,7 +107,7 @@ def weighted_summary(values: np.ndarray, weights: np.ndarray) -> WeightedSummary
         chance2 = square @ ((flat <= ends[k]) - tail) ** 2
         ess_ends[k] = ess(np.full(flat.shape[1], tail * (1 - tail)), chance2)
         for column in np.flatnonzero(moving):
-            # One standard error of the probability, carried to the quantity, as ArviZ does for equal draws.
+            # One standard error of the probability, propagated to the quantity, as ArviZ does for equal weights.
             about = np.clip(tail + np.sqrt(chance2[column]) * np.array([-1.0, 1.0]), 0.0, 1.0)
             low, high = weighted_quantiles(flat[:, column], weights, about.tolist())
             errors[k, column] = 0.5 * (high - low)
@@ -125,14 +125,14 @@ def weighted_summary(values: np.ndarray, weights: np.ndarray) -> WeightedSummary
 
 
 def systematic(weights: np.ndarray, count: int, offset: float) -> np.ndarray:
-    """Places of `count` equal draws, ascending: systematic resampling (Kitagawa, J. Comput. Graph. Stat. 5 (1996) 1).
+    """Resample `count` draws systematically: ascending indices (Kitagawa, J. Comput. Graph. Stat. 5 (1996) 1).
 
-    Of equal weights it takes evenly spaced draws.
+    With equal weights it takes evenly spaced draws.
 
     Args:
         weights: shape (n,), sum 1.
-        count: of draws wanted.
-        offset: in [0, 1), the only thing that is random.
+        count: number of draws.
+        offset: in [0, 1), the only random number.
     """
     reached = np.cumsum(weights)
     places = np.searchsorted(reached / reached[-1], (np.arange(count) + offset) / count, side="right")
@@ -141,20 +141,20 @@ def systematic(weights: np.ndarray, count: int, offset: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ParetoTail:
-    """A generalised Pareto distribution of what exceeds a threshold: shape k and scale."""
+    """A generalised Pareto distribution of exceedances over a threshold: shape k and scale."""
 
     k: float
     scale: float
 
     def quantiles(self, probabilities: np.ndarray) -> np.ndarray:
-        """Exceedances at probabilities (n,)."""
+        """Compute the exceedances at probabilities (n,)."""
         if abs(self.k) < 1e-30:
             return -self.scale * np.log1p(-probabilities)
         return self.scale * np.expm1(-self.k * np.log1p(-probabilities)) / self.k
 
 
 def pareto_tail(exceedances: np.ndarray) -> ParetoTail:
-    """Fit to ascending exceedances (n,) by Zhang and Stephens, Technometrics 51 (2009) 316, k drawn towards a half."""
+    """Fit ascending exceedances (n,) by Zhang and Stephens, Technometrics 51 (2009) 316, with k shrunk to 1/2."""
     n = len(exceedances)
     grid = 30 + int(np.sqrt(n))
     b = 1 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))
@@ -169,29 +169,29 @@ def pareto_tail(exceedances: np.ndarray) -> ParetoTail:
 
 
 def _tail_count(count: int) -> int:
-    """Largest draws that stand for the tail (Vehtari et al. 2024, 3)."""
+    """Return the number of largest draws that form the tail (Vehtari et al. 2024, 3)."""
     return int(3 * np.sqrt(count)) if count > 225 else int(TAIL_SHARE_MAX * count)
 
 
 def pareto_k(values: np.ndarray) -> float:
-    """Tail index of positive numbers (n,), n >= 25: from 0.7 on their mean cannot be told from so many."""
+    """Estimate the tail index of positive numbers (n,), n >= 25; from 0.7 on n numbers do not determine their mean."""
     ordered = np.sort(values)
     count = _tail_count(len(values))
     exceedances = ordered[-count:] - ordered[-count - 1]
-    # Where no number exceeds the others there is no tail.
+    # Equal numbers have no tail.
     return pareto_tail(exceedances).k if exceedances[int(count / 4 + 0.5) - 1] > 0 else 0.0
 
 
 @dataclass(frozen=True)
 class SmoothedWeights:
-    """Weights (n,) of sum 1 whose largest were replaced by quantiles of their fitted tail, and its index."""
+    """Weights (n,) of sum 1, the largest replaced by quantiles of the fitted tail, and the tail index."""
 
     weights: np.ndarray
     pareto_k: float
 
 
 def smoothed_weights(log_ratios: np.ndarray) -> SmoothedWeights:
-    """Pareto smoothed importance sampling (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72).
+    """Smooth weights by Pareto smoothed importance sampling (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72).
 
     Args:
         log_ratios: log (target / proposal) of n >= 25 draws up to a constant; -inf where the target is zero.
