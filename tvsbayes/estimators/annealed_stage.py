@@ -1,8 +1,8 @@
-"""One least-squares stage of the joint fit: geometry and stereo for held noise scales (formulation 4.2).
+"""One least-squares stage of the joint fit: geometry and stereo at fixed noise scales (formulation 4.2).
 
 Levenberg-Marquardt on [standardised innovations; prior residuals] in the coordinates of `model.parameter_space`. Slopes
-and projections are held in the Jacobian (Kaufman's variant of variable projection: the optimum is unchanged to first
-order in the residual), so that it is the linearisation that all diagnoses use, sent through the filter.
+and projections are held constant in the Jacobian (Kaufman's variant of variable projection: the optimum is unchanged to
+first order in the residual). The filter can then process the same linearisation that all diagnoses use.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from tvsbayes.statistics.least_squares import LinearResidual
 
 STAGE_TOLERANCE = 1e-2
 STAGE_STEPS = 12
-"""Levenberg-Marquardt only has to reach the basin: its frozen Jacobian is not exact at the level of the noise, where it
-would stall; the Newton steps on the full density finish the work."""
+"""Levenberg-Marquardt only has to reach the basin of the mode: with its approximate Jacobian it would stall at the
+level of the noise. Newton steps on the full density find the mode."""
 PART = 128
-"""Spots that are linearised in one call: a campaign of any size takes as many calls as its spots need."""
+"""Spots linearised in one call; a larger campaign takes more calls."""
 NO_STEP = 1e300
-"""The tolerance that the start meets: the stage is then the linearisation there."""
+"""Tolerance that the start meets: the stage then linearises there only."""
 
 
 class Fixed(eqx.Module):
-    """What a least-squares stage holds: coordinates kept at a value, and the factor on the noise."""
+    """Constants of a least-squares stage: coordinates held at a value, and the factor on the noise."""
 
     held: Bool[Array | np.ndarray, " parameters"]
     value: Float[Array | np.ndarray, " parameters"]
@@ -43,10 +43,10 @@ class Fixed(eqx.Module):
 
 
 def innovations(lin: LinearLooks, arrays: CampaignArrays, before: Belief) -> Seen:
-    """Standardised innovations of linearised spots; in the further columns how coordinates move them.
+    """Compute standardised innovations of linearised spots and, in further columns, their derivatives.
 
-    The errors at places stand last among them, as coordinates in rad. Behind the two components that the filter sees
-    stand the four that no state changes.
+    Derivatives are by the coordinates, then by the errors at places, in rad. The first two components pass the filter;
+    the other four depend on no state.
     """
     by_pan, by_tilt = (tuple(lin.slope[:, :, axis].T) for axis in range(2))
     turned = ToStates.of(by_pan, by_tilt)
@@ -59,7 +59,7 @@ def innovations(lin: LinearLooks, arrays: CampaignArrays, before: Belief) -> See
 
 
 class Part(LinearLooks):
-    """Some spots linearised; products of the columns of their innovations, and the filter's belief after them."""
+    """Some spots linearised, products of the columns of their innovations, and the filter's state after them."""
 
     gram: Float[Array, "columns columns"]
     mean: Float[Array, "6 columns"]
@@ -75,7 +75,7 @@ def linear_part(
     first: Int[Array, ""],
     before: Belief,
 ) -> Part:
-    """`PART` spots from the first on; `inflation` is a factor on their noise."""
+    """Linearise `PART` spots from the first on; `inflation` is a factor on their noise."""
     part = arrays.of_spots(first, min(PART, len(arrays.spots.valid)))
     lin = linearise(at, space, part, inflation)
     result = innovations(lin, part, before)
@@ -86,12 +86,12 @@ def linear_part(
 
 
 def linear_campaign(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays, fixed: Fixed) -> LinearResidual:
-    """As few residuals as have the sum of squares, slope and normal equations of innovations and prior.
+    """Reduce innovations and prior to the fewest residuals of equal sum of squares, gradient and normal equations.
 
-    With N = J'J + 1 = L L' and the slope g they are [L^-1 g; what is left of the length], their Jacobian [L'; 0]: prior
-    coordinates keep N's condition harmless, and every later product is a thirtieth of the size. The errors at places
-    are least squares in every step: they stand before the coordinates in N, and what L has of them is left out.
-    Besides comes the campaign linearised there, as NumPy arrays, without padding.
+    With N = J'J + 1 = L L' and the gradient g they are [L^-1 g; the remaining length], with Jacobian [L'; 0]. In prior
+    coordinates N is well conditioned, and later products are a thirtieth of the size. The errors at places are
+    eliminated in every step: they precede the coordinates in N, and their rows of L are dropped. `also` is the campaign
+    linearised there, as NumPy arrays, without padding.
     """
     places, filled = len(arrays.gears.places.steps), arrays.gears.errors_filled
     point = space.known_point(np.where(fixed.held, fixed.value, z))
@@ -117,8 +117,8 @@ def linear_campaign(z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
 def stage(
     z: np.ndarray, space: ParameterSpace, arrays: CampaignArrays, fixed: Fixed, tolerance: float = STAGE_TOLERANCE
 ) -> Linearised:
-    """Geometry and stereo for given noise scales, from z: where Levenberg-Marquardt ended, and the campaign there.
+    """Fit geometry and stereo for given noise scales from z; return the campaign linearised there.
 
-    With the tolerance `NO_STEP` the campaign linearised at z.
+    The tolerance `NO_STEP` linearises at z.
     """
     return descend(lambda at: linear_campaign(at, space, arrays, fixed), z, tolerance, STAGE_STEPS).also

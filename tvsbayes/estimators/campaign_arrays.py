@@ -1,7 +1,7 @@
-"""A campaign as the arrays that the compiled functions take: spots in time order, moves, both padded to a bucket.
+"""A campaign as arrays for the compiled functions: spots in time order and moves, both padded to a bucket.
 
-Sizes are powers of two from `SMALLEST_BUCKET`, so that a second campaign compiles nothing; places of gears have sizes
-of their own. px, counters in steps, aperture readings in rad; padded rows are not valid and count nothing.
+Sizes are powers of two from `SMALLEST_BUCKET`, so that a second campaign compiles nothing; places of gears have other
+sizes. px, counters in steps, aperture readings in rad; padded rows are not valid and have no effect.
 """
 
 from __future__ import annotations
@@ -28,29 +28,28 @@ from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.laser_path import MoveArrays
 
 PLACES_TOGETHER = 6
-"""Places of both axes whose columns go through the filter together: columns are what a density costs, and the paper's
-protocol has these six counters."""
+"""Places of both axes whose columns pass the filter together. Columns determine the cost of a density; the paper's
+protocol has six counters."""
 SMALLEST_BUCKET = 4096
-"""Spots and moves are padded to this size or the next power of two above it: campaigns up to it share their compiled
-functions, and cost what their own rows need."""
+"""Spots and moves are padded to this size or the next power of two above it: smaller campaigns share compiled
+functions, and their cost follows their own rows."""
 SIGHTED = (1, 2)
-"""Columns of the pixels in which sightings have their two angles: the first column is where ranges are taken out."""
+"""Columns of the pixels that hold the two angles of sightings; the first column is where ranges are eliminated."""
 NOWHERE_MM = np.array([500.0, 0.0, 0.0])
-"""Stands for the point of a look that counts for nothing: finite, and in front of the cameras."""
+"""Point of a look that is not used: finite, and in front of the cameras."""
 
 
 class SpotArrays(eqx.Module):
     """Spots with status ok in time order, padded.
 
-    `whitening` maps a pixel residual to stated standard deviations. `weight` scales a spot's information
-    (1, or below for the robust option), `valid` is 0 for padding and excluded spots. `redraw[axis]` says that the
-    stop error of the axis was drawn anew since the previous spot, with variance
-    `redraw_mix[axis] @ (sd_right^2, sd_left^2)` (or down, up). `hours` have passed since the spot before, or since the
-    homing that came after it.
+    `whitening` maps a pixel residual to stated standard deviations. `weight` scales a spot's information (1, or below
+    for the robust option), `valid` is 0 for padding and excluded spots. `redraw[axis]` is whether the axis has a new
+    stop error since the previous spot, with variance `redraw_mix[axis] @ (sd_right^2, sd_left^2)` (or down, up).
+    `hours` is the time since the previous spot, or since a later homing.
 
-    Of sightings `triangulated_mm` is the direction in which the head was found to point, a unit vector of frame P, and
-    `tangents` are those along azimuth and elevation there; None where a stereo pair sees spots. The pixels are then
-    angles on the sphere about that direction, rad: none in the left image, two in the columns of `SIGHTED`.
+    For sightings `triangulated_mm` is the direction of the head, a unit vector of frame P, and `tangents` are the unit
+    vectors along azimuth and elevation there (None for a stereo pair). The pixels are then angles on the sphere about
+    that direction, rad, in the columns of `SIGHTED`.
     """
 
     move_index: Int[Array, " spots"]
@@ -70,10 +69,10 @@ class SpotArrays(eqx.Module):
 
 
 class GearArrays(eqx.Module):
-    """Where looks found the gears: places of both axes, and what the errors there do to each spot.
+    """Places of both axes at which looks found the gears, and the effect of the errors there on each spot.
 
-    The angle of the spot's axis of a place holds the transmission error there times `error_share`, and the play there
-    times `play_share`: minus half of it where the axis came from the right or from below, with the other sign else.
+    A spot's axis angle contains the transmission error of a place times `error_share` and its play times `play_share`:
+    minus half the play where the axis came from the right or from below, else plus half.
     """
 
     places: Places
@@ -81,7 +80,7 @@ class GearArrays(eqx.Module):
     play_share: Float[Array | np.ndarray, "spots places"]
 
     def some(self, start: Int[Array, ""] | int, count: int) -> GearArrays:
-        """So many places from one on."""
+        """Return `count` places from `start` on."""
 
         def part(array):
             return jax.lax.dynamic_slice_in_dim(array, start, count, axis=-1)
@@ -90,33 +89,33 @@ class GearArrays(eqx.Module):
 
     @property
     def together(self) -> int:
-        """Places of a group: `PLACES_TOGETHER`, or what divides their padded number evenly."""
+        """Return the number of places in a group: `PLACES_TOGETHER`, or a divisor of the padded number."""
         return math.gcd(len(self.places.steps), PLACES_TOGETHER)
 
     @property
     def groups(self) -> int:
-        """Of places, padding included."""
+        """Return the number of groups of places, padding included."""
         return len(self.places.steps) // max(self.together, 1)
 
     @property
     def filled(self) -> int:
-        """Places of the groups that hold one; for NumPy's side."""
+        """Return the number of places in all groups that are not only padding; NumPy only."""
         together = max(self.together, 1)
         return together * -(-int(np.asarray(self.places.valid).sum()) // together)
 
     @property
     def errors_filled(self) -> np.ndarray:
-        """Which of the errors at all places, transmission errors and plays, are those at the filled ones."""
+        """Return the indices of the errors (transmission errors, then plays) at the filled places."""
         return np.add.outer([0, len(self.places.steps)], np.arange(self.filled)).ravel()
 
     def without_padding(self) -> GearArrays:
-        """As NumPy arrays, of the `filled` places."""
+        """Return NumPy arrays of the `filled` places."""
         count = self.filled
         return jax.tree.map(lambda array: np.asarray(array)[..., :count], self)
 
 
 class CampaignArrays(eqx.Module):
-    """A campaign as arguments of jitted functions; `count` of its spots are no padding."""
+    """A campaign as argument of jitted functions; `count` is the number of its spots without padding."""
 
     moves: MoveArrays
     spots: SpotArrays
@@ -125,7 +124,7 @@ class CampaignArrays(eqx.Module):
     count: Int[Array, ""]
 
     def of_spots(self, start: Int[Array, ""] | int, count: int) -> CampaignArrays:
-        """The same moves with `count` spots from one on: what follows the last is never asked for."""
+        """Return the same moves with `count` spots from `start` on."""
 
         def part(array):
             return jax.lax.dynamic_slice_in_dim(array, start, count)
@@ -135,7 +134,7 @@ class CampaignArrays(eqx.Module):
 
 
 def bucket(count: int, smallest: int | None = None, growth: int = 2) -> int:
-    """Padded length for `count` rows: `smallest`, by default `SMALLEST_BUCKET`, times a power of `growth`."""
+    """Return the padded length for `count` rows: `smallest` (default `SMALLEST_BUCKET`) times a power of `growth`."""
     size = SMALLEST_BUCKET if smallest is None else smallest
     while size < count:
         size *= growth
@@ -143,14 +142,14 @@ def bucket(count: int, smallest: int | None = None, growth: int = 2) -> int:
 
 
 def padded(rows: Sequence[object] | ArrayLike, size: int, fill: ArrayLike = 0.0, dtype: type = np.float64) -> jax.Array:
-    """Rows (n, ...) with as many like `fill` behind them as make `size`."""
+    """Pad rows (n, ...) with `fill` to `size` rows."""
     given: np.ndarray = np.asarray(rows, dtype)
     rest: np.ndarray = np.broadcast_to(np.asarray(fill, dtype), (size - len(given), *given.shape[1:]))
     return placed(np.concatenate([given, rest]))
 
 
 def move_arrays(moves: Sequence[Move], size: int | None = None, powered_on_s: float | None = None) -> MoveArrays:
-    """Pad the moves, by default to their `bucket`; padding repeats the last counters and therefore changes nothing.
+    """Pad the moves, by default to their `bucket`; padding repeats the last counters and so has no effect.
 
     Args:
         moves: in time order.
@@ -179,7 +178,7 @@ def place_arrays(places: SeenPlaces) -> Places:
 
 
 def no_gears(size: int) -> GearArrays:
-    """Of spots, padded to this number, whose gears are taken not to vary."""
+    """Return the arrays of gears without errors by position, for this padded number of spots."""
     none = padded(np.zeros((0, 0)), size)
     return GearArrays(Places(placed(np.zeros(0)), *2 * [placed(np.zeros(0, dtype=bool))]), none, none)
 
@@ -197,7 +196,7 @@ def gear_arrays(given: SeenPlaces, size: int) -> GearArrays:
 
 
 def pixel_covariance(spot: Spot | Sighting) -> np.ndarray:
-    """Stated covariance of (u_left, v_left, u_right, v_right), px^2; of a sighting rad^2, 1 where it has none."""
+    """Return the stated covariance of (u_left, v_left, u_right, v_right), px^2; of a sighting, rad^2."""
     if isinstance(spot, Sighting):
         covariance = np.eye(4)
         covariance[SIGHTED, SIGHTED] = np.radians(spot.u_deg or 1.0) ** 2
@@ -214,7 +213,7 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
 
     Args:
         campaign: a checked campaign with at least one spot of status ok.
-        table: the priors of the fit, by default those of the campaign; gears without repeating errors have no places.
+        table: priors of the fit, by default those of the campaign; gears without repeating errors have no places.
 
     Returns:
         Arrays padded to `bucket` sizes.
@@ -256,19 +255,19 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
 
 
 def components(rig: RigTable) -> int:
-    """Independent residuals of a look besides the aperture's: four pixels less their range, or two angles."""
+    """Count independent residuals of a look without the aperture: four pixels less the range, or two angles."""
     return len(SIGHTED) if rig.mechanism.sightings else 3
 
 
 def in_sight(campaign: Campaign) -> np.ndarray:
-    """Whether each ordered spot has a triangulated point: one beyond the reach of the lens model has none."""
+    """Mark each ordered spot that has a triangulated point; one outside the lens model's range has none."""
     if campaign.rig.mechanism.sightings:
         return np.ones(len(ordered_spots(campaign)), dtype=bool)
     return np.isfinite(triangulate(campaign.stereo, pixels_of(ordered_spots(campaign)))).all(axis=1)
 
 
 def spot_constants(campaign: Campaign) -> np.ndarray:
-    """Terms of each ordered spot's log likelihood that no parameter changes: 2 pi and its stated covariance."""
+    """Compute the constant terms of each ordered spot's log likelihood: 2 pi and its stated covariance."""
     constants = components(campaign.rig)
     return np.array(
         [

@@ -1,9 +1,9 @@
-"""What spots say of the counters of their moves: the wrong sign, steps of each move, columns exchanged, rows shifted.
+"""Tests of counters against spots: the wrong sign, steps of each move, columns exchanged, rows shifted.
 
-Spots move across when a counter grows. Of every spot the angles across and up are held against the counters and the
-distance of its sheet, deg and steps, in the axes of frame P as far as the campaign states them. A counter is doubted
-only where its spread is large against the play and the scatter that the priors allow: two counters of the size of the
-play need not show. The limits are far from what sound campaigns show (experiments/robustness/mistakes.md). No JAX.
+Spots move across when a counter grows. Their angles across and up, deg, are regressed on the counters, steps, and the
+distance of their sheet, in the axes of frame P as far as the campaign states them. A counter is tested only where its
+spread is large against the play and scatter that the priors allow; a smaller motion need not be visible. The limits are
+far from the values of correct campaigns (experiments/robustness/mistakes.md). No JAX.
 """
 
 from __future__ import annotations
@@ -23,39 +23,39 @@ from tvsbayes.instrument.parameters import Prior, names_of
 from tvsbayes.instrument.stereo_pair import rotation_matrix
 
 PRIOR_SDS = 3.0
-"""Standard uncertainties of a prior up to which play, scatter and the mounting of the cameras are believed."""
+"""Standard uncertainties of a prior up to which play, scatter and the cameras' mounting are considered possible."""
 EXPECTED = 3.0
-"""Spread of a counter over the motion that play and scatter may hide: a right one then explains 0.9 of the motion."""
+"""Least ratio of a counter's spread to motion that play and scatter may hide: a correct one then explains 0.9 of it."""
 UNEXPLAINED = 1.5
-"""Motion that a counter leaves, over what play and scatter may leave, from which other rows are asked."""
+"""Least ratio of unexplained motion to that of play and scatter for other rows to be tried."""
 FOLLOWED, LOST = 0.8, 0.5
-"""Share of the motion that a right counter explains at least (sound campaigns: 0.94), a wrong one at most."""
+"""Share of the motion that a correct counter explains at least (correct campaigns: 0.94), a wrong one at most."""
 LEAST_SLOPE = 0.3
-"""Slope over the stated ratio, from which a counter with the other sign is meant."""
+"""Negative slope, as a share of the stated ratio, from which a counter has the wrong sign."""
 BETTER = 3.0
-"""Times less of the motion that the right counters leave than those of the table: sums of cells that are steps, or the
-counters of the row before or after."""
+"""Factor by which the unexplained motion must fall with corrected counters: sums of steps, or counters of the row
+before or after."""
 STOPS_FREE_MIN, STOPS_CERTAIN, STOPS_MANY = 4, 8, 30
-"""Stops beyond the coefficients of a line, from which it is a pattern, from which it is certain, from which it is no
-chance even within play and scatter."""
+"""Stops beyond the coefficients of a line from which a pattern counts, is certain, and cannot be chance even within
+play and scatter."""
 CERTAIN = 9.0
-"""`BETTER` where rows are shifted for certain."""
+"""`BETTER` for certainty that rows are shifted."""
 LOOKS_TRIED, BEGINS_TRIED = 2000, 64
-"""Looks, spread evenly, by which rows are held against their neighbours, and how many of them are tried as the first
-that belongs to another; then those around the best."""
+"""Evenly spread looks by which rows are compared with their neighbours, and how many of them are tried as the first
+shifted one before those around the best."""
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """Looks as counters are held against them.
+    """Looks prepared for the comparison with counters.
 
     Attributes:
-        pattern: of the campaign.
+        pattern: spots of the campaign.
         at: (n,) move of every look.
         angles_deg: across (left) and up of every look, (n,) by axis.
         nearness: (n,) mean distance of all sheets over that of the sheet.
         counters: steps of all moves by axis.
-        hidden_deg: what play and scatter may hide, by axis.
+        hidden_deg: motion that play and scatter may hide, by axis.
         ratios: degrees per step as stated, by axis.
     """
 
@@ -69,19 +69,19 @@ class _Seen:
 
     @property
     def campaign(self) -> Campaign:
-        """Where they come from."""
+        """Return the campaign of the looks."""
         return self.pattern.campaign
 
 
 @dataclass(frozen=True)
 class _Followed:
-    """How far a counter explains a motion.
+    """Result of explaining a motion by a counter.
 
     Attributes:
-        share: of the motion that other columns leave.
+        share: explained share of the motion that other columns leave.
         slope: deg per step at the mean distance.
-        left_deg: root mean square of what is left.
-        spread_steps: standard deviation of the counter beside the other columns.
+        left_deg: root mean square of the residual motion.
+        spread_steps: standard deviation of the counter given the other columns.
         stops_free: stops beyond the coefficients.
     """
 
@@ -93,25 +93,25 @@ class _Followed:
 
     @property
     def follows(self) -> bool:
-        """Whether the motion is this counter's, up or down."""
+        """Whether this counter explains the motion, with either sign."""
         return self.share > FOLLOWED
 
 
 def _rest(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Coefficients, what they leave, and the rank of a design."""
+    """Compute coefficients, residuals and rank of a design."""
     scale = np.maximum(np.abs(design).max(axis=0), 1e-12)
     solution, _, rank, _ = np.linalg.lstsq(design / scale, values, rcond=1e-9)
     return (solution.T / scale).T, values - (design / scale) @ solution, int(rank)
 
 
 def _columns(nearness: np.ndarray, *counters: np.ndarray) -> np.ndarray:
-    """A line in counters whose height and slopes change with the distance: beams do not begin where cameras stand."""
+    """Build a line in counters whose constant and slopes vary with distance: beams do not start at the cameras."""
     products = [part for steps in (np.ones_like(nearness), *counters) for part in (steps, steps * nearness)]
     return np.column_stack(products)
 
 
 def _followed(pattern: _Seen, axis: Axis, steps: np.ndarray, other: np.ndarray) -> _Followed:
-    """A line in the counter beside another counter's."""
+    """Fit a line in the counter, given another counter."""
     base = _columns(pattern.nearness, other)
     full = np.column_stack((base, steps, steps * pattern.nearness))
     _, before, _ = _rest(base, pattern.angles_deg[axis])
@@ -128,7 +128,7 @@ def _followed(pattern: _Seen, axis: Axis, steps: np.ndarray, other: np.ndarray) 
 
 
 def hidden_deg(priors: Mapping[str, Prior], axis: Axis) -> float:
-    """Motion of the beam, deg, that counters need not show: half the play, scatter of stops, errors of the gears."""
+    """Compute the motion of the beam, deg, not due to counters: half the play, scatter of stops, errors of gears."""
 
     def highest(name: str) -> float:
         prior = priors[name]
@@ -145,10 +145,10 @@ def _seen(pattern: SpotPattern) -> _Seen:
     campaign = pattern.campaign
     priors = campaign.rig.priors
     turned = rotation_matrix(np.array([priors[name].value for name in names_of("extrinsics.rotation_rad")]))
-    # Into the axes of frame P, as far as the campaign states them: columns X depth, Y left, Z up.
+    # Rotated to the axes of frame P, as far as the campaign states them: columns X depth, Y left, Z up.
     depth_mm, *across_mm = (pattern.points_mm @ turned).T
     group = sheet_groups(pattern.points_mm[:, 0])
-    # The sheet's, not the spot's own: a sheet that stands askew is deeper on one side, as if depth were a counter.
+    # Depth of the sheet, not of the spot: on an oblique sheet depth varies across, as a counter does.
     sheet_mm = np.array([depth_mm[group == g].mean() for g in range(group.max() + 1)])[group]
     angles_deg = {axis: np.degrees(np.arctan2(across, depth_mm)) for axis, across in zip(AXES, across_mm, strict=True)}
     return _Seen(
@@ -163,7 +163,7 @@ def _seen(pattern: SpotPattern) -> _Seen:
 
 
 def counter_findings(pattern: SpotPattern) -> list[Finding]:
-    """Counters that are steps of a move, run the wrong way, belong to the other axis, or to other spots."""
+    """Find counters that are steps of a move, have the wrong sign, or belong to the other axis or to other spots."""
     seen = _seen(pattern)
     table = {axis: steps[seen.at] for axis, steps in seen.counters.items()}
     summed = {axis: _summed(seen.campaign, axis)[seen.at] for axis in AXES}
@@ -201,7 +201,7 @@ def counter_findings(pattern: SpotPattern) -> list[Finding]:
 
 
 def _runs_back(seen: _Seen, axis: Axis, followed: _Followed) -> bool:
-    """Whether spots run against a counter, with cameras that cannot be upside down."""
+    """Whether spots move against a counter, with cameras that cannot be upside down."""
     roll = seen.campaign.rig.priors["extrinsics.rotation_rad.x"]
     mounted = PRIOR_SDS * roll.u < np.pi / 2
     return mounted and followed.follows and followed.slope < -LEAST_SLOPE * seen.ratios[axis]
@@ -209,7 +209,7 @@ def _runs_back(seen: _Seen, axis: Axis, followed: _Followed) -> bool:
 
 def _are_steps(seen: _Seen, axis: Axis, followed: _Followed, added: _Followed) -> bool:
     """Whether the cells of a counter are the steps of each move."""
-    # What play and scatter may hide, sums of a few counters explain by chance.
+    # A motion within play and scatter is explained by sums of a few counters by chance.
     decided = followed.stops_free >= STOPS_MANY or followed.left_deg > UNEXPLAINED * seen.hidden_deg[axis]
     return decided and added.follows and followed.left_deg**2 > BETTER * added.left_deg**2
 
@@ -230,11 +230,11 @@ def _steps_finding(seen: _Seen, axes: list[Axis], followed: Mapping[Axis, _Follo
 
 
 def _sign_finding(seen: _Seen, axes: list[Axis], followed: Mapping[Axis, _Followed]) -> Finding:
-    """That counters run the wrong way; with rows that are one apart where that shows the same."""
+    """Describe counters of the wrong sign, and a shift of rows by one where that has the same effect."""
     parts, pair = [], (0, 0)
     for axis in axes:
         positive, negative = SENSES[axis]
-        # Two looks in turn between which the counter changed most, as an example.
+        # The two consecutive looks between which the counter changed most serve as example.
         steps = seen.counters[axis][seen.at]
         first = int(np.argmax(np.abs(np.diff(steps))))
         pair = first, first + 1
@@ -265,7 +265,7 @@ def _sign_finding(seen: _Seen, axes: list[Axis], followed: Mapping[Axis, _Follow
 
 
 def _shift_shows_the_same(seen: _Seen, axes: list[Axis], lag: int) -> bool:
-    """Whether counters of the row beside explain the motion as well, with the right sign."""
+    """Whether counters of the neighbouring row explain the motion as well, with the correct sign."""
     last = len(seen.campaign.moves) - 1
     at = np.clip(seen.at + lag, 0, last)
     for axis in axes:
@@ -277,7 +277,7 @@ def _shift_shows_the_same(seen: _Seen, axes: list[Axis], lag: int) -> bool:
 
 
 def _row_finding(seen: _Seen) -> Finding | None:
-    """That spots belong to the moves beside theirs, all or from one on: two ways to number rows, or a missing row."""
+    """Find spots that belong to the moves next to theirs, all or from one on: different numbering, or a missing row."""
     spots = seen.pattern.spots
     chosen = np.unique(np.linspace(0, len(spots) - 1, LOOKS_TRIED).astype(int))
     at, nearness = seen.at[chosen], seen.nearness[chosen]
@@ -285,7 +285,7 @@ def _row_finding(seen: _Seen) -> Finding | None:
     motion_deg = np.column_stack([seen.angles_deg[axis][chosen] for axis in AXES])
 
     def left(steps: np.ndarray) -> np.ndarray:
-        """What counters (n, 2) leave of both motions, deg^2 a look."""
+        """Compute the variance of both motions that counters (n, 2) leave unexplained, deg^2."""
         return np.mean(_rest(_columns(nearness, *steps.T), motion_deg)[1] ** 2, axis=0)
 
     def beside(lag: int, begin: int) -> np.ndarray:
@@ -329,7 +329,7 @@ def _row_finding(seen: _Seen) -> Finding | None:
 
 
 def _summed(campaign: Campaign, axis: Axis) -> np.ndarray:
-    """What the counters of an axis add up to, anew in every segment."""
+    """Sum the counters of an axis within each segment."""
     total, before, sums = 0, -1, []
     for move in campaign.moves:
         total = (total if move.segment == before else 0) + getattr(move, f"{axis}_steps")

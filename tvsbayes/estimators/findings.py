@@ -1,7 +1,7 @@
-"""What is found in a campaign before a fit: one record of it, and the command that mends it.
+"""Findings in a campaign before a fit, and the command that corrects each.
 
-A finding is certain where no rig, however odd, leaves such spots: commands that fit stop there. All others are doubts,
-which are printed and stop nothing. No units, no frames.
+A finding is certain where no possible rig produces such spots: commands that fit stop there. All others are doubts,
+which are printed and do not stop a command. No units, no frames.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from tvsbayes.instrument.campaign import Campaign
 
 @dataclass(frozen=True)
 class Finding:
-    """What contradicts a campaign's tables.
+    """A contradiction in a campaign's tables.
 
     Attributes:
         code: short stable identifier, e.g. "counter-sign".
-        message: what was seen and where, in words.
-        remedy: what to do, with the command where one mends it; "" where the message says it.
-        certain: no rig leaves this; commands that fit stop.
-        file: of the campaign, None where no single one is wrong.
-        line: the row in that file where it shows, 1-based, or None.
+        message: what was found and where, in words.
+        remedy: what to do, with the command where one corrects it; "" where the message says it.
+        certain: no rig produces this; commands that fit stop.
+        file: name of the wrong file of the campaign, None where it is not a single one.
+        line: line in that file, 1-based, or None.
     """
 
     code: str
@@ -36,27 +36,27 @@ class Finding:
 
     @property
     def sentence(self) -> str:
-        """Message and remedy in one sentence."""
+        """Return message and remedy as one sentence."""
         return f"{self.message}; {self.remedy}" if self.remedy else self.message
 
 
 def doubts(code: str, sentences: Iterable[str], file: str | None = None) -> list[Finding]:
-    """Findings that stop nothing, of what was said in words alone."""
+    """Make findings that do not stop a command from sentences."""
     return [Finding(code, sentence, file=file) for sentence in sentences]
 
 
 def line_of(row: int) -> int:
-    """The line of a row of `moves.csv` or `spots.csv`, which begin with one line of names; rows count from 0."""
+    """Return the line of a row of `moves.csv` or `spots.csv`, after one line of names; rows count from 0."""
     return row + 2
 
 
 def mending_command(campaign: Campaign, options: str) -> str:
-    """The command that writes a corrected copy of a campaign, as it is typed."""
+    """Return the command to type that writes a corrected copy of a campaign."""
     if campaign.path is None:
         return f"`tvsbayes import CAMPAIGN --to MENDED {options} --yes`"
     folder = Path(campaign.path)
     mended = folder.parent / f"{folder.resolve().name}-mended"
-    # "." has no name of its own, and its copy belongs beside it.
+    # "." has no name; its copy is written beside it.
     mended = mended if folder.name else Path("..") / mended.name
     return f"`tvsbayes import {typed(folder)} --to {typed(mended)} {options} --yes`"
 
@@ -65,8 +65,8 @@ def stop_at(findings: Iterable[Finding], go_on: str) -> None:
     """Refuse a campaign with a certain finding.
 
     Args:
-        findings: of the campaign.
-        go_on: how to fit it all the same, in words.
+        findings: findings in the campaign.
+        go_on: how to fit it nevertheless, in words.
 
     Raises:
         InputError: the first certain finding, the others in its message.

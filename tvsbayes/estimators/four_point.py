@@ -1,9 +1,9 @@
 """The paper's four-point estimator, exactly as printed, with type A and GUM uncertainties (formulation 4.4).
 
-Two spots before and two after a move of N steps, each triangulated alone; the beam's slope in the plane
-of the moved axis; the difference of two arctangents over N. Frame S (X depth, Y left, Z up, mm); degrees;
-pixels with the integer at the centre of a pixel. What the estimator cannot know (backlash, the tangent
-of a tilt read off its own azimuth) stays in its answer: that is what it is here for. No JAX.
+Two spots before and two after a move of N steps, each triangulated alone; the beam's slope in the plane of the moved
+axis; the difference of two arctangents over N. Frame S (X depth, Y left, Z up, mm); degrees; pixels with the integer at
+the centre of a pixel. Effects that the method neglects (backlash, the tangent of a tilt off its own azimuth) remain in
+its result, for comparison with the joint fit. No JAX.
 
 Source: Lopez-Medina et al., Metrology 2025, 5(4), 58, equations (4) to (8).
 """
@@ -28,7 +28,7 @@ from tvsbayes.statistics.intervals import coverage_factor, effective_dof
 PROBE_PX = 0.01
 """Step of the ratios' derivatives: far above rounding (1e-9 px), far below curvature (10 px)."""
 STEP_HALVINGS = 40
-"""Of a difference quotient's step, until both ends lie in the lens model: a 10^-13th of a standard deviation."""
+"""Largest number of halvings of a difference quotient's step, until both ends lie in the lens model: 1e-13 sd."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Selection:
         pixels: (e, 4, 4) u_left, v_left, u_right, v_right of points 1 to 4, px.
         steps: (e,) signed N.
         axis: (e,) "pan" or "tilt".
-        skipped: what was left out, with reasons.
+        skipped: experiments left out, with reasons.
     """
 
     experiments: np.ndarray
@@ -81,7 +81,7 @@ class Selection:
 
     @property
     def direction(self) -> np.ndarray:
-        """(e,) "left", "right", "up" or "down" by axis and sign of N (formulation 2)."""
+        """Return (e,) "left", "right", "up" or "down" by axis and sign of N (formulation 2)."""
         pan, tilt = (np.where(self.steps > 0, *SENSES[axis]) for axis in AXES)
         return np.where(self.axis == "tilt", tilt, pan)
 
@@ -90,9 +90,9 @@ class Selection:
 class DirectionResult:
     """Mean of one direction's experiments, deg/step, with type A and GUM uncertainty.
 
-    What needs two experiments (`sd`, `u`, intervals, degrees of freedom) is None for n = 1.
-    `u_stereo_deg_per_step` is sqrt(J C J^T) of stereo parameters and focal scale alone;
-    `effective_dof` is Welch-Satterthwaite's, with infinitely many for that type B part.
+    Fields that need two experiments (`sd`, `u`, intervals, degrees of freedom) are None for n = 1.
+    `u_stereo_deg_per_step` is sqrt(J C J^T) of stereo parameters and focal scale alone. `effective_dof` is by
+    Welch-Satterthwaite, with infinite degrees of freedom for that type B part.
     """
 
     n: int
@@ -106,21 +106,21 @@ class DirectionResult:
     effective_dof: float | None
 
     def as_json(self) -> dict[str, object]:
-        """The direction's object of `classic --json`; infinite dof becomes null."""
+        """Return the direction's object of `classic --json`; infinite dof become null."""
         finite = self.effective_dof is not None and np.isfinite(self.effective_dof)
         return {**plain(self), "effective_dof": self.effective_dof if finite else None}
 
 
 @dataclass(frozen=True, repr=False)
 class ClassicResult(Shown):
-    """What the paper's method says of a campaign; a direction without experiments is None."""
+    """The paper's estimate for a campaign; a direction without experiments is None."""
 
     directions: dict[str, DirectionResult | None]
     experiments: tuple[Experiment, ...]
     skipped: tuple[SkippedExperiment, ...]
 
     def shown(self) -> View:
-        """Mean, scatter and uncertainty by direction."""
+        """Show mean, scatter and uncertainty by direction."""
         columns = ("direction", "n", "mean, deg/step", "sd", "u type A", "u GUM", "2.5 % (GUM)", "97.5 % (GUM)")
         rows = []
         for name, r in self.directions.items():
@@ -132,7 +132,7 @@ class ClassicResult(Shown):
         return View(f"ClassicResult of {len(self.experiments)} experiments{left_out}", columns, rows)
 
     def as_json(self) -> dict[str, object]:
-        """The document of `tvsbayes classic --json`."""
+        """Return the document of `tvsbayes classic --json`."""
         directions = {name: None if of is None else of.as_json() for name, of in self.directions.items()}
         return {**plain(self), "directions": directions}
 
@@ -140,12 +140,12 @@ class ClassicResult(Shown):
 def ratio_deg_per_step(
     theta_i_deg: float | np.ndarray, theta_f_deg: float | np.ndarray, steps: int | np.ndarray
 ) -> float | np.ndarray:
-    """Equation (5): (theta_f - theta_i) / N with signed N, so that a sane rig gives a positive ratio."""
+    """Compute equation (5): (theta_f - theta_i) / N with signed N, so that a correct rig has a positive ratio."""
     return (theta_f_deg - theta_i_deg) / steps
 
 
 def four_point_angle_deg(points_S_mm: np.ndarray, axis: str | np.ndarray) -> FourPointAngles:
-    """Slopes of points 1-2 and 4-3 in the plane of the moved axis, equations (4), (6) and (8).
+    """Compute slopes of points 1-2 and 4-3 in the plane of the moved axis, equations (4), (6) and (8).
 
     Args:
         points_S_mm: (..., 4, 3) points 1 to 4 in frame S.
@@ -164,7 +164,7 @@ def four_point_angle_deg(points_S_mm: np.ndarray, axis: str | np.ndarray) -> Fou
 def four_point_ratios(
     pixels: np.ndarray, steps: np.ndarray, axis: str | np.ndarray, stereo: Stereo, focal_scale: float = 1.0
 ) -> np.ndarray:
-    """Degrees per step (..., e) of many experiments at once, through the paper's whole chain.
+    """Compute degrees per step (..., e) of many experiments through the paper's whole chain.
 
     Args:
         pixels: (..., e, 4, 4) raw pixels (u_left, v_left, u_right, v_right) of points 1 to 4.
@@ -181,7 +181,7 @@ def four_point_ratios(
 
 @dataclass(frozen=True)
 class RatioSlopes:
-    """Ratios of experiments and how they depend on their pixels, for propagation to first order.
+    """Ratios of experiments and their derivatives by the pixels, for first-order propagation.
 
     Attributes:
         ratio: (e,) deg/step.
@@ -194,7 +194,7 @@ class RatioSlopes:
 
 
 def ratio_slopes(pixels: np.ndarray, steps: np.ndarray, axis: str | np.ndarray, stereo: Stereo) -> RatioSlopes:
-    """Ratios as `four_point_ratios` finds them, with difference quotients; NaN where a pixel has no ratio."""
+    """Compute `four_point_ratios` and their difference quotients; NaN where a pixel gives no ratio."""
     pixels = np.asarray(pixels, float).reshape(-1, 4, 4)
     ratio = four_point_ratios(pixels, steps, axis, stereo)
     by_pixel = np.empty(pixels.shape)
@@ -208,8 +208,8 @@ def ratio_slopes(pixels: np.ndarray, steps: np.ndarray, axis: str | np.ndarray, 
 def select_experiments(campaign: Campaign) -> Selection:
     """Collect the complete four-point experiments; the others are listed with a reason.
 
-    Complete: one ok spot for each point 1 to 4, points 1 and 2 at the same counters, 3 and 4 at the same,
-    exactly one axis moved between, no homing in between.
+    An experiment is complete with one ok spot for each point 1 to 4, points 1 and 2 at the same counters, 3 and 4
+    likewise, exactly one axis moved and no homing between them.
     """
     moves = {move.move: move for move in campaign.moves}
     rows: dict[int, list[int]] = {}
@@ -239,14 +239,14 @@ def select_experiments(campaign: Campaign) -> Selection:
 
 
 def experiment_rows(campaign: Campaign, selection: Selection) -> np.ndarray:
-    """Rows (e, 4) of the selected looks among `ordered_spots`, the order of whatever a fit says of every spot."""
+    """Find the rows (e, 4) of the selected looks among `ordered_spots`, the order of spots in a fit."""
     row_of = {spot.spot: row for row, spot in enumerate(ordered_spots(campaign))}
     rows = [[row_of[campaign.spots[row].spot] for row in four] for four in selection.spot_rows]
     return np.array(rows, dtype=int).reshape(-1, 4)
 
 
 def _by_point(spots: Sequence[Spot], rows: list[int]) -> tuple[list[int], str | None]:
-    """Rows of points 1 to 4 in order, or the reason why there are not exactly four."""
+    """Find the rows of points 1 to 4 in order, or the reason why there are not exactly four."""
     by_point: dict[int | None, list[int]] = {}
     for row in rows:
         by_point.setdefault(spots[row].point, []).append(row)
@@ -265,7 +265,7 @@ def _by_point(spots: Sequence[Spot], rows: list[int]) -> tuple[list[int], str | 
 
 
 def _commanded(at: list[Move]) -> tuple[str, int, str | None]:
-    """Moved axis and signed N of the moves under points 1 to 4, or the reason why there is none."""
+    """Find the moved axis and signed N of the moves of points 1 to 4, or the reason why there is none."""
     one, two, three, four = ((m.segment, m.pan_steps, m.tilt_steps) for m in at)
     if len({m.segment for m in at}) > 1:
         return "", 0, "the positioner was homed within the experiment"
@@ -282,7 +282,7 @@ def _commanded(at: list[Move]) -> tuple[str, int, str | None]:
 
 
 def classic(campaign: Campaign) -> ClassicResult:
-    """The paper's result for a campaign: every experiment, and each direction's mean and uncertainty.
+    """Estimate a campaign by the paper's method: every experiment, and each direction's mean and uncertainty.
 
     Raises:
         NothingToEstimate: no experiment is complete.
@@ -319,7 +319,7 @@ def classic(campaign: Campaign) -> ClassicResult:
 
 
 def _direction(campaign: Campaign, selection: Selection, rows: np.ndarray, ratios: np.ndarray) -> DirectionResult:
-    """Statistics of one direction; `rows` index the selection, `ratios` (n,) are its results."""
+    """Compute the statistics of one direction; `rows` index the selection, `ratios` (n,) are its results."""
 
     def mean(stereo: Stereo, focal_scale: float) -> float:
         chosen = selection.pixels[rows], selection.steps[rows], selection.axis[rows]
@@ -349,17 +349,17 @@ def _direction(campaign: Campaign, selection: Selection, rows: np.ndarray, ratio
 
 
 def _interval(mean: float, u: float, dof: float) -> tuple[float, float]:
-    """Two-sided 95 % interval with Student's t."""
+    """Compute the two-sided 95 % interval with Student's t."""
     factor = coverage_factor(dof)
     return (float(mean - factor * u), float(mean + factor * u))
 
 
 def stereo_variance(function: Callable[[Stereo, float], float], stereo: Stereo, focal_scale_u: float) -> float:
-    """J C J^T of a scalar `function(stereo, focal_scale)` for the stereo covariance and the focal scale.
+    """Compute J C J^T of a scalar `function(stereo, focal_scale)` for the stereo covariance and the focal scale.
 
-    Central differences with steps of one tenth of each parameter's standard deviation: small enough that
-    the third derivative does not show, large enough against rounding. Fixed parameters (zero variance)
-    are skipped. A step that takes a pixel out of the lens model is halved until it does not.
+    Central differences with steps of one tenth of each parameter's standard deviation: small enough for the third
+    derivative to be negligible, large enough against rounding. Fixed parameters (zero variance) are skipped. A step
+    that takes a pixel out of the lens model is halved until it does not.
     """
 
     def slope(of: Callable[[float], float], step: float) -> float:
@@ -386,7 +386,7 @@ def stereo_variance(function: Callable[[Stereo, float], float], stereo: Stereo, 
 
 
 def classic_of(campaign: Campaign) -> ClassicResult | None:
-    """The same, None where no experiment is complete."""
+    """Return `classic`, None where no experiment is complete."""
     try:
         return classic(campaign)
     except NothingToEstimate:

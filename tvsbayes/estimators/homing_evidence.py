@@ -1,4 +1,4 @@
-"""How probable each way is in which axes came home that nobody recorded, by the evidence of the fits under them."""
+"""Probabilities of the possible sides of unrecorded homings, by the evidence of the fits under each."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 from tvsbayes.instrument.homing import ANYWHERE, Sides, every_way, ways
 
 WORTH_A_FIT = 0.02
-"""Probability from which a way of homing takes part in the posterior: one below adds a fiftieth of its own distance to
-a mean."""
+"""Least probability of a way of homing in the posterior: one below shifts a mean by at most 1/50 of its difference."""
 
 
 @dataclass(frozen=True)
@@ -23,18 +22,18 @@ class WeighedWay:
 
 
 def most_fits(axes: Sequence[str]) -> int:
-    """How many ways `weighed` asks for, at most."""
+    """Return the largest number of ways that `weighed` evaluates."""
     return len(every_way(axes)) if axes else 0
 
 
 def weighed(axes: Sequence[str], evidence: Callable[[Sides], float]) -> tuple[WeighedWay, ...]:
-    """Ways of homing, most probable first.
+    """Compute the probabilities of ways of homing, most probable first.
 
-    Ways of one axis are weighed with the other axis' homing left open, then together where both may matter.
+    Ways of one axis are compared with the other axis' homing left open, then likely ways jointly.
 
     Args:
-        axes: whose sides nobody recorded, at least one.
-        evidence: log evidence of the fit under a way, its prior chance included; asked for one way more than once.
+        axes: axes with unrecorded sides, at least one.
+        evidence: log evidence of the fit under a way, including its prior probability; may be called again for a way.
     """
     open_sides = dict.fromkeys(axes, ANYWHERE)
     alone = {axis: {side: evidence({**open_sides, axis: side}) for side in ways(axis)} for axis in axes}

@@ -1,8 +1,8 @@
-"""The joint estimator: every parameter from every spot, with a Laplace covariance.
+"""The joint estimator: all parameters from all spots, with a Laplace covariance.
 
-Newton steps on the full log density from where `mode_search` arrived, the inverse Hessian there, draws of the
-approximation and diagnoses. Everything happens in the coordinates of `model.parameter_space` (prior N(0, 1) each);
-results are handed out in the units of the names: deg, mm, px, rad.
+Newton steps on the full log density from the result of `mode_search`, the inverse Hessian at the mode, draws of the
+approximation and diagnoses. All computations use the coordinates of `model.parameter_space` (prior N(0, 1) each);
+results have the units of their names: deg, mm, px, rad.
 """
 
 from __future__ import annotations
@@ -42,32 +42,32 @@ from tvsbayes.statistics.least_squares import LAPLACE_DRAWS, Mode, laplace_draws
 SMALLEST_CAMPAIGN = 8
 """Spots below which no fit is tried: two beams at two depths, seen before and after one move on each axis."""
 MISFIT_LIMIT = 20.0
-"""Factor on the stated pixel noise beyond which the mode explains no spot: a wrong basin, swapped cameras or wrong
-counters, not noise."""
+"""Factor on the stated pixel noise above which the mode does not explain the spots: a wrong basin, swapped cameras or
+wrong counters, not noise."""
 
 
 NEWTON, DIAGNOSING = "Newton steps to the mode", "diagnosing the fit"
 LAST_SECONDS = {NEWTON: 0.8, DIAGNOSING: 0.3}
-"""After the search: what progress predicts with."""
+"""Seconds of the stages after the search, for the progress display."""
 HOMING = "weighing ways of homing"
 HOMING_SECONDS = 1.5
-"""Of the fit under one way."""
+"""Seconds of the fit under one way of homing."""
 
 
 def fit_stages(robust: bool, moves: Sequence[Move]) -> dict[str, float]:
-    """Stages of a fit, with seconds."""
+    """Return the stages of a fit with their seconds."""
     ways = most_fits(unrecorded(moves))
     return search_stages(robust) | LAST_SECONDS | ({HOMING: HOMING_SECONDS * ways} if ways else {})
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """A way in which the axes may have come home.
+    """A possible way of homing.
 
     Attributes:
-        sides: by axis.
-        probability: of all ways, by the evidence of their Laplace approximations.
-        fit: under it; None for one that is less probable than `WORTH_A_FIT`.
+        sides: side of the homing by axis.
+        probability: among all ways, by the evidence of their Laplace approximations.
+        fit: the fit under it; None if less probable than `WORTH_A_FIT`.
     """
 
     sides: Mapping[str, str]
@@ -77,13 +77,13 @@ class Alternative:
 
 @dataclass(frozen=True, repr=False)
 class JointFit(Shown):
-    """Mode and Laplace approximation of the posterior: what `fit` returns.
+    """Mode and Laplace approximation of the posterior, the result of `fit`.
 
     Read it through `summary.summarise` (values, intervals, diagnostics in words), `sampling.sample` (draws of the
-    posterior itself) or `fitted_calibration.calibration_of` (coordinates); the fields are what those are made of.
+    posterior itself) or `fitted_calibration.calibration_of` (coordinates), which use these fields.
 
     Attributes:
-        campaign: what was fitted.
+        campaign: the fitted campaign.
         space: priors as arrays.
         arrays: the campaign as arrays, with the weights of the robust option.
         z: mode in prior coordinates, shape (p,).
@@ -93,20 +93,20 @@ class JointFit(Shown):
         information: leave-one-out quantities per stop.
         chi2: squared standardised innovations of the spots used.
         reference_pose_rad: mean mirror angles (pan, tilt) over the spots used.
-        seen_line: their counters, over which the headlines are slopes.
+        seen_line: counters of the spots, over which the headlines are slopes.
         free: parameters that are estimated, shape (p,).
         draws_z: Laplace draws, shape (draws, p), with mean and covariance exactly those of the approximation.
-        draws_places: with them, the errors at places in units of `linearised.place_root`, shape (draws, e).
+        draws_places: errors at places of these draws in units of `linearised.place_root`, shape (draws, e).
         draws: headlines and parameters of the draws.
         prior_draws: the same under the priors, at the same pose.
         mode: headlines and parameters at the mode (fields without leading axis).
         ends95: parameters at z - 1.96 sd and z + 1.96 sd, shape (2, p): interval ends under monotone maps.
         excluded_spots: ids of spots that the robust option or the caller left out.
-        suspect_spots: ids of spots used although a clean spot would look so less often than `GATE_PROBABILITY`.
+        suspect_spots: ids of used spots whose misfit has a probability below `GATE_PROBABILITY`.
         converged: the mode was reached and is a maximum.
         problems: sentences on what failed; empty when converged.
-        sides: how the axes came home whose sides nobody recorded, as this fit has it.
-        alternatives: every way that is worth a thought, this fit's first; empty where the sides were recorded.
+        sides: sides of unrecorded homings by axis, as this fit assumes them.
+        alternatives: ways of homing considered, this fit's first; empty where the sides were recorded.
     """
 
     campaign: Campaign
@@ -135,7 +135,7 @@ class JointFit(Shown):
     alternatives: tuple[Alternative, ...] = ()
 
     def shown(self) -> View:
-        """Mode and Laplace sd of what a fit is for."""
+        """Show mode and Laplace sd of the headlines."""
         state = "converged" if self.converged else f"NOT CONVERGED: {'; '.join(self.problems)}"
         used = sum(spot.status == "ok" for spot in self.campaign.spots) - len(self.excluded_spots)
         moved = set(legs_of(self.campaign.moves))
@@ -148,17 +148,17 @@ class JointFit(Shown):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Contract names of the coordinates and of the columns of `draws.physical`."""
+        """Return the public names of the coordinates and of the columns of `draws.physical`."""
         return self.space.mechanism.names
 
     @property
     def held(self) -> np.ndarray:
-        """What the linearisation takes as known, shape (p,)."""
+        """Mark the parameters that the linearisation takes as known, shape (p,)."""
         return held_by(self.free)
 
     @property
     def stored(self) -> StoredMode:
-        """What `restored` needs."""
+        """Return the record from which `restored` builds the fit."""
         count = len(self.linearised.residual)
         return StoredMode(
             self.names,
@@ -173,7 +173,7 @@ class JointFit(Shown):
 
     @property
     def laplace_evidence(self) -> float:
-        """Log of the integral of the density over the estimated coordinates and of its way of homing.
+        """Compute the log evidence of this fit and its way of homing, integrated over the estimated coordinates.
 
         By the Laplace approximation, without `campaign_arrays.spot_constants`.
         """
@@ -182,18 +182,18 @@ class JointFit(Shown):
 
     @property
     def log_evidence(self) -> float:
-        """The same of all ways of homing together."""
+        """Compute the log evidence of all ways of homing together."""
         return self.laplace_evidence - float(np.log(self.mixture[0].probability))
 
     @property
     def mixture(self) -> tuple[Alternative, ...]:
-        """What the posterior is made of, this fit first: itself, or the ways of homing that count."""
+        """Return the components of the posterior, this fit first: only itself, or the fitted ways of homing."""
         counted = tuple(way for way in self.alternatives if way.fit is not None)
         return counted or (Alternative(self.sides, 1.0, self),)
 
     @property
     def homing_side(self) -> dict[str, dict[str, float]]:
-        """Probability of each way of homing, by axis whose sides nobody recorded."""
+        """Return the probability of each side of unrecorded homings, by axis."""
         sides: dict[str, dict[str, float]] = {}
         for way in self.alternatives:
             for axis, side in way.sides.items():
@@ -218,15 +218,15 @@ def fit(
     Args:
         campaign: from `read_campaign`.
         model: simpler or richer gears than the rig states, robust against outliers or not.
-        without: ids of spots that teach the fit nothing but can be predicted by it.
+        without: ids of spots that are held out but can be predicted.
         seed: seed of the Laplace draws.
-        progress: told how far it is.
+        progress: called with the share that is done.
 
     Returns:
-        Mode, Laplace approximation and diagnostics; look at `converged` before using it.
+        Mode, Laplace approximation and diagnostics; check `converged` before using it.
 
     Raises:
-        TypeError: an argument of another kind.
+        TypeError: an argument has the wrong type.
         InputError: if harmonics are wanted and no axis states their period.
         NothingToEstimate: if the campaign has fewer than `SMALLEST_CAMPAIGN` usable spots, or all is fixed.
         NotConverged: if the fit diverged; a fit that ended badly is returned with `converged` False.
@@ -271,11 +271,11 @@ def fit(
 
 
 def _by_homing(first: JointFit, problem: Problem, axes: tuple[str, ...], seed: int, advance: Advance) -> JointFit:
-    """The fit under the most probable way of homing, with all that count.
+    """Fit under each way of homing; return the most probable fit with all alternatives.
 
     Args:
-        first: under "anywhere" for every axis.
-        problem: that it came from.
+        first: fit under "anywhere" for every axis.
+        problem: problem of that fit.
         axes: whose sides nobody recorded.
         seed: of the Laplace draws.
         advance: told how far it is.
@@ -311,7 +311,7 @@ def _by_homing(first: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
 
 
 def _problem_under(found: JointFit, problem: Problem, sides: Sides) -> Problem:
-    """The problem of a fit if the axes came home in these ways."""
+    """Build the problem of a fit with these sides of the homings."""
     used = np.asarray(found.arrays.spots.valid)[: len(problem.spots)] > 0
     under = Problem(homed(found.campaign, sides), problem.table, used)
     under.arrays = eqx.tree_at(lambda a: a.spots.weight, under.arrays, problem.arrays.spots.weight)
@@ -319,16 +319,16 @@ def _problem_under(found: JointFit, problem: Problem, sides: Sides) -> Problem:
 
 
 def laplace_evidence(mode: Mode, free: Bool[np.ndarray, " parameters"]) -> float:
-    """Log of the integral of a density over the estimated coordinates by its Laplace approximation.
+    """Compute the log of the integral of a density over the estimated coordinates by its Laplace approximation.
 
-    The coordinates have N(0, 1) priors, whose (2 pi)^(-p/2) the Gaussian integral cancels.
+    The coordinates have N(0, 1) priors, whose (2 pi)^(-p/2) cancels with that of the Gaussian integral.
     """
     rows = np.flatnonzero(free)
     return 0.5 * float(np.linalg.slogdet(mode.covariance[np.ix_(rows, rows)])[1]) - mode.negative_log_density
 
 
 def _usable(campaign: Campaign, without: Collection[int]) -> Bool[np.ndarray, " spots"]:
-    """Which ordered spots teach the fit; one beyond what the lens model can undistort is in nobody's sight line."""
+    """Mark the ordered spots that the fit uses; one that the lens model cannot undistort has no line of sight."""
     used = np.array([spot.spot not in without for spot in ordered_spots(campaign)], dtype=bool) & in_sight(campaign)
     if used.sum() < SMALLEST_CAMPAIGN:
         raise NothingToEstimate(
@@ -341,7 +341,7 @@ def _usable(campaign: Campaign, without: Collection[int]) -> Bool[np.ndarray, " 
 
 
 def priors_used(stated: Mapping[str, Prior], value: np.ndarray, u: np.ndarray) -> dict[str, Prior]:
-    """The priors of a fit, which its options may have changed from the stated ones; columns in their order."""
+    """Return the priors of a fit, which its options may have changed; columns are in the order of `stated`."""
     return {
         name: replace(prior, value=float(value[column]), u=float(u[column]))
         for column, (name, prior) in enumerate(stated.items())
@@ -349,15 +349,15 @@ def priors_used(stated: Mapping[str, Prior], value: np.ndarray, u: np.ndarray) -
 
 
 def restored(campaign: Campaign, stored: StoredMode, seed: int = 0) -> JointFit | None:
-    """The converged fit that ended at a stored mode, without fitting: its model, weights and Laplace draws.
+    """Restore a converged fit from its stored mode, without fitting: its model, weights and Laplace draws.
 
     Args:
-        campaign: the one it was made from.
+        campaign: the campaign that was fitted.
         stored: from `stored_draws.stored_mode`.
-        seed: of the Laplace draws; those of `fit` with the same seed.
+        seed: seed of the Laplace draws, which equal those of `fit` with the same seed.
 
     Returns:
-        The fit; None where another version of tvsbayes named its parameters otherwise.
+        The fit; None where another version of tvsbayes used other parameter names.
     """
     if stored.names != campaign.rig.mechanism.names or stored.prior.shape[1] != len(RIG_NAMES):
         return None
@@ -382,14 +382,14 @@ class Gaussian:
 
 
 def with_places(z: np.ndarray, covariance: np.ndarray, information: StopInformation) -> Gaussian:
-    """The Laplace approximation of coordinates and errors at places, these in units of N(0, 1) a priori.
+    """Extend the Laplace approximation of the coordinates by the errors at places, which are N(0, 1) a priori.
 
     At the noise scales of the mode the errors follow the coordinates linearly.
 
     Args:
         z: the mode of the coordinates, shape (p,).
-        covariance: theirs, shape (p, p).
-        information: of the stops there.
+        covariance: covariance of the coordinates, shape (p, p).
+        information: leave-one-out quantities at the mode.
     """
     slope, own = information.place_slope, covariance
     follows = slope @ own
@@ -398,14 +398,14 @@ def with_places(z: np.ndarray, covariance: np.ndarray, information: StopInformat
 
 
 def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_draws: Derived | None = None) -> JointFit:
-    """The fit that ends at a mode: residuals, information, Laplace draws and diagnoses there.
+    """Build the fit at a mode: residuals, information, Laplace draws and diagnoses.
 
     Args:
-        campaign: that `problem` was made from.
+        campaign: campaign of `problem`.
         problem: model, priors and the weights of the spots.
         mode: converged, or with the problems that `JointFit.problems` then states.
         seed: of the Laplace draws.
-        prior_draws: of a fit of the same campaign and seed; made where None are given.
+        prior_draws: those of a fit of the same campaign and seed; by default they are drawn.
     """
     used = np.asarray(problem.arrays.spots.valid)[: len(problem.spots)] > 0
     lin = problem.linearised(mode.z)
@@ -419,7 +419,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     share = placed(np.pad(line_share(seen_at, used), (0, len(places.steps) - len(seen_at.steps))))
     line = SeenLine(np.asarray(pose), places, share)
     count, joint = len(NAMES), with_places(mode.z, mode.covariance, information)
-    # What the campaign cannot tell of has no draws: those of the others are then the same whether it is known or not.
+    # Shifts of the zeros that are not estimated are not drawn: the draws of the others then do not depend on them.
     drawn = np.ones(len(joint.mean), dtype=bool)
     drawn[[INDEX[name] for name in ZERO_SHIFT_NAMES if not problem.free[INDEX[name]]]] = False
     both = np.tile(joint.mean, (LAPLACE_DRAWS, 1))
@@ -428,7 +428,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     centre_rad = np.asarray(lin.place_root) @ information.place_mean
 
     def derived(z: np.ndarray, errors_rad: np.ndarray) -> Derived:
-        """At the mode, and of draws."""
+        """Compute derived quantities at the mode and of draws."""
         z, errors = np.concatenate([mode.z[None], z]), np.concatenate([centre_rad[None], errors_rad])
         return jax.tree.map(np.asarray, derived_quantities(z, errors, problem.space, line))
 
@@ -443,7 +443,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
     ids = np.array([s.spot for s in problem.spots])
     problems = mode.problems
     chi2 = sum(float(np.asarray(lin.residual)[g.rows].ravel() @ g.residual) for g in information.groups)
-    # Where the scale is fixed the misfit stays in chi-square.
+    # Where the pixel scale is fixed, chi-square contains the misfit.
     looks = max(float(np.sum(used * (3 + readings))), 1.0)
     misfit = float(np.asarray(at_mode_and_draws.physical)[0, INDEX["pixel_scale"]]) * max(1.0, np.sqrt(chi2 / looks))
     if misfit > MISFIT_LIMIT:

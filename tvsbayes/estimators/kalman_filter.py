@@ -1,6 +1,6 @@
-"""The Kalman filter of a campaign: spots in time order, the belief after each, and columns that follow them.
+"""The Kalman filter of a campaign over spots in time order, and further columns through its gains.
 
-Its state: stop error (pan, tilt), home offset (pan, tilt), position in the unknown play band (pan, tilt) in units of
+Its state: stop error (pan, tilt), home offset (pan, tilt), position in the unknown play band (pan, tilt), in units of
 its standard deviation. Angles rad; residuals in units of their noise (formulation 4.1).
 """
 
@@ -23,11 +23,11 @@ STATES = 6
 
 
 class FilterRows(eqx.Module):
-    """What the filter meets at each spot, in time order: its residual, how its states move it, which are new.
+    """Input of the filter at each spot, in time order: residual, loads of the states, and which states are new.
 
-    `residual` has the shape (spots, components), or (spots, components, columns) where several are filtered at once;
-    `load` is d(predicted)/d(state), `keep` is 0 for a state drawn anew since the previous spot and 1 otherwise,
-    `variance` what is added to its variance since then: that of the draw, or of a random walk.
+    `residual` has the shape (spots, components), or (spots, components, columns) where several are filtered at once.
+    `load` is d(predicted)/d(state). `keep` is 0 for a state drawn again since the previous spot, else 1. `variance` is
+    added to the state's variance since then: that of the draw, or of a random walk.
     """
 
     residual: Float[Array | np.ndarray, "..."]
@@ -45,15 +45,15 @@ def filter_rows(
     spots: SpotArrays,
     functions: ModuleType = jnp,
 ) -> FilterRows:
-    """States of the filter at every spot: stop errors, home offsets with their drift, places in an unknown play.
+    """Build the filter's input at every spot: stop errors, home offsets with drift, positions in an unknown play.
 
     Args:
-        residual: observed - predicted, or whatever else goes through the filter.
+        residual: observed - predicted, or other columns to filter.
         slope: d(predicted)/d(pan, tilt).
-        play_sd_rad: of the place in the play, zero where it is known.
+        play_sd_rad: sd of the position in the play, zero where it is known.
         stop_variance: from `stop_variances`.
         drift_variance: from `drift_variances`.
-        spots: which of them re-home and draw stop errors anew.
+        spots: which of them follow a homing or have new stop errors.
         functions: jax.numpy or numpy.
     """
     xp, pairs = functions, (len(spots.valid), 2)
@@ -69,31 +69,31 @@ def filter_rows(
 
 
 def _along(states: Float[Array | np.ndarray, "6"], like: Array | np.ndarray) -> Float[Array, "6 ..."]:
-    """Numbers of the six states for every column of `like`."""
+    """Reshape numbers of the six states to broadcast over the columns of `like`."""
     return jnp.reshape(states, (STATES,) + (1,) * (like.ndim - 1))
 
 
 class Belief(eqx.Module):
-    """Mean, one for every column of residuals, and covariance of the filter's state."""
+    """Mean (for every column of residuals) and covariance of the filter's state."""
 
     mean: Float[Array | np.ndarray, "6 *columns"]
     covariance: Float[Array | np.ndarray, "6 6"]
 
     def renewed(self, row: FilterRows) -> Belief:
-        """The state as the spot finds it, before the spot is looked at."""
+        """Predict the state at the spot, before the update with it."""
         new = jnp.diag(row.variance)
         return Belief(self.mean * _along(row.keep, self.mean), self.covariance * (row.keep[:, None] * row.keep) + new)
 
 
 class Gains(eqx.Module):
-    """How a spot's components, one after the other, move the means: `gain` times a standardised error of this `sd`."""
+    """Gains of a spot's successive components: the means change by `gain` times the error standardised by `sd`."""
 
     gain: Float[Array, "*spots components 6"]
     sd: Float[Array, "*spots components"]
 
 
 class KalmanUpdate(eqx.Module):
-    """A spot seen by the filter: the state after it, standardised errors and the log of their variances' product."""
+    """Result of an update with one spot: the state, standardised errors and the log of their variances' product."""
 
     belief: Belief
     standardised: Float[Array, "components *columns"]
@@ -102,11 +102,11 @@ class KalmanUpdate(eqx.Module):
 
 
 def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
-    """Update with one spot: its components have independent unit noise, so a scalar update each and no inverse."""
+    """Update with one spot, by a scalar update for each component, as their noise is independent, of unit variance."""
     mean, covariance = belief.mean, belief.covariance
     errors, variances, gains = [], [], []
     for component in range(len(row.load)):
-        # Sums instead of products: a call into a matrix library costs more than six numbers.
+        # Sums instead of matrix products: a library call costs more than six numbers.
         gain = jnp.sum(covariance * row.load[component], axis=1)
         variance_ahead = 1 + jnp.sum(row.load[component] * gain)
         error = row.residual[component] - jnp.sum(_along(row.load[component], mean) * mean, axis=0)
@@ -121,14 +121,14 @@ def kalman_update(belief: Belief, row: FilterRows) -> KalmanUpdate:
 
 
 def no_belief(*columns: int) -> Belief:
-    """Before the first spot, whose states are all new."""
+    """Return the state before the first spot, at which all states are new."""
     return Belief(jnp.zeros((STATES, *columns)), jnp.zeros((STATES, STATES)))
 
 
 class Seen(eqx.Module):
-    """Spots seen by the filter: standardised errors (spots, components, ...), and logs of their variances' products.
+    """Filtered spots: standardised errors (spots, components, ...), and logs of their variances' products.
 
-    `belief` is that after the last of them; `gains` are theirs.
+    `belief` is the state after the last of them; `gains` are those of all.
     """
 
     standardised: Float[Array, "..."]
@@ -138,7 +138,7 @@ class Seen(eqx.Module):
 
 
 def filtered(rows: FilterRows, before: Belief) -> Seen:
-    """Run the filter over spots in time order, from the belief before them."""
+    """Run the filter over spots in time order, from the state before them."""
 
     def step(belief, row):
         updated = kalman_update(belief.renewed(row), row)
@@ -149,7 +149,7 @@ def filtered(rows: FilterRows, before: Belief) -> Seen:
 
 
 class ColumnsSeen(eqx.Module):
-    """Columns that the filter standardised, and the means of its state for them after the last spot."""
+    """Columns standardised by the filter, and the means of its state for them after the last spot."""
 
     standardised: Float[Array, "spots components columns"]
     mean: Float[Array, "6 columns"]
@@ -161,11 +161,11 @@ def columns_filtered(
     gains: Gains,
     before: Float[Array, "6 columns"],
 ) -> ColumnsSeen:
-    """Send further columns through a filter whose gains are known: a product of few numbers before and after."""
+    """Filter further columns with known gains: products of few numbers before and after the scan."""
     load, whitened = rows.load / gains.sd[..., None], columns / gains.sd[..., None]
     loads: list[Any] = []
     residuals: list[Any] = []
-    # What earlier components have moved stands in the load of later ones.
+    # The load of later components includes the updates by earlier ones.
     for component in range(whitened.shape[1]):
         slope, residual = load[:, component], whitened[:, component]
         for earlier in range(component):
@@ -177,7 +177,7 @@ def columns_filtered(
 
     def step(mean, row):
         load, residual, keep, gain = row
-        # Sums spelled out: loops over whole rows of columns.
+        # Explicit sums compile to loops over whole rows of columns.
         moved = sum(load[:, state, None] * mean[state] for state in range(STATES))
         standardised = materialise(residual - moved)
         followed = sum(gain[component, :, None] * standardised[component] for component in range(len(gain)))

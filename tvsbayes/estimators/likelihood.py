@@ -1,8 +1,8 @@
 """Likelihood of all spots of a campaign: flat ranges, marginal errors of stops, homings and gears (formulation 4.1).
 
 Stop errors (persistent while their axis stands still), drifting home offsets and unknown play at the start of a segment
-are Gaussian states of a Kalman filter in time order. Errors that repeat by position stay for the whole campaign: their
-columns go through the filter like the residuals, and normal equations take them out. Angles rad, lengths mm; residuals
+are Gaussian states of a Kalman filter in time order. Errors that repeat by position are constant during the campaign:
+their columns pass the filter like the residuals, and normal equations eliminate them. Angles rad, lengths mm; residuals
 are in units of their noise, stated standard deviations times the pixel scale.
 """
 
@@ -42,38 +42,38 @@ from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 RATIO_COLUMNS = np.array([INDEX[name] for name in names_of("degrees_per_step")])
 POINTS_TOGETHER = 256
-"""Points whose errors at places are taken out together: many, since NumPy's calls cost more than small matrices; few
+"""Points whose errors at places are eliminated together: many, since NumPy's calls cost more than small matrices; few
 enough for their memory."""
 BLOCK = 64
-"""Spots that go through the filter together: their numbers stay in the processor's cache, and a campaign costs what its
-own spots need, not what it was padded to."""
+"""Spots that pass the filter together: their numbers stay in the processor's cache, and the cost follows the campaign's
+own spots, not its padded length."""
 
 
 def stop_variances(stop_sd_rad: Float[Array, "2 2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
-    """Variance of the stop errors (pan, tilt) that are new at each spot, by the direction of their move."""
+    """Compute the variance of new stop errors (pan, tilt) at each spot, by the direction of their move."""
     return jnp.sum(spots.redraw_mix * stop_sd_rad**2, axis=2)
 
 
 def drift_variances(drift_rad_per_root_hour: Float[Array, "2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
-    """Variance of what the zeros (pan, tilt) walked since the spot before, or since the homing after it."""
+    """Compute the variance of the drift of the zeros (pan, tilt) since the previous spot, or since a later homing."""
     return spots.hours[:, None] * drift_rad_per_root_hour**2
 
 
 def scatter_variances(scatter_rad: Float[Array, "2"], spots: SpotArrays) -> Float[Array, "spots 2"]:
-    """Variance of the beam's angles (pan, tilt) at each look about where the axes stand; robust weights enlarge it."""
+    """Compute the variance of the beam's angles (pan, tilt) about the axes' at each look; robust weights enlarge it."""
     return scatter_rad**2 / spots.weight[:, None]
 
 
 def place_columns(
     slope: Float[Array | np.ndarray, "spots components 2"], gears: GearArrays
 ) -> Float[Array, "spots components errors"]:
-    """d(predicted)/d(transmission errors, then plays, at the places), rad^-1."""
+    """Compute d(predicted)/d(transmission errors, then plays, at the places), rad^-1."""
     by_place = jnp.where(gears.places.on_tilt, slope[..., 1:], slope[..., :1])
     return jnp.concatenate([by_place * gears.error_share[:, None], by_place * gears.play_share[:, None]], axis=2)
 
 
 class Standing(eqx.Module):
-    """A campaign at a point of parameter space, before its filter: looks, their residuals, the mirrors' places."""
+    """Input of the filter at a point of parameter space: looks, their residuals, variances of the states."""
 
     looks: Looks
     noise: NoiseScales
@@ -91,7 +91,7 @@ def standing(
     inflation: Float[Array | np.ndarray, ""] | float = 1.0,
     angles: MirrorAngles | None = None,
 ) -> Standing:
-    """Linearise all spots; `inflation` is a factor on pixel and aperture noise (annealing), `angles` are the spots'."""
+    """Linearise all spots; `inflation` scales pixel and aperture noise (annealing), `angles` are the spots'."""
     spots = arrays.spots
     angles = spot_angles(model, arrays) if angles is None else angles
     pan, tilt = angles.angle_rad.T
@@ -111,10 +111,10 @@ def standing(
 
 
 class FilterInput(eqx.Module):
-    """Rows of the filter, and what no state can change.
+    """Rows of the filter, and the residuals that depend on no state.
 
-    `slope` is d(rows' residual)/d(pan, tilt). `free` is what is left of the standardised components, which no state
-    changes; `log_scale` is what each spot adds to the log density besides the rows: theirs in it.
+    `slope` is d(rows' residual)/d(pan, tilt). `free` are the other standardised components, which depend on no state.
+    `log_scale` is each spot's log density without the rows, `free` included.
     """
 
     rows: FilterRows
@@ -124,7 +124,7 @@ class FilterInput(eqx.Module):
 
 
 def root_at_places(model: Model, gears: GearArrays) -> Float[Array, "errors errors"]:
-    """Factor of the covariance of transmission errors, then plays, at the places, rad."""
+    """Compute the factor of the covariance of transmission errors, then plays, at the places, rad."""
     places = gears.places
     if not len(places.steps):
         return jnp.zeros((0, 0))
@@ -133,7 +133,7 @@ def root_at_places(model: Model, gears: GearArrays) -> Float[Array, "errors erro
 
 
 def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | None = None) -> FilterInput:
-    """Linearise all spots for the filter; `angles` are the spots', if they are known."""
+    """Linearise all spots for the filter; `angles` are the spots', if known."""
     stood = standing(model, arrays, angles=angles)
     terms, turned = stood.terms, stood.to_states
     first, second, *free = turned.of_many(terms.residual)
@@ -144,12 +144,12 @@ def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | No
 
 
 class Sums(eqx.Module):
-    """What a campaign says of the errors at its places, summed over spots, many points with a leading axis.
+    """Sums over spots for the normal equations of the errors at places; many points have a leading axis.
 
-    Places stand in groups of `PLACES_TOGETHER`, of each a column for every transmission error, then for every play.
-    `log_density` is that of the spots if all those errors were zero; `along` holds the products of the standardised
-    columns with the standardised residuals, `gram` those of the columns of two groups, for the pairs (0, 0), (1, 0),
-    (1, 1), (2, 0) ...
+    Places are in groups of `PLACES_TOGETHER`, each with a column for every transmission error, then for every play.
+    `log_density` is that of the spots with all those errors zero. `along` holds the products of the standardised
+    columns and residuals, `gram` those of the columns of two groups, for the pairs (0, 0), (1, 0), (1, 1), (2, 0)
+    ......
     """
 
     log_density: Float[Array | np.ndarray, "*batch"]
@@ -158,17 +158,16 @@ class Sums(eqx.Module):
 
 
 def pairs_of(groups: Any) -> Any:
-    """How many pairs there are of so many groups of places, each with itself and with those before it."""
+    """Count the pairs of groups of places, each with itself and with those before it."""
     return groups * (groups + 1) // 2
 
 
 class Passed(eqx.Module):
-    """A campaign on its way through the filter, block by block; rows of spots ahead are zero.
+    """State of the filter after some blocks of a campaign; rows of later spots are zero.
 
-    `belief` is that of the residuals and of the first group's columns, which tell how errors at places move them,
-    `means` are those of the other groups; `block` holds all these columns, standardised, in the last block. A caller
-    that needs the sums alone does not pay for `standardised`, `columns` and `free`: the compiler drops what nobody
-    reads.
+    `belief` has the means of the residuals and of the first group's columns, their derivatives by errors at places;
+    `means` are those of the other groups. `block` holds all these columns of the last block, standardised. If a caller
+    uses the sums alone, the compiler drops `standardised`, `columns` and `free`.
     """
 
     belief: Belief
@@ -182,21 +181,21 @@ class Passed(eqx.Module):
 
 
 def block_size(spots: SpotArrays) -> int:
-    """Spots of a block: `BLOCK`, or what divides the padded number evenly."""
+    """Return the number of spots of a block: `BLOCK`, or a divisor of the padded number."""
     count = len(spots.valid)
     return count if count <= BLOCK else math.gcd(count, BLOCK)
 
 
 def blocks_filled(arrays: CampaignArrays) -> Int[Array, ""]:
-    """Blocks that hold a spot: padding comes last."""
+    """Return the number of blocks that hold a spot; padding is last."""
     return -(-arrays.count // block_size(arrays.spots))
 
 
 def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -> Passed:
-    """Send the first blocks of spots through the filter; nothing depends on how they are cut.
+    """Run the filter over the first blocks of spots; the result does not depend on the block size.
 
-    Moves are followed as far as the spots go, and columns are those of groups with a place; all of them where the
-    number of blocks is a constant.
+    Moves are computed up to the last spot, and columns of groups with a place only; all of both where the number of
+    blocks is a constant.
     """
     count, size, together = len(arrays.spots.valid), block_size(arrays.spots), arrays.gears.together
     gears, zero = model.transmission, model.tilt_zero_rad
@@ -215,7 +214,7 @@ def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -
         else:
             angles = jax.tree.map(lambda of_moves: of_moves[index], every)
         given = filter_input(model, part, angles)
-        # The first group goes along with the residuals: its columns cost no loop of their own.
+        # The first group is filtered with the residuals: its columns need no loop of their own.
         both = [given.rows.residual[..., None], place_columns(given.slope, part.gears.some(0, together))]
         rows = eqx.tree_at(lambda r: r.residual, given.rows, jnp.concatenate(both, axis=2))
         after = filtered(rows, so_far.belief)
@@ -267,7 +266,7 @@ def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -
 
 
 class RepeatedErrors(eqx.Module):
-    """What all looks say of the errors at places: those divided by `root` are N(mean, (factor factor')^-1).
+    """Conditional distribution of errors at places given all looks: divided by `root`, N(mean, (factor factor')^-1).
 
     A priori they are N(0, 1). `explained` is the mean times the transposed factor. Many points with leading axes.
     """
@@ -278,11 +277,11 @@ class RepeatedErrors(eqx.Module):
 
     @classmethod
     def of(cls, sums: Sums, root: BlockRoot, functions: ModuleType = jnp) -> RepeatedErrors:
-        """Normal equations of the errors at places.
+        """Solve the normal equations of the errors at places.
 
         Args:
-            sums: of all groups, or of the first of them.
-            root: of the prior covariance of their errors, rad.
+            sums: sums of all groups, or of the first of them.
+            root: factor of the prior covariance of their errors, rad.
             functions: jax.numpy or numpy.
         """
         xp, groups = functions, sums.along.shape[-2]
@@ -295,7 +294,7 @@ class RepeatedErrors(eqx.Module):
         whole = xp.einsum("...ghkplq->...kgplhq", whole.reshape(*batch, groups, groups, 2, half, 2, half))
         precision = xp.eye(size) + root.congruent(whole.reshape(*batch, size, size))
         slope = root.transposed_times(along[..., None])[..., 0]
-        # Its last row divides the slope by the factor; its last pivot, which nobody reads, is positive.
+        # The last row of its factor is the slope divided by the factor; its last pivot is not used, but positive.
         corner = 1 + xp.sum(slope**2, axis=-1)[..., None, None]
         below = xp.concatenate([slope[..., None, :], corner], axis=-1)
         bordered = xp.concatenate([xp.concatenate([precision, slope[..., None]], axis=-1), below], axis=-2)
@@ -303,22 +302,22 @@ class RepeatedErrors(eqx.Module):
         return cls(root, factor[..., :-1, :-1], factor[..., -1, :-1])
 
     def log_density(self, functions: ModuleType = jnp) -> Any:
-        """What the errors add to the log density of the spots (least squares: r'r - b' P^-1 b)."""
+        """Compute the term of the errors in the spots' log density (least squares: r'r - b' P^-1 b)."""
         logs = functions.log(functions.diagonal(self.factor, axis1=-2, axis2=-1))
         return 0.5 * functions.sum(self.explained**2, axis=-1) - functions.sum(logs, axis=-1)
 
     def drawn(self, normal: Any, functions: ModuleType = jnp) -> Any:
-        """One draw of them from standard normal numbers, divided by `root`; zeros give their mean."""
+        """Draw the errors, divided by `root`, from standard normal numbers; zeros give their mean."""
         return functions.linalg.solve(self.factor.swapaxes(-2, -1), (self.explained + normal)[..., None])[..., 0]
 
 
 class Innovations(eqx.Module):
     """Standardised one-step prediction errors, N(0, 1) and independent under the model at given errors of places.
 
-    Of each spot two by the filter, then what no stop error changes: four components with the freedom of two at most.
-    They hold at the means of the errors at places, whose standardised values are in `places`; squares of both together
-    are the quadratic form of the campaign. `log_density` is its log likelihood without the terms of `spot_constants`;
-    `place_errors_rad` a draw of the errors at places, or their means.
+    Each spot has two from the filter, then four components that depend on no stop error, with at most two degrees of
+    freedom. They are taken at the means of the errors at places, whose standardised values are in `places`; the squares
+    of both sum to the quadratic form of the campaign. `log_density` is its log likelihood without the terms of
+    `spot_constants`; `place_errors_rad` is a draw of the errors at places, or their means.
     """
 
     standardised: Float[Array, "spots 6"]
@@ -330,14 +329,14 @@ class Innovations(eqx.Module):
 def innovations(
     model: Model, arrays: CampaignArrays, normal: Float[Array, " errors"], blocks: Int[Array, ""] | int | None = None
 ) -> Innovations:
-    """Run the filter over all spots in time order, and take out what repeats.
+    """Run the filter over all spots in time order, and eliminate errors that repeat.
 
     Args:
         model: parameters.
         arrays: the campaign.
-        normal: what moves the errors at places from their means, in units of their sds: zero, or a draw's numbers.
-        blocks: of spots to look at, by default all of them. A number that is no constant of the compiled function
-            (`blocks_filled`) saves what padding costs, and has no derivative in reverse mode.
+        normal: deviations of the errors at places from their means, in units of their sds: zero, or a draw's numbers.
+        blocks: blocks of spots to filter, by default all of them. A number that is not a constant of the compiled
+            function (`blocks_filled`) saves the cost of padding, but has no derivative in reverse mode.
 
     Returns:
         Standardised innovations and log likelihood; cost linear in the number of spots.
@@ -359,10 +358,10 @@ def innovations(
 
 
 def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> BlockRoot:
-    """Factors of the covariance of errors at places as in `root_at_places`, of n points.
+    """Compute the factors of `root_at_places` for n points.
 
     Args:
-        values: of all parameters in the units of their names, shape (n, p).
+        values: all parameters in the units of their names, shape (n, p).
         space: priors.
         gears: as NumPy arrays.
     """
@@ -375,10 +374,10 @@ def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> Bl
 def prior_errors_at_places(
     z: np.ndarray, normal: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
 ) -> np.ndarray:
-    """Transmission errors, then plays, at the filled places before any look, rad: a draw each.
+    """Draw transmission errors, then plays, at the filled places from the prior, rad.
 
     Args:
-        z: coordinates of many points (n, p), which have the scales.
+        z: coordinates of many points (n, p), which include the scales.
         normal: standard normal numbers, shape (n, e).
         space: priors.
         arrays: the campaign.
@@ -392,7 +391,7 @@ def prior_errors_at_places(
 
 
 def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Scalar:
-    """Log posterior density of the coordinates, up to a constant: likelihood and standard-normal priors."""
+    """Compute the log posterior density of the coordinates, up to a constant: likelihood and standard normal priors."""
     still = jnp.zeros(2 * len(arrays.gears.places.steps))
     return innovations(space.model(z), arrays, still).log_density - 0.5 * jnp.dot(z, z)
 
@@ -405,7 +404,7 @@ def _sums(values: Float[Array, "batch parameters"], space: ParameterSpace, array
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Of many points: log posterior density (n,) and errors at places (n, e) as in `Innovations`."""
+    """Log posterior density (n,) and errors at places (n, e), as in `Innovations`, of many points."""
 
     log_density: np.ndarray
     place_errors_rad: np.ndarray
@@ -417,7 +416,7 @@ def evaluate(
     space: ParameterSpace,
     arrays: CampaignArrays,
 ) -> Evaluation:
-    """`log_density` of many points; NaN where the model has no value.
+    """Evaluate `log_density` at many points; NaN where the model has no value.
 
     Args:
         z: coordinates, shape (n, p).
@@ -469,7 +468,7 @@ def _joined(parts: Sequence[Evaluation]) -> Evaluation:
 def _residuals(
     values: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays, first: Int[Array, ""]
 ) -> Float[Array, "batch spots 4"]:
-    """Of `WINDOW` spots from the first on."""
+    """Compute residuals of `WINDOW` spots from the first on."""
     size, window = block_size(arrays.spots), min(WINDOW, len(arrays.spots.valid))
     blocks = jnp.minimum(blocks_filled(arrays) - first // size, window // size)
 
@@ -492,7 +491,7 @@ def _residuals(
 def residuals(
     z: Float[Array | np.ndarray, "points parameters"], space: ParameterSpace, arrays: CampaignArrays
 ) -> np.ndarray:
-    """Observed - predicted of all spots in units of their noise, ranges projected out, before any filter.
+    """Compute observed - predicted of all spots in units of their noise, ranges projected out, before the filter.
 
     Args:
         z: coordinates of many points, shape (n, p).
@@ -508,5 +507,5 @@ def residuals(
 
 
 def no_draw(count: int, arrays: CampaignArrays) -> np.ndarray:
-    """For `evaluate`: the errors at places of this many points are their means."""
+    """Return zeros for `evaluate`: the errors at places of this many points are then their means."""
     return np.zeros((count, 2 * arrays.gears.filled))

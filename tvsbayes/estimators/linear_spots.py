@@ -1,10 +1,10 @@
-"""Spots linearised at a point of parameter space, and what each spot and each stop says beside all the others.
+"""Spots linearised at a point of parameter space, and leave-one-out quantities of each spot and stop.
 
 NumPy after one compiled linearisation. All spots taken between two moves share their stop errors and form a group. With
 C the covariance of all residuals (unit noise + stop errors, home offsets, unknown play), one forward and one backward
 pass give, for every group g, u_g = [C^-1 r]_g, [C^-1 J]_g and the diagonal block M_g = [C^-1]_gg in time linear in the
 number of groups (disturbance smoother: de Jong, Biometrika 75 (1988) 594; Durbin and Koopman, Time Series Analysis by
-State Space Methods, 4.5): leave-one-out residuals, and what a fit would lose without a stop. Residuals are whitened.
+State Space Methods, 4.5). These give leave-one-out residuals and standard deviations. Residuals are whitened.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from tvsbayes.model.parameter_space import ParameterSpace, Point
 
 
 class LinearLooks(eqx.Module):
-    """Spots linearised at a point; first axis of the Jacobians, as of everything, is the spot.
+    """Spots linearised at a point; the first axis of all arrays is over spots.
 
-    Residuals, slopes and what follows from them are in units of the noise of a look, its scatter included.
-    `place_columns` is d(predicted)/d(errors at places, rad).
+    Residuals, slopes and derived arrays are in units of the noise of a look, its scatter included. `place_columns` is
+    d(predicted)/d(errors at places, rad).
     """
 
     residual: Float[Array | np.ndarray, "spots 4"]
@@ -47,9 +47,9 @@ class LinearLooks(eqx.Module):
 
 
 class Linearised(LinearLooks):
-    """A campaign linearised at coordinates `z`, without padding; `place_root` is the prior's of the errors at places.
+    """A campaign linearised at coordinates `z`, without padding.
 
-    It is the factor of their covariance, rad.
+    `place_root` is the factor of the prior covariance of the errors at places, rad.
     """
 
     z: Float[Array | np.ndarray, " parameters"]
@@ -59,7 +59,7 @@ class Linearised(LinearLooks):
     def joined(
         cls, parts: Sequence[LinearLooks], point: Point, space: ParameterSpace, arrays: CampaignArrays
     ) -> Linearised:
-        """One after the other, at the places that are filled, as NumPy arrays."""
+        """Concatenate parts, at the filled places, as NumPy arrays."""
         count, gears = int(arrays.count), arrays.gears.without_padding()
         given = {
             field.name: np.concatenate([np.asarray(getattr(part, field.name)) for part in parts])[:count]
@@ -72,11 +72,11 @@ class Linearised(LinearLooks):
 
     @property
     def place_load(self) -> Float[Array | np.ndarray, "spots 4 errors"]:
-        """d(predicted)/d(errors at places) in units in which they are N(0, 1) a priori."""
+        """Compute d(predicted)/d(errors at places), these in units in which they are N(0, 1) a priori."""
         return self.place_columns @ self.place_root
 
     def spot_deviations(self) -> SpotDeviations:
-        """Least squares of the whitened residuals, spot by spot; covariance 0 where a spot tells neither angle."""
+        """Fit both angles to the whitened residuals of each spot; covariance 0 where a spot determines neither."""
         slope = np.asarray(self.slope)
         with np.errstate(all="ignore"):
             covariance = np.linalg.pinv(np.einsum("nia,nib->nab", slope, slope))
@@ -85,11 +85,11 @@ class Linearised(LinearLooks):
 
 @dataclass(frozen=True)
 class SpotDeviations:
-    """Mirror angles (pan, tilt), seen minus predicted, every spot by itself, its range projected out.
+    """Mirror angles (pan, tilt), observed minus predicted, of every spot by itself, its range projected out.
 
     Attributes:
         deviation_rad: shape (spots, 2).
-        covariance_rad2: of the pixel noise and the scatter of looks, shape (spots, 2, 2).
+        covariance_rad2: covariance due to pixel noise and scatter of looks, shape (spots, 2, 2).
     """
 
     deviation_rad: np.ndarray
@@ -102,7 +102,7 @@ def linearise(
     arrays: CampaignArrays,
     inflation: Float[Array | np.ndarray, ""] | float = 1.0,
 ) -> LinearLooks:
-    """Residuals, ideal observations at the observed ranges, and d/d(coordinates) of both; noise scales are held.
+    """Linearise residuals and ideal observations at the observed ranges in the coordinates, at fixed noise scales.
 
     Args:
         at: coordinates and the values that they stand for.
@@ -139,8 +139,8 @@ class LinearSpots:
     Attributes:
         residual: observed - predicted, shape (n, 4).
         load: d(predicted)/d(filter state), shape (n, 4, 6).
-        renewed: states drawn anew since the previous spot, shape (n, 6).
-        variance: added to theirs since the previous spot, shape (n, 6).
+        renewed: states drawn again since the previous spot, shape (n, 6).
+        variance: variance added to the states since the previous spot, shape (n, 6).
         jacobian: -d(residual)/d(coordinates), shape (n, 4, p).
         places: d(predicted)/d(errors at places, N(0, 1) a priori), shape (n, 4, e).
     """
@@ -153,17 +153,17 @@ class LinearSpots:
     places: np.ndarray
 
     def spelled_out(self, columns: np.ndarray) -> LinearSpots:
-        """The same with the errors at places as further coordinates; `columns` (n, 4, e) are theirs, in any unit."""
+        """Append the errors at places to the coordinates; `columns` (n, 4, e) are their derivatives, in any unit."""
         return replace(self, jacobian=np.concatenate([self.jacobian, columns], axis=2), places=self.places[..., :0])
 
 
 def linear_spots(lin: Linearised, arrays: CampaignArrays, jacobian: np.ndarray) -> LinearSpots:
-    """A linearised campaign as the smoother reads it.
+    """Prepare a linearised campaign for the smoother.
 
     Args:
-        lin: without padding.
-        arrays: the campaign it comes from.
-        jacobian: d(prediction)/d(whatever is asked about), shape (spots, 4, columns).
+        lin: linearised campaign, without padding.
+        arrays: the campaign.
+        jacobian: d(prediction)/d(quantities of interest), shape (spots, 4, columns).
     """
     spots = jax.tree.map(lambda x: np.asarray(x)[: len(lin.residual)], arrays.spots)
     variances = np.asarray(lin.stop_variance), np.asarray(lin.drift_variance)
@@ -179,7 +179,7 @@ class StopGroup:
 
     Attributes:
         rows: slice of the spots.
-        residual: [C^-1 r] of the group, shape (4 s,).
+        residual: [C^-1 r] of the group of s spots, shape (4 s,).
         jacobian: [C^-1 J] of the group, shape (4 s, p).
         precision: [C^-1] of the group, shape (4 s, 4 s).
     """
@@ -192,14 +192,14 @@ class StopGroup:
 
 @dataclass(frozen=True)
 class StopInformation:
-    """All groups, what they tell of the coordinates, and what is left of the errors at places.
+    """All groups, the information on the coordinates, and the conditional errors at places.
 
     Attributes:
         groups: in time order.
         fisher: the likelihood's information J^T C^-1 J, shape (p, p).
-        place_mean: of the errors at places given the coordinates, in units of N(0, 1) a priori, shape (e,).
-        place_slope: how that mean moves with the coordinates, shape (e, p).
-        place_covariance: of those errors given the coordinates, shape (e, e).
+        place_mean: mean of the errors at places given the coordinates, in units of N(0, 1) a priori, shape (e,).
+        place_slope: derivative of that mean by the coordinates, shape (e, p).
+        place_covariance: covariance of those errors given the coordinates, shape (e, e).
     """
 
     groups: tuple[StopGroup, ...]
@@ -216,7 +216,7 @@ def _group_rows(spots: LinearSpots) -> list[slice]:
 
 
 def stop_information(spots: LinearSpots) -> StopInformation:
-    """Filter forward, smooth backward, and take out what repeats (Woodbury's identity).
+    """Filter forward, smooth backward, and eliminate errors that repeat (Woodbury's identity).
 
     Args:
         spots: the linearised campaign.
@@ -250,24 +250,24 @@ def stop_information(spots: LinearSpots) -> StopInformation:
     groups = []
     score, information = np.zeros((states, 1 + parameters)), np.zeros((states, states))
     for rows, (keep, load, inverse, gain, whitened) in zip(slices[::-1], forward[::-1], strict=True):
-        # `score` and `information` stand after this group's update: u = F^-1 v - K^T r, M = F^-1 + K^T N K.
+        # `score` and `information` are those after this group's update: u = F^-1 v - K^T r, M = F^-1 + K^T N K.
         disturbance = whitened - gain.T @ score
         precision = inverse + gain.T @ information @ gain
         groups.append(StopGroup(rows, disturbance[:, 0], disturbance[:, 1:], precision))
         through = np.eye(states) - gain @ load
         score = (load.T @ disturbance + score) * keep[:, None]
         information = (load.T @ inverse @ load + through.T @ information @ through) * np.outer(keep, keep)
-    # One product of all rows: with many columns the sum over the groups would cost more than everything else.
+    # One product of all rows: with many columns a sum over groups would dominate the cost.
     nothing = np.zeros((0, 1 + parameters))
     whole = np.concatenate([nothing, *aheads]).T @ np.concatenate([nothing, *(entry[-1] for entry in forward)])
     return _without_places(groups[::-1], whole, parameters - places)
 
 
 def _without_places(groups: list[StopGroup], whole: np.ndarray, parameters: int) -> StopInformation:
-    """Integrate the errors at places out.
+    """Integrate out the errors at places.
 
     Args:
-        groups: with those errors as further coordinates.
+        groups: groups with those errors as further coordinates.
         whole: products of the columns residual, coordinates and errors by the inverse covariance without the latter.
         parameters: number of coordinates.
     """
@@ -290,15 +290,15 @@ def _without_places(groups: list[StopGroup], whole: np.ndarray, parameters: int)
 
 
 def leave_one_out_chi2(information: StopInformation, weight: np.ndarray | None = None) -> np.ndarray:
-    """Squared distance of each spot from what all OTHER spots predict for it, shape (n,).
+    """Compute the squared distance of each spot from its prediction by all OTHER spots, shape (n,).
 
-    It equals twice the gain in log density from leaving the spot out, up to the determinant: of two spots of a
-    stop that disagree, the one without which the rest fits better has the larger value. That is the spot to blame.
+    It equals twice the gain in log density from leaving the spot out, up to the determinant: of two spots of a stop
+    that disagree, the one without which the others fit better has the larger value.
 
     Args:
-        information: of the linearised campaign.
-        weight: robust weights w that are in its residuals, shape (n,). Distances are those of spots of full weight:
-            of the covariance I + w P of a weighted innovation, P predicted, the noise alone is scaled back.
+        information: information of the linearised campaign.
+        weight: robust weights w that are in its residuals, shape (n,). Distances are those at full weight: in the
+            covariance I + w P of a weighted innovation, with P predicted, only the noise is scaled back.
     """
     weight = np.ones(sum(len(g.residual) // 4 for g in information.groups)) if weight is None else weight
     values: list[float] = []
@@ -314,7 +314,7 @@ def leave_one_out_chi2(information: StopInformation, weight: np.ndarray | None =
 
 
 def standard_deviations_without(group: StopGroup, covariance: np.ndarray, gradients: np.ndarray) -> np.ndarray:
-    """Standard deviations of quantities if a group's spots had not been taken.
+    """Compute standard deviations of quantities without a group's spots.
 
     Removing a block from a Gaussian changes the information by -[C^-1 J]^T M^-1 [C^-1 J]; the covariance follows
     by Woodbury's identity.
@@ -325,7 +325,7 @@ def standard_deviations_without(group: StopGroup, covariance: np.ndarray, gradie
         gradients: d(quantity)/d(coordinates), shape (q, p).
 
     Returns:
-        Shape (q,); inf where the rest of the campaign and the priors hold no information.
+        Shape (q,); inf where the other spots and the priors have no information.
     """
     spread = group.jacobian @ covariance
     inner = group.precision - spread @ group.jacobian.T

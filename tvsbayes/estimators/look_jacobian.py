@@ -1,8 +1,8 @@
-"""How ideal looks move with every coordinate at held ranges, block by block.
+"""Derivatives of ideal looks by all coordinates at fixed ranges, block by block.
 
-A gear moves looks through their mirror angles only, a mirror through the point that is hit, a lens through its own two
-pixels: derivatives of the parts, chained, cost a fraction of those of the whole. Angles rad, px; derivatives are by the
-coordinates of `model.parameter_space`. Columns come first, spots last.
+A gear changes looks through their mirror angles only, a mirror through the point that is hit, a lens through its own
+two pixels: derivatives of the parts, chained, cost a fraction of those of the whole. Angles rad, px; derivatives are by
+the coordinates of `model.parameter_space`. Columns come first, spots last.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ CAMERAS = np.array([INDEX["focal_scale"], *(INDEX[name] for name in STEREO_PARAM
 RECEIVER = _columns("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg")
 NOISE = np.array([INDEX[name] for name in NOISE_NAMES])
 IN_ORDER = np.argsort(np.concatenate([GEARS, OPTICS, FRAMES, CAMERAS, RECEIVER, NOISE]))
-"""Places of the coordinates in these blocks, one after the other: every coordinate has one."""
+"""Positions of the coordinates in the concatenated blocks, which hold each coordinate once."""
 
 
 def look_jacobian(at: Point, space: ParameterSpace, looks: Looks, arrays: CampaignArrays) -> Numbers:
-    """d(predicted)/d(coordinates) at held ranges, shape (parameters, spots) for each of the five components.
+    """Compute d(predicted)/d(coordinates) at fixed ranges, shape (parameters, spots) for each of five components.
 
     Args:
         at: coordinates and the values that they stand for.
         space: priors.
-        looks: at these coordinates.
+        looks: ideal looks at these coordinates.
         arrays: the campaign.
     """
 
     def moved(columns: np.ndarray, part: Callable[[Model], PyTree]) -> PyTree:
-        """How a part of the model moves with some parameters in the units of their names, columns first."""
+        """Differentiate a part of the model by some parameters in the units of their names, columns first."""
 
         def along(direction: Float[Array, " parameters"]) -> PyTree:
             return jax.jvp(lambda values: part(space.model_at(values)), (jnp.asarray(at.values),), (direction,))[1]
@@ -84,7 +84,7 @@ def look_jacobian(at: Point, space: ParameterSpace, looks: Looks, arrays: Campai
     slope = at.slopes[:, None]
 
     def by_coordinates(by_values: Float[Array, "parameters spots"]) -> Float[Array, "parameters spots"]:
-        # Of the rig every value has a coordinate of its own; the cameras' values share theirs.
+        # Every value of the rig has its own coordinate; the cameras' values share theirs.
         return jnp.concatenate([by_values[:rig] * slope, space.stereo_root.T @ by_values[rig:]])
 
     return tuple(by_coordinates(jnp.concatenate(own)[IN_ORDER]) for own in blocks)

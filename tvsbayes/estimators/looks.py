@@ -1,7 +1,7 @@
-"""Ideal looks: what a spot's pixels and aperture angle are, and how they move with mirror angles, range and parameters.
+"""Ideal looks: pixels and aperture angle of spots, and their derivatives by mirror angles, range and points.
 
-Angles rad, lengths mm, px. The range of a look is where its beam passes closest to the spot that the cameras
-triangulated (formulation 4.1). Components of looks are separate arrays, as vectors are (`instrument.mirrors.Vectors`).
+Angles rad, lengths mm, px. The range of a look is that at which its beam passes closest to the triangulated spot
+(formulation 4.1). Components of looks are separate arrays, as vectors are (`instrument.mirrors.Vectors`).
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from tvsbayes.model.laser_path import MirrorAngles, angles_at, no_moves, trace
 from tvsbayes.model.parameter_space import Extrinsics, Model, ParameterSpace, Receiver
 
 WINDOW = 512
-"""Spots of which a compiled function gives numbers spot by spot in one call."""
+"""Spots for which a compiled function returns numbers by spot in one call."""
 Numbers = tuple[Float[Array, "..."], ...]
-"""Components of many looks, an array each: pixels (u_left, v_left, u_right, v_right) and the aperture's angle."""
+"""Components of many looks, one array each: pixels (u_left, v_left, u_right, v_right) and the aperture's angle."""
 
 
 def aperture_angle(
     receiver: Receiver, points_p_mm: Vectors, azimuth_convention: Bool[Array, ""]
 ) -> Float[Array, "*batch"]:
-    """Angle B at the aperture between +y of frame T and the spot, or its projection on x-y (formulation 5)."""
+    """Compute angle B at the aperture between +y of frame T and the spot, or its projection on x-y (formulation 5)."""
     turned = Turn.by(receiver.pan_zero_emission_rad - jnp.pi / 2, jnp).forward(points_p_mm)
     lateral2 = turned.x**2 + jnp.where(azimuth_convention, 0.0, 1.0) * turned.z**2
-    # A spot on the baseline itself has no direction; the floor keeps the derivative finite there.
+    # A spot on the baseline has no direction; the floor keeps the derivative finite there.
     return jnp.arctan2(jnp.sqrt(jnp.maximum(lateral2, 1e-12)), turned.y + receiver.baseline_mm)
 
 
 def observe(
     model: Model, pose: Float[Array, "3 *batch"], azimuth_convention: Bool[Array, ""]
 ) -> Float[Array, "5 *batch"]:
-    """What ideal looks return.
+    """Compute the observations of ideal looks.
 
     Args:
         model: parameters.
@@ -55,7 +55,7 @@ def observe(
 
 
 def in_frame_s(extrinsics: Extrinsics, points_p_mm: Vectors) -> Vectors:
-    """Points of frame P in frame S."""
+    """Transform points from frame P to frame S."""
     turned = transform(rotation_matrix(extrinsics.rotation_rad), points_p_mm)
     return turned + Vectors.of(extrinsics.translation_mm)
 
@@ -63,27 +63,27 @@ def in_frame_s(extrinsics: Extrinsics, points_p_mm: Vectors) -> Vectors:
 def aperture_reading(
     receiver: Receiver, points_p_mm: Vectors, azimuth_convention: Bool[Array, ""]
 ) -> Float[Array, "*batch"]:
-    """What the aperture reads of points, its zero included, rad."""
+    """Compute the aperture's readings of points, its zero included, rad."""
     return aperture_angle(receiver, points_p_mm, azimuth_convention) + receiver.aperture_zero_rad
 
 
 def nearest_range(extrinsics: Extrinsics, ray: Ray, points_s_mm: Vectors) -> Float[Array, "*batch"]:
-    """Ranges at which beams pass closest to points of frame S, mm."""
+    """Compute the ranges at which beams pass closest to points of frame S, mm."""
     from_origin = points_s_mm - Vectors.of(extrinsics.translation_mm)
     points_p = transform(rotation_matrix(extrinsics.rotation_rad).T, from_origin)
     return (points_p - ray.origin_mm).dot(ray.direction)
 
 
 def angles_seen(points_mm: Vectors, spots: SpotArrays) -> tuple[Float[Array, "..."], ...]:
-    """Where points stand on the sphere about the directions sighted, along azimuth and elevation, in four columns.
+    """Compute angles of points from the sighted directions along azimuth and elevation, in four columns.
 
-    Angles on the great circle, rad: no pole and no wrap is special.
+    Angles are on the great circle, rad, so that poles and full turns need no special case.
     """
     assert spots.tangents is not None
     across, above = (points_mm.dot(Vectors.of(spots.tangents[:, k].T)) for k in range(2))
     along = points_mm.dot(Vectors.of(spots.triangulated_mm.T))
     square = across**2 + above**2
-    # The angle over its sine, by its series where they are equal.
+    # The ratio of the angle to its sine, by its series for small angles.
     small = square < 1e-8 * along**2
     off = jnp.sqrt(jnp.where(small, 1.0, square))
     stretch = jnp.where(small & (along > 0), 1 / along * (1 - square / along**2 / 3), jnp.arctan2(off, along) / off)
@@ -92,14 +92,14 @@ def angles_seen(points_mm: Vectors, spots: SpotArrays) -> tuple[Float[Array, "..
 
 
 def seen(model: Model, points_s_mm: Vectors, spots: SpotArrays) -> tuple[Float[Array, "..."], ...]:
-    """What is seen of points of frame S: pixels of a stereo pair, or angles on the sphere."""
+    """Compute the observations of points of frame S: pixels of a stereo pair, or angles on the sphere."""
     return image(model.cameras, points_s_mm) if spots.tangents is None else angles_seen(points_s_mm, spots)
 
 
 class Looks(eqx.Module):
-    """Ideal looks at the ranges where the beams pass closest to the triangulated points, and how they move.
+    """Ideal looks at the ranges where the beams pass closest to the triangulated points, and their derivatives.
 
-    `by_pan`, `by_tilt` and `by_range` are the derivatives of `predicted`, `pixels_by_point` and `reading_by_point`
+    `by_pan`, `by_tilt` and `by_range` are the derivatives of `predicted`. `pixels_by_point` and `reading_by_point` are
     those of pixels and reading by the points in frames S and P.
     """
 
@@ -116,14 +116,14 @@ class Looks(eqx.Module):
     reading_by_point: Vectors
 
     def moved(self, way_s_mm: Vectors, way_p_mm: Vectors) -> Numbers:
-        """How predicted numbers change as the points move so in both frames."""
+        """Compute the change of the predicted numbers for displacements of the points in both frames."""
         return moved(self.pixels_by_point, self.reading_by_point, way_s_mm, way_p_mm)
 
 
 def moved(
     pixels_by_point: tuple[Vectors, ...], reading_by_point: Vectors, way_s_mm: Vectors, way_p_mm: Vectors
 ) -> Numbers:
-    """How pixels and reading change as points move so in frames S and P."""
+    """Compute the change of pixels and reading for displacements of points in frames S and P."""
     return (*(by_point.dot(way_s_mm) for by_point in pixels_by_point), reading_by_point.dot(way_p_mm))
 
 
@@ -173,7 +173,7 @@ def looks_at(model: Model, pan_rad: Array, tilt_rad: Array, arrays: CampaignArra
 
 
 def spot_angles(model: Model, arrays: CampaignArrays) -> MirrorAngles:
-    """Mirror angles at all spots, from the first move on."""
+    """Compute mirror angles at all spots, from the first move on."""
     index, begin = arrays.spots.move_index, no_moves(arrays.moves)
     return angles_at(model.transmission, model.tilt_zero_rad, arrays.moves, index, begin).angles
 
@@ -204,12 +204,12 @@ def _observed(
 def observe_with_stop_errors(
     z: np.ndarray, stop_error_rad: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
 ) -> np.ndarray:
-    """Noiseless looks at the ranges of the observed spots, the mirrors off by given angles (pan, tilt).
+    """Compute noiseless looks at the ranges of the observed spots, the mirrors off by given angles (pan, tilt).
 
     Args:
         z: coordinates, shape (n, p).
-        stop_error_rad: added to the mirror angles, rad; stop error, home offset and position in the play; shape (n,
-            spots, 2).
+        stop_error_rad: sum of stop error, home offset and position in the play, added to the mirror angles, rad, shape
+            (n, spots, 2).
         space: priors.
         arrays: the campaign.
 

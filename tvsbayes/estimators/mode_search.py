@@ -1,7 +1,7 @@
-"""The search for the mode: one campaign in front of the compiled functions, before the Newton steps on its density.
+"""The search for the basin of the mode, before the Newton steps on the full density.
 
-Annealed Levenberg-Marquardt for geometry and stereo in turn with the noise scales, and the robust option's weights.
-Everything happens in the coordinates of `model.parameter_space` (prior N(0, 1) each).
+It alternates annealed Levenberg-Marquardt for geometry and stereo with the noise scales, and sets the robust option's
+weights. All computations use the coordinates of `model.parameter_space` (prior N(0, 1) each).
 """
 
 from __future__ import annotations
@@ -38,44 +38,44 @@ from tvsbayes.statistics.least_squares import Mode, neighbouring_mode, newton_mo
 
 RATIO_COLUMNS = np.array([INDEX[name] for name in names_of("degrees_per_step")])
 ANNEALING = (60.0, 10.0, 2.0, 1.0)
-"""Factors on the noise of pixels and readings before it takes its own value: plain Levenberg-Marquardt from the nominal
-rig goes astray when the extrinsics are off by 0.3 rad and 60 mm (formulation 4.2)."""
+"""Successive factors on the noise of pixels and readings: plain Levenberg-Marquardt from the nominal rig ends in a
+wrong minimum when the extrinsics are off by 0.3 rad and 60 mm (formulation 4.2)."""
 NOISE_STEP = 1e-3
-"""Of differences along noise coordinates, in prior sds: a hundredth of a posterior sd."""
+"""Step of differences along noise coordinates, in prior sds: a hundredth of a posterior sd."""
 SCALE_STEP = 0.3
-"""Of second differences along scales of repeating errors, whose density is no parabola, in prior sds."""
+"""Step of second differences along scales of repeating errors, whose log density is not parabolic, in prior sds."""
 NOISE_SETTLED = 0.05
-"""Change of every noise coordinate (prior sds) below which the alternation stops: half a posterior sd."""
+"""Largest change of a noise coordinate (prior sds) at which the alternation stops: half a posterior sd."""
 HOPELESS = 20.0
-"""Loss of log density with which a way of homing has no evidence worth a better mode."""
+"""Loss of log density beyond which a way of homing is negligible and needs no more accurate mode."""
 GATE_PROBABILITY = 1e-6
-"""A clean spot is excluded by the robust option with this probability."""
+"""Probability that the robust option excludes a clean spot."""
 HUBER_CORE = 0.8214
 """Share of clean spots with full weight: P(|z| < 1.345), the constant of 95 % efficiency (Huber 1964)."""
 ROUNDS_MAX, WEIGHTS_SETTLED = 20, 0.02
 """Rounds of the robust option, and the largest change of a weight at which they end."""
 ALTERNATIONS_MAX, ROUNDS_EXPECTED = 6, 6
-"""Of geometry and noise in turn at most, and rounds of the robust option as progress predicts them."""
+"""Largest number of alternations of geometry and noise; rounds of the robust option that progress assumes."""
 COMPILING, SEARCHING = "compiling the model", "searching the mode"
 COMPILED_SECONDS, SEARCHED_SECONDS = 40.0, 1.0
-"""What progress predicts with."""
+"""Seconds of the stages, for the progress display."""
 
 
 def search_stages(robust: bool) -> dict[str, float]:
-    """Stages of a search, with seconds."""
+    """Return the stages of a search with their seconds."""
     return {COMPILING: linear_part.wait(COMPILED_SECONDS), SEARCHING: SEARCHED_SECONDS * (2 if robust else 1)}
 
 
 @dataclass(frozen=True)
 class Room:
-    """Log of the volume that geometry and cameras have at scales of repeating errors, up to a constant.
+    """Log volume of geometry and cameras at given scales of repeating errors, up to a constant.
 
     Attributes:
         space: priors.
-        products: of the columns of coordinates, then errors at places (rad), by the inverse covariance of everything
-            else, shape (p + e, p + e).
+        products: products of the columns of coordinates, then errors at places (rad), by the inverse covariance of all
+            other terms, shape (p + e, p + e).
         angle_rad: k n of the places.
-        places: of the campaign, as NumPy arrays.
+        places: places of the campaign, as NumPy arrays.
     """
 
     space: ParameterSpace
@@ -84,7 +84,7 @@ class Room:
     places: Places
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
-        """At points (n, p), which tell the scales, shape (n,)."""
+        """Evaluate at points (n, p), of which the scales are used, shape (n,)."""
         free, rest = slice(len(NAMES)), slice(len(NAMES), None)
         if not self.products[rest].size:
             return np.zeros(len(z))
@@ -103,12 +103,12 @@ class Room:
 
 
 def held_by(free: Bool[np.ndarray, " parameters"]) -> Bool[np.ndarray, " parameters"]:
-    """What a linearisation takes as known: noise scales, and what is not estimated."""
+    """Mark the parameters that a linearisation takes as known: noise scales and those not estimated."""
     return np.isin(NAMES, NOISE_NAMES) | ~free
 
 
 class Problem:
-    """One campaign in front of the compiled functions."""
+    """One campaign with its priors, as arguments of the compiled functions."""
 
     def __init__(self, campaign: Campaign, table: RigTable, used: np.ndarray | None = None):
         self.spots, self.table = ordered_spots(campaign), table
@@ -126,11 +126,11 @@ class Problem:
 
     @property
     def further(self) -> np.ndarray:
-        """Residuals of each spot beyond the three that a stereo pair gives: aperture readings; a sighting lacks one."""
+        """Count each spot's residuals beyond the three of a stereo pair: +1 for the aperture, -1 for a sighting."""
         return np.asarray(self.arrays.spots.has_aperture)[: len(self.spots)] + components(self.table) - 3
 
     def compile_aside(self, executor: ThreadPoolExecutor) -> None:
-        """Start the compilation that later steps need while the first stage runs on the other core."""
+        """Start the compilation for later steps in another thread, while the first stage runs."""
 
         def work():
             self.negative_log_density(np.zeros((1, len(NAMES))))
@@ -138,25 +138,25 @@ class Problem:
         executor.submit(work)
 
     def least_squares(self, z: np.ndarray, inflation: float) -> np.ndarray:
-        """Geometry and stereo for given noise scales."""
+        """Fit geometry and stereo for given noise scales."""
         return np.array(self.stage(z, inflation, STAGE_TOLERANCE).z)
 
     def stage(self, z: np.ndarray, inflation: float, tolerance: float) -> Linearised:
-        """The campaign linearised where a least-squares stage from z ends."""
+        """Run a least-squares stage from z; return the campaign linearised at its end."""
         fixed = Fixed(self.held, z, np.array(inflation))
         return stage(z, self.space, self.arrays, fixed, tolerance)
 
     def negative_log_density(self, z: np.ndarray) -> np.ndarray:
-        """Of many points (n, p); infinite where the model has no value."""
+        """Evaluate many points (n, p); infinite where the model has no value."""
         still = no_draw(len(z), self.arrays)
         log_density = evaluate(z, still, self.space, self.arrays).log_density
         return np.where(np.isfinite(log_density), -log_density, np.inf)
 
     def noise_scales(self, z: np.ndarray) -> np.ndarray:
-        """Best noise scales for given geometry, under their priors.
+        """Optimise the noise scales for given geometry, under their priors.
 
-        Scales of errors that repeat are those that are most probable when geometry and cameras are integrated out: a
-        larger error leaves these more room, and at the mode of everything together it would be far too small.
+        Scales of errors that repeat maximise the density with geometry and cameras integrated out. The volume of these
+        grows with the errors; at the joint mode the scales would be far too small.
         """
         count = self.noise.size
         if not count:
@@ -172,7 +172,7 @@ class Problem:
             curvature = (ahead + behind - 2 * centre) / NOISE_STEP**2
             return float(centre[0]), (ahead - behind) / (2 * NOISE_STEP), curvature
 
-        # In units of what the density at the start says of their spread a quasi-Newton method knows its first step.
+        # Scaled by the curvature of the density at the start, a quasi-Newton method has a suitable first step.
         curvature = about(z[self.noise])[2]
         unit = 1 / np.sqrt(np.where(np.isfinite(curvature), np.clip(curvature, 1.0, None), 1.0))
 
@@ -191,7 +191,7 @@ class Problem:
         return result
 
     def room(self, z: np.ndarray) -> Room:
-        """How the scales of repeating errors change the room of geometry and cameras, linearised at z."""
+        """Return the volume of geometry and cameras by scales of repeating errors, linearised at z."""
         places = self.arrays.gears.without_padding().places
         if not len(places.steps):
             return Room(self.space, np.zeros((len(NAMES), len(NAMES))), places.steps, places)
@@ -203,7 +203,7 @@ class Problem:
         return Room(self.space, information.fisher, places.steps * ratio[places.on_tilt.astype(int)], places)
 
     def alternate(self, z: np.ndarray) -> np.ndarray:
-        """Geometry and noise scales in turn until the noise settles (formulation 4.2)."""
+        """Alternate geometry and noise scales until the noise settles (formulation 4.2)."""
         for _ in range(ALTERNATIONS_MAX):
             previous = z
             z = self.least_squares(self.noise_scales(z), 1.0)
@@ -212,9 +212,9 @@ class Problem:
         return z
 
     def searched(self, robust: bool, job: Job) -> np.ndarray:
-        """Where the Newton steps on the full density may begin: the basin of the mode, weights settled if `robust`.
+        """Find the start of the Newton steps: a point in the basin of the mode, weights settled if `robust`.
 
-        `job` has the stages of `search_stages`.
+        `job` must have the stages of `search_stages`.
         """
         z, passes = np.zeros(len(NAMES)), len(ANNEALING) + 1 + (ROUNDS_EXPECTED if robust else 0)
         job.begin(COMPILING)
@@ -231,16 +231,16 @@ class Problem:
         return z
 
     def linearised(self, z: np.ndarray) -> Linearised:
-        """The campaign linearised at a point, without padding."""
+        """Linearise the campaign at a point, without padding."""
         return self.stage(z, 1.0, NO_STEP)
 
     def information(self, lin: Linearised) -> StopInformation:
-        """What its stops tell of geometry and stereo, noise scales held."""
+        """Compute the stops' information on geometry and stereo at fixed noise scales."""
         jacobian = np.where(self.held, 0.0, -np.asarray(lin.residual_jacobian))
         return stop_information(linear_spots(lin, self.arrays, jacobian))
 
     def mode(self, z: np.ndarray) -> Mode:
-        """Newton steps from z with the scales of repeating errors held, and these scales' own spread.
+        """Find the mode by Newton steps from z at fixed scales of repeating errors, and the variance of these scales.
 
         Their variance is that of the density with geometry and cameras integrated out, at most the prior's.
         """
@@ -257,19 +257,19 @@ class Problem:
         return replace(optimum, covariance=covariance)
 
     def mode_beside(self, known: Mode) -> Mode:
-        """The mode from that of another way of homing, which is seldom far away; scales of repeating errors held."""
+        """Find the mode from that of another way of homing, usually near, at fixed scales of repeating errors."""
         optimum = neighbouring_mode(self.negative_log_density, known, self.free & ~self.repeated)
         if optimum is not None:
             return optimum
         z = self.alternate(known.z.copy())
         value = float(self.negative_log_density(z[None])[0])
-        # So far below, the last Newton steps change nothing: the way is as good as impossible.
+        # With so low a density the last Newton steps do not matter: the way of homing has no weight.
         if not value < known.negative_log_density + HOPELESS:
             return Mode(z, known.covariance, value, ())
         return self.mode(z)
 
     def curvature(self, z: np.ndarray) -> np.ndarray:
-        """Expected information of the coordinates: Fisher's of geometry and stereo, measured for the noise."""
+        """Compute the information on the coordinates: Fisher's, and for the noise by differences."""
         value = self.information(self.linearised(z)).fisher + np.eye(len(NAMES))
         steps = NOISE_STEP * np.eye(len(NAMES))[self.noise]
         centre, *nudged = self.negative_log_density(np.concatenate([z[None], z + steps, z - steps]))
@@ -278,7 +278,7 @@ class Problem:
         return value
 
     def reweighted(self, z: np.ndarray) -> float:
-        """One round of the robust option: gate and Huber weights from leave-one-out residuals.
+        """Run one round of the robust option: gate and Huber weights from leave-one-out residuals.
 
         Returns:
             The largest change of a weight.
@@ -293,7 +293,7 @@ class Problem:
         scale2 = np.median(chi2[used] / chi2_quantile(readings[used], 0.5))
         chi2 = chi2 / max(scale2, 1e-12)
         over = used & (chi2 > chi2_quantile(readings, GATE_PROBABILITY))
-        # A bad spot makes its neighbours look bad: only the worst of each run is blamed in one round.
+        # A bad spot also increases its neighbours' distances: only the worst of each run is excluded in one round.
         for index in np.flatnonzero(over):
             run = slice(max(index - 2, 0), index + 3)
             if chi2[index] >= np.max(np.where(used[run], chi2[run], 0.0)):

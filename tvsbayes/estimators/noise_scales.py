@@ -1,8 +1,8 @@
-"""Noise scales of a fit with geometry and cameras integrated out: their most probable values, and weighted draws.
+"""Noise scales of a fit with geometry and cameras integrated out: their marginal mode, and weighted draws.
 
-At the mode of everything together they are too small: geometry and cameras have followed the noise of the same looks,
-and what they took is missing there, as n is for n - p in a variance (restricted likelihood: Patterson and Thompson,
-Biometrika 58 (1971) 545). Anyone who predicts new looks needs the scales without that loss.
+At the joint mode they are too small, since geometry and cameras are fitted to the noise of the same looks: as a
+variance divided by n instead of n - p (restricted likelihood: Patterson and Thompson, Biometrika 58 (1971) 545). A
+prediction of new looks needs the marginal scales.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from tvsbayes.instrument.parameters import GEAR_ERROR_NAMES, INDEX, NAMES, NOISE
 from tvsbayes.model.parameter_space import ParameterSpace
 
 STEP = 0.05
-"""Of central differences, in sds of the Laplace approximation: what bends beyond is the weights' business."""
+"""Step of central differences, in sds of the Laplace approximation; the weights correct for larger curvature."""
 STEPS_TO_MODE = 2
 LONGEST_STEP = 2.0
-"""In the same sds, of one step towards the mode."""
+"""Longest step towards the mode, in the same sds."""
 WIDER = 1.15
-"""The proposal's sds over those of the Laplace approximation, which has no room for what geometry took."""
+"""Factor on the sds of the Laplace approximation for the proposal, as the approximation is at the joint mode."""
 
 
 @dataclass(frozen=True)
 class NoiseDraws:
-    """Points whose noise scales differ, everything else at the mode of the fit.
+    """Points with drawn noise scales and all other coordinates at the mode of the fit.
 
     Attributes:
         centre: the most probable scales, shape (p,).
@@ -43,9 +43,9 @@ class NoiseDraws:
 
 
 class ScalesAlone:
-    """Log density of the noise scales of a fit, geometry and cameras integrated out, up to a constant.
+    """Marginal log density of the noise scales of a fit, geometry and cameras integrated out, up to a constant.
 
-    These are normal at given scales as the campaign is linearised at the mode.
+    These are normal at given scales, as the campaign is linearised there.
     """
 
     def __init__(self, fit: JointFit):
@@ -54,14 +54,14 @@ class ScalesAlone:
         self._space: ParameterSpace = fit.space
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
-        """At points (n, p) that differ in their noise scales, shape (n,)."""
+        """Evaluate at points (n, p) that differ in their noise scales, shape (n,)."""
         arrays, still = self.fit.arrays, no_draw(len(z), self.fit.arrays)
         joint = evaluate(z, still, self._space, arrays).log_density
         log_density = joint + np.array([self._room(point) for point in z])
         return np.where(np.isfinite(log_density), log_density, -np.inf)
 
     def _room(self, z: np.ndarray) -> float:
-        """What integrating geometry and cameras out adds to the density at z."""
+        """Compute the log density's increase at z by integrating out geometry and cameras."""
         arrays = self.fit.arrays
         lin = stage(z, self._space, arrays, Fixed(self.fit.held, z, np.array(1.0)), NO_STEP)
         jacobian = np.where(self.fit.held, 0.0, -np.asarray(lin.residual_jacobian))
@@ -74,18 +74,18 @@ class ScalesAlone:
 
 
 def noise_draws(fit: JointFit, count: int, seed: int) -> NoiseDraws:
-    """Weighted draws of the noise scales alone.
+    """Draw noise scales from their marginal, with weights.
 
     Args:
-        fit: converged.
-        count: draws, an even number.
+        fit: a converged fit.
+        count: number of draws, even.
         seed: of the draws.
     """
     alone = ScalesAlone(fit)
     columns, centre = alone.columns, fit.z.copy()
     if not columns.size:
         return NoiseDraws(centre, centre[None], np.ones(1))
-    # What the gears repeat has given its room back already, in the search for the mode.
+    # Scales of repeating errors are at their marginal mode already, by the search for the mode.
     taken = np.setdiff1d(columns, [INDEX[name] for name in GEAR_ERROR_NAMES])
     root = np.linalg.cholesky(fit.covariance[np.ix_(taken, taken)])
     for _ in range(STEPS_TO_MODE if taken.size else 0):

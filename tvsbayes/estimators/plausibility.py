@@ -1,8 +1,8 @@
-"""Hints about a campaign before it is fitted: spots that no rig can have seen, and what its moves cannot tell apart.
+"""Checks of a campaign before it is fitted: impossible spots, and parameters that its moves cannot separate.
 
-Sightings that do not follow the counters: another sign of an axis, azimuth and elevation exchanged; nothing but the
-stated ratios is believed, and these within three of their u. Angles in degrees on the circle.
-Depths are triangulated, mm along X of frame S; counters in steps. Certain findings stop the commands that fit.
+Sightings are tested for another sign of an axis and for azimuth and elevation exchanged, by the stated ratios within
+three of their u. Angles are in degrees on the circle. Depths of spots are triangulated, mm along X of frame S; counters
+in steps. Certain findings stop commands that fit.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ from tvsbayes.results.records import plain
 
 RATIOS_TRIED, RATIO_SDS = 61, 3.0
 FAR_DEG, NEARER = 5.0, 4.0
-"""Median misfit of a rough line from which sightings do not follow their counters, and how much better they must follow
-others to be sure which."""
+"""Median misfit of a line above which sightings do not follow their counters, and the factor by which it must fall with
+other counters to be certain."""
 LEAST = 6
-"""Sightings at different counters of an axis below which nothing is said."""
+"""Least number of different counters of an axis for a test."""
 LISTED = 6
 
 
 def sighting_findings(campaign: Campaign) -> tuple[Finding, ...]:
-    """What no head can have seen, as `plausibility.implausible` lists it."""
+    """Find sightings that no head can have made, as `implausible` does for spots."""
     misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
     findings = []
     if misspelt:
@@ -81,7 +81,7 @@ def sighting_findings(campaign: Campaign) -> tuple[Finding, ...]:
 
 
 def _misfit_deg(campaign: Campaign, axis: str, steps: np.ndarray, angle_deg: np.ndarray) -> float:
-    """Median distance of angles (n,) from a line over counters (n,), on the circle, by the best stated ratio."""
+    """Compute the median distance of angles (n,) from a line over counters (n,), on the circle, by the best ratio."""
     prior = campaign.rig.priors[f"degrees_per_step.{axis}"]
     ratios = prior.value + prior.u * np.linspace(-RATIO_SDS, RATIO_SDS, RATIOS_TRIED)
     turned = np.exp(1j * np.radians(angle_deg - ratios[:, None] * steps))
@@ -91,22 +91,22 @@ def _misfit_deg(campaign: Campaign, axis: str, steps: np.ndarray, angle_deg: np.
 
 
 NEAREST_SHEET_MM, FARTHEST_SHEET_MM = 20.0, 100_000.0
-"""Depths between which a sheet can stand: nearer than a lens barrel, or beyond a hall, is a mismatched pair."""
+"""Possible depths of a sheet: nearer than a lens barrel or beyond a hall, the pair is mismatched."""
 SHORTEST_MM = 0.5
-"""Nothing of a rig that is stated at all is shorter, and no length in metres is longer."""
+"""All stated lengths of a rig are longer in mm, and shorter if given in metres."""
 CORNER_SHARE = 0.02
-"""Share of the picture's height: spots that all lie nearer than that to its first pixel were not measured in pixels."""
+"""Share of the picture's height: if all spots are nearer to the first pixel, they are not in pixels."""
 ODD_SHARE = 0.1
-"""Share of spots at impossible depths from which the others tell nothing of counters and names."""
+"""Share of spots at impossible depths from which counters and names are not tested."""
 NOISE_OFF = 4.0
-"""Pixel noise over the stated one, either way, that a fit's prior (a factor of 1.6, log-normal) does not expect."""
+"""Ratio of pixel noise to the stated one, either way, that a fit's prior (a factor of 1.6, log-normal) excludes."""
 SHALLOW = 1.2
-"""Ratio of the largest to the smallest depth below which the sheet stood at one place (the paper's: 1.6)."""
+"""Ratio of the largest to the smallest depth below which the sheet had one position (the paper's: 1.6)."""
 
 
 @dataclass(frozen=True)
 class CampaignCheck:
-    """What `check` says of a readable campaign: counts, what contradicts its tables, and all warnings in words."""
+    """Result of `check` for a readable campaign: counts, findings, and all warnings in words."""
 
     moves: int
     segments: int
@@ -119,7 +119,7 @@ class CampaignCheck:
     warnings: tuple[str, ...]
 
     def as_json(self) -> dict[str, object]:
-        """The document of `check --json`."""
+        """Return the document of `check --json`."""
         return {"kind": "campaign", **plain(self)}
 
 
@@ -128,14 +128,14 @@ def _can_stand(depths_mm: np.ndarray) -> np.ndarray:
 
 
 def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tuple[Finding, ...]:
-    """What no rig can have measured: wrong units, swapped cameras, counters that spots do not follow, misspelt words.
+    """Find data that no rig can have measured: wrong units, swapped cameras, wrong counters, misspelt words.
 
     Args:
         campaign: a campaign that its reader accepted.
-        points_mm: (n, 3) its usable spots in frame S, where they are known already.
+        points_mm: (n, 3) usable spots in frame S, if known already.
 
     Returns:
-        Findings, certain ones and doubts; `Finding.sentence` is what is printed.
+        Findings, certain ones and doubts; `Finding.sentence` is printed.
     """
     if campaign.rig.mechanism.sightings:
         return sighting_findings(campaign)
@@ -166,22 +166,22 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
         there = [spot for spot, can in zip(ok, stands, strict=True) if can]
         if len(there) >= SPOTS_MIN:
             pattern = pattern_of(campaign, there, points_mm[stands])
-            # Counters and planes say nothing where the pictures themselves contradict each other.
+            # Counters and planes cannot be tested where the pictures contradict each other.
             pictures = picture_findings(pattern)
             findings += pictures or [*counter_findings(pattern), *table_findings(pattern)]
     return (*findings, *_reading_findings(ok))
 
 
 def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple[Finding, ...]:
-    """What explains that a fit of a campaign fails, likeliest first.
+    """Find explanations for a failed fit of a campaign, likeliest first.
 
     Args:
-        campaign: that was fitted.
+        campaign: the fitted campaign.
         pixel_scale: pixel noise over the stated one where the fit ended; None without a fit.
 
     Returns:
-        What `implausible` finds, and noise that is not as stated: a poor calibration leaves the same, so that `check`
-        itself does not say it. Empty where nothing of it explains the failure.
+        Findings of `implausible`, and noise that is not as stated: a poor calibration has the same effect, so `check`
+        does not test it. Empty where nothing explains the failure.
     """
     findings = [*implausible(campaign)]
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
@@ -200,12 +200,12 @@ def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple
         said += f", but beams miss them by {pixel_scale:.2g} times that: the beam scatters, not the pixels"
         remedy = "look for a loose laser or mirror, vibration, steps that were lost, or a sheet that moved"
         findings.append(Finding("beam-scatter", said, remedy))
-    # What is certain explains most.
+    # Certain findings come first.
     return tuple(sorted(findings, key=lambda finding: not finding.certain))
 
 
 def _stereo_findings(campaign: Campaign) -> list[Finding]:
-    """What contradicts the pair of cameras; a baseline that no pair has is certain."""
+    """Find contradictions in the pair of cameras; an impossible baseline is certain."""
     unit = baseline_doubt(campaign.stereo)
     others = doubts("stereo", (text for text in pair_doubts(campaign.stereo) if text != unit), "stereo.json")
     if unit is None:
@@ -216,7 +216,7 @@ def _stereo_findings(campaign: Campaign) -> list[Finding]:
 
 
 def _pixel_unit(campaign: Campaign, ok: Sequence[Spot]) -> Finding | None:
-    """Centres that are no pixels: all of them near the corner of the picture."""
+    """Find centres that are not in pixels: all of them are near the corner of the picture."""
     largest_px = float(np.abs(pixels_of(ok)).max())
     if largest_px >= CORNER_SHARE * campaign.stereo.image_height:
         return None
@@ -226,12 +226,12 @@ def _pixel_unit(campaign: Campaign, ok: Sequence[Spot]) -> Finding | None:
 
 
 def _from_one(campaign: Campaign, ok: Sequence[Spot]) -> list[Finding]:
-    """Centres outside the picture by less than a pixel, which there are where the first pixel is called 1."""
+    """Find centres outside the picture by less than a pixel, as where the first pixel is called 1."""
     width, height = campaign.stereo.image_width, campaign.stereo.image_height
     last = np.array([width, height, width, height]) - 0.5
     pixels = pixels_of(ok)
     beyond = np.any(pixels > last, axis=1)
-    # Counted from 1 they reach from 0.5 to the size + 0.5.
+    # Counted from 1, they range from 0.5 to the size + 0.5.
     if not beyond.any() or pixels.min() < 0.5 or np.any(pixels > last + 1):
         return []
     first = ok[int(np.argmax(beyond))]
@@ -241,12 +241,12 @@ def _from_one(campaign: Campaign, ok: Sequence[Spot]) -> list[Finding]:
     )
     remedy = f"take 1 from all pixels: {mending_command(campaign, '--pixels-from 1')}"
     line = line_of(campaign.spots.index(first))
-    # A single one may be a spot that the edge of the picture cuts.
+    # A single one may be a spot cut by the edge of the picture.
     return [Finding("pixels-from-one", said, remedy, bool(beyond.sum() > 1), "spots.csv", line)]
 
 
 def _impossible_depths(campaign: Campaign, ok: Sequence[Spot], odd: Sequence[Spot]) -> Finding:
-    """Spots that no sheet can have shown; swapped cameras where exchanged pictures put nearly all on sheets."""
+    """Report spots at impossible depths; cameras are swapped where exchanged pictures put nearly all on sheets."""
     limits = f"{NEAREST_SHEET_MM:g} to {FARTHEST_SHEET_MM:g} mm"
     said = f"spots {listed([spot.spot for spot in odd], SPOTS_LISTED)} triangulate outside {limits}: "
     line = line_of(campaign.spots.index(odd[0]))
@@ -263,7 +263,7 @@ def _impossible_depths(campaign: Campaign, ok: Sequence[Spot], odd: Sequence[Spo
 
 
 def _reading_findings(ok: Sequence[Spot]) -> list[Finding]:
-    """Aperture readings in another unit, or from another direction."""
+    """Find aperture readings in another unit, or from another direction."""
     readings = {s.spot: s.aperture_deg for s in ok if s.aperture_deg is not None}
     beyond = [spot for spot, reading in readings.items() if not 0 < reading < 180]
     if beyond:
@@ -272,13 +272,13 @@ def _reading_findings(ok: Sequence[Spot]) -> list[Finding]:
     if not readings or max(readings.values()) >= np.pi:
         return []
     said = f"all aperture readings lie below {np.pi:.2f}: are they in radians? aperture_deg is in degrees"
-    # A sheet before both cameras is never seen so nearly along the baseline.
+    # A sheet in front of both cameras is never seen so close to the baseline's direction.
     remedy = "import the table again with --angles rad"
     return [Finding("units", said, remedy, len(readings) >= SPOTS_MIN, "spots.csv")]
 
 
 def _metres(campaign: Campaign) -> list[str]:
-    """Lengths that are stated in metres where the name says mm."""
+    """Find lengths stated in metres where the name says mm."""
     lengths = [name for name in campaign.rig.mechanism.documented if name == "mirror_offset_mm"]
     stated = {name: campaign.rig.priors[name].value for name in lengths}
     origin = [campaign.rig.priors[name].value for name in names_of("extrinsics.translation_mm")]
@@ -294,7 +294,7 @@ def _metres(campaign: Campaign) -> list[str]:
 
 
 def _incomplete(skipped: Sequence[SkippedExperiment]) -> list[str]:
-    """One sentence for all experiments that lack the same."""
+    """Write one sentence for all experiments that are incomplete for the same reason."""
     by_reason: dict[str, list[int]] = {}
     for one in skipped:
         by_reason.setdefault(one.reason, []).append(one.experiment)
@@ -306,11 +306,11 @@ def _incomplete(skipped: Sequence[SkippedExperiment]) -> list[str]:
 
 
 def _calibrated_later(header: Mapping[str, Any]) -> list[str]:
-    """That the cameras were calibrated on a later day than the campaign was made, as a sentence."""
+    """Warn in a sentence if the cameras were calibrated on a later day than the campaign was made."""
     created, calibrated = header.get("created"), header.get("traceability", {}).get("stereo_calibrated")
     if created is None or calibrated is None:
         return []
-    # By their days: a date has no hour, and a time may have no zone.
+    # Days are compared: a date has no hour, and a time may have no zone.
     days = [datetime.date(when.year, when.month, when.day) for when in (created, calibrated)]
     if days[1] <= days[0]:
         return []
@@ -321,20 +321,20 @@ def _calibrated_later(header: Mapping[str, Any]) -> list[str]:
 
 
 def check_campaign(campaign: Campaign) -> CampaignCheck:
-    """Plausibility and identifiability of a campaign before any fit.
+    """Check plausibility and identifiability of a campaign before any fit.
 
     Args:
         campaign: a campaign that its reader accepted.
 
     Returns:
-        Counts and warnings; an empty tuple means that nothing stands in the way of a fit.
+        Counts and warnings; without warnings the campaign can be fitted.
     """
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
     refused = Counter(spot.status for spot in campaign.spots if spot.status != "ok")
     selection = select_experiments(campaign)
     sightings = campaign.rig.mechanism.sightings
     points_mm = np.zeros((0, 3)) if sightings else campaign.usable_points_mm
-    # What is wrong first, then what follows from it.
+    # Causes first, then their consequences.
     findings = implausible(campaign, points_mm)
     warnings = [*(finding.sentence for finding in findings), *_incomplete(selection.skipped)]
     if not ok:

@@ -1,8 +1,8 @@
-"""What spots in space say of the tables, before any fit: of pictures, names of sheets, single mistyped cells.
+"""Tests of the tables by spots in space, before any fit: pictures, names of sheets, single mistyped cells.
 
-Points are triangulated, mm in frame S (X depth, Y left, Z up); px. A rig of any kind leaves the same pattern: both
-pictures of a spot agree, spots of one sheet lie on a plane; for counters see `counter_pattern`. The limits are far from
-what sound campaigns show (experiments/robustness/mistakes.md). No JAX.
+Points are triangulated, mm in frame S (X depth, Y left, Z up); px. With any rig, both pictures of a spot agree and
+spots of one sheet lie on a plane; for counters see `counter_pattern`. The limits are far from the values of correct
+campaigns (experiments/robustness/mistakes.md). No JAX.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from tvsbayes.instrument.campaign import Campaign, Spot, pixels_of
 from tvsbayes.instrument.stereo_pair import Stereo, project_pair, triangulate
 
 SPOTS_MIN = 8
-"""Fewer show no pattern."""
+"""Least number of spots for a test."""
 SPOTS_LISTED = 10
 MISMATCH_PX = 3.0
-"""Distance of a spot's pixels from those of its point that no calibration in use leaves on most spots."""
+"""Distance of a spot's pixels from those of its point that no calibration in use exceeds on most spots."""
 CURED = 0.25
-"""Share of the mismatch that may be left where another size of the pictures, or the transpose of R, explains it."""
+"""Largest remaining share of the mismatch where another size of the pictures, or the transpose of R, explains it."""
 STRAY_MISMATCH = 10.0
-"""Times the median mismatch, and above `MISMATCH_PX`, that makes a single spot stray."""
+"""Multiple of the median mismatch, and at least `MISMATCH_PX`, above which a single spot is an outlier."""
 KNOCK_PX, KNOCK_SPREADS = 1.0, 6.0
-"""Step of the mismatch within sheets, absolute and in its own standard deviations, by which one camera has moved."""
+"""Step of the mismatch within sheets, absolute and in its standard deviations, from which one camera has moved."""
 GAP_MM, GAP_SHARE = 10.0, 0.1
 """Least gap between the depths of two sheets, absolute and of the depth."""
 PLANE_MIN = 16
-"""Looks at a sheet, below which the spread about its plane, which three of them determine, is not known."""
+"""Least number of looks at a sheet for the spread about its plane, which three of them determine."""
 SHEET_SLOPE = 0.026
-"""Slope, 1.5 deg, by which a sheet that is put there anew may differ from how it stood."""
+"""Slope, 1.5 deg, by which a sheet may differ after it is put back."""
 ALONE = 3.0
-"""Times farther from the plane that a look must lie which is the only one of its placement."""
+"""Factor on the distance from the plane for a look that is the only one of its placement."""
 STRAY_PLANE, STRAY_FEW, STRAY_NEIGHBOUR, NEIGHBOUR_FLOOR = 3.5, 12.0, 8.0, 0.4
-"""Deviations from the plane of its sheet (in standard deviations of all placements, more of them by that many over the
-number of looks), and from both neighbours in its placement (in theirs, at least that share of the former), that make a
-spot stray: a sheet put there anew is seen by all looks of its placement."""
+"""Limits for an outlier. Its deviation from the plane of its sheet is in standard deviations of all placements, with a
+limit increased by `STRAY_FEW` over the number of looks. That from both neighbours in its placement is in their standard
+deviation, at least `NEIGHBOUR_FLOOR` of the former: a moved sheet shows in all looks of its placement."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,12 @@ class SpotPattern:
 
 
 def mismatch_px(stereo: Stereo, pixels: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
-    """How far pixels (n, 4) lie from those of their triangulated points (n, 3), (n,): left and right contradict."""
+    """Compute the distance (n,) of pixels (n, 4) from those of their triangulated points (n, 3)."""
     return np.linalg.norm(project_pair(stereo, points_mm) - pixels, axis=1)
 
 
 def pattern_of(campaign: Campaign, spots: Sequence[Spot], points_mm: np.ndarray) -> SpotPattern:
-    """Spots in space, in the order of the looks.
+    """Build the pattern of spots in space, in the order of the looks.
 
     Args:
         campaign: where they come from.
@@ -83,20 +83,20 @@ def pattern_of(campaign: Campaign, spots: Sequence[Spot], points_mm: np.ndarray)
 
 
 def picture_findings(pattern: SpotPattern) -> list[Finding]:
-    """What contradicts the cameras: pictures of another size or that do not belong together, a camera that moved."""
+    """Find contradictions to the cameras: pictures of another size or mismatched, a camera that moved."""
     said = _picture_doubts(pattern)
     return doubts("pictures", said) or doubts("camera-moved", _knock_doubts(pattern))
 
 
 def table_findings(pattern: SpotPattern) -> list[Finding]:
-    """What the sheets contradict: names of others, single spots apart."""
-    # A spot of another sheet would stray from the plane of the one that it is called after.
+    """Find contradictions to the sheets: wrong names, single outliers."""
+    # A spot with the name of another sheet would be an outlier to the plane of that sheet.
     named = doubts("sheet-name", _name_doubts(pattern), "spots.csv")
     return named or doubts("spot-apart", _stray_doubts(pattern), "spots.csv")
 
 
 def sheet_groups(depths_mm: np.ndarray) -> np.ndarray:
-    """The number of the sheet of every depth, (n,), by the gaps between them: 0 for the nearest."""
+    """Number the sheet of every depth, (n,), by gaps between depths: 0 for the nearest."""
     order = np.argsort(depths_mm)
     far = np.diff(depths_mm[order]) > np.maximum(GAP_MM, GAP_SHARE * depths_mm[order][:-1])
     group = np.empty(len(depths_mm), int)
@@ -105,7 +105,7 @@ def sheet_groups(depths_mm: np.ndarray) -> np.ndarray:
 
 
 def _picture_doubts(pattern: SpotPattern) -> tuple[str, ...]:
-    """Pixels of pictures of another size, or of pictures that do not belong together."""
+    """Describe pixels of pictures of another size, or of mismatched pictures."""
     off_px = float(np.median(pattern.mismatch_px))
     if off_px < MISMATCH_PX:
         return ()
@@ -132,16 +132,16 @@ def _picture_doubts(pattern: SpotPattern) -> tuple[str, ...]:
 
 
 def signed_mismatch_px(pattern: SpotPattern) -> np.ndarray:
-    """The mismatch with the sign of that of the left row, (n,)."""
+    """Compute the mismatch with the sign of the left row's, (n,)."""
     projected = project_pair(pattern.campaign.stereo, pattern.points_mm)
     return pattern.mismatch_px * np.sign((projected - pattern.pixels)[:, 1])
 
 
 def mismatch_spread_px(pattern: SpotPattern) -> float:
-    """Standard deviation of a centre's error, px, by how both pictures of the spots contradict each other.
+    """Estimate the standard deviation of a centre's error, px, from the mismatch of both pictures.
 
-    Four coordinates have one condition, whose error is that of one coordinate. What changes evenly over the pictures
-    and with the distance is the calibration's and left out.
+    Four coordinates have one condition, whose error is that of one coordinate. Linear trends over the pictures and with
+    distance are due to the calibration and removed.
     """
     off, pixels = signed_mismatch_px(pattern), pattern.pixels
     design = np.column_stack((np.ones(len(off)), pixels[:, :2], pixels[:, 0] - pixels[:, 2]))
@@ -151,10 +151,10 @@ def mismatch_spread_px(pattern: SpotPattern) -> float:
 
 
 def _knock_doubts(pattern: SpotPattern) -> tuple[str, ...]:
-    """That left and right begin to contradict each other on the way: one camera was knocked, turned or focused anew.
+    """Describe a step in the mismatch of left and right during the campaign: a camera was knocked, turned or refocused.
 
-    Of the mismatch the sign counts, that of the left row, and its step within each sheet: by a poor calibration they
-    contradict each other at one distance more than at another.
+    The mismatch has the sign of the left row's, and its step is taken within each sheet: under a poor calibration the
+    mismatch depends on distance.
     """
     off = signed_mismatch_px(pattern)
     if len(off) < 2 * SPOTS_MIN:
@@ -187,7 +187,7 @@ def _knock_doubts(pattern: SpotPattern) -> tuple[str, ...]:
 
 
 def _name_doubts(pattern: SpotPattern) -> tuple[str, ...]:
-    """Spots whose depth is that of a sheet of another name; sheets without names."""
+    """Describe spots at the depth of a sheet of another name, and sheets without names."""
     depths = pattern.points_mm[:, 0]
     group = sheet_groups(depths)
     names = [spot.target for spot in pattern.spots]
@@ -218,12 +218,12 @@ def _name_doubts(pattern: SpotPattern) -> tuple[str, ...]:
 
 
 def listed_text(words: Sequence[str]) -> str:
-    """Words with an "and" before the last."""
+    """Join words, with "and" before the last."""
     return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
 
 def _stray_doubts(pattern: SpotPattern) -> tuple[str, ...]:
-    """Single spots away from the pattern of all others: a mistyped cell, or a reflection."""
+    """Describe single outliers: a mistyped cell, or a reflection."""
     off = pattern.mismatch_px
     apart = off > max(MISMATCH_PX, STRAY_MISMATCH * float(np.median(off)))
     reasons = {int(k): f"left and right contradict each other by {off[k]:.1f} px" for k in np.flatnonzero(apart)}
@@ -232,7 +232,7 @@ def _stray_doubts(pattern: SpotPattern) -> tuple[str, ...]:
         if len(rows) < PLANE_MIN:
             continue
         away, unsure = _off_plane_mm(pattern.points_mm[rows])
-        # Of its own placement: rows follow each other where no other sheet was put there in between.
+        # Consecutive rows have one placement where no other sheet was used in between.
         placement = np.cumsum(np.diff(rows, prepend=rows[0]) > 1)
         spread, apart_mm = _spread(away), _from_neighbours(away[:, None], placement, np.abs(away) / ALONE)
         usual = max(_spread(np.concatenate((apart_mm, -apart_mm))), NEIGHBOUR_FLOOR * spread)
@@ -250,24 +250,24 @@ def _stray_doubts(pattern: SpotPattern) -> tuple[str, ...]:
 
 
 def _mm_per_pixel(pattern: SpotPattern, rows: np.ndarray) -> np.ndarray:
-    """What one pixel of disparity moves a spot in depth, (n,): depth squared over focal length times baseline."""
+    """Compute the change of depth per pixel of disparity, (n,): depth squared over focal length times baseline."""
     stereo = pattern.campaign.stereo
     return pattern.points_mm[rows, 0] ** 2 / (stereo.M1[0, 0] * float(np.linalg.norm(stereo.T)))
 
 
 def _off_plane_mm(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depths of points (n, 3) above the plane that most of them lie on, and how unsure that of the others is there.
+    """Compute depths of points (n, 3) above the plane of most of them, and the uncertainty of that plane there.
 
     Returns:
-        (n,) mm, and (n,) variance of such a depth over that where the plane is known: a look far from all others lies
-        off their plane by their error of its slope.
+        (n,) mm, and (n,) ratio of the variance of such a depth to that with a known plane: far from all other looks the
+        error of the plane's slope adds to it.
     """
     design = np.column_stack((np.ones(len(points_mm)), points_mm[:, 1:] - points_mm[:, 1:].mean(axis=0)))
     weights = np.ones(len(points_mm))
     for _ in range(10):
         plane = np.linalg.lstsq(design * weights[:, None], points_mm[:, 0] * weights, rcond=None)[0]
         away = points_mm[:, 0] - design @ plane
-        # Cauchy's weights: a spot 10 mm off does not tilt the plane.
+        # With Cauchy's weights an outlier of 10 mm does not tilt the plane.
         weights = 1 / np.sqrt(1 + (away / (2 * _spread(away))) ** 2)
     weighted = design * weights[:, None]
     leverage = np.einsum("ij,jk,ik->i", design, np.linalg.pinv(weighted.T @ weighted), design)
@@ -276,9 +276,9 @@ def _off_plane_mm(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _from_neighbours(values: np.ndarray, placement: np.ndarray, alone: np.ndarray) -> np.ndarray:
-    """Distance of values (n, k) from the nearer of those before and after in the same placement, (n,).
+    """Compute distances (n,) of values (n, k) from the nearer of both neighbours in the same placement.
 
-    A sheet put there anew for a single look stands apart as a mistyped cell does: such a look gets that of `alone`.
+    A single look at a moved sheet cannot be distinguished from a mistyped cell: it gets its value of `alone`.
     """
     steps = np.where(np.diff(placement) == 0, np.linalg.norm(np.diff(values, axis=0), axis=1), math.inf)
     nearer = np.minimum(np.append(math.inf, steps), np.append(steps, math.inf))
@@ -286,5 +286,5 @@ def _from_neighbours(values: np.ndarray, placement: np.ndarray, alone: np.ndarra
 
 
 def _spread(values: np.ndarray) -> float:
-    """Standard deviation by the median, for normal ones; above rounding."""
+    """Estimate the standard deviation of normal values by the median absolute deviation; above rounding."""
     return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-6)

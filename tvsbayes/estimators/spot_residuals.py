@@ -1,8 +1,8 @@
-"""Residuals of spots in units of their noise, ranges projected out, turned towards what the stops can move.
+"""Residuals of spots in units of their noise, ranges projected out, rotated to the directions of the mirror angles.
 
 Each spot gives four pixels and perhaps an aperture angle. Its range along the beam is unknown and flat in image
-displacement: the part of the residual along d(pixels)/d(range) is projected out (formulation 4.1). Reflections do it:
-they keep the noise independent.
+displacement: the part of the residual along d(pixels)/d(range) is projected out (formulation 4.1), by reflections,
+which keep the noise independent.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class NoiseScales(eqx.Module):
     aperture: Float[Array, " spots"]
 
     def whitened(self, numbers: Numbers, spots: SpotArrays) -> Numbers:
-        """Differences of observations in units of their noise; the noise of a pair of pixels is that of one camera."""
+        """Whiten differences of observations; the noise of each camera's two pixels may be correlated."""
         u_left, v_left, u_right, v_right, reading = numbers
         w = spots.whitening
         return (
@@ -38,7 +38,7 @@ class NoiseScales(eqx.Module):
 
 
 def noise_scales(model: Model, spots: SpotArrays, inflation: Float[Array | np.ndarray, ""] | float) -> NoiseScales:
-    """Noise of every spot at the model's scales; robust weights make it larger, padding infinite."""
+    """Compute the scales of every spot's noise; robust weights enlarge it, padding has infinite noise."""
     root_weight = jnp.sqrt(spots.weight) * spots.valid
     return NoiseScales(
         root_weight / (model.noise.pixel_scale * inflation),
@@ -47,15 +47,15 @@ def noise_scales(model: Model, spots: SpotArrays, inflation: Float[Array | np.nd
 
 
 def _dot(first: Numbers, second: Numbers) -> Float[Array, "..."]:
-    """Scalar product of components."""
+    """Compute the scalar product of components."""
     return jnp.asarray(sum(a * b for a, b in zip(first, second, strict=True)))
 
 
 class Reflection(eqx.Module):
-    """Householder reflections that take a direction per spot to the first axis.
+    """Householder reflections that map one direction per spot to the first axis.
 
-    `first` is what becomes of the direction: its length, with the sign that avoids cancellation. Without a direction
-    (padding) the first axis stands for it, and the length is 0.
+    `first` is the reflected direction's first component: its length, with the sign that avoids cancellation. Without a
+    direction (padding) the first axis replaces it, and the length is 0.
     """
 
     mirror: Numbers
@@ -64,7 +64,7 @@ class Reflection(eqx.Module):
 
     @classmethod
     def of(cls, direction: Numbers) -> Reflection:
-        """The reflection of a direction given by its components."""
+        """Build the reflection of a direction given by its components."""
         length2 = _dot(direction, direction)
         there = length2 > 0
         length = jnp.sqrt(jnp.where(there, length2, 1.0))
@@ -75,7 +75,7 @@ class Reflection(eqx.Module):
         return cls(mirror, 0.5 * _dot(mirror, mirror), -sign * jnp.where(there, length, 0.0))
 
     def of_many(self, numbers: Numbers) -> Numbers:
-        """Reflected components; an axis of columns may come before the spots."""
+        """Reflect components; an axis of columns may precede the spots."""
         share = _dot(self.mirror, numbers) / self.half
         return tuple(number - share * m for m, number in zip(self.mirror, numbers, strict=True))
 
@@ -84,8 +84,8 @@ class SpotResiduals(eqx.Module):
     """All spots after their ranges are projected out, in units of their noise (stated sd x pixel scale).
 
     `residual` = observed - predicted; `by_pan`, `by_tilt` = d(predicted)/d(pan, tilt): four components each.
-    `log_scale` holds each spot's -3 log(pixel_scale) and, with an aperture reading, what the fifth observation adds:
-    zero for padding. `range_out` takes the range out of whitened numbers: its reflections' first component.
+    `log_scale` holds each spot's -3 log(pixel_scale) and, with an aperture reading, the term of the fifth observation;
+    zero for padding. `range_out` projects the range out of whitened numbers: the first component after reflection.
     """
 
     residual: Numbers
@@ -96,7 +96,7 @@ class SpotResiduals(eqx.Module):
 
 
 def spot_residuals(looks: Looks, noise: NoiseScales, model: Model, spots: SpotArrays) -> SpotResiduals:
-    """Compare looks with what was seen, and project their ranges out (formulation 4.1)."""
+    """Compare looks with the observations, and project their ranges out (formulation 4.1)."""
     *pixels, reading = looks.predicted
     off = spots.aperture_rad - reading
     # Angles are compared on the circle.
@@ -110,7 +110,7 @@ def spot_residuals(looks: Looks, noise: NoiseScales, model: Model, spots: SpotAr
     if spots.tangents is not None:
         log_scale = -len(SIGHTED) * jnp.log(model.noise.pixel_scale) * spots.valid
         return SpotResiduals(residual, by_pan, by_tilt, log_scale, range_out)
-    # Four pixels give s^-4, their range integral s; the aperture's noise takes part in that integral.
+    # Four pixels give s^-4, their range integral s; the aperture's noise also enters that integral.
     pixel_part = _dot(by_range[:4], by_range[:4])
     log_scale = -3 * jnp.log(model.noise.pixel_scale) - 0.5 * jnp.log1p(
         by_range[4] ** 2 / jnp.where(spots.valid > 0, pixel_part, 1.0)
@@ -120,7 +120,7 @@ def spot_residuals(looks: Looks, noise: NoiseScales, model: Model, spots: SpotAr
 
 
 def _unit(direction: Numbers) -> tuple[Numbers, Float[Array, " spots"]]:
-    """Directions of length 1 and the lengths; zero where there is no direction (padding)."""
+    """Normalise directions; return them and their lengths, zero where there is no direction (padding)."""
     length2 = _dot(direction, direction)
     there = length2 > 0
     length = jnp.sqrt(jnp.where(there, length2, 1.0))
@@ -128,15 +128,15 @@ def _unit(direction: Numbers) -> tuple[Numbers, Float[Array, " spots"]]:
 
 
 class ToStates(eqx.Module):
-    """The two directions in which looks see the mirror angles, the first of them pan and tilt, the second tilt alone.
+    """The two directions in which looks depend on mirror angles: the first on pan and tilt, the second on tilt.
 
-    Four components with independent unit noise become one along each, which have it too, and what is left: the filter
-    then has two to look at instead of four. Everything is smooth in the slopes (Gram and Schmidt's directions, where a
+    Four components with independent unit noise become one along each direction, with the same noise, and a remainder:
+    the filter then processes two instead of four. Everything is smooth in the slopes (Gram-Schmidt directions; a
     reflection would change its sign).
 
     Where the beam's angles scatter from look to look, the noise of the two has the covariance R = 1 + slope
-    diag(variances) slope^T = U U^T, U upper triangular: they are multiplied by U^-1, which leaves them unit noise and
-    the second blind to pan. `spread` holds U11, U12 and U22, which are 1, 0 and 1 without scatter.
+    diag(variances) slope^T = U U^T, U upper triangular: they are multiplied by U^-1, so that they have unit noise and
+    the second does not depend on pan. `spread` holds U11, U12 and U22, which are 1, 0 and 1 without scatter.
     """
 
     first: Numbers
@@ -148,7 +148,7 @@ class ToStates(eqx.Module):
 
     @classmethod
     def of(cls, by_pan: Numbers, by_tilt: Numbers, scatter_variance: Float[Array, "spots 2"] | None = None) -> ToStates:
-        """The directions of looks that move so with pan and tilt, whose angles scatter by these variances (rad^2)."""
+        """Compute the directions from derivatives by pan and tilt and the variances of scattering angles (rad^2)."""
         first, pan_load = _unit(by_pan)
         tilt_load = _dot(first, by_tilt)
         second, tilt_rest = _unit(tuple(b - tilt_load * a for a, b in zip(first, by_tilt, strict=True)))
@@ -156,7 +156,7 @@ class ToStates(eqx.Module):
         if scatter_variance is None:
             return cls(first, second, pan_load, tilt_load, tilt_rest, (one, none, one))
         by_pan_2, by_tilt_2 = scatter_variance.T
-        # By Schur's complement, in sums of what is positive: a large scatter costs no digits.
+        # Schur's complement, in sums of positive terms: no cancellation at large scatter.
         last2 = 1 + by_tilt_2 * tilt_rest**2
         last, across = jnp.sqrt(last2), tilt_load * by_tilt_2 * tilt_rest
         scale = jnp.sqrt(1 + by_pan_2 * pan_load**2 + by_tilt_2 * tilt_load**2 / last2)
@@ -166,25 +166,25 @@ class ToStates(eqx.Module):
 
     @property
     def log_scale(self) -> Float[Array, " spots"]:
-        """What the scatter of looks adds to the log density besides the two components: -ln det U."""
+        """Compute the term of the looks' scatter in the log density: -ln det U."""
         scale, _, last = self.spread
         return -jnp.log(scale) - jnp.log(last)
 
     @property
     def slope(self) -> Float[Array, "spots 2 2"]:
-        """d(predicted)/d(pan, tilt) of the two components."""
+        """Return d(predicted)/d(pan, tilt) of the two components."""
         none = jnp.zeros_like(self.tilt_load)
         first = jnp.stack([self.pan_load, self.tilt_load], axis=1)
         return jnp.stack([first, jnp.stack([none, self.tilt_rest], axis=1)], axis=1)
 
     def of_many(self, numbers: Numbers) -> Numbers:
-        """The components along both directions, and the four of what is left; columns may come before the spots."""
+        """Compute the components along both directions, and the four remaining; columns may precede the spots."""
         one, two = _dot(self.first, numbers), _dot(self.second, numbers)
         left = (n - p * one - q * two for p, q, n in zip(self.first, self.second, numbers, strict=True))
         return (*self._unit_noise(one, two), *left)
 
     def in_place(self, numbers: Numbers) -> Numbers:
-        """Four components of unit noise again, the scatter of looks included."""
+        """Whiten four components in place, the scatter of looks included."""
         one, two = _dot(self.first, numbers), _dot(self.second, numbers)
         by_one, by_two = (new - old for new, old in zip(self._unit_noise(one, two), (one, two), strict=True))
         return tuple(n + p * by_one + q * by_two for p, q, n in zip(self.first, self.second, numbers, strict=True))

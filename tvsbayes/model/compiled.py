@@ -228,7 +228,7 @@ class Compiled[**P, Result]:
 
     @functools.cached_property
     def _structure(self) -> Any:
-        """Of a result; made without its constructor, which is for one point where a result may hold many."""
+        """Return a result's structure, made without its constructor: that takes one point, a result may hold many."""
         blank = object.__new__(self._result)
         for field in self._fields():
             object.__setattr__(blank, field.name, 0.0)

@@ -230,8 +230,7 @@ def scale_of(mechanism: Mechanism) -> np.ndarray:
 
 STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{side}"] for side in SIDES[axis]] for axis in AXES])
 SCATTER_COLUMNS = np.array([INDEX[name] for name in LOOK_SCATTER_NAMES])
-"""Coordinates of the stop sds by axis and approach side, (right, left) and (down, up), shape (2, 2); of looks'
-scatter."""
+"""Coordinates of the stop sds by axis and side, (right, left) and (down, up): shape (2, 2); those of looks' scatter."""
 
 
 def _camera_columns(*parts: str) -> slice | np.ndarray:
