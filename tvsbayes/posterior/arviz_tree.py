@@ -1,6 +1,6 @@
-"""What ArviZ works on: the posterior with its prior, predictions and log likelihoods, and `posterior.nc`.
+"""The posterior with its prior, predictions and log likelihoods as a tree for ArviZ, and `posterior.nc`.
 
-Variables by contract name, with named dimensions; units are those of the names (deg, mm, rad, px).
+Variables have the public names and named dimensions; units are those of the names (deg, mm, rad, px).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 POSTERIOR_FORMAT = "tvsbayes-posterior/1"
 RESAMPLED = 4, 1024
-"""Chains and draws of weighted draws that were made equal."""
+"""Chains and draws after resampling weighted draws with equal weights."""
 COORDS: dict[str, tuple[str, ...]] = {
     "direction": DIRECTIONS,
     "axis": AXES,
@@ -52,14 +52,14 @@ COORDS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of posterior.nc: contract names behind it, and their dimension beyond (chain, draw) if it has one."""
+    """A variable of posterior.nc: the names of its quantities, and their dimension beyond (chain, draw), if any."""
 
     names: tuple[str, ...]
     dim: str | None = None
 
 
 def _of_block(block: str, names: tuple[str, ...]) -> Variable:
-    """Quantities of a block, whose dimension is the one with their labels; a single one has none."""
+    """Build the variable of a block, with the dimension of its labels; a single quantity has none."""
     if len(names) == 1:
         return Variable(names)
     labels = tuple(name.removeprefix(f"{block}.") for name in names)
@@ -80,7 +80,7 @@ VARIABLES: dict[str, Variable] = {
 
 
 def variables_of(mechanism: Mechanism) -> dict[str, Variable]:
-    """Variables of posterior.nc of a mechanism; each term of a head's geometry is one."""
+    """Return the variables of posterior.nc for a mechanism; each term of a head's geometry is one."""
     shared = {name: spec for name, spec in VARIABLES.items() if not mechanism.terms.keys() & set(spec.names)}
     return shared | {term.name.replace(".", "_"): Variable((term.name,)) for term in mechanism.terms.values()}
 
@@ -88,7 +88,7 @@ def variables_of(mechanism: Mechanism) -> dict[str, Variable]:
 def _variables(
     draws: Derived, varying: set[str], shape: tuple[int, int], mechanism: Mechanism = TWO_MIRROR
 ) -> dict[str, xr.DataArray]:
-    """All variables that vary, with named dimensions; fixed entries of a dimension are left out."""
+    """Return all variables that vary, with named dimensions; fixed entries of a dimension are left out."""
     columns = Draws(draws, mechanism)
     result = {}
     for variable, spec in variables_of(mechanism).items():
@@ -107,7 +107,7 @@ def _variables(
 
 
 def _dataset(variables: Mapping[str, xr.DataArray]) -> xr.Dataset:
-    """Join variables; a coordinate of which some have fewer entries is kept apart under the variable's name."""
+    """Join variables; a dimension with fewer entries in some variable gets a name of its own."""
     full = {}
     for name, array in variables.items():
         for dim in array.dims[2:]:
@@ -118,16 +118,16 @@ def _dataset(variables: Mapping[str, xr.DataArray]) -> xr.Dataset:
 
 
 def data_tree(posterior: Posterior) -> xr.DataTree:
-    """Everything ArviZ works on, in its groups.
+    """Build the tree for ArviZ with its groups.
 
-    Posterior, prior, posterior_predictive, log_likelihood, observed_data and sample_stats.
+    The groups are posterior, prior, posterior_predictive, log_likelihood, observed_data and sample_stats.
 
     Args:
         posterior: a sampled posterior.
 
     Returns:
         A tree for `az.summary`, `az.loo`, `az.compare` and ArviZ's plots. The unit of the log likelihood is a move.
-        Weighted draws are resampled: ArviZ knows no weights.
+        Weighted draws are resampled, since ArviZ has no weights.
     """
     if posterior.tier == IMPORTANCE:
         posterior = posterior.resampled(*RESAMPLED)
@@ -135,7 +135,7 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
     shape = posterior.z.shape[:2]
     mechanism = fit.space.mechanism
     varying = {fit.names[i] for i in np.flatnonzero(fit.free)}
-    # By the gears of their axis, where they are of one.
+    # Quantities of one axis vary if its gears do.
     of_axis = {a: {f"degrees_per_step.{a}", f"ratio_contrast_deg_per_step.{a}"} & varying for a in AXES}
     varying |= {name for name in derived_names(mechanism) if (axis := QUANTITIES[name].axis) is None or of_axis[axis]}
     prior_draws = jax.tree.map(lambda x: np.asarray(x)[None], fit.prior_draws)
@@ -149,7 +149,7 @@ def data_tree(posterior: Posterior) -> xr.DataTree:
         lengths = {"steps": convergence.steps, "discarded": convergence.discarded, "thin": convergence.thin}
     places = {"spot": [s.spot for s in spots], "pixel": list(PIXEL_LABELS)}
     pixels = np.zeros((len(spots), len(PIXEL_LABELS))) if mechanism.sightings else pixels_of(spots)
-    # Of sightings angles about the direction sighted, rad, in the columns of `campaign_arrays.SIGHTED`.
+    # Sightings have angles about the direction sighted, rad, in the columns of `campaign_arrays.SIGHTED`.
     observed = xr.DataArray(pixels, places, tuple(places), name="pixels")
     tree = xr.DataTree.from_dict(
         {

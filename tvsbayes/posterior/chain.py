@@ -1,4 +1,4 @@
-"""The file that keeps a chain and what it began with: all that continues it bit for bit.
+"""The file of a chain and its start, from which it continues bit for bit.
 
 Coordinates w of `posterior.transport`; arrays of a chain are ordered (step, walker, ...).
 """
@@ -30,11 +30,11 @@ from tvsbayes.results.tiers import CHAIN
 CHAIN_KIND = "tvsbayes-chain/"
 CHAIN_FORMAT = f"{CHAIN_KIND}7"
 CHAIN_BYTES_MAX = 2**32
-"""A chain is the user's own file: what was in memory when it was written fits there again."""
+"""Largest chain file read; it is the user's own and fitted into memory when it was written."""
 
 
 def fingerprint(fit: JointFit) -> str:
-    """Hash of what a chain depends on: data, weights, model options and priors, versions of what computes it."""
+    """Hash all that a chain depends on: data, weights, model options and priors, versions of the packages."""
     digest = hashlib.sha256(json.dumps(input_hashes(fit.campaign), sort_keys=True).encode())
     for array in (*jax.tree.leaves(fit.space), *jax.tree.leaves(fit.arrays), fit.free):
         array = np.asarray(array)
@@ -45,7 +45,7 @@ def fingerprint(fit: JointFit) -> str:
 
 
 def _pool_arrays(pool: Pool) -> dict[str, np.ndarray]:
-    """A pool as arrays; the proposal that comes next is the last of them."""
+    """Convert a pool to arrays; the next proposal is the last of the proposals."""
     every = [each for each in (*pool.proposals, pool.next_proposal) if isinstance(each, Independence)]
     last = every[-1]
     return {
@@ -68,7 +68,7 @@ def _pool_arrays(pool: Pool) -> dict[str, np.ndarray]:
 
 
 def _pool_of(stored: dict[str, np.ndarray], target: Target) -> Pool:
-    """The pool of `_pool_arrays`."""
+    """Build the pool from `_pool_arrays`."""
     names = "mean", "sd", "tables", "followers", "origin", "turn"
     rounds = zip(*(stored[f"proposal_{name}"] for name in names), strict=True)
     places, coupled = stored["proposal_places"], stored["proposal_coupled"]
@@ -87,7 +87,7 @@ def _pool_of(stored: dict[str, np.ndarray], target: Target) -> Pool:
 
 
 def write_chain(path: Path, fit: JointFit, start: ImportanceRun[Target], chain: Chain) -> None:
-    """Keep a chain and what it started from, whole or not at all."""
+    """Write a chain and its start, whole or not at all."""
     buffer = io.BytesIO()
     kind, keys, position, has_gauss, gauss = chain.random_state
     np.savez(

@@ -1,4 +1,4 @@
-"""Importance sampling of a fit, by the map of `posterior.transport`; ways of homing that nobody recorded are mixed."""
+"""Importance sampling of a fit, by the map of `posterior.transport`, mixed over unrecorded ways of homing."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import weighted_summary
 
 MAPPED_SHARE = 0.25
-"""Of the time, for the map to nearly normal coordinates: what progress predicts with."""
+"""Share of the time for the map to nearly normal coordinates, for the progress display."""
 ALONE_ROUNDS_LEAST, BESIDE_ROUNDS_MAX = 2, 12
-"""Rounds of a way of homing that has draws of its own."""
+"""Least and largest number of rounds of a way of homing with draws of its own."""
 
 
 def importance_run(
@@ -34,7 +34,7 @@ def importance_run(
     advance: Advance = unshown,
     rounds_max: int | None = None,
 ) -> ImportanceRun[Target]:
-    """`weighted_run` of a converged fit."""
+    """Run `weighted_run` for a converged fit."""
     began, path = time.monotonic(), transport(fit)
     advance(MAPPED_SHARE)
 
@@ -46,15 +46,15 @@ def importance_run(
 
 
 def run_beside(fit: JointFit, run: ImportanceRun[Target], seed: int) -> Posterior:
-    """The posterior under another way of homing, from the draws of the most probable one weighted anew.
+    """Compute the posterior under another way of homing, by reweighting the draws of the most probable one.
 
-    Both posteriors mostly lie over each other. Where they do not, the other one has draws of its own, by its own map
-    from the proposal that the most probable one has learnt; of either so many that the whole is known.
+    Both posteriors usually overlap. Where they do not, the other one has draws of its own, by its own map and the
+    proposal fitted for the most probable one. The number of draws in either case depends on the error of the mixture.
 
     Args:
-        fit: under the other way.
-        run: of the most probable way.
-        seed: of draws of the errors at places.
+        fit: the fit under the other way.
+        run: the run of the most probable way.
+        seed: seed of draws of the errors at places.
     """
     began = time.monotonic()
     first = run.sample.convergence
@@ -64,7 +64,7 @@ def run_beside(fit: JointFit, run: ImportanceRun[Target], seed: int) -> Posterio
     def known(weighed: Weighing) -> bool:
         error = max(e.rounds_factor for e in weighed.monte_carlo_error.values())
         share = np.exp(weighed.log_evidence - first.importance.log_evidence + odds)
-        # An error of a part is as large in the whole as the part.
+        # The error of a part enters the mixture by the share of the part.
         return weighed.importance.pareto_k < K_MAX and bool(error * share**2 <= 1)
 
     weighed = _weighed_anew(fit, run, known, seed)
@@ -78,7 +78,7 @@ def run_beside(fit: JointFit, run: ImportanceRun[Target], seed: int) -> Posterio
 def _weighing_alone(
     fit: JointFit, run: ImportanceRun[Target], known: Callable[[Weighing], bool], seed: int
 ) -> Weighing:
-    """Draws of another way of homing, until they are known well enough or the budget is spent."""
+    """Draw from another way of homing until its error is small enough or the rounds are used up."""
     target = Target(fit, transport_beside(fit, run.density.path))
     pool, generator = Pool.empty(run.pool.proposals[-1]), np.random.RandomState(seed)
     for count in range(1, BESIDE_ROUNDS_MAX + 1):
@@ -90,7 +90,7 @@ def _weighing_alone(
 
 
 def _weighed_anew(fit: JointFit, run: ImportanceRun[Target], known: Callable[[Weighing], bool], seed: int) -> Weighing:
-    """The draws of a run, weighted by the density under another way of homing, round by round until it is known."""
+    """Reweight the draws of a run under another way of homing, round by round until its error is small enough."""
     target, drawn, parts = Target(fit, run.density.path), run.pool.drawn, []
     normal = target.place_normals(len(drawn), random_stream(seed, Stream.OTHER_HOMING))
     for begin in range(0, len(drawn), ROUND):
@@ -105,10 +105,10 @@ def _weighed_anew(fit: JointFit, run: ImportanceRun[Target], known: Callable[[We
 
 
 def mixed(parts: Sequence[Posterior]) -> Posterior:
-    """One posterior of the fits under several ways of homing, by their evidence and prior probabilities.
+    """Mix the posteriors under several ways of homing by their evidence and prior probabilities.
 
     Args:
-        parts: by importance sampling, of `JointFit.mixture` in its order.
+        parts: posteriors by importance sampling, in the order of `JointFit.mixture`.
     """
     first = parts[0]
     evidence = np.array([part.convergence.importance.log_evidence for part in parts])
@@ -133,9 +133,9 @@ def mixed(parts: Sequence[Posterior]) -> Posterior:
 
 
 def _joined(parts: Sequence[Posterior], chance: np.ndarray) -> Reweighted:
-    """The diagnosis of a mixture: that of its first part, with the Monte Carlo errors of all.
+    """Build the diagnosis of a mixture: that of its first part, with the Monte Carlo errors of the mixture.
 
-    Parts share draws; one that several have weighs what all of them give it.
+    Parts may share draws; the weights of a shared draw are added.
     """
     first = parts[0]
     diagnosis = first.convergence

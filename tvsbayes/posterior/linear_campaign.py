@@ -15,13 +15,13 @@ from tvsbayes.posterior.stop_states import Elimination, StopStates
 
 @dataclass(frozen=True)
 class Creep:
-    """Zeros that creep: columns of a linearised campaign that another time constant changes.
+    """Creep of the zeros: columns of a linearised campaign that depend on its time constant.
 
     Attributes:
-        warm_minutes: since the machine was switched on, of every spot, shape (s,).
+        warm_minutes: time of every spot since the machine was switched on, shape (s,).
         minutes: time constant at the mode.
-        looks: whose angles move as the zeros do.
-        rows: how far the zeros creep in all, in its units, by the columns of `LinearCampaign`, shape (2, c).
+        looks: looks, whose angles follow the zeros.
+        rows: total creep of the zeros, in units of `looks`, by the columns of `LinearCampaign`, shape (2, c).
     """
 
     warm_minutes: np.ndarray
@@ -30,22 +30,22 @@ class Creep:
     rows: np.ndarray
 
     def later(self, log_scale: np.ndarray) -> np.ndarray:
-        """How much more of the creep is over at each spot than at the mode, by ln of the time constants (n,) over it.
+        """Compute how much more of the creep is over at each spot than at the mode, shape (n, s).
 
-        Shape (n, s).
+        `log_scale` is ln of the time constants (n,) over that at the mode.
         """
         minutes = self.minutes * np.exp([[0.0], *log_scale[:, None]])
         over = -np.expm1(-self.warm_minutes / minutes)
         return over[1:] - over[0]
 
     def products(self, misfit: np.ndarray, later: np.ndarray) -> np.ndarray:
-        """Of misfits (n, 4 s) with what `more` sees of either zero, shares (n, s) or (1, s), shape (n, 2)."""
+        """Multiply misfits (n, 4 s) by the columns of `more` at shares (n, s) or (1, s), shape (n, 2)."""
         load = self.looks.load
         by_spot = np.einsum("nsi,sia->nsa", misfit.reshape(len(misfit), *load.shape[:2]), load)
         return np.einsum("nsa,ns->na", by_spot, np.broadcast_to(later, by_spot.shape[:2]))
 
     def more(self, later: np.ndarray, crept_rad: np.ndarray) -> np.ndarray:
-        """What spots are seen farther on where zeros (n, 2) creep, by shares (n, s) of it, shape (n, 4 s)."""
+        """Compute the shift of predicted spots by shares (n, s) of creeps (n, 2) of the zeros, shape (n, 4 s)."""
         return np.einsum("sia,ns,na->nsi", self.looks.load, later, crept_rad, optimize=True).reshape(len(later), -1)
 
 
@@ -53,19 +53,19 @@ class Creep:
 class LinearCampaign:
     """The campaign linearised at the mode: observed - predicted is residual - along y - states s - places e + noise.
 
-    Rows are the components of the spots in units of their noise at the mode, states s and errors e rad. Errors repeat
-    by position, or are drifts: what stays for many looks.
+    Rows are the components of the spots in units of their noise at the mode; states s and errors e are in rad. The
+    errors e, repeating by position or drifts, affect many looks.
 
     Attributes:
         residual: shape (4 n,).
-        along: d(predicted)/dy of the coordinates that are no noise scales, shape (4 n, g).
-        states: stop errors and their like.
+        along: d(predicted)/dy of the coordinates other than noise scales, shape (4 n, g).
+        states: stop errors, home offsets and unknown plays.
         by_noise: variance of every state at the mode by the noise coordinates that scale it, shape (m, q).
-        constant: variance that scales with none, shape (m,).
+        constant: variance independent of all of them, shape (m,).
         places: d(predicted)/d(errors at places, then terms of the drifts), shape (4 n, e).
         prior: precision of y without data, shape (g, g).
-        looks: their noise at other scales.
-        creep: None where its time constant is not estimated.
+        looks: noise of the looks at other scales.
+        creep: creep of the zeros; None where its time constant is not estimated.
     """
 
     residual: np.ndarray
@@ -80,7 +80,7 @@ class LinearCampaign:
 
     @cached_property
     def columns(self) -> np.ndarray:
-        """Errors at places, coordinates from the narrowest on, and the residual, shape (4 n, e + g + 1)."""
+        """Stack errors at places, coordinates from the narrowest on, and the residual, shape (4 n, e + g + 1)."""
         return np.column_stack([self.places, self.along[:, ::-1], self.residual])
 
     @cached_property
@@ -89,7 +89,7 @@ class LinearCampaign:
 
     @cached_property
     def _spanned(self) -> np.ndarray:
-        """All of `Products` at the mode, then what every function of `LookNoise.basis` takes off, shape (1 + r, k)."""
+        """Compute `Products` at the mode, then the reductions by functions of `LookNoise.basis`, shape (1 + r, k)."""
         by_states, of_states = self.states.load.T @ self.columns, self.states.gram[self.states.overlapping]
         at_mode = np.concatenate([(self.columns.T @ self.columns).ravel(), by_states.ravel(), of_states])
         count = self.columns.shape[1]
@@ -101,11 +101,11 @@ class LinearCampaign:
         return np.concatenate([at_mode[None], np.concatenate([flat, self.looks.basis @ lost], axis=1)])
 
     def at(self, inner: np.ndarray, later: np.ndarray | None) -> Products:
-        """Products of the columns by the inverse noise covariance of K, as `LookNoise.inner` gives it.
+        """Compute products of the columns by the inverse noise covariance of K, from `LookNoise.inner`.
 
         Args:
             inner: K, shape (n, s, 2, 2).
-            later: how much more of a creep is over, as `Creep.later` gives it.
+            later: from `Creep.later`.
         """
         count, states = self.columns.shape[1], self.states.load.shape[1]
         shares = self.looks.shares(inner)
@@ -115,8 +115,8 @@ class LinearCampaign:
         creep = self.creep
         if creep is None or later is None:
             return Products(gram, by_states, of_states)
-        # All products belong to one covariance, that of the functions that span K: only then is what is left of the
-        # columns without the states positive.
+        # All products use one covariance, that of the functions that span K: only then is the product of the columns
+        # positive definite after eliminating the states.
         spanned = (shares @ self.looks.basis).reshape(inner.shape)
         left = later[..., None, None] * (np.eye(2) - self.looks.square @ spanned)
         new = np.tensordot(np.swapaxes(left, 1, 2), self._seen, ((2, 3), (0, 1)))
@@ -129,7 +129,7 @@ class LinearCampaign:
 
 @dataclass(frozen=True)
 class Products:
-    """Of a linearised campaign's columns and states, by the inverse noise covariance of n points.
+    """Products of a linearised campaign's columns and states by the inverse noise covariance of n points.
 
     Attributes:
         gram: of the columns with each other, shape (n, c, c).
@@ -144,18 +144,18 @@ class Products:
 
 @dataclass(frozen=True)
 class Conditional:
-    """The linearised campaign at noise scales, a row for each of n points; coordinates y from the narrowest on.
+    """The linearised campaign at n points of noise scales; coordinates y from the narrowest on.
 
     Attributes:
-        weight: of squared residuals, by the pixel scale, shape (n,).
-        inner: as `LookNoise.inner` gives it.
-        elimination: of the states.
-        white: of the products of states and columns, shape (n, m, e + g + 1).
-        root: of the covariance of the errors at places, of n points.
+        weight: weight of squared residuals by the pixel scale, shape (n,).
+        inner: from `LookNoise.inner`.
+        elimination: elimination of the states.
+        white: whitened products of states and columns, shape (n, m, e + g + 1).
+        root: factor of the covariance of the errors at places, of n points.
         factor: lower triangular factor of the precision of errors at places (N(0, 1) a priori) and y together, shape
             (n, e + g, e + g).
         shift: factor' x the mean of y, shape (n, g).
-        later: as `Creep.later` gives it; None without a creep.
+        later: from `Creep.later`; None without a creep.
     """
 
     weight: np.ndarray
@@ -169,21 +169,21 @@ class Conditional:
 
     @property
     def own(self) -> np.ndarray:
-        """The factor of the precision of y alone, shape (n, g, g)."""
+        """Return the factor of the precision of y alone, shape (n, g, g)."""
         places = self.root.size
         return self.factor[:, places:, places:]
 
     def solved(self, right: np.ndarray) -> np.ndarray:
-        """Back substitution for y in own' y = right, shape (n, g): NumPy's solver would factorise anew."""
+        """Solve own' y = right for y by back substitution, shape (n, g); NumPy's solver would factorise again."""
         pairs = zip(self.own, right, strict=True)
         return np.array([lapack.dtrtrs(factor.T, each)[0] for factor, each in pairs]).reshape(right.shape)
 
     def centring(self, linear: LinearCampaign, misfit: np.ndarray, narrow: int) -> np.ndarray:
-        """The Gauss-Newton step of the narrow coordinates by which a misfit becomes least, wide ones held.
+        """Compute the Gauss-Newton step of the narrow coordinates for a misfit, wide ones fixed.
 
         Args:
             linear: the campaign.
-            misfit: residuals beyond the linear ones, shape (n, 4 k); for one point of noise scales any number of them.
+            misfit: residuals less the linear ones, shape (n, 4 k); any number of them for one point of noise scales.
             narrow: number of narrow coordinates, the first of y here.
         """
         places = self.root.size
@@ -201,7 +201,7 @@ class Conditional:
         return np.reshape(solved, (len(misfit), narrow))
 
     def means(self, wide: np.ndarray) -> np.ndarray:
-        """Of the narrow coordinates (n, k) by the linearised campaign, at y of the others (n, g - k)."""
+        """Compute means of the narrow coordinates (n, k) by the linearised campaign, given the others (n, g - k)."""
         narrow = self.shift.shape[1] - wide.shape[1]
         right = self.shift[:, :narrow] - np.einsum("nij,ni->nj", self.own[:, narrow:, :narrow], wide)
         pairs = zip(self.own[:, :narrow, :narrow], right, strict=True)

@@ -1,4 +1,4 @@
-"""What a posterior says of looks: their density given all others, and their pixels if they were taken again.
+"""Posterior predictions of looks: their density given all others, and their pixels if taken again.
 
 The unit of the log likelihood is a move: the spots between two moves share their stop errors. Pixels px; angles rad.
 """
@@ -33,22 +33,22 @@ if TYPE_CHECKING:
 
 DRIFT_COLUMNS = [INDEX[name] for name in names_of("drift_deg_per_root_hour")]
 RANK_TOLERANCE = 1e-12
-"""Share of a state's precision below which what other states leave of it is rounding, not information."""
+"""Share of a state's precision below which its conditional precision given other states is rounding."""
 
 
 class LaterSpots(eqx.Module):
-    """What later spots say about the present state x: log density -x.precision.x/2 + score.x + constant."""
+    """Likelihood of the present state x by later spots: log density -x.precision.x/2 + score.x + constant."""
 
     precision: Float[Array, "6 6"]
     score: Float[Array, "6"]
 
     def with_spot(self, row: FilterRows) -> LaterSpots:
-        """Add a spot that sees this state with unit noise."""
+        """Add a spot that observes this state with unit noise."""
         precision = jnp.sum(row.load[:, :, None] * row.load[:, None, :], axis=0)
         return LaterSpots(self.precision + precision, self.score + jnp.sum(row.load * row.residual[:, None], axis=0))
 
     def before(self, row: FilterRows) -> LaterSpots:
-        """Pass to the state of the previous spot: what was drawn or walked in between is integrated out, one by one."""
+        """Go back to the state of the previous spot, integrating out the changes in between one by one."""
         precision, score = self.precision, self.score
         for state in range(STATES):
             variance = row.variance[state]
@@ -59,10 +59,10 @@ class LaterSpots(eqx.Module):
         return LaterSpots(precision * (row.keep[:, None] * row.keep), score * row.keep)
 
     def joined(self, belief: Belief) -> Belief:
-        """Belief of the state from earlier and later spots together.
+        """Combine earlier and later spots for the state's mean and covariance.
 
-        The later spots' precision is taken apart column by column (Cholesky without roots), each column acting
-        like one more scalar look: no matrix library, whose calls would cost more than the filter.
+        The later spots' precision is decomposed column by column (Cholesky without roots), and each column is used as a
+        scalar observation. Calls of a matrix library would cost more than the filter.
         """
         mean, covariance = belief.mean, belief.covariance
         precision, score = self.precision, self.score
@@ -122,11 +122,11 @@ def _by_move(
 def move_log_density(
     z: np.ndarray, place_errors_rad: np.ndarray, space: ParameterSpace, arrays: CampaignArrays
 ) -> np.ndarray:
-    """Log density of the spots of each move given ALL other spots, parameters and gear errors (formulation 4.3).
+    """Compute the log density of each move's spots given ALL other spots, parameters and gear errors (formulation 4.3).
 
-    Stop errors persist while their axis stands, so spots are not independent given the parameters; whole moves
-    are the unit that can be left out. Backward and forward passes meet at each move (two-filter smoother: Fraser
-    and Potter, IEEE Trans. Automat. Control 14 (1969) 387). Compiled for `WINDOW` spots or a doubling of them.
+    Stop errors persist while their axis stands still, so spots are not independent given the parameters; only whole
+    moves can be left out. Backward and forward passes meet at each move (two-filter smoother: Fraser and Potter, IEEE
+    Trans. Automat. Control 14 (1969) 387). It is compiled for `WINDOW` spots or a power of two times as many.
 
     Args:
         z: coordinates of many points, shape (n, p).
@@ -147,14 +147,14 @@ def move_log_density(
 
 @dataclass(frozen=True)
 class OneWay:
-    """A way of homing: the fit under it, and which of some draws came from it, shape (n,)."""
+    """A way of homing: the fit under it, and the rows of its draws, shape (n,)."""
 
     fit: JointFit
     rows: np.ndarray
 
 
 def ways_of(posterior: Posterior, places: np.ndarray) -> tuple[OneWay, ...]:
-    """The ways of homing that draws at places (n,) of a posterior came from, each with their rows."""
+    """Group draws at indices (n,) of a posterior by their way of homing."""
     if posterior.way is None:
         return (OneWay(posterior.fit, np.arange(len(places))),)
     own = posterior.way.ravel()[places]
@@ -164,11 +164,11 @@ def ways_of(posterior: Posterior, places: np.ndarray) -> tuple[OneWay, ...]:
 
 
 def by_way(ways: Sequence[OneWay], function: Callable[[JointFit, np.ndarray], np.ndarray]) -> np.ndarray:
-    """What draws say of looks, each by the fit under the way of homing that it came from.
+    """Evaluate a function of draws, each by the fit under its way of homing.
 
     Args:
-        ways: of the draws.
-        function: of a fit and the rows of its draws, a row for each.
+        ways: ways of homing of the draws.
+        function: function of a fit and the rows of its draws, which returns a row for each.
     """
     values = np.concatenate([function(way.fit, way.rows) for way in ways])
     return values[np.argsort(np.concatenate([way.rows for way in ways]))]
@@ -178,7 +178,7 @@ PIXEL_LABELS = tuple(name.removesuffix("_px") for name in PIXELS)
 
 
 def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
-    """Log p(spots of a move | all other spots, parameters), dimensions (chain, draw, move); constants included."""
+    """Compute log p(spots of a move | all other spots, parameters), dimensions (chain, draw, move), with constants."""
     import xarray as xr
 
     fit = posterior.fit
@@ -201,13 +201,13 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
 
 
 def looks(fit: JointFit, z: np.ndarray, stop_error_rad: np.ndarray) -> np.ndarray:
-    """Noiseless pixels of all ordered spots, shape (draws, spots, 4), for coordinates (draws, p)."""
+    """Compute noiseless pixels of all ordered spots, shape (draws, spots, 4), for coordinates (draws, p)."""
     observed = in_batches(lambda z, e: observe_with_stop_errors(z, e, fit.space, fit.arrays), z, stop_error_rad)
     return observed[..., :4]
 
 
 def turned_by(arrays: CampaignArrays, place_errors_rad: np.ndarray) -> np.ndarray:
-    """What the gears' repeating errors (draws, e) do to the angles (pan, tilt) of spots, shape (draws, spots, 2)."""
+    """Compute the change of spots' angles (pan, tilt) by repeating errors (draws, e), shape (draws, spots, 2)."""
     gears = arrays.gears.without_padding()
     count, spots = len(gears.places.steps), int(arrays.count)
     axes = []
@@ -218,12 +218,12 @@ def turned_by(arrays: CampaignArrays, place_errors_rad: np.ndarray) -> np.ndarra
 
 
 def repeated_rad(fit: JointFit, place_errors_rad: np.ndarray) -> np.ndarray:
-    """`turned_by` of a fit's campaign."""
+    """Compute `turned_by` for a fit's campaign."""
     return turned_by(fit.arrays, place_errors_rad)
 
 
 def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
-    """Pixels without noise and stop errors for draws that weigh the same, shape (draws, spots, 4)."""
+    """Compute pixels without noise and stop errors for draws of equal weight, shape (draws, spots, 4)."""
     z = posterior.coordinates(draws)
     errors_rad = np.asarray(posterior.thinned(draws).place_errors_rad)
 
@@ -234,10 +234,10 @@ def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
 
 
 def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.DataArray:
-    """The same looks taken again: stop errors, home offsets, play and noise drawn anew, ranges as observed.
+    """Predict the same looks taken again: new stop errors, home offsets, play and noise, ranges as observed.
 
     Returns:
-        Dimensions (chain, draw, spot, pixel); the draws are a subset of the posterior's, by its own coordinate.
+        Dimensions (chain, draw, spot, pixel); the draws are a subset of the posterior's, with its coordinate.
     """
     import xarray as xr
 
@@ -267,10 +267,10 @@ def looks_again(
     place_errors_rad: np.ndarray,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Pixels (draws, spots, 4) of the same looks taken again at coordinates z (draws, p) with values `physical`.
+    """Predict pixels (draws, spots, 4) of the same looks taken again at z (draws, p) with values `physical`.
 
-    Gears repeat their errors at places (draws, e); stop errors, home offsets, drifts, place in the play, scatter of
-    looks and pixel noise are drawn anew; ranges are those observed.
+    Gears repeat their errors at places (draws, e). Stop errors, home offsets, drifts, positions in the play, scatter of
+    looks and pixel noise are drawn again; ranges are as observed.
     """
     count = len(ordered_spots(fit.campaign))
     arrays = jax.tree.map(lambda of_spot: np.asarray(of_spot)[:count], fit.arrays.spots)
@@ -287,7 +287,7 @@ def looks_again(
     # The zero walks from its homing on.
     error = error + home[:, segment] + total - (total - walked)[:, segment]
     error = error + repeated_rad(fit, place_errors_rad)
-    # Where the play stands is unknown after an unknown approach: Gaussian, as in the filter.
+    # The position in the play is Gaussian after an unknown approach, as in the filter.
     place = generator.standard_normal(home.shape)[:, segment]
     error = error + fit.linearised.play_sd_rad * place
     pixel_scale = physical[:, INDEX["pixel_scale"]].reshape(-1, 1, 1)

@@ -23,15 +23,15 @@ from tvsbayes.results.records import Tier
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE, TIERS
 
 MIXTURE_ROUNDS, MIXTURE_MARGIN = 16, 1.5
-"""Rounds of the most probable way of homing, at most, where fewer leave the mixture of all rough; and how many times as
-many it has as the errors of the mixture ask for."""
+"""Largest number of rounds of the most probable way of homing where the mixture of all would be rough, and the factor
+on the rounds that the errors of the mixture require."""
 DRAWING, WALKING = "drawing weighted samples", f"sampling with {CHAIN}"
 DRAWN_SECONDS, WALKED_SECONDS = 3.0, 8.0
-"""What progress predicts with."""
+"""Seconds of the stages, for the progress display."""
 
 
 def sampling_stages(tier: Tier) -> dict[str, float]:
-    """Stages of sampling, with seconds."""
+    """Return the stages of sampling with their seconds."""
     return {DRAWING: DRAWN_SECONDS, WALKING: WALKED_SECONDS if tier == CHAIN else 0.0}
 
 
@@ -51,13 +51,13 @@ def sample(
     Args:
         fit: a converged fit.
         tier: "importance" for weighted independent draws, seconds; "emcee" for a chain that starts from them, is
-            extended until it has converged, and must say the same.
+            extended until it has converged, and must agree with them.
         max_minutes: time for this call; a chain that has not converged by then is returned as it is.
-        seed: of everything random. The same fit, seed and versions give the same draws bit for bit.
+        seed: seed of all random numbers. The same fit, seed and versions give the same draws bit for bit.
         checkpoint: file in which the chain is kept as it grows (written whole or not at all), also on Ctrl-C.
         resume: continue the chain of `checkpoint`.
-        progress: told how far it is: rounds of draws towards the effective draws wanted, steps of the chain towards the
-            next look at it.
+        progress: called with the share that is done: rounds of draws towards the effective draws required, steps of the
+            chain towards its next test.
         first: called with the posterior of importance sampling before the chain starts.
 
     Returns:
@@ -66,7 +66,7 @@ def sample(
         for ArviZ of it.
 
     Raises:
-        TypeError: an argument of another kind.
+        TypeError: an argument has the wrong type.
         NotConverged: the fit has not converged, or its density is not finite around the mode.
         InputError: `resume` without a usable chain.
         ValueError: no such tier, max_minutes is not positive, or a chain's option without a chain.
@@ -91,7 +91,7 @@ def sample(
             start, chain = importance_run(fit, seed, job.at), None
         early = _mixture(start, seed)
         if early.convergence.answer == "rough" and start.sample.convergence.answer == "accepted" and chain is None:
-            # The share of a less probable way of homing asks for more draws than the most probable one needs.
+            # A mixture with less probable ways of homing needs more draws than the most probable one alone.
             start = start.extended(_rounds_of_mixture(start, early))
             early = _mixture(start, seed)
         if tier == IMPORTANCE:
@@ -106,19 +106,19 @@ def sample(
         convergence = walked.convergence
         assert isinstance(convergence, Convergence)
         agrees = convergence.agreement is None or convergence.agreement.agrees
-        # A chain knows one way of homing; where others count, the weighted draws of all have the last word.
+        # A chain has one way of homing only; where others have weight, the weighted draws of all are the result.
         return early if len(early.fit.mixture) > 1 and walked.converged and agrees else better(early, walked)
 
 
 def _rounds_of_mixture(start: ImportanceRun[Target], mixture: Posterior) -> int:
-    """How many rounds the most probable way of homing has for the errors of the mixture."""
+    """Compute the rounds of the most probable way of homing that the errors of the mixture require."""
     factor = max(error.rounds_factor for error in mixture.convergence.monte_carlo_error.values())
     rounds = start.sample.convergence.importance.rounds
     return int(np.clip(np.ceil(MIXTURE_MARGIN * factor * rounds), rounds + 1, MIXTURE_ROUNDS))
 
 
 def _mixture(start: ImportanceRun[Target], seed: int) -> Posterior:
-    """The posterior of all ways of homing, from the draws of the most probable one."""
+    """Build the posterior over all ways of homing, from the draws of the most probable one."""
     first = start.density.posterior(start.sample, seed)
     others = [run_beside(way.fit, start, seed) for way in first.fit.mixture[1:] if way.fit]
     return mixed([first, *others]) if others else first

@@ -1,9 +1,9 @@
 """Stop errors, home offsets and unknown plays of a campaign as columns, eliminated in time order for many noise scales.
 
-With G the columns, T the standard deviations of the states and unit noise, the covariance of the residuals is
-C = 1 + G T^2 G'. A state is coupled only to those alive at the same looks, so the Cholesky factor of 1 + T G'G T is
-sparse when states are eliminated in the order in which they end: the information form of the filter of
-`estimators.likelihood`, with a cost linear in the number of states. NumPy; leading axes are points of other scales.
+With G the columns, T the standard deviations of the states and unit noise, the covariance of the residuals is C = 1 + G
+T^2 G'. A state is coupled only to those present in the same looks, so the Cholesky factor of 1 + T G'G T is sparse when
+states are eliminated in the order in which they end: the information form of the filter of `estimators.likelihood`,
+with a cost linear in the number of states. NumPy; leading axes are points of other scales.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from tvsbayes.model.parameter_space import STOP_COLUMNS
 
 @dataclass(frozen=True)
 class StopStates:
-    """Every stop error, home offset and place in the play that a campaign drew, in the order in which they end.
+    """All stop errors, home offsets and positions in the play of a campaign, in the order in which they end.
 
     Attributes:
         load: d(predicted)/d(state) of the spots' components, shape (4 n, m).
-        variance: at the fit's noise scales, by direction (right, left, down, up), shape (m, 4).
-        constant: of states of another kind, shape (m,).
+        variance: variances at the fit's noise scales, by direction (right, left, down, up), shape (m, 4).
+        constant: variances of all other states, shape (m,).
     """
 
     load: np.ndarray
@@ -34,18 +34,18 @@ class StopStates:
 
     @cached_property
     def gram(self) -> np.ndarray:
-        """G'G, shape (m, m)."""
+        """Compute G'G, shape (m, m)."""
         return self.load.T @ self.load
 
     @cached_property
     def overlapping(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of the upper triangle of G'G where spots see both states, the diagonal included."""
+        """Return rows and columns of the upper triangle of G'G where both states affect a spot, with the diagonal."""
         rows, columns = np.nonzero(np.triu(self.gram))
         return rows, columns
 
     @cached_property
     def later(self) -> tuple[tuple[int, ...], ...]:
-        """For each state, the later states in its column of the Cholesky factor, fill included."""
+        """Return for each state the later states in its column of the Cholesky factor, fill-in included."""
         coupled = [set(np.flatnonzero(row[k + 1 :]) + k + 1) for k, row in enumerate(self.gram)]
         for after in coupled:
             ordered = sorted(after)
@@ -55,7 +55,7 @@ class StopStates:
 
 
 def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
-    """Unroll the filter's six states: a column for each time that one is drawn anew."""
+    """Expand the filter's six states: one column for each new draw of a state."""
     spots, states = linear.load.shape[0], linear.load.shape[2]
     mix = np.asarray(fit.arrays.spots.redraw_mix)[:spots]
     physical = np.asarray(fit.mode.physical)
@@ -83,11 +83,11 @@ def stop_states(fit: JointFit, linear: LinearSpots) -> StopStates:
 
 @dataclass(frozen=True)
 class Elimination:
-    """The Cholesky factor of 1 + T G'G T for many T, and as many noise covariances by which the products are taken.
+    """The Cholesky factor of 1 + T G'G T for n standard deviations T and noise covariances.
 
     Attributes:
         sd: standard deviations of the states in units of the noise, shape (n, m).
-        states: which states there are.
+        states: the states.
         pivot: diagonal of the factor, shape (n, m).
         below: its other columns: for each state, shape (n, later states).
     """
@@ -99,7 +99,7 @@ class Elimination:
 
     @classmethod
     def of(cls, states: StopStates, sd: np.ndarray, gram: np.ndarray) -> Elimination:
-        """The factor, column by column; `gram` is G'G of each point where states are `overlapping`, shape (n, k)."""
+        """Factorise column by column; `gram` is G'G of each point where states are `overlapping`, shape (n, k)."""
         later, (rows, columns) = states.later, states.overlapping
         scaled = np.ascontiguousarray((sd[:, rows] * sd[:, columns] * gram).T)
         diagonal = 1 + scaled[rows == columns].T
@@ -117,10 +117,10 @@ class Elimination:
         return cls(sd, states, pivot, tuple(below))
 
     def whitened(self, products: np.ndarray) -> np.ndarray:
-        """Rows B with B'B = X'G T (1 + T G'G T)^-1 T G'X.
+        """Compute B with B'B = X'G T (1 + T G'G T)^-1 T G'X.
 
         Args:
-            products: G'X, shape (m, c), or of each point its own, shape (n, m, c).
+            products: G'X, shape (m, c), or one for each point, shape (n, m, c).
 
         Returns:
             Shape (n, m, c).

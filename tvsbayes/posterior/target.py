@@ -1,6 +1,6 @@
-"""The posterior of a fit as samplers call it: the density in the map's coordinates, compiled, with all quantities.
+"""The posterior of a fit for samplers: the compiled density in the map's coordinates, with all quantities.
 
-Coordinates w of `posterior.transport`; log densities are exact, the map's Jacobian in them.
+Coordinates w of `posterior.transport`; log densities are exact and include the map's Jacobian.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ WALKERS = 64
 
 
 def walkers_for(dimension: int) -> int:
-    """Ensemble size: at least half as many walkers as dimensions, whole batches and whole groups in each half."""
+    """Choose the ensemble size: at least half as many walkers as dimensions, whole batches and groups in each half."""
     return max(WALKERS, 2 * BATCH * -(-dimension // (4 * BATCH)))
 
 
 class Target:
-    """A `Density`: NumPy in, NumPy out, NaN refused and counted.
+    """A `Density` on NumPy arrays; NaN become -inf and are counted.
 
-    Parts of its points: `z` (n, p) and `log_jacobian` (n,) where w is mapped to, `place_errors_rad` (n, e) a draw of
+    The parts of its points are `z` (n, p) and `log_jacobian` (n,) of the map, and `place_errors_rad` (n, e), draws of
     the errors at places.
     """
 
@@ -42,53 +42,53 @@ class Target:
 
     @property
     def dimension(self) -> int:
-        """Number of sampled coordinates."""
+        """Return the number of sampled coordinates."""
         return self.path.dimension
 
     @property
     def walkers(self) -> int:
-        """In an ensemble."""
+        """Return the number of walkers in an ensemble."""
         return walkers_for(self.dimension)
 
     @cached_property
     def headlines(self) -> tuple[str, ...]:
-        """What a fit is for."""
+        """Return the names of the headlines."""
         return headline_names(self.fit)
 
     @cached_property
     def fixed(self) -> frozenset[str]:
-        """Parameters that priors hold."""
+        """Return the names of parameters fixed by their priors."""
         return frozenset(self.fit.names[i] for i in np.flatnonzero(~self.fit.free))
 
     @cached_property
     def log_constant(self) -> float:
-        """Of the evidence over the free parameters: likelihoods have the constants of `spot_constants`.
+        """Compute the constant of the evidence over the free parameters, `spot_constants` included.
 
-        |det root| takes the integral over w to the coordinates z, whose normal priors `likelihood.log_density` has
-        without their constants.
+        |det root| converts the integral over w to the coordinates z, whose normal priors have no constants in
+        `likelihood.log_density`.
         """
         fit = self.fit
         used = np.asarray(fit.arrays.spots.valid)[: len(ordered_spots(fit.campaign))] > 0
         constants = float(spot_constants(fit.campaign)[used].sum()) - 0.5 * self.dimension * np.log(2 * np.pi)
-        # What is held fixed has no prior to be integrated over.
+        # Fixed parameters have no prior to integrate over.
         held = 0.5 * float(np.sum(fit.z[~fit.free] ** 2))
         volume = float(np.sum(np.log(np.diag(self.path.root))))
         return float(volume + fit.log_density + constants + held)
 
     def __call__(self, w: np.ndarray) -> np.ndarray:
-        """Log density of w (n, d), relative to z's at the mode; -inf where the model has no value."""
+        """Compute the log density of w (n, d), relative to that of z at the mode; -inf where the model has no value."""
         return self.at(w, self.path.mapped(w), no_draw(len(w), self.fit.arrays)).log_target
 
     def valued(self, w: np.ndarray, generator: np.random.Generator) -> Points:
-        """The same, with draws of the errors at places."""
+        """Compute the same, with draws of the errors at places."""
         return self.at(w, self.path.mapped(w), self.place_normals(len(w), generator))
 
     def place_normals(self, count: int, generator: np.random.Generator) -> np.ndarray:
-        """What `evaluate` makes draws of the errors at places from."""
+        """Draw the normal numbers from which `evaluate` draws the errors at places."""
         return generator.standard_normal((count, 2 * self.fit.arrays.gears.filled))
 
     def at(self, w: np.ndarray, mapped: Mapped, normal: np.ndarray) -> Points:
-        """Of points that are mapped already, with draws of the errors from standard normal numbers (n, e)."""
+        """Evaluate mapped points, with draws of the errors from standard normal numbers (n, e)."""
         evaluated = evaluate(mapped.z, normal, self.fit.space, self.fit.arrays)
         value, errors_rad = evaluated.log_density, evaluated.place_errors_rad
         invalid = np.isnan(value)
@@ -98,20 +98,20 @@ class Target:
         return Points(w, log_target, parts)
 
     def log_density(self, points: Points) -> np.ndarray:
-        """In z, shape (n,)."""
+        """Return the log density in z, shape (n,)."""
         return points.log_target + self.fit.log_density - points.parts["log_jacobian"]
 
     def quantities(self, points: Points) -> Draws:
-        """Parameters and headlines."""
+        """Compute parameters and headlines."""
         derived = derived_of(self.fit, points.parts["z"][None], points.parts["place_errors_rad"][None])
         return Draws(derived, self.fit.space.mechanism)
 
     def first_proposal(self) -> Independence:
-        """Standard normal but for heavy and coupled coordinates."""
+        """Build a proposal that is standard normal except in heavy and coupled coordinates."""
         return first_proposal(self, self.dimension, self.path.heavy, self.path.coupled)
 
     def posterior(self, sample: Sample, seed: int) -> Posterior:
-        """What was sampled, by the names of the contract; `seed` of everything random."""
+        """Build the posterior from a sample; `seed` is that of all random numbers."""
         shape = sample.weights.shape
         z, density = sample.points.parts["z"].reshape(*shape, -1), self.log_density(sample.points).reshape(shape)
         assert isinstance(sample.quantities, Draws)

@@ -1,12 +1,11 @@
-"""The map that makes the posterior nearly normal, so that proposals need no knowledge of its ridges.
+"""The map to coordinates in which the posterior is nearly normal, so that proposals need not follow its ridges.
 
-Three layers: z, the prior-normal coordinates of the model; y, whitened by the Laplace covariance; w, in which draws are
-made. Noise scales widen and turn what they limit (a stop sd its ratio, the backlash and their sums), and so does the
-time constant of a creep: in w everything else is measured from the mean and by the covariance that the linearised
-campaign has at these scales of the draw.
-Wide directions (laser tilt, lens distortion) bend the ridges on which the narrow ones (extrinsics, ratios) lie: at
-every draw of the noise scales and the wide coordinates the narrow ones are centred by Gauss-Newton steps from the
-residuals that the model has there. NumPy outside the compiled functions.
+It has three layers: z, the prior-normal coordinates of the model; y, whitened by the Laplace covariance; w, in which
+draws are made. Mean and covariance of other parameters depend on the noise scales (as of ratio and backlash on a stop
+sd) and on the time constant of a creep. In w all others are therefore relative to their conditional mean and covariance
+given these scales, by the linearised campaign. The ridges of narrow directions (extrinsics, ratios) are curved along
+wide ones (laser tilt, lens distortion). For every draw of the noise scales and wide coordinates, Gauss-Newton steps
+from the model's residuals centre the narrow ones. NumPy outside the compiled functions.
 """
 
 from __future__ import annotations
@@ -46,34 +45,34 @@ GEAR_SCALES = np.array(
         )
     ]
 )
-"""Coordinates of what the covariance of the errors at places depends on."""
+"""Coordinates on which the covariance of the errors at places depends."""
 DRIFT_COLUMNS = np.array([INDEX[name] for name in names_of("drift_deg_per_root_hour")])
 CREEP_COLUMNS = np.array([INDEX[name] for name in names_of("creep_deg")])
 WALK_STEPS = 128
-"""Steps of a drift between two homings, at most; it is linear within each."""
+"""Largest number of steps of a drift between two homings; it is linear within each."""
 WALK_INFORMATION = 1.0
-"""What the spots must say of a term of a drift that is one sd larger than at the mode, in prior precisions of the term:
-where a term that they see is left out, the rest of the map takes the drift for something else, such as a creep."""
+"""Least information of the spots on a term of a drift whose sd is one sd larger than at the mode, in prior precisions
+of the term. If an informed term is left out, other coordinates of the map absorb it, such as a creep."""
 LEAST_SCALE = 1e-6
-"""Of a noise scale over that at the mode: what is smaller moves nothing."""
+"""Least ratio of a noise scale to that at the mode: smaller ones have no effect."""
 FAR_ABOVE = 1e200
-"""A last diagonal element that keeps a matrix positive definite whatever stands in its row; nothing reads its root."""
+"""Last diagonal element that makes a matrix positive definite for any last row; its root is not used."""
 FAR_SD, FAR_PIXELS = 4.0, 4.0
-"""How far the map follows scatter of looks: sds of its prior, and pixel variance at the mode over that of a draw."""
+"""Limits of the map for the scatter of looks: sds of its prior, and pixel variance at the mode over that of a draw."""
 BLOCK_ROWS = 64
-"""Points that are mapped at a time: their matrices stay in the processor's cache."""
+"""Points mapped together: their matrices fit into the processor's cache."""
 CENTRINGS = 1
-"""Gauss-Newton steps of the narrow coordinates at every draw: a second one takes nothing more off the weights."""
+"""Gauss-Newton steps of the narrow coordinates at every draw: a second one does not improve the weights."""
 BEND_STEP = 2.0
-"""Step of second differences in posterior sds: they should hold over +-2 sd, not only at the mode. A move as
-long as the play bends the residuals by a kink, whose second difference grows as the step gets shorter."""
+"""Step of second differences in posterior sds: they should hold over +-2 sd, not only at the mode. A move as long as
+the play makes a kink in the residuals, whose second difference grows as the step gets shorter."""
 SCALE_NAMES = (*NOISE_NAMES, *BLOCKS["creep_minutes"])
-"""What everything else is conditioned on: scales of the noise, and the time constant of a creep, by whose size it moves
-the spots far from linearly."""
+"""Coordinates on which all others are conditioned: noise scales, and the time constant of a creep, in which the spots
+are strongly nonlinear."""
 HEAVY_NAMES = (*SCALE_NAMES, *BLOCKS["backlash_deg"], "extrinsics.rotation_rad.y", "mirror_offset_mm")
-"""Coordinates whose tails are heavier than normal: those that few stops tell (a walker stood still for 155 steps at 3.7
-sd of a stop sd), and the tilt of the frames with the mirrors' offset. Each of them is always proposed from a t of its
-own."""
+"""Coordinates whose tails are heavier than normal: those that few stops determine (a walker did not move for 155 steps
+at 3.7 sd of a stop sd), and the tilt of the frames with the mirrors' offset. Each is always proposed from a table and a
+t of its own."""
 
 
 @dataclass(frozen=True)
@@ -85,15 +84,15 @@ class Mapped:
 
     @classmethod
     def joined(cls, parts: Sequence[Mapped]) -> Mapped:
-        """One after the other."""
+        """Concatenate parts."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
 @dataclass(frozen=True)
 class Centred:
-    """Narrow coordinates y given the others: y = centre + turn^-1 (y by the linearised campaign - mean).
+    """Narrow coordinates y given the others: y = centre + turn^-1 (linear y - mean).
 
-    Shapes (n, k), (n, k) and (n, k, k).
+    The linear y is that of the linearised campaign. Shapes (n, k), (n, k) and (n, k, k).
     """
 
     mean: np.ndarray
@@ -102,7 +101,7 @@ class Centred:
 
 
 def by_width(covariance: np.ndarray) -> np.ndarray:
-    """Order of the coordinates in which each has the largest variance left by those before it."""
+    """Order the coordinates so that each has the largest conditional variance given those before it."""
     rest = covariance.copy()
     order: list[int] = []
     for _ in range(len(covariance)):
@@ -124,29 +123,29 @@ class Transport:
 
     Attributes:
         mode: z at w = 0, shape (p,).
-        free: columns of z that are sampled, (d,): noise scales, then all others, the widest conditional sd first.
-        root: lower-triangular factor of their covariance in that order, of noise coordinates and others apart, whose
-            mean at other scales follows from the residuals, shape (d, d).
+        free: sampled columns of z, (d,): noise scales, then all others, the widest conditional sd first.
+        root: lower-triangular factor of their covariance in that order, separately for noise coordinates and others,
+            whose mean at other scales follows from the residuals, shape (d, d).
         noise: number q of noise coordinates.
-        narrow: number of the last coordinates that are centred anew at every draw.
-        slope: ln of the noise scales over those at the mode, by w of the noise coordinates, shape (q, q); of
-            half-normal scales, whose logarithm is no linear function, the step of z instead.
+        narrow: number of the last coordinates, which are centred at every draw.
+        slope: derivative of ln of the noise scales by w of the noise coordinates, shape (q, q); of half-normal scales,
+            whose logarithm is not linear, the step of z instead.
         half: which noise scales are half-normal, shape (q,).
         pixels: 1 at the noise coordinate that scales all pixels, shape (q,).
         scatter: 1 at the noise coordinates that are the scatter of looks (pan, tilt), shape (2, q).
-        linear: the campaign at the mode.
-        residuals: of the model, for centring.
-        bend: how the slopes of the narrow coordinates change with all others, as these move away from the mode: by
-            bend' y their parts along each other grow, shape (g, narrow, narrow).
-        place_angle_rad, place_on_tilt: of places, as `gear_processes.place_blocks` takes them; their transmission
-            errors and plays are the first of the e errors, terms of the drifts the others.
+        linear: the campaign linearised at the mode.
+        residuals: residuals of the model, for centring.
+        bend: change of the slopes of the narrow coordinates with all others, `turn` = 1 + bend' y, shape (g, narrow,
+            narrow).
+        place_angle_rad, place_on_tilt: places, as arguments of `gear_processes.place_blocks`; their transmission errors
+            and plays are the first of the e errors, followed by the terms of the drifts.
         drift_axis: 1 at the axis (pan, tilt) whose drift is the sd of each of those terms, shape (terms, 2).
-        drift_scale: of the drifts at the mode, rad h^(-1/2), shape (2,).
-        drift_noise: which noise coordinate each of them is, shape (2, q).
+        drift_scale: sd of the drifts at the mode, rad h^(-1/2), shape (2,).
+        drift_noise: 1 at the noise coordinate of each of them, shape (2, q).
         gear_scale: values of `GEAR_SCALES` at the mode, in the units of their names, shape (12,).
-        gear_noise: which noise coordinate each of them is, shape (12, q).
+        gear_noise: 1 at the noise coordinate of each of them, shape (12, q).
         creep_noise: 1 at the noise coordinate that is the time constant of a creep, shape (q,).
-        period_deg: of the gears, shape (2, 3).
+        period_deg: periods of the gears' errors, shape (2, 3).
     """
 
     mode: np.ndarray
@@ -173,25 +172,25 @@ class Transport:
 
     @property
     def dimension(self) -> int:
-        """Number of sampled coordinates."""
+        """Return the number of sampled coordinates."""
         return len(self.free)
 
     @property
     def heavy(self) -> np.ndarray:
-        """Coordinates of `HEAVY_NAMES`, shape (d,)."""
+        """Mark the coordinates of `HEAVY_NAMES`, shape (d,)."""
         return np.isin(np.array(NAMES)[self.free], HEAVY_NAMES)
 
     @property
     def coupled(self) -> np.ndarray:
-        """Coordinates of what bends the beam's way through the positioner, shape (d,).
+        """Mark the coordinates of the optics, shape (d,).
 
-        They are wide: where several of them are far out together the target lies beside the proposal.
+        They are wide: where several of them are far out together, the proposal fits the target badly.
         """
         return np.isin(np.array(NAMES)[self.free], OPTICS_NAMES)
 
     @cached_property
     def plays(self) -> tuple[int, ...]:
-        """Places in y, noise coordinates not counted, of backlashes that are not narrow."""
+        """Return the positions in y, without noise coordinates, of backlashes that are not narrow."""
         wide = np.array(NAMES)[self.free[self.noise : self.dimension - self.narrow]]
         return tuple(np.flatnonzero(np.isin(wide, BLOCKS["backlash_deg"])))
 
@@ -199,7 +198,7 @@ class Transport:
         return HalfNormal(float(self.mode[self.free[self.noise + place]]))
 
     def from_whitened(self, y: np.ndarray) -> np.ndarray:
-        """From y (n, d) to z (n, p): linear, but for a backlash, whose degrees are linear in y and never below zero."""
+        """Map y (n, d) to z (n, p): linear, except for a backlash, whose degrees are linear and never negative."""
         step = y @ self.root.T
         for place in self.plays:
             column = self.noise + place
@@ -209,7 +208,7 @@ class Transport:
         return z
 
     def to_whitened(self, z: np.ndarray) -> np.ndarray:
-        """From z (n, p) to y (n, d)."""
+        """Map z (n, p) to y (n, d)."""
         step = (z - self.mode)[:, self.free]
         for place in self.plays:
             column = self.noise + place
@@ -217,12 +216,12 @@ class Transport:
         return np.linalg.solve(self.root, step.T).T
 
     def _log_bend(self, z: np.ndarray) -> np.ndarray:
-        """Ln |dz/dy| at z (n, p), relative to the mode, shape (n,)."""
+        """Compute ln |dz/dy| at z (n, p), relative to the mode, shape (n,)."""
         columns = self.free[self.noise + np.array(self.plays, dtype=int)]
         return np.log(half_normal_slope(self.mode[columns]) / half_normal_slope(z[:, columns])).sum(axis=1)
 
     def _bounds(self, place: int, given: Conditional, y: np.ndarray) -> np.ndarray:
-        """Where a backlash is zero, in its coordinate w less the mean's shift, given y (n, g) of the wider ones."""
+        """Compute the bound at zero backlash, in its coordinate w less the mean's shift, given the wider y (n, g)."""
         row = self.root[self.noise + place, self.noise :]
         least = (self._play_at_mode(place).least - y[:, :place] @ row[:place]) / row[place]
         factor = given.own[:, ::-1, ::-1][:, :, place]
@@ -230,7 +229,7 @@ class Transport:
         return others + least * factor[:, place] - given.shift[:, ::-1][:, place]
 
     def _log_scale(self, noise: np.ndarray) -> np.ndarray:
-        """Ln of the noise scales over those at the mode, at noise coordinates (n, q)."""
+        """Compute ln of the noise scales over those at the mode, at noise coordinates (n, q)."""
         step = noise @ self.slope.T
         at = self.mode[self.free[: self.noise]]
         z = np.minimum(np.where(self.half, at + step, 0.0), FARTHEST_SD)
@@ -238,7 +237,7 @@ class Transport:
         return np.where(self.half, np.log(np.maximum(ratio, LEAST_SCALE)), step)
 
     def _place_roots(self, log_scale: np.ndarray) -> BlockRoot:
-        """Factors of the covariance of errors at places, then of the terms of drifts, at ln of noise scales (n, q)."""
+        """Compute factors of the covariance of errors at places, then of drift terms, at ln of noise scales (n, q)."""
         values = np.zeros((len(log_scale), len(NAMES)))
         values[:, GEAR_SCALES] = self.gear_scale * np.exp(log_scale @ self.gear_noise.T)
         scales, valid = scales_at(values, self.period_deg), np.ones(len(self.place_on_tilt), dtype=bool)
@@ -248,10 +247,10 @@ class Transport:
         return BlockRoot((*errors.blocks, terms))
 
     def _conditional(self, noise: np.ndarray, score_at_mode: np.ndarray) -> Conditional:
-        """What the linearised campaign and the prior say of y at noise coordinates (n, q), slopes from one at the mode.
+        """Compute the distribution of y given noise coordinates (n, q), by the linearised campaign and the prior.
 
-        The factor of the precision of errors at places and y together has the slope as a last row: its parts of y are
-        the factor and the forward solution that are wanted, the errors integrated out (Schur complement).
+        The precision of errors at places and y has the slope as an additional last row. The parts of y in its factor
+        are the required factor and forward solution, the errors integrated out (Schur complement).
         """
         linear, log_scale = self.linear, self._log_scale(noise)
         weight = np.exp(-2 * log_scale @ self.pixels)
@@ -264,7 +263,7 @@ class Transport:
         white = elimination.whitened(products.by_states)
         whole = weight[:, None, None] * (products.gram - np.swapaxes(white, 1, 2) @ white)
         root = self._place_roots(log_scale)
-        # Errors at places in units of their prior sds: their covariance may be as good as singular.
+        # Errors at places are in units of their prior sds, since their covariance may be nearly singular.
         whole[:, places:, :places] = np.swapaxes(root.transposed_times(whole[:, :places, places:]), 1, 2)
         whole[:, :places, :places] = root.congruent(whole[:, :places, :places])
         diagonal = np.arange(places)
@@ -280,7 +279,7 @@ class Transport:
 
     @cached_property
     def _score_at_mode(self) -> np.ndarray:
-        """What is left of the score there that stays: of the likelihood by other ways than the residuals."""
+        """Compute the constant part of the score at the mode: that of the likelihood not through the residuals."""
         given = self._conditional(np.zeros((1, self.noise)), np.zeros(len(self.linear.prior)))
         score = np.zeros(len(self.linear.prior))
         for place in self.plays:
@@ -288,14 +287,14 @@ class Transport:
         return given.own[0] @ given.shift[0] - score[::-1]
 
     def conditional(self, noise: np.ndarray) -> Conditional:
-        """The normal density of y at noise coordinates (n, q), its mean at the mode where the scales are those.
+        """Compute the normal density of y at noise coordinates (n, q), with its mean at the mode for the mode's scales.
 
-        That of a backlash is cut where it is zero: its mean lies elsewhere.
+        That of a backlash is truncated at zero, so its mean differs.
         """
         return self._conditional(noise, self._score_at_mode)
 
     def _centred(self, noise: np.ndarray, wide: np.ndarray, given: Conditional) -> Centred:
-        """The narrow coordinates given noise coordinates (n, q) and y of the wide ones (n, g - k)."""
+        """Centre the narrow coordinates given noise coordinates (n, q) and y of the wide ones (n, g - k)."""
         mean, linear = given.means(wide[:, ::-1])[:, ::-1], self.linear
         centre, still = mean, self.free[: self.noise][self.creep_noise == 0]
         for _ in range(CENTRINGS):
@@ -312,7 +311,7 @@ class Transport:
         return Centred(mean, centre, turn)
 
     def mapped(self, w: np.ndarray) -> Mapped:
-        """From w (n, d) to z with the Jacobian; noise coordinates are the same in w and y."""
+        """Map w (n, d) to z with the Jacobian; noise coordinates are the same in w and y."""
         return Mapped.joined([self._mapped(block) for block in np.split(w, range(BLOCK_ROWS, len(w), BLOCK_ROWS))])
 
     def _mapped(self, w: np.ndarray) -> Mapped:
@@ -336,7 +335,7 @@ class Transport:
         return Mapped(z, log_jacobian + self._log_bend(z))
 
     def to_w(self, z: np.ndarray) -> np.ndarray:
-        """From z (n, p) to w (n, d); the inverse of `mapped` on the sampled columns."""
+        """Map z (n, p) to w (n, d), the inverse of `mapped` on the sampled columns."""
         y = self.to_whitened(z)
         noise, narrow = y[:, : self.noise], self.dimension - self.narrow
         given = self.conditional(noise)
@@ -350,14 +349,14 @@ class Transport:
 
 
 def curvatures(path: Transport) -> np.ndarray:
-    """Second differences of the residuals along all pairs of coordinates, shape (g, g, g).
+    """Compute Gauss-Newton steps of the residuals' second differences along all pairs of coordinates, shape (g, g, g).
 
-    The bend of the residuals along two coordinates is another residual: what a Gauss-Newton step makes of it says how
-    far the best values of all coordinates move, by the product of the two.
+    The second difference along two coordinates is a residual. Its Gauss-Newton step is the shift of the optimum of all
+    coordinates, per product of the two.
     """
     count, whole = len(path.linear.prior), np.zeros((1, path.noise))
     steps = BEND_STEP * np.eye(count)
-    # Degrees of a play are linear, and below zero there are none.
+    # A play is linear in degrees, and cannot be negative.
     steps[list(path.plays)] = 0.0
 
     def curvature(y: np.ndarray) -> np.ndarray:
@@ -376,17 +375,17 @@ def curvatures(path: Transport) -> np.ndarray:
 
 
 def centred_count(moved: np.ndarray) -> int:
-    """How many of the last coordinates are centred anew at every draw: so many that least is left of `curvatures`.
+    """Choose the number of last coordinates to centre at every draw, so that the least remains of `curvatures`.
 
-    Centring takes away what the others do to a coordinate, alone or by a product with it. What coordinates that are
-    centred do to each other stays, and so does whatever moves a wide one. A coordinate along which the ridge of the
-    narrower ones is bent is therefore better wide, however well it is known: they follow it then.
+    Centring removes the effect of the others on a coordinate, alone or in a product with it. Effects of centred
+    coordinates on each other remain, and so do all on wide ones. A coordinate along which the ridge of narrower ones is
+    curved is therefore better wide, however well it is determined: the others are then centred given it.
 
     Args:
-        moved: by `curvatures`, shape (g, g, g).
+        moved: from `curvatures`, shape (g, g, g).
 
     Returns:
-        The number for which the sum of the variances of what stays, in posterior variances, is least.
+        The number with the least sum of remaining variances, in posterior variances.
     """
     count = len(moved)
     # Variances of products of standard normal numbers: 1, and of half a square 1/2.
@@ -398,11 +397,11 @@ def centred_count(moved: np.ndarray) -> int:
 
 @dataclass(frozen=True)
 class Walks:
-    """Drifts of the zeros as terms of unit prior variance that the spots see.
+    """Drifts of the zeros as terms of unit prior variance.
 
     Attributes:
         columns: d(predicted)/d(term) of a drift of 1 rad h^(-1/2), shape (4 n, terms).
-        axis: as in `Transport`.
+        axis: as `drift_axis` in `Transport`.
     """
 
     columns: np.ndarray
@@ -410,10 +409,10 @@ class Walks:
 
 
 def walks(fit: JointFit, stops: StopStates) -> Walks:
-    """Of the axes whose drift is estimated, anew after every homing.
+    """Build the terms of estimated drifts, separately after every homing.
 
-    A random walk is the sum of its steps from look to look. Rotated to where the spots, their stop errors eliminated,
-    see the terms apart, few of them count.
+    A random walk is the sum of its steps from look to look. After rotation to the eigenvectors of the spots'
+    information, with stop errors eliminated, few terms are needed.
     """
     slope = np.asarray(fit.linearised.slope)
     spots = jax.tree.map(lambda x: np.asarray(x)[: len(slope)], fit.arrays.spots)
@@ -441,13 +440,13 @@ def walks(fit: JointFit, stops: StopStates) -> Walks:
 
 
 def creep(fit: JointFit, by_y: np.ndarray, errors: int, looks: LookNoise) -> Creep | None:
-    """Of zeros whose creep's time constant is estimated.
+    """Build the creep of the zeros where its time constant is estimated, else None.
 
     Args:
         fit: converged.
-        by_y: the coordinates z of how far each zero creeps by y, shape (2, g).
-        errors: at places and of drifts, columns before those of y.
-        looks: all of them.
+        by_y: d(z)/dy of the total creep of each zero, shape (2, g).
+        errors: number of columns of errors at places and drifts, before those of y.
+        looks: noise of all looks.
     """
     minutes = INDEX["creep_minutes"]
     if not fit.free[minutes]:
@@ -461,7 +460,7 @@ def creep(fit: JointFit, by_y: np.ndarray, errors: int, looks: LookNoise) -> Cre
 
 
 def look_noise(fit: JointFit) -> LookNoise:
-    """Of the looks of a fit, as far as its prior of their scatter goes."""
+    """Build the noise of a fit's looks, up to a scatter that its prior allows."""
     slope, held = np.asarray(fit.linearised.slope), ~fit.free[SCATTER_COLUMNS]
     variance_rad2 = np.radians(np.asarray(fit.mode.physical)[SCATTER_COLUMNS]) ** 2
     at = np.where(held, FAR_SD, fit.z[SCATTER_COLUMNS])
@@ -470,7 +469,7 @@ def look_noise(fit: JointFit) -> LookNoise:
 
 
 def transport(fit: JointFit) -> Transport:
-    """The map at the mode of a converged fit."""
+    """Build the map at the mode of a converged fit."""
     by_noise = np.isin(NAMES, SCALE_NAMES)
     others = np.flatnonzero(fit.free & ~by_noise)
     covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
@@ -479,7 +478,7 @@ def transport(fit: JointFit) -> Transport:
     moved = curvatures(straight)
     plain = np.setdiff1d(np.arange(len(others)), straight.plays)
     narrow = centred_count(moved[np.ix_(plain, plain, plain)])
-    # A play is never centred: its degrees are linear as they are.
+    # A play is never centred, as it is linear in degrees.
     last = plain[len(plain) - narrow :]
     turned = np.concatenate([np.setdiff1d(np.arange(len(others)), last), last])
     order = order[turned]
@@ -494,9 +493,9 @@ def transport(fit: JointFit) -> Transport:
 
 
 def transport_beside(fit: JointFit, path: Transport) -> Transport:
-    """The map of another way of homing: coordinates in the order of a known map, centred and bent as there.
+    """Build the map of another way of homing, with order, centring and curvature of a known map.
 
-    What a proposal has learnt there of w holds here, and no second differences are asked for.
+    A proposal fitted in w there is valid here, and no second differences are needed.
     """
     others = path.free[path.noise :]
     covariance = np.linalg.inv(np.eye(len(others)) + fit.information.fisher[np.ix_(others, others)])
@@ -504,18 +503,18 @@ def transport_beside(fit: JointFit, path: Transport) -> Transport:
 
 
 def uncentred(fit: JointFit, others: np.ndarray, wide: np.ndarray) -> Transport:
-    """The map at the mode of a converged fit, no coordinate centred.
+    """Build the map at the mode of a converged fit, with no coordinate centred.
 
     Args:
         fit: converged.
-        others: coordinates of z that are sampled, noise scales left out, in the order of y, shape (g,).
+        others: sampled coordinates of z except noise scales, in the order of y, shape (g,).
         wide: lower triangular factor of their covariance, shape (g, g).
     """
     linear = linear_spots(fit.linearised, fit.arrays, -np.asarray(fit.linearised.residual_jacobian))
     names = np.array(NAMES)
     free = np.flatnonzero(fit.free)
     scales = np.isin(names[free], SCALE_NAMES)
-    # What several scales share comes first: given it, they have little to do with each other.
+    # The scatter of looks comes first: given it, the other scales are nearly independent.
     noise = free[scales]
     noise = noise[np.argsort(~np.isin(names[noise], names_of("look_scatter_deg")), kind="stable")]
     of_noise = np.linalg.cholesky(fit.covariance[np.ix_(noise, noise)])
