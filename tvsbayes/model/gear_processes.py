@@ -115,7 +115,7 @@ def _joined(parts: list[Any], axis: int) -> Any:
 
 
 def _roots(scales: GearScales, rows: Callable[[Any], Any], angle_rad: Any, together: Any, xp: ModuleType) -> BlockRoot:
-    """Transmission errors, then plays, a block each; `rows` gives a number of an axis to the rows of its places."""
+    """Compute factors of transmission errors and plays, a block each; `rows` spreads an axis' number over places."""
     size, distance = angle_rad.shape[-1], angle_rad[..., :, None] - angle_rad[..., None, :]
     amplitudes, periods = (
         [rows(x[..., k]) for k in range(PERIODS_MAX)] for x in (scales.amplitude_rad, scales.period_rad)

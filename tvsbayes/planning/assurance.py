@@ -1,4 +1,4 @@
-"""Assurance of a design: the probability that its fit, over drawn instruments, reports the target as met.
+"""Assurance of a design: the probability over drawn instruments that its fit reports the target as met.
 
 An instrument is drawn from `[truth]` of the rig file, or from the posterior of a campaign. Values in the target's unit.
 """
@@ -40,19 +40,19 @@ def judged_z(
     knowledge: Knowledge,
     noise: np.ndarray,
 ) -> np.ndarray:
-    """Coordinates at which fits evaluate their uncertainty: the true ones, with estimated noise scales.
+    """Compute the coordinates at which fits evaluate their uncertainty: the true ones, with estimated noise scales.
 
-    A standard deviation is known from n stops to 1 / sqrt(2 n): the log of each scale has the expected information
-    2 sum (s^2 m / (1 + s^2 m))^2 over the stops of its direction, m the information of the pixels on one stop, less the
-    share used by the geometry; its estimate is the weighted mean of prior and truth, with scatter. A sampled fit
-    averages its variance over the scale: E s^2 of a log-normal, not s^2 of its median.
+    n stops determine a standard deviation to 1 / sqrt(2 n). The log of each scale has the expected information 2 sum
+    (s^2 m / (1 + s^2 m))^2 over the stops of its direction, m the information of the pixels on one stop, less the share
+    used by the geometry. Its estimate is the weighted mean of prior and truth, with scatter. A sampled fit averages its
+    variance over the scale: E s^2 of a log-normal, not s^2 of its median.
 
     Args:
-        instruments: the true ones, n of them.
-        seen: expectation of m looks for each, shapes (n, m, ...).
-        side: sides of these, shape (m, 2).
+        instruments: n true instruments.
+        seen: expectation of m looks for each instrument, shapes (n, m, ...).
+        side: sides of these looks, shape (m, 2).
         picks: numbers of the looks taken, repeats allowed, shape (k,).
-        covariance: of coordinates and errors of gears after the looks, shape (n, p + e, p + e).
+        covariance: covariance of coordinates and errors of gears after the looks, shape (n, p + e, p + e).
         knowledge: before the looks.
         noise: standard normal numbers in the order of `SCALES`, shape (n, 5).
 
@@ -89,7 +89,7 @@ def judged_z(
 
 
 def instrument_gears(knowledge: Knowledge, physical: np.ndarray) -> GearPlaces:
-    """The places of the gears of an instrument: before any data with its own scales of errors.
+    """Return the places of the gears of an instrument; before any data they have its own scales of errors.
 
     A fit averages its variance over the scales; on average over instruments it reports the same as with known scales.
     After data the scales count as known.
@@ -117,29 +117,29 @@ class Family:
     aperture: bool
 
     def looks(self, experiments: int) -> Looks:
-        """Looks of n experiments."""
+        """Return the looks of n experiments."""
         return self.candidates.looks[self.picks[: LOOKS_PER_EXPERIMENT * experiments]]
 
     def arranged(self, experiments: int) -> LookPlan:
-        """Their plan."""
+        """Arrange these looks as a plan."""
         return arrange(self.looks(experiments), self.knowledge.sheets, self.candidates.overshoot)
 
     @property
     def largest(self) -> int:
-        """Experiments of the largest design."""
+        """Return the number of experiments of the largest design."""
         return len(self.picks) // LOOKS_PER_EXPERIMENT
 
 
 @dataclass(frozen=True)
 class _VisibleInstruments:
-    """Instruments of a block that can make the looks of a family, their expectations, and the target's sensitivity.
+    """Instruments of a block that can make looks of a family, their expectations, and the target's sensitivity.
 
     Attributes:
-        rows: numbers of those that see any look and reach the target's point, n of them.
+        rows: numbers of the n instruments that see any look and reach the target's point.
         instruments: these.
         seen: expectations, shapes (n, looks, ...).
-        gradient: of the target, shape (n, q, p + e); for lines by place, summed for each design, (n, c + 1, q, p + e).
-        own_variance: of the target in addition, shape (n, q).
+        gradient: gradient of the target, shape (n, q, p + e); for lines by place, to be summed, (n, c + 1, q, p + e).
+        own_variance: additional variance of the target, shape (n, q).
     """
 
     rows: np.ndarray
@@ -168,11 +168,11 @@ class Assurance:
         self._values: dict[int, np.ndarray] = {}
 
     def of(self, family: Family) -> Assurance:
-        """The same instruments with other designs."""
+        """Return the assurance of other designs for the same instruments."""
         return Assurance(family, self.target, self.instruments, self.seed)
 
     def values(self, sizes: Sequence[int], advance: Advance = unshown) -> dict[int, np.ndarray]:
-        """Reported uncertainty of the target at each truth, shape (draws,), by number of experiments."""
+        """Compute the reported uncertainty of the target at each truth, shape (draws,), by number of experiments."""
         draws, block_size = len(self.instruments), max(1, self.PAIRS // len(self.looks))
         designs = {n: self.family.arranged(n) for n in sizes if n not in self._values}
         values_by_size = {n: np.full(draws, np.inf) for n in designs}
@@ -185,7 +185,7 @@ class Assurance:
         return {n: self._values[n] for n in sizes}
 
     def met_share(self, experiments: int) -> float:
-        """Share of the truths whose fit of n experiments reports the target as met."""
+        """Compute the share of truths whose fit of n experiments reports the target as met."""
         return float(np.mean(self.values([experiments])[experiments] <= self.target.limit))
 
     def _evaluate(self, first: int, end: int) -> _VisibleInstruments:
@@ -208,7 +208,7 @@ class Assurance:
         return _VisibleInstruments(first + visible, block[visible], expectation[visible], gradient, own_variance)
 
     def _target_at(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray, gears: GearPlaces) -> Sensitivity:
-        """Sensitivity of the target at an instrument; for lines by place (leading axis c + 1).
+        """Compute the sensitivity of the target at an instrument; for lines by place (leading axis c + 1).
 
         Raises:
             InputError: no beam reaches the target's point.
@@ -218,7 +218,7 @@ class Assurance:
         return sensitivity(self.target, z, space, self.family.knowledge.rig.table, pose_rad, gears)
 
     def _reported_values(self, scene: _VisibleInstruments, experiments: int, design: LookPlan) -> np.ndarray:
-        """Reported uncertainty for the instruments of a block, shape (n,)."""
+        """Compute the reported uncertainty for the instruments of a block, shape (n,)."""
         knowledge, picks = self.family.knowledge, self.index[: LOOKS_PER_EXPERIMENT * experiments]
         context = design.path, knowledge.space, knowledge.after_data, design.warm_minutes(knowledge.rig)
 
@@ -233,7 +233,7 @@ class Assurance:
         return self._sensitivity_of(scene, picks).values(covariance_judged, self.target.factor)
 
     def _sensitivity_of(self, scene: _VisibleInstruments, picks: np.ndarray) -> Sensitivity:
-        """Sensitivity of the target for a design: ratios along the lines through the visible looks."""
+        """Compute the sensitivity of the target for a design: ratios along the lines through the visible looks."""
         if not self._of_lines:
             return Sensitivity(scene.gradient, {"at the point": scene.own_variance})
         gears, rows = self.family.knowledge.gears, list(self.target.indices)
@@ -242,10 +242,11 @@ class Assurance:
         return Sensitivity(np.einsum("nqi,niqp->nqp", weights, scene.gradient))
 
     def rescaled(self, seen: Seen, instruments: Instruments, z: np.ndarray) -> Seen:
-        """The looks (n, m) whitened with noise scales of other coordinates (n, p) and the same scatter of looks.
+        """Whiten looks (n, m) again with the noise scales of other coordinates (n, p) and the same scatter of looks.
 
-        Rows and slope J are in units of pixels and scatter of looks D together: J D J^T of I is the scatter's part, the
-        rest scales with the pixel scale s. With stop errors S the covariance is s^2 (I - J D J^T) + J (D + S) J^T.
+        Rows and slope J are in units of the noise of pixels and scatter of looks D together. J D J^T is the scatter's
+        part of I; the other part scales with the pixel scale s. With stop errors S the covariance is s^2 (I - J D J^T)
+        + J (D + S) J^T.
         """
         u, true = np.asarray(self.family.knowledge.space.u)[SCALES], instruments.value[:, SCALES]
         old_sd, new_sd = (true * np.exp(u * point[:, SCALES]) for point in (instruments.z, z))

@@ -1,4 +1,4 @@
-"""Looks that the rig can make: within its limits, on its sheets, in both images. Counters in steps."""
+"""Looks that the rig can make: within its limits, on its sheets, visible in both images. Counters in steps."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ VISIBILITY_DRAWS = 24
 VISIBLE_SHARE = 0.95
 """Share of draws of the instrument in which a candidate must be in both images."""
 REACH_DEG = 60.0
-"""Mirror angles beyond this are no candidates: a sheet is seen at grazing incidence there."""
+"""Largest mirror angle of candidates: beyond it the beam meets a sheet at grazing incidence."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Candidates:
     """All looks that a search may choose from.
 
     Attributes:
-        looks: candidates.
+        looks: the candidates.
         overshoot: run-up (pan, tilt), steps.
         limits: lowest and highest counter of (pan, tilt), shape (2, 2).
         turned: whether a look lies a full turn of pan away, shape (m,).
@@ -50,17 +50,17 @@ class Candidates:
 
 BACKLASH_COLUMNS = [INDEX[f"backlash_deg.{axis}"] for axis in AXES]
 RUN_UP_STOPS = 4.0
-"""Sds of a stop in addition to the play: the stop before the run-up deviates by more once in 30 000."""
+"""Sds of a stop added to the play: the stop before the run-up deviates by more once in 30 000 runs."""
 RUN_UP_MARGIN = 1.5
 """Factor for the uncertainty of play and scatter: a longer run-up costs seconds, remaining play a look."""
 
 
 def run_up_steps(physical: np.ndarray, play_axes_deg: np.ndarray) -> np.ndarray:
-    """Run-up (pan, tilt) that takes up a play and a few stop errors, with a margin.
+    """Compute the run-up (pan, tilt) that takes up a play and a few stop errors, with a margin.
 
     Args:
         physical: parameters in the units of their names, shape (p,): ratios and scatter of stops.
-        play_axes_deg: the play of (pan, tilt) that is to be taken up.
+        play_axes_deg: play of (pan, tilt) to be taken up.
     """
     result = []
     for (axis, sides), play_deg in zip(SENSES.items(), play_axes_deg, strict=True):
@@ -71,7 +71,7 @@ def run_up_steps(physical: np.ndarray, play_axes_deg: np.ndarray) -> np.ndarray:
 
 
 def overshoot_steps(knowledge: Knowledge) -> np.ndarray:
-    """Run-up (pan, tilt) that takes up the play in 99 % of expected instruments."""
+    """Compute the run-up (pan, tilt) that takes up the play in 99 % of expected instruments."""
     draws = draws_of(knowledge, 200, np.random.default_rng(17))
     physical = np.stack([physical_at(z, knowledge.space).value for z in draws])
     play_deg = np.quantile(physical[:, BACKLASH_COLUMNS], 0.99, axis=0)
@@ -87,7 +87,7 @@ class Positions:
 
     @classmethod
     def grid(cls, window: np.ndarray, counts: tuple[int, int], sheets: int) -> Positions:
-        """Even levels of (pan, tilt) over a window (2, 2) of lowest and highest counters, on every sheet."""
+        """Build a regular grid of (pan, tilt) over a window (2, 2) of lowest and highest counters, on every sheet."""
         levels = [np.unique(np.linspace(low, high, n).round()) for (low, high), n in zip(window, counts, strict=True)]
         pan, tilt, sheet = np.meshgrid(*levels, np.arange(sheets), indexing="ij")
         return cls(np.stack([pan.ravel(), tilt.ravel()], 1).astype(int), sheet.ravel())
@@ -96,18 +96,18 @@ class Positions:
         return Positions(self.steps[chosen], self.sheet[chosen])
 
     def with_turns(self, pan_turns: Sequence[int]) -> Positions:
-        """The positions, and the same shifted by turns of pan, steps."""
+        """Append the positions shifted by turns of pan, steps."""
         shifted = [self.steps, *(self.steps + np.array([turn, 0]) for turn in pan_turns)]
         return Positions(np.concatenate(shifted), np.tile(self.sheet, len(shifted)))
 
     def visible(self, knowledge: Knowledge, points: np.ndarray) -> np.ndarray:
-        """Share of instruments at points (n, p) whose images both show the spot, shape (m,)."""
+        """Compute the share of instruments at points (n, p) whose images both show the spot, shape (m,)."""
         arrays = LookArrays(Looks(self.steps, np.ones_like(self.steps), self.sheet), knowledge, False)
         return arrays.in_images(points).mean(axis=0)
 
 
 def from_all_sides(positions: Positions, limits: np.ndarray, overshoot: np.ndarray) -> Looks:
-    """Positions from all four sides whose run-up stays inside the limits (2, 2)."""
+    """Build looks at positions from all four sides whose run-up is inside the limits (2, 2)."""
     parts = []
     for side in itertools.product((1, -1), repeat=2):
         start = positions.steps - np.array(side) * overshoot
@@ -127,7 +127,7 @@ class CounterRange:
 
 
 def counter_range(stated: CounterLimits, widest: Mapping[str, tuple[int, int]]) -> CounterRange:
-    """The limits of the rig file, else `widest`."""
+    """Return the limits of the rig file, else `widest`."""
     by_axis = stated.within(widest)
     steps = np.array([by_axis[axis] for axis in AXES])
     if not stated.unstated:
@@ -141,7 +141,7 @@ def counter_range(stated: CounterLimits, widest: Mapping[str, tuple[int, int]]) 
 
 
 def _box_in_view(knowledge: Knowledge, limits: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """Lowest and highest counter of (pan, tilt) in view of both cameras at the most probable instrument, (2, 2)."""
+    """Find the range of counters (pan, tilt) in view of both cameras at the most probable instrument, (2, 2)."""
     reach = REACH_DEG / np.abs(ratio)
     window = np.stack([np.maximum(limits[:, 0], -reach), np.minimum(limits[:, 1], reach)], axis=1)
     coarse = Positions.grid(window, (COARSE_PAN, COARSE_TILT), len(knowledge.sheets))
@@ -159,14 +159,14 @@ def _box_in_view(knowledge: Knowledge, limits: np.ndarray, ratio: np.ndarray) ->
 
 @dataclass(frozen=True)
 class _InView:
-    """Positions that drawn instruments see, and notes on excluded ones."""
+    """Positions visible to drawn instruments, and notes on excluded ones."""
 
     positions: Positions
     notes: tuple[str, ...]
 
 
 def _visible_positions(knowledge: Knowledge, box: np.ndarray, turns: Sequence[int], half_turn: float) -> _InView:
-    """Positions of a box (2, 2) and full turns away from it that `VISIBLE_SHARE` of drawn instruments see."""
+    """Find positions of a box (2, 2) and full turns away visible to `VISIBLE_SHARE` of drawn instruments."""
     positions = Positions.grid(box, (PAN_LEVELS, TILT_LEVELS), len(knowledge.sheets)).with_turns(turns)
     share = positions.visible(knowledge, draws_of(knowledge, VISIBILITY_DRAWS, np.random.default_rng(23)))
     visible = share >= VISIBLE_SHARE
@@ -188,7 +188,7 @@ def _visible_positions(knowledge: Knowledge, box: np.ndarray, turns: Sequence[in
 
 
 def candidates(knowledge: Knowledge) -> Candidates:
-    """Looks on a grid within images and motor limits, on every sheet, from both sides of both axes.
+    """Build looks on a grid within images and motor limits, on every sheet, from both sides of both axes.
 
     Where the limits allow, the same beams a full turn of pan away are candidates too; counters never wrap. A candidate
     must be in both images in `VISIBLE_SHARE` of drawn instruments: a full turn only once the ratio is known.

@@ -20,7 +20,7 @@ class Instruments:
 
     Attributes:
         z: coordinates, shape (n, p).
-        value: of their spaces, shape (n, rig): parameters fixed by the priors are at their true values.
+        value: `value` of their spaces, shape (n, rig): parameters fixed by the priors are at their true values.
         physical: values in the units of `NAMES`, shape (n, p).
         common: the rest of their spaces.
     """
@@ -32,7 +32,7 @@ class Instruments:
 
     @classmethod
     def at(cls, z: np.ndarray, value: np.ndarray, common: ParameterSpace) -> Instruments:
-        """Points with coordinates (n, p) in spaces that differ by `value` (n, rig)."""
+        """Build points with coordinates (n, p) in spaces that differ by `value` (n, rig)."""
         instruments = cls(z, value, np.empty_like(z), common)
         physical = [physical_at(point, instruments.space_of(row)).value for row, point in enumerate(z)]
         return replace(instruments, physical=np.array(physical).reshape(z.shape))
@@ -44,12 +44,12 @@ class Instruments:
         return Instruments(self.z[chosen], self.value[chosen], self.physical[chosen], self.common)
 
     def space_of(self, row: int) -> ParameterSpace:
-        """The space of one instrument's coordinates."""
+        """Return the space of one instrument's coordinates."""
         return replace(self.common, value=placed(self.value[row]))
 
 
 def instruments_in(knowledge: Knowledge, truths: Sequence[Truth]) -> Instruments:
-    """Coordinates of rigs under the ANALYSIS priors; parameters fixed by these are at their true values."""
+    """Convert rigs to coordinates under the ANALYSIS priors; parameters fixed by these are at their true values."""
     space = knowledge.space
     names = knowledge.rig.table.mechanism.rig_names
     truth_values = np.array([[truth.parameters[name] for name in names] for truth in truths]).reshape(-1, len(names))
@@ -60,13 +60,13 @@ def instruments_in(knowledge: Knowledge, truths: Sequence[Truth]) -> Instruments
 
 
 def draws_of(knowledge: Knowledge, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Coordinates of possible instruments, shape (count, p)."""
+    """Draw coordinates of possible instruments, shape (count, p)."""
     root = np.linalg.cholesky(knowledge.covariance[:PARAMETERS, :PARAMETERS])
     return knowledge.z + generator.standard_normal((count, PARAMETERS)) @ root.T
 
 
 def draw_instruments(knowledge: Knowledge, count: int, seed: int) -> Instruments:
-    """Instruments from `[truth]` of the rig file (the design prior), or from the posterior where there are data."""
+    """Draw instruments from `[truth]` of the rig file (the design prior), or from the posterior of a campaign."""
     generator = random_stream(seed, Stream.INSTRUMENTS)
     if knowledge.after_data:
         z = draws_of(knowledge, count, generator)

@@ -2,8 +2,8 @@
 
 The model predicts the looks; the information of the priors (or of a fit) plus J^T C^-1 J of all looks gives the
 covariance that a fit will report. `information_of` evaluates any plan move by move, by the filter of the likelihood:
-shared stops, home offsets and unknown play as in a fit. Counters in steps, mm, rad; coordinates z have the prior
-N(0, 1) each, and so have the further coordinates after them, repeated errors of the gears at regular counters.
+shared stops, home offsets and unknown play as in a fit. Counters in steps, mm, rad. Coordinates z, and after them
+repeated errors of the gears at regular counters, have the prior N(0, 1) each.
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ class Knowledge:
     """Knowledge of an instrument before the looks of a plan.
 
     Attributes:
-        rig: limits, sheets, costs; its table and stereo calibration are those of the data where there are any.
+        rig: limits, sheets, costs; table and stereo calibration are those of the data, if any.
         space: priors as arrays.
         z: most probable coordinates, shape (p,).
         precision: inverse covariance of the coordinates and of the errors at `gears`, shape (p + e, p + e).
-        after_data: there is a campaign already: a new session begins with an unknown home offset.
+        after_data: whether there is a campaign; a new session then begins with an unknown home offset.
         gears: counters with coordinates for repeated errors of the gears, see `with_gears`.
         warm_minutes: time since power-on of looks that continue a campaign.
-        errors_of_fit: estimate of those errors by a fit at its own places.
+        errors_of_fit: estimate of errors by a fit at its own places.
     """
 
     rig: Rig
@@ -85,17 +85,17 @@ class Knowledge:
 
     @property
     def size(self) -> int:
-        """Number of coordinates and errors, p + e."""
+        """Return the number of coordinates and errors, p + e."""
         return len(self.precision)
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Shape (p + e, p + e)."""
+        """Compute the covariance, shape (p + e, p + e)."""
         return np.linalg.inv(self.precision)
 
     @property
     def sheets(self) -> tuple[str, ...]:
-        """Names of the sheets, nearest first."""
+        """Return the names of the sheets, nearest first."""
         return tuple(sorted(self.rig.depths_mm, key=self.rig.depths_mm.__getitem__))
 
     @property
@@ -104,7 +104,7 @@ class Knowledge:
         return gears_vary(self.rig.table)
 
     def with_gears(self, reached: np.ndarray) -> Knowledge:
-        """The knowledge with errors of gears at regular places over counters (m, 2); unchanged for perfect gears.
+        """Add errors of gears at regular places over counters (m, 2); perfect gears add none.
 
         Ratios are then the slopes of lines over these counters.
         """
@@ -115,7 +115,7 @@ class Knowledge:
         return self.with_places(regular_places(reached, ratio, expected_scales(self.z, self.space, self.after_data)))
 
     def with_places(self, gears: GearPlaces) -> Knowledge:
-        """The knowledge with errors of gears at given places."""
+        """Add errors of gears at given places."""
         if self.errors_of_fit is not None:
             return replace(self, precision=np.linalg.inv(self.errors_of_fit.covariance_at(gears)), gears=gears)
         precision = np.eye(PARAMETERS + gears.size)
@@ -124,12 +124,12 @@ class Knowledge:
 
 
 def prior_knowledge(rig: Rig) -> Knowledge:
-    """Knowledge before any data: the priors of the rig file."""
+    """Return the knowledge before any data: the priors of the rig file."""
     return Knowledge(rig, parameter_space(rig.table, rig.stereo), np.zeros(PARAMETERS), np.eye(PARAMETERS))
 
 
 def knowledge_of(result: JointFit, rig: Rig) -> Knowledge:
-    """Knowledge after a fit: its mode without creep and its Laplace covariance; the rest is the rig file's."""
+    """Return the knowledge after a fit: its mode without creep, its Laplace covariance, and the rig file."""
     data_rig = replace(rig, table=result.campaign.rig, stereo=result.campaign.stereo)
     precision = np.linalg.inv(result.covariance)
     z = np.where(np.isin(NAMES, CREEP_NAMES), 0.0, result.z)
@@ -137,11 +137,11 @@ def knowledge_of(result: JointFit, rig: Rig) -> Knowledge:
 
 
 def fitted_errors(result: JointFit, covariance: np.ndarray) -> FittedErrors | None:
-    """Estimate of the errors at the places of a fit's looks, without padding; None for perfect gears.
+    """Return the estimated errors at the places of a fit's looks, without padding; None for perfect gears.
 
     Args:
         result: the fit.
-        covariance: of the coordinates, shape (p, p), on which the errors depend.
+        covariance: covariance of the coordinates, shape (p, p), on which the errors depend.
     """
     if not len(result.information.place_mean):
         return None
@@ -152,7 +152,7 @@ def fitted_errors(result: JointFit, covariance: np.ndarray) -> FittedErrors | No
 
 
 def fit_places(result: JointFit) -> GearPlaces:
-    """The places of a fit's looks, with the scales of its mode and its ratios along lines over its looks."""
+    """Return the places of a fit's looks, with the scales of its mode and its ratios along lines over its looks."""
     places = result.seen_line.places
     valid = np.asarray(places.valid)
     steps, on_tilt, share = (np.asarray(a)[valid] for a in (places.steps, places.on_tilt, result.seen_line.share))
@@ -196,7 +196,7 @@ def sheet_points(
     image_px: Float[Array, "4"] | None,
     look_moves: Int[Array, " looks"] | slice = slice(None),
 ) -> _SheetPoints:
-    """Looks after some of the moves, by default after each, at sheets normal to X, without errors.
+    """Compute error-free looks after some of the moves, by default after each, at sheets normal to X.
 
     Without images (head with sightings) points are directions, and all are visible.
     """
@@ -223,14 +223,14 @@ def expect(
     image_px: Float[Array, "4"] | None,
     turning: Float[Array, "looks 2 errors"],
 ) -> Expectation:
-    """Expected looks on sheets at given depths X, linearised and whitened by the filter in time order.
+    """Compute expected looks on sheets at given depths X, linearised and whitened by the filter in time order.
 
     Args:
         z: coordinates.
         space: priors.
         arrays: moves and looks; pixels and points are not read.
         depth_mm: X of each look's sheet in frame S.
-        image_px: largest (u, v, u, v) inside the images; None of a head with sightings.
+        image_px: largest (u, v, u, v) inside the images; None for a head with sightings.
         turning: derivative of (pan, tilt) by errors of the gears, see `GearPlaces.turning`.
 
     Returns:
@@ -265,7 +265,7 @@ def expect(
 
 
 def tangents_at(direction: Float[Array, "looks 3"]) -> Float[Array, "looks 2 3"]:
-    """Unit vectors along azimuth and elevation at directions, as `sightings.tangent_frames` for angles."""
+    """Compute unit vectors along azimuth and elevation at directions, as `sightings.tangent_frames` for angles."""
     x, y, _ = direction.T
     horizontal = jnp.maximum(jnp.hypot(x, y), 1e-9)
     azimuth_tangent = jnp.stack([-y / horizontal, x / horizontal, jnp.zeros_like(x)], axis=1)
@@ -275,8 +275,8 @@ def tangents_at(direction: Float[Array, "looks 3"]) -> Float[Array, "looks 2 3"]
 def design_arrays(
     moves: Sequence[Move], look_moves: Sequence[int], rig: Rig, *, homed_from: int, aperture: bool
 ) -> CampaignArrays:
-    """Moves and looks without pixels; segments from `homed_from` on have an unknown home offset."""
-    # Half the moves rounded up: their arrays have twice the size of those of looks.
+    """Pack moves and looks without pixels; segments from `homed_from` on have an unknown home offset."""
+    # Half the moves, rounded up: arrays of moves have twice the size of those of looks.
     count = len(look_moves)
     size = bucket(max(count, (len(moves) + 1) // 2), SMALLEST_DESIGN, DESIGN_GROWTH)
     redraw_arrays = redraws(moves, look_moves, homed_from)
@@ -305,7 +305,7 @@ def design_arrays(
 
 
 def largest_px(rig: Rig) -> np.ndarray | None:
-    """Largest (u, v, u, v) inside the images of a rig, shape (4,); None of a head with sightings."""
+    """Return the largest (u, v, u, v) inside the images of a rig, shape (4,); None for a head with sightings."""
     if rig.table.mechanism.sightings:
         return None
     return np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
@@ -319,7 +319,7 @@ def expected_information(
     space: ParameterSpace,
     turning: np.ndarray,
 ) -> Expectation:
-    """`expect` without padding, as NumPy arrays."""
+    """Compute `expect` without padding, as NumPy arrays."""
     count = len(depth_mm)
     depths = padded(depth_mm, len(arrays.spots.valid), depth_mm[-1])
     turns = padded(turning, len(arrays.spots.valid))
@@ -333,7 +333,7 @@ class PlanInformation:
 
     Attributes:
         fisher: J^T C^-1 J of all its looks, shape (p + e, p + e), without that of priors or earlier data.
-        expectation: of its looks, shape (looks, ...).
+        expectation: expectation of its looks, shape (looks, ...).
         moves: its moves.
         look_moves: move of each look.
         minutes: duration by the rig's costs.
@@ -349,12 +349,12 @@ class PlanInformation:
 
     @property
     def seen_moves(self) -> set[int]:
-        """Moves after which a look is in both images."""
+        """Return the moves after which a look is in both images."""
         return {move for move, seen in zip(self.look_moves, self.expectation.seen, strict=True) if seen}
 
 
 def plan_minutes(steps: Sequence[PlanStep], rig: Rig) -> float:
-    """Duration of a plan by `[costs]`, minutes."""
+    """Compute the duration of a plan by `[costs]`, minutes."""
     return plan_seconds(rig, steps) / 60
 
 
@@ -374,17 +374,17 @@ def information_of(
     z: np.ndarray | None = None,
     space: ParameterSpace | None = None,
 ) -> PlanInformation:
-    """Expected Fisher information of a plan, move by move as in a fit.
+    """Compute the expected Fisher information of a plan, move by move as in a fit.
 
     Args:
         steps: the plan; every target is a sheet of the rig.
         knowledge: of the instrument before the plan.
         aperture: looks also read the aperture.
         z: another point of evaluation (a drawn truth), shape (p,).
-        space: its priors, where they differ.
+        space: priors of that point, where they differ.
 
     Raises:
-        InputError: a plan that looks at nothing or places an unknown sheet.
+        InputError: the plan has no look or places an unknown sheet.
     """
     rig = knowledge.rig
     log = _logged_plan(steps, rig)

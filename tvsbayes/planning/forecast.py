@@ -1,4 +1,4 @@
-"""Forecast of the paper's four-point estimator on drawn rigs, and its own number of experiments; deg/step."""
+"""Forecast of the paper's four-point estimator on drawn rigs, and the number of experiments it needs; deg/step."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ClassicForecast:
     Attributes:
         sd: standard deviation of one experiment, shape (draws, 4).
         error: its systematic error, estimate less local ratio at the mean pose of the looks, shape (draws, 4).
-        stereo_u: uncertainty by stereo and focal scale at the first of them, common to all experiments, shape (4,).
+        stereo_u: uncertainty by stereo and focal scale at the first draw, common to all experiments, shape (4,).
     """
 
     sd: np.ndarray
@@ -42,10 +42,10 @@ CLASSIC_DRAWS = 100
 
 
 def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicForecast | None:
-    """Simulates the paper's experiments on drawn instruments without noise; None where the rig has no two sheets.
+    """Simulate the paper's experiments on drawn instruments without noise; None with fewer than two sheets.
 
-    Pixels by the twin; noise by first-order propagation of pixel noise, of the two stops of an experiment and of the
-    scatter of its looks.
+    The twin computes pixels. Noise of pixels, of the two stops of an experiment and of the scatter of its looks is
+    propagated to first order.
     """
     rig = knowledge.rig
     if len(rig.sheets_mm) < 2:
@@ -53,7 +53,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
     near, far = knowledge.sheets[0], knowledge.sheets[1]
     plan = four_point_protocol(2, targets=(near, far))
     near_mm, far_mm = rig.sheets_mm[near], rig.sheets_mm[far]
-    # A beam through two spots that its angle scatters at, e each: (away e2 - close e1) / (away - close).
+    # Error of a beam through two spots with angle errors e1, e2: (far e2 - near e1) / (far - near).
     factor = (near_mm**2 + far_mm**2) / (far_mm - near_mm) ** 2
     pixels, steps, axes, local, stops, looks, spot_sds = [], [], [], [], [], [], []
     campaign = None
@@ -63,7 +63,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         stereo = rig.stereo.with_vector(physical[len(RIG_NAMES) :])
         simulated = simulate(rig, plan, 0, Truth(with_derived({**parameters, **noise_free}), stereo))
         selection = select_experiments(simulated.campaign)
-        # The second experiment of each direction: its start is reached like those of all later ones.
+        # The second experiment of each direction, as its start is reached as in all later ones.
         second_experiments = np.flatnonzero(selection.experiments % 2 == 1)
         pose = simulated.truth.reference_pose_deg
         if len(second_experiments) < len(DIRECTIONS) or pose is None:
@@ -84,13 +84,13 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
     by_pixel = np.sum(slopes.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
     stop_variance = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]] + 2 * factor * np.array(looks)
     variance = by_pixel * np.array(spot_sds) ** 2 + stop_variance * (ratio / np.array(local) / np.array(steps)) ** 2
-    # Every direction has experiments: other draws are skipped.
+    # Every direction has experiments, since other draws were skipped.
     stereo_u = np.array([r.u_stereo_deg_per_step for r in classic(campaign).directions.values() if r is not None])
     return ClassicForecast(np.sqrt(variance), ratio - np.array(local), stereo_u)
 
 
 def classic_count(sd: float, half_width: float) -> int:
-    """Experiments of one direction for a 95 % half width: n = (t s / E)^2, t with n - 1 degrees of freedom."""
+    """Compute the experiments of one direction for a 95 % half width E: n = (t s / E)^2, t for n - 1 dof."""
     n = 2
     for _ in range(200):
         needed = max(2, math.ceil((coverage_factor(n - 1) * sd / half_width) ** 2))
@@ -108,13 +108,13 @@ class ClassicAnswer:
     """The four-point method's own number of experiments: n = (t s / E)^2 in every direction.
 
     Attributes:
-        direction: the one that needs most, or that of the target.
+        direction: direction with the largest number, or that of the target.
         sd, sd_interval95: s, deg/step: median and 95 % range, over instruments or (with data) by chi-square.
         half_width: E, deg/step.
-        experiments, experiments_interval95: n of one direction, for s and for its interval.
+        experiments, experiments_interval95: n of the direction, for s and for its interval.
         stereo_u: uncertainty common to all experiments, deg/step; no n lowers it.
         systematic, systematic_interval95: its error for the median instrument and in 95 % of them, deg/step.
-        from_data: s was measured.
+        from_data: whether s was measured.
     """
 
     direction: str
@@ -130,7 +130,7 @@ class ClassicAnswer:
 
 
 def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: Campaign | None) -> ClassicAnswer | None:
-    """N = (t s / E)^2 with the uncertainty of s: over instruments, or by chi-square where s was measured."""
+    """Compute n = (t s / E)^2 with the uncertainty of s: over instruments, or by chi-square where s was measured."""
     if forecast is None or not target.of_ratios:
         return None
     half_width = target.limit * NORMAL_95 / target.factor
@@ -162,7 +162,7 @@ def classic_answer(target: Target, forecast: ClassicForecast | None, campaign: C
 
 
 def _measured_sds(campaign: Campaign) -> dict[str, tuple[float, int]] | None:
-    """The sd s and n of each direction of a campaign with complete experiments."""
+    """Return sd s and n of each direction of a campaign with complete experiments."""
     try:
         results = classic(campaign).directions
     except TvsError:
@@ -171,7 +171,7 @@ def _measured_sds(campaign: Campaign) -> dict[str, tuple[float, int]] | None:
 
 
 def value_of_classic(forecast: ClassicForecast | None, target: Target, experiments: int) -> float | None:
-    """Median over instruments of the expected classic uncertainty: type A and stereo, combined as in the GUM."""
+    """Compute the median over instruments of the expected classic uncertainty: type A and stereo, as in the GUM."""
     per_direction = experiments / len(DIRECTIONS)
     if forecast is None or per_direction < 2 or not target.of_ratios:
         return None

@@ -1,6 +1,6 @@
 """Repeated errors of the gears as further coordinates of a plan, at regular counters that plans may use.
 
-A fit integrates these errors out at its counters; before a plan these are unknown. The errors at the regular places are
+A fit integrates these errors out at its counters, which are unknown before a plan. The errors at the regular places are
 N(0, 1) each in units of the factor of their covariance at the expected scales (formulation 3.1, 6), transmission errors
 first, then plays; errors in between follow by kriging. Counters in steps, angles in rad.
 """
@@ -32,21 +32,21 @@ from tvsbayes.model.parameter_space import ParameterSpace, physical_at
 PLACES_MAX = 12
 """Largest number of places of one axis in one window."""
 GAP_DEG = 60.0
-"""Counters of an axis with a larger gap belong to different windows: a full turn away, for instance."""
+"""Gap between counters of an axis above which they belong to different windows, such as a full turn away."""
 
 
 @dataclass(frozen=True)
 class GearPlaces(KnownPlaces):
-    """Places of both axes, and the lines whose slopes are the ratios.
+    """Places of both axes, and the lines of which the ratios are the slopes.
 
     Attributes:
-        share: of the value at each place in the slope of the line of its axis, steps^-1, shape (c,).
+        share: weight of the value at each place in the slope of the line of its axis, steps^-1, shape (c,).
     """
 
     share: np.ndarray
 
     def turning(self, steps: np.ndarray, side: np.ndarray) -> np.ndarray:
-        """Derivative of the angles (pan, tilt) of looks by the errors, rad, shape (m, 2, 2 c).
+        """Compute the derivative of the angles (pan, tilt) of looks by the errors, rad, shape (m, 2, 2 c).
 
         Args:
             steps: counters, shape (m, 2).
@@ -60,7 +60,7 @@ class GearPlaces(KnownPlaces):
         return derivative
 
     def line_through(self, steps: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Share of each place in the slope of the line of its axis through looks, as in a fit of these looks.
+        """Compute the weight of each place in the slope of its axis' line through looks, as in a fit of these looks.
 
         Args:
             steps: counters of the looks, shape (m, 2).
@@ -80,7 +80,7 @@ class GearPlaces(KnownPlaces):
         return shares
 
     def _interpolation(self, counters: np.ndarray, axis: int) -> np.ndarray:
-        """Share of the places in the counters (m,) of an axis, within their window, shape (m, c)."""
+        """Compute interpolation weights of the places for counters (m,) of an axis, within windows, shape (m, c)."""
         weights = np.zeros((len(counters), len(self.steps)))
         of_axis = self.on_tilt == (axis == 1)
         windows = windows_of(self.steps[of_axis], abs(float(np.degrees(self.ratio_rad_per_step[axis]))))
@@ -92,7 +92,7 @@ class GearPlaces(KnownPlaces):
         return weights
 
     def turning_after(self, moves: Sequence[Move], looks: Sequence[int]) -> np.ndarray:
-        """`turning` of the looks after some of the moves."""
+        """Compute `turning` of the looks after some of the moves."""
         rests = [[rests[move] for move in looks] for rests in (rests_of(moves, axis) for axis in AXES)]
         steps, side = (
             np.array([[getattr(rest, name) for rest in axis] for axis in rests]).T for name in ("steps", "sign")
@@ -100,7 +100,7 @@ class GearPlaces(KnownPlaces):
         return self.turning(steps, side)
 
     def headlines(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray) -> Headlines:
-        """Headlines at coordinates, with derivatives by coordinates and errors, shape (9, p + 2 c).
+        """Compute headlines at coordinates, with derivatives by coordinates and errors, shape (9, p + 2 c).
 
         Ratios are slopes of the lines over the places, at the pose without errors of the gears.
         """
@@ -113,16 +113,16 @@ class GearPlaces(KnownPlaces):
         )
 
     def parts(self, z: np.ndarray, space: ParameterSpace, pose_rad: np.ndarray) -> Headlines:
-        """Headlines for each single place, and last for none; `weights` sum them: arrays with a leading axis c + 1."""
+        """Compute headlines for each single place, then for none (leading axis c + 1), to be summed by `weights`."""
         places = Places(placed(self.steps), placed(self.on_tilt), placed(np.ones(len(self.steps), dtype=bool)))
         single_places = np.eye(len(self.steps) + 1, len(self.steps))
         return place_headlines(z, space, placed(pose_rad), places, placed(single_places), placed(self.root))
 
     def weights(self, share: np.ndarray) -> np.ndarray:
-        """Weights of `parts` for lines, shape (..., 9, c + 1): a slope over places is the sum of their contributions.
+        """Compute weights of `parts` for lines, shape (..., 9, c + 1): a slope is the sum of its places' contributions.
 
         Args:
-            share: of each place in the slope of the line of its axis, steps^-1, shape (..., c).
+            share: weight of each place in the slope of the line of its axis, steps^-1, shape (..., c).
         """
         of_places = np.where(LINE_AXES[:, None] == self.on_tilt, share[..., None, :], 0.0)
         of_none = ~(of_places != 0).any(axis=-1, keepdims=True)
@@ -144,7 +144,7 @@ def place_headlines(
     shares: Float[Array, "lines places"],
     root: Float[Array, "errors errors"],
 ) -> Headlines:
-    """Headlines with ratios along lines (formulation 3.2), several at once: every field has the leading axis `lines`.
+    """Compute headlines with ratios along several lines (formulation 3.2); fields have the leading axis `lines`.
 
     Derivatives are by coordinates and errors at the places.
     """
@@ -165,7 +165,7 @@ def place_headlines(
 
 
 def expected_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> GearScales:
-    """Scales of the gears' errors at coordinates; before any data root mean squares of half-normal ones.
+    """Return scales of the gears' errors at coordinates; before any data, half-normal ones by their root mean square.
 
     Sampling averages the variance over a scale, E s^2: u^2 for a half-normal.
     """
@@ -177,19 +177,19 @@ def expected_scales(z: np.ndarray, space: ParameterSpace, after_data: bool) -> G
 
 
 def windows_of(counters: np.ndarray, deg_per_step: float) -> list[np.ndarray]:
-    """Distinct counters (n,) of an axis, split at gaps above `GAP_DEG`; the largest windows, nearest to 0, first."""
+    """Split distinct counters (n,) of an axis at gaps above `GAP_DEG`; largest windows, nearest to 0, first."""
     distinct = np.unique(counters).astype(float)
     gaps = np.flatnonzero(np.diff(distinct) * deg_per_step > GAP_DEG) + 1
     return sorted(np.split(distinct, gaps), key=lambda window: (-len(window), abs(window.mean())))
 
 
 def regular_places(reached: np.ndarray, ratio_deg_per_step: np.ndarray, scales: GearScales) -> GearPlaces:
-    """Places over the counters that plans may use; a ratio is the slope of the line over its axis' first window.
+    """Build places over the counters of plans; a ratio is the slope of the line over its axis' first window.
 
     Args:
         reached: counters (pan, tilt), shape (m, 2).
         ratio_deg_per_step: mean ratios, shape (2,).
-        scales: expected.
+        scales: expected scales.
     """
     steps, on_tilt, share = [], [], []
     for axis in range(2):
@@ -211,19 +211,19 @@ class FittedErrors:
     """Estimate of the errors by a fit at its own places.
 
     Attributes:
-        places: its places.
-        covariance: of the coordinates and of the errors at these places, shape (p + e, p + e).
+        places: places of the fit.
+        covariance: covariance of the coordinates and of the errors at these places, shape (p + e, p + e).
     """
 
     places: GearPlaces
     covariance: np.ndarray
 
     def covariance_at(self, places: GearPlaces) -> np.ndarray:
-        """The covariance of the coordinates and of the errors at other places."""
+        """Compute the covariance of the coordinates and of the errors at other places."""
         size, count = len(self.places.steps), len(NAMES)
         scales = self.places.scales
         assert scales is not None, "a fit with places has scales"
-        # Correlations do not depend on the size of the errors; a zero size of play would divide by zero.
+        # Correlations do not depend on the scale of the errors; a zero scale of the play would divide by zero.
         scaled = replace(scales, play_rad=np.where(scales.play_rad > 0, scales.play_rad, 1.0))
         fitted, target = replace(self.places, scales=scaled), replace(places, scales=scaled)
         roots = np.split(target.root, 2)

@@ -1,4 +1,4 @@
-"""The floor of a target, the inputs that set it, the next looks, and the stopping rule. Values in the target's unit."""
+"""The floor of a target, the inputs that determine it, the next looks, and the stopping rule, in the target's unit."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tvsbayes.results.plan_record import Advice, Batch
 
 @dataclass(frozen=True)
 class Limit:
-    """The remaining variance of the target after very many looks.
+    """The uncertainty of the target that remains after very many looks.
 
     Attributes:
         floor: lowest value for any number of looks, in the target's unit.
-        cause: the largest share of the floor.
+        cause: the cause with the largest share of the floor.
         shares: share of every cause of the floor's variance; they add up to 1.
-        reachable: the target lies above the floor.
+        reachable: whether the target is above the floor.
         needed: the sufficient input uncertainty, in words; None where no input prevents the target.
     """
 
@@ -40,19 +40,19 @@ class Limit:
 
 MANY_TIMES = 100.0
 """Multiple of the largest design that represents any number of looks: a week. With more, the spots would calibrate the
-cameras, with trust in the model to a thousandth of a pixel."""
+cameras, if the model held to a thousandth of a pixel."""
 NEXT_LISTED = 5
 STOP_SHARE_PER_MINUTE = 1e-3
 """Measuring stops when the best next looks lower the target by less than this share a minute."""
 
 
 def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, aim: Sensitivity) -> dict[str, float]:
-    """Share of each cause in the worst quantity's variance; see `causes.causes_of`.
+    """Compute the share of each cause in the worst quantity's variance; see `causes.causes_of`.
 
     Args:
         knowledge: before the looks.
         data: information of the looks, shape (p + e, p + e).
-        noise: its part by pixel noise alone, or None not to split the looks.
+        noise: part of it by pixel noise alone, or None not to split the looks.
         aim: the target.
     """
     covariance = covariance_of(knowledge.precision + data)
@@ -81,14 +81,14 @@ def split_of(knowledge: Knowledge, data: np.ndarray, noise: np.ndarray | None, a
 
 
 def _rounded_down(value: float) -> str:
-    """A positive number to two digits, rounded down: a sufficient uncertainty stays sufficient."""
+    """Format a positive number to two digits, rounded down, so that a sufficient uncertainty stays sufficient."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
     # A number with two digits may be an ulp below them.
     return f"{unit * math.floor(value / unit + 1e-9):.2g}"
 
 
 def _requirement(table: RigTable, columns: Sequence[int], share: float) -> str:
-    """The stated u of a prior, and the required one, in words."""
+    """Write the stated u of a prior and the required one in words."""
     if len(columns) == len(NAMES) - len(RIG_NAMES):
         return f"the stereo calibration to {_rounded_down(100 * share)} % of its present uncertainty"
     prior_u = {NAMES[c]: table.priors[NAMES[c]].u for c in columns if table.priors[NAMES[c]].u > 0}
@@ -96,10 +96,10 @@ def _requirement(table: RigTable, columns: Sequence[int], share: float) -> str:
 
 
 def _needed_at_point(aim: Sensitivity, target: Target) -> str | None:
-    """The required improvement at the target's point itself, in words; None where its variance permits the target."""
+    """Write the required improvement at the target's point itself; None where its variance permits the target."""
     total = aim.own_variance
     gears = aim.own.get(GEARS_AT_POINT, np.zeros_like(total))
-    # The worst of the quantities, each with its own parts.
+    # The worst quantity, for each of these parts.
     stop, gear, worst = (target.factor * math.sqrt(max(variance)) for variance in (total - gears, gears, total))
     unit = target.unit
     if stop > target.limit:
@@ -113,12 +113,12 @@ def _needed_at_point(aim: Sensitivity, target: Target) -> str | None:
 
 
 def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: Target) -> Limit:
-    """The floor of the target for looks of this kind, and the input that would lower it.
+    """Compute the floor of the target for looks of this kind, and the input that would lower it.
 
     Args:
         knowledge: before the looks.
         data: information of the largest design, shape (p + e, p + e).
-        aim: the target's sensitivities.
+        aim: sensitivity of the target.
         target: the target.
     """
     many_looks = MANY_TIMES * data
@@ -135,7 +135,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: T
         precision = knowledge.precision.copy()
         for name, share in scaled.items():
             columns = groups[name]
-            # The precision of the prior is 1 in its coordinates; the campaign adds to it.
+            # The prior's precision is 1 in its coordinates; that of the campaign is added.
             precision[columns, columns] += share**-2 - 1
         return aim.value(covariance_of(precision + many_looks), target.factor)
 
@@ -152,7 +152,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: T
             middle = math.sqrt(low * high)
             low, high = (middle, high) if with_inputs({**scaled, name: middle}) <= target.limit else (low, middle)
         scaled[name] = low
-        # Earlier inputs that are not needed keep their uncertainty.
+        # Earlier inputs that need no improvement keep their uncertainty.
         for other in [n for n in scaled if n != name]:
             others = {n: s for n, s in scaled.items() if n != other}
             if with_inputs(others) <= target.limit:
@@ -163,7 +163,7 @@ def limit_of(knowledge: Knowledge, data: np.ndarray, aim: Sensitivity, target: T
 
 
 def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:
-    """Four looks on every sheet, chosen from all candidates and from those a full turn away, by gain per minute."""
+    """Choose four looks on every sheet from all candidates and from those a full turn away, by gain per minute."""
     search, candidates, rig, now = problem.search(), problem.candidates, problem.knowledge.rig, problem.now
     batches = []
     for number in range(len(problem.knowledge.sheets)):
@@ -180,14 +180,14 @@ def next_experiments(problem: DesignProblem) -> tuple[Batch, ...]:
 
 
 def stop_now(now: float, target: Target, limit: Limit, batches: Sequence[Batch], after_data: bool) -> Advice:
-    """The stopping rule: target met, or no useful looks.
+    """Apply the stopping rule: target met, or no useful looks.
 
     Args:
         now: the target's value before further looks.
         target: the target.
         limit: its floor.
         batches: possible next experiments, best first.
-        after_data: there is a campaign to stop.
+        after_data: whether there is a campaign to stop.
     """
     best = batches[0].gain_per_minute if batches else 0.0
     least_gain = STOP_SHARE_PER_MINUTE * now

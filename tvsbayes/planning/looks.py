@@ -1,8 +1,8 @@
 """Independent looks: the expectation of each, and the information of a design.
 
-Every look is approached anew on both axes from a known side: stop errors are independent and information adds up look
-by look. Only the length of the path remains of the history (for the contrast of the two directions), and low-rank
-updates score thousands of candidates. Counters in steps, angles in rad.
+Every look has a new approach on both axes from a known side. Stop errors are therefore independent, and information
+adds up look by look. Of the history only the length of the path matters (for the contrast of the two directions), and
+low-rank updates score thousands of candidates. Counters in steps, angles in rad.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2, Knowledge, expect,
 
 @dataclass(frozen=True)
 class Looks:
-    """Looks with a new approach on both axes each, arrays over looks.
+    """Looks, each with a new approach on both axes; arrays over looks.
 
     Attributes:
         steps: counters (pan, tilt), shape (m, 2).
@@ -69,13 +69,13 @@ class LookPlan:
 
     @cached_property
     def _legs(self) -> np.ndarray:
-        """Steps to the start of every run-up and from there to the look, shape (m, 2, 2)."""
+        """Compute steps to the start of every run-up and from there to the look, shape (m, 2, 2)."""
         waypoints = np.stack([self.via, self.goal], axis=1).reshape(-1, 2)
         return np.diff(waypoints, axis=0, prepend=[self.home]).reshape(-1, 2, 2)
 
     @property
     def path(self) -> np.ndarray:
-        """Steps travelled per axis since homing when each look (in the caller's order) is taken, shape (m, 2)."""
+        """Compute the steps per axis from the homing to each look (in the caller's order), shape (m, 2)."""
         path = np.empty_like(self.goal)
         path[self.order] = np.cumsum(np.abs(self._legs).sum(axis=1), axis=0)
         return path
@@ -87,7 +87,7 @@ class LookPlan:
         placed = np.array([now != before for now, before in zip(self.sheet, ("", *self.sheet[:-1]), strict=True)])
         taken = placed * cost["place"] + moves * cost["move"] + cost["look"]
         ends = cost["home"] + np.cumsum(taken)
-        # The time of a row is the start of its move; without a move that of the previous row.
+        # The time of a row is the start of its move; without a move it is that of the previous row.
         last = np.where(moves > 0, ends - cost["look"] - cost["move"], 0.0)
         minutes = np.empty(len(self.order))
         minutes[self.order] = np.maximum.accumulate(last) / 60
@@ -95,25 +95,25 @@ class LookPlan:
 
     @property
     def actions(self) -> dict[str, int]:
-        """Number of actions of each kind."""
+        """Count the actions of each kind."""
         moves, looks = int(self._legs.any(axis=2).sum()), len(self.order)
         places = sum(now != before for now, before in zip(self.sheet, ("", *self.sheet[:-1]), strict=True))
         return {"home": 1, "place": places, "move": moves, "look": looks}
 
     def minutes(self, rig: Rig) -> float:
-        """Duration by `[costs]`."""
+        """Compute the duration by `[costs]`, minutes."""
         return action_seconds(rig, self.actions) / 60
 
     @cached_property
     def steps(self) -> tuple[PlanStep, ...]:
-        """The plan, from its homing on."""
+        """Return the plan, from its homing on."""
         plan = PlanBuilder()
         plan.home(*self.home)
         return self._plan(plan)
 
     @cached_property
     def steps_onwards(self) -> tuple[PlanStep, ...]:
-        """The plan without homing, where the axes are at `home` already."""
+        """Return the plan without homing, where the axes are at `home` already."""
         return self._plan(PlanBuilder(at=self.home))
 
     def _plan(self, plan: PlanBuilder) -> tuple[PlanStep, ...]:
@@ -132,8 +132,8 @@ def arrange(looks: Looks, sheets: Sequence[str], overshoot: np.ndarray, home: tu
     """Order looks into a plan.
 
     Args:
-        looks: to be arranged.
-        sheets: names, in the order of `Looks.sheet`.
+        looks: looks to arrange.
+        sheets: names of the sheets, in the order of `Looks.sheet`.
         overshoot: run-up (pan, tilt) in steps that takes up all play, shape (2,).
         home: counters of the homing.
     """
@@ -149,10 +149,10 @@ class Seen:
     """Expectation of m looks, at one point of parameter space or, with a leading axis, at several.
 
     Attributes:
-        rows: shape (m, 4, p + e + 2), see `expectation.Expectation`.
-        slope: shape (m, 4, 2).
+        rows: as in `expectation.Expectation`, shape (m, 4, p + e + 2).
+        slope: as there, shape (m, 4, 2).
         seen: whether a look is in both images, shape (m,).
-        mirror_angles_rad: (pan, tilt), shape (m, 2).
+        mirror_angles_rad: mirror angles (pan, tilt), shape (m, 2).
     """
 
     rows: np.ndarray
@@ -183,17 +183,17 @@ class _Pairs(eqx.Module):
     depth_mm: Float[Array, " pairs"]
 
     def space(self, common: ParameterSpace) -> ParameterSpace:
-        """The space of one pair."""
+        """Return the space of one pair."""
         return eqx.tree_at(lambda s: s.value, common, self.value)
 
     def moves(self, warm_minutes: Float[Array, ""]) -> MoveArrays:
-        """The move of one pair: the look's counters, approached from its side as if homed there."""
+        """Return the move of one pair: the look's counters, approached from its side as if homed there."""
         steps, side = self.steps[None], self.side[None]
         return MoveArrays(steps, jnp.ones(1, dtype=bool), side, warm_minutes[None], jnp.zeros(1))
 
 
 class _Observer(eqx.Module):
-    """Settings of the observation: largest (u, v, u, v) inside the images, noise of a look, aperture, time."""
+    """Settings of looks: largest (u, v, u, v) inside the images, noise of a look, aperture, time."""
 
     image_px: Float[Array, "4"] | None
     look_sd: Float[Array, ""]
@@ -204,7 +204,7 @@ class _Observer(eqx.Module):
 
 @compiled(_PairExpectation)
 def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer) -> _PairExpectation:
-    """Expectation of every pair's look: `expect` of a plan of one look."""
+    """Compute the expectation of every pair's look: `expect` of a plan of one look."""
 
     def expectation_of(pair: _Pairs) -> _PairExpectation:
         spot = SpotArrays(
@@ -227,7 +227,7 @@ def _pair_expectation(pairs: _Pairs, space: ParameterSpace, observer: _Observer)
         gears = GearArrays(Places(jnp.zeros(0), no_places, no_places), jnp.zeros((1, 0)), jnp.zeros((1, 0)))
         count = jnp.ones((), dtype=jnp.int32)
         arrays = CampaignArrays(pair.moves(observer.warm_minutes), spot, gears, observer.azimuth_convention, count)
-        # Errors of the gears act as an offset: their columns follow from the offset's, see `at_all`.
+        # Errors of the gears act as an offset, so their columns follow from the offset's, see `at_all`.
         no_turning = jnp.zeros((1, 2, 0))
         expectation = expect(pair.z, pair.space(space), arrays, pair.depth_mm[None], observer.image_px, no_turning)
         return _PairExpectation(*(getattr(expectation, part.name)[0] for part in fields(_PairExpectation)))
@@ -239,7 +239,7 @@ LOOKS_COMPILED_SECONDS = 20.0
 
 
 def looks_wait() -> float:
-    """Expected compilation time of the first looks of a process, s."""
+    """Predict the compilation time of the first looks of a process, s."""
     return _pair_expectation.wait(LOOKS_COMPILED_SECONDS)
 
 
@@ -271,7 +271,7 @@ class LookArrays:
         self.observer = _Observer(None if image_px is None else placed(image_px), *settings)
 
     def _blocks(self, z: np.ndarray, value: np.ndarray, size: int) -> list[_Pairs]:
-        """Every instrument (n,) with every look (m,), the last block padded with its last pair."""
+        """Pair every instrument (n,) with every look (m,) in blocks, the last one padded with its last pair."""
         m, total = len(self.looks), len(z) * len(self.looks)
         blocks = []
         for start in range(0, total, size):
@@ -283,11 +283,11 @@ class LookArrays:
         return blocks
 
     def at_all(self, z: np.ndarray, value: np.ndarray, turning: np.ndarray | None = None) -> Seen:
-        """The expectation at several instruments, with a leading axis n.
+        """Compute the expectation at several instruments, with a leading axis n.
 
         Args:
             z: coordinates, shape (n, p).
-            value: of their spaces, shape (n, rig).
+            value: `value` of their spaces, shape (n, rig).
             turning: derivatives by errors of their own gears, shape (n, m, 2, e); by default those of the knowledge.
         """
         turning = self.turning if turning is None else turning
@@ -304,7 +304,7 @@ class LookArrays:
         return replace(seen, rows=np.concatenate([columns, offset @ turning, offset], axis=-1))
 
     def at(self, z: np.ndarray, space: ParameterSpace) -> Seen:
-        """The expectation at one instrument: coordinates (p,), a space that differs from the knowledge's in `value`."""
+        """Compute the expectation at one instrument, coordinates (p,); its space may have another `value`."""
         return self.at_all(z[None], np.asarray(space.value)[None])[0]
 
     def in_images(self, z: np.ndarray) -> np.ndarray:
@@ -328,17 +328,17 @@ def information_of_looks(
     homed: bool,
     warm_minutes: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Fisher information of chosen looks, shape (..., p + e, p + e); equal to `information_of` of the arranged plan.
+    """Compute the Fisher information of chosen looks, shape (..., p + e, p + e), as `information_of` their plan.
 
-    Repeats of a look differ only in their path: the product of each look is computed once.
+    Repeats of a look differ only in their path, so the product of each look is computed once.
 
     Args:
         seen: all looks, at one point or with leading axes at several.
         picks: numbers of the looks taken, repeats allowed, shape (k,).
         path: steps travelled at each look, shape (k, 2).
         space: priors, for the scale of the contrast.
-        homed: the session begins with an unknown home offset.
-        warm_minutes: since the start of the session at each look, shape (k,); None for the constant creep of `seen`.
+        homed: whether the session begins with an unknown home offset.
+        warm_minutes: time since the session's start at each look, shape (k,); None for the constant creep of `seen`.
     """
     looks, index, count = np.unique(picks, return_inverse=True, return_counts=True)
     # q = sum of k_dir dn = k n + (contrast / 2) x path: the contrast's column is the offset's, times the path.
@@ -372,7 +372,7 @@ def information_of_looks(
 
 
 def covariance_of(information: np.ndarray) -> np.ndarray:
-    """Inverse of positive definite matrices (..., p, p) whose diagonals span many orders of magnitude."""
+    """Invert positive definite matrices (..., p, p) whose diagonals span many orders of magnitude."""
     scale = 1 / np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     scales = scale[..., :, None] * scale[..., None, :]
     return np.linalg.inv(information * scales) * scales

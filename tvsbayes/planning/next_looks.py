@@ -1,6 +1,6 @@
 """The next best looks of a running session: from the present counters, first on the present sheet, without homing.
 
-What `plan --given --next` prints and `acquire --adapt` follows. Counters in steps, values in the target's unit.
+`plan --given --next` prints them and `acquire --adapt` takes them. Counters in steps, values in the target's unit.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Confirmation:
     """Effective ratios by importance sampling, by direction, deg/step.
 
     Attributes:
-        accepted: whether its weights may be used.
+        accepted: whether the weights may be used.
         deg_per_step, u_deg_per_step: means and sds.
         interval95: low and high ends.
     """
@@ -42,7 +42,7 @@ class Confirmation:
     interval95: dict[str, tuple[float, float]]
 
     def as_json(self) -> dict[str, Any]:
-        """As part of the document of `plan --given --next`."""
+        """Return this part of the document of `plan --given --next`."""
         ratios = {
             d: {"value": self.deg_per_step[d], "sd": self.u_deg_per_step[d], "interval95": list(self.interval95[d])}
             for d in DIRECTIONS
@@ -55,10 +55,10 @@ class NextLooks:
     """A few looks that continue a campaign.
 
     Attributes:
-        target: of the looks.
+        target: target of the looks.
         steps: placements, moves and looks; the first is a placement.
-        minutes: by `[costs]`, without that placement where its sheet is placed already.
-        now: the target's value by the campaign; `expected` after the looks.
+        minutes: duration by `[costs]`, without that placement where its sheet is placed already.
+        now: the target's value by the campaign; `expected`: after the looks.
         after_each: the target's value after each look, in their order.
         deg_per_step, u_deg_per_step: effective ratios of the fit by direction, and their Laplace sds.
         why: reason of the choice, in words.
@@ -77,7 +77,7 @@ class NextLooks:
     confirmed: Confirmation | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """The document of `plan --given --next`."""
+        """Return the document of `plan --given --next`."""
         ratios = {d: {"value": self.deg_per_step[d], "sd": self.u_deg_per_step[d]} for d in DIRECTIONS}
         return {
             "target": self.target.as_json(),
@@ -93,7 +93,7 @@ class NextLooks:
 
 
 def confirmation(fit: JointFit) -> Confirmation:
-    """The effective ratios of a converged fit by importance sampling: Laplace sds are too small for rough scales."""
+    """Estimate the effective ratios of a converged fit by importance sampling; Laplace sds may be too small."""
     posterior = sample(fit, IMPORTANCE)
     stats = posterior.propagate(lambda p: np.stack([p[f"effective_deg_per_step.{d}"] for d in DIRECTIONS], axis=1))
     ends = [(low, high) for low, high in stats.interval95.T.tolist()]
@@ -102,12 +102,12 @@ def confirmation(fit: JointFit) -> Confirmation:
 
 
 def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_below: float | None = None) -> NextLooks:
-    """The looks that lower a target most per minute, by the fit of the present data.
+    """Choose the looks that lower a target most per minute, by the fit of the present data.
 
     Args:
-        fit: of the campaign so far; its last segment continues.
+        fit: fit of the campaign so far; its last segment continues.
         rig: sheets, limits, costs.
-        target: to be lowered.
+        target: target to be lowered.
         count: number of looks.
         confirm_below: sample the posterior where the Laplace sd of every effective ratio is at most this, deg/step.
 
@@ -151,7 +151,7 @@ def next_looks(fit: JointFit, rig: Rig, target: Target, count: int, *, confirm_b
 
 
 def _choices(problem: DesignProblem, count: int, start: tuple[int, int]) -> list[Choice]:
-    """The best looks on every sheet and on every pair of sheets."""
+    """Choose the best looks on every sheet and on every pair of sheets."""
     search, sheet_of_look = problem.search(), problem.candidates.looks.sheet
     subsets = [s for size in (1, 2) for s in combinations(range(len(problem.knowledge.sheets)), size)]
     masks = (np.isin(sheet_of_look, subset) for subset in subsets)

@@ -1,7 +1,7 @@
-"""Faults of a plan in words, and the smallest addition that removes each.
+"""Faults of a plan in words, and the smallest addition that corrects each.
 
-Judged at the most probable instrument by the rules for fits (`stops.inseparable`, `stops.few_stops`). Counters
-in steps, u of the ratios in deg/step, minutes by the rig's `[costs]`.
+Plans are judged at the most probable instrument by the rules for fits (`stops.inseparable`, `stops.few_stops`).
+Counters in steps, u of the ratios in deg/step, minutes by the rig's `[costs]`.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ CURE_LOOKS = 24
 """Largest number of looks in an addition."""
 JUDGING, CURING = "evaluating the plan", "searching for more looks"
 JUDGED_SECONDS, EXPECT_COMPILED_SECONDS, CURED_SECONDS = 0.2, 12.0, 1.0
-"""Expected durations for the progress."""
+"""Expected durations for the progress display, s."""
 
 
 def judging_seconds() -> float:
-    """Expected duration of judging a plan, s."""
+    """Predict the duration of judging a plan, s."""
     return JUDGED_SECONDS + expect.wait(EXPECT_COMPILED_SECONDS)
 
 
 @dataclass(frozen=True)
 class PlanFault:
-    """A quantity that a plan does not determine, and the smallest addition that does.
+    """A quantity that a plan does not determine, and the smallest addition that determines it.
 
     Attributes:
         axis: pan or tilt.
@@ -70,10 +70,10 @@ class PlanCheck:
 
     Attributes:
         looks, seen: all looks, and those in both images at the most probable instrument.
-        minutes: by `[costs]`.
+        minutes: duration by `[costs]`.
         expected: u of every headline after the plan, in its unit.
         contraction: 1 - var_post / var_prior of every headline, None where the priors fix it.
-        faults: of the plan.
+        faults: faults of the plan.
         warnings: faults and further warnings, as sentences.
     """
 
@@ -86,7 +86,7 @@ class PlanCheck:
     warnings: tuple[str, ...]
 
     def as_json(self) -> dict[str, object]:
-        """The document of `check --json` for a rig with a plan."""
+        """Return the document of `check --json` for a rig with a plan."""
         names = ("looks", "seen", "minutes", "expected", "contraction")
         faults = [
             {"axis": f.axis, "text": f.text, "addition": [step_json(s) for s in f.addition], "u_deg_per_step": f.after}
@@ -106,11 +106,11 @@ class Judgement:
     prior: np.ndarray
 
     def rows(self, axis: Axis) -> list[int]:
-        """Rows of the ratio and of the backlash of an axis."""
+        """Return the rows of the ratio and of the backlash of an axis."""
         return [TARGET_ROWS[SENSES[axis][0]], TARGET_ROWS[f"backlash.{axis}"]]
 
     def exchange(self, axis: Axis) -> float:
-        """Correlation of ratio and backlash of an axis: its square is their common share of variance."""
+        """Compute the correlation of ratio and backlash of an axis; its square is their common share of variance."""
         ratio, backlash = self.rows(axis)
         c = self.covariance
         if self.prior[backlash] == 0:
@@ -118,26 +118,26 @@ class Judgement:
         return float(c[ratio, backlash] / np.sqrt(c[ratio, ratio] * c[backlash, backlash]))
 
     def u(self, axis: Axis) -> float:
-        """Uncertainty of the worse effective ratio of an axis, deg/step."""
+        """Return the uncertainty of the worse effective ratio of an axis, deg/step."""
         rows = [TARGET_ROWS[direction] for direction in SENSES[axis]]
         return float(np.sqrt(np.diag(self.covariance)[rows].max()))
 
     def contraction(self) -> np.ndarray:
-        """Contraction of every headline, shape (9,); NaN where its prior fixes it."""
+        """Compute the contraction of every headline, shape (9,); NaN where its prior fixes it."""
         variance = np.diag(self.covariance)
         return 1 - np.divide(variance, self.prior, out=np.full(len(variance), np.nan), where=self.prior > 0)
 
     def stops(self, axis: Axis) -> tuple[Stop, ...]:
-        """Stops with a visible look."""
+        """Return the stops with a visible look."""
         return observed_stops(self.information.moves, self.information.seen_moves, axis)
 
     def inseparable_text(self, axis: Axis) -> str:
-        """A sentence that ratio and backlash of the axis are not separable."""
+        """Write that ratio and backlash of the axis are not separable."""
         share = 100 * self.exchange(axis) ** 2
         return f"{axis} ratio and {axis} backlash are not well separated ({share:.0f} % of the variance is common)"
 
     def fault(self, axis: Axis) -> str | None:
-        """The fault of the axis in words: ratio or backlash not determined, or not separable; None without one."""
+        """Describe the fault of the axis: ratio or backlash not determined, or not separable; None without one."""
         ratio, backlash = self.contraction()[self.rows(axis)]
         stops = self.stops(axis)
         free = self.prior[self.rows(axis)[1]] > 0
@@ -154,7 +154,7 @@ class Judgement:
 
 
 def judge(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = False) -> Judgement:
-    """Expected headlines of a plan at the most probable instrument.
+    """Compute expected headlines of a plan at the most probable instrument.
 
     Raises:
         InputError: a plan that looks at nothing or places an unknown sheet.
@@ -169,7 +169,7 @@ def judge(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = F
 def appended(
     steps: Sequence[PlanStep], looks: Looks, knowledge: Knowledge, overshoot: np.ndarray
 ) -> tuple[PlanStep, ...]:
-    """Steps of looks appended to a plan: without homing, with a placement only where another sheet is needed."""
+    """Write looks as steps after a plan: without homing, with a placement only where another sheet is needed."""
     end = run_plan(steps, knowledge.rig)
     addition = [s for s in arrange(looks, knowledge.sheets, overshoot, end.at).steps if s.action != "home"]
     if addition and addition[0].action == "place" and addition[0].target == end.sheet:
@@ -188,7 +188,7 @@ class _Cure:
 def _cure(
     steps: Sequence[PlanStep], knowledge: Knowledge, possible: Candidates, axis: Axis, before: Judgement
 ) -> _Cure | None:
-    """Fewest looks after which the axis has no fault, on the present sheet; None if there are none."""
+    """Find the fewest looks after which the axis has no fault, on the present sheet; None if there are none."""
     expectation = LookArrays(possible.looks, knowledge, False).at(knowledge.z, knowledge.space)
     rows = before.rows(axis)
     precision = knowledge.precision + before.information.fisher
@@ -205,7 +205,7 @@ def _cure(
 
 
 def beyond_limits(limits: CounterLimits, moves: Sequence[Move]) -> list[str]:
-    """Axes beyond the limits of `[positioner]`, as sentences."""
+    """Describe axes beyond the limits of `[positioner]` in sentences."""
     faults = []
     for axis in AXES:
         counters = [getattr(move, f"{axis}_steps") for move in moves]
@@ -218,7 +218,7 @@ def beyond_limits(limits: CounterLimits, moves: Sequence[Move]) -> list[str]:
 def _fault(
     steps: Sequence[PlanStep], knowledge: Knowledge, possible: Candidates | None, plan: Judgement, axis: Axis, text: str
 ) -> PlanFault:
-    """A fault with its smallest cure, if there are candidates."""
+    """Build a fault with its smallest addition, if there are candidates."""
     before = plan.u(axis)
     if possible is None:
         return PlanFault(axis, text, (), before, None)
@@ -234,7 +234,7 @@ def _fault(
 
 
 def _candidates(knowledge: Knowledge, warnings: list[str]) -> Candidates | None:
-    """Looks that the rig can make; adds a warning where there are none."""
+    """Return the looks that the rig can make; add a warning where there are none."""
     try:
         return candidates(knowledge)
     except InputError as error:
@@ -243,7 +243,7 @@ def _candidates(knowledge: Knowledge, warnings: list[str]) -> Candidates | None:
 
 
 def _few_stops(knowledge: Knowledge, plan: Judgement) -> list[str]:
-    """Directions with too few stops for their scatter, as a sentence."""
+    """Describe directions with too few stops for their scatter in a sentence."""
     counts = few_stops(plan.information.moves, plan.information.seen_moves)
     free = np.asarray(knowledge.space.u) > 0
     counts_text = ", ".join(f"{name} {count}" for name, count in counts.items() if free[INDEX[f"stop_sd_deg.{name}"]])
@@ -251,7 +251,7 @@ def _few_stops(knowledge: Knowledge, plan: Judgement) -> list[str]:
 
 
 def _few_counters(knowledge: Knowledge, plan: Judgement) -> list[str]:
-    """Axes with too few counters to separate gear error and ratio, as sentences."""
+    """Describe axes with too few counters to separate gear error and ratio in sentences."""
     gears, notes = knowledge.gears, list[str]()
     if not gears.size:
         return notes
@@ -269,7 +269,7 @@ def _few_counters(knowledge: Knowledge, plan: Judgement) -> list[str]:
 
 
 def _with_gears(knowledge: Knowledge, steps: Sequence[PlanStep], possible: Candidates | None) -> Knowledge:
-    """The knowledge with errors of gears over the counters of the plan and of all candidates."""
+    """Add errors of gears over the counters of the plan and of all candidates."""
     log = run_plan(steps, knowledge.rig)
     looks = [log.moves[look.move] for look in log.looks]
     reached = np.array([(move.pan_steps, move.tilt_steps) for move in looks]).reshape(-1, 2)
@@ -278,7 +278,7 @@ def _with_gears(knowledge: Knowledge, steps: Sequence[PlanStep], possible: Candi
 
 
 def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = None) -> PlanCheck:
-    """Faults of a plan on a rig, in words, and the smallest addition that removes each (formulation 6).
+    """Find faults of a plan on a rig, in words, and the smallest addition that corrects each (formulation 6).
 
     Args:
         rig: priors, sheets, limits.

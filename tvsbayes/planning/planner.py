@@ -69,7 +69,7 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class Baseline:
-    """A known protocol, or the planned one, judged in the same way at the most probable instrument."""
+    """A known protocol, or the planned one, evaluated in the same way at the most probable instrument."""
 
     name: str
     spots: int
@@ -87,19 +87,19 @@ class PlanResult(Shown):
         steps: the recommended plan; empty where the target is met already.
         experiments, looks, minutes: its size.
         expected: the target's value after it at the most probable instrument; `now`: before it.
-        assurance, assurance_se: probability that its fit reports the target as met, and Monte Carlo error; None where
-            the target is met already.
-        curve: by number of experiments.
+        assurance, assurance_se: probability that its fit reports the target as met, and its Monte Carlo error; None
+            where the target is met already.
+        curve: results by number of experiments.
         n80, n95: experiments for which the assurance is 80 % and 95 %, None if none.
         limit: floor of the target.
-        shares: of the variance of the target after the plan, by cause.
+        shares: shares of the variance of the target after the plan, by cause.
         baselines: the plan and other protocols.
         next: possible next experiments, best first.
         stop: the stopping rule applied now.
         classic: the four-point method's own number of experiments, None for quantities that it does not estimate.
         met: the target is met already, or the plan meets it with an assurance of 80 %.
-        notes: on excluded looks and the reasons.
-        draws, seed, criterion: of the computation.
+        notes: sentences on excluded looks and the reasons.
+        draws, seed, criterion: settings of the computation.
     """
 
     target: Target
@@ -127,14 +127,14 @@ class PlanResult(Shown):
     criterion: str
 
     def shown(self) -> View:
-        """The curve by number of looks."""
+        """Show the curve by number of looks."""
         size = "met already" if self.assurance is None else f"{self.looks} looks in {self.minutes:.1f} minutes"
         columns = ("looks", "minutes", "classic", "joint", "chance of success")
         rows = [(LOOKS_PER_EXPERIMENT * p.experiments, p.minutes, p.classic, p.joint, p.assurance) for p in self.curve]
         return View(f"PlanResult for {self.target.text}: {size}", columns, rows)
 
     def as_json(self) -> dict[str, object]:
-        """The document of `plan --json`."""
+        """Return the document of `plan --json`."""
 
         def plain(value: object) -> object:
             if isinstance(value, float):
@@ -159,7 +159,7 @@ PLAN_DRAWS = 200
 
 
 def _baselines(knowledge: Knowledge, target: Target, aperture: bool, pose_rad: np.ndarray | None) -> list[Baseline]:
-    """The paper's protocol, its mixture of step counts and starts, and the grid, on this rig's sheets."""
+    """Evaluate the paper's protocol, its mixture of step counts and starts, and the grid, on this rig's sheets."""
     sheets = knowledge.sheets
     plans: dict[str, tuple[PlanStep, ...]] = {}
     if len(sheets) > 1:
@@ -175,7 +175,7 @@ def _baselines(knowledge: Knowledge, target: Target, aperture: bool, pose_rad: n
 def baseline_of(
     name: str, information: PlanInformation, knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None = None
 ) -> Baseline:
-    """One plan at the most probable instrument; ratios are at `pose_rad`, by default the plan's own, as in a fit."""
+    """Evaluate a plan at the most probable instrument; ratios are at `pose_rad`, by default the plan's, as in a fit."""
     pose = information.pose_rad if pose_rad is None else pose_rad
     at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, pose, knowledge.gears)
     value = at.value(covariance_of(knowledge.precision + information.fisher), target.factor)
@@ -196,14 +196,14 @@ def plan(
     seed: int = 0,
     progress: Show | None = None,
 ) -> PlanResult:
-    """Finds the cheapest plan that meets a target, with expected results, or the reason why none can (formulation 6).
+    """Find the cheapest plan that meets a target, with expected results, or the reason why none can (formulation 6).
 
     Args:
         rig: sheets, limits, costs; its priors where there is no campaign.
         target: of the plan.
         given: a fit of earlier data.
         minutes: the plan must not take longer.
-        criterion: of the search: "c" the target, "D" or "A" ratios and backlashes together.
+        criterion: criterion of the search: "c" the target, "D" or "A" ratios and backlashes together.
         aperture: looks also read the aperture.
         draws: number of instruments for the assurance.
         largest: largest number of experiments (of four looks) of a plan.
@@ -228,10 +228,10 @@ def plan(
 def _curve(
     assurance: Assurance, forecast: ClassicForecast | None, durations: Mapping[int, float], sizes: Sequence[int]
 ) -> tuple[CurvePoint, ...]:
-    """Results of up to n experiments, for each size.
+    """Compute results of up to n experiments, for each size.
 
-    Noise scales estimated from few stops make single draws jump; a row states the best of all sizes up to its own,
-    so that more experiments never appear worse. The best of several estimates is biased towards optimism.
+    Noise scales estimated from few stops make values vary from size to size. A row states the best of all sizes up to
+    its own, so that more experiments never appear worse. The best of several estimates has an optimistic bias.
     """
     target, draws = assurance.target, len(assurance.instruments)
     rows, best_value, best_share = [], math.inf, 0.0
@@ -245,7 +245,7 @@ def _curve(
 
 
 def few_looks(looks: Looks, target: Target) -> list[str]:
-    """Notes on directions with too few stops in a design for reliable intervals.
+    """Write notes on directions with too few stops in a design for reliable intervals.
 
     Every look of a design is a separate stop.
     """
@@ -261,7 +261,7 @@ def few_looks(looks: Looks, target: Target) -> list[str]:
 
 
 def design_problem(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | None, aperture: bool) -> DesignProblem:
-    """The candidates for an instrument, and a target there.
+    """Build the candidates for an instrument, and a target there.
 
     Raises:
         InputError: nothing to look at or in view; a fixed target.
@@ -285,7 +285,7 @@ def design_problem(knowledge: Knowledge, target: Target, pose_rad: np.ndarray | 
 
 
 def _durations(family: Family, scope: Scope) -> dict[int, float]:
-    """Minutes by number of experiments, for those that the time allows."""
+    """Compute minutes by number of experiments, for those that the time allows."""
     durations = {n: family.arranged(n).minutes(family.knowledge.rig) for n in range(1, scope.largest + 1)}
     allowed = {n: minutes for n, minutes in durations.items() if scope.minutes is None or minutes <= scope.minutes}
     if not allowed:
@@ -329,7 +329,7 @@ COUNTING, EXCHANGING = "counting experiments", "exchanging looks"
 
 
 def _stages(draws: int) -> dict[str, float]:
-    """Stages of planning, with expected seconds."""
+    """Return the stages of planning with expected seconds."""
     return {
         LOOKING: 0.1 + looks_wait(),
         CHOOSING: 2.5,
@@ -350,7 +350,7 @@ def plan_from(
     seed: int,
     progress: Show | None = None,
 ) -> PlanResult:
-    """`plan` from knowledge; effective ratios are at `pose_rad`, by default in the middle of the candidates."""
+    """Plan from knowledge; effective ratios are at `pose_rad`, by default in the middle of the candidates."""
     with Job(_stages(draws), progress) as job:
         return _plan_in_stages(knowledge, target, campaign, pose_rad, scope, draws, seed, job)
 
@@ -417,7 +417,7 @@ def _plan_in_stages(
 
 
 def _pixel_part(expectation: Expectation) -> np.ndarray:
-    """Contribution of pixel noise alone to the information, (C^-1 J)^T (C^-1 J), shape (p + e, p + e)."""
+    """Compute the part of pixel noise alone in the information, (C^-1 J)^T (C^-1 J), shape (p + e, p + e)."""
     spots = LinearSpots(
         residual=np.zeros(expectation.jacobian.shape[:2]),
         load=np.asarray(expectation.load),

@@ -25,13 +25,13 @@ from tvsbayes.progress import Advance, unshown
 
 CRITERIA = ("c", "D", "A")
 EXCHANGED_SHARE = 0.6
-"""Share of the exchanges in the expected time of `refine`, for the progress."""
+"""Share of the exchanges in the expected time of `refine`, for the progress display."""
 MEAN_WEIGHT = 0.05
-"""Weight of the mean variance in addition to the worst: looks that improve only other quantities count a little."""
+"""Weight of the mean variance added to the worst, so that looks that improve only other quantities count a little."""
 
 
 def scores(variances: np.ndarray, reference: np.ndarray, criterion: str) -> np.ndarray:
-    """Scores that a search lowers, from covariances (..., q, q) of the quantities; shape (...).
+    """Compute scores to minimise from covariances (..., q, q) of the quantities; shape (...).
 
     "c": the worst variance and `MEAN_WEIGHT` of the mean; "D": log-determinant; "A": mean variance in units of
     `reference` (q,).
@@ -46,12 +46,12 @@ def scores(variances: np.ndarray, reference: np.ndarray, criterion: str) -> np.n
 
 @dataclass(frozen=True)
 class _Prospects:
-    """Covariances of every candidate as the next look; the last axis counts the candidates.
+    """Covariances with every candidate as the next look; the last axis is over candidates.
 
     Attributes:
-        covariance: of the columns, before it, shape (P, P).
-        inner: of its residuals, noise included, shape (4, 4, m).
-        moved: of its residuals with the quantities, shape (4, q, m).
+        covariance: covariance of the columns before that look, shape (P, P).
+        inner: covariance of its residuals, noise included, shape (4, 4, m).
+        moved: covariance of its residuals with the quantities, shape (4, q, m).
     """
 
     covariance: np.ndarray
@@ -59,9 +59,9 @@ class _Prospects:
     moved: np.ndarray
 
     def gain(self) -> np.ndarray:
-        """Reduction of the covariance of the quantities, moved^T inner^-1 moved, shape (q, q, m).
+        """Compute the reduction of the covariance of the quantities, moved^T inner^-1 moved, shape (q, q, m).
 
-        By elimination for all candidates at once: calls of LAPACK for each would be slower.
+        Elimination runs over all candidates at once; LAPACK calls for each would be slower.
         """
         inner, moved = self.inner.copy(), self.moved.copy()
         gain = np.zeros((moved.shape[1], *moved.shape[1:]))
@@ -74,7 +74,7 @@ class _Prospects:
 
 
 RECOMPUTED_AFTER = 16
-"""Number of added looks before prospects are recomputed: rounding of differences accumulates."""
+"""Number of added looks after which prospects are recomputed, as rounding errors of differences accumulate."""
 
 
 @dataclass
@@ -82,12 +82,12 @@ class Search:
     """Greedy choice and exchange of looks by low-rank updates of one covariance.
 
     Attributes:
-        rows: of all candidates, shape (m, 4, P); an excluded candidate has zero rows.
-        precision: before any look, shape (P, P).
+        rows: rows of all candidates, shape (m, 4, P); an excluded candidate has zero rows.
+        precision: precision before any look, shape (P, P).
         gradient: d(quantity)/d(column), shape (q, P).
-        variance: of the quantities in addition, shape (q,).
+        variance: additional variance of the quantities, shape (q,).
         criterion: see `scores`.
-        numbers: of the candidates, ascending, shape (m,); by default their indices in `rows`.
+        numbers: numbers of the candidates, ascending, shape (m,); by default their indices in `rows`.
 
     A quantity fixed by the priors has no variance and is omitted.
     """
@@ -105,7 +105,7 @@ class Search:
         self.gradient, self.variance = self.gradient[uncertain], self.variance[uncertain]
         self.reference = np.diag(self._quantities(self.covariance)).copy()
         self.numbers = np.arange(len(self.rows)) if self.numbers is None else self.numbers
-        # Candidates last, as in prospects: large products need no copy.
+        # Candidates are last, as in prospects, so that large products need no copy.
         self.columns = np.ascontiguousarray(self.rows.transpose(2, 1, 0)).reshape(self.rows.shape[2], -1)
 
     def _quantities(self, covariance: np.ndarray) -> np.ndarray:
@@ -123,11 +123,11 @@ class Search:
         return scores(np.moveaxis(remaining, -1, 0), self.reference, self.criterion)
 
     def after_one_more(self, covariance: np.ndarray) -> np.ndarray:
-        """Score after adding each candidate, shape (m,): C - B^T K^-1 B, K of four components."""
+        """Compute the score after adding each candidate, shape (m,): C - B^T K^-1 B, K of four components."""
         return self._scores(self._prospects(covariance))
 
     def _with(self, prospects: _Prospects, index: int) -> _Prospects:
-        """Prospects after one more look: a low-rank update of every covariance."""
+        """Compute prospects after one more look, by a low-rank update of every covariance."""
         row, (components, _, count) = self.rows[index], prospects.inner.shape
         root = np.linalg.cholesky(np.eye(components) + row @ prospects.covariance @ row.T)
         update = np.linalg.solve(root, row @ prospects.covariance)
@@ -139,7 +139,7 @@ class Search:
         return _Prospects(0.5 * (covariance + covariance.T), inner, moved)
 
     def greedy(self, count: int) -> list[int]:
-        """The best look, then the best in addition, and so on; empty where there is no candidate."""
+        """Choose the best look, then the best addition, and so on; empty where there is no candidate."""
         prospects, places = self._prospects(self.covariance), []
         for count_added in range(1, count + 1 if len(self.rows) else 1):
             places.append(int(np.argmin(self._scores(prospects))))
@@ -155,20 +155,20 @@ class Search:
         return np.searchsorted(np.asarray(self.numbers), list(picks)).tolist()
 
     def among(self, allowed: np.ndarray) -> Search:
-        """The same search among some candidates, mask of shape (m,)."""
+        """Restrict the search to some candidates, mask of shape (m,)."""
         return replace(self, rows=self.rows[allowed], numbers=np.asarray(self.numbers)[allowed])
 
     def _after(self, places: Sequence[int]) -> np.ndarray:
-        """Covariance of the columns after a design."""
+        """Compute the covariance of the columns after a design."""
         rows = self.rows[list(places)].reshape(-1, self.rows.shape[2])
         return covariance_of(self.precision + rows.T @ rows)
 
     def value(self, picks: Sequence[int]) -> float:
-        """Score of a design."""
+        """Compute the score of a design."""
         return float(scores(self._quantities(self._after(self._places(picks))), self.reference, self.criterion))
 
     def exchange(self, picks: Sequence[int], passes: int = 2, worth: float = 1e-3) -> list[int]:
-        """Replaces looks one by one while this lowers the score by more than a share `worth` (Fedorov's exchange)."""
+        """Replace looks one by one while this lowers the score by more than a share `worth` (Fedorov's exchange)."""
         places = self._places(picks)
         for _ in range(passes):
             changed = False
@@ -185,11 +185,11 @@ class Search:
 LADDER = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 """Numbers of experiments of the curve; 96 is the paper's."""
 CONTRAST_PRECISION = 1e8
-"""Precision of the contrasts during a search: their information depends on the path, which is unknown then."""
+"""Precision of the contrasts during a search: their information depends on the path, which is not yet known."""
 
 
 def search_rows(seen: Seen, knowledge: Knowledge) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and precision with known contrasts; home offsets are two more columns after data."""
+    """Return rows and precision with known contrasts; after data home offsets are two more columns."""
     precision = knowledge.precision.copy()
     precision[CONTRAST_COLUMNS, CONTRAST_COLUMNS] += CONTRAST_PRECISION
     if not knowledge.after_data:
@@ -222,7 +222,7 @@ SUBSETS_MAX = 40
 
 
 def _sheet_subsets(count: int) -> list[tuple[int, ...]]:
-    """Choices of sheets: all subsets of one to three, the farthest apart first."""
+    """List choices of sheets: all subsets of one to three, the farthest apart first."""
     subsets = [s for size in (1, 2, 3) for s in combinations(range(count), size)]
     return sorted(subsets, key=lambda s: (s[0] - s[-1], len(s)))[:SUBSETS_MAX]
 
@@ -234,7 +234,7 @@ class Choice:
     Attributes:
         picks: numbers of the candidates, shape (k,).
         design: their plan.
-        value: of the target after it, in the target's unit.
+        value: value of the target after it, in the target's unit.
     """
 
     picks: np.ndarray
@@ -247,12 +247,12 @@ class DesignProblem:
     """The candidates, their expectation at the most probable instrument, and the target there.
 
     Attributes:
-        knowledge: with the errors of the gears at places over all candidates.
+        knowledge: knowledge with the errors of the gears at places over all candidates.
         candidates: looks to choose from.
         seen: their expectation.
-        target: of the design.
+        target: target of the design.
         at_centre: sensitivity of the target.
-        warming: the zeros creep during the looks; False where `seen` includes the creep of the whole session.
+        warming: whether the zeros creep during the looks; False where `seen` includes the creep of the whole session.
     """
 
     knowledge: Knowledge
@@ -264,11 +264,11 @@ class DesignProblem:
 
     @cached_property
     def now(self) -> float:
-        """The target's value before any further look."""
+        """Compute the target's value before any further look."""
         return self.at_centre.value(self.knowledge.covariance, self.target.factor)
 
     def search(self, sensitivity_sought: Sensitivity | None = None, criterion: str = "c") -> Search:
-        """A search among the looks, for the target or for other quantities; contrasts count as known."""
+        """Build a search among the looks, for the target or for other quantities; contrasts count as known."""
         rows, precision = search_rows(self.seen, self.knowledge)
         aim = self.at_centre if sensitivity_sought is None else sensitivity_sought
         gradient = np.zeros((len(aim.gradient), rows.shape[2]))
@@ -276,22 +276,22 @@ class DesignProblem:
         return Search(rows, precision, gradient, aim.own_variance, criterion)
 
     def information(self, picks: np.ndarray, design: LookPlan, taken: np.ndarray | None = None) -> np.ndarray:
-        """Information of the looks `picks` (k,) of a design, or of those `taken` (indices in `picks`)."""
+        """Compute the information of the looks `picks` (k,) of a design, or of those `taken` (indices in `picks`)."""
         rows = np.arange(len(picks)) if taken is None else taken
         minutes = design.warm_minutes(self.knowledge.rig)[rows] if self.warming else None
         context = self.knowledge.space, self.knowledge.after_data, minutes
         return information_of_looks(self.seen, picks[rows], design.path[rows], *context)
 
     def value(self, picks: np.ndarray, design: LookPlan, taken: np.ndarray | None = None) -> float:
-        """Value of the target after looks, see `information`; in its unit."""
+        """Compute the value of the target after looks, see `information`; in its unit."""
         precision = self.knowledge.precision + self.information(picks, design, taken)
         return self.at_centre.value(covariance_of(precision), self.target.factor)
 
     def choose(self, search: Search, allowed: np.ndarray, count: int, start: tuple[int, int] | None = None) -> Choice:
-        """The best looks among some candidates.
+        """Choose the best looks among some candidates.
 
         Args:
-            search: for the target.
+            search: search for the target.
             allowed: mask of candidates, shape (m,); at least one.
             count: number of looks.
             start: present counters; None for a plan that begins with a homing.
@@ -300,7 +300,7 @@ class DesignProblem:
         looks = self.candidates.looks[picks]
         design = arrange(looks, self.knowledge.sheets, self.candidates.overshoot, start or (0, 0))
         if start is not None:
-            # The first look gets a run-up: the counters at the start of the looks are unknown.
+            # The first look gets a run-up, since the counters at the start of the looks are unknown.
             via = design.via.copy()
             via[0] = design.goal[0] - looks.side[design.order[0]] * self.candidates.overshoot
             design = replace(design, via=via)
@@ -308,7 +308,7 @@ class DesignProblem:
 
 
 def _of_gears(knowledge: Knowledge, seen: Seen) -> Sensitivity:
-    """Ratios and backlashes of both axes, in the middle of the looks."""
+    """Compute the sensitivity of ratios and backlashes of both axes, in the middle of the looks."""
     pose_rad = seen.mirror_angles_rad.mean(axis=0)
     everything = np.asarray(knowledge.gears.headlines(knowledge.z, knowledge.space, pose_rad).gradient)
     return Sensitivity(everything[[TARGET_ROWS[q] for q in ("left", "up", "backlash.pan", "backlash.tilt")]])
@@ -335,7 +335,7 @@ def _family_score(family: Family, problem: DesignProblem, scope: Scope) -> _Fami
 
 
 def design_family(problem: DesignProblem, scope: Scope | None = None, advance: Advance = unshown) -> Family:
-    """The choice of sheets and the order of looks that reach the target soonest.
+    """Find the choice of sheets and order of looks that meet the target soonest.
 
     For every choice of sheets looks are added greedily. The result is the choice that first meets the target, in
     minutes, or the best after the largest number of experiments (or minutes) if none does.
@@ -354,7 +354,7 @@ def design_family(problem: DesignProblem, scope: Scope | None = None, advance: A
 
 
 def smallest_design(meets: Callable[[int], bool], sizes: Sequence[int]) -> int | None:
-    """Smallest whole number that meets a monotone condition, bracketed by `sizes` first."""
+    """Find the smallest whole number that meets a monotone condition, bracketed by `sizes` first."""
     above = next((n for n in sizes if meets(n)), None)
     if above is None:
         return None
@@ -381,7 +381,7 @@ def refine(
     assurance: Assurance,
     advance: Advance = unshown,
 ) -> Refined:
-    """The design of n experiments after exchanges.
+    """Improve the design of n experiments by exchanges.
 
     Exchanges are optimal for the most probable instrument; they are kept only where assurance and time permit.
     """

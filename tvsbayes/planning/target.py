@@ -29,7 +29,7 @@ UNITS = {
 }
 COORDINATES = {"x": (0,), "y": (1,), "z": (2,), "xyz": (0, 1, 2)}
 DEFAULT_TARGET = "u(worst) <= 2e-4 deg/step"
-"""0.3 % of the paper's ratios: above the floor by stereo and a focal scale known to 0.2 %."""
+"""The limit is 0.3 % of the paper's ratios: above the floor by stereo and a focal scale known to 0.2 %."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Target:
         text: as written.
         quantity: one of `UNITS`.
         factor: 1 for u, 1.96 for U95.
-        limit: in the unit.
+        limit: limit in the unit.
         unit: deg/step, deg or mm.
-        point_mm: of a target coordinate, frame T.
+        point_mm: point of a target coordinate, frame T.
     """
 
     text: str
@@ -54,18 +54,18 @@ class Target:
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Rows of the headlines, or of x, y, z; the target is the worst of them."""
+        """Return the rows of the headlines, or of x, y, z; the target is the worst of them."""
         if self.quantity in COORDINATES:
             return COORDINATES[self.quantity]
         return tuple(range(len(DIRECTIONS))) if self.quantity == "worst" else (TARGET_ROWS[self.quantity],)
 
     @property
     def of_ratios(self) -> bool:
-        """Whether the target is effective ratios, which the four-point estimator estimates too."""
+        """Whether the target is an effective ratio, which the four-point method estimates too."""
         return self.quantity == "worst" or self.quantity in DIRECTIONS
 
     def as_json(self) -> dict[str, object]:
-        """Part of the documents of `plan` and `study`."""
+        """Return this part of the documents of `plan` and `study`."""
         point = None if self.point_mm is None else list(self.point_mm)
         return {
             "text": self.text,
@@ -85,7 +85,7 @@ _TARGET = re.compile(
     re.ASCII,
 )
 SMALLEST_LIMIT, LARGEST_NUMBER = 1e-12, 1e9
-"""Limits and coordinates of a target: numbers beyond these are typing errors, and their squares overflow."""
+"""Least limit and largest number of a target: numbers beyond these are typing errors, and their squares overflow."""
 _NAMED = {
     unit: ", ".join(name for name in dict.fromkeys((*DIRECTIONS, "worst", *TARGETS)) if UNITS[name] == unit)
     for unit in UNITS.values()
@@ -98,10 +98,10 @@ TARGET_FORMS = (
 
 
 def parse_target(text: str) -> Target:
-    """Reads a target such as `u(left) <= 2e-4 deg/step` or `U95(x) at 1000,0,0 mm <= 60 mm`.
+    """Read a target such as `u(left) <= 2e-4 deg/step` or `U95(x) at 1000,0,0 mm <= 60 mm`.
 
     Raises:
-        InputError: anything else, with the allowed forms.
+        InputError: the text has another form; the allowed forms are named.
     """
 
     def refuse(found: str, remedy: str) -> InputError:
@@ -133,12 +133,12 @@ def parse_target(text: str) -> Target:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Sensitivity of a target to the coordinates, at one point of parameter space or with a leading axis at several.
+    """Sensitivity of a target to the coordinates, at one point of parameter space, or several by a leading axis.
 
     Attributes:
         gradient: d(quantity)/d(coordinates, errors of gears) of each quantity of the target, shape (q, p + e).
-        own: variance that no calibration lowers, by cause, shapes (q,): the stop and the reading at the point itself,
-            and the gears' errors at its counters that are independent of those at the places.
+        own: variance by cause that no calibration lowers, shapes (q,): the stop and the reading at the point itself,
+            and gear errors at its counters independent of those at the places.
     """
 
     gradient: np.ndarray
@@ -146,16 +146,16 @@ class Sensitivity:
 
     @property
     def own_variance(self) -> np.ndarray:
-        """Shape (q,)."""
+        """Sum the own variances, shape (q,)."""
         return sum(self.own.values(), np.zeros(self.gradient.shape[:-1]))
 
     def values(self, covariance: np.ndarray, factor: float = 1.0) -> np.ndarray:
-        """The target's values under covariances (..., p + e, p + e) of coordinates and errors."""
+        """Compute the target's values under covariances (..., p + e, p + e) of coordinates and errors."""
         variance = np.sum((self.gradient @ covariance) * self.gradient, axis=-1) + self.own_variance
         return factor * np.sqrt(variance.max(axis=-1))
 
     def value(self, covariance: np.ndarray, factor: float = 1.0) -> float:
-        """The target's value under a covariance (p + e, p + e), at one point."""
+        """Compute the target's value under a covariance (p + e, p + e), at one point."""
         return float(self.values(covariance, factor))
 
 
@@ -171,15 +171,15 @@ def sensitivity(
     pose_rad: np.ndarray,
     gears: GearPlaces = NO_PLACES,
 ) -> Sensitivity:
-    """Linearises a target at a point of parameter space.
+    """Linearise a target at a point of parameter space.
 
     Args:
         target: the target.
         z: coordinates, shape (p,).
         space: priors.
-        table: gives the aperture's convention and the periods.
+        table: aperture's convention and periods.
         pose_rad: pose of effective ratios, shape (2,).
-        gears: places of the gears' errors, further coordinates; ratios are then lines over these places.
+        gears: places of the gears' errors as further coordinates; ratios are then slopes of lines over these places.
 
     Raises:
         InputError: no beam reaches the target's point.
@@ -209,7 +209,7 @@ def sensitivity(
     gradient = jacobian[:, :count] @ slope[inputs]
     if not gears.size:
         return Sensitivity(gradient, by_source)
-    # Derivatives per rad of both mirrors, from those by stop errors of sd 1.
+    # Derivatives per rad of both mirrors, from those by standardised stop errors.
     stop_columns = [CALIBRATION_NOISE.index(f"stop_sd_deg.{name}") for name in goal.approach]
     by_angle = jacobian[:, count : count + 2] / np.radians(stop_sd[stop_columns])
     kriged = [gears.between(np.array([steps]), axis) for axis, steps in enumerate((goal.pan_steps, goal.tilt_steps))]

@@ -1,9 +1,9 @@
 """`plan --watch`: the fewest looks that detect every stated change, within a budget, and undetectable changes.
 
 Candidates are the looks of the campaign itself: within the limits, in both images, at counters with known gear errors.
-A pattern of them on every sheet is repeated after further homings, since the error of a homing hides the same part of a
-positioner's rotation from all looks after it. The search assumes independent stops, so that information adds up; the
-final powers follow from the plan's own moves. Counters in steps, minutes by `[costs]`.
+A pattern of them on every sheet is repeated after further homings, since the error of a homing masks the same part of a
+positioner's rotation in all looks after it. The search assumes independent stops, so that information adds up; the
+final powers are computed from the plan's own moves. Counters in steps, minutes by `[costs]`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ CANDIDATES_MAX = 32
 CHANGE_DIRECTIONS = 24
 """Number of directions of a change for judging patterns."""
 NONCENTRALITY_ENOUGH = 20.0
-"""Noncentrality at which a test of three components at 1 % shared by eight has a power of 80 %."""
+"""Noncentrality at which a test of three components, at 1 % over eight tests, has a power of 80 %."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Candidate:
 
 
 def _candidates(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> list[Candidate]:
-    """One look of each kind; at most `CANDIDATES_MAX` on a sheet, outermost counters first."""
+    """List one look of each kind, at most `CANDIDATES_MAX` on a sheet, outermost counters first."""
     rests = [rests_of(campaign.moves, axis) for axis in AXES]
     by_place: dict[tuple, Candidate] = {}
     for row, spot in enumerate(spots):
@@ -88,18 +88,18 @@ def _candidates(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Numbers of the candidates after a homing, by sheet."""
+    """Numbers of the candidates to look at after a homing, by sheet."""
 
     looks: dict[str, tuple[int, ...]]
 
     @property
     def size(self) -> int:
-        """Number of looks with one homing on every sheet."""
+        """Count the looks with one homing on every sheet."""
         return sum(map(len, self.looks.values()))
 
 
 def _rig_of(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> Rig:
-    """A rig from a campaign: sheets at the depths of its spots, default costs."""
+    """Build a rig from a campaign: sheets at the depths of its spots, default costs."""
     sheets: dict[str, float] = {}
     for name in () if campaign.rig.mechanism.sightings else dict.fromkeys(spot.target for spot in spots):
         sheet_spots = [spot for spot, use in zip(spots, used, strict=True) if use and spot.target == name]
@@ -112,9 +112,9 @@ class WatchDesigns:
     """Plans for watching a calibration, and their powers.
 
     Args:
-        fit: converged.
+        fit: a converged fit.
         rig: limits, costs and sheets; None: the campaign's own counters and default costs.
-        seed: of the noise scales and of the directions of a change.
+        seed: seed of the noise scales and of the directions of a change.
     """
 
     def __init__(self, fit: JointFit, rig: Rig | None, seed: int):
@@ -144,13 +144,13 @@ class WatchDesigns:
 
     @cached_property
     def _overshoot(self) -> np.ndarray:
-        """Run-up (pan, tilt) that takes up the play by the fit, steps."""
+        """Compute the run-up (pan, tilt) that takes up the play by the fit, steps."""
         physical = physical_at(self.z, self.fit.space).value
         return run_up_steps(physical, physical[BACKLASH_COLUMNS])
 
     @cached_property
     def _limits(self) -> np.ndarray:
-        """Lowest and highest counter of (pan, tilt): the rig's, else those of the campaign; (2, 2)."""
+        """Return the lowest and highest counter of (pan, tilt): the rig's, else those of the campaign; (2, 2)."""
         reached = {axis: [getattr(move, f"{axis}_steps") for move in self.campaign.moves] for axis in AXES}
         known = self.rig.limits.within({axis: (min(reach), max(reach)) for axis, reach in reached.items()})
         return np.array([known[axis] for axis in AXES])
@@ -163,7 +163,7 @@ class WatchDesigns:
         return bool(np.all((end_points >= self._limits[:, 0]) & (end_points <= self._limits[:, 1])))
 
     def _prepare(self, linear: LinearSpots, first: int, places: list[int]) -> None:
-        """Information of the first session, and of every candidate (its row), stop errors integrated out."""
+        """Compute the information of the first session and of every candidate (its row), stop errors integrated out."""
         errors = linear.places.shape[2]
         self.parameters = len(NAMES)
         spelled = linear.spelled_out(linear.places)
@@ -177,7 +177,7 @@ class WatchDesigns:
             variance = self._stop_variance(candidate)
             columns = spelled.jacobian[row]
             fitted = columns[:, keep].copy()
-            # The path since homing is short in these plans: the contrast is left to the first session.
+            # The path since homing is short in these plans: only the first session informs on the contrast.
             fitted[:, [INDEX[f"ratio_contrast_deg_per_step.{axis}"] for axis in AXES]] = 0.0
             joined = np.concatenate([fitted, columns[:, self.parameters : self.parameters + shifts], slope], axis=1)
             root = np.linalg.cholesky(np.eye(4) + slope @ np.diag(variance) @ slope.T)
@@ -197,7 +197,7 @@ class WatchDesigns:
         return np.radians([physical[INDEX[f"stop_sd_deg.{name}"]] for name in names]) ** 2
 
     def information(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:
-        """Information on the changes after a pattern with so many homings on every sheet, shape (q, q).
+        """Compute the information on the changes by a pattern with so many homings on every sheet, shape (q, q).
 
         With `also_before` the same looks are added to the campaign too.
         """
@@ -212,13 +212,13 @@ class WatchDesigns:
         return total[count:, count:] - coupling.T @ np.linalg.solve(known, coupling)
 
     def powers(self, pattern: Pattern, homings: float, also_before: bool = False) -> np.ndarray:
-        """Power for every change, at a limit by Bonferroni's bound."""
+        """Compute the power for every change, at a limit by Bonferroni's bound."""
         information = self.information(pattern, homings, also_before)
         departure = Departure(0.0, 0, np.zeros(len(information)), information, self.changes)
         return np.array(powers(departure, np.log(FALSE_ALARM_RATE / len(self.changes)), self.seed))
 
     def _score(self, pattern: Pattern, homings: float) -> float:
-        """Score of a pattern: mean logs of insufficient noncentralities, over directions and changes."""
+        """Score a pattern: mean logs of insufficient noncentralities, over directions and changes."""
         information, total = self.information(pattern, homings), 0.0
         for rows, directions in zip(columns_of(self.changes), self._directions, strict=True):
             shares = np.einsum("ni,ij,nj->n", directions, information[rows, rows], directions) / NONCENTRALITY_ENOUGH
@@ -226,7 +226,7 @@ class WatchDesigns:
         return total
 
     def grown(self, sheets: Sequence[str], homings: float) -> list[Pattern]:
-        """Patterns of one look on every sheet, two and so on, each the best in addition to the previous ones."""
+        """Grow patterns of one look on every sheet, two and so on, by the best addition to the previous looks."""
         pattern, patterns = Pattern(dict.fromkeys(sheets, ())), []
         for _ in range(PATTERN_MAX):
             for sheet in sheets:
@@ -237,18 +237,18 @@ class WatchDesigns:
         return patterns
 
     def patterns(self) -> list[Pattern]:
-        """Patterns for every choice of sheets, grown for few homings and for many."""
+        """Build patterns for every choice of sheets, grown for few homings and for many."""
         names = list(dict.fromkeys(candidate.target for candidate in self.candidates))
         choices = [(name,) for name in names] + list(combinations(names, 2))
         grown = [pattern for sheets in choices for homings in (1.0, 8.0) for pattern in self.grown(sheets, homings)]
         return list({tuple(pattern.looks.items()): pattern for pattern in grown}.values())
 
     def steps(self, pattern: Pattern, homings: int) -> tuple[PlanStep, ...]:
-        """The plan: each sheet placed once, with the pattern after every homing."""
+        """Build the plan: each sheet placed once, with the pattern after every homing."""
         return tuple(step for step, _ in self._ordered(pattern, homings))
 
     def _ordered(self, pattern: Pattern, homings: int) -> list[tuple[PlanStep, Spot | None]]:
-        """Steps with the spot of each look in the campaign."""
+        """Build the steps with the campaign's spot of each look."""
         plan, counts = PlanBuilder(), {}
         for sheet, looks in pattern.looks.items():
             for homing in range(homings):
@@ -267,11 +267,11 @@ class WatchDesigns:
         return [(step, counts.get(step.step)) for step in plan.steps]
 
     def minutes(self, pattern: Pattern, homings: int) -> float:
-        """Duration by `[costs]`."""
+        """Compute the duration by `[costs]`, minutes."""
         return plan_seconds(self.rig, self.steps(pattern, homings)) / 60
 
     def judged(self, pattern: Pattern, homings: int) -> list[float]:
-        """Powers of the plan by its own moves, at the limit of all tests together."""
+        """Compute powers of the plan by its own moves, at the limit of all tests together."""
         ordered = self._ordered(pattern, homings)
         log = run_plan([step for step, _ in ordered], self.rig)
         seen = [spot for _, spot in ordered if spot is not None]
@@ -284,9 +284,9 @@ class WatchDesigns:
 
 
 MINUTES = 10.0
-"""Default limit of a plan."""
+"""Default limit of the duration of a plan, minutes."""
 HOMINGS_MAX = 3000
-"""Largest number of homings on a sheet in a stated need."""
+"""Largest number of homings on a sheet that is stated as needed."""
 HOMING_COUNTS = np.unique(np.geomspace(1, HOMINGS_MAX, 30).round().astype(int))
 """Trial numbers of homings, before bisection between two of them."""
 CORRECTIONS = 4
@@ -303,15 +303,15 @@ class _Trial:
     minutes_each: float
 
     def looks(self, homings: int) -> int:
-        """Number of looks on all its sheets."""
+        """Count the looks on all its sheets."""
         return homings * self.pattern.size
 
     def minutes(self, homings: int) -> float:
-        """Duration with so many homings on every sheet."""
+        """Compute the duration with so many homings on every sheet, minutes."""
         return self.first_minutes + (homings - 1) * self.minutes_each
 
     def allowed(self, minutes: float) -> np.ndarray:
-        """Mask of `HOMING_COUNTS` within a budget."""
+        """Mark the `HOMING_COUNTS` within a budget."""
         looks = HOMING_COUNTS * self.pattern.size
         minutes_needed = np.array([self.minutes(int(homings)) for homings in HOMING_COUNTS])
         return (minutes_needed <= minutes) & (looks <= LOOKS_MAX) & (looks >= LOOKS_MIN)
@@ -327,7 +327,7 @@ def _trials(designs: WatchDesigns) -> list[_Trial]:
 
 
 def _smallest(designs: WatchDesigns, trial: _Trial, mask: np.ndarray) -> int | None:
-    """Least number of homings at which a pattern detects the changes of a mask with enough power."""
+    """Find the least number of homings at which a pattern detects the changes of a mask with enough power."""
     sufficient = np.flatnonzero(np.all(trial.powers[:, mask] >= POWER_MIN, axis=1))
     if not sufficient.size:
         return None
@@ -357,8 +357,8 @@ class _Need:
 
 
 def _fewest(designs: WatchDesigns, trials: list[_Trial], mask: np.ndarray, minutes: float = np.inf) -> _Need | None:
-    """The fewest looks that detect the changes of a mask; among equal numbers the least time."""
-    # Rank by trial counts first: values in between cost a bisection for every pattern.
+    """Find the fewest looks that detect the changes of a mask; among equal numbers the least time."""
+    # Patterns are first ranked by trial counts: values in between cost a bisection for each.
     ranked = sorted(
         (trial.looks(int(HOMING_COUNTS[rung])), number)
         for number, trial in enumerate(trials)
@@ -377,7 +377,7 @@ def _meets_at_first(trial: _Trial, mask: np.ndarray) -> bool:
 
 
 def _noticeable(trials: list[_Trial], minutes: float) -> np.ndarray:
-    """The largest set of changes that a plan within the budget detects, as a mask."""
+    """Find the largest set of changes that a plan within the budget detects, as a mask."""
     best, best_key = np.zeros(trials[0].powers.shape[1], dtype=bool), (-1, -1.0)
     for trial in trials:
         for row in trial.powers[trial.allowed(minutes)]:
@@ -389,7 +389,7 @@ def _noticeable(trials: list[_Trial], minutes: float) -> np.ndarray:
 
 
 def _most_powerful(trials: list[_Trial], minutes: float) -> _Need:
-    """The pattern with the largest total power, where no change can be detected with enough power."""
+    """Find the pattern with the largest total power, where no change can be detected with enough power."""
     by_power = [
         (float(trial.powers[rung].sum()), number, int(HOMING_COUNTS[rung]))
         for number, trial in enumerate(trials)
@@ -400,13 +400,13 @@ def _most_powerful(trials: list[_Trial], minutes: float) -> _Need:
 
 
 def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTES, seed: int = 0) -> WatchPlan:
-    """The fewest looks that detect every stated change with a power of 80 %, or as many changes as the time allows.
+    """Plan the fewest looks that detect every stated change with a power of 80 %, or as many as the time allows.
 
     Args:
-        fit: of the campaign to be watched.
+        fit: fit of the campaign to be watched.
         rig: limits and costs; None: the counters of the campaign, and default costs.
         minutes: the plan must not take longer.
-        seed: of noise scales, null distribution and directions.
+        seed: seed of noise scales, null distribution and directions.
 
     Raises:
         NotConverged: the fit.
@@ -444,7 +444,7 @@ def watch_plan(fit: JointFit, rig: Rig | None = None, *, minutes: float = MINUTE
 
 
 def _changes(designs: WatchDesigns, trials: list[_Trial], judged: list[float]) -> tuple[PlannedChange, ...]:
-    """The plan's power for every change, and the need of each change alone."""
+    """Compute the plan's power for every change, and the looks needed for each change alone."""
     needs = [_fewest(designs, trials, mask) for mask in np.eye(len(designs.changes), dtype=bool)]
     additions = _looks_to_add(designs, trials) if None in needs else [None] * len(needs)
     changes = []
@@ -459,7 +459,7 @@ def _changes(designs: WatchDesigns, trials: list[_Trial], judged: list[float]) -
 
 
 def _looks_to_add(designs: WatchDesigns, trials: list[_Trial]) -> list[int | None]:
-    """Additional looks of the campaign and of every watch to detect each change, to the next trial count."""
+    """Compute additional looks of the campaign and of every watch to detect each change, to the next trial count."""
     fewest: list[int | None] = [None] * len(designs.changes)
     for trial in trials:
         for homings in HOMING_COUNTS:
@@ -473,7 +473,7 @@ def _looks_to_add(designs: WatchDesigns, trials: list[_Trial]) -> list[int | Non
 
 
 def _corrected(designs: WatchDesigns, need: _Need, noticed: np.ndarray, minutes: float) -> tuple[int, list[float]]:
-    """Homings, and powers by the plan's own moves: more homings where shared stops reduce the power."""
+    """Compute powers by the plan's own moves, with more homings where shared stops reduce the power."""
     homings = need.homings
     judged = designs.judged(need.trial.pattern, homings)
     for _ in range(CORRECTIONS):
