@@ -1,7 +1,7 @@
-"""What uncertainty comes from: that of ratios and backlashes, and that of the inputs of a coordinate.
+"""Causes of uncertainty: of ratios and backlashes, and of the inputs of a coordinate.
 
-Expected information in coordinates, each in sds of its prior, so that every prior has precision 1; noise scales are
-taken as known. Quantities in the units of their names.
+The expected information is in coordinates, each in sds of its prior, so that every prior has precision 1; noise scales
+are taken as known. Quantities in the units of their names.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ STOP_ERRORS = "stop errors of the campaign"
 LOOK_SCATTER = "scatter of the campaign's looks"
 TRANSMISSION_ERROR, PLAY_VARIATION = "transmission error", "play variation"
 PRIOR_PARTS = (TRANSMISSION_ERROR, PLAY_VARIATION, "stereo calibration")
-"""Causes of many coordinates each, known by their prior: type B of GUM, as every single prior is."""
+"""Causes of many coordinates each, with a prior: type B of the GUM, as every single prior."""
 
 
 @dataclass(frozen=True)
 class _Told:
-    """What the campaign tells of coordinates and errors at places, J^T C^-1 J, by the noise that limits it.
+    """Information J^T C^-1 J of a campaign on coordinates and errors at places, split by noise.
 
-    With C = 1 + (stop errors), whitened by the noise of looks: (C^-1 J)^T (C^-1 J), and the rest; matrices (p + e,
-    p + e). Of the unit noise b S b^T is the scatter of looks, b the slopes by the angles and S their variances.
+    With C = 1 + (stop errors), whitened by the noise of looks, it is (C^-1 J)^T (C^-1 J) and a remainder; matrices (p +
+    e, p + e). Of the unit noise b S b^T is the scatter of looks, b the slopes by the angles and S their variances.
 
     Attributes:
         pixels: name of the noise of the first part.
         by_pixels, by_looks, by_stops: the parts.
-        posterior: inverse of both together with the priors.
-        groups: coordinates and errors by the prior that they have.
+        posterior: inverse of the sum of all parts and the priors.
+        groups: coordinates and errors by their prior.
     """
 
     pixels: str
@@ -52,7 +52,7 @@ class _Told:
 
 
 def _noise_of(fit: JointFit, readings: bool) -> str:
-    """What limits single looks, in words."""
+    """Name the noise of single looks."""
     if fit.space.mechanism.sightings:
         return "noise of sightings"
     return "pixel and aperture noise" if readings else "pixel noise"
@@ -84,12 +84,12 @@ def _told(fit: JointFit) -> _Told:
 
 @dataclass(frozen=True)
 class Causes:
-    """What the covariance of the inputs of a coordinate comes from.
+    """Covariance of the inputs of a coordinate by cause.
 
     Attributes:
         names: causes.
-        covariance: their parts, shape (causes, inputs, inputs), ordered as `INPUT_NAMES`, then what else was asked
-            for; they add up.
+        covariance: their parts, shape (causes, inputs, inputs), ordered as `INPUT_NAMES`, then further inputs; they add
+            up.
     """
 
     names: tuple[str, ...]
@@ -99,10 +99,10 @@ class Causes:
 def causes_of(fit: JointFit, by_places: np.ndarray | None = None) -> Causes:
     """Split the covariance of a fit by cause (formulation 5).
 
-    An estimate moves by S J^T C^-1 e when the data err by e, and by S e_j when prior j is off by its sd, S the
+    An error e of the data shifts an estimate by S J^T C^-1 e, an error of prior j by its sd by S e_j, with S the
     posterior covariance. With C = 1 + (stop errors) the parts S (C^-1 J)^T (C^-1 J) S (pixels, and the scatter of looks
-    within it), S (J^T C^-1 J - that) S and S e_j e_j^T S add up to S. Expected information about geometry and cameras;
-    noise scales are taken as known.
+    within it), S (J^T C^-1 J - that) S and S e_j e_j^T S add up to S. The information is the expected one on geometry
+    and cameras; noise scales are taken as known.
 
     Args:
         fit: a converged fit.
@@ -124,7 +124,7 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None) -> Causes:
     if by_places is not None:
         spread = np.concatenate([spread, by_places @ information.posterior[len(NAMES) :]])
     covariance = {name: spread @ part @ spread.T for name, part in parts.items()}
-    # A prior that was fixed, or that no coordinate depends on, is no cause.
+    # A fixed prior, or one without effect on any input, is no cause.
     kept = {name: c for name, c in covariance.items() if np.any(np.diag(c) > 0)}
     return Causes(tuple(kept), np.stack(list(kept.values())))
 
@@ -144,8 +144,8 @@ class _Cause:
 def headline_causes(fit: JointFit) -> HeadlineCauses:
     """Split the variance of ratios and backlashes by cause, as `causes_of` does for the inputs of a coordinate.
 
-    Linear part of each headline in the coordinates; expected information, noise scales taken as known. How well the
-    noise scales are known gives the degrees of freedom: nu = 1/(2 var(ln s)) (GUM G.4.2, eq. G.3).
+    It uses the linear part of each headline in the coordinates and the expected information at known noise scales. The
+    uncertainty of the noise scales gives the degrees of freedom: nu = 1/(2 var(ln s)) (GUM G.4.2, eq. G.3).
     """
     columns = _headline_draws(fit)
     if not columns:
@@ -167,14 +167,14 @@ def headline_causes(fit: JointFit) -> HeadlineCauses:
 
 
 def _headline_draws(fit: JointFit) -> dict[str, np.ndarray]:
-    """Draws of judged headlines, as far as their directions moved, by contract name."""
+    """Return draws of judged headlines whose directions moved, by name."""
     moved = moved_directions(fit)
     names = [of.name for of in HEADLINES if of.judged and of.applies(moved) and moved & set(of.sides or DIRECTIONS)]
     return {name: fit.draws[name] for name in names}
 
 
 def _noise_causes(fit: JointFit, information: _Told, quantities: tuple[str, ...], spread: np.ndarray) -> list[_Cause]:
-    """What is no single quantity: noise of the campaign, errors of the gears, the cameras' calibration as one."""
+    """Compute causes other than single priors: noise of the campaign, errors of the gears, the cameras' calibration."""
     moved, every = moved_directions(fit), np.ones(len(quantities))
     physical = np.asarray(fit.draws.physical)
 
@@ -193,7 +193,7 @@ def _noise_causes(fit: JointFit, information: _Told, quantities: tuple[str, ...]
         return freedom(f"stop_sd_deg.{d}" for d in sides(quantity) if d in moved)
 
     def look_freedom(quantity: str) -> float:
-        # A scale that may be 0 has no logarithm: by its relative sd.
+        # A scale that may be 0 has no logarithm; its relative sd is used.
         drawn = [fit.draws[f"look_scatter_deg.{axis}"] for axis in AXES if set(SENSES[axis]) <= set(sides(quantity))]
         known = [0.5 * (float(np.mean(sds)) / float(np.std(sds))) ** 2 for sds in drawn if np.ptp(sds) > 0]
         return min(known, default=np.inf)
@@ -211,7 +211,7 @@ def _noise_causes(fit: JointFit, information: _Told, quantities: tuple[str, ...]
 
 
 def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
-    """Every stated prior of the rig that a quantity depends on."""
+    """Compute the causes of all stated priors of the rig that a quantity depends on."""
     causes = []
     stated = (np.asarray(x).tolist() for x in (fit.space.value, fit.space.u, fit.space.kind))
     for column, (name, centre, u, kind) in enumerate(zip(fit.space.mechanism.rig_names, *stated, strict=True)):
@@ -227,16 +227,16 @@ def _prior_causes(fit: JointFit, spread: np.ndarray) -> list[_Cause]:
 
 
 def headline_budget(causes: HeadlineCauses, quantity: str, estimate: Estimate) -> BudgetTable:
-    """The budget of an effective ratio or a backlash, by cause.
+    """Build the budget of an effective ratio or a backlash, by cause.
 
-    Rows are independent of each other: noise of the campaign (type A); the errors that the gears repeat, the cameras'
-    calibration as one, and every stated prior (type B). An estimate moves by c when the centre of a prior moves by one
-    unit.
+    Rows are independent of each other: noise of the campaign (type A); repeating errors of the gears, the cameras'
+    calibration as a whole, and every stated prior (type B). The sensitivity c is the shift of the estimate when the
+    centre of a prior shifts by one unit.
 
     Args:
-        causes: of `headline_causes`.
+        causes: from `headline_causes`.
         quantity: one of its quantities.
-        estimate: what is reported of it, Laplace or posterior; its sd is the combined uncertainty.
+        estimate: its reported estimate, Laplace or posterior; its sd is the combined uncertainty.
     """
     row = causes.quantities.index(quantity)
     sources = []

@@ -1,6 +1,6 @@
-"""From a fit, or a posterior's draws, to what a robot loads: a `Calibration` with the causes of its covariance.
+"""A `Calibration` for robots from a fit or a posterior's draws, with the causes of its covariance.
 
-Columns in the units of their contract names; counters in steps.
+Columns have the units of their names; counters in steps.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from tvsbayes.posterior.draws import Posterior
 from tvsbayes.statistics.streams import Stream, random_stream
 
 CLEARED_PROBABILITY = 0.99
-"""With this probability an overshoot takes up all the play."""
+"""Probability that an overshoot takes up all the play."""
 DRAWS_KEPT = 4096
-"""Posterior draws in a calibration, at most, that weigh the same."""
+"""Largest number of posterior draws, of equal weight, in a calibration."""
 
 
 def calibration_of_draws(
@@ -41,25 +41,25 @@ def calibration_of_draws(
     range_steps: np.ndarray,
     gears: DrawnGears | None = None,
 ) -> Calibration:
-    """Choose the columns that coordinates depend on.
+    """Build a calibration from the columns that coordinates depend on.
 
-    Baseline, C0, the aperture's zero and its noise take their priors where no reading told them: a sampler holds them
-    still.
+    Baseline, C0, the aperture's zero and its noise are drawn from their priors without readings, since a sampler holds
+    them fixed.
 
     Args:
-        names: contract names of the columns of `physical`.
+        names: public names of the columns of `physical`.
         physical: draws (n, names) in the units of the names.
-        campaign: what was fitted.
+        campaign: the fitted campaign.
         estimator: "posterior" or "laplace".
-        seed: of the draws from priors.
-        range_steps: lowest and highest counter of each axis that a look saw, shape (2, 2).
-        gears: errors of the gears that the draws allow; None where gears do not vary.
+        seed: seed of the draws from priors.
+        range_steps: lowest and highest counter of each axis with a look, shape (2, 2).
+        gears: errors of the gears by draw; None without repeating errors.
     """
     column = {name: physical[:, i] for i, name in enumerate(names)}
     generator = random_stream(seed, Stream.CALIBRATION_NOISE)
 
     def standard() -> np.ndarray:
-        # Exactly mean 0 and sd 1: the prior is known, its few draws need not be noise.
+        # Scaled to exactly mean 0 and sd 1, so that moments of the prior have no Monte Carlo error.
         normal = generator.standard_normal(len(physical))
         return (normal - normal.mean()) / normal.std()
 
@@ -75,12 +75,12 @@ def calibration_of_draws(
     if gears is not None:
         inputs = np.concatenate([inputs, gears.expected + gears.left_open], axis=1)
     mean = inputs.mean(axis=0)
-    # Means of what nobody knows are zero but for rounding.
+    # Means of errors without any information are zero but for rounding.
     mean[len(INPUT_NAMES) + np.array([part.stop - 1 for part in table.parts.values()], dtype=int)] = 0.0
     return Calibration(
         mean=mean,
         covariance=np.cov(inputs, rowvar=False),
-        # Summed exactly: a variance that is stated, not estimated, comes out as it was stated.
+        # Summed exactly, so that a stated variance is reproduced exactly.
         noise_variance={
             n: math.fsum(v**2 for v in each) / len(each) for n, each in zip(NOISE_NAMES, noise.T.tolist(), strict=True)
         },
@@ -99,7 +99,7 @@ def calibration_of_draws(
 
 
 def _widest(table: GearTable, inputs: np.ndarray, axis: str) -> np.ndarray | float:
-    """What the play of each draw gains at most where it varies, deg."""
+    """Return the largest increase of each draw's play by position, deg."""
     part = table.parts.get(f"{PLAY_AT}.{axis}")
     return 0.0 if part is None else np.maximum(inputs[:, len(INPUT_NAMES) :][:, part].max(axis=1), 0.0)
 
@@ -110,28 +110,28 @@ def _overshoot_steps(column: Mapping[str, np.ndarray], axis: str, widest_deg: np
 
 
 def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: int = 0) -> Calibration:
-    """What coordinates need of a fit: the posterior's draws where one has converged, else the Laplace approximation's.
+    """Build the calibration of a fit: from the posterior's draws if converged, else from the Laplace approximation's.
 
-    Where several ways of homing count, the draws are of all of them; causes and the scales of the gears' errors are
-    those of the most probable one.
+    With several ways of homing, the draws are of all of them; causes and the scales of the gears' errors are those of
+    the most probable one.
 
     Args:
         fit: a converged fit.
-        posterior: its sample; left out, or unconverged, the Laplace draws are taken.
-        seed: of the draws of baseline, C0 and aperture zero where no reading told them.
+        posterior: its sample; without one, or if it has not converged, the Laplace draws are used.
+        seed: seed of the draws of baseline, C0 and aperture zero without readings.
 
     Returns:
-        A calibration for `locate`, with `.ray`, `.locate` and `.steps_for` of its own.
+        A calibration for `locate`, with methods `.ray`, `.locate` and `.steps_for`.
     """
     if posterior is not None and posterior.converged:
         draws, estimator = posterior.thinned(DRAWS_KEPT), "posterior"
     else:
         draws, estimator = equal_laplace_draws(fit), "laplace"
     physical = np.asarray(draws.physical)
-    # Laplace draws of the errors at places hold at the mode's scales, those of a posterior at their own.
+    # Laplace draws of the errors at places are at the mode's scales, those of a posterior at their own.
     sampled = estimator == "posterior"
     gears = drawn_gears(fit, physical, np.asarray(draws.place_errors_rad), seed, own_scales=sampled)
-    # Looks that the fit left out reached nothing.
+    # Looks that the fit excluded do not extend the range.
     counters = seen_range(fit)
     range_steps = np.array([counters[axis] for axis in AXES], dtype=float)
     calibration = calibration_of_draws(fit.names, physical, fit.campaign, estimator, seed, range_steps, gears)
@@ -140,7 +140,7 @@ def calibration_of(fit: JointFit, posterior: Posterior | None = None, *, seed: i
 
 
 def _with_left_open(causes: Causes, gears: DrawnGears) -> Causes:
-    """Causes, with what the looks leave open of the gears' errors between and beyond the counters seen."""
+    """Add the conditional covariance of the gears' errors between and beyond the counters seen."""
     parts, first = dict(zip(causes.names, causes.covariance, strict=True)), len(INPUT_NAMES)
     for name, part in gears.table.parts.items():
         cause = TRANSMISSION_ERROR if name.startswith(ERROR_AT) else PLAY_VARIATION

@@ -1,8 +1,8 @@
-"""Errors of the gears at counters that nobody saw, drawn given what a fit's draws hold at the counters seen.
+"""Errors of the gears at counters without looks, drawn given a fit's draws at the counters seen.
 
 Transmission error e and change of play d are Gaussian processes of the output's angle k n (formulation 3.1). Every draw
-has values of its own at the places, scales and lengths of its own: its table is the mean of the processes there plus
-what the places leave open. deg, steps.
+has its own values at the places, scales and lengths: its table is the conditional mean of the processes plus a draw of
+the conditional deviation. deg, steps.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from tvsbayes.statistics.gaussian_process import JITTER, repeated
 from tvsbayes.statistics.streams import Stream, random_stream
 
 MARGIN_LENGTHS = 3.0
-"""A table reaches as many correlation lengths beyond the counters seen: 97 % of a process has forgotten them there."""
+"""Correlation lengths by which a table extends beyond the counters seen: the correlation with them is 3 % there."""
 COUNTERS_PER_LENGTH = 4.0
-"""Cubic interpolation between them errs by 1.2 % of the sd (root mean square)."""
+"""Counters of a table per correlation length: cubic interpolation has an RMS error of 1.2 % of the sd."""
 BLOCK = 256
-"""Draws whose covariances are held at once."""
+"""Draws whose covariances are in memory at once."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class DrawnGears:
     Attributes:
         table: its counters.
         expected: means given the errors at the places, shape (draws, table.size).
-        left_open: what those leave open, drawn, likewise; the sum of both is the draw.
+        left_open: drawn conditional deviations, same shape; the sum of both is the draw.
         by_places: d(expected)/d(errors at the places, in units of N(0, 1) a priori), at the fit's own scales, shape
             (table.size, errors).
     """
@@ -55,7 +55,7 @@ class Process:
     Attributes:
         sd, length: shapes (draws,); deg.
         amplitudes: sds of the parts of stated period, shape (draws, periods).
-        periods: deg.
+        periods: stated periods, deg.
     """
 
     sd: np.ndarray
@@ -64,24 +64,24 @@ class Process:
     periods: tuple[float, ...] = ()
 
     def covariance(self, angle_deg: np.ndarray) -> np.ndarray:
-        """Of values at angles (draws, n): shape (draws, n, n), deg^2."""
+        """Compute the covariance of values at angles (draws, n): shape (draws, n, n), deg^2."""
         distance = angle_deg[:, :, None] - angle_deg[:, None, :]
         sd, length, *amplitudes = (x[:, None, None] for x in (self.sd, self.length, *self.amplitudes.T))
         covariance = repeated(distance, sd, length, zip(amplitudes, self.periods, strict=True))
-        # Of plays too, which `place_root` scales after their factor: draws may have none.
+        # Plays get the floor too, as draws may have none; `place_root` instead scales the factor.
         floor = JITTER * self.variance + FLOOR_RAD2 * DEGREES**2
         return covariance + floor[:, None, None] * np.eye(angle_deg.shape[1])
 
     @property
     def variance(self) -> np.ndarray:
-        """Of a value anywhere, shape (draws,), deg^2."""
+        """Compute the variance of a value, shape (draws,), deg^2."""
         return self.sd**2 + np.sum(self.amplitudes**2, axis=1)
 
     def __getitem__(self, chosen: slice) -> Process:
         return Process(self.sd[chosen], self.length[chosen], self.amplitudes[chosen], self.periods)
 
     def without(self, number: int) -> Process:
-        """The process without one of its parts of stated period."""
+        """Return the process without one of its parts of stated period."""
         amplitudes = self.amplitudes.copy()
         amplitudes[:, number] = 0.0
         return Process(self.sd, self.length, amplitudes, self.periods)
@@ -89,7 +89,7 @@ class Process:
 
 @dataclass(frozen=True)
 class Conditional:
-    """Values at new angles: means given those at places, and what is left open; shapes (draws, n)."""
+    """Values at new angles: conditional means given those at places, and conditional deviations; shapes (draws, n)."""
 
     expected: np.ndarray
     left_open: np.ndarray
@@ -98,14 +98,14 @@ class Conditional:
 def conditional(
     process: Process, seen_deg: np.ndarray, values: np.ndarray, new_deg: np.ndarray, normal: np.ndarray
 ) -> Conditional:
-    """A process at new angles given its values at places (Rasmussen and Williams 2.19, by one Cholesky factor).
+    """Draw a process at new angles given its values at places (Rasmussen and Williams 2.19, by one Cholesky factor).
 
     Args:
         process: scales by draw.
         seen_deg: angles of the places, shape (draws, p).
-        values: there, shape (draws, p).
-        new_deg: shape (draws, n).
-        normal: standard normal numbers for what is left open, shape (draws, n).
+        values: values at the places, shape (draws, p).
+        new_deg: new angles, shape (draws, n).
+        normal: standard normal numbers for the deviations, shape (draws, n).
     """
     expected, left_open = np.empty(new_deg.shape), np.empty(new_deg.shape)
     count = seen_deg.shape[1]
@@ -119,24 +119,24 @@ def conditional(
 
 
 def _axis(name: str) -> Axis:
-    """Of one of `GEAR_INPUTS`."""
+    """Return the axis of one of `GEAR_INPUTS`."""
     return AXES[0] if name.endswith(AXES[0]) else AXES[1]
 
 
 def stated_periods(fit: JointFit, axis: Axis) -> tuple[float, ...]:
-    """Periods of an axis that the rig states, deg."""
+    """Return the periods of an axis that the rig states, deg."""
     return tuple(np.ravel(fit.campaign.rig.harmonic_period_deg.get(axis, ())).tolist())
 
 
 def seen_places(fit: JointFit) -> dict[Axis, np.ndarray]:
-    """Numbers of each axis' places among those of the fit."""
+    """Return the indices of each axis' places among those of the fit."""
     places = fit.arrays.gears.places
     valid, on_tilt = np.asarray(places.valid), np.asarray(places.on_tilt)
     return {axis: np.flatnonzero(valid & (on_tilt == (axis == AXES[1]))) for axis in AXES}
 
 
 def process_of(physical: np.ndarray, name: str, periods: tuple[float, ...]) -> Process:
-    """Scales of one of `GEAR_INPUTS`, of draws (n, parameters)."""
+    """Return the scales of one of `GEAR_INPUTS` from draws (n, parameters)."""
     axis = _axis(name)
     length = physical[:, INDEX[f"transmission_error_length_deg.{axis}"]]
     if not name.startswith(ERROR_AT):
@@ -147,7 +147,7 @@ def process_of(physical: np.ndarray, name: str, periods: tuple[float, ...]) -> P
 
 
 def _table(physical: np.ndarray, seen_steps: Mapping[str, np.ndarray]) -> GearTable:
-    """Regular counters around those seen, by the draws' middle lengths."""
+    """Choose regular counters around those seen, by the draws' median lengths."""
     columns = []
     for axis in AXES:
         length = float(np.median(physical[:, INDEX[f"transmission_error_length_deg.{axis}"]]))
@@ -162,17 +162,17 @@ def _table(physical: np.ndarray, seen_steps: Mapping[str, np.ndarray]) -> GearTa
 def drawn_gears(
     fit: JointFit, physical: np.ndarray, place_errors_rad: np.ndarray, seed: int, own_scales: bool = True
 ) -> DrawnGears:
-    """Tables of draws.
+    """Draw tables of the gears' errors.
 
     Args:
-        fit: whose campaign the places are of.
+        fit: fit of the campaign with these places.
         physical: draws in the units of the names, shape (n, parameters).
-        place_errors_rad: with them the transmission errors at the places, then the plays, shape (n, errors).
-        seed: of what the places leave open.
-        own_scales: the errors at places were drawn at the scales of their own draws, else at those of the fit's mode.
+        place_errors_rad: their transmission errors at the places, then the plays, shape (n, errors).
+        seed: seed of the conditional deviations.
+        own_scales: whether the errors at places were drawn at their own scales, else at those of the fit's mode.
 
     Returns:
-        Columns as a calibration keeps them; none where gears do not vary.
+        Columns as a calibration stores them; none without repeating errors.
     """
     count, errors = place_errors_rad.shape
     if not errors:
@@ -180,7 +180,7 @@ def drawn_gears(
         return DrawnGears(NO_GEARS, none, none, np.zeros((0, 0)))
     steps, seen_of = np.asarray(fit.arrays.gears.places.steps), seen_places(fit)
     table = _table(physical, {axis: steps[seen_of[axis]] for axis in AXES})
-    # The fit's own scales too: how its table follows the places, in units in which they are N(0, 1) a priori.
+    # The derivative of the table by the places at the fit's scales, these in units in which they are N(0, 1) a priori.
     mode, root = np.asarray(fit.mode.physical), np.asarray(fit.linearised.place_root) * DEGREES
     generator = random_stream(seed, Stream.GEAR_TABLES)
     expected, left_open = np.zeros((count, table.size)), np.zeros((count, table.size))
@@ -201,12 +201,12 @@ def drawn_gears(
         expected[:, inner] = drawn.expected if own_scales else values @ follows.T
         left_open[:, inner] = drawn.left_open
         left_open[:, part.stop - 1] = np.sqrt(process.variance) * normal[:, -1]
-    # What nobody knows moves no estimate.
+    # Unknown deviations must not shift the mean.
     return DrawnGears(table, expected, left_open - left_open.mean(axis=0), by_places)
 
 
 def _following(process: Process, seen_deg: np.ndarray, new_deg: np.ndarray) -> np.ndarray:
-    """How means at new angles follow the values at places: shape (new, seen)."""
+    """Compute the weights of the values at places in the means at new angles: shape (new, seen)."""
     covariance = process.covariance(np.concatenate([seen_deg, new_deg])[None])[0]
     count = len(seen_deg)
     return np.linalg.solve(covariance[:count, :count], covariance[:count, count:]).T

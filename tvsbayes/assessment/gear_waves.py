@@ -1,7 +1,7 @@
 """Waves of stated period in the gears of a scanner: amplitude, phase, and the probability that there is one.
 
 A wave is a cos(2 pi x / P) + b sin(2 pi x / P) of the output's angle x = k n, with a and b normal of sd A, half-normal
-itself (formulation 3.1). Given the errors at the places, a and b are normal again. deg.
+itself (formulation 3.1). Given the errors at the places, a and b are normal too. deg.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tvsbayes.statistics.intervals import interval95, phases_deg
 from tvsbayes.statistics.streams import Stream, random_stream
 
 DRAWS = 2048
-"""Of equal weight: the error of a mean is a forty-fifth of its sd, that of a probability at most 0.011."""
+"""Draws of equal weight: the error of a mean is 1/45 of its sd, that of a probability at most 0.011."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class WaveDraws:
 
     Attributes:
         cosine, sine: its parts, deg, shape (draws,).
-        log_evidence_ratio: of the errors at the places without the wave against those with it, shape (draws,).
+        log_evidence_ratio: log density ratio of the errors at the places, without the wave to with it, shape (draws,).
     """
 
     cosine: np.ndarray
@@ -39,35 +39,35 @@ class WaveDraws:
 
     @property
     def probability(self) -> float:
-        """That there is a wave, where it was as likely as none beforehand.
+        """Compute the probability of a wave, for prior odds of one.
 
-        The mean over the posterior of p(errors | no wave) / p(errors | wave) is the ratio of both evidences, since
-        the looks know of the wave by the errors alone.
+        The mean over the posterior of p(errors | no wave) / p(errors | wave) is the ratio of both evidences, since the
+        looks depend on the wave through the errors alone.
         """
         none = float(np.mean(np.exp(self.log_evidence_ratio)))
         return 1 / (1 + none)
 
     @property
     def amplitude(self) -> np.ndarray:
-        """Half of what it makes from crest to trough, deg, shape (draws,)."""
+        """Compute the amplitude, half of crest to trough, deg, shape (draws,)."""
         return np.hypot(self.cosine, self.sine)
 
     @property
     def phase_deg(self) -> np.ndarray:
-        """Within half a turn of the circular mean, shape (draws,)."""
+        """Compute phases within half a turn of their circular mean, shape (draws,)."""
         return phases_deg(self.cosine, self.sine)
 
 
 def wave_draws(
     process: Process, number: int, angle_deg: np.ndarray, errors_deg: np.ndarray, normal: np.ndarray
 ) -> WaveDraws:
-    """The wave of one stated period, given the errors at places.
+    """Draw the wave of one stated period, given the errors at places.
 
     Args:
         process: scales by draw.
-        number: of the period in `process.periods`.
-        angle_deg: of the places, shape (draws, p).
-        errors_deg: transmission errors there, shape (draws, p).
+        number: index of the period in `process.periods`.
+        angle_deg: angles of the places, shape (draws, p).
+        errors_deg: transmission errors at the places, shape (draws, p).
         normal: standard normal numbers, shape (draws, 2).
     """
     parts, ratio = np.empty((len(errors_deg), 2)), np.empty(len(errors_deg))
@@ -78,8 +78,8 @@ def wave_draws(
         phase = 2 * np.pi * angle / process.periods[number]
         wave = np.stack([np.cos(phase), np.sin(phase)], axis=-1)
         root = np.linalg.cholesky(whole.covariance(angle))
-        # a, b | errors: gain V W^T C^-1 e, covariance V (1 - V W^T C^-1 W), of which the 2 x 2 root is taken by its
-        # eigenvalues: rounding may leave one of them below 0 where the errors determine the wave.
+        # a, b | errors: gain V W^T C^-1 e, covariance V (1 - V W^T C^-1 W), whose 2 x 2 root is taken by eigenvalues:
+        # rounding may make one negative where the errors determine the wave.
         scaled, white = np.linalg.solve(root, wave), np.linalg.solve(root, error[..., None])
         mean = variance[:, None] * (scaled.swapaxes(1, 2) @ white)[..., 0]
         left = np.eye(2) - variance[:, None, None] * (scaled.swapaxes(1, 2) @ scaled)
@@ -94,7 +94,7 @@ def wave_draws(
 
 
 def _log_root(root: np.ndarray) -> np.ndarray:
-    """Half the logarithm of the determinant of a covariance, of its factors (n, p, p)."""
+    """Compute half the log determinant of covariances from their factors (n, p, p)."""
     return np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)), axis=1)
 
 
@@ -103,7 +103,7 @@ def _measured(draws: np.ndarray) -> Measured:
 
 
 def gear_periods(posterior: Posterior) -> tuple[GearPeriod, ...]:
-    """Every wave whose period `[rig]` states and whose amplitude is not held at 0, given that it is there."""
+    """Estimate all waves of periods stated in `[rig]` with amplitudes not fixed at 0, given that they exist."""
     fit, rng = posterior.fit, random_stream(posterior.seed, Stream.WAVES)
     drawn = posterior.resampled(1, DRAWS).joined
     physical, errors_deg = np.asarray(drawn.physical), np.asarray(drawn.place_errors_rad) * DEGREES

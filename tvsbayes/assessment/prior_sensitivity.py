@@ -1,8 +1,8 @@
-"""What each stated prior does to the headlines: its u doubled and halved.
+"""Sensitivity of the headlines to each stated prior: its u doubled and halved.
 
-Draws of a posterior are weighted by the ratio of the priors, which is exact; where too few draws bear it (a prior of
-many coordinates, or one that the data hardly touch), and for the Laplace approximation, the normal distribution with
-the same moments is changed instead.
+Draws of a posterior are weighted by the ratio of the priors, which is exact. Where too few draws have weight (a prior
+of many coordinates, or a parameter with little information), and for the Laplace approximation, the normal distribution
+with the same moments is changed instead.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
 
 FACTORS = 2.0, 0.5
 SENSITIVE_SHIFT = 0.2
-"""Change of a headline, in its sds, when a prior is doubled or halved, from which it is listed."""
+"""Shift of a headline, in its sds, from which a prior is listed."""
 SENSITIVE_SD = 0.1
 """Relative change of a headline's sd from which it is listed."""
 LISTED = 16
 K_LIMIT, ENOUGH = 0.5, 1000
-"""Tail index of the new weights below which they are believed, and effective draws that they must leave: what lies two
-sds out in a posterior, where a prior in conflict with the data would pull, is known by few of its draws."""
+"""Tail index of the new weights below which they are reliable, and least effective draws: two sds out in a posterior,
+where a prior in conflict with the data shifts it, there are few draws."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """Of the headlines: shift in their present sds, and new sd over the present one; shape (quantities,)."""
+    """Change of the headlines: shift in their present sds, and new sd over the present one; shape (quantities,)."""
 
     shift_sd: np.ndarray
     sd_ratio: np.ndarray
@@ -40,11 +40,11 @@ class Change:
 
 @dataclass(frozen=True)
 class NormalModel:
-    """The d free coordinates as normal, and headlines linear in them.
+    """A normal approximation of the d free coordinates, with linear headlines.
 
     Attributes:
         mean: shape (d,).
-        precision: shape (d, d), that of the priors (the identity) in it.
+        precision: precision, including that of the priors (the identity), shape (d, d).
         gradient: of the headlines, shape (quantities, d).
         sd: of the headlines, shape (quantities,).
     """
@@ -55,13 +55,13 @@ class NormalModel:
     sd: np.ndarray
 
     def changed(self, members: np.ndarray, factor: float) -> Change:
-        """With the u of some coordinates' prior times a factor, which divides its precision 1 by the square."""
+        """Compute the change for a factor on some priors' u, which divides their precision 1 by its square."""
         precision = self.precision.copy()
         precision[members, members] += factor**-2 - 1
         values, vectors = np.linalg.eigh(precision)
-        # Data only add to the precision of the priors: draws that scatter more than these do not say otherwise.
+        # Data only add to the precision of the priors, even if draws scatter more than these.
         covariance = (vectors / np.maximum(values, min(1.0, factor**-2))) @ vectors.T
-        # The data's share of the slope at zero stays.
+        # The data's score at zero does not change.
         mean = covariance @ (self.precision @ self.mean)
         variance = np.einsum("qi,ij,qj->q", self.gradient, covariance, self.gradient)
         before = np.einsum("qi,ij,qj->q", self.gradient, np.linalg.inv(self.precision), self.gradient)
@@ -70,7 +70,7 @@ class NormalModel:
 
 @dataclass(frozen=True)
 class SampledHeadlines:
-    """Draws of the free coordinates z (n, d) and of the headlines (n, quantities), with their weights (n,)."""
+    """Draws of the free coordinates z (n, d) and of the headlines (n, quantities), with weights (n,)."""
 
     z: np.ndarray
     values: np.ndarray
@@ -80,7 +80,7 @@ class SampledHeadlines:
 
     @property
     def normal(self) -> NormalModel:
-        """With the moments of the draws."""
+        """Return the normal approximation with the moments of the draws."""
         mean, centre = weighted_mean(self.z, self.weights), weighted_mean(self.values, self.weights)
         away, off = self.z - mean, self.values - centre
         precision = np.linalg.inv((away * self.weights[:, None]).T @ away)
@@ -88,9 +88,9 @@ class SampledHeadlines:
         return NormalModel(mean, precision, gradient, np.sqrt(self.weights @ off**2))
 
     def changed(self, members: np.ndarray, factor: float) -> Change | None:
-        """By the ratio of the priors; None where too few draws bear it."""
+        """Compute the change by the ratio of the priors; None where too few draws have weight."""
         z = self.z[:, members]
-        # In units of the stated u: a half-normal quantity of its own value, all others of their coordinate.
+        # In units of the stated u: the value of a half-normal quantity, the coordinate of all others.
         stated = np.where(self.half[members], half_normal(z), z)
         log_ratio = -0.5 * (factor**-2 - 1) * np.sum(stated**2, axis=1)
         weights = smoothed_weights(np.log(np.maximum(self.weights, np.finfo(float).tiny)) + log_ratio)
@@ -102,7 +102,7 @@ class SampledHeadlines:
 
 
 def sampled_headlines(fit: JointFit, moved: set[str], posterior: Posterior) -> tuple[list[str], SampledHeadlines]:
-    """Judged headlines of a posterior's draws, with their labels."""
+    """Return judged headlines of a posterior's draws, with their labels."""
     draws, rows = posterior.joined, np.flatnonzero(fit.free)
     columns = {of.label: draws[of.name] for of in HEADLINES if of.judged and of.applies(moved)}
     columns = {name: values for name, values in columns.items() if np.ptp(values) > 1e-12 * np.max(np.abs(values))}
@@ -116,16 +116,16 @@ def sampled_headlines(fit: JointFit, moved: set[str], posterior: Posterior) -> t
 def prior_sensitivity(
     fit: JointFit, moved: set[str], posterior: Posterior | None = None
 ) -> tuple[PriorSensitivity, ...]:
-    """Each prior in turn doubled and halved in u. The stereo calibration is one prior: its coordinates go together.
+    """Double and halve the u of each prior in turn; the stereo calibration is one prior of many coordinates.
 
     Args:
         fit: a joint fit.
         moved: directions in which the campaign ever moved.
-        posterior: its sample; without it the Laplace approximation is changed, a half-normal as normal in its
-            coordinate.
+        posterior: its sample; without it the Laplace approximation is changed, with a half-normal prior as normal in
+            its coordinate.
 
     Returns:
-        What changes a headline noticeably, largest first.
+        Priors that change a headline noticeably, largest first.
     """
     rows = np.flatnonzero(fit.free)
     sampled = None

@@ -1,6 +1,6 @@
-"""Deviations at the stops: seen minus modelled mirror angles, as readings of an axis and grouped by possible cause.
+"""Deviations at the stops: observed minus modelled mirror angles, as readings of an axis and grouped by cause.
 
-Angles in degrees (rad inside, where a name says so), counters in steps, depths in mm, times in s.
+Angles in degrees (rad where a name says so), counters in steps, depths in mm, times in s.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from tvsbayes.statistics.chances import one_way_chance, recursive_residuals
 
 CAUSE_BINS = 6
 PLACEMENT_GAP = 1.03
-"""Ratio of two neighbouring depths that belong to different placements: ten times the noise of a depth of 0.3 %."""
+"""Ratio of neighbouring depths above which placements differ: ten times the noise of a depth, 0.3 %."""
 CAUSE_LIMIT = 0.01
-"""Probability, all tests of a campaign together, with which clean residuals are called dependent on a cause."""
+"""Probability, for all tests of a campaign together, that correct residuals are called dependent on a cause."""
 STEP_PHASES = 4
-"""Full steps per electrical period of a two-phase stepper: what its currents repeat with."""
+"""Full steps per electrical period of a two-phase stepper."""
 
 
 @dataclass(frozen=True)
 class _SeenRest:
-    """A rest of an axis with its usable spots, the mean weighted by their pixel noise.
+    """A rest of an axis with the deviations of its usable spots, and their mean weighted by pixel noise.
 
-    At each spot the residual, range projected out, is explained by two angles (`SpotDeviations`).
+    Each spot's residual, range projected out, is explained by two angles (`SpotDeviations`).
 
     Attributes:
-        rest: where the axis stood and how it came there.
-        first: row among `ordered_spots` of its first spot, usable or not: the one that drew the stop error.
+        rest: counter of the axis and its approach.
+        first: row among `ordered_spots` of its first spot, usable or not, at which the stop error was drawn.
         rows: of its usable spots, shape (n,).
         deviation_rad: of each, shape (n,).
         variance_rad2: of each by pixel noise, shape (n,).
@@ -55,11 +55,11 @@ class _SeenRest:
 
 
 def _left_to_stops(fit: JointFit) -> np.ndarray:
-    """Residuals without what homings, drift, play and the gears' repeating errors do to them, shape (spots, 4).
+    """Remove the effects of homings, drift, play and the gears' repeating errors from residuals, shape (spots, 4).
 
-    All these stand for many stops and are estimated with the rest: what a stop shares with the others is no deviation
-    of its own. With u = C^-1 r of all spots, unit noise has the mean u, and the error of a stop its variance times what
-    u says of it, so that the rest need not be known one by one.
+    These effects are common to many stops and estimated with all other parameters, so they are no deviation of a single
+    stop. With u = C^-1 r of all spots, unit noise has the conditional mean u, and the error of a stop its variance
+    times the projection of u. The other effects need not be computed one by one.
     """
     left = np.concatenate([group.residual for group in fit.information.groups]).reshape(-1, 4)
     slope, spots = np.asarray(fit.linearised.slope), ordered_spots(fit.campaign)
@@ -73,7 +73,7 @@ def _left_to_stops(fit: JointFit) -> np.ndarray:
 
 
 def _seen_rests(fit: JointFit, axis: str, residual: np.ndarray) -> list[_SeenRest]:
-    """Rests of an axis that usable spots tell of, in order, by whitened residuals (spots, 4)."""
+    """Collect rests of an axis with usable spots, in order, from whitened residuals (spots, 4)."""
     index, rests = AXES.index(axis), rests_of(fit.campaign.moves, axis)
     deviations = replace(fit.linearised, residual=residual).spot_deviations()
     deviation, variance = deviations.deviation_rad[:, index], deviations.covariance_rad2[:, index, index]
@@ -94,16 +94,16 @@ def _seen_rests(fit: JointFit, axis: str, residual: np.ndarray) -> list[_SeenRes
 
 
 def stop_readings(fit: JointFit, axis: str) -> StopReadings:
-    """What the spots say of every stop of an axis, before any error is shrunk towards zero.
+    """Estimate every stop of an axis from its spots, without shrinking errors towards zero.
 
-    At each stop the mean deviation of its spots, added to the angle that counters and play predict.
+    The reading of a stop is the mean deviation of its spots plus the angle predicted by counters and play.
 
     Args:
         fit: a converged fit.
         axis: pan or tilt.
 
     Returns:
-        One row per stop with a known side and the play taken up for certain.
+        One row per stop with a known side and the play certainly taken up.
     """
     values = dict(zip(fit.names, np.asarray(fit.mode.physical, dtype=float).tolist(), strict=True))
     needed = values[f"backlash_deg.{axis}"] / abs(values[f"degrees_per_step.{axis}"])
@@ -125,10 +125,10 @@ def stop_readings(fit: JointFit, axis: str) -> StopReadings:
 
 
 def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
-    """Deviations of all stops from the fitted model, both axes, in order.
+    """Compute deviations of all stops from the fitted model, both axes, in order.
 
-    The common part of the calibration is in none of them, nor is a drift or what the gears repeat; each deviation has
-    lost a little to the fit and to these: they scatter by less than `u_deg`.
+    They exclude the common part of the calibration, drifts and repeating errors of the gears. The fit of all these
+    absorbs a little of each deviation, so they scatter by less than `u_deg`.
     """
     spots, moves = ordered_spots(fit.campaign), fit.campaign.moves
     # A direction has no depth.
@@ -136,7 +136,7 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
     left, residuals = _left_to_stops(fit), list[StopResidual]()
     for index, axis in enumerate(AXES):
         for one in _seen_rests(fit, axis, left):
-            # The row that drew the stop error has its variance, whether that spot is used or not.
+            # The row at which the stop error was drawn has its variance, whether that spot is used or not.
             variance = one.mean_variance_rad2 + fit.linearised.stop_variance[one.first, index]
             residuals.append(
                 StopResidual(
@@ -156,10 +156,10 @@ def stop_residuals(fit: JointFit) -> tuple[StopResidual, ...]:
 
 
 def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
-    """Deviations of the stops grouped by depth, direction, N, step phase and time, pan and tilt apart.
+    """Group deviations of the stops by depth, direction, N, step phase and time, separately for pan and tilt.
 
-    Spots of one rest share its stop error: for depth they are held against each other, not against the model.
-    A cause is suspicious where its p is below `CAUSE_LIMIT` shared out among all tests (Bonferroni).
+    Spots of one rest share its stop error, so for depth they are compared with each other, not with the model. A cause
+    is suspicious where its p is below `CAUSE_LIMIT` divided by the number of tests (Bonferroni).
     """
     keys: dict[str, Callable[[StopResidual], float | str]] = {
         "direction": lambda r: r.direction or "unknown",
@@ -198,9 +198,9 @@ def residual_causes(residuals: Sequence[StopResidual]) -> tuple[Cause, ...]:
 
 
 def _placed(depths_mm: Sequence[float]) -> list[tuple[str, np.ndarray]]:
-    """Groups of depths that pixel noise cannot mix: placements of the sheet, or bins of depths that reach far.
+    """Group depths so that pixel noise does not mix groups: placements of the sheet, or bins of a wide range.
 
-    A depth is triangulated from the pixels that also give the deviation: groups inside one placement would sort the
+    A depth is triangulated from the pixels that also give the deviation: groups within one placement would sort the
     stops by their own noise.
     """
     array = np.array(depths_mm)
@@ -213,12 +213,12 @@ def _placed(depths_mm: Sequence[float]) -> list[tuple[str, np.ndarray]]:
 
 
 def _told(value: float) -> str:
-    """Four digits, without an exponent."""
+    """Format with four digits, without an exponent."""
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def _binned(values: Sequence[float | str], unit: str) -> list[tuple[str, np.ndarray]]:
-    """Groups of equal values; more than `CAUSE_BINS` numbers go into bins of about equal counts."""
+    """Group equal values; more than `CAUSE_BINS` numbers go into bins of about equal counts."""
     array = np.array(values)
     distinct = np.unique(array)
     if len(distinct) <= CAUSE_BINS or array.dtype.kind not in "if":

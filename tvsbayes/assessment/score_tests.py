@@ -1,4 +1,4 @@
-"""Whether the residuals look as the model says: score tests of defects that it leaves out.
+"""Validation of the residuals: score tests of defects that the model leaves out.
 
 Residuals are whitened by the pixel noise, four components a spot (range projected out; the last is empty without a
 reading); coordinates are in sds of their priors. Counters in steps, angles in degrees.
@@ -23,21 +23,21 @@ from tvsbayes.results.estimates import Validation, ValidationTest
 from tvsbayes.statistics.chances import log_chance
 
 VALIDATION_LEVEL = 0.01
-"""Probability, all tests together, with which a clean campaign fails; `experiments/robustness/model_error.md`."""
+"""Probability, for all tests together, that a correct campaign fails; `experiments/robustness/model_error.md`."""
 CHANGE_POINTS = 16
-"""Places, evenly over the spots, at which cameras may have moved; twice as many for lost steps."""
+"""Number of places, evenly over the spots, at which cameras may have moved; twice as many for lost steps."""
 WAVES = 16
-"""Transmission errors looked for per axis: 1/2, 1, 3/2 ... periods over the range that was seen."""
+"""Number of periods tested per axis for transmission errors: 1/2, 1, 3/2 ... periods over the range seen."""
 ABSORBED = 1e-3
-"""Share of a defect's effect below which the fit has swallowed it: what is left is no more than its curvature."""
+"""Share of a defect's effect below which the fit has absorbed it: the remainder is its curvature only."""
 KNOWN_DIRECTION = 1e-4
-"""Information (in prior sds) from which the fit can move along a direction; below it the spots cannot follow."""
+"""Information (in prior sds) above which the fit can move along a direction."""
 _POSE = names_of("extrinsics.rotation_rad", "extrinsics.translation_mm")
 
 
 @dataclass(frozen=True)
 class _Defect:
-    """Columns d(prediction)/d(size of the defect), shape (spots, 4, q), for each of its `places`."""
+    """A defect: columns d(prediction)/d(size of the defect), shape (spots, 4, q), for each of its `places`."""
 
     name: str
     places: tuple[str, ...]
@@ -45,13 +45,13 @@ class _Defect:
 
 
 def _times(columns: np.ndarray, pattern: np.ndarray) -> np.ndarray:
-    """Columns (spots, 4, q) at spots where a pattern (spots,) says how much of the defect there is."""
+    """Scale columns (spots, 4, q) by a pattern (spots,), the amount of the defect at each spot."""
     return columns * pattern[:, None, None]
 
 
 @dataclass(frozen=True)
 class _SeenAxis:
-    """One axis as the spots saw it: effect of its angle (spots, 4, 1), angle, counter, last move."""
+    """One axis at the spots: effect of its angle (spots, 4, 1), angle, counter, last move."""
 
     name: str
     push: np.ndarray
@@ -72,9 +72,9 @@ def _seen_axes(fit: JointFit) -> list[_SeenAxis]:
 
 
 def _epipolar(fit: JointFit) -> np.ndarray:
-    """Rows of one camera against those of the other: a shift, and its gradients over the picture, shape (n, 4, 3).
+    """Compute columns of a shift of one camera's rows against the other's, and its gradients, shape (n, 4, 3).
 
-    The part of a residual that neither a mirror angle nor a range explains: no model of the beam is in it.
+    They are the part of a residual that neither a mirror angle nor a range explains, independent of the beam's model.
     """
     jacobian, slope = np.asarray(fit.linearised.residual_jacobian), np.asarray(fit.linearised.slope)
     readings = -jacobian[:, :, INDEX["aperture_zero_deg"]]
@@ -92,11 +92,11 @@ def _epipolar(fit: JointFit) -> np.ndarray:
 
 
 def _defects_in_time(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]:
-    """What moves, drifts or slips while the campaign runs."""
+    """Build defects of motion, drift or slip during the campaign."""
     spots, moves = ordered_spots(fit.campaign), fit.campaign.moves
     order = np.arange(len(spots))
     time = np.array([moves[spot.move].time_s for spot in spots])
-    # Without a clock the order stands for the time.
+    # Without times the order is used.
     time = order if np.ptp(time) == 0 else time
     drift = (time - time.mean()) / max(np.ptp(time), 1)
     segment = np.array([moves[spot.move].segment for spot in spots])
@@ -133,19 +133,19 @@ def _defects_in_time(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]:
         _Defect(
             "steps were lost, or a joint slipped",
             tuple(f"{axis.name} {place(row)}" for axis, row in slips),
-            # A homing finds the zero again.
+            # A homing restores the zero.
             tuple(_times(axis.push, since(row) * (segment == segment[row])) for axis, row in slips),
         ),
     ]
 
 
 def _defects_in_place(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]:
-    """What depends on where the axes stand, how they got there, and on the sheet."""
+    """Build defects that depend on position, approach, or sheet."""
     targets = np.array([spot.target for spot in ordered_spots(fit.campaign)])
     places, waves = [], []
     for axis in axes:
         stops = len(np.unique(axis.counter))
-        # Fewer stops than this fit any wave; a search that has left every rig may end where an axis does not turn.
+        # Fewer stops fit any wave; a search that failed may end where an axis does not turn.
         reach = 2 * float(np.ptp(axis.angle_deg)) if stops > 3 else 0.0
         periods = reach / np.arange(1, min(WAVES, 2 * stops) + 1) if reach else ()
         for period in [*periods, *fit.campaign.rig.harmonic_period_deg.get(axis.name, ())]:
@@ -174,7 +174,7 @@ def _defects_in_place(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]
 
 @dataclass(frozen=True)
 class _Answer:
-    """A test before it is judged; `log_p` because chi-squares of hundreds have no p in double precision."""
+    """A test before the joint decision; `log_p`, since p of chi-squares of hundreds underflows."""
 
     log_p: float
     name: str
@@ -187,12 +187,12 @@ class _Answer:
 
 @dataclass(frozen=True)
 class _Scores:
-    """Scores of all columns, each scaled to unit information, less what the fit can follow.
+    """Scores of all columns, each scaled to unit information, with the fit's coordinates eliminated.
 
     Attributes:
         score: shape (q,).
         variance: shape (q, q).
-        moved_by: how far a defect of unit size moves every headline, in its sds, shape (headlines, q).
+        moved_by: shift of every headline by a defect of unit size, in its sds, shape (headlines, q).
     """
 
     score: np.ndarray
@@ -200,7 +200,7 @@ class _Scores:
     moved_by: np.ndarray
 
     def answer(self, name: str, place: str, rows: slice) -> _Answer | None:
-        """The test of some columns; None where the fit can follow them entirely."""
+        """Test some columns; None where the fit can absorb them entirely."""
         values, vectors = np.linalg.eigh(self.variance[rows, rows])
         kept = values > ABSORBED
         if not kept.any():
@@ -214,13 +214,13 @@ class _Scores:
 
 @dataclass(frozen=True)
 class _Asked:
-    """What all tests share.
+    """Arrays common to all tests.
 
     Attributes:
         groups: stops of the campaign; the first p columns of their Jacobians are the fit's own, then the defects'.
-        own_score: of the fit's own columns, shape (p,): what the residuals still ask for.
-        followed: inverse information of the directions that the fit can follow, shape (p, p).
-        scores: of the defects' columns.
+        own_score: remaining score of the fit's own columns, shape (p,).
+        followed: inverse information of the directions that the fit can absorb, shape (p, p).
+        scores: scores of the defects' columns.
     """
 
     groups: Sequence[StopGroup]
@@ -256,23 +256,23 @@ def _ask(fit: JointFit, defects: Sequence[_Defect]) -> _Asked:
 
 
 def validate(fit: JointFit) -> Validation:
-    """Look for defects that the model does not have, by score tests at the mode.
+    """Test for defects that the model does not have, by score tests at the mode.
 
     For columns D = d(prediction)/d(size of a defect) the score is g = D'^T C^-1 r, C the covariance of pixel noise,
-    stop errors and home offsets, D' = D less what the fit can follow. If the model holds, g ~ N(0, D'^T C^-1 D') and
-    g^T (D'^T C^-1 D')^-1 g is chi-square wherever the true rig lies (Rao, Proc. Cambridge Phil. Soc. 44 (1948) 50).
+    stop errors and home offsets, D' = D less the part that the fit can absorb. If the model holds, g ~ N(0, D'^T C^-1
+    D') and g^T (D'^T C^-1 D')^-1 g is chi-square for any true rig (Rao, Proc. Cambridge Phil. Soc. 44 (1948) 50).
     Nothing is refitted. The places of one defect share its level (Bonferroni), all tests share `VALIDATION_LEVEL`
-    (Holm, Scand. J. Statist. 6 (1979) 65). Noise scales are the fitted ones, which a defect has already widened.
+    (Holm, Scand. J. Statist. 6 (1979) 65). Noise scales are the fitted ones, which include the effect of a defect.
 
-    A defect of size s = (D'^T C^-1 D')^-1 g, left out of the model, moves the mode by S J^T C^-1 D s. That is a
-    systematic effect without correction: its square joins the squared u (GUM F.2.4.5, as an uncorrected effect).
-    `inflation` is sqrt(1 + (largest move of a headline in its sds)^2), over the tests that failed.
+    A defect of size s = (D'^T C^-1 D')^-1 g, left out of the model, shifts the mode by S J^T C^-1 D s. That is an
+    uncorrected systematic effect: its square is added to the squared u (GUM F.2.4.5). `inflation` is sqrt(1 + (largest
+    shift of a headline in its sds)^2), over the tests that failed.
 
     Args:
         fit: a joint fit.
 
     Returns:
-        What was asked and found; a question that the fit can follow entirely is not asked.
+        All tests and the verdict, without tests of defects that the fit can absorb entirely.
     """
     axes = _seen_axes(fit)
     defects = [*_defects_in_time(fit, axes), *_defects_in_place(fit, axes)]
@@ -294,9 +294,9 @@ def validate(fit: JointFit) -> Validation:
 
 
 def _single_spots(fit: JointFit, question: _Asked) -> _Answer:
-    """The spot that all others predict worst; how far it moves a headline is not asked (`--robust` drops it).
+    """Test the spot that all others predict worst; its effect on headlines is not computed (`--robust` drops it).
 
-    As `linear_spots.leave_one_out_chi2`, less what the fit can follow.
+    As `linear_spots.leave_one_out_chi2`, with the fit's coordinates eliminated.
     """
     spots = ordered_spots(fit.campaign)
     p, shift = len(question.own_score), question.followed @ question.own_score
@@ -327,7 +327,7 @@ def _single_spots(fit: JointFit, question: _Asked) -> _Answer:
 
 
 def _holm(answers: Sequence[_Answer]) -> Validation:
-    """All tests together at `VALIDATION_LEVEL`; the defect with the least p is named as the cause."""
+    """Decide all tests together at `VALIDATION_LEVEL`; the defect with the least p is named as the cause."""
     answers = sorted(answers, key=lambda a: a.log_p)
     bad = 0
     while bad < len(answers) and answers[bad].log_p <= np.log(VALIDATION_LEVEL / (len(answers) - bad)):

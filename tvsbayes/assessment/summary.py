@@ -1,6 +1,6 @@
-"""What a fit knows, put together: headlines, parameters, diagnostics, and what the classic estimator should report.
+"""Summary of a fit: headlines, parameters, diagnostics, and the predicted result of the classic estimator.
 
-Works on a finished `JointFit`, and on a `Posterior` where there is one; computes no new fit. Units as in the names.
+It uses a finished `JointFit`, and a `Posterior` if given; nothing is fitted again. Units as in the names.
 """
 
 from __future__ import annotations
@@ -46,24 +46,24 @@ from tvsbayes.statistics.weighted_draws import TAILS, systematic, weighted_mean,
 EFFECTIVE = "effective_deg_per_step"
 CLASSIC_DRAWS = 256
 SEEN_SHARE = 0.5
-"""Of the draws that must show an experiment, for it to count: one draw that went astray drops none."""
+"""Least share of draws with a finite ratio for an experiment to count, so that one outlying draw drops none."""
 LENGTH_NAMES = names_of("transmission_error_length_deg")
 ABSENT_AT_ZERO = tuple(
     name
     for name in (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
     if name not in (*LENGTH_NAMES, *names_of("creep_minutes"))
 )
-"""Parameters that are not told of where they are fixed at 0."""
+"""Parameters that are not reported where they are fixed at 0."""
 MIXING_SEED = 11
-"""Fixed, so that everything made of one fit has the same draws row by row."""
+"""Fixed seed, so that all results of one fit have the same draws row by row."""
 CURVE_POINTS = 7
 CURVE_DRAWS = 2048
-"""Of equal weight, behind a curve's points: the error of a mean is a forty-fifth of its sd, no line's width."""
+"""Draws of equal weight for a curve's points: the error of a mean is 1/45 of its sd, less than a line's width."""
 
 
 def _estimate(value: float, draws: np.ndarray, weights: np.ndarray, prior_draws: np.ndarray) -> Estimate:
-    """From weighted draws: equal-tailed interval, standard deviations."""
-    # The mean of equal numbers may be off by a rounding: what is fixed would scatter by 1e-17 of itself.
+    """Build an estimate from weighted draws: equal-tailed interval, standard deviations."""
+    # The mean of equal numbers may have a rounding error: a fixed quantity would scatter by 1e-17 of its value.
     prior_sd = float(np.std(prior_draws)) if np.ptp(prior_draws) > 0 else 0.0
     sd = float(np.sqrt(weights @ (draws - weighted_mean(draws, weights)) ** 2))
     contraction = float(1 - (sd / prior_sd) ** 2) if prior_sd > 0 else None
@@ -72,14 +72,14 @@ def _estimate(value: float, draws: np.ndarray, weights: np.ndarray, prior_draws:
 
 
 class LaplaceDraws(NamedTuple):
-    """Draws of the Laplace approximation under every way of homing that counts; weights (n,) of sum 1."""
+    """Draws of the Laplace approximations under all fitted ways of homing; weights (n,) of sum 1."""
 
     draws: Derived
     weights: np.ndarray
 
 
 def laplace_draws(fit: JointFit) -> LaplaceDraws:
-    """The draws of all ways, one way after the other: those of the fit alone where the sides were recorded."""
+    """Concatenate the draws of all ways of homing; those of the fit alone where the sides were recorded."""
     parts = [(way.probability, way.fit.draws) for way in fit.mixture if way.fit is not None]
     counts = [len(part.physical) for _, part in parts]
     weights = np.concatenate([np.full(n, p / n) for n, (p, _) in zip(counts, parts, strict=True)])
@@ -88,17 +88,17 @@ def laplace_draws(fit: JointFit) -> LaplaceDraws:
 
 
 def equal_laplace_draws(fit: JointFit) -> Derived:
-    """`laplace_draws` that weigh the same, as many as the fit has of its own; its own where there is one way."""
+    """Resample `laplace_draws` with equal weights, as many as the fit has; its own draws if there is one way."""
     if len(fit.mixture) == 1:
         return fit.draws
     weighted, count = laplace_draws(fit), len(fit.draws.physical)
-    # In order, the first of them would be of one way alone.
+    # Without the permutation the first draws would be of one way only.
     places = np.random.default_rng(MIXING_SEED).permutation(systematic(weighted.weights, count, 0.5))
     return jax.tree.map(lambda x: x[places], weighted.draws)
 
 
 class _Source:
-    """Where the numbers come from: the Laplace approximation, or a posterior and its diagnosis."""
+    """Source of the estimates: the Laplace approximation, or a posterior and its diagnosis."""
 
     def __init__(self, fit: JointFit, posterior: Posterior | None):
         self.fit, self.posterior = fit, posterior
@@ -110,7 +110,7 @@ class _Source:
             self.centre, self.draws, self.weights = posterior.centre, posterior.joined, posterior.weights.ravel()
 
     def estimate(self, name: str) -> Estimate:
-        """A quantity that is linear in the fields of `Derived`, with the sampler's diagnosis of it."""
+        """Estimate a quantity that is linear in the fields of `Derived`, with the sampler's diagnosis."""
         plain = _estimate(float(self.centre[name]), self.draws[name], self.weights, self.prior[name])
         if self.posterior is None:
             return plain
@@ -124,7 +124,7 @@ class _Source:
 
 
 def _absent(fit: JointFit) -> set[str]:
-    """What the model does not have of errors of the gears, scatter of looks and shifts of the zeros, or means not."""
+    """Return parameters absent from the model: of gear errors, scatter of looks and shifts of zeros."""
     value = dict(zip(fit.names, np.asarray(fit.mode.physical).tolist(), strict=True))
     none = {name for name in ABSENT_AT_ZERO if not fit.free[INDEX[name]] and value[name] == 0}
     for axis in AXES:
@@ -135,9 +135,9 @@ def _absent(fit: JointFit) -> set[str]:
 
 
 def _parameters(source: _Source) -> dict[str, Estimate]:
-    """Parameters with a coordinate; Laplace interval ends are exact images of z -+ 1.96 sd under monotone maps.
+    """Estimate the parameters; Laplace interval ends are exact images of z -+ 1.96 sd under monotone maps.
 
-    Of a mixture of ways of homing they are quantiles of its draws, as a posterior's are.
+    For a mixture of ways of homing they are quantiles of its draws, as for a posterior.
     """
     fit = source.fit
     low, high = fit.ends95
@@ -162,17 +162,17 @@ def _parameters(source: _Source) -> dict[str, Estimate]:
 
 
 def _by_part(source: _Source, block: str, moved: set[str]) -> dict[str, Estimate | None]:
-    """Quantities of a block by the last part of their names; None of directions that never moved."""
+    """Estimate quantities of a block, by the last part of their names; None for directions that never moved."""
     quantities = (QUANTITIES[name] for name in QUANTITIES.blocks[block])
     return {of.parts[-1]: source.estimate(of.name) if of.applies(moved) else None for of in quantities}
 
 
 def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
-    """Mean of each direction as the classic estimator would compute it from ideal spots of the fitted model.
+    """Predict each direction's classic mean from ideal spots of the fitted model.
 
-    Under the Laplace approximation it follows the parameters linearly from the mode, as the pixels do: over what they
-    leave open it bends by less than a hundredth of its standard deviation. Under a posterior pixels are those of each
-    draw. The classic's stereo calibration stays the stated one.
+    Under the Laplace approximation it is linear in the parameters about the mode, as the pixels are: over their
+    uncertainty the nonlinearity is less than 1/100 of its standard deviation. Under a posterior the pixels are computed
+    for each draw. The classic's stereo calibration is the stated one.
     """
     fit = source.fit
     selection = select_experiments(fit.campaign)
@@ -191,7 +191,7 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
         centre = np.where(np.isfinite(draws), draws, 0.0).sum(axis=0) / np.maximum(np.isfinite(draws).sum(axis=0), 1)
     finite = np.isfinite(draws).mean(axis=0) > SEEN_SHARE
     for direction in DIRECTIONS:
-        # Pixels far from the image, of a fit or draw that went astray, cannot be undistorted: there is no ratio then.
+        # Pixels far outside the image, of an outlying fit or draw, cannot be undistorted: there is no ratio then.
         chosen = (selection.direction == direction) & finite
         values = draws[:, chosen].mean(axis=1) if chosen.any() else np.zeros(0)
         values = values[np.isfinite(values)]
@@ -202,7 +202,7 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
 
 
 def _curves(posterior: Posterior, moved: set[str]) -> Curves:
-    """Local ratios along both axes over the range that was seen, and lost motion at the step counts used."""
+    """Compute local ratios along both axes over the range seen, and lost motion at the step counts used."""
     lost = {direction: _lost_motion(posterior, direction) for direction in DIRECTIONS if direction in moved}
     some = posterior.resampled(1, CURVE_DRAWS)
     along: dict[str, tuple[CurvePoint, ...]] = {axis: _along(some, index, moved) for index, axis in enumerate(AXES)}
@@ -210,7 +210,7 @@ def _curves(posterior: Posterior, moved: set[str]) -> Curves:
 
 
 def _along(posterior: Posterior, axis: int, moved: set[str]) -> tuple[CurvePoint, ...]:
-    """Local ratios at angles of one axis, the other at the reference pose."""
+    """Compute local ratios at angles of one axis, the other at the reference pose."""
     angles = np.degrees(posterior.fit.linearised.mirror_angles_rad)[:, axis]
     points = []
     for angle in np.linspace(angles.min(), angles.max(), CURVE_POINTS):
@@ -230,7 +230,7 @@ def _along(posterior: Posterior, axis: int, moved: set[str]) -> tuple[CurvePoint
 
 
 def _lost_motion(posterior: Posterior, direction: str) -> tuple[LostMotion, ...]:
-    """Mirror angle that a reversal costs, at a few of the lengths that the campaign moved."""
+    """Compute the mirror angle lost by a reversal, at a few of the move lengths of the campaign."""
     used = sorted(set(legs_of(posterior.fit.campaign.moves)[direction]))
     chosen = np.unique(np.linspace(0, len(used) - 1, min(CURVE_POINTS, len(used))).astype(int))
     steps = [used[i] for i in chosen]
@@ -242,7 +242,7 @@ def _lost_motion(posterior: Posterior, direction: str) -> tuple[LostMotion, ...]
 
 
 def seen_range(fit: JointFit) -> dict[str, tuple[int, int]]:
-    """Lowest and highest counter of each axis that the looks used saw."""
+    """Return the lowest and highest counter of each axis with a used look."""
     used = np.asarray(fit.arrays.spots.valid) > 0
     moves = np.unique(np.asarray(fit.arrays.spots.move_index)[used])
     steps = {axis: [getattr(fit.campaign.moves[move], f"{axis}_steps") for move in moves] for axis in AXES}
@@ -258,12 +258,12 @@ def worth_sampling(fit: JointFit) -> bool:
 
 
 def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
-    """Put a fit into the contract's terms.
+    """Summarise a fit in the terms of `fit.json`.
 
     Args:
         fit: a joint fit, converged or not.
-        posterior: its sample. One without an answer lends no number: what is returned is then the Laplace
-            approximation, labelled so, and not converged.
+        posterior: its sample. If it has no answer, the Laplace approximation is returned, labelled so, and not
+            converged.
 
     Returns:
         Headlines, parameters and diagnostics.
@@ -280,7 +280,7 @@ def summarise(fit: JointFit, posterior: Posterior | None = None) -> FitSummary:
     if posterior is not None:
         lacks = {"accepted": "", "rough": "ROUGH", "laplace": "LAPLACE"}[posterior.convergence.answer]
         problems += tuple(f"{lacks}: {sentence}" for sentence in posterior.convergence.missing)
-    # What `fit.json` holds by direction has places of its own.
+    # Quantities by direction have their own fields in `fit.json`.
     others = [name for name in derived_names(fit.space.mechanism) if not QUANTITIES[name].ratio]
     parameters = {**_parameters(source), **{name: source.estimate(name) for name in others}}
     return FitSummary(

@@ -1,6 +1,6 @@
-"""What the data leave open: weak directions, stops on which all hangs, priors in conflict, directions with few stops.
+"""Weaknesses of the data: weak directions, stops of high leverage, priors in conflict, directions with few stops.
 
-Directions and gradients are those of the coordinates, each in sds of its prior; the linear model about the mode.
+Directions and gradients are in the coordinates, each in sds of its prior, of the linear model about the mode.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ LEVERAGE_LIMIT = 2.0
 """A stop is named if a headline's sd would grow by more than this factor without it (formulation 4.2)."""
 LOADING_LIMIT = 0.3
 WEAK_VARIANCE = 0.5
-"""A direction of parameter space is weak if more than this share of its prior variance is left."""
+"""A direction of parameter space is weak if more than this share of its prior variance remains."""
 LISTED = 8
 
 
 def moved_directions(fit: JointFit) -> set[str]:
-    """Directions in which the campaign ever moved."""
+    """Return the directions in which the campaign ever moved."""
     return set(legs_of(fit.campaign.moves))
 
 
 def _used_moves(fit: JointFit) -> set[int]:
-    """Moves after which a spot counts."""
+    """Return the moves with a used spot."""
     return {s.move for s in fit.campaign.spots if s.status == "ok" and s.spot not in fit.excluded_spots}
 
 
 def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirection | None:
-    """Ratio and backlash of an axis, if they move together or the stops cannot separate them."""
+    """Return ratio and backlash of an axis, if they are correlated or the stops cannot separate them."""
     index = INDEX[f"backlash_deg.{axis}"]
     if not fit.free[index]:
         return None
     ratio = fit.draws.effective_deg_per_step[:, DIRECTIONS.index(direction)]
     if np.ptp(ratio) == 0:
-        # Held by the priors: nothing moves with the backlash.
+        # Fixed by the priors, hence uncorrelated with the backlash.
         return None
     correlation = float(np.corrcoef(ratio, fit.draws.physical[:, index])[0, 1])
     stops = observed_stops(fit.campaign.moves, _used_moves(fit), axis)
@@ -56,7 +56,7 @@ def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirecti
 
 
 def _counters_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
-    """Gear error and ratio of an axis seen at few counters, if the error halfway between them is the prior's."""
+    """Return gear error and ratio of an axis seen at few counters, if the error between them is set by the prior."""
     steps = {getattr(fit.campaign.moves[move], f"{axis}_steps") for move in _used_moves(fit)}
     counters, count = sorted(steps), len(NAMES)
     if not 2 <= len(counters) <= FEW_COUNTERS or not len(fit.information.place_mean):
@@ -87,7 +87,7 @@ def _counters_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
 
 
 def _scatter_direction(fit: JointFit, axis: Axis) -> WeakDirection | None:
-    """Scatter of stops and of looks of an axis, if no stop has a second look by which they are told apart."""
+    """Return scatter of stops and of looks of an axis, if no stop has a second look to separate them."""
     look, *stops = f"look_scatter_deg.{axis}", *(f"stop_sd_deg.{direction}" for direction in SENSES[axis])
     stops = [name for name in stops if fit.free[INDEX[name]]]
     if not fit.free[INDEX[look]] or not stops:
@@ -110,11 +110,11 @@ SHIFTS = {
     ),
     "thermal_deg_per_K": ("a shift with the temperature", "come back to the first stop at another temperature"),
 }
-"""Of a zero in time: in words, and what tells it from the gears."""
+"""Shifts of a zero in time: in words, and what separates them from the gears."""
 
 
 def _shift_directions(fit: JointFit, axis: Axis) -> list[WeakDirection]:
-    """What of the gears of an axis cannot be told from a shift of its zero."""
+    """Return gear parameters of an axis that cannot be separated from a shift of its zero."""
     negative, positive = (fit.draws.effective_deg_per_step[:, DIRECTIONS.index(d)] for d in SENSES[axis])
     backlash = fit.draws.physical[:, INDEX[f"backlash_deg.{axis}"]]
     contrast = f"the contrast of {SENSES[axis][0]} and {SENSES[axis][1]}"
@@ -139,7 +139,7 @@ def _shift_directions(fit: JointFit, axis: Axis) -> list[WeakDirection]:
 
 
 def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]:
-    """Combinations of parameters that data and priors leave wide, in words: axes never moved, play, priors alone."""
+    """Describe parameter combinations that data and priors do not determine: axes never moved, play, priors alone."""
     directions = []
     for axis, pair in SENSES.items():
         if not moved & set(pair):
@@ -163,7 +163,7 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
         if not loadings:
             loadings = {fit.names[rows[order[0]]]: float(vector[order[0]])}
         names = list(loadings)
-        # Rounding may leave a hair more than the prior's variance: more than 100 % is not a finding.
+        # Rounding may give slightly more than the prior's variance; more than 100 % is not reported.
         left = f"{min(100.0, 100 * value):.0f} % of"
         if len(names) == 1:
             text = f"{names[0]} is set by the prior: {left} its variance is left; state it better or accept it"
@@ -176,20 +176,20 @@ def weak_directions(fit: JointFit, moved: set[str]) -> tuple[WeakDirection, ...]
 
 
 def headline_gradients(fit: JointFit, moved: set[str]) -> tuple[list[str], np.ndarray]:
-    """Labels of judged headlines, and d(quantity)/d(coordinates), shape (q, p)."""
+    """Return labels of judged headlines, and d(quantity)/d(coordinates), shape (q, p)."""
     # Parameters in coordinates, where a backlash is Gaussian.
     quantities = {
         of.label: fit.draws_z[:, INDEX[of.name]] if of.name in INDEX else fit.draws[of.name]
         for of in HEADLINES
         if of.judged and of.applies(moved)
     }
-    # What the priors hold fixed scatters by roundings, which nothing may be measured by.
+    # Quantities fixed by the priors scatter by rounding only and are left out.
     quantities = {name: v for name, v in quantities.items() if np.ptp(v) > 1e-12 * np.max(np.abs(v))}
     return list(quantities), gradients(fit, np.stack(list(quantities.values()), axis=1))
 
 
 def gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
-    """d(quantity)/d(coordinates), shape (q, p), of quantities with values (draws, q) on the Laplace draws.
+    """Compute d(quantity)/d(coordinates), shape (q, p), of quantities with values (draws, q) on the Laplace draws.
 
     Regression on the moment-matched draws gives the gradient of the linear part, averaged over the posterior.
     """
@@ -199,7 +199,7 @@ def gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
 
 
 def whole_gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
-    """d(quantity)/d(coordinates, then errors at places), shape (q, p + e), as `gradients` finds them."""
+    """Compute d(quantity)/d(coordinates, then errors at places), shape (q, p + e), as `gradients` does."""
     draws = np.concatenate([fit.draws_z, fit.draws_places], axis=1)
     centred = draws - draws.mean(axis=0)
     cross = (values - values.mean(axis=0)).T @ centred / len(centred)
@@ -207,7 +207,7 @@ def whole_gradients(fit: JointFit, values: np.ndarray) -> np.ndarray:
 
 
 def leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
-    """Stops without which a headline's sd would more than double."""
+    """Find stops without which a headline's sd would more than double."""
     quantities, gradients = headline_gradients(fit, moved)
     sd = np.sqrt(np.einsum("qi,ij,qj->q", gradients, fit.covariance, gradients))
     ordered = ordered_spots(fit.campaign)
@@ -232,7 +232,7 @@ def leverage(fit: JointFit, moved: set[str]) -> tuple[Leverage, ...]:
 
 
 def prior_conflicts(fit: JointFit) -> tuple[str, ...]:
-    """Parameters whose mode lies where their prior hardly allows: a wrong sign or unit, or a prior stated too tight."""
+    """Find parameters whose mode is far out in their prior: a wrong sign or unit, or a prior stated too narrow."""
     conflicts = []
     for index in np.flatnonzero(fit.free & (np.abs(fit.z) > CONFLICT_LIMIT)):
         value, distance = fit.mode.physical[index], abs(fit.z[index])
@@ -241,6 +241,6 @@ def prior_conflicts(fit: JointFit) -> tuple[str, ...]:
 
 
 def poorly_known_stops(fit: JointFit) -> dict[str, int]:
-    """Directions whose stop sd is estimated from `few_stops`, with their number."""
+    """Return directions whose stop sd is estimated from `few_stops`, with their number."""
     few = few_stops(fit.campaign.moves, _used_moves(fit))
     return {direction: count for direction, count in few.items() if fit.free[INDEX[f"stop_sd_deg.{direction}"]]}

@@ -1,7 +1,7 @@
-"""Two campaigns of one rig: which of its ratios and backlashes have changed, beyond what both fits leave open.
+"""Comparison of two campaigns of one rig: ratios and backlashes that have changed significantly.
 
-Local ratios in deg/step at the reference pose of the first, backlashes in deg: lines through looks at other counters
-are other quantities. Loads JAX when asked, not when imported.
+Local ratios in deg/step at the reference pose of the first, backlashes in deg. Effective ratios are not compared, since
+lines through looks at other counters are other quantities. JAX is loaded by a comparison, not by the import.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 
 COMPARED = tuple(of.name for of in TARGETS.values() if of.judged)
-"""What is compared, by the names that JSON gives it; the ratios are local ones."""
+"""Names of the compared quantities, as in JSON; the ratios are local ones."""
 
 
 def _draws_at(fit: JointFit, pose_rad: np.ndarray) -> np.ndarray:
-    """`COMPARED` at a pose, shape (1 + draws, quantities): the estimate, then the Laplace draws."""
+    """Compute `COMPARED` at a pose, shape (1 + draws, quantities): the estimate, then the Laplace draws."""
     from tvsbayes.posterior.draws import local_at
 
     drawn = local_at(fit, np.vstack([fit.z, fit.draws_z]), pose_rad)
@@ -33,11 +33,10 @@ def _draws_at(fit: JointFit, pose_rad: np.ndarray) -> np.ndarray:
 
 
 def compare(first: JointFit, second: JointFit) -> Comparison:
-    """Whether an instrument has changed between two campaigns (normalised differences; ISO 13528 9.7 has the idea).
+    """Test whether an instrument has changed between two campaigns (normalised differences, as in ISO 13528 9.7).
 
-    The u of a difference leaves out what both campaigns share: with the same stereo calibration, its error and that
-    of the focal scale move both estimates alike, by influences known from the fits. Everything else is taken as
-    independent.
+    The u of a difference excludes common errors: errors of a shared stereo calibration and of the focal scale shift
+    both estimates, by influences known from the fits. All other errors are taken as independent.
 
     Args:
         first: converged fit of A.
@@ -60,7 +59,7 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
     changes = []
     for k, name in enumerate(COMPARED):
         a, b = float(before[0, k]), float(after[0, k])
-        # What both hold fixed has changed if the statements differ; its variance is zero but for rounding.
+        # A quantity fixed in both has changed if the stated values differ; its variance is zero but for rounding.
         fixed = np.ptp(before[1:, k]) == np.ptp(after[1:, k]) == 0
         u = 0.0 if fixed else float(np.sqrt(max(variance[k], 0.0)))
         ratio = (b - a) / u if u > 0 else None
@@ -79,7 +78,7 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
 
 
 def _days_between(first: Campaign, second: Campaign) -> float | None:
-    """Days between two campaigns that both say when they were made; dates count from midnight, UTC."""
+    """Compute the days between two campaigns that both state when they were made; dates count from midnight, UTC."""
     made = []
     for campaign in (first, second):
         when = campaign.header.get("created")

@@ -1,7 +1,7 @@
-"""Why classic and joint differ: their gap term by term, and what the cameras alone do to both.
+"""The gap between the classic and joint estimates term by term, and the cameras' uncertainty, common to both.
 
-Ratios in deg/step. The classic estimator is asked on the model's own spots while the rig is made ideal step by step.
-Loads JAX when a gap is asked for, not when imported.
+Ratios in deg/step. The classic estimator is applied to the model's own spots while the rig is made ideal step by step.
+JAX is loaded by the computation, not by the import.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 
 GAP_DRAWS = 128
-"""The sds of terms are then known to 6 %; each costs the classic estimator of every experiment four times."""
+"""Number of draws: it gives the sds of terms to 6 %; each draw takes four classic estimates of every experiment."""
 OPTICS = tuple(name for name in OPTICS_NAMES if name != "mirror_offset_mm")
-"""Of what bends the beam's way, what is zero in the nominal rig."""
+"""Parameters of the optics that are zero in the nominal rig."""
 BACKLASH, STEREO_SCALE, SKEW, PROJECTION, CHANCE = (
     "backlash over N",
     "stereo scale and focal scale",
@@ -37,11 +37,11 @@ BACKLASH, STEREO_SCALE, SKEW, PROJECTION, CHANCE = (
     "projection and pose",
     "chance",
 )
-"""Terms of the gap. The last is what the classic's own spots add: stop errors and pixel noise."""
+"""Terms of the gap. The last is due to the classic's own spots: stop errors and pixel noise."""
 
 
 def _ideal(space: ParameterSpace, names: Sequence[str]) -> ParameterSpace:
-    """The priors with parameters fixed at their ideal values: 0, or 1 for the focal scale; cameras as stated."""
+    """Fix parameters at their ideal values: 0, or 1 for the focal scale; cameras as stated."""
     from tvsbayes.instrument.parameters import INDEX, RIG_NAMES
     from tvsbayes.model.compiled import placed
 
@@ -56,18 +56,17 @@ def _ideal(space: ParameterSpace, names: Sequence[str]) -> ParameterSpace:
 
 
 def explain_gap(fit: JointFit, posterior: Posterior | None = None, draws: int = GAP_DRAWS) -> dict[str, Gap | None]:
-    """The gap between both estimators, term by term (formulation 1).
+    """Split the gap between both estimators term by term (formulation 1).
 
-    On every draw the model takes the classic estimator's spots without noise, and again without backlash, then with
-    the stated cameras in place of the true ones, then with ideal optics. Each change of the classic mean is one
-    term; what then still separates it from the ratio of the ideal optics is projection: the tilt read as
-    atan(dZ/dX) off the X axis, the offset of the mirrors, poses other than the reference. Terms depend little on
-    their order, and they add up.
+    For every draw the model predicts the classic estimator's spots without noise, then without backlash, then with the
+    stated cameras, then with ideal optics. Each change of the classic mean is one term. The remaining difference from
+    the ratio of the ideal optics is projection: the tilt computed as atan(dZ/dX) off the X axis, the offset of the
+    mirrors, poses other than the reference. Terms depend little on their order, and they add up to the gap.
 
     Args:
         fit: a converged fit of the campaign.
-        posterior: its sample, for its draws in place of the Laplace approximation's.
-        draws: that the intervals of the terms rest on, at least two; ratio and gap rest on all.
+        posterior: its sample, for draws instead of those of the Laplace approximation.
+        draws: number of draws for the intervals of the terms, at least two; ratio and gap use all.
 
     Returns:
         By direction; None without complete experiments.
@@ -81,7 +80,7 @@ def explain_gap(fit: JointFit, posterior: Posterior | None = None, draws: int = 
         return result
     chosen = _chosen_draws(fit, posterior, draws)
     idealised = _idealised(fit, selection, chosen)
-    # An experiment whose spots lie on one another, or beyond the lens model, has no ratio.
+    # An experiment with coincident spots, or spots outside the lens model, has no ratio.
     sound = np.all([np.isfinite(r).all(axis=0) for r in idealised.classic], axis=0)
     for k, direction in enumerate(DIRECTIONS):
         rows, classic = (selection.direction == direction) & sound, measured.directions[direction]
@@ -92,15 +91,15 @@ def explain_gap(fit: JointFit, posterior: Posterior | None = None, draws: int = 
 
 @dataclass(frozen=True)
 class _Chosen:
-    """Draws that the terms rest on.
+    """Draws used for the terms.
 
     Attributes:
-        z: coordinates (n, p); of the Laplace approximation the mode, then draws.
-        place_errors_rad: what the gears repeat, shape (n, e).
-        mode_first: so it is; else the estimate is the mean of the draws.
+        z: coordinates (n, p); for the Laplace approximation the mode, then draws.
+        place_errors_rad: repeating errors of the gears, shape (n, e).
+        mode_first: whether the first row is the mode; else the estimate is the mean of the draws.
         ratios: effective ratios of all draws, shape (N, 4), deg/step.
-        weights: of all draws, sum 1, shape (N,).
-        ways: of homing that they came from: several where nobody recorded it.
+        weights: weights of all draws, sum 1, shape (N,).
+        ways: ways of homing of the draws, several where it was not recorded.
     """
 
     z: np.ndarray
@@ -128,13 +127,13 @@ def _chosen_draws(fit: JointFit, posterior: Posterior | None, draws: int) -> _Ch
 
 @dataclass(frozen=True)
 class _Idealised:
-    """The classic estimator on the model's own spots, from the rig as it is to the ideal one.
+    """The classic estimator on the model's own spots, from the estimated rig to the ideal one.
 
     Attributes:
-        classic: ratios (n, experiments), deg/step: as it is, without backlash, with the stated cameras, with ideal
+        classic: ratios (n, experiments), deg/step: as estimated, without backlash, with the stated cameras, with ideal
             optics.
-        full: effective ratios (n, 4) of the rig as it is, deg/step.
-        ideal: those of the ideal optics.
+        full: effective ratios (n, 4) of the estimated rig, deg/step.
+        ideal: effective ratios of the ideal optics.
     """
 
     classic: tuple[np.ndarray, ...]
@@ -171,7 +170,7 @@ def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Ideal
 
 
 def _gap(reported: float, chosen: _Chosen, idealised: _Idealised, k: int, rows: np.ndarray) -> Gap:
-    """The gap of direction k, whose experiments are `rows`, to the classic mean that was seen."""
+    """Compute the gap of direction k, whose experiments are `rows`, from the reported classic mean."""
     whole, unplayed, scaled, straight = (r[:, rows].mean(axis=1) for r in idealised.classic)
     full, ideal = idealised.full[:, k], idealised.ideal[:, k]
     parts = {
@@ -181,8 +180,8 @@ def _gap(reported: float, chosen: _Chosen, idealised: _Idealised, k: int, rows: 
         PROJECTION: straight - ideal,
         CHANCE: reported - whole,
     }
-    # The ratio itself as every table states it, from all draws; its mean is a control variate for those of the
-    # terms, which then add up to the gap.
+    # The ratio is computed from all draws, as in every table. Its mean is a control variate for the means of the terms,
+    # which then add up to the gap.
     ratio, weights = chosen.ratios[:, k], chosen.weights
     mean = weighted_mean(ratio, weights)
     centre = float(full[0] if chosen.mode_first else mean)
@@ -203,9 +202,9 @@ def _gap(reported: float, chosen: _Chosen, idealised: _Idealised, k: int, rows: 
 
 
 def camera_influence(fit: JointFit, values: np.ndarray) -> np.ndarray:
-    """Shift of quantities with draws (n, q) if a camera parameter is off by the sd of its prior, shape (q, cameras).
+    """Compute shifts (q, cameras) of quantities with draws (n, q) by one prior sd of each camera parameter.
 
-    Of the focal scale and the stereo calibration's coordinates: the prior of coordinate j moves the mode by S e_j.
+    The parameters are the focal scale and the stereo coordinates; the prior of coordinate j shifts the mode by S e_j.
     """
     from tvsbayes.assessment.weaknesses import gradients
     from tvsbayes.instrument.parameters import INDEX, NAMES, RIG_NAMES
@@ -216,6 +215,6 @@ def camera_influence(fit: JointFit, values: np.ndarray) -> np.ndarray:
 
 
 def camera_u(fit: JointFit) -> np.ndarray:
-    """Standard uncertainty (4,) of the effective ratios that stereo calibration and focal scale alone cause."""
+    """Compute the standard uncertainty (4,) of the effective ratios due to stereo calibration and focal scale alone."""
     shift = camera_influence(fit, np.asarray(fit.draws.effective_deg_per_step))
     return np.sqrt(np.sum(shift**2, axis=1))

@@ -1,8 +1,8 @@
-"""Classic against joint on experiments that neither had seen: folds left out, refitted and predicted.
+"""Hold-out comparison of classic and joint: folds of experiments left out, refitted and predicted.
 
-Scored by errors, coverage and density of predictions, and by the interval of the ratio of two errors; a block is the
-predictions of one fold and direction, whose errors go together. Four-point angles in degrees, counters in steps. Loads
-JAX when a fold is refitted, not when imported.
+Scores are errors, coverage and density of predictions, and the interval of the ratio of both errors. A block is the
+predictions of one fold and direction, whose errors are correlated. Four-point angles in degrees, counters in steps. JAX
+is loaded by a refit, not by the import.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from tvsbayes.estimators.joint_fit import JointFit
 
 BLOCKS_MIN = 3
-"""Fewest blocks whose scatter is worth an interval."""
+"""Least number of blocks for an interval."""
 
 
 def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: dict[str, float]) -> HoldOut:
-    """Scores of both, and whether the difference is more than chance.
+    """Score both estimators, and test whether their difference is significant.
 
     Args:
-        by: how experiments were left out.
-        predictions: of all of them.
+        by: scheme of the folds.
+        predictions: predictions of all experiments.
         lengths: distinct |N| of the campaign.
-        unseen: as in `HoldOut`.
+        unseen: see `HoldOut`.
     """
     angle, blocks = np.array([p.angle_deg for p in predictions]), [(p.fold, p.direction) for p in predictions]
     of_block = {b: np.array([x == b for x in blocks]) for b in dict.fromkeys(blocks)}
@@ -78,15 +78,15 @@ def judge(by: str, predictions: list[Prediction], lengths: np.ndarray, unseen: d
 
 
 def ratio_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
-    """95 % interval of rms(first) / rms(second) for pairs of errors with mean 0 and any correlation.
+    """Compute the 95 % interval of rms(first) / rms(second) for pairs of errors with mean 0 and any correlation.
 
-    First and c second have equal mean squares if their sum and difference are uncorrelated: those c for which the
-    t test of that correlation (n - 1 degrees of freedom, means known to be 0) does not reject are the interval.
+    First and c second have equal mean squares if their sum and difference are uncorrelated. The interval holds all c
+    for which the t test of that correlation (n - 1 degrees of freedom, means known to be 0) does not reject.
     """
     n = len(first)
     ratio = np.sqrt(np.sum(first**2) / np.sum(second**2))
     correlation = first @ second / np.sqrt(np.sum(first**2) * np.sum(second**2))
-    # Of proportional errors the correlation may exceed 1 by rounding.
+    # The correlation of proportional errors may exceed 1 by rounding.
     k = 1 + 2 * max(0.0, 1 - correlation**2) * coverage_factor(n - 1) ** 2 / (n - 1)
     root = np.sqrt(k**2 - 1)
     return float(ratio * np.sqrt(k - root)), float(ratio * np.sqrt(k + root))
@@ -97,10 +97,10 @@ REGIONS = 4
 
 
 def folds_of(campaign: Campaign, selection: Selection, by: str) -> dict[str, np.ndarray]:
-    """Masks (e,) of the experiments that are left out together.
+    """Return masks (e,) of the experiments that are left out together.
 
     Raises:
-        ValueError: another scheme.
+        ValueError: there is no such scheme.
     """
     if by == "steps":
         lengths = np.abs(selection.steps)
@@ -123,18 +123,18 @@ def folds_of(campaign: Campaign, selection: Selection, by: str) -> dict[str, np.
 
 
 def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress: Show | None = None) -> HoldOut:
-    """Leave experiments out, fold by fold, refit, and ask both estimators for their four-point angles.
+    """Leave experiments out, fold by fold, refit, and predict their four-point angles by both estimators.
 
-    The classic predicts N times its mean of the direction; its uncertainty is the scatter of angles about N times
-    the mean, and that of the mean. The joint predicts what the classic chain would measure on its beams, with
-    stop errors and pixel noise drawn anew: the same quantity for both. Noise common to all experiments (the cameras)
-    moves both predictions and the measured angle alike and is reported beside.
+    The classic predicts N times its mean of the direction; its uncertainty is the scatter of angles about N times the
+    mean, and that of the mean. The joint predicts the classic chain's result on its beams, with new stop errors and
+    pixel noise, so that both predict the same quantity. Noise common to all experiments (the cameras) shifts both
+    predictions and the measured angle equally and is reported separately.
 
     Args:
         fit_of_all: a converged fit; its campaign and model are used.
         by: "steps" or "regions", see `folds_of`.
-        seed: of the predictive draws.
-        progress: told how far it is.
+        seed: seed of the predictive draws.
+        progress: called with the share that is done.
     """
     campaign = fit_of_all.campaign
     selection = select_experiments(campaign)
@@ -179,10 +179,10 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress
 
 
 def refit(fit_of_all: JointFit, without: frozenset[int], progress: Show | None = None) -> JointFit:
-    """The same model without some spots; its harmonics, contrasts and backlash are free where they were.
+    """Refit the same model without some spots; harmonics, contrasts and backlash are free as in the fit of all.
 
-    Spots that a robust fit left out stay out. Those that it kept count in full: what their weight was rests on the
-    spots that are left out, too.
+    Spots that a robust fit excluded stay excluded. Those that it kept have full weight, since their weights depended on
+    the spots now left out.
     """
     from tvsbayes.estimators.joint_fit import fit, priors_used
 
@@ -193,7 +193,7 @@ def refit(fit_of_all: JointFit, without: frozenset[int], progress: Show | None =
 
 
 class ClassicAngle(NamedTuple):
-    """An angle as the classic predicts it, deg: its standard uncertainty has few degrees of freedom."""
+    """An angle predicted by the classic estimator, deg; its standard uncertainty has few degrees of freedom."""
 
     angle_deg: float
     u_deg: float
@@ -201,10 +201,10 @@ class ClassicAngle(NamedTuple):
 
 
 def predict_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) -> dict[int, ClassicAngle]:
-    """What N times the mean of a direction says of each left-out experiment with two others there, by row.
+    """Predict each left-out experiment by N times the mean of two or more others of its direction, by row.
 
-    Its uncertainty is the scatter of angles (e,) about N times the mean, and that of the mean.
-    Experiments without a finite angle (pixels beyond the lens model) neither teach nor are asked.
+    Its uncertainty is the scatter of angles (e,) about N times the mean, and that of the mean. Experiments without a
+    finite angle (pixels outside the lens model) are neither used nor predicted.
     """
     angles: dict[int, ClassicAngle] = {}
     finite = np.isfinite(angle)
@@ -224,7 +224,7 @@ def predict_classic(angle: np.ndarray, selection: Selection, out: np.ndarray) ->
 
 
 class JointAngle(NamedTuple):
-    """An angle as the joint predicts it, deg."""
+    """An angle predicted by the joint estimator, deg."""
 
     angle_deg: float
     u_deg: float
@@ -233,9 +233,9 @@ class JointAngle(NamedTuple):
 def predict_joint(
     taught: JointFit, selection: Selection, out: np.ndarray, generator: np.random.Generator
 ) -> dict[int, JointAngle]:
-    """What the classic chain would measure on the joint's beams for each left-out experiment, by row.
+    """Predict the classic chain's angle on the joint's beams for each left-out experiment, by row.
 
-    Stop errors and pixel noise are drawn anew. Draws beyond the cameras' lens model tell no angle.
+    Stop errors and pixel noise are drawn again. Draws outside the cameras' lens model give no angle.
     """
     from tvsbayes.posterior.predictive import looks_again
 

@@ -1,9 +1,8 @@
-"""Hold-out by position: every counter of an axis left out in turn with all its looks, fitted without, predicted.
+"""Hold-out by position: every counter of an axis is left out in turn with all its looks, and predicted.
 
-A rest is predicted by all other looks: ratio and mirrors, and what the gears repeat at neighbouring counters. The
-looks left out are given angles of their own, free in the linear model about the mode that was found without them; what
-these add to the prediction, and how well they are known, is the deviation of the position and its u. Mirror angles in
-deg, counters in steps.
+A rest is predicted by all other looks, through ratio, mirrors and the gears' errors at neighbouring counters. The looks
+left out get free angles in the linear model about the mode found without them. These are the deviation of the position
+from its prediction, and their sd is its u. Mirror angles in deg, counters in steps.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from tvsbayes.results.comparison_record import HeldOutCounter, PositionHoldOut
 from tvsbayes.statistics.intervals import rms
 
 POSITIONS_MIN = 3
-"""Counters of an axis: with one left out, two make a line."""
+"""Least number of counters of an axis: with one left out, two determine a line."""
 
 
 def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) -> PositionHoldOut:
-    """Every counter at which an axis was seen left out in turn, with all its looks from both sides.
+    """Leave out every counter at which an axis was seen in turn, with all its looks from both sides.
 
     Args:
         fit_of_all: a converged fit; its campaign and model are used.
@@ -74,7 +73,7 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
 
 
 def _of_all_looks(fit_of_all: JointFit, taught: JointFit) -> Linearised:
-    """All looks linearised at the mode that some of them taught."""
+    """Linearise all looks at the mode of a fit of some."""
     constant = fit_of_all.held
     fixed = Fixed(constant, taught.z, np.array(1.0))
     return stage(taught.z, fit_of_all.space, fit_of_all.arrays, fixed, NO_STEP)
@@ -83,13 +82,13 @@ def _of_all_looks(fit_of_all: JointFit, taught: JointFit) -> Linearised:
 def predicted_positions(
     fit_of_all: JointFit, taught: JointFit, axis: int, counter: int, out: np.ndarray, sign: np.ndarray
 ) -> list[HeldOutCounter]:
-    """A counter from each side from which its looks came.
+    """Predict a counter, separately for each side of its looks.
 
     Args:
-        fit_of_all: has all looks.
+        fit_of_all: fit of all looks.
         taught: the fit without those left out.
         axis: number of the axis.
-        counter: of the axis.
+        counter: counter of the axis.
         out: looks left out, shape (spots,).
         sign: side from which the axis came, shape (spots,).
     """
@@ -101,7 +100,7 @@ def predicted_positions(
         free[row, :, 2 * k : 2 * k + 2] = np.asarray(lin.slope)[row]
     linear = linear_spots(lin, fit_of_all.arrays, np.concatenate([columns, free], axis=2))
     information, count = stop_information(linear), len(NAMES)
-    # Coordinates have their priors; angles of the looks left out have none.
+    # Coordinates have priors, angles of the looks left out do not.
     precision = information.fisher + np.diag(np.arange(len(information.fisher)) < count)
     score = np.zeros(len(precision))
     for group in information.groups:

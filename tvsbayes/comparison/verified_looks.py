@@ -1,8 +1,8 @@
-"""Looks at counters that `steps-for` or the header gave: whether a scanner or head points where its calibration says.
+"""Verification of a scanner's or head's pointing by looks at counters that `steps-for` or the header computed.
 
-Every look says where both mirror angles were, seen less predicted, with the covariance of `watched_looks`: both
-angles are two axes, and `compensation.verification` judges them as the readings of one. Not applied means counters by
-the nominal degrees per step without play; what is applied is the rest. Mirror angles in degrees, points in mm.
+Every look gives both mirror angles, observed less predicted, with the covariance of `watched_looks`.
+`compensation.verification` judges them as readings of two axes. "Not applied" means counters by the nominal degrees per
+step without play; the correction is the difference. Mirror angles in degrees, points in mm.
 """
 
 from __future__ import annotations
@@ -37,29 +37,29 @@ from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
 NOISE_DRAWS = 32
-"""Of the noise scales, geometry and cameras integrated out."""
+"""Draws of the noise scales, geometry and cameras integrated out."""
 RUN_UP = 2
-"""Times the overshoot that takes up the play, in a plan."""
+"""Run-up of a plan as a multiple of the overshoot that takes up the play."""
 CANDIDATES, DRAWS = 9, 1000
-"""Counters tried by axis, each from both sides; draws of the calibration behind their covariance."""
+"""Counters tried for each axis, from both sides; draws of the calibration for their covariance."""
 DISTANCE_MM = 1000.0
-"""At which errors are said in mm where nobody names another distance."""
+"""Default distance at which errors are stated in mm."""
 PROMISED_DRAWS = 4000
-"""Of errors, behind what 95 % of points do not exceed."""
+"""Draws of errors for the bound that 95 % of points do not exceed."""
 
 
 SURER = (
     "state how the axes came to the first row, if you know it; run `tvsbayes fit` again, without --no-sample or "
     "--quick, or with --perfect-gears where gear errors are below the scatter of looks"
 )
-"""What makes a rough answer an accepted one."""
+"""Remedies that make a rough answer an accepted one."""
 
 
 def accepted_calibration(campaign: Campaign) -> Calibration:
-    """The calibration in force: that of `results/`, of these data and of an accepted fit.
+    """Return the calibration in force: that of `results/`, for these data, by an accepted fit.
 
     Raises:
-        InputError: there is none of these data, or it is damaged.
+        InputError: there is none for these data, or it is damaged.
         NotConverged: the fit is not accepted.
     """
     document = stored_document(campaign, "fit.json", FIT_FORMATS, input_hashes(campaign))
@@ -78,7 +78,7 @@ def accepted_calibration(campaign: Campaign) -> Calibration:
 
 @dataclass(frozen=True)
 class AimedLooks:
-    """Where looks were aimed at, m of them: `steps` and `sides`, each (m, 2), pan and tilt."""
+    """Counters and sides of m aimed looks: `steps` and `sides`, each (m, 2), pan and tilt."""
 
     calibration: Calibration
     steps: np.ndarray
@@ -86,7 +86,7 @@ class AimedLooks:
 
     @classmethod
     def of(cls, calibration: Calibration, looks: Campaign, used: np.ndarray) -> AimedLooks:
-        """Of the usable looks of a campaign; `used` is a mask of its ordered spots."""
+        """Collect the usable looks of a campaign; `used` is a mask of its ordered spots."""
         rests = {
             axis: dict(zip((m.move for m in looks.moves), rests_of(looks.moves, axis), strict=True)) for axis in AXES
         }
@@ -96,7 +96,7 @@ class AimedLooks:
         return cls(calibration, np.array(steps, dtype=float), np.array(sides, dtype=float))
 
     def angles_deg(self, sides: np.ndarray) -> np.ndarray:
-        """Mirror angles (m, 2) at the counters, reached from sides (m, 2)."""
+        """Compute mirror angles (m, 2) at the counters, reached from sides (m, 2)."""
         angles = []
         for k, axis in enumerate(AXES):
             values = self.calibration.estimates_at((self.steps[:, 0], self.steps[:, 1]))
@@ -105,14 +105,14 @@ class AimedLooks:
         return np.stack(angles, axis=1)
 
     def nominal_steps(self, nominal: dict[str, float]) -> np.ndarray:
-        """Counters (m, 2) that the nominal degrees per step send to the same directions (formulation 5)."""
+        """Compute counters (m, 2) of the same directions by the nominal degrees per step (formulation 5)."""
         values, (pan, tilt) = self.calibration.estimates, self.angles_deg(self.sides).T
         x, y, z = beam_components(values, pan, tilt).direction
         azimuth, elevation = np.degrees([np.arctan2(y, x), np.arcsin(z)])
         if is_head(values):
             aims = [Direction(*map(float, row)) for row in zip(azimuth, elevation, strict=True)]
             angles = np.array([mirror_angles(nominal, aim) for aim in aims]) - [0.0, nominal["elevation_zero_deg"]]
-            # Of all turns, the one that the axis has made.
+            # The turn that is nearest to the axis' own.
             angles[:, 0] += FULL_TURN_DEG * np.round((pan - angles[:, 0]) / FULL_TURN_DEG)
         else:
             angles = np.stack([azimuth + 90.0 - nominal["pan_zero_emission_deg"], elevation], axis=1)
@@ -120,25 +120,25 @@ class AimedLooks:
 
     @property
     def ratios(self) -> np.ndarray:
-        """Degrees per step (pan, tilt) of the gears."""
+        """Return degrees per step (pan, tilt) of the gears."""
         return np.array([self.calibration.estimates[f"degrees_per_step.{axis}"] for axis in AXES])
 
     def off_deg(self, nominal: np.ndarray, common: float, play: float) -> np.ndarray:
-        """How far mirror angles (m, 2) are off the aim where the correction acts so many times.
+        """Compute the deviation of mirror angles (m, 2) from the aim, if the correction acts by these factors.
 
         Args:
-            nominal: counters without it, shape (m, 2).
-            common: factor of what both sides of an axis have in common.
-            play: factor of what they differ by.
+            nominal: counters without the correction, shape (m, 2).
+            common: factor on the part common to both sides of an axis.
+            play: factor on their difference.
         """
-        # What the sides of one counter differ by in angle, they differ by in counters for one angle.
+        # The angle difference of both sides at one counter, converted to counters for one angle.
         half = (self.angles_deg(-self.sides) - self.angles_deg(self.sides)) / (2 * self.ratios)
         middle = self.steps - half
         sent = np.round(nominal + common * (middle - nominal) + play * half)
         return self.ratios * (sent - self.steps)
 
     def slopes_mm(self, distance_mm: float) -> np.ndarray:
-        """How points at a distance along the beams move by the mirror angles, mm/deg, shape (m, 3, 2)."""
+        """Compute derivatives of points at a distance along the beams by the mirror angles, mm/deg, shape (m, 3, 2)."""
         values, angles, step = self.calibration.estimates, self.angles_deg(self.sides), 1e-4
         columns = []
         for off in step * np.eye(2):
@@ -149,12 +149,12 @@ class AimedLooks:
 
 @dataclass(frozen=True)
 class SeenAngles:
-    """What looks say of both mirror angles, pan and tilt of each look in turn.
+    """Estimates of both mirror angles, pan and tilt of each look in turn.
 
     Attributes:
-        value: seen less predicted, deg, shape (2 m,).
-        covariance: of the prediction and of seeing it, by draws of the noise scales, deg^2, shape (n, 2 m, 2 m).
-        noise: of it what every visit draws anew, shape (2 m,).
+        value: observed less predicted, deg, shape (2 m,).
+        covariance: covariance of prediction and observation, by draws of the noise scales, deg^2, shape (n, 2 m, 2 m).
+        noise: its part that is independent at every visit, deg^2, shape (2 m,).
     """
 
     value: np.ndarray
@@ -163,7 +163,7 @@ class SeenAngles:
 
     @classmethod
     def of(cls, fit: JointFit, watched: WatchedLooks, sides: np.ndarray, seed: int) -> SeenAngles:
-        """Generalised least squares of the looks' angles; `sides` (m, 2) of their arrivals."""
+        """Estimate the looks' angles by generalised least squares; `sides` (m, 2) are those of their arrivals."""
         noise = noise_draws(fit, NOISE_DRAWS, seed)
         centre = watched.departure(noise.centre, angles=True)
         covariance = np.linalg.inv(centre.information)
@@ -183,7 +183,7 @@ class SeenAngles:
 
 
 def _other(aimed: AimedLooks) -> np.ndarray:
-    """Shape (2 m, 2 m) of the covariance of what another scanner adds: two other axes."""
+    """Compute the additional covariance (2 m, 2 m) if it is another scanner: two other axes."""
     count = len(aimed.steps)
     covariance = np.zeros((2 * count, 2 * count))
     for k in range(2):
@@ -194,7 +194,7 @@ def _other(aimed: AimedLooks) -> np.ndarray:
 def _millimetres(
     aimed: AimedLooks, measured: SeenAngles, before: np.ndarray, distance_mm: float, seed: int
 ) -> Millimetres:
-    """Errors of points at a distance, beside what 95 % of them are promised not to exceed."""
+    """Compute errors of points at a distance, and the promised bound of 95 % of them."""
     slopes = aimed.slopes_mm(distance_mm)
 
     def lengths(angles: np.ndarray) -> np.ndarray:
@@ -213,13 +213,13 @@ def _millimetres(
 def verify_looks(
     fit: JointFit, calibration: Calibration, looks: Campaign, *, distance_mm: float = DISTANCE_MM, seed: int = 0
 ) -> Verification:
-    """Fresh looks of a scanner that was aimed with its calibration.
+    """Verify a scanner that was aimed with its calibration by fresh looks.
 
     Args:
-        fit: that the calibration was made of.
-        calibration: in force.
-        looks: a campaign whose moves have the counters that `steps-for` or the header gave, with those on the way.
-        distance_mm: along the beams, at which errors are said in mm.
+        fit: fit of the calibration.
+        calibration: calibration in force.
+        looks: a campaign with all its moves, whose counters `steps-for` or the header computed.
+        distance_mm: distance along the beams at which errors are stated in mm.
         seed: of what is drawn.
 
     Raises:
@@ -255,7 +255,7 @@ def verify_looks(
         after=size_of(angles.value),
         promised95=bound_of(judgement.promised, aim, np.arange(len(aim))),
         readings=len(aimed.steps),
-        # A head that says where it points has no lengths.
+        # Sightings of a head have no lengths.
         millimetres=None if looks.rig.mechanism.sightings else _millimetres(aimed, angles, before, distance_mm, seed),
         unit="deg",
         needed=None if judgement.needed is None else -(-judgement.needed // 2),
@@ -266,13 +266,13 @@ def verify_looks(
 
 @dataclass(frozen=True)
 class AimPlan:
-    """Looks to be made with the calibration in force, in this order.
+    """Looks to make with the calibration in force, in this order.
 
     Attributes:
-        stops: counters of pan and tilt, and the sides (1 or -1) that they are reached from, of each look.
-        run_up: steps beyond a counter from which an axis comes back to it, pan and tilt.
-        enough: whether they tell the worlds apart in 95 of 100, by the axis that tells more.
-        distance: of the nearest two worlds, standard deviations.
+        stops: counters of pan and tilt, and the sides (1 or -1) from which they are reached, of each look.
+        run_up: run-up of pan and tilt before a counter, steps.
+        enough: whether they discriminate the hypotheses in 95 of 100 cases, by the more informative axis.
+        distance: distance of the nearest two hypotheses, standard deviations.
     """
 
     stops: tuple[tuple[int, int, int, int], ...]
@@ -281,7 +281,7 @@ class AimPlan:
     distance: float
 
     def steps(self, target: str) -> tuple[PlanStep, ...]:
-        """The plan, for looks at one target."""
+        """Return the plan, for looks at one target."""
         plan = PlanBuilder()
         plan.home()
         plan.place(target)
@@ -293,15 +293,15 @@ class AimPlan:
 
 
 def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
-    """The fewest looks that tell what became of a calibration: stops of each axis by greedy choice, made together.
+    """Plan the fewest looks that verify a calibration: greedy choice of stops for each axis, visited together.
 
     Raises:
-        NothingToEstimate: nominal counters are those of the calibration: nothing is to be verified.
+        NothingToEstimate: the nominal counters are those of the calibration: there is nothing to verify.
     """
     run_up = tuple(RUN_UP * max(calibration.overshoot_steps[axis], 1) for axis in AXES)
     axes = [_axis_stops(campaign, calibration, k, run_up[k]) for k in range(2)]
     count = max(LOOKS_MIN, *(len(axis.stops) for axis in axes))
-    # The axis that needs fewer goes through its stops again: every look shows both.
+    # The axis that needs fewer stops repeats them: every look measures both axes.
     pan, tilt = ([axis.stops[i % len(axis.stops)] for i in range(count)] for axis in axes)
     stops = tuple((p, t, ps, ts) for (p, ps), (t, ts) in zip(pan, tilt, strict=True))
     reached = max(axis.reached for axis in axes)
@@ -310,14 +310,14 @@ def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
 
 @dataclass(frozen=True)
 class _AxisStops:
-    """Counters and sides of one axis, and the squared distance of the nearest world that they reach."""
+    """Counters and sides of one axis, and the squared distance of the nearest hypothesis by these stops."""
 
     stops: list[tuple[int, int]]
     reached: float
 
 
 def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: int) -> _AxisStops:
-    """Of one axis, the other in the middle of its range."""
+    """Choose the stops of one axis, the other in the middle of its range."""
     low, high = calibration.range_steps[k]
     if high - low > 4 * run_up:
         low, high = low + run_up, high - run_up
@@ -334,7 +334,7 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
         raise NothingToEstimate("no-correction", what, remedy="verify that nothing moved with `tvsbayes watch`")
     noise = np.array([calibration.noise_variance[f"stop_sd_deg.{SIDES[AXES[k]][int(s > 0)]}"] for s in sides[:, k]])
     common = np.cov(_drawn_angles(calibration, aimed, k), rowvar=False) + HOME_SD_DEG**2
-    # A play smaller than what every look leaves open is not told from its loss, and harms no promise.
+    # A play smaller than the uncertainty of a look cannot be distinguished from none, and does not affect the promise.
     visible = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
     worlds = off if visible else off[:1]
     spread = np.isin(np.arange(CANDIDATES), [0, CANDIDATES // 2, CANDIDATES - 1])
@@ -344,7 +344,7 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
 
 
 def _drawn_angles(calibration: Calibration, aimed: AimedLooks, k: int) -> np.ndarray:
-    """Mirror angles (draws, m) of one axis by the draws of the calibration."""
+    """Compute mirror angles (draws, m) of one axis by the draws of the calibration."""
     inputs, gears = np.split(calibration.inputs[:DRAWS], [len(INPUT_NAMES)], axis=1)
     values = dict(zip(calibration.names, inputs.T[..., None], strict=True))
     values |= calibration.gears.at(gears, (aimed.steps[:, 0], aimed.steps[:, 1]))
@@ -353,7 +353,7 @@ def _drawn_angles(calibration: Calibration, aimed: AimedLooks, k: int) -> np.nda
 
 
 def _remarks(campaign: Campaign, looks: Campaign, aimed: AimedLooks) -> tuple[str, ...]:
-    """What else is to be said."""
+    """Return further remarks for the user."""
     remarks = []
     outside = sum(not aimed.calibration.covers(*steps) for steps in aimed.steps.tolist())
     if outside:

@@ -1,7 +1,7 @@
-"""A few new looks against a stored fit: does the calibration still hold, and if not, what moved?
+"""Watch over a stored fit by a few new looks: whether the calibration still holds, and if not, what moved.
 
-Both days are linearised together at the mode of the first, the second as a run that begins with a homing. Stop errors,
-home offsets and errors of gears that repeat are in the covariance, those at counters of the first day as that day knows
+Both sessions are linearised together at the mode of the first; the second begins with a homing. Stop errors, home
+offsets and repeating errors of gears are in the covariance, those at counters of the first session as it determined
 them; nothing is refitted. A change is a shift of parameters for the new looks alone (formulation 9). Degrees, mm.
 """
 
@@ -32,30 +32,30 @@ from tvsbayes.results.watch_record import CANNOT_TELL, MOVED, OK, MovedPart, See
 from tvsbayes.statistics.chances import log_chance
 
 LOOKS_MIN = 4
-"""Usable new looks below which nothing is asked."""
+"""Least number of usable new looks."""
 FALSE_ALARM_RATE = 0.01
 POWER_MIN = 0.8
-"""Probability with which a change of the stated size must be noticed for a verdict of OK."""
+"""Power for a change of the stated size that a verdict of OK requires."""
 NOISE_DRAWS = 32
-"""Of the noise scales, geometry and cameras integrated out, over which probabilities are averaged."""
+"""Draws of the noise scales, geometry and cameras integrated out, over which probabilities are averaged."""
 NULL_DRAWS, DIRECTIONS_ASKED = 20_000, 200
-"""Of the joint null distribution, and directions of a change over which its power is averaged."""
+"""Draws of the joint null distribution, and directions of a change over which its power is averaged."""
 FOLLOWED = 1e-6
-"""Share of a direction's information below which the old parameters can follow it entirely."""
+"""Share of a direction's information below which the old parameters can explain it entirely."""
 TOLD_U = 2.0
-"""Components of a change beyond so many u are told."""
+"""Components of a change above this many u are reported."""
 
 
 @dataclass(frozen=True)
 class StatedChange:
-    """A change that is asked about.
+    """A change that is tested.
 
     Attributes:
-        what: its name for people.
+        what: its name in reports.
         names: parameters that it shifts.
-        parts: how their shifts are called.
-        size: length of the shift that must be noticed, in `unit`.
-        unit: of it.
+        parts: names of their shifts in reports.
+        size: length of the shift that must be detected, in `unit`.
+        unit: unit of the shift.
     """
 
     what: str
@@ -83,25 +83,25 @@ _GEARS = (
     *(_single(f"play: {axis}", f"backlash_deg.{axis}", 0.1, "deg") for axis in AXES),
 )
 CHANGES = (*_pose("cameras", "stereo"), *_pose("positioner", "extrinsics"), *_GEARS)
-"""Everything that is asked about, and the size that must be noticed."""
+"""All tested changes, with the sizes that must be detected."""
 _LEAN = tuple(f"azimuth_axis_tilt_deg.{side}" for side in ("north", "east"))
 SIGHTED_CHANGES = (
-    # What a homing leaves open hides less.
+    # Above the uncertainty of a homing.
     *(_single(f"zero: {angle}", f"{angle}_zero_deg", 5 * HOME_SD_DEG, "deg") for angle in ("azimuth", "elevation")),
     StatedChange("base: lean", _LEAN, ("base: lean to azimuth 0", "base: lean to azimuth 90"), 0.1, "deg"),
     _single("beam: not square", "beam_not_square_deg", 0.1, "deg"),
     *_GEARS,
 )
-"""The same of a head that says where it points."""
+"""Tested changes of a head with sightings."""
 
 
 def changes_of(mechanism: Mechanism) -> tuple[StatedChange, ...]:
-    """What is asked about an instrument."""
+    """Return the tested changes of an instrument."""
     return SIGHTED_CHANGES if mechanism.sightings else CHANGES
 
 
 def columns_of(changes: Sequence[StatedChange]) -> tuple[slice, ...]:
-    """Places of each change among the shifts of all."""
+    """Return the columns of each change among the shifts of all."""
     ends = np.cumsum([len(change.names) for change in changes])
     return tuple(slice(int(end) - len(change.names), int(end)) for end, change in zip(ends, changes, strict=True))
 
@@ -110,7 +110,7 @@ COLUMNS = columns_of(CHANGES)
 
 
 def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
-    """Two days as one campaign: the second begins with a homing of its own."""
+    """Join two sessions to one campaign; the second begins with a homing of its own."""
     moves, spots, last = len(campaign.moves), max(spot.spot for spot in campaign.spots) + 1, campaign.moves[-1]
     later = tuple(
         replace(m, move=m.move + moves, segment=m.segment + last.segment + 1, time_s=m.time_s + last.time_s)
@@ -122,14 +122,14 @@ def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
 
 @dataclass(frozen=True)
 class Departure:
-    """What new looks say beyond what the first day predicts of them, at one set of noise scales.
+    """Residuals of new looks from their prediction by the first session, at one set of noise scales.
 
     Attributes:
-        chi2: squared length of the predicted residuals in units of their covariance.
-        dof: observations in it.
-        score: of the shifts, in the units of `changes`, shape (q,).
-        information: that the looks have of them, shape (q, q).
-        changes: whose shifts these are.
+        chi2: squared length of the residuals in units of their covariance.
+        dof: its number of observations.
+        score: score of the shifts, in the units of `changes`, shape (q,).
+        information: information of the looks on them, shape (q, q).
+        changes: changes of these shifts.
     """
 
     chi2: float
@@ -140,11 +140,11 @@ class Departure:
 
     @property
     def columns(self) -> tuple[slice, ...]:
-        """Places of each change among the shifts."""
+        """Return the columns of each change among the shifts."""
         return columns_of(self.changes)
 
     def given(self, known: list[slice]) -> Departure:
-        """With some changes free: what is left for the others."""
+        """Condition on some changes being free; score and information of the others remain."""
         if not known:
             return self
         rows = np.concatenate([np.arange(part.start, part.stop) for part in known])
@@ -155,12 +155,12 @@ class Departure:
 
 @dataclass(frozen=True)
 class Believed:
-    """Departures over what is believed of the noise scales.
+    """Departures over the distribution of the noise scales.
 
     Attributes:
-        centre: at their most probable values.
-        drawn: at draws of them.
-        weights: of the draws, their sum 1.
+        centre: departure at their most probable values.
+        drawn: departures at draws of them.
+        weights: weights of the draws, sum 1.
     """
 
     centre: Departure
@@ -177,7 +177,7 @@ class Shift:
 
 
 def _directions(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues and vectors of the scaled information that the old parameters cannot follow; the scale back in."""
+    """Compute eigenvalues of the scaled information not explained by old parameters, and unscaled vectors."""
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     kept = values > FOLLOWED
@@ -190,19 +190,19 @@ def _inverse(information: np.ndarray) -> np.ndarray:
 
 
 def _test(score: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, int]:
-    """Chi-squares of scores (..., q) and their degrees of freedom."""
+    """Compute chi-squares of scores (..., q) and their degrees of freedom."""
     values, vectors = _directions(information)
     return np.sum((score @ vectors) ** 2 / values, axis=-1), len(values)
 
 
 @dataclass(frozen=True)
 class _Told:
-    """What linearised spots say where the coordinates follow them.
+    """Score and information of columns of linearised spots, with the coordinates eliminated.
 
     Attributes:
-        chi2: squared length of what is left of the residuals and the priors, up to a constant.
-        score: of the columns behind the coordinates, shape (q,).
-        information: of them, shape (q, q).
+        chi2: squared length of the remaining residuals and priors, up to a constant.
+        score: score of the columns after the coordinates, shape (q,).
+        information: information of these columns, shape (q, q).
     """
 
     chi2: float
@@ -211,7 +211,7 @@ class _Told:
 
     @classmethod
     def of(cls, spots: LinearSpots, prior: np.ndarray) -> _Told:
-        """Of spots whose first columns are coordinates that stand at `prior`, shape (p,), before N(0, 1)."""
+        """Eliminate the first columns, coordinates with prior N(0, 1) that are at `prior`, shape (p,)."""
         information, count = stop_information(spots), len(prior)
         errors = np.concatenate([group.residual for group in information.groups])
         score = spots.jacobian.reshape(len(errors), -1).T @ errors
@@ -226,7 +226,7 @@ class _Told:
 
 
 class WatchedLooks:
-    """New looks and the campaign that they are watched against, in front of the compiled functions."""
+    """New looks and the campaign that they are compared with, as arguments of the compiled functions."""
 
     def __init__(self, fit: JointFit, looks: Campaign):
         campaign = homed(fit.campaign, fit.sides)
@@ -246,22 +246,22 @@ class WatchedLooks:
         self.looks = int(used[self.first :].sum())
         readings = sum(s.aperture_deg is not None for s, use in zip(later, used[self.first :], strict=True) if use)
         self.changes = changes_of(table.mechanism)
-        # Three of four pixels: one is the range's. A sighting has two angles.
+        # Four pixels less the range are three residuals. A sighting has two angles.
         self.dof = 2 * self.looks if table.mechanism.sightings else 3 * self.looks + readings
 
     def departure(self, z: np.ndarray, *, angles: bool = False) -> Departure:
-        """What the looks say beyond the first day, both linearised at z; its noise scales are held.
+        """Compute the departure of the looks from the first session, both linearised at z, at its noise scales.
 
-        Of the shifts of the changes, or with `angles` of the mirror angles (pan, tilt) of every usable look, deg.
+        The shifts are those of the changes, or with `angles` the mirror angles (pan, tilt) of every usable look, deg.
         """
         linear, prior = self.linear(z, angles=angles), np.where(self.problem.held, 0.0, z)
         whole, before = (_Told.of(spots, prior) for spots in (linear, rows_of(linear, slice(self.first))))
         return Departure(whole.chi2 - before.chi2, self.dof, whole.score, whole.information, self.changes)
 
     def linear(self, z: np.ndarray, *, angles: bool = False) -> LinearSpots:
-        """Both days at z, with columns for the coordinates and, behind them, for the changes or the looks' angles.
+        """Linearise both sessions at z, with columns for the coordinates, then for the changes or the looks' angles.
 
-        Linearised in physical values, not in coordinates: a change may shift what the fit holds fixed.
+        They are linearised in physical values, not in coordinates, since a change may shift a fixed parameter.
         """
         at, rig = physical_at(z, self.problem.space), len(RIG_NAMES)
         plain = replace(
@@ -287,19 +287,19 @@ class WatchedLooks:
 
     @property
     def usable(self) -> np.ndarray:
-        """Places of the usable new looks in the linearised campaign, shape (looks,)."""
+        """Return indices of the usable new looks in the linearised campaign, shape (looks,)."""
         used = np.asarray(self.problem.arrays.spots.valid)[: len(self.problem.spots)] > 0
         return self.first + np.flatnonzero(used[self.first :])
 
     def _of_angles(self, slope: np.ndarray) -> np.ndarray:
-        """Columns for the mirror angles of every usable new look, pan and tilt in turn, per degree."""
+        """Build columns for the mirror angles of every usable new look, pan and tilt in turn, per degree."""
         columns = np.zeros((*slope.shape[:2], 2 * self.looks))
         for k, place in enumerate(self.usable):
             columns[place, :, 2 * k : 2 * k + 2] = np.radians(1.0) * slope[place]
         return columns
 
     def _unit_sizes(self, value: np.ndarray) -> np.ndarray:
-        """Physical values of a shift by one unit of the changes, shape (q,)."""
+        """Return physical values of a shift by one unit of the changes, shape (q,)."""
         sizes = []
         for change in self.changes:
             for name in change.names:
@@ -308,19 +308,19 @@ class WatchedLooks:
         return np.array(sizes)
 
     def believed(self, seed: int) -> Believed:
-        """Over what the first day alone says of the noise scales."""
+        """Compute departures over the first session's marginal of the noise scales."""
         noise = noise_draws(self.fit, NOISE_DRAWS, seed)
         drawn = tuple(self.departure(z) for z in noise.z)
         return Believed(self.departure(noise.centre), drawn, noise.weights)
 
 
 def rows_of(spots: LinearSpots, rows: slice) -> LinearSpots:
-    """Some spots of a linearised campaign, in their order."""
+    """Select spots of a linearised campaign, in their order."""
     return LinearSpots(**{part.name: getattr(spots, part.name)[rows] for part in fields(spots)})
 
 
 def log_chances(believed: Believed, known: list[slice]) -> np.ndarray:
-    """Log p of all residuals, then of every change given those known, averaged over noise scales; shape (1 + c,)."""
+    """Compute log p of all residuals, then of every change given known ones, averaged over noise scales, (1 + c,)."""
     chances = []
     for departure in believed.drawn:
         left, logs = departure.given(known), [log_chance(departure.chi2, departure.dof)]
@@ -335,18 +335,18 @@ def log_chances(believed: Believed, known: list[slice]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class NullDistribution:
-    """Least log p of all changes if nothing has moved, sorted, shape (draws,); so many `tests` there are."""
+    """Null distribution of the least log p of all changes, sorted, shape (draws,); `tests` is their number."""
 
     least: np.ndarray
     tests: int
 
     @property
     def limit(self) -> float:
-        """Log p of a single test below which the false-alarm rate of all together is reached."""
+        """Compute the limit of log p of single tests at the false-alarm rate of all together."""
         return float(np.quantile(self.least, FALSE_ALARM_RATE))
 
     def probability(self, log_p: float) -> float:
-        """Of a least log p like this; beyond the draws by Bonferroni's bound."""
+        """Compute the p-value of a least log p; beyond the draws by Bonferroni's bound."""
         counted = np.searchsorted(self.least, log_p, side="right")
         if not counted:
             return float(min(1 / len(self.least), self.tests * np.exp(log_p)))
@@ -354,7 +354,7 @@ class NullDistribution:
 
 
 def null_distribution(departure: Departure, seed: int) -> NullDistribution:
-    """By simulation of the linear model: scores ~ N(0, information)."""
+    """Simulate the linear model: scores ~ N(0, information)."""
     generator = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(departure.information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -368,15 +368,15 @@ def null_distribution(departure: Departure, seed: int) -> NullDistribution:
 
 
 def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) -> list[float]:
-    """Probability with which each change fails its own test, over all directions of the shift.
+    """Compute the power of each change's own test, averaged over directions of the shift.
 
-    A lower bound of the power of all tests together.
+    It is a lower bound of the power of all tests together.
 
     Args:
-        departure: only its information counts: a plan has one as well as looks.
+        departure: only its information is used, so it may be that of a plan.
         limit: of log p.
         seed: of the directions.
-        times: how often its stated size the change has.
+        times: size of the change as a multiple of the stated one.
     """
     from scipy import special
 
@@ -396,7 +396,7 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
 
 
 def _moved(believed: Believed, limit: float) -> tuple[MovedPart, ...]:
-    """Changes that explain the looks, the best first, each beyond what those before it explain."""
+    """Find changes that explain the looks, the best first, each given those before it."""
     known: list[slice] = []
     places = believed.centre.columns
     while len(known) < len(places):
@@ -426,12 +426,12 @@ def _moved(believed: Believed, limit: float) -> tuple[MovedPart, ...]:
 
 
 def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
-    """Whether a calibration still holds for new looks.
+    """Test whether a calibration still holds for new looks.
 
     Args:
         fit: converged fit of the campaign.
         looks: new looks at the same rig, from a homing on.
-        seed: of the draws of noise scales and of the null distribution.
+        seed: seed of the draws of noise scales and of the null distribution.
 
     Raises:
         NothingToEstimate: fewer than `LOOKS_MIN` usable looks.
@@ -453,7 +453,7 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
         SeenChange(change.what, change.size, change.unit, power, float(np.exp(log_p)))
         for change, power, log_p in zip(watched.changes, able, logs[1:], strict=True)
     )
-    # All residuals together raise no alarm: much that moves nothing makes single looks bad.
+    # The test of all residuals raises no alarm, since single bad looks have many causes other than a change.
     moved = bool(logs[1:].min() <= null.limit)
     verdict: Verdict = MOVED if moved else OK if min(able) >= POWER_MIN else CANNOT_TELL
     hashes = input_hashes(fit.campaign)["stereo"], input_hashes(looks)["stereo"]

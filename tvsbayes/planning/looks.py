@@ -81,7 +81,7 @@ class LookPlan:
         return path
 
     def warm_minutes(self, rig: Rig) -> np.ndarray:
-        """Minutes from the homing to the last move before each look (in the caller's order), by `[costs]`, (m,)."""
+        """Compute minutes (m,) by `[costs]` from homing to the last move before each look, in the caller's order."""
         cost = {name: action_seconds(rig, {name: 1}) for name in ("home", "place", "move", "look")}
         moves = self._legs.any(axis=2).sum(axis=1)
         placed = np.array([now != before for now, before in zip(self.sheet, ("", *self.sheet[:-1]), strict=True)])
