@@ -2,11 +2,11 @@
 
 Interlaced and two-tap readouts take alternate lines at another moment or with another gain. A constant gain moves no
 centre: it changes only the height of each half. A beam that moved in between, or a gain that changes along the spot,
-does, and the two are indistinguishable on a Gaussian. Under white noise of pixels the difference of the halves' centres
-has four times the covariance C of the whole's (each half has 2 C). Where a difference d is significant, all positions
-between both are equally probable: d d'/12 is added to C (JCGM 100:2008, 4.3.7: limits d apart, uniform).
+moves a centre; on a Gaussian both look the same. For white pixel noise the difference of the halves' centres has four
+times the covariance C of the whole's (each half has 2 C). Where a difference d is significant, all positions between
+both are equally probable: d d'/12 is added to C (JCGM 100:2008, 4.3.7: limits d apart, uniform).
 
-Demosaicing mixes lines: pictures in colour show about a quarter of d, and noise less, so a larger d is needed.
+Demosaicing mixes lines: colour pictures show about a quarter of d, and less noise, so that a larger d is needed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _IDENTITY = np.ones(1, np.float32)
 
 @dataclass(frozen=True)
 class AlternateLines:
-    """A disagreement of even and odd lines about the centres of a camera's spots.
+    """A difference between even and odd lines in the centres of a camera's spots.
 
     Attributes:
         lines: "rows" or "columns".
@@ -53,22 +53,22 @@ class Widening:
 
 
 def shift_of_lines(patch: Patch, jacobian: np.ndarray, weights: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Centre of the odd less that of the even rows, then columns: (2, 2) of u and v, px.
+    """Centre of the odd minus that of the even rows, then of columns: (2, 2) of u and v, px.
 
-    The centres of both halves with the weights of the whole, to first order: the alternating part of the picture is the
-    right side of the fit's own normal equations.
+    The centres of both halves have the weights of the whole, to first order: the alternating part of the picture is the
+    right-hand side of the fit's own normal equations.
 
     Args:
         patch: the pixels; lines are counted from the picture's border.
-        jacobian: derivatives (9, n) of the fit, over the patch's cells; 1 and 2 are the centre's.
-        weights: of the cells (n,), 0 where one is not usable.
-        residual: grey less fitted (n,), DN.
+        jacobian: derivatives (9, n) of the fit, over the patch's cells; rows 1 and 2 belong to the centre.
+        weights: weights of the cells (n,), 0 for unusable cells.
+        residual: grey minus fitted (n,), DN.
     """
     weighted = jacobian * weights
     alternating = np.empty((2, residual.size))
     for axis in (0, 1):
         numbers = np.arange(patch.raw.shape[axis]) + patch.corner[1 - axis]
-        # Odd less even light is twice what alternates around the mean of both.
+        # Odd minus even light is twice the part that alternates about the mean of both.
         sign = np.where(numbers % 2, np.float32(2), np.float32(-2))
         signs = sign[:, None] if axis == 0 else sign
         if patch.block == 1:
@@ -81,11 +81,11 @@ def shift_of_lines(patch: Patch, jacobian: np.ndarray, weights: np.ndarray, resi
 def widening(shifts_px: Sequence[np.ndarray], covariances_px2: Sequence[np.ndarray]) -> Widening:
     """Additional covariance of the centres of one camera from the differences of alternate lines.
 
-    A significant difference increases the covariance of its spot; where the differences of the others are significant
-    together, and `EXCESS_MIN` times as large in mean square as stated, those of all spots do.
+    A significant difference increases the covariance of its spot. Where the other differences are significant together,
+    and `EXCESS_MIN` times as large in mean square as stated, the covariances of all spots increase.
 
     Args:
-        shifts_px: (2, 2) of each spot, as `shift_of_lines` makes them.
+        shifts_px: (2, 2) of each spot, as returned by `shift_of_lines`.
         covariances_px2: (2, 2) of each spot's centre.
     """
     from scipy.special import chdtri

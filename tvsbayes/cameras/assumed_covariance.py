@@ -57,17 +57,17 @@ class Provenance:
     """How a calibration was made, and its uncertainties; None where unknown.
 
     Attributes:
-        rms_px: over corners of both cameras, as OpenCV defines it.
-        views: of the board, by both cameras.
+        rms_px: rms over the corners of both cameras, as OpenCV defines it.
+        views: views of the board by both cameras.
         board: inner corners, columns and rows.
         pitch_mm: side of a square.
         pitch_u_mm: its standard uncertainty.
         fixed_intrinsics: whether each camera was calibrated alone, then R and T with fixed cameras (OpenCV's
             CALIB_FIX_INTRINSIC, as ROS does); else all in one adjustment.
         u_focal_percent: relative standard uncertainty of each of fx and fy.
-        u_principal_px: of each of cx and cy.
-        u_rotation_mrad: of each component of R.
-        u_baseline_mm: of each component of T.
+        u_principal_px: standard uncertainty of each of cx and cy.
+        u_rotation_mrad: standard uncertainty of each component of R.
+        u_baseline_mm: standard uncertainty of each component of T.
     """
 
     rms_px: float | None = None
@@ -90,12 +90,12 @@ def with_assumed_covariance(stereo: Stereo, stated: Provenance, of_file: Provena
     """The pair with an assumed covariance, and with a text that names its sources.
 
     Args:
-        stereo: its own covariance is ignored.
-        stated: by the user.
-        of_file: by the file, used where nothing is stated; usual values where neither states one.
+        stereo: the pair; its own covariance is ignored.
+        stated: provenance stated by the user.
+        of_file: provenance in the file, used where the user states nothing; usual values where neither states one.
 
     Raises:
-        InputError: impossible values, or cameras that see no board together.
+        InputError: impossible values, or cameras without a common view of any board.
     """
     words = []
 
@@ -128,13 +128,13 @@ def calibration_covariance(
 
     Args:
         stereo: the cameras; their covariance is not used.
-        board: with the standard uncertainty of its pitch, which scales T.
-        views: seen by both cameras.
-        rms_px: over corners, as OpenCV defines it: sqrt(2) sigma sqrt(degrees of freedom / coordinates).
+        board: the board; the standard uncertainty of its pitch scales T.
+        views: number of views seen by both cameras.
+        rms_px: rms over corners, as OpenCV defines it: sqrt(2) sigma sqrt(degrees of freedom / coordinates).
         fixed_intrinsics: see `Provenance`; None: both, with equal probability.
 
     Raises:
-        InputError: fewer corners than unknowns, or boards that the cameras do not see together.
+        InputError: fewer corners than unknowns, or no board in both cameras' views.
     """
     coordinates = 4 * board.corners * views
     dof = coordinates - 24 - 6 * views
@@ -152,7 +152,7 @@ def calibration_covariance(
 def with_marginal(covariance: np.ndarray, group: list[int], sds: np.ndarray) -> np.ndarray:
     """The covariance with these sds for the parameters of a group.
 
-    Their correlations and the conditional distribution of all others given them stay the same (Jeffrey 1965).
+    Their correlations and the conditional distribution of the others given them are unchanged (Jeffrey 1965).
     """
     others = np.setdiff1d(np.arange(len(covariance)), group)
     block = covariance[np.ix_(group, group)]
@@ -183,7 +183,7 @@ def _stated_sds(stereo: Stereo, stated: Provenance) -> list[tuple[str, list[int]
 
 
 def _one_view_covariance(stereo: Stereo, board: Board, fixed_intrinsics: bool | None) -> np.ndarray:
-    """Covariance (24, 24) of one view, corners of 1 px.
+    """Covariance (24, 24) from one view, for corners of 1 px.
 
     The mean over the sets of the table and over the possible kinds of adjustment: the covariance of a mixture whose
     members have the same mean.
@@ -203,7 +203,7 @@ def _one_view_covariance(stereo: Stereo, board: Board, fixed_intrinsics: bool | 
 
 
 def _in_two_steps(together: np.ndarray, alone: np.ndarray) -> np.ndarray:
-    """Covariance where each camera was calibrated alone, then R and T with these (OpenCV's CALIB_FIX_INTRINSIC)."""
+    """Covariance for cameras calibrated alone, then R and T with fixed cameras (OpenCV's CALIB_FIX_INTRINSIC)."""
     inner = _inverse(alone)
     outer = np.linalg.inv(together[18:, 18:])
     gain = -outer @ together[18:, :18]
@@ -212,7 +212,7 @@ def _in_two_steps(together: np.ndarray, alone: np.ndarray) -> np.ndarray:
 
 
 def _inverse(information: np.ndarray) -> np.ndarray:
-    """The inverse of an information, scaled first: px, rad and mm differ by ten powers of ten."""
+    """The inverse of an information matrix, scaled first: px, rad and mm differ by ten powers of ten."""
     scale = np.sqrt(np.diag(information))
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = information / np.outer(scale, scale)
@@ -232,11 +232,11 @@ def _no_common_view() -> InputError:
 
 
 class ViewInformation(NamedTuple):
-    """Information of one view about the cameras for corners of 1 px, the pose of its board eliminated, 1/px^2.
+    """Information of one view about the cameras for corners of 1 px, with the board's pose eliminated, 1/px^2.
 
     Attributes:
-        together: of the pair, (24, 24).
-        alone: of each camera from its own picture, with its own pose of the board eliminated, (18, 18) in two blocks.
+        together: information on the pair, (24, 24).
+        alone: information on each camera from its own picture and its own eliminated pose, (18, 18) in two blocks.
     """
 
     together: np.ndarray
@@ -254,7 +254,7 @@ def view_information(stereo: Stereo, board: Board, pose: np.ndarray) -> ViewInfo
     rotation, translation = np.asarray(pose[:3], float), np.asarray(pose[3:], float)
     r_relative, t_relative = rotation_vector(stereo.R), np.asarray(stereo.T, float).ravel()
     left = cv2.projectPoints(board.points_mm, rotation, translation, stereo.M1, stereo.D1)[1]
-    # The right camera sees the composed pose; composeRT gives its slopes by both.
+    # The right camera sees the composed pose; composeRT gives its derivatives by both.
     r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = cv2.composeRT(rotation, translation, r_relative, t_relative)
     right = cv2.projectPoints(board.points_mm, r, t, stereo.M2, stereo.D2)[1]
 
@@ -285,8 +285,8 @@ def _schur_complement(columns: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
 def placed_boards(stereo: Stereo, board: Board) -> dict[str, list[np.ndarray]]:
     """Poses (6,) of boards in front of these cameras, as in each public set; both cameras see the whole board.
 
-    A board keeps its rotation, its position in the picture and its share of it for a camera halfway between both; where
-    it is partly outside a picture it moves away, nearer, or towards the middle.
+    A board keeps its rotation, its position in the picture and its share of it, for a camera halfway between both.
+    Where it is partly outside a picture it is moved away, nearer, or towards the middle.
     """
     path = shipped_data() / "reference" / POSES_FILE
     names = np.loadtxt(path, delimiter=",", skiprows=1, usecols=0, dtype=str)
@@ -295,7 +295,7 @@ def placed_boards(stereo: Stereo, board: Board) -> dict[str, list[np.ndarray]]:
     centre = -stereo.R.T @ stereo.T / 2
     size = np.array([stereo.image_width, stereo.image_height], float)
     focal = float(np.mean([m[k, k] for m in (stereo.M1, stereo.M2) for k in (0, 1)]))
-    # From the optical axis to the middle of the pictures, px.
+    # Vector from the optical axis to the middle of the pictures, px.
     middle = (size - 1) / 2 - (stereo.M1[:2, 2] + stereo.M2[:2, 2]) / 2
     diagonal = np.hypot(board.columns - 1, board.rows - 1) * board.pitch_mm
     poses: dict[str, list[np.ndarray]] = {name: [] for name in names.tolist()}

@@ -1,8 +1,8 @@
-"""The effect of a board that is no perfect grid on a calibration: corners displaced by micrometres, alike in all views.
+"""The effect of an imperfect board on a calibration: corners displaced by micrometres, equally in all views.
 
-Printed and glued boards are such boards; all pictures agree, so the residuals of single views do not show it. The mean
-residual of each corner over all views does. The estimate stays that of least squares with a perfect grid; its
-covariance gets the effect of independent displacements of the corners, of the size that the residuals show. mm, px; z
+Printed and glued boards have such errors. All pictures agree, so the residuals of single views do not show them, but
+the mean residual of each corner over all views does. The estimate stays that of least squares with a perfect grid; its
+covariance gets the effect of independent displacements of the corners, of the size found in the residuals. mm, px; z
 are the whitened coordinates of `bundle_adjustment`.
 """
 
@@ -20,11 +20,11 @@ from tvsbayes.cameras.stereo_start import pose_of
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 
 PRIOR_SHARE = 2e-3
-"""Of the pitch: scale of the half-normal prior of a corner's displacement, one coordinate; 0.05 mm for 25 mm."""
+"""Scale of the half-normal prior of a corner's displacement, one coordinate, over the pitch; 0.05 mm for 25 mm."""
 CORNERS_MAX = 200
-"""Largest number of corners, spread evenly over the board, that determine the size of all displacements."""
+"""Largest number of corners, spread evenly over the board, used to estimate the size of all displacements."""
 STEP_SHARE = 1e-3
-"""Of the pitch: step of the differences; projections are smooth over whole squares."""
+"""Step of the differences over the pitch; projections are smooth over whole squares."""
 SIZES = np.linspace(0, 5, 501)
 """Grid of displacements, in scales of the prior."""
 
@@ -34,8 +34,8 @@ class BoardErrors:
     """Deviations of the corners of the board from a grid, and their effect.
 
     Attributes:
-        sd_mm: of one coordinate of one corner: root of the posterior mean of its square.
-        covariance: (24, 24) of the cameras' parameters from it.
+        sd_mm: sd of one coordinate of one corner: root of the posterior mean of its square.
+        covariance: (24, 24), its effect on the cameras' parameters.
         correlation_factor: for further common errors of a view, see `bundle_adjustment.correlation_factor`.
     """
 
@@ -45,18 +45,18 @@ class BoardErrors:
 
 
 def board_errors(adjustment: Adjustment, views: Sequence[View], board: Board, stereo: Stereo) -> BoardErrors:
-    """The displacements of the board's corners in the residuals, and their part in the covariance.
+    """Estimate the displacements of the board's corners from residuals, and their effect on the covariance.
 
     Args:
         adjustment: the adjustment of `views`.
-        views: in its order.
-        board: whose corners they hold.
-        stereo: the pair that it found.
+        views: the views, in its order.
+        board: the board in the views.
+        stereo: the adjusted pair.
     """
     visible = np.isfinite(adjustment.residuals_px)
     residuals = np.where(visible, adjustment.residuals_px, 0.0)
     slopes = np.stack([_corner_slopes(view, board, stereo) for view in views]) * visible[..., None]
-    # Orthonormal columns: a change of z that costs a squared pixel each.
+    # Orthonormal columns: each is a change of z with a sum of squares of 1 px^2.
     free = adjustment.root.shape[1]
     flat = np.linalg.qr(adjustment.jacobian.reshape(-1, free))
     basis = np.reshape(flat.Q, adjustment.jacobian.shape)
@@ -98,9 +98,9 @@ def _corner_slopes(view: View, board: Board, stereo: Stereo) -> np.ndarray:
 def _variance(residuals: np.ndarray, slopes: np.ndarray, total: np.ndarray, board: Board, fit: Adjustment) -> float:
     """Posterior mean of the variance of a corner's displacement, mm^2.
 
-    The residuals' inner products with displacements have variance s^2 L + v L^2 along each principal direction, L the
-    squared effect of a displacement of 1 mm, px^2. Displacements that are a motion or another scale of the whole board
-    are left out: they are poses and pitch.
+    Along each principal direction, the residuals' inner products with displacements have variance s^2 L + v L^2, L
+    being the squared effect of a displacement of 1 mm, px^2. Displacements that move or scale the whole board are left
+    out: they belong to poses and pitch.
     """
     chosen = np.unique(np.linspace(0, board.corners - 1, CORNERS_MAX).astype(int))
     count = 3 * len(chosen)
@@ -108,7 +108,7 @@ def _variance(residuals: np.ndarray, slopes: np.ndarray, total: np.ndarray, boar
     blocks = np.einsum("kqca,kqcb->cab", chosen_slopes, chosen_slopes, optimize=True)
     gram = np.zeros((len(chosen), 3, len(chosen), 3))
     gram[np.arange(len(chosen)), :, np.arange(len(chosen)), :] = blocks
-    # Without the projection on the cameras' parameters.
+    # The projection on the cameras' parameters is subtracted.
     gram = gram.reshape(count, count) - fixed.T @ fixed
     products = -np.einsum("kqca,kqc->ca", chosen_slopes, residuals[:, :, chosen], optimize=True).ravel()
     points = board.points_mm[chosen]
@@ -120,7 +120,7 @@ def _variance(residuals: np.ndarray, slopes: np.ndarray, total: np.ndarray, boar
     gains, energy = gains[visible], ((products @ free) @ directions[:, visible]) ** 2 / gains[visible]
     scale = PRIOR_SHARE * board.pitch_mm
     sizes = (scale * SIZES) ** 2
-    # The residuals' variance holds both; a tenth of it is noise at least.
+    # The residuals' variance contains both; at least a tenth of it is noise.
     noise = np.maximum(fit.noise_sd_px**2 - sizes * gains.sum() / fit.dof, 0.1 * fit.noise_sd_px**2)
     expected = noise[:, None] + sizes[:, None] * gains
     logs = -np.sum(np.log(expected) + energy / expected, axis=1) / 2 - SIZES**2 / 2

@@ -46,27 +46,27 @@ from tvsbayes.progress import Advance, unshown
 
 Finder = Literal["classic", "sector"]
 REFINING_SHARE = 0.25
-"""Half the window of cornerSubPix over the smallest distance of two corners: the window must hold one corner only,
-and a wide one averages more noise. On OpenCV's pairs (22 to 37 px) fixed halves of 3, 5, 7, 9, 11 px leave 0.23,
-0.20, 0.18, 0.20, 0.41 px: the best is a quarter of the distance; from half of it on, neighbours bias the corner."""
+"""Half the window of cornerSubPix over the smallest distance of two corners: the window must hold a single corner, and
+a wide one averages more noise. On OpenCV's pairs (22 to 37 px) fixed halves of 3, 5, 7, 9, 11 px leave 0.23, 0.20,
+0.18, 0.20, 0.41 px: the best is a quarter of the distance; from half of it on, neighbours bias the corner."""
 WIDEST_SHARE = 0.5
-"""Largest such share, where the narrower window loses a corner: a wider one contains neighbours."""
+"""Largest such share, used where a narrower window loses a corner: a wider one would contain neighbours."""
 REFINING_HALF_MIN, REFINING_HALF_MAX = 2, 11
 WORKERS_MAX = 8
 PICTURES_MAX = 2000
 PIXELS_MAX = 20_000_000
-"""Of one picture, and of all that are searched in parallel: one of 20 million takes 0.8 GB."""
+"""Limit for one picture, and for all that are searched in parallel: 20 million pixels take 0.8 GB."""
 SAMPLE_MAX, SAMPLE_BATCH = 12, 4
-"""Pictures that are searched first, in batches; all are searched once one shows the board."""
+"""Number of pictures searched first, in batches; all are searched once one shows the board."""
 SMALLEST = (3, 3)
-"""Least inner corners in the search for a board of unknown size."""
+"""Least numbers of inner corners in the search for a board of unknown size."""
 SECTOR_PIXELS_MAX = 3_000_000
 """Larger pictures are searched by sectors in a smaller copy, then refined: 20 million pixels would take 3.8 GB and half
 a minute."""
 DARK_DN, BRIGHT_DN = 40.0, 225.0
 """Mean grey level below or above which a picture is too dark or overexposed to show a board."""
 BLURRED_SHARE = 0.02
-"""Largest second difference of neighbours over the range of grey levels: below it no edge is in focus. An edge in focus
+"""Largest second difference of neighbours over the range of grey levels: that counts as blurred. An edge in focus
 has about 1, an edge blurred over 10 px 0.03."""
 CLIPPED_SHARE = 0.3
 _BOARD_SIZE = re.compile(r"([0-9]{1,3})\s*[xX*]\s*([0-9]{1,3})")
@@ -81,7 +81,7 @@ class Board:
         rows: inner corners along y.
         pitch_mm: side of a square.
         pitch_u_mm: standard uncertainty of the mean pitch (GUM type B: certificate, ruler, printer).
-        markers: of a ChArUco board, which may be partly visible; None for a plain checkerboard.
+        markers: markers of a ChArUco board, which may be partly visible; None for a plain checkerboard.
     """
 
     columns: int
@@ -103,10 +103,10 @@ class Board:
 
     @classmethod
     def named(cls, size: str, pitch_mm: float, pitch_u_mm: float = 0.0) -> Board:
-        """From text such as "9x6".
+        """Build from a text such as "9x6".
 
         Raises:
-            InputError: no such text, or impossible values.
+            InputError: another text, or impossible values.
         """
         match = _BOARD_SIZE.fullmatch(size.strip())
         if match is None:
@@ -117,10 +117,10 @@ class Board:
     def with_markers(
         cls, squares: str, dictionary: str, pitch_mm: float, marker_mm: float | None = None, pitch_u_mm: float = 0.0
     ) -> Board:
-        """A ChArUco board by its squares, such as "15x10", and its dictionary, such as "5X5_100".
+        """Build a ChArUco board from its squares, such as "15x10", and its dictionary, such as "5X5_100".
 
         Raises:
-            InputError: no such text, no such dictionary, or impossible values.
+            InputError: another text, no such dictionary, or impossible values.
         """
         match = _BOARD_SIZE.fullmatch(squares.strip())
         if match is None:
@@ -170,16 +170,16 @@ class Views:
     """The board in a folder of pictures.
 
     Attributes:
-        views: with the board in at least one picture, in the order of their names.
-        image_width: of one camera, px.
-        image_height: px.
-        unpaired: pictures of one camera without one of the other; where they show the board, they are in `views`.
-        unnamed: pictures without a camera in their names that hold no two pictures side by side; not used.
+        views: views with the board in at least one picture, in the order of their names.
+        image_width: width of one camera's picture, px.
+        image_height: its height, px.
+        unpaired: pictures of one camera without a picture of the other; where they show the board, they are in `views`.
+        unnamed: pictures without a camera in their names that are not two pictures side by side; not used.
         without_board: pictures in which no board was found.
         other_size: pictures of another size than most; not used.
-        by_fallback: pictures whose board only the other finder found.
+        by_fallback: pictures whose board only the fallback finder found.
         reordered: views whose right corners were reordered to match the left ones.
-        right_image_size: of the right camera's pictures where it differs; its corners are scaled to the left size.
+        right_image_size: size of the right camera's pictures where it differs; corners are scaled to the left size.
     """
 
     views: tuple[View, ...]
@@ -202,8 +202,8 @@ def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> 
 
     Args:
         grey: (height, width) uint8.
-        board: the board; its markers, if any, are the finder.
-        finder: the first to try.
+        board: the board; its markers, if any, replace the finder.
+        finder: the finder tried first.
 
     Returns:
         Corners (corners, 2), px, in right-handed order (the sense of the image's x, y), and whether the fallback found
@@ -218,7 +218,7 @@ def find_corners(grey: np.ndarray, board: Board, finder: Finder = "classic") -> 
             continue
         grid = corners.reshape(board.rows, board.columns, 2)
         along, across = (grid[:, -1] - grid[:, 0]).mean(0), (grid[-1] - grid[0]).mean(0)
-        # Every picture shows the front of the board, so the order has the same sense in all of them.
+        # Every picture shows the front of the board, so the order has the same sense in all pictures.
         if along[0] * across[1] - along[1] * across[0] < 0:
             grid = grid[:, ::-1]
         return grid.reshape(-1, 2), method != finder
@@ -243,7 +243,7 @@ def _refined(grey: np.ndarray, corners: np.ndarray, board: Board) -> np.ndarray:
     half = int(np.clip(round(REFINING_SHARE * nearest), REFINING_HALF_MIN, REFINING_HALF_MAX))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
     # cornerSubPix returns a corner unchanged, wrong by pixels, where its search leaves the window (boards at a steep
-    # angle): widen the window then, up to the neighbours, whose distance is itself known to pixels only.
+    # angle). The window is then widened, up to the neighbours, whose distance is itself known to pixels only.
     for size in range(half, max(half + 1, int(WIDEST_SHARE * nearest)) + 1):
         refined = cv2.cornerSubPix(grey, corners.reshape(-1, 1, 2).copy(), (size, size), (-1, -1), criteria)
         refined = np.asarray(refined).reshape(-1, 2)
@@ -283,7 +283,7 @@ def _first_is_bright(grey: np.ndarray, corners: np.ndarray, board: Board) -> boo
 
 @dataclass(frozen=True)
 class _Detected:
-    """Corners of one picture; `colours[k]` tells whether the first square is bright in the k-th of `corner_orders`."""
+    """Corners of one picture; `colours[k]` states whether the first square is bright in the k-th of `corner_orders`."""
 
     corners: np.ndarray
     colours: tuple[bool, ...]
@@ -321,15 +321,15 @@ def find_views(
     twice as wide as high are split in the middle. Other files are ignored; other pictures are listed.
 
     Args:
-        folder: of the pictures.
+        folder: folder of the pictures.
         board: the board.
         finder: see `find_corners`.
         pairing: the camera of each picture.
         advance: called with the share of pictures searched.
 
     Raises:
-        InputError: no folder, an unreadable picture, or two for one camera and view.
-        NothingToEstimate: no picture of a camera, or no board in any.
+        InputError: no folder, an unreadable picture, or two pictures for one camera and view.
+        NothingToEstimate: no picture of a camera, or no board in any picture.
     """
     pictures = read_folder(folder, PICTURES_MAX, PIXELS_MAX, pairing)
     usual, used = pictures.usual, pictures.used
@@ -384,7 +384,7 @@ def find_views(
 
 
 def _any_board(sample: Sequence[Picture], pictures: PictureFolder, board: Board, finder: Finder) -> bool:
-    """Whether a picture of the sample shows the board: a search of all would take minutes."""
+    """Whether a picture of the sample shows the board; a search of all pictures would take minutes."""
     for k in range(0, len(sample), SAMPLE_BATCH):
         batch = _detections(sample[k : k + SAMPLE_BATCH], pictures, board, finder)
         if any(detection is not None for detections in batch for detection in detections.values()):
@@ -393,7 +393,7 @@ def _any_board(sample: Sequence[Picture], pictures: PictureFolder, board: Board,
 
 
 def _no_board_error(sample: Sequence[Picture], pictures: PictureFolder, board: Board) -> NothingToEstimate:
-    """The refusal of pictures without the board, with what they show instead."""
+    """The refusal of pictures without the board, with the reason."""
     count, sizes = len(pictures.used), dict.fromkeys(pictures.sizes[p] for p in sample)
     greys = [part for picture in sample for part in _greys(picture, pictures).values()]
     sizes_text = " and ".join(f"{width} x {height}" for width, height in sizes)
@@ -419,7 +419,7 @@ def _no_board_error(sample: Sequence[Picture], pictures: PictureFolder, board: B
 def _greys(picture: Picture, pictures: PictureFolder) -> dict[str, np.ndarray]:
     """The grey images in a picture by camera, uint8."""
     pixels, width = in_grey_levels(read_image(picture.path, pictures.folder)), pictures.sizes[picture][0]
-    # The finders need 8 bits; a corner is an average over hundreds of pixels.
+    # The finders need 8 bits; a corner averages over hundreds of pixels.
     if pixels.dtype != np.uint8:
         pixels = np.rint(pixels).astype(np.uint8)
     grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
@@ -427,7 +427,7 @@ def _greys(picture: Picture, pictures: PictureFolder) -> dict[str, np.ndarray]:
 
 
 def _check_sizes(pictures: PictureFolder) -> None:
-    """Refuse pictures of one camera alone, and sizes of two proportions: they are no scaled copies."""
+    """Refuse pictures of one camera alone, and sizes of different aspect ratios, which are not scaled copies."""
     if not pictures.sizes:
         raise NothingToEstimate(
             "no-pictures",
@@ -509,9 +509,9 @@ def why_no_board(pictures: Sequence[np.ndarray], columns: int, rows: int) -> tup
     """A reason why pictures do not show the board, and a remedy.
 
     Args:
-        pictures: a sample of one camera.
+        pictures: a sample of one camera's pictures.
         columns: inner corners of the board along one side.
-        rows: along the other.
+        rows: inner corners along the other side.
     """
     stated = (max(columns, rows), min(columns, rows))
     boards = Counter(size for grey in pictures if (size := inner_corners(grey)) is not None)

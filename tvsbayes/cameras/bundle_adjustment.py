@@ -4,10 +4,10 @@ Frames: the board's x runs along its columns, y along its rows, z away from the 
 (OpenCV's axes: x right, y down, z along the view), x_right = R x_left + T. mm, rad, px with the integer at a pixel's
 centre.
 
-Board poses are nuisances. At every trial of the camera parameters each board is moved to its own optimum, and the
-derivative of what remains is (1 - P) J, P the projector on the columns of that board's pose (variable projection:
+Board poses are nuisance parameters. At every trial of the camera parameters each board is moved to its own optimum, and
+the remaining derivative is (1 - P) J, P being the projector on the columns of that board's pose (variable projection:
 Golub and Pereyra 1973, in Kaufman's form of 1975). Its normal matrix is the Schur complement of the whole bundle
-adjustment: the least squares see 24 parameters whatever the number of views, and their covariance is marginal.
+adjustment: least squares have 24 parameters for any number of views, and their covariance is marginal.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from tvsbayes.model.geometry import CV_FROM_S, StereoCameras, project, rotation_
 from tvsbayes.statistics.least_squares import LinearResidual, least_squares_covariance, linear_residual
 
 VIEWS_PER_BUCKET, CORNERS_PER_BUCKET = 16, 32
-"""Padding: calibrations of like size share one compilation."""
+"""Padding: calibrations of similar size share one compilation."""
 POSE_STEPS, POSE_TOLERANCE = 40, 1e-20
 """Largest number of Gauss-Newton steps of a pose, and the squared step at convergence, in rad and board sizes."""
 TOLERANCE, STEPS_MAX = 1e-7, 200
-"""In whitened coordinates this ended within 1e-7 standard errors of the minimum; the end is also checked."""
+"""Convergence limits in whitened coordinates: ends lie within 1e-7 standard errors of the minimum, and are checked."""
 RESTART_SD = 3.0
 """The repeated adjustment starts this many standard errors away in every parameter."""
 RESTART_AGREEMENT_SD = 1e-2
 RESTARTS_MAX, LOWER_SHARE = 4, 1e-6
-"""A repetition with a lower end replaces the first and is itself repeated: lenses far from the model have several
+"""A repetition with a lower minimum replaces the first and is itself repeated: lenses far from the model have several
 minima."""
 STATIONARY_SD = 1e-3
 EXACT_PX = 1e-7
-"""Residuals of exact corners are rounding errors, whose direction is meaningless."""
+"""Residuals below this are rounding errors of exact corners, whose direction is meaningless."""
 
 
 class BoardArrays(eqx.Module):
@@ -54,9 +54,9 @@ class BoardArrays(eqx.Module):
         points_mm: corners in the board's frame, first axis x, y, z.
         corners_px: (u_left, v_left, u_right, v_right) of every view and corner.
         weight: 1 where a corner was seen, else 0.
-        poses: start of every board's rotation vector and translation (board to left camera).
+        poses: start value of every board's rotation vector and translation (board to left camera).
         origin: the 24 parameters at z = 0.
-        root: d(parameters)/dz; a fixed parameter has a zero row and column, so that every choice of fixed ones
+        root: d(parameters)/dz; a fixed parameter has a zero row and column, so that every choice of fixed parameters
             shares one compilation.
     """
 
@@ -94,9 +94,9 @@ def _view_residuals(
 
 
 def _pose_gain(pose, parameters, corners_px, weight, points_mm):
-    """Jacobian by the pose and its pseudo-inverse; zero for padding."""
+    """Jacobian with respect to the pose and its pseudo-inverse; zero for padding."""
     by_pose = jax.jacfwd(_view_residuals)(pose, parameters, corners_px, weight, points_mm)
-    # Rotation in rad and translation in board sizes change corners alike; the ridge only serves padding.
+    # Rotation in rad and translation in board sizes move corners equally; the ridge only serves padding.
     size = jnp.max(jnp.abs(points_mm))
     scale = jnp.concatenate([jnp.ones(3), size * jnp.ones(3)])
     scaled = by_pose * scale
@@ -106,7 +106,7 @@ def _pose_gain(pose, parameters, corners_px, weight, points_mm):
 
 
 def _converged_pose(pose, parameters, corners_px, weight, points_mm):
-    """The pose of least squares for given cameras, by Gauss-Newton steps from a pose nearby."""
+    """The least-squares pose for given cameras, by Gauss-Newton steps from a nearby pose."""
 
     def not_converged(state):
         _, step2, steps = state
@@ -154,15 +154,15 @@ def _linearised(z: Float[Array, "24"], arrays: BoardArrays) -> _Linear:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """Least squares over all views, poses eliminated.
+    """Least squares over all views, with poses eliminated.
 
     Attributes:
         vector: the 24 parameters in the order of `STEREO_PARAMETER_NAMES`.
         covariance: (24, 24), type A, under `noise_sd_px` alone: independent corners.
         residuals_px: projected minus found, shape (views, 4, corners), NaN where no corner was seen.
         noise_sd_px: standard deviation of one corner coordinate, from the residuals.
-        dof: its degrees of freedom: coordinates - camera parameters - 6 per view.
-        jacobian: of the residuals by the whitened coordinates of the free parameters, boards following, shape (views,
+        dof: degrees of freedom of `noise_sd_px`: coordinates - camera parameters - 6 per view.
+        jacobian: of the residuals by the free parameters' whitened coordinates, with readjusted boards, shape (views,
             4, corners, free); 0 where no corner was seen.
         root: d(parameters)/d(whitened coordinates), (24, free).
     """
@@ -181,19 +181,19 @@ def correlation_factor(
 ) -> float:
     """Ratio of the scores of whole views to those expected for independent corners; at least 1.
 
-    Corner errors of one picture have common causes (light, defocus, a lens that is not quite the model, a bent
-    board): they are not independent, and (J^T J)^-1 s^2 is then too small. The score of view i, J_i^T r_i, shows
-    it: independent errors give the sum of |J_i^T r_i|^2 in coordinates where J^T J = 1 the expectation
-    s^2 (p - sum_i tr (J_i^T J_i)^2), the second term for the residuals having been fitted. The ratio scales the
-    covariance: the cluster-robust variance of Liang and Zeger (1986) reduced to one number, since a dozen views
-    cannot support a 24 x 24 matrix of them. Errors common to ALL views stay unseen: see `board_errors`.
+    Corner errors of one picture have common causes (light, defocus, a lens that deviates from the model, a bent board):
+    they are not independent, and (J^T J)^-1 s^2 is then too small. The score of view i, J_i^T r_i, shows this. In
+    coordinates where J^T J = 1, independent errors give the sum of |J_i^T r_i|^2 the expectation
+    s^2 (p - sum_i tr (J_i^T J_i)^2), where the second term is due to the fit. The ratio scales the covariance: the
+    cluster-robust variance of Liang and Zeger (1986) reduced to one number, since a dozen views cannot determine a
+    24 x 24 matrix. Errors common to ALL views are not detected: see `board_errors`.
 
     Args:
         jacobian: (residuals, p), of full rank.
         residuals: (residuals,).
-        views: (residuals,), which view each belongs to, numbered from 0.
-        noise_sd: s.
-        explained: expectation of the scores' squares that something else accounts for.
+        views: (residuals,), number of the view of each, from 0.
+        noise_sd: s, the standard deviation of one coordinate.
+        explained: expectation of the scores' squares due to other known causes.
     """
     q, _ = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))
     count = int(views.max()) + 1
@@ -209,14 +209,14 @@ def correlation_factor(
 def bundle_adjustment(
     views: Sequence[View], board: Board, start: np.ndarray, poses: np.ndarray, free: np.ndarray
 ) -> Adjustment:
-    """Least squares of all corners over cameras and board poses, checked at its end and repeated from another start.
+    """Fit cameras and board poses to all corners by least squares, check the end, and repeat from another start.
 
     Args:
         views: at least one.
-        board: whose corners they hold.
+        board: the board in the views.
         start: the 24 parameters.
         poses: (views, 6), board to left camera.
-        free: (24,) of bool; the others keep their start.
+        free: (24,) of bool; the other parameters keep their start.
 
     Raises:
         NothingToEstimate: the views do not determine all parameters.
@@ -230,8 +230,8 @@ def bundle_adjustment(
         raise undetermined("fewer corner coordinates than unknowns")
     zero = np.zeros(24)
     jacobian = np.asarray(_linearised(zero, arrays).jacobian)
-    # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal
-    # length and a k3 would share one damping.
+    # Whitened at the start: a unit of z is one standard error for corners of 1 px. In their own units a focal length
+    # and a k3 would share one damping.
     root = np.zeros((24, 24))
     root[np.ix_(free, free)] = _whitening(jacobian[:, free], np.flatnonzero(free))
     arrays = replace(arrays, root=placed(root))
@@ -257,7 +257,7 @@ def bundle_adjustment(
 
 
 def _padded(views: Sequence[View], board: Board, start: np.ndarray, poses: np.ndarray, free: np.ndarray) -> BoardArrays:
-    """The arrays of an adjustment in buckets, its coordinates in the parameters' own units."""
+    """The arrays of an adjustment padded to buckets, with coordinates in the parameters' own units."""
     count = -(-len(views) // VIEWS_PER_BUCKET) * VIEWS_PER_BUCKET
     corners = -(-board.corners // CORNERS_PER_BUCKET) * CORNERS_PER_BUCKET
     pixels, weight = np.zeros((count, 4, corners)), np.zeros((count, 4, corners))
@@ -276,7 +276,7 @@ def _padded(views: Sequence[View], board: Board, start: np.ndarray, poses: np.nd
 
 
 def _check_minimum(jacobian: np.ndarray, residuals: np.ndarray, difference: np.ndarray, noise_sd: float) -> None:
-    """Refuse an end that is no minimum.
+    """Refuse an end that is not a minimum.
 
     Checks the next step of the linear model and `difference`, the deviation of the repetition, both as distances in
     standard errors for any conditioning: |J dz| / s.
@@ -298,7 +298,7 @@ def _check_minimum(jacobian: np.ndarray, residuals: np.ndarray, difference: np.n
 
 @dataclass(frozen=True)
 class _End:
-    """The end of a descent: coordinates z (24,), residuals and Jacobian."""
+    """The end point of a descent: coordinates z (24,), residuals and Jacobian."""
 
     z: np.ndarray
     residuals: np.ndarray
@@ -310,12 +310,12 @@ class _End:
 
 
 def _lowest(end: _End, arrays: BoardArrays, free: np.ndarray, dof: int) -> tuple[_End, _End]:
-    """The lowest end, and the end of the last repetition from a start near it."""
+    """The lowest end point, and that of the last repetition from a start near it."""
     again = _repeated(end, arrays, free, dof)
     for _ in range(RESTARTS_MAX):
         if not again.noise_sd(dof) < (1 - LOWER_SHARE) * end.noise_sd(dof):
             break
-        # The returned end is always repeated itself: compared with itself it would seem confirmed.
+        # The returned end is always repeated: compared with itself it would seem confirmed.
         end, again = again, _repeated(again, arrays, free, dof)
     return end, again
 

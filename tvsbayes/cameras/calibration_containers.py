@@ -1,10 +1,10 @@
-"""Reads containers of calibrations by content: YAML, XML and JSON (OpenCV's too), TOML, .npz, MATLAB's .mat.
+"""Read containers of calibrations by their content: YAML, XML and JSON (OpenCV's too), TOML, .npz, MATLAB's .mat.
 
-`maker_calibrations` reads the text that the programs of camera makers print.
+`maker_calibrations` reads the printed text of camera makers' programs.
 
 Every container becomes nested maps, lists and numbers, as `Keys` with file and line. OpenCV's matrices stay maps of
-rows, cols, data. OpenCV's FileStorage has had memory errors on hostile files (CVE-2019-5063, -5064; opencv #28619):
-general libraries read the formats instead, with limits: bytes, entries (aliases expanded), depth; no entities, pickles.
+rows, cols, data. OpenCV's FileStorage has had memory errors on hostile files (CVE-2019-5063, -5064; opencv #28619).
+General libraries read the formats instead, with limits: bytes, entries (aliases expanded), depth; no entities, pickles.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ REWRITE_REMEDY = "write it as its own program does"
 _TEXT_REMEDY = "name a calibration file; from Python save the matrices by numpy.savez, not as pickles or pictures"
 MAT_SECONDS_MAX = 60.0
 _MAT_HEADER_BYTES, _MAT_COMPRESSED = 128, 15
-"""Of MAT-file 5: the header, and the type of a compressed element (MATLAB MAT-File Format, 1-3, 1-6)."""
+"""MAT-file 5: length of the header, and type of a compressed element (MATLAB MAT-File Format, 1-3, 1-6)."""
 
 
 def read_container(data: bytes, file: str) -> list[Keys]:
-    """The top map of a calibration file; several where it holds messages of several cameras.
+    """Read the top map of a calibration file; several where it contains messages of several cameras.
 
     Raises:
         InputError: too large, unknown, damaged, or above the limits; with file and line.
@@ -86,7 +86,7 @@ def container_error(file: str, line: int | None, found: str, remedy: str = REWRI
 
 
 def _plain_values(value: Any, file: str) -> Any:
-    """Only maps, lists, numbers and text, within the limits."""
+    """Reduce a value to maps, lists, numbers and text, within the limits."""
     count = 0
 
     def plain(value: Any, depth: int) -> Any:
@@ -139,7 +139,7 @@ json.dump(plain(loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True
 def _mat(data: bytes) -> dict[str, Any]:
     """Variables of a MAT-file of version 5 (saved by -v6 or -v7); structures become maps.
 
-    `scipy.io.loadmat` ends in a segmentation fault on some damaged files: a separate process reads them.
+    `scipy.io.loadmat` ends in a segmentation fault on some damaged files: they are read in a separate process.
     """
     offset, unpacked = _MAT_HEADER_BYTES, 0
     order = "<" if data[126:128] == b"IM" else ">"
@@ -203,7 +203,7 @@ def _xml(text: str, file: str) -> dict[str, Any]:
 
 
 def _number(word: str) -> int | float | None:
-    """A finite number of text, else None."""
+    """A finite number in a text, else None."""
     if not NUMBER.fullmatch(word) or not math.isfinite(float(word)):
         return None
     return int(word) if re.fullmatch(r"[+-]?[0-9]{1,15}", word) else float(word)
@@ -239,7 +239,7 @@ def _yaml(text: str, file: str) -> list[dict[str, Any]]:
     for kind in ("opencv-matrix", "opencv-nd-matrix"):
         Loader.yaml_constructors[f"tag:yaml.org,2002:{kind}"] = mapping
     Loader.yaml_constructors[None] = yaml.SafeLoader.construct_undefined
-    # OpenCV's header is no YAML directive; separators of ROS' dumps start empty documents.
+    # OpenCV's header is not a YAML directive; separators of ROS' dumps start empty documents.
     body = re.sub(r"\A%YAML[^\n]*\n", "\n", text)
     try:
         _check_limits(yaml.parse(body, Loader=Loader), file)
@@ -262,7 +262,7 @@ def _yaml(text: str, file: str) -> list[dict[str, Any]]:
 
 
 def _check_limits(events: Iterable[Any], file: str) -> None:
-    """Check depth and number of entries before anything is built; `_plain_values` counts expanded aliases."""
+    """Check depth and number of entries before any object is built; `_plain_values` counts expanded aliases."""
     depth = count = 0
     for event in events:
         name, line = type(event).__name__, event.start_mark.line + 1

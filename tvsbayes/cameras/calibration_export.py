@@ -1,4 +1,4 @@
-"""A calibrated pair as files of OpenCV and ROS; neither keeps the covariance. Lengths: OpenCV mm, ROS metres."""
+"""A calibrated pair as files of OpenCV and ROS; neither format keeps the covariance. Lengths: OpenCV mm, ROS metres."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EXPORT_NAMES: dict[Format, tuple[str, str]] = {
 
 
 def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
-    """Files by name for another tool; none of them keeps the covariance.
+    """The files for another tool, by name; none of them keeps the covariance.
 
     `opencv`: `intrinsics.yml` (M1 D1 M2 D2, image size) and `extrinsics.yml` (R T R1 R2 P1 P2 Q) of the stereo
     sample, mm. `ros`: `left.yaml` and `right.yaml`, camera_info, metres.
@@ -28,7 +28,7 @@ def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
     import cv2
 
     size = (stereo.image_width, stereo.image_height)
-    # alpha = 0: only pixels that both cameras have, as ROS' calibrator and OpenCV's sample do by default.
+    # alpha = 0: only pixels of both cameras, the default of ROS' calibrator and of OpenCV's sample.
     R1, R2, P1, P2, Q, *_ = cv2.stereoRectify(
         stereo.M1, stereo.D1, stereo.M2, stereo.D2, size, stereo.R, stereo.T.reshape(3, 1), alpha=0
     )
@@ -53,7 +53,7 @@ def exported(stereo: Stereo, form: Format) -> dict[str, bytes]:
 
 
 def _opencv_text(matrices: Mapping[str, np.ndarray], numbers: Mapping[str, int]) -> bytes:
-    """OpenCV's YAML 1.0 of 2-D matrices: 4.x and 5.x read it alike."""
+    """OpenCV's YAML 1.0 of 2-D matrices, read equally by 4.x and 5.x."""
     lines = ["%YAML:1.0", "---", *(f"{key}: {value}" for key, value in numbers.items())]
     for key, matrix in matrices.items():
         lines += [f"{key}: {MATRIX_TAG}", *_entries(matrix, "   ", "[ {} ]", "dt: d")]
@@ -69,7 +69,7 @@ def _ros_text(name: str, size: tuple[int, int], matrices: Mapping[str, np.ndarra
 
 
 def _entries(matrix: np.ndarray, indent: str, form: str, *format_lines: str) -> list[str]:
-    """Rows, columns, further lines of a format, and the numbers in its form of a list."""
+    """Rows, columns, further lines of a format, and the numbers as a list in that format."""
     rows, cols = matrix.shape
     data = form.format(", ".join(map(repr, map(float, matrix.ravel()))))
     return [f"{indent}{entry}" for entry in (f"rows: {rows}", f"cols: {cols}", *format_lines, f"data: {data}")]

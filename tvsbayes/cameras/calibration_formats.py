@@ -1,4 +1,4 @@
-"""Stereo calibrations of other programs, by content, and `stereo.json`; and the files of an export.
+"""Stereo calibrations of other programs, recognised by content, and `stereo.json`.
 
 `calibration_names` finds the meaning of each number; here numbers become a pair: M and D of both cameras, R and T of
 x_right = R x_left + T. None of these files contains an uncertainty: an import gets the covariance of
@@ -36,21 +36,21 @@ from tvsbayes.instrument.stereo_pair import (
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 BASELINE_RANGE_MM = (20.0, 3000.0)
-"""Distance of the cameras of one bench; outside of it the unit is not assumed but asked."""
+"""Distance of the cameras of one bench; outside this range the user must state the unit."""
 RMS_PX_MAX, VIEWS_MAX = 20.0, 100_000
 NO_PROVENANCE = Provenance()
 SIDE_NAMES = ("left", "right")
 KEY_FIELDS = ("M1", "D1", "M2", "D2", "R", "T")
 """Fields that `--key` can name."""
 POSE_KEYS = {"kalibr": ("T_cn_cnm1",), "orb-slam": ("Stereo.T_c1_c2",), "boofcv": ("rightToLeft",)}
-"""Keys of a pose that only one program uses."""
+"""Keys of a pose that identify one program."""
 TURN_NOTED_DEG = 0.5
-"""Below this angle a rotation and its transpose differ little."""
+"""Angle below which a rotation and its transpose are hardly different."""
 
 
 @dataclass(frozen=True)
 class Imported:
-    """A calibration of another tool.
+    """A calibration from another tool.
 
     Attributes:
         stereo: the pair, mm and px.
@@ -74,14 +74,14 @@ def read_calibration(
     stated: Provenance = NO_PROVENANCE,
     keys: Mapping[str, str] | None = None,
 ) -> Imported:
-    """A stereo calibration from the files of another program, or from `stereo.json`.
+    """Read a stereo calibration from the files of another program, or from `stereo.json`.
 
     Args:
         paths: one file of a pair, or two or three: one for each camera, or intrinsics and extrinsics.
         size: image width and height, px, where the files do not state it.
-        unit_mm: unit of lengths, mm; None: that of the format, and asked for where the baseline is implausible.
-        stated: how the calibration was made and its uncertainties, for the covariance: no such file has one.
-        keys: what holds M1, D1, M2, D2, R, T, where no name that is known does.
+        unit_mm: unit of lengths, mm; None: that of the format; with an implausible baseline the user must state it.
+        stated: how the calibration was made, with its uncertainties, for the covariance, which no such file contains.
+        keys: keys of M1, D1, M2, D2, R, T in the file, where their names are unknown.
 
     Raises:
         InputError: unreadable, unknown, contradictory, or of lenses that five coefficients do not describe.
@@ -127,9 +127,9 @@ class _Pose:
     """R (3, 3) and T (3,) of x_right = R x_left + T, T in the file's unit.
 
     Attributes:
-        rotation, translation: both.
+        rotation, translation: R and T.
         turn, shift: their entries in the file.
-        source: the program, "" where the entries do not tell.
+        source: the program, "" where the entries do not identify it.
         plain: whether the name of R leaves its direction open.
     """
 
@@ -142,16 +142,16 @@ class _Pose:
 
 
 class _Reader:
-    """Makes a pair of the entries by field.
+    """Builds a pair from the entries by field.
 
     Attributes:
         source: the program that probably wrote the file.
         notes: assumptions.
         warnings: doubtful values.
         places: key and file of M1, M2, D1, D2, R, T, in words.
-        right_size: size of the right camera's pictures, where it differs from the left one's.
-        matrices: of both cameras, as the file states them.
-        transposed: a camera matrix that the file stores by columns.
+        right_size: size of the right camera's pictures, where it differs from the left.
+        matrices: matrices of both cameras, as the file states them.
+        transposed: whether the file stores a camera matrix by columns.
     """
 
     def __init__(self, fields: Fields, size: tuple[int, int] | None, unit_mm: float | None):
@@ -171,7 +171,7 @@ class _Reader:
         self.notes += [f"{maker.keys.file}: {note}" for note in maker.notes]
 
     def pair(self) -> Stereo:
-        """The pair, without a covariance, checked as `stereo.json` is."""
+        """The pair, without a covariance, checked like `stereo.json`."""
         for name, (first, second) in self.fields.twice.items():
             remedy = f"say which: --key {name}={second.path}" if name in KEY_FIELDS else "remove one of them"
             raise first.refuse("twice", "every quantity once", remedy, f"another under {second.place}")
@@ -218,7 +218,7 @@ class _Reader:
         return structured or self.transposed is not None or _has_key(pair.get("pose"), "a")
 
     def _swap_sides(self) -> None:
-        """Swap two files of one camera each, named in the other order: only the left projection has no shift."""
+        """Swap two files of one camera each, named in reverse order: only the left projection has no shift."""
         cameras = self.fields.cameras
         if self.fields.by_file and all("P" in camera for camera in cameras):
             shifts = [np.abs(camera["P"].numbers[[3, 7]]).max() for camera in cameras]
@@ -226,13 +226,13 @@ class _Reader:
                 self.fields.cameras = cameras[::-1]
 
     def _complete_rectified(self) -> None:
-        """One camera and a baseline: the right camera of a rectified pair equals the left one."""
+        """Complete one camera and a baseline: the right camera of a rectified pair equals the left one."""
         left, right = self.fields.cameras
         if "baseline" in self.fields.pair and "fx" in left and not {"M", "fx", "P"} & set(right):
             right.update({key: entry for key, entry in left.items() if key in ("fx", "fy", "cx", "cy")})
 
     def _matrix(self, side: int) -> np.ndarray:
-        """The camera matrix: from nine numbers, from four, from two and two, from single ones or from a projection."""
+        """The camera matrix: from nine numbers, from four, from two pairs, from single numbers or from a projection."""
         camera, name = self.fields.cameras[side], f"M{side + 1}"
         parts = [camera.get(key) for key in ("fx", "fy", "cx", "cy")]
         if "focal" in camera and "centre" in camera:
@@ -321,7 +321,7 @@ class _Reader:
         return (values, present[0]) if present else None
 
     def _size(self, matrices: Sequence[np.ndarray]) -> tuple[int, int]:
-        """The size of the left camera's pictures; stores that of the right one's where it differs."""
+        """The size of the left camera's pictures; stores the size of the right camera's where it differs."""
         sizes: list[tuple[tuple[int, int], Entry]] = []
         for side, camera in enumerate(self.fields.cameras):
             if "size" in camera:
@@ -396,7 +396,7 @@ class _Reader:
         """All poses of the right camera in the files."""
         pair, (left, right) = self.fields.pair, self.fields.cameras
         for field, camera_field in (("R", "rectification"), ("T", "camera_T")):
-            # In the file or table of one camera only: that of the pair; rectifications and poses come in twos.
+            # An entry for one camera only belongs to the pair; rectifications and poses of cameras come in twos.
             if field not in pair and (camera_field in left) != (camera_field in right) and "P" not in left:
                 pair[field] = left.get(camera_field) or right[camera_field]
         if "baseline" in pair and right.get("fx") is left.get("fx") and "fx" in left:
@@ -430,7 +430,7 @@ class _Reader:
             yield self._from_projections()
 
     def _from_projections(self) -> _Pose:
-        """Rectified, the right camera sees x' = x + (P03 / P00, P13 / P11, 0): R = R2^T R1, T = R2^T of that."""
+        """The rectified right camera sees x' = x + (P03 / P00, P13 / P11, 0): R = R2^T R1, T = R2^T times the shift."""
         left, right = self.fields.cameras
         left_p, right_p = (camera["P"].numbers.reshape(3, 4) for camera in (left, right))
         if np.any(left_p[:2, 3] != 0) or not np.any(right_p[:2, 3]) or not (right_p[0, 0] > 0 and right_p[1, 1] > 0):
@@ -439,14 +439,14 @@ class _Reader:
             raise right["P"].refuse("projection", allowed, remedy, "files that are no stereo pair")
         turns = [c["rectification"].rotation() if "rectification" in c else np.eye(3) for c in (left, right)]
         if "M" not in left and "fx" not in left:
-            # The files hold the rectified pair itself.
+            # The files contain the rectified pair itself.
             turns = [np.eye(3), np.eye(3)]
         shift = np.array([right_p[0, 3] / right_p[0, 0], right_p[1, 3] / right_p[1, 1], 0.0])
         source = "ros" if self.fields.by_file else ""
         return _Pose(turns[1].T @ turns[0], turns[1].T @ shift, right["P"], right["P"], source)
 
     def _check_direction(self, pose: _Pose) -> None:
-        """Note the meaning of R and of its transpose, where nothing else in the file decides.
+        """Note the meaning of R and of its transpose, where nothing else in the file determines it.
 
         Raises:
             InputError: the camera matrices are transposed, so that R may be too.
@@ -470,7 +470,7 @@ class _Reader:
             self.notes.append(text)
 
     def _unit(self, length: float) -> float:
-        """Millimetres per unit of the file: as stated, or as the format defines it; asked where this is implausible."""
+        """Millimetres per unit of the file: as stated, or by the format; an implausible one must be stated."""
         if not 0 < length < math.inf:
             raise refusal(
                 "translation",
@@ -518,7 +518,7 @@ def _has_key(entry: Entry | None, word: str) -> bool:
 
 
 def _pose_deviation(other: _Pose) -> Callable[[np.ndarray, np.ndarray], float]:
-    """Deviation of a pose from another one, whose unit may differ."""
+    """Function that returns the deviation of a pose from another one, whose unit may differ."""
 
     def deviation(rotation: np.ndarray, translation: np.ndarray) -> float:
         directions = [t / np.linalg.norm(t) for t in (translation, other.translation) if t.any()]
@@ -548,7 +548,7 @@ def _toe_in(angle_deg: float) -> str:
 
 
 def _stated_provenance(pair: Mapping[str, Entry], fixed_intrinsics: bool | None) -> Provenance:
-    """How the calibration was made, as its files state it."""
+    """The provenance of the calibration, as its files state it."""
     rms, views, columns, rows = (float(pair[name].numbers[0]) if name in pair else 0.0 for name in PROVENANCE_FIELDS)
     return Provenance(
         rms_px=rms if 0 < rms <= RMS_PX_MAX else None,

@@ -22,9 +22,9 @@ from tvsbayes.instrument.stereo_pair import rotation_matrix, rotation_vector
 NAMES_LISTED = 12
 NUMBER_MAX = 1e12
 ROTATION_TOLERANCE = 1e-3
-"""Largest deviation of R from a rotation, for files of few digits; the nearest rotation is taken."""
+"""Largest deviation of R from a rotation, for files of few digits; the nearest rotation is used."""
 FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
-    # Of each camera.
+    # Fields of each camera.
     "M": (
         (9, 4),
         "m k a cm mtx matrix cammat cameramatrix cammatrix cameramtx intrinsic intrinsics intrinsicmatrix "
@@ -56,7 +56,7 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
     "cy": ((1,), "cy ppy intrinsicscy intrinsicsppy"),
     **{f"coefficient_{name}": ((1,), name) for name in ("k1", "k2", "k3", "k4")},
     **{f"coefficient_p{n}": ((1,), f"p{n} radialtangentialt{n}") for n in (1, 2)},
-    # Of the pair.
+    # Fields of the pair.
     "R": (
         (9, 3),
         "r rot rotation rotationmatrix rmat rmatrix stereor rstereo rotationvector rvec om rotmatrix rlr "
@@ -89,14 +89,14 @@ FIELDS: dict[str, tuple[tuple[int, ...], str]] = {
 }
 """Counts of numbers that a field can have, and its names. The side is before or after the name of a camera's field."""
 PROVENANCE_FIELDS = tuple(FIELDS)[tuple(FIELDS).index("rms_px") :]
-"""Fields that state how a calibration was made. The pitch is left out: its unit is not known."""
+"""Fields that state how a calibration was made. The pitch is left out, since its unit is unknown."""
 CAMERA_FIELDS = tuple(FIELDS)[: tuple(FIELDS).index("R")]
 SIDES = {"left": 0, "right": 1, "l": 0, "r": 1, "first": 0, "second": 1}
 """Words for the camera; numbers start at 0 where one of them is 0, else at 1."""
 _MARKS = ("cam", "camera", "cameraparameters", "sensor", "")
 _SIDED = re.compile(r"left|right|first|second|[0-9]|l|r")
 _IGNORED_TABLES = {"roi", "region_of_interest", "header"}
-"""Tables whose numbers are no part of the calibration."""
+"""Tables whose numbers are not part of the calibration."""
 MODEL_NAMES = ("distortionmodel", "distmodel", "cameratype", "cameramodel", "model", "lensmodel", "distortiontype")
 
 
@@ -124,10 +124,10 @@ class Entry:
     """Numbers of a file.
 
     Attributes:
-        keys: their table.
-        key: their name in it.
-        numbers: flat.
-        shape: in the file.
+        keys: the table that contains them.
+        key: their name in the table.
+        numbers: the numbers, flattened.
+        shape: their shape in the file.
         file: number of the file.
     """
 
@@ -139,12 +139,12 @@ class Entry:
 
     @property
     def path(self) -> str:
-        """Dotted, as users name it."""
+        """Dotted path, as users name it."""
         return ".".join((*self.keys.path, self.key))
 
     @property
     def place(self) -> str:
-        """In words: which key of which file."""
+        """Key and file, in words."""
         return f"{escaped(self.path, 80)} of {self.keys.file}"
 
     def refuse(self, code: str, allowed: str, remedy: str, found: str) -> InputError:
@@ -152,7 +152,7 @@ class Entry:
         return self.keys.refuse(self.key, code, allowed, remedy, found)
 
     def rotation(self) -> np.ndarray:
-        """The rotation (3, 3): the nearest to a matrix of nine numbers, or that of Rodrigues' three."""
+        """The rotation (3, 3): nearest to a matrix of nine numbers, or from Rodrigues' three."""
         if self.numbers.size == 3:
             if np.linalg.norm(self.numbers) > math.pi:
                 found = escaped(str(self.numbers.tolist()), 60)
@@ -188,7 +188,7 @@ def numbers_of(value: Any) -> tuple[np.ndarray, tuple[int, ...]] | None:
             return data[0], (data[0].size,)
         if data is None or not isinstance(rows, int) or not isinstance(cols, int) or rows * cols != data[0].size:
             if {"x", "y", "z"} <= set(value) <= {"x", "y", "z", "rotation"}:
-                # BoofCV states the rotation of a pose in the same table.
+                # BoofCV states the rotation of a pose in the same table as its shift.
                 shift, turn = numbers_of([value[axis] for axis in "xyz"]), numbers_of(value.get("rotation"))
                 if shift is None or turn is None or turn[0].size != 9:
                     return shift
@@ -230,11 +230,11 @@ def _letters(name: str) -> str:
 
 
 def meanings(entry: Entry, *, of_any_count: bool = False) -> list[tuple[str, str]]:
-    """Fields and sides that an entry may have, by the longest part of its path that is a known name.
+    """Possible fields and sides of an entry, by the longest part of its path that is a known name.
 
     Args:
-        entry: of a file.
-        of_any_count: by its name alone, for any count of numbers.
+        entry: an entry of a file.
+        of_any_count: use its name alone, for any count of numbers.
     """
     parts = (*entry.keys.path, entry.key)
     if _IGNORED_TABLES & set(parts):
@@ -250,7 +250,7 @@ def meanings(entry: Entry, *, of_any_count: bool = False) -> list[tuple[str, str
 
 
 def _side_of(part: str) -> str:
-    """The camera in the name of a table, or ""."""
+    """The camera in the name of a table, "" if none."""
     name = _letters(part)
     for mark in ("cameraparameters", "camera", "cam", "sensor"):
         name = name.replace(mark, "", 1)
@@ -258,7 +258,7 @@ def _side_of(part: str) -> str:
 
 
 def _side_in_name(file: str) -> int | None:
-    """The camera in the name of a file; None without one."""
+    """The camera in the name of a file; None if none."""
     for number, pattern in enumerate((r"left|cam(era)?[ _-]?0", r"right|cam(era)?[ _-]?1")):
         if re.search(pattern, file.lower()):
             return number
@@ -276,11 +276,11 @@ class Fields:
         self.cameras: tuple[dict[str, Entry], dict[str, Entry]] = ({}, {})
         self.twice: dict[str, tuple[Entry, Entry]] = {}
         readings = [(entry, *meaning) for entry in self.entries for meaning in meanings(entry)]
-        # Entries without a side come last: they fill what a camera lacks.
+        # Entries without a side come last: they fill the gaps of a camera.
         readings.sort(key=lambda reading: not reading[2])
         numbers = {side for _, _, side in readings if side.isdigit()}
         offset = 0 if "0" in numbers or not numbers else 1
-        # Files of one camera each have entries without a side: the first file is the left one, unless its name tells.
+        # Files of one camera each have entries without a side: the first file is the left one, unless names state it.
         camera_files = [k for k in range(len(files)) if self._has_camera(readings, k)]
         one_camera_each = len(camera_files) == 2
         if one_camera_each and [_side_in_name(files[k].file) for k in camera_files] == [1, 0]:
@@ -314,13 +314,13 @@ class Fields:
 
     @staticmethod
     def _has_camera(readings: Sequence[tuple[Entry, str, str]], file: int) -> bool:
-        """Whether a file has a camera matrix without a side."""
+        """Whether a file contains a camera matrix without a side."""
         return any(e.file == file and field in ("M", "fx") and not side for e, field, side in readings)
 
     def _add(self, table: dict[str, Entry], field: str, name: str, entry: Entry) -> None:
         previous = table.get(field)
         if previous is None or (previous.numbers.size == 3 and entry.numbers.size == 9):
-            # Of a rotation's vector and its matrix, the matrix.
+            # The matrix of a rotation replaces its vector.
             table[field] = entry
         elif previous.numbers.size == entry.numbers.size and not np.array_equal(previous.numbers, entry.numbers):
             self.twice[name] = previous, entry
@@ -387,7 +387,7 @@ class Fields:
         )
 
     def model(self, camera: int) -> str:
-        """The name of a camera's lens model in the files, lower case; "" without one."""
+        """The name of a camera's lens model in the files, lower case; "" if none."""
         lens = next((self.cameras[camera][f] for f in ("D", "M", "fx") if f in self.cameras[camera]), None)
         tables = list(self.files)
         if lens is not None:

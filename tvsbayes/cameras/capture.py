@@ -1,13 +1,13 @@
 """The stereo cameras on OpenCV.
 
 A picture is valid only if its exposure began after the request. Drivers keep old frames in their buffers, and frames
-have no time stamp. So every `grab` first empties the buffers: a buffered frame arrives as fast as it can be decoded, a
-live one at the rate of the camera, which is measured at opening; the first live frames, which may be older, are
-dropped. A camera whose frames never need a wait is refused: they could be of any age. Where decoding takes as long as
-the camera's period the two cases are indistinguishable; then the test by light of the laser's driver decides. Network
-streams are read continuously (`network_stream`).
+have no time stamp. Every `grab` therefore first empties the buffers: a buffered frame arrives as fast as it can be
+decoded, a live one at the rate of the camera, which is measured at opening; the first live frames, which may be older,
+are dropped. A camera whose frames never need a wait is refused: they could be of any age. Where decoding takes as long
+as the camera's period, both cases look the same; then the laser driver's test by light decides. Network streams are
+read continuously (`network_stream`).
 
-Pictures are (height, width, 3), blue, green, red, uint8 or uint16 as the camera gives them: raw pixels, not rectified,
+Pictures are (height, width, 3), blue, green, red, uint8 or uint16 from the camera: raw pixels, not rectified,
 with full depth. Names with `_s` are in seconds.
 """
 
@@ -31,13 +31,13 @@ from tvsbayes.instrument.rig import Rig
 from tvsbayes.positioner.interface import Clock
 
 LIVE_S = 0.004
-"""A frame that took less than this was in a buffer, at any rate: cameras up to 200 frames/s are slower."""
+"""A frame that took less than this was certainly in a buffer: cameras up to 200 frames/s are slower."""
 LIVE_SHARE = 0.7
 """Share of the camera's period that a frame must take to count as live."""
 RATE_FRAMES, RATE_S = 12, 0.4
 """Least number of frames and seconds for the measurement of the rate at opening; the last eight frames are used."""
 PIPELINE_FRAMES = 2
-"""Live frames to leave out: one was being exposed at the request, one may be in transfer."""
+"""Number of live frames to leave out: one was being exposed at the request, one may be in transfer."""
 FLUSH_FRAMES_MAX = 2_000
 FLUSH_MAX_S = 10.0
 """Limits for emptying the buffers, in frames and in seconds: sockets hold some hundred small frames."""
@@ -50,7 +50,7 @@ FFMPEG_QUIET = "-8"
 class StereoImage:
     """Two pictures of one moment, each (height, width, 3) uint8 or uint16, blue, green, red.
 
-    `white` is the largest value that a pixel can have, where the driver knows it; None where it does not.
+    `white` is the largest possible value of a pixel, None where the driver does not state it.
     """
 
     left: np.ndarray
@@ -59,7 +59,7 @@ class StereoImage:
 
     @property
     def full_scale(self) -> int:
-        """The largest value: as the driver states it, else that of the smallest usual converter."""
+        """The full scale stated by the driver, else that of the smallest usual converter."""
         return self.white or white_level(max(int(self.left.max()), int(self.right.max())))
 
 
@@ -68,7 +68,7 @@ class CameraSettings:
     """Settings that the cameras report.
 
     Attributes:
-        values: readings by name and camera, e.g. "left.exposure"; without those that a camera does not report.
+        values: readings by name and camera, e.g. "left.exposure"; without settings that a camera does not report.
         warnings: settings that could not be fixed, in words.
     """
 
@@ -77,10 +77,10 @@ class CameraSettings:
 
 
 class StereoCamera(Protocol):
-    """A pair of cameras of any driver."""
+    """A pair of cameras with any driver."""
 
     def grab(self) -> StereoImage:
-        """A pair whose exposure began after this call."""
+        """Take a pair whose exposure began after this call."""
 
     def settings(self) -> CameraSettings:
         """Current exposure, gain, white balance and focus."""
@@ -93,7 +93,7 @@ class StereoCamera(Protocol):
 def _quiet_opencv() -> Iterator[None]:
     """Suppresses warnings of OpenCV and its FFmpeg on stderr: failures are raised, with a remedy.
 
-    Not where a user has set OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL. FFmpeg reads its variable once, at the first
+    A user's OPENCV_LOG_LEVEL or OPENCV_FFMPEG_LOGLEVEL has priority. FFmpeg reads its variable once, at the first
     stream that a process opens.
     """
     import cv2
@@ -113,12 +113,12 @@ def _quiet_opencv() -> Iterator[None]:
 
 
 def without_password(source: str) -> str:
-    """A source for messages and logs: an address without user and password."""
+    """The source for messages and logs: addresses lose user and password."""
     return re.sub(r"://[^/?#]*@", "://", source)
 
 
 def open_capture(source: str | int) -> Capture:
-    """A device by number or path, or a stream by address.
+    """Open a device by number or path, or a stream by address.
 
     Raises:
         DeviceFault: it cannot be opened.
@@ -137,7 +137,7 @@ def open_capture(source: str | int) -> Capture:
 
 
 def _open_stream(address: str) -> Capture:
-    """A stream with timeouts for opening and reading."""
+    """Open a stream with time limits for opening and reading."""
     import cv2
 
     timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, STREAM_TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, STREAM_TIMEOUT_MS]
@@ -160,10 +160,10 @@ def open_cameras(
     opener: Callable[[str | int], Capture] = open_capture,
     clock: Clock = time,
 ) -> OpenCVCamera:
-    """The cameras of `[cameras]` in a rig file: `source` side by side, or `left` and `right`.
+    """Open the cameras of `[cameras]` in a rig file: `source` side by side, or `left` and `right`.
 
     Raises:
-        InputError: neither, or both.
+        InputError: neither or both are stated.
         DeviceFault: they cannot be opened or set.
     """
     two_devices = "left" in table and "right" in table
@@ -198,13 +198,13 @@ class OpenCVCamera:
 
     Args:
         captures: one (side by side) or two (left, right) open captures; this object closes them.
-        width: of one picture, px.
-        height: px.
-        exposure: in the driver's unit; None switches the automatic off and keeps the current exposure.
-        clock: source of the time.
+        width: width of one picture, px.
+        height: height of one picture, px.
+        exposure: in the driver's unit; None switches the automatic mode off and keeps the current exposure.
+        clock: source of time.
 
     Raises:
-        DeviceFault: an exposure that does not read back as set.
+        DeviceFault: the exposure does not read back as set.
     """
 
     def __init__(
@@ -226,10 +226,10 @@ class OpenCVCamera:
         return ("left", "right") if len(self._captures) == 2 else ("stereo",)
 
     def _fix(self, name: str, capture: Capture, exposure: float | None) -> None:
-        """Switch off all automatics, set size and exposure; a refused setting is a fault or a warning."""
+        """Switch off all automatic modes, set size and exposure; a refused setting is a fault or a warning."""
         import cv2
 
-        # One frame in the buffer, if the driver allows it: less to empty.
+        # One frame in the buffer, if the driver allows it, leaves less to empty.
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._width * (1 if len(self._captures) == 2 else 2))
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._height)
@@ -244,7 +244,7 @@ class OpenCVCamera:
         if exposure is None:
             return
         accepted, reported = capture.set(cv2.CAP_PROP_EXPOSURE, exposure), capture.get(cv2.CAP_PROP_EXPOSURE)
-        # Drivers round to their own steps: 5 % of the value, or one unit.
+        # Drivers round to their own steps; tolerance: 5 % of the value, or one unit.
         if not accepted or abs(reported - exposure) > max(0.05 * abs(exposure), 1.0):
             found = f"{name}: exposure {exposure:g} was set and {reported:g} read back"
             remedy = "leave [cameras] exposure out and fix it at the camera, or give a value the driver takes"
@@ -275,7 +275,7 @@ class OpenCVCamera:
         """See `StereoCamera.grab`.
 
         Raises:
-            DeviceFault: no frame, one of another size, or a camera whose frames never need a wait.
+            DeviceFault: no frame, a frame of another size, or a camera whose frames never need a wait.
         """
         for capture, period_s in zip(self._captures, self._period_s, strict=True):
             self._flush(capture, max(LIVE_S, LIVE_SHARE * period_s))
@@ -319,7 +319,7 @@ class OpenCVCamera:
             found = f"{name}: pictures of {picture.shape[1]} x {picture.shape[0]} px"
             remedy = f"{expected[1]} x {expected[0]} px were calibrated: set the camera to that size"
             raise fault("image-size", found, remedy)
-        # Monochrome cameras give one channel.
+        # Monochrome cameras deliver one channel.
         return (
             picture if picture.ndim == 3 and picture.shape[2] == 3 else np.repeat(picture.reshape(*expected, 1), 3, 2)
         )
@@ -340,7 +340,7 @@ class OpenCVCamera:
 def _manual_exposure(capture: Capture) -> int:
     """The value of CAP_PROP_AUTO_EXPOSURE for manual: V4L2_EXPOSURE_MANUAL = 1 with Video4Linux, elsewhere 0.
 
-    On Windows 1 would switch the automatic on (opencv pull request 22635).
+    On Windows 1 would switch the automatic mode on (opencv pull request 22635).
     """
     return 1 if capture.getBackendName() == "V4L2" else 0
 

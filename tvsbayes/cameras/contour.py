@@ -1,4 +1,4 @@
-"""The paper's centre, by the spot's outline in the rectified picture (section 2.4), and the epipolar check of a pair.
+"""The paper's centre from the spot's outline in the rectified picture (section 2.4), and the epipolar check of a pair.
 
 Raw image px with the integer at the centre of a pixel; grey levels of 8 bits; pictures (height, width, 3) uint8, blue,
 green, red.
@@ -18,9 +18,9 @@ from tvsbayes.cameras.spot_window import AREA_MAX_SHARE, BRIGHT_SHARE, CLIPPED_D
 from tvsbayes.instrument.stereo_pair import Stereo, distort, undistort
 
 EPIPOLAR_SIGMAS, EPIPOLAR_FLOOR_PX = 6.0, 0.5
-"""A pair is refused beyond six combined sds (spot and calibration), and never below half a pixel."""
+"""A pair is refused beyond six combined sds (spot and calibration), but never below half a pixel."""
 REGION_HALF_PX = 60
-"""Half side of the paper's region of interest, around the brightest place of the rectified picture."""
+"""Half side of the paper's region of interest, around the brightest point of the rectified picture."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,14 @@ class Rectified:
     distortion: np.ndarray
 
     def raw(self, points_px: np.ndarray) -> np.ndarray:
-        """Raw pixels (n, 2) of rectified ones."""
+        """Raw pixels (n, 2) from rectified ones."""
         focal, middle = self.projection[[0, 1], [0, 1]], self.projection[:2, 2]
         rays = np.column_stack(((points_px - middle) / focal, np.ones(len(points_px)))) @ self.rotation
         return distort(rays[:, :2] / rays[:, 2:], self.distortion) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
 
 
 def rectified_pair(stereo: Stereo) -> tuple[Rectified, Rectified]:
-    """Both cameras of a pair as OpenCV rectifies it."""
+    """Both cameras of a pair, rectified by OpenCV."""
     import cv2
 
     size = stereo.image_width, stereo.image_height
@@ -57,16 +57,16 @@ def rectified_pair(stereo: Stereo) -> tuple[Rectified, Rectified]:
 
 
 def contour_of(picture: np.ndarray, camera: Rectified, noise: SpotNoise) -> Centre:
-    """The paper's method: centroid of the region above a threshold on V of HSV, in the rectified picture.
+    """Apply the paper's method: centroid of the region above a threshold on V of HSV, in the rectified picture.
 
-    The threshold is on V alone: at 808 nm hue is undefined and saturation low. The stated variance is that of the
+    The threshold applies to V alone: at 808 nm hue is undefined and saturation low. The stated variance is that of the
     region's outline, displaced by noise over slope and rounded to whole pixels, for a round Gaussian spot: its 2 pi r
     pixels are independent.
     """
     import cv2
 
     if picture.dtype != np.uint8:
-        # The paper's method has 8 bits.
+        # The paper's method uses 8 bits.
         picture = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
     rectified = cv2.remap(picture, *camera.maps, cv2.INTER_LINEAR)
     value = cv2.cvtColor(rectified, cv2.COLOR_BGR2HSV)[..., 2]
@@ -117,11 +117,11 @@ def epipolar_residual(pixels: np.ndarray, stereo: Stereo) -> np.ndarray:
 
 
 def epipolar_refused(pixels: np.ndarray, covariances: np.ndarray, stereo: Stereo) -> np.ndarray:
-    """Which pairs (n,) cannot be images of one point within the uncertainties of spots and calibration.
+    """Mask of pairs (n,) that cannot be images of one point within the uncertainties of spots and calibration.
 
     Args:
         pixels: (n, 4) u_left, v_left, u_right, v_right.
-        covariances: (n, 4, 4) of them, px^2.
+        covariances: (n, 4, 4), px^2.
         stereo: the calibration; its covariance enters by central differences.
     """
     if not len(pixels):
@@ -146,5 +146,5 @@ def epipolar_refused(pixels: np.ndarray, covariances: np.ndarray, stereo: Stereo
         variance = variance + np.einsum("in,ij,jn->n", camera_slope, covariance[np.ix_(free, free)], camera_slope)
     distance = np.abs(residual) / np.linalg.norm(slope, axis=1)
     allowed = EPIPOLAR_SIGMAS * np.sqrt(variance) / np.linalg.norm(slope, axis=1)
-    # Beyond where the lens model turns back nothing can be undistorted: NaN is refused too.
+    # Pixels outside the range of the lens model cannot be undistorted: NaN is refused too.
     return ~(distance <= np.maximum(allowed, EPIPOLAR_FLOOR_PX))

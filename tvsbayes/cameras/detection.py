@@ -6,9 +6,9 @@ of the binary region, here taken back to the raw pixels of the format.
 
 Gain and contrast are estimated from the campaign itself, per camera, from third-order (skew) residuals, which a
 symmetric fit does not remove: they have the scale of the spot, are pure noise for any symmetric spot, and average
-demosaicing and the grain of speckle as the centre does. A skewed beam counts as noise and increases the sd. Sd of an
-intensity centroid under speckle alone: contrast / sqrt(8 pi) = 0.2 contrast px for any size of the spot (Gaussian spot,
-independent pixels).
+demosaicing and the grain of speckle as the centre does. A skewed beam counts as noise and increases the sd. The sd of
+an intensity centroid under speckle alone is contrast / sqrt(8 pi) = 0.2 contrast px for any size of the spot (Gaussian
+spot, independent pixels).
 
 Refusals (status in spots.csv: reason, then the camera): see `REASONS`.
 """
@@ -48,7 +48,7 @@ from tvsbayes.progress import Job, Show
 
 METHODS = ("fit", "contour")
 _Patches = tuple[Patch | str, Patch | str]
-"""Left and right patch of a look, or the reason why there is none."""
+"""Left and right patch of a look, or the reason for a missing one."""
 REASONS = {
     "no-spot": "nothing stands out of the background",
     "two-spots": "a second spot holds over a quarter of the light of the first",
@@ -63,9 +63,9 @@ REASONS = {
     "epipolar": "left and right are not images of one point",
 }
 LEVELLING, LEARNING, DETECTING = "finding the brightest pixel", "learning the noise", "detecting"
-"""Stages of the progress; the first only for pictures of more than 8 bits."""
+"""Stages of the progress; the first is only used for pictures of more than 8 bits."""
 PILOT_LOOKS_MAX = 24
-"""Largest number of looks that determine the weights of the fits; all looks determine the uncertainties."""
+"""Largest number of looks used for the weights of the fits; all looks are used for the uncertainties."""
 LEARNING_ROUNDS = 3
 SKEW_SPOTS_MAX = 1000
 OVERLAY_HALF_PX, OVERLAY_ZOOM = 32, 8
@@ -83,11 +83,11 @@ class Detection:
         method: "fit" or "contour".
         processed: rows whose two frames were read.
         missing: rows without frames; unchanged.
-        kept: rows refused by a person (a status that is none of `REASONS`); unchanged.
+        kept: rows refused by a person (a status other than `REASONS`); unchanged.
         statuses: number of processed rows by status.
-        noise: noise of the left and of the right camera, for the weights.
+        noise: noise of the left and the right camera, for the weights.
         median_sd_px: median stated sd of the ok coordinates; None without any.
-        lines: disagreeing rows or columns of the left and of the right camera.
+        lines: disagreeing rows or columns of the left and the right camera.
     """
 
     campaign: Campaign
@@ -137,7 +137,7 @@ def _row(spot: Spot, left: Centre, right: Centre) -> Spot:
         located = centre.located
         sd = np.sqrt(np.diag(located.covariance_px2))
         pixels += [round(float(value), 6) for value in located.centre_px]
-        # The smallest sd of the format; no spot is that accurate.
+        # The smallest sd in the format; no spot is that accurate.
         sds += [max(round(float(value), 7), 1e-4) for value in sd]
         correlations.append(round(float(located.covariance_px2[0, 1] / sd[0] / sd[1]), 6))
     return with_pixels(spot, status, pixels, sds, correlations)
@@ -145,10 +145,10 @@ def _row(spot: Spot, left: Centre, right: Centre) -> Spot:
 
 @dataclass(frozen=True)
 class _Frames:
-    """Reads the frames of a campaign: names are fixed by the format, links out of the folder are refused.
+    """Reads the frames of a campaign: the format fixes their names; links out of the folder are refused.
 
     `white` is the largest value of cameras with more than 8 bits; None before it is known. `dark` has pictures with the
-    laser off, of the same names or one for each camera.
+    laser off, with the same names or one for each camera.
     """
 
     folder: Path
@@ -163,7 +163,7 @@ class _Frames:
         return all(os.path.lexists(self.path(spot, side)) for side in CAMERAS)
 
     def read(self, spot: Spot, side: str) -> np.ndarray:
-        """A picture (height, width, 3): uint8, or float32 grey levels of 8 bits (DN) where it is deeper.
+        """A picture (height, width, 3): uint8, or float32 grey levels of 8 bits (DN) for deeper pictures.
 
         A dark picture, if any, is subtracted and `PEDESTAL_DN` added; clipped pixels stay unchanged.
         """
@@ -198,13 +198,13 @@ class _Frames:
         return any(is_deep(self._data(spot, side)) for side in CAMERAS)
 
     def largest(self, spot: Spot) -> int:
-        """The largest value in those pictures of a look that have more than 8 bits; 0 without any."""
+        """The largest value in the pictures of a look with more than 8 bits; 0 if none."""
         data = {side: self._data(spot, side) for side in CAMERAS}
         deep = {side: png for side, png in data.items() if is_deep(png)}
         return max((int(decode_image(png, self.path(spot, side).name).max()) for side, png in deep.items()), default=0)
 
     def refused(self, picture: tuple[Spot, str]) -> InputError | None:
-        """The reason why the picture of a look and a side cannot be used; None where it can."""
+        """The reason why a look's picture from one side cannot be used; None where it can."""
         try:
             decode_image(self._data(*picture), self.path(*picture).name)
         except InputError as error:
@@ -213,13 +213,13 @@ class _Frames:
 
     def _data(self, spot: Spot, side: str) -> bytes:
         path = self.path(spot, side)
-        # The size is checked before decoding: a small file can hold 50 million pixels, on every thread.
+        # The size is checked before decoding: a small file can hold 50 million pixels in every thread.
         data = read_bytes(path, IMAGE_BYTES_MAX, self.folder)
         self._require_size(data, path, side)
         return data
 
     def _require_size(self, data: bytes, path: Path, side: str) -> None:
-        """Refuse a picture of another size than that of the calibration."""
+        """Refuse a picture of another size than in the calibration."""
         size = image_size(data, escaped(path.name))
         if size != self.sizes[side]:
             raise refusal(
@@ -256,15 +256,15 @@ def detect(
         campaign: read from a folder.
         method: "fit" or "contour".
         speckle_contrast: known contrast per independent pixel; by default `fit` estimates it from the looks of each
-            camera and `contour` takes 0.4.
+            camera and `contour` uses 0.4.
         dark: folder of pictures with the laser off, to be subtracted: named as the frames, or one for each camera,
             left.png and right.png.
-        workers: threads; default one per core.
+        workers: number of threads; by default one per core.
         overlay: folder for one picture per look: outline of the bright area and centre.
         progress: shows the progress.
 
     Raises:
-        InputError: a frame that cannot be read safely, has another size, or a campaign without folder.
+        InputError: a frame cannot be read safely or has another size, or the campaign has no folder.
         NothingToEstimate: no row has both frames.
     """
     frames = replace(_frames_of(campaign, method), dark=dark)
@@ -280,7 +280,7 @@ def detect(
         with Job({LEVELLING: deep_looks, LEARNING: pilot_looks, DETECTING: len(present)}, progress) as job:
             job.begin(LEVELLING)
             largest = 0
-            # All looks: a few may not contain the brightest pixel, and all looks need the same level.
+            # All looks are read: a few may lack the brightest pixel, and all looks need the same level.
             for count, largest_value in enumerate(_threaded(frames.largest, present_spots, workers)):
                 largest = max(largest, largest_value)
                 job.at(count / len(present))
@@ -323,7 +323,7 @@ def detect(
 
 
 def _no_frames(campaign: Campaign) -> NothingToEstimate:
-    """The refusal of a campaign without frames, with how to add pictures."""
+    """The refusal of a campaign without frames, with the ways to add pictures."""
     pairing = (
         f"`tvsbayes new {typed(campaign.path)} --pictures FOLDER` lists the pictures of a folder and copies them there"
     )
@@ -358,8 +358,8 @@ class _Looks:
     Attributes:
         spots: all rows of spots.csv.
         frames: their pictures.
-        noise: of the left and of the right camera.
-        patches: of rows that were read before.
+        noise: noise of the left and the right camera.
+        patches: patches of rows that were read before.
         rectified: both cameras for the method `contour`, empty for `fit`.
         overlay: folder for a picture of every look.
     """
@@ -446,7 +446,7 @@ def _pilots(spots: Sequence[Spot], present: Sequence[int], frames: _Frames, work
 def _rows(
     spots: Sequence[Spot], present: Sequence[int], centres: Sequence[tuple[Centre, Centre]], stereo: Stereo
 ) -> list[Spot]:
-    """All rows of spots.csv, those in `present` with their centres (left, right); refused off their epipolar line."""
+    """All rows of spots.csv, those in `present` with their centres (left, right); off their epipolar line refused."""
     rows = list(spots)
     matched: list[tuple[int, Located, Located]] = []
     for row, (left, right) in zip(present, centres, strict=True):
@@ -474,11 +474,11 @@ def _contrast(stated: float | None) -> float:
 
 
 def _estimated_noise(patches: Sequence[Patch], speckle_contrast: float | None) -> SpotNoise:
-    """The noise of one camera from some of its spots: weights depend on the noise, so in a few rounds.
+    """Estimate the noise of one camera from some of its spots, in a few rounds, since weights depend on the noise.
 
-    Too few spots show no scatter between looks; then the pixels of wide spots give the estimate.
+    With too few spots for a scatter between looks, the pixels of wide spots give the estimate.
     """
-    # Wide spots: first without speckle, whose weights would overrate the wings, which are not Gaussian.
+    # Wide spots are first fitted without speckle, whose weights would overrate the wings, which are not Gaussian.
     wide = bool(patches) and speckle_contrast is None and all(patch.wide for patch in patches)
     if wide and len(patches) < SHAPE_SPOTS_MIN:
         return mean_noise([with_measured_noise(patch)[1] for patch in patches])

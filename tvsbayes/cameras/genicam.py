@@ -2,10 +2,10 @@
 
 The extra `tvsbayes[genicam]` installs `harvesters`; the producer, a `.cti` file, comes from the camera's maker and is
 named in `[cameras.options]`. Pictures are triggered, by software in one call or by a line that the positioner pulses,
-so each is exposed after the request. A camera without a trigger runs freely; then its buffers are emptied first, and
-the next frames, which may be older than the request, are left out.
+so that each is exposed after the request. A camera without a trigger runs freely; then its buffers are emptied first,
+and the next frames, which may be older than the request, are left out.
 
-Mono8 to Mono16 and colour of 8 bits are taken at full depth. Names with `_s` are in seconds.
+Mono8 to Mono16 and colour of 8 bits are used at full depth. Names with `_s` are in seconds.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ DRAIN_BUFFERS_MAX = 64
 """Largest number of buffers to empty; producers use about five."""
 STEP_SHARE = 0.05
 STEPS = {"ExposureTime": 1.0, "Gain": 0.1}
-"""Largest relative and absolute deviation of a value that reads back, since cameras round: us, and the camera's unit of
-gain, mostly dB."""
+"""Largest relative and absolute deviation of a value that is read back, since cameras round: in us, and in the camera's
+unit of gain, mostly dB."""
 _NAMES = ("left", "right")
 _refused = partial(entry_refusal, "cameras", "cameras")
 
@@ -45,10 +45,10 @@ class GenicamSettings:
     Attributes:
         producer: the `.cti` file.
         cameras: serial numbers or user-defined names of left and right.
-        pixel_format: of `PIXEL_BITS`.
-        exposure_us: microseconds; None keeps that of the camera.
-        gain: in the camera's unit; None keeps that of the camera.
-        trigger: starts an exposure, a `TriggerSource` of the camera: "Software", or a line.
+        pixel_format: one of `PIXEL_BITS`.
+        exposure_us: microseconds; None keeps the camera's value.
+        gain: in the camera's unit; None keeps the camera's value.
+        trigger: source of the trigger, a `TriggerSource` of the camera: "Software", or a line.
     """
 
     producer: str
@@ -91,7 +91,7 @@ def genicam_cameras(rig: Rig) -> GenicamCamera:
 
     Raises:
         InputError: `harvesters` is not installed, or `[cameras]` does not fit.
-        DeviceFault: a camera that is not there or does not obey.
+        DeviceFault: a camera is missing or refuses a setting.
     """
     stated = GenicamSettings.of(rig.cameras)
     try:
@@ -100,7 +100,7 @@ def genicam_cameras(rig: Rig) -> GenicamCamera:
         remedy = "pip install 'tvsbayes[genicam]'"
         raise InputError("genicam", f"GenICam cameras need harvesters; {remedy}", remedy=remedy) from error
     if not Path(stated.producer).is_file():
-        # Harvesters would go on without it, and find no cameras.
+        # Harvesters would continue without it, and find no cameras.
         allowed, remedy = "the GenTL producer of the cameras' maker", "install it, or correct the path of its .cti file"
         raise _refused("options.producer", f"no file {escaped(stated.producer, 200)}", allowed, remedy)
     return GenicamCamera(Harvester(), stated, rig.stereo.image_width, rig.stereo.image_height)
@@ -112,11 +112,11 @@ class GenicamCamera:
     Args:
         harvester: a `harvesters.core.Harvester` without files; this object closes it.
         stated: settings of the rig file.
-        width: of one picture, px.
-        height: px.
+        width: width of one picture, px.
+        height: height of one picture, px.
 
     Raises:
-        DeviceFault: the producer cannot be used, a camera is not there, or does not obey.
+        DeviceFault: the producer cannot be used, or a camera is missing or refuses a setting.
     """
 
     def __init__(self, harvester: Any, stated: GenicamSettings, width: int, height: int):
@@ -153,7 +153,7 @@ class GenicamCamera:
             acquirer.start()
 
     def _fix(self, name: str, nodes: Any) -> None:
-        """Size, format, software trigger, exposure; automatics off."""
+        """Set size, format, software trigger and exposure; switch automatic modes off."""
         stated, (width, height) = self._stated, self._size
         features: dict[str, object] = {"PixelFormat": stated.pixel_format, "Width": width, "Height": height}
         if hasattr(nodes, "TriggerMode"):
@@ -195,10 +195,10 @@ class GenicamCamera:
         return CameraSettings(values, tuple(self._warnings))
 
     def grab(self) -> StereoImage:
-        """See `StereoCamera.grab`: triggers both immediately one after the other.
+        """See `StereoCamera.grab`: triggers both cameras in immediate succession.
 
         Raises:
-            DeviceFault: no picture, one of another size, or no pulse for the trigger line.
+            DeviceFault: no picture, a picture of another size, or no pulse for the trigger line.
         """
         if self.wants_pulse and self._pulse is None:
             remedy = "use a positioner that offers one (driver serial), or leave out [cameras.options] trigger"
@@ -237,7 +237,7 @@ class GenicamCamera:
             if size != self._size:
                 found = f"{name}: pictures of {size[0]} x {size[1]} px"
                 raise fault("image-size", found, f"{self._size[0]} x {self._size[1]} px were calibrated")
-            # The memory belongs to the producer again once the buffer is given back.
+            # The memory returns to the producer with the buffer, so the data are copied.
             data = np.array(component.data)
         return _as_bgr(data, self._size, self._stated.pixel_format)
 
@@ -253,7 +253,7 @@ class GenicamCamera:
 
 
 def _as_bgr(data: np.ndarray, size: tuple[int, int], pixel_format: str) -> np.ndarray:
-    """Pixels of a format as (height, width, 3), blue, green, red; values as they are."""
+    """Pixels of a format as (height, width, 3), blue, green, red; values unchanged."""
     if pixel_format.startswith("Mono"):
         grey = data.reshape(size[1], size[0])
         return np.repeat(grey[..., None], 3, axis=2)
@@ -284,7 +284,7 @@ def _set(nodes: Any, name: str, value: object) -> bool:
 
 
 def _text(device: Any, name: str) -> str:
-    """An entry of the device list, "" without one: producers raise errors of any type."""
+    """An entry of the device list, "" if none: producers raise errors of any type."""
     try:
         return str(getattr(device, name) or "")
     except Exception:

@@ -1,7 +1,7 @@
-"""Lens models of other programs, fitted to k1 k2 p1 p2 k3 over the picture; what the five cannot describe is refused.
+"""Lens models of other programs, fitted to k1 k2 p1 p2 k3 over the picture; other lenses are refused.
 
-Normalised coordinates and pixels as in `stereo_pair`. The fit is linear: rays of a grid of pixels by the other model,
-then the five coefficients that bring them back to their pixels, the camera matrix as it is.
+Normalised coordinates and pixels as in `stereo_pair`. The fit is linear: a grid of pixels gives rays by the other
+model, and the five coefficients are fitted that return these rays to their pixels, with the camera matrix unchanged.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ FIVE: tuple[str, ...] = (
 )
 RATIONAL = ("rational_polynomial", "rational", "thin_prism", "tilted")
 INVERSE = ("inverse_brown_conrady",)
-"""librealsense's: five coefficients that bring pixels to rays, not rays to pixels (rs2_deproject_pixel_to_point)."""
+"""librealsense's model: five coefficients map pixels to rays, not rays to pixels (rs2_deproject_pixel_to_point)."""
 FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "kannalabrandt8", "kannala_brandt8", "equi")
 GRID = 25
 """Number of grid points along each side of the picture."""
 ERROR_MAX_PX = 0.1
-"""Largest error of a fit: that of a centroid."""
+"""Largest accepted error of a fit, equal to that of a centroid."""
 WIDEST_TAN = 4.0
 """Tangent of the angle off the axis, 76 deg, beyond which five coefficients are not tried."""
 
@@ -58,13 +58,13 @@ def kind_of(model: str) -> Kind | None:
 
 
 def fitted_to_five(matrix: np.ndarray, distortion: np.ndarray, size: tuple[int, int], kind: Kind) -> FittedLens:
-    """The five coefficients nearest to another model.
+    """Fit five coefficients to another model.
 
     Args:
-        matrix: of the camera.
+        matrix: camera matrix.
         distortion: OpenCV's 8, 12 or 14, the 4 of its fisheye model, or the 5 of the inverse one.
         size: width and height of the picture, px.
-        kind: which of them.
+        kind: kind of the other model.
     """
     grid = np.stack(np.meshgrid(*(np.linspace(0, n - 1, GRID) for n in size)), axis=-1).reshape(-1, 1, 2)
     if kind == "inverse":

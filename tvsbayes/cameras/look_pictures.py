@@ -1,7 +1,7 @@
-"""Pictures of spots from a folder with any names: finds the look of each pair and copies the pictures to `frames/`.
+"""Pictures of spots from a folder with any names: find the look of each pair and copy the pictures to `frames/`.
 
-The number in its name gives the row of `spots.csv` of a pair (where there are rows), else its move; without such a
-number, pairs and rows are matched one by one in the order of the names. Nothing is overwritten.
+The number in a pair's name gives its row of `spots.csv` (where there are rows), else its move; without such a number,
+pairs and rows are matched one by one in the order of the names. Nothing is overwritten.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tvsbayes.progress import Advance, unshown
 Matching = Literal["number", "order"]
 LOOKS_MAX = 100_000
 SPARSE_MARGIN = 10
-"""The numbers in names are a clock or a counter, no moves, where the largest exceeds twice their count plus this."""
+"""The numbers in names are times or a counter, not moves, where the largest exceeds twice their count plus this."""
 _NUMBER = re.compile(r"[0-9]{1,9}")
 
 
@@ -66,9 +66,9 @@ class ViewedFolder:
 
     Attributes:
         views: pairs, in the natural order of their names.
-        image_sizes: of most pictures of the left and of the right camera, px.
+        image_sizes: size of most pictures of the left and the right camera, px.
         unpaired: files without a picture of the other camera.
-        unnamed: files without a camera in their names that hold no two pictures side by side.
+        unnamed: files without a camera in their names that are not two pictures side by side.
         other_size: files of another size than most.
         unread: files in formats that are not read.
     """
@@ -87,9 +87,9 @@ class PairedLooks:
 
     Attributes:
         spots: all rows to be written.
-        pictures: of each row that has some, by its `spot`.
+        pictures: pictures of each row that has any, by its `spot`.
         matching: by number or in order.
-        left_over: views whose row has another pair.
+        left_over: views whose row already has a pair.
         without: numbers of the rows, or moves, without pictures.
         renumbered: lowest and highest number in the names, where moves get new numbers; else None.
     """
@@ -103,10 +103,10 @@ class PairedLooks:
 
 
 def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
-    """The pairs of pictures in a folder.
+    """Find the pairs of pictures in a folder.
 
     Args:
-        folder: of the pictures; see `picture_pairs` for names.
+        folder: folder of the pictures; see `picture_pairs` for names.
         swap: the left camera's image is the right half of a wide picture.
 
     Raises:
@@ -135,7 +135,7 @@ def views_of(folder: Path, *, swap: bool = False) -> ViewedFolder:
 
 
 def _number_position(views: Sequence[View], ids: Sequence[int] | None) -> int | None:
-    """Position of the number that gives the look: the one with most values, all of them among `ids`; None without."""
+    """Position of the number that gives the look: the number with most values, all among `ids`; None if none."""
     positions = range(min(len(view.numbers) for view in views))
     known = None if ids is None else set(ids)
     numbers = {position: {view.numbers[position] for view in views} for position in positions}
@@ -150,10 +150,10 @@ def pair_looks(
     """Find the look of every view.
 
     Args:
-        views: of a folder.
-        moves: numbers of the moves; None where none are listed yet: the numbers in the names are then moves, and get
+        views: views of a folder.
+        moves: numbers of the moves; None where none are listed: the numbers in the names are then moves, and get
             new numbers where they are too sparse; without numbers every view is a move.
-        rows: of `spots.csv`; pictures then belong to the rows without detection ("undetected").
+        rows: rows of `spots.csv`; pictures then belong to the rows without detection ("undetected").
         matching: "number" or "order"; None takes the number where every name has one that matches, else the order.
 
     Raises:
@@ -188,7 +188,7 @@ def pair_looks(
 
 
 def _differences(names: Sequence[str]) -> list[str]:
-    """Words of each name that not all names have, cut to the length of a target."""
+    """Words of each name that not all names share, cut to the length of a target."""
     words = [name.split() for name in names]
     common = set.intersection(*map(set, words))
     return [" ".join(word for word in own_words if word not in common)[:100] for own_words in words]
@@ -219,7 +219,7 @@ def _unmatched(views: Sequence[View], ids: Sequence[int], file: str) -> InputErr
 
 
 def _camera_png(view: View, camera: int) -> bytes:
-    """The PNG of one camera: the file itself where it is a PNG of this camera, else its pixels encoded."""
+    """The PNG of one camera: the file itself where it is a PNG of this camera, else its encoded pixels."""
     picture = view.pictures[camera]
     data = read_bytes(picture.path, IMAGE_BYTES_MAX)
     if len(picture.sides) == 1 and data.startswith(PNG_SIGNATURE):
@@ -234,7 +234,7 @@ def copy_frames(pictures: dict[int, View], campaign: Path, advance: Advance = un
 
     Args:
         pictures: both pictures of each look, by its `spot`.
-        campaign: the folder that will hold `frames/`; an identical picture there stays.
+        campaign: the folder that will hold `frames/`; identical pictures there are kept.
         advance: called with the share that is complete.
 
     Returns:

@@ -1,8 +1,8 @@
 """Calibrations in the formats of the makers of stereo cameras, converted to the names of `calibration_names`.
 
-They need more than names: cameras by the number of a socket and poses by a chain (DepthAI), one calibration for each
-size of the pictures (ZED, RealSense), a pose in components. Each becomes tables `left` and `right` and the pose between
-them; numbers change only by the transformation that the format defines.
+These formats need more than names: cameras are given by the number of a socket and poses by a chain (DepthAI), there is
+one calibration for each size of the pictures (ZED, RealSense), or a pose is in components. Each becomes tables `left`
+and `right` with the pose between them; numbers change only by the transformation that the format defines.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ZED_SIZES: dict[str, Size] = {
     **{"2k": (2208, 1242), "fhd": (1920, 1080), "fhd1200": (1920, 1200), "hd": (1280, 720), "svga": (960, 600)},
     **{"vga": (672, 376), "4k": (3840, 2160), "qhdplus": (3200, 1800)},
 }
-"""Pictures of one camera, px, by the end of a section's name (StereoLabs, zed-open-capture and zedx-one-capture)."""
+"""Size of one camera's pictures, by the end of a section's name (StereoLabs, zed-open-capture and zedx-one-capture)."""
 DEPTHAI_MODELS = {0: "perspective", 1: "equidistant"}
 """`CameraModel` of depthai-core; its fisheye is OpenCV's of four coefficients."""
 _ZED_SECTION = re.compile(r"^\s*\[LEFT_CAM_\w+\]\s*$", re.MULTILINE | re.IGNORECASE)
@@ -48,7 +48,7 @@ class MakersPair:
     Attributes:
         keys: its tables; refusals name the file.
         source: the maker.
-        unit: of the translation: "m", "cm", "mm"; "" where the file does not state it.
+        unit: unit of the translation: "m", "cm", "mm"; "" where the file does not state it.
         notes: assumptions.
     """
 
@@ -72,7 +72,7 @@ def makers_pair(keys: Keys, size: Size | None) -> MakersPair | None:
 
     Args:
         keys: the file.
-        size: of the pictures, px, where the user states it.
+        size: size of the pictures, px, where the user states it.
 
     Raises:
         InputError: no pair in the file, or several picture sizes and none stated.
@@ -111,7 +111,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _streams(text: str) -> Values:
-    """Streams and poses between them, of `rs-enumerate-devices -c` or of printed objects of pyrealsense2.
+    """Streams and poses between them, from `rs-enumerate-devices -c` or of printed objects of pyrealsense2.
 
     The tool prints R row by row (`print` in rs-enumerate-devices.cpp), an object has it column by column (rs_types.h).
     """
@@ -158,7 +158,7 @@ def _name_of_size(sizes: Mapping[str, Size], size: Size | None, file: str) -> st
 
 
 def _zed(document: Values, keys: Keys, size: Size | None) -> MakersPair:
-    """SN*.conf: R of the vector RX, CV, RZ; T = (-Baseline, TY, TZ) mm.
+    """SN*.conf: R from the vector RX, CV, RZ; T = (-Baseline, TY, TZ) mm.
 
     As StereoLabs' zedx-one-capture writes it from cv2.stereoCalibrate (stereo_calibration/main.cpp).
     """
@@ -203,7 +203,7 @@ def _depthai(document: Values, keys: Keys, size: Size | None) -> MakersPair:
     stated = document.get("stereoRectificationData", {})
     sockets = [stated.get(f"{side}CameraSocket") for side in ("left", "right")]
     if not all(socket in cameras for socket in sockets) or sockets[0] == sockets[1]:
-        # CAM_B and CAM_C, where the rectification was never stored.
+        # CAM_B and CAM_C are used where the rectification was never stored.
         sockets = [1, 2]
     poses = [_chain_pose(cameras, socket) for socket in sockets if socket in cameras] + [None, None]
     if poses[0] is None or poses[1] is None or poses[0][0] != poses[1][0]:

@@ -1,7 +1,7 @@
-"""ChArUco boards: a checkerboard with a marker in each white square, so that a picture of a part of it is enough.
+"""ChArUco boards: a checkerboard with a marker in each white square, so that a picture of part of it suffices.
 
-Squares are counted, as OpenCV's CharucoBoard does; inner corners are one less each way. Corners are px with the integer
-at a pixel's centre, row by row, NaN where unseen. No JAX.
+Squares are counted, as OpenCV's CharucoBoard does; inner corners are one fewer each way. Corners are px with the
+integer at a pixel's centre, row by row, NaN where unseen. No JAX.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from tvsbayes.errors import InputError, NothingToEstimate, closest, escaped
 
 DICTIONARIES = sorted(name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_"))
 WIDEST_DICTIONARIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", "APRILTAG_36h11")
-"""Each holds the smaller ones of its bits as its first markers."""
+"""Each contains the smaller dictionaries of the same bits as its first markers."""
 CORNERS_MIN, LINES_MIN = 8, 3
-"""Least corners of a view, and different rows and columns among them: fewer do not determine the tilt of the board."""
+"""Least numbers of corners in a view, and of different rows and columns: fewer do not determine the board's tilt."""
 MISFIT_SQUARES = 0.2
 """Largest deviation of centres of markers from a plane, in squares: distortion of a lens is smaller."""
 MARKERS_MIN = 6
-"""A homography has eight parameters: four markers fit any arrangement."""
+"""Least number of markers: a homography has eight parameters, so four markers fit any arrangement."""
 SAMPLE_PICTURES = 4
-"""Pictures that are searched for markers of other dictionaries: a thousand markers take 0.2 s per picture."""
+"""Number of pictures searched for markers of other dictionaries: a thousand markers take 0.2 s per picture."""
 SQUARES_MAX = 60
 GAP_SHARE = 0.9
 """Half the window of cornerSubPix over the gap between a corner and the next markers, which must stay outside."""
 SHARE_DEFAULT = 0.75
-"""Side of a marker over that of a square, where no picture shows enough markers."""
+"""Side of a marker over that of a square, used where no picture shows enough markers."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Markers:
         squares: columns and rows of squares.
         dictionary: name in OpenCV without DICT_.
         share: side of a marker over that of a square; None before it is estimated from pictures.
-        legacy: the first square is white, on boards of an even number of rows (OpenCV before 4.6, calib.io).
+        legacy: whether the first square is white, for boards with an even number of rows (OpenCV before 4.6, calib.io).
     """
 
     squares: tuple[int, int]
@@ -86,13 +86,13 @@ def _markers(grey: np.ndarray, dictionary: str) -> _Detected:
 
 
 def _plane_fit(detected: _Detected, board: cv2.aruco.CharucoBoard) -> tuple[float, float] | None:
-    """Rms deviation of the centres of markers from those of a board, and their side, in squares; None for too few."""
+    """Rms deviation of markers' centres from those of a board, and the markers' side, in squares; None for too few."""
     places = np.array([np.asarray(four, float)[:, :2] for four in board.getObjPoints()])
     on_board = detected.numbers < len(places)
     if on_board.sum() < MARKERS_MIN:
         return None
     centres, corners = places[detected.numbers[on_board]].mean(axis=1), detected.corners_px[on_board]
-    # From pixels to squares, by the centres alone.
+    # The map from pixels to squares uses the centres alone.
     plane, _ = cv2.findHomography(corners.mean(axis=1), centres)
     if plane is None or not np.isfinite(plane).all():
         return None
@@ -104,11 +104,11 @@ def _plane_fit(detected: _Detected, board: cv2.aruco.CharucoBoard) -> tuple[floa
 
 
 def fitted_markers(pictures: Sequence[np.ndarray], markers: Markers) -> Markers:
-    """The markers with the size and the first square that pictures show.
+    """Estimate the size of the markers, and the first square, from pictures.
 
     Args:
-        pictures: a sample of one camera, grey, uint8.
-        markers: as stated.
+        pictures: a sample of one camera's pictures, grey, uint8.
+        markers: the stated markers.
 
     Raises:
         NothingToEstimate: the markers are arranged otherwise than on that board, or are of another dictionary.
@@ -157,7 +157,7 @@ def spread[T](pictures: Sequence[T], count: int = SAMPLE_PICTURES) -> list[T]:
 
 
 def most_markers(pictures: Sequence[np.ndarray]) -> tuple[str, int]:
-    """The dictionary of which pictures show the most markers, or the first of which all show enough, and how many."""
+    """The dictionary with the most markers in the pictures, or the first with enough in all, and their number."""
     counted: dict[str, int] = {}
     for name in WIDEST_DICTIONARIES:
         counted[name] = sum(len(_markers(grey, name).numbers) for grey in pictures)
@@ -170,7 +170,7 @@ def most_markers(pictures: Sequence[np.ndarray]) -> tuple[str, int]:
 def _refuse_other_markers(pictures: Sequence[np.ndarray], markers: Markers) -> None:
     """Refuse pictures that show no markers of the dictionary, or more of another one.
 
-    False markers of dictionaries with few bits are usual.
+    False detections are common for dictionaries with few bits.
     """
     matching = sum(len(_markers(grey, markers.dictionary).numbers) for grey in pictures)
     name, count = most_markers(pictures)
@@ -185,11 +185,11 @@ def _refuse_other_markers(pictures: Sequence[np.ndarray], markers: Markers) -> N
 
 
 def marker_board_corners(grey: np.ndarray, markers: Markers) -> np.ndarray | None:
-    """Inner corners of a board in a picture, ((columns - 1) (rows - 1), 2), NaN where unseen; None where too few are.
+    """Inner corners of a board in a picture, ((columns - 1) (rows - 1), 2), NaN where unseen; None with too few.
 
     Args:
         grey: (height, width) uint8.
-        markers: with their size, of `fitted_markers`.
+        markers: markers with their size, from `fitted_markers`.
     """
     columns, rows = markers.squares[0] - 1, markers.squares[1] - 1
     detected, numbers, *_ = cv2.aruco.CharucoDetector(markers.board()).detectBoard(grey)

@@ -1,7 +1,7 @@
-"""A network camera that a separate thread reads continuously, so that a caller always gets the newest frame.
+"""A network camera read continuously by a separate thread, so that a caller always gets the newest frame.
 
-An unread stream fills the buffers of both computers with old frames, and many servers drop a viewer who is idle for
-some seconds, as during a homing. The thread takes every frame and drops it; a caller gets the next one that arrives.
+An unread stream fills the buffers of both computers with old frames, and many servers drop a client that is idle for
+some seconds, as during a homing. The thread reads every frame and drops it; a caller gets the next frame that arrives.
 A stream that ends is opened again, but only after at least one frame.
 
 Only the thread uses the capture: other threads send it requests. Names with `_s` are in seconds.
@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from tvsbayes.errors import TvsError
 
 FRAME_WAIT_S = 20.0
-"""Longest wait for a frame: opening and reading each have a timeout of 5 s."""
+"""Longest wait for a frame: opening and reading each have a time limit of 5 s."""
 
 
 class Capture(Protocol):
@@ -30,23 +30,23 @@ class Capture(Protocol):
         """Decode the frame taken last."""
 
     def get(self, prop: int) -> float:
-        """A property; 0 or -1 where there is none."""
+        """A property; 0 or -1 if there is none."""
 
     def set(self, prop: int, value: float) -> bool:
-        """Set a property; whether the driver took it."""
+        """Set a property; returns whether the driver accepted it."""
 
     def getBackendName(self) -> str:
         """Name of OpenCV's backend."""
 
     def release(self) -> None:
-        """Give the device back."""
+        """Release the device."""
 
 
 class NetworkStream:
     """A `Capture` whose frames are always the newest.
 
     Args:
-        open_stream: opens the stream, also again after it has ended.
+        open_stream: opens the stream, and opens it again after it has ended.
 
     Raises:
         DeviceFault: it cannot be opened.
@@ -92,7 +92,7 @@ class NetworkStream:
         self._thread.join(FRAME_WAIT_S)
 
     def _ask(self, request: Callable[[], Any], default: Any) -> Any:
-        """Run a request on the thread between two frames; its answer."""
+        """Run a request on the thread between two frames and return its answer."""
         answers: list[Any] = []
         answered = threading.Event()
 
@@ -107,7 +107,7 @@ class NetworkStream:
         return answers[0]
 
     def _read(self) -> None:
-        """The thread: read all frames until the stream has finally ended."""
+        """Run the thread: read all frames until the stream has finally ended."""
         reopen = False
         try:
             while not self._stopped:
@@ -117,7 +117,7 @@ class NetworkStream:
                     reopen = True
                     self._hand_over()
                 elif reopen and not self._stopped:
-                    # Connection lost: open it again, but not twice without a frame in between.
+                    # The connection is lost: open it again, but not twice without a frame in between.
                     reopen = False
                     self._capture.release()
                     self._capture = self._open()
@@ -125,7 +125,7 @@ class NetworkStream:
                 else:
                     break
         except TvsError:
-            # It cannot be opened again: `grab` then returns False, as for any camera without frames.
+            # The stream cannot be opened again: `grab` then returns False, as for any camera without frames.
             pass
         finally:
             self._capture.release()

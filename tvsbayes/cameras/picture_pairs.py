@@ -1,9 +1,9 @@
 """Pictures of two cameras in a folder: the camera of each file, and the pairs.
 
 A view is one moment of both cameras; its name is the file name without the mark of the camera. The documented names
-(`NAMING`) come first. Recorders also number their cameras, `cam0_3` and `cam1_3`, put the mark in the middle of a name
-or twice, keep a folder for each view, or name pictures by the time: each naming is tried in turn, the most explicit
-first, and is used if the names form pairs. Links are not followed. Sizes come from headers; nothing is decoded here.
+(`NAMING`) are tried first. Recorders also number their cameras, `cam0_3` and `cam1_3`, put the mark in the middle of a
+name or twice, keep a folder for each view, or name pictures by the time. Each naming is tried in turn, the most
+explicit first, and used if the names form pairs. Links are not followed. Sizes come from headers; nothing is decoded.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from tvsbayes.instrument.campaign import CAMERAS
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 OTHER_SUFFIXES = (".bmp", ".pgm", ".ppm", ".pnm", ".tif", ".tiff", ".webp")
-"""Picture formats that `files.images` does not read."""
+"""Picture formats not read by `files.images`."""
 SIDE_BY_SIDE_RATIO = 2.0
-"""Least ratio of width to height of a picture without a side in its name that holds the images of both cameras."""
+"""Least aspect ratio of a picture without a side in its name that counts as the images of both cameras."""
 Size = tuple[int, int]
 """Width and height, px."""
 NAMING = "left01.png with right01.png, 01_left.png with 01_right.png, or folders left/ and right/"
-"""How pictures of two cameras are named, for messages."""
+"""Names of the pictures of two cameras, for messages."""
 DEPTH_MAX = 3
-"""Levels of subfolders that are searched: set/left/, set/01/cam0/."""
+"""Number of levels of subfolders searched: set/left/, set/01/cam0/."""
 NUMBERED_PAIRS_MIN = 3
-"""Least number of pairs for which a number marks the camera: two frames may be called 0 and 1 by chance."""
+"""Least number of pairs for which a number marks the camera: two frames may be named 0 and 1 by chance."""
 _SIDES = {"l": "left", "r": "right", "left": "left", "right": "right"}
 _DOCUMENTED = (
-    # left01, then 01_left, L01 or l_01, 01L or 01_l: a letter alone counts beside a digit or a separator only.
+    # left01, then 01_left, L01 or l_01, 01L or 01_l: a single letter counts only beside a digit or a separator.
     re.compile(r"(?P<side>left|right)(?P<view>.*)", re.IGNORECASE | re.DOTALL),
     re.compile(r"(?P<view>.*?)[ _.-]*(?P<side>left|right)", re.IGNORECASE | re.DOTALL),
     re.compile(r"(?P<side>[lr])(?P<view>[ _.-]*[0-9].*)", re.IGNORECASE | re.DOTALL),
@@ -52,7 +52,7 @@ _NUMBERS = (
     re.compile(r"[_-]0*([0-9]{1,9})$"),
 )
 _Key = tuple[str, str]
-"""A name without the marks of the camera, and their side."""
+"""A name without the marks of the camera, and their side of the pair."""
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
@@ -62,7 +62,7 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 
 @dataclass(frozen=True)
 class Picture:
-    """A file, and the cameras of its equal parts from left to right."""
+    """A file, and the cameras of its equal-width parts from left to right."""
 
     view: str
     path: Path
@@ -76,7 +76,7 @@ class Pairing:
     Attributes:
         swap: the left camera's image is the right half of a wide frame, or has the larger number or later folder.
         globs: patterns of the pictures of the left and of the right camera, below the folder.
-        in_order: the first of the left belongs to the first of the right camera, whatever their names.
+        in_order: the first picture of the left camera belongs to the first of the right, for any names.
     """
 
     swap: bool = False
@@ -97,9 +97,9 @@ class PictureFolder:
     """The pictures of two cameras in a folder, by their headers.
 
     Attributes:
-        folder: of the pictures.
+        folder: folder of the pictures.
         count: number of pictures read.
-        sizes: of one camera's image, px, in every picture of a known camera or of both.
+        sizes: size of one camera's image, px, in every picture of a known camera or of both.
         usual: the most frequent picture size of each camera, the larger of equal counts; (0, 0) without any.
     """
 
@@ -121,7 +121,7 @@ class PictureFolder:
 
     @property
     def unnamed(self) -> tuple[str, ...]:
-        """Pictures in the folder or beside its pairs that are no part of a pair, relative to the folder, in order."""
+        """Pictures in the folder or beside its pairs that belong to no pair, relative to the folder, in order."""
         known = {picture.path for picture in self.sizes}
         folders = {self.folder, *(path.parent for path in known)}
         names = [name for name in _names(self.folder) if name.lower().endswith(SUFFIXES)]
@@ -130,12 +130,12 @@ class PictureFolder:
 
 
 def read_folder(folder: Path, most: int, pixels_max: int, pairing: Pairing = AS_NAMED) -> PictureFolder:
-    """The pictures of a folder with their sizes; a picture without a side counts where it is wide enough for both.
+    """List the pictures of a folder with their sizes; one without a side counts if it is wide enough for both cameras.
 
     Args:
-        folder: of the pictures.
+        folder: folder of the pictures.
         most: largest number of pictures.
-        pixels_max: of one picture.
+        pixels_max: largest number of pixels of one picture.
         pairing: the camera of each picture.
 
     Raises:
@@ -165,16 +165,16 @@ def read_folder(folder: Path, most: int, pixels_max: int, pairing: Pairing = AS_
 
 
 def paired_pictures(folder: Path, most: int, pairing: Pairing = AS_NAMED) -> list[Picture]:
-    """The pictures of a folder: by the documented names where these give a pair, else by other marks, else wide ones.
+    """The pictures of a folder, paired by the documented names if these form a pair, else by other marks, else wide.
 
     Args:
-        folder: with pictures in it or in its subfolders.
+        folder: folder with pictures in it or in its subfolders.
         most: largest number of pictures.
         pairing: the camera of each picture.
 
     Raises:
-        InputError: no readable folder, too many pictures, two of one camera and view, or none of a format that is read;
-            where pairs are stated, no two cameras or unlike numbers of pictures.
+        InputError: no readable folder, too many pictures, two of one camera and view, or none in a readable format;
+            where pairs are stated, no two cameras or different numbers of pictures.
     """
     folder = Path(folder)
     refuse = partial(refusal, file=escaped(str(folder), 200))
@@ -261,7 +261,7 @@ def _from_side_folders(folder: Path) -> list[Picture]:
 
 
 def _stated_pairs(folder: Path, pairing: Pairing, most: int, refuse: Callable[..., InputError]) -> list[Picture]:
-    """Pictures in the order of their names, the first of one camera with the first of the other.
+    """Pair pictures in the order of their names, the first of one camera with the first of the other.
 
     The cameras are those of two patterns, else of two folders, else of the names.
     """
@@ -295,7 +295,7 @@ def _by_side(names: Sequence[str], keys: Sequence[_Key | None]) -> dict[str, lis
 
 
 def _in_order(folder: Path, groups: Sequence[Sequence[str]]) -> list[Picture]:
-    """The first of the left camera with the first of the right one."""
+    """Pair the first picture of the left camera with the first of the right one."""
     views = [_view_name(Path(name).stem) for name in groups[0]]
     views = views if len(set(views)) == len(views) else [f"pair {k}" for k in range(1, len(views) + 1)]
     return [
@@ -308,7 +308,7 @@ def _in_order(folder: Path, groups: Sequence[Sequence[str]]) -> list[Picture]:
 def _paired_by_marks(folder: Path, images: Sequence[str], numbered: tuple[str, str]) -> list[Picture]:
     """The pictures with a side, by the first method whose names form pairs; `numbered` are the sides of 0 and 1.
 
-    Where sides are known and no names are alike (times, for example) pictures are paired in order.
+    Where sides are known but no names match (times, for example), pictures are paired in order.
     """
     stems = [name[: name.rindex(".")] for name in images]
     by_name = [[_by_words(stem) for stem in stems], [_by_letter(stem) for stem in stems]]
@@ -342,7 +342,7 @@ def _key(stem: str, pattern: re.Pattern[str]) -> _Key | None:
 
 def _by_words(stem: str) -> _Key | None:
     key = _key(stem, _WORDS)
-    # stereoLeft/imageL0 has two marks.
+    # Names such as stereoLeft/imageL0 have two marks.
     return None if key is None else (_LETTERS.sub("*", key[0]), key[1])
 
 
@@ -363,7 +363,7 @@ def _by_number(stems: Sequence[str], pattern: re.Pattern[str], sides: tuple[str,
 
 
 def _by_folder(stems: Sequence[str], sides: tuple[str, str]) -> list[_Key | None]:
-    """Sides by the folder, where exactly two exist; equal names in both are a pair."""
+    """Sides by the folder, where exactly two exist; equal names in both form a pair."""
     parts = [stem.rpartition("/") for stem in stems]
     folders = sorted({folder for folder, _, _ in parts}, key=natural_order)
     if len(folders) != 2:

@@ -1,13 +1,13 @@
 """The centre of one camera's spot with its covariance, or the reason for a refusal; and the noise of its pixels.
 
 An elliptic Gaussian on a sloping background is fitted to the pixels around the spot by iterated weighted least squares.
-Pixels next to a clipped one are left out: a clipped core is normal, but it costs information and so widens the standard
-uncertainty. Grey is (B + 2 G + R) / 4, with equal weights for all photosites of a Bayer sensor; 808 nm passes all three
-dyes, so hue has no information. Variance of a pixel with signal S: background + gain * S + (contrast * S)^2: noise
-outside of the spot, shot noise, speckle.
+Pixels next to a clipped one are left out: a clipped core is normal, but reduces the information and so widens the
+standard uncertainty. Grey is (B + 2 G + R) / 4, with equal weights for all photosites of a Bayer sensor; 808 nm passes
+all three dyes, so hue has no information. The variance of a pixel with signal S is background + gain * S
++ (contrast * S)^2: noise outside the spot, shot noise, speckle.
 
 Raw image px with the integer at the centre of a pixel; DN = grey levels of 8 bits; pictures (height, width, 3), blue,
-green, red, uint8 or float32 DN of deeper ones.
+green, red, uint8, or float32 DN for deeper pictures.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from tvsbayes.instrument.stereo_pair import scaled_px
 AREA_MIN_PX = 4.0
 """Least area at half height, px^2: a hot pixel after demosaicing has 2."""
 AXES_RATIO_MAX = 4.0
-"""A sheet at 70 degrees to the beam gives 2.9."""
+"""Largest ratio of the spot's axes; a sheet at 70 degrees to the beam gives 2.9."""
 BORDER_SDS = 3.0
-"""Least distance of a centre from the border: a spot cut off there is biased."""
+"""Least distance of a centre from the border, in sds of the spot: a spot cut off there is biased."""
 SKEW_LIMIT = 80.0
 """Largest sum of a spot's four standardised squared skew residuals (normal: one in 10^15; speckle has longer tails)."""
 NOISE_REACH = 3.5
@@ -39,12 +39,12 @@ SKEW_SHAPE_MAX = 0.15
 """Largest skew amplitude of a spot without others to compare with: half a Gaussian has 0.17, the worst of nine real
 beams 0.13."""
 SPECKLE_CONTRAST_MIN = 0.1
-"""Contrast from which speckle exceeds shot noise, so that weights by the noise model are better than equal ones."""
+"""Contrast from which speckle exceeds shot noise, so that weights by the noise model are better than equal weights."""
 WIDE_FLOOR_SHARE = 0.02
-"""Of the height: replaces the background in the weights of wide spots, whose noise is mostly shot noise."""
+"""Share of the height that replaces the background in the weights of wide spots, whose noise is mostly shot noise."""
 REACH, REACH_PX = 4.0, 9.0
-"""Distance at which the weights of pixels fade to 0, in sds of the spot and px beyond: no real beam is Gaussian in its
-wings, and with a sharp edge the centre would depend on which pixels happen to be inside."""
+"""Distance at which the weights of pixels fade to 0, in sds of the spot plus px: no real beam is Gaussian in its wings,
+and with a sharp edge the centre would depend on the pixels that happen to be inside."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,14 @@ class Centre:
 
     Attributes:
         status: "ok" or a key of `REASONS`.
-        centre_px: (2,) u, v; None where there is none.
-        covariance_px2: (2, 2) of the centre; None where there is none.
+        centre_px: (2,) u, v; None if refused.
+        covariance_px2: (2, 2) of the centre; None if refused.
         axes_px: sds of the spot's image along its long and short axis.
         clipped_share: clipped area over bright area.
         outline_px: (n, 2) outline of the bright area, for pictures; may be empty.
         parts_px2: (3, 2, 2) covariance from the background's noise, per gain and per contrast^2 (`fit`).
-        skews: (4, 4) as `skewness` makes them (`fit`).
-        lines_px: (2, 2) as `shift_of_lines` makes them (`fit`).
+        skews: (4, 4) as returned by `skewness` (`fit`).
+        lines_px: (2, 2) as returned by `shift_of_lines` (`fit`).
     """
 
     status: str
@@ -83,7 +83,7 @@ class Centre:
 
     @property
     def located(self) -> Located:
-        """Centre and covariance of a spot that was found."""
+        """Centre and covariance of an accepted spot."""
         assert self.centre_px is not None and self.covariance_px2 is not None, self.status
         return Located(self.centre_px, self.covariance_px2)
 
@@ -95,7 +95,7 @@ class Centre:
         return replace(self, centre_px=scaled_px(self.centre_px, size, to), covariance_px2=covariance)
 
     def under(self, noise: SpotNoise) -> Centre:
-        """The same centre with its covariance under this noise; misshapen where its skew exceeds noise."""
+        """The same centre with its covariance under this noise; refused as misshapen where its skew exceeds noise."""
         if self.parts_px2 is None or self.skews is None:
             return self
         units = np.array([1.0, noise.gain_dn, noise.speckle_contrast**2])
@@ -111,7 +111,7 @@ class Centre:
 class _Fit:
     """A converged fit: centre (2,), precision (2, 2), height, and the terms of its covariance.
 
-    Over the n pixels of the patch: signal, its derivatives (9, n), weights (0 where not usable), residuals and the
+    For the n pixels of the patch: signal, its derivatives (9, n), weights (0 for unusable ones), residuals and the
     coordinates in sds of the spot.
     """
 
@@ -140,9 +140,9 @@ class _Model:
 
 @dataclass(frozen=True)
 class _Pixels:
-    """A patch for the fit: coordinates, data (n,), which of them are usable, and the derivatives (9, n) to be filled.
+    """A patch for the fit: coordinates, data (n,), mask of usable pixels, and the derivatives (9, n) to be filled.
 
-    The last three derivatives, of the background's level and slopes, are constant.
+    The last three derivatives, by the background's level and slopes, are constant.
     """
 
     u: np.ndarray
@@ -178,10 +178,10 @@ class _Pixels:
 
 
 def fit_spot(patch: Patch, noise: SpotNoise) -> _Fit | None:
-    """Elliptic Gaussian on a plane by weighted Gauss-Newton steps; None where they do not converge.
+    """Fit an elliptic Gaussian on a plane by weighted Gauss-Newton steps; None where they do not converge.
 
     Parameters: log height, centre, lower triangle of the precision's Cholesky factor with logs on its diagonal,
-    level and slopes of the background. A general solver of a library would take longer than decoding the picture.
+    level and slopes of the background. A library's general solver would take longer than decoding the picture.
     """
     if patch.usable.sum() < 25:
         return None
@@ -197,9 +197,9 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fit | None:
         model = pixels.model(p)
         signal = model.signal
         residual = pixels.data - signal - p[6:] @ jacobian[6:]
-        # Far from the solution the weights of a wrong model are wrong: equal ones first.
+        # Far from the solution the model's weights are wrong: equal weights come first.
         if patch.wide and noise.speckle_contrast < SPECKLE_CONTRAST_MIN:
-            # No real beam is exactly Gaussian, which matters for a wide spot: its centre must not depend on the noise.
+            # Real beams are not exactly Gaussian; for a wide spot the centre must therefore not depend on the noise.
             variance = signal + WIDE_FLOOR_SHARE * np.exp(p[0]) if settled else 1.0
         else:
             variance = patch.background_variance + (
@@ -224,7 +224,7 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fit | None:
         limits[4] = 0.4 * model.c
         step *= min(1.0, float((limits / np.maximum(np.abs(step), 1e-300)).min()))
         move, change = np.abs(step[1:3]).max() * max(model.a, model.c), np.abs(step[[0, 3, 5]]).max()
-        # In sds of the spot; the error after the last step is ten times smaller.
+        # Limits in sds of the spot; the error after the last step is ten times smaller.
         if settled > 1 and move < 5e-4 / patch.block and change < 5e-3 / patch.block:
             factor = np.array([[model.a, 0.0], [model.b, model.c]])
             centre = p[1:3] + step[1:3] + np.array(patch.corner)
@@ -240,7 +240,7 @@ def fit_spot(patch: Patch, noise: SpotNoise) -> _Fit | None:
 def _covariance_parts(fitted: _Fit, patch: Patch) -> np.ndarray:
     """Covariance (3, 2, 2) of the centre from the background's noise, per gain and per contrast^2, px^2."""
     weighted = fitted.jacobian * fitted.weights
-    # Two rows of the inverse; the full inverse times all pixels would take longer than the rest of this function.
+    # Only two rows of the inverse: the full inverse times all pixels would take longer than the rest of this function.
     gains = np.linalg.solve(weighted @ fitted.jacobian.T, np.eye(9)[:, 1:3]).T @ weighted
     # The variance of u + v gives the covariance.
     u, v, sums = _noise_parts(np.vstack((gains, gains.sum(axis=0))), fitted.signal, patch).T
@@ -256,10 +256,10 @@ def _noise_parts(filters: np.ndarray, signal: np.ndarray, patch: Patch) -> np.nd
 
 
 def skewness(fitted: _Fit, patch: Patch) -> np.ndarray:
-    """Rows (4, 4): amplitude of a skew shape in the spot, its variance from background, per gain and per contrast^2.
+    """Rows (4, 4): amplitude of a skew shape in the spot, and its variance from background, per gain, per contrast^2.
 
-    The four third-order Hermite functions of the spot without their projection on the fit's parameters; 1 is the height
-    of the spot.
+    The shapes are the four third-order Hermite functions of the spot, minus their projection on the fit's parameters;
+    the unit is the height of the spot.
     """
     z1, z2, signal = fitted.z1, fitted.z2, fitted.signal
     z11, z22 = z1 * z1, z2 * z2
@@ -292,7 +292,7 @@ def with_measured_noise(patch: Patch) -> tuple[Patch, SpotNoise]:
 
 
 def centre_of(patch: Patch | str, noise: SpotNoise) -> Centre:
-    """The checked result of a fit."""
+    """Fit a patch and check the result."""
     if isinstance(patch, str):
         return Centre(patch)
     result = partial(Centre, clipped_share=patch.clipped_share, outline_px=patch.outline_px)
@@ -343,13 +343,13 @@ def _at_border(centre: np.ndarray, margin: np.ndarray | float, size: tuple[int, 
 
 
 def find_spot(picture: np.ndarray, noise: SpotNoise | None = None, white: int | None = None) -> Centre:
-    """The spot of one picture by the method `fit`.
+    """Find the spot of one picture by the method `fit`.
 
     Args:
         picture: (height, width, 3), blue, green, red, uint8 or uint16.
-        noise: of the camera, as `detect` estimates it from many looks; by default from the pixels of a wide spot,
-            without speckle whose grain exceeds a few pixels; for a narrow spot the medians of the priors.
-        white: largest value of a camera with more than 8 bits; by default from the picture.
+        noise: noise of the camera, as `detect` estimates it from many looks; by default from the pixels of a wide spot,
+            without speckle whose grain exceeds a few pixels, or for a narrow spot the medians of the priors.
+        white: full scale of a camera with more than 8 bits; by default from the picture.
     """
     patch = patch_around(in_grey_levels(picture, white))
     if noise is None and not isinstance(patch, str) and patch.wide and patch.clipped_share <= CLIPPED_SHARE_MAX:

@@ -1,7 +1,7 @@
-"""The noise of a camera's pixels around a laser spot: the effect of demosaicing, and estimates from a campaign.
+"""The noise of a camera's pixels around a laser spot: the effect of demosaicing, and the estimation from a campaign.
 
-DN = grey levels of 8 bits; pictures (height, width, 3), blue, green, red, uint8 or float32 DN of deeper ones; grey is
-(B + 2 G + R) / 4, in which every photosite of a Bayer sensor weighs alike.
+DN = grey levels of 8 bits; pictures (height, width, 3), blue, green, red, uint8, deeper ones float32 DN; grey is
+(B + 2 G + R) / 4, with equal weights for all photosites of a Bayer sensor.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import numpy as np
 GAIN_MEDIAN_DN, GAIN_SD_OF_LOG = 0.05, 1.0
 """Prior of the shot-noise gain, log-normal, DN per DN of signal: 255 DN at 5000 electrons, within a factor of e."""
 CONTRAST_DEFAULT = 0.4
-"""Speckle contrast without a campaign: the middle of the contrasts after averaging, 0.3 to 0.63."""
+"""Speckle contrast assumed without a campaign: the middle of the contrasts after averaging, 0.3 to 0.63."""
 CONTRAST_SCALE, CONTRAST_MAX = 0.5, 2.0
-"""Prior of the learned contrast: half-normal of this scale, up to here. Speckle may be absent; fully developed it has
-1, and its grain in px multiplies that."""
+"""Prior of the estimated contrast: half-normal of this scale, up to this limit. Speckle may be absent; fully developed
+it has contrast 1, multiplied by its grain in px."""
 SKEW_OUTLIER = 30.0
-"""A squared skew residual above this many times its expectation is left out (normal: one in 10^7)."""
+"""Limit of a squared skew residual over its expectation, above which it is left out (normal: one in 10^7)."""
 DEEP_VARIANCE_MIN = 1e-5
 """Least variance of a pixel of more than 8 bits, DN^2: rounding of 14 bits."""
 SHAPE_SPOTS_MIN = 4
 OWN_PIXELS_MIN, OWN_BINS, OWN_SHARE, OWN_DARK_SHARE, OWN_GAIN_MIN_DN = 200, 8, 0.05, 0.005, 1e-4
-"""Of `pixel_noise`: least number of pixels, number of bins, shares of the peak above which a pixel counts as lit and
+"""For `pixel_noise`: least number of pixels, number of bins, shares of the peak above which a pixel counts as lit and
 below which as dark, smallest gain."""
 _CELL = 8
 
@@ -34,7 +34,7 @@ def _autocorrelation(kernel: np.ndarray) -> np.ndarray:
     return np.array([[np.sum(kernel * padded[i : i + 3, j : j + 3]) for j in range(5)] for i in range(5)])
 
 
-# Correlation of grey pixels after bilinear demosaicing: mean over red and blue sites and green sites.
+# Correlation of grey pixels after bilinear demosaicing: mean over red, blue and green sites.
 _CORRELATION = (
     _autocorrelation(np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 16)
     + _autocorrelation(np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 8)
@@ -49,7 +49,7 @@ class SpotNoise:
     """Variance of a grey pixel with signal S beyond the background's: gain_dn * S + (speckle_contrast * S)^2, DN^2.
 
     The contrast is that per independent pixel: contrast times the root of the grain's area in px. `skew` is the shape
-    that all spots of the camera share, as the amplitudes of four functions (`spot_fit.skewness`): no noise.
+    common to all spots of the camera, as the amplitudes of four functions (`spot_fit.skewness`); it is not noise.
     """
 
     gain_dn: float = GAIN_MEDIAN_DN
@@ -58,14 +58,14 @@ class SpotNoise:
 
 
 def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> SpotNoise:
-    """Gain and contrast of one camera: posterior means of contrast and log gain on a grid.
+    """Estimate gain and contrast of one camera: posterior means of contrast and log gain on a grid.
 
-    Means of their squares would state too much where there is no speckle: the contrast's posterior begins at 0.
+    Means of their squares would be too large without speckle, since the contrast's posterior begins at 0.
 
     Args:
-        skews: (spots, 4, 4) as `skewness` makes them. From `SHAPE_SPOTS_MIN` spots on their median is the beam's own
-            shape and no noise: speckle differs from look to look, a beam does not.
-        speckle_contrast: taken as known where given.
+        skews: (spots, 4, 4) as returned by `skewness`. With `SHAPE_SPOTS_MIN` spots or more, their median is the beam's
+            own shape and not noise: speckle differs from look to look, a beam does not.
+        speckle_contrast: known contrast; by default it is estimated.
     """
     count, shape = len(skews), np.zeros(4)
     if count >= SHAPE_SPOTS_MIN:
@@ -75,7 +75,7 @@ def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> Spo
     skews = squared.reshape(-1, 4)
     deviations = np.linspace(-3, 3, 41)[:, None]
     gains = GAIN_MEDIAN_DN * np.exp(deviations * GAIN_SD_OF_LOG)
-    # Equal steps of the root: fine near 0; the weight of a point is the width of its cell.
+    # Equal steps of the root make the grid fine near 0; the weight of a point is the width of its cell.
     contrasts = np.linspace(0, 1, 121) ** 2 * CONTRAST_MAX
     widths = np.gradient(contrasts)
     if speckle_contrast is not None:
@@ -97,7 +97,7 @@ def learn_noise(skews: np.ndarray, speckle_contrast: float | None = None) -> Spo
 
 @dataclass(frozen=True)
 class PixelNoise:
-    """The noise of one picture by its own pixels, and the variance of a photosite without light, DN^2."""
+    """The noise of one picture from its own pixels, and the variance of a photosite without light, DN^2."""
 
     noise: SpotNoise
     background_dn2: float
@@ -106,15 +106,15 @@ class PixelNoise:
 def pixel_noise(
     residual: np.ndarray, signal: np.ndarray, usable: np.ndarray, background: float, mono: bool
 ) -> PixelNoise:
-    """Gain and contrast of one picture from its own pixels: second differences of the residuals of a fit, by signal.
+    """Estimate gain and contrast of one picture from second differences of a fit's residuals, by signal.
 
-    Differences over 1 px, in demosaiced pictures 3, contain the noise of pixels and the finest grain of speckle, and
-    little of a beam's rings and fringes. Only the scatter between looks shows a wider grain.
+    Differences over 1 px (3 px in demosaiced pictures) contain the noise of pixels and the finest grain of speckle, and
+    little of a beam's rings and fringes. Only the scatter between looks shows a coarser grain.
 
     Args:
-        residual: grey less fitted (h, w), DN.
+        residual: grey minus fitted (h, w), DN.
         signal: fitted light of the spot (h, w), DN.
-        usable: which pixels count (h, w).
+        usable: mask of the pixels used (h, w).
         background: variance of one photosite without light, DN^2, where too few pixels around the spot are dark.
         mono: whether the pixels are single photosites, not demosaiced.
     """
@@ -129,7 +129,7 @@ def pixel_noise(
         parts = [np.arange(k * lag, length - (2 - k) * lag) for k in range(3)]
         earlier, middle, later = (np.take(residual, part, axis) for part in parts)
         inside = np.logical_and.reduce([np.take(usable, part, axis) for part in parts])
-        # Of one value and two halves of others: 1 + 1/4 + 1/4.
+        # Variance of one value minus half of two others: 1 + 1/4 + 1/4.
         rows.append(
             np.stack(
                 ((middle - (earlier + later) / 2)[inside] ** 2 / 1.5 / single, np.take(signal, parts[1], axis)[inside])
@@ -145,7 +145,7 @@ def pixel_noise(
     bins = np.array_split(order[light[order] > OWN_SHARE * light.max()], OWN_BINS)
     level = np.array([light[part].mean() for part in bins])
     mean = np.array([squares[part].mean() for part in bins])
-    # The means have equal relative errors, so relative residuals are fitted.
+    # The means have equal relative errors, so relative residuals are minimised.
     weight = 1 / np.maximum(mean, 1e-12)
     excess = np.maximum(mean - background, 0.0)
     gain, contrast2 = nnls(np.column_stack((level, level**2)) * weight[:, None], excess * weight)[0]
@@ -153,22 +153,22 @@ def pixel_noise(
 
 
 def mean_noise(noises: Sequence[SpotNoise]) -> SpotNoise:
-    """One camera's noise from that of a few pictures: means of variances, median shape."""
+    """Average the noise of a few pictures of one camera: means of variances, median shape."""
     gain = float(np.mean([noise.gain_dn for noise in noises]))
     contrast = float(np.sqrt(np.mean([noise.speckle_contrast**2 for noise in noises])))
     return SpotNoise(gain, contrast, tuple(np.median([noise.skew for noise in noises], axis=0).tolist()))
 
 
 def is_mono(picture: np.ndarray) -> bool:
-    """Whether the three channels are equal: a monochrome camera, or grey saved as colour."""
+    """Whether the three channels are equal: a monochrome camera, or a grey picture saved as colour."""
     return bool((picture[..., 0] == picture[..., 1]).all() and (picture[..., 0] == picture[..., 2]).all())
 
 
 def background_variance(picture: np.ndarray, centre: np.ndarray, half: int) -> float:
     """Variance of one photosite around the spot, DN^2.
 
-    From means of 8 x 8 px, in second differences that slopes do not enter: single demosaiced pixels are smoothed and
-    show too little.
+    It uses means of 8 x 8 px, in second differences that slopes do not affect: single demosaiced pixels are smoothed
+    and show too small a variance.
     """
     import cv2
 
@@ -187,7 +187,7 @@ def background_variance(picture: np.ndarray, centre: np.ndarray, half: int) -> f
     values = (means[:, 1:-1] - (means[:, :-2] + means[:, 2:]) / 2)[outside[:, 1:-1]]
     if values.size < 8:
         return 1.0
-    # MAD: edges of other things in the picture are few. 1.5: variance of the difference of independent means.
+    # MAD, since edges of other objects in the picture are few. 1.5: variance of the difference of independent means.
     variance = (1.4826 * float(np.median(np.abs(values)))) ** 2 / 1.5 / _CELL_VARIANCE
     return max(variance, 1 / 12 if picture.dtype == np.uint8 else DEEP_VARIANCE_MIN)  # rounding to whole grey levels
 
@@ -197,7 +197,7 @@ def through_demosaicing(filters: np.ndarray, shape: tuple[int, int], block: int 
     import cv2
 
     if block > 1:
-        # Demosaicing keeps the sum of its correlations at 1: wide blocks of pixels are independent.
+        # Demosaicing keeps the sum of its correlations at 1, so wide blocks of pixels are independent.
         return np.einsum("kn,kn->k", filters, filters) / block**2
     pictures = filters.reshape(len(filters), *shape)
     smooth = [cv2.filter2D(picture, cv2.CV_64F, _CORRELATION, borderType=cv2.BORDER_CONSTANT) for picture in pictures]

@@ -1,7 +1,7 @@
-"""The place of the spot in a picture, and the pixels around it for the fit; the reason where there is not exactly one.
+"""Locate the spot in a picture and select the pixels around it for the fit; or state why there is not exactly one.
 
 Raw image px with the integer at the centre of a pixel; DN = grey levels of 8 bits; pictures (height, width, 3), blue,
-green, red, uint8 or float32 DN of deeper ones.
+green, red, uint8, or float32 DN for deeper pictures.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ import numpy as np
 from tvsbayes.cameras.spot_noise import background_variance, grey_of, is_mono
 
 CLIPPED_DN = 250
-"""A channel at or above this counts as clipped: white balance and JPEG leave full wells a little below 255."""
+"""A channel at or above this counts as clipped: white balance and JPEG leave full wells slightly below 255."""
 CLIPPED_SHARE_MAX = 0.5
-"""Half the bright area: about three times overexposed."""
+"""Largest clipped share of the bright area: half of it means about three times overexposed."""
 BRIGHT_SHARE = 0.3
 """Level of the bright area and of the paper's contour between background and highest value."""
 SECOND_SHARE = 0.25
 AREA_MAX_SHARE = 0.05
-"""Of the picture; at 1280 x 720 px a spot of 70 px sd."""
+"""Largest bright area over the picture; at 1280 x 720 px a spot of 70 px sd."""
 DETECTION_SIGMAS, DETECTION_MIN_DN = 8.0, 2.0
-"""Least height of a spot over the background, of means of 4 x 4 px: in sds of them and in DN."""
+"""Least height of a spot over the background, for means of 4 x 4 px: in their sds and in DN."""
 BLOCKS_PER_SD = 4
 """Wide spots are fitted to means of blocks of pixels, a quarter of their sd wide: as accurate, and faster."""
 WIDE_SD_PX = 5.0
-"""Least sd of a spot whose pixels determine the noise; in a narrower one they also show its shape."""
+"""Least sd of a spot whose pixels determine the noise; those of a narrower spot also show its shape."""
 SHRINK = 4
 LAMP_SHARE = 0.01
-"""Least area, over the picture, of a bright area at the border that is a lamp or a window and no spot."""
+"""Least area, over the picture, of a bright area at the border that counts as a lamp or a window."""
 LAMP_AREA_RATIO, LAMP_HEIGHT_SHARE = 4.0, 0.8
-"""A bright area at the border, or larger than any spot, is a lamp or a window if there is a spot in the picture and the
-area is this many times larger or has at most this share of its height: a laser spot at the border would be brighter
-than its own reflections, and no larger."""
+"""A bright area at the border, or larger than any spot, is a lamp or a window if the picture has a spot and the area is
+this many times larger or has at most this share of its height: a laser spot at the border would be brighter than its
+own reflections, and not larger."""
 
 
 @dataclass(frozen=True)
@@ -60,21 +60,21 @@ class Patch:
 
     @property
     def wide(self) -> bool:
-        """Whether noise and shape are separable in its pixels."""
+        """Whether its pixels separate noise and shape."""
         return self.start_sd_px >= WIDE_SD_PX
 
 
 def patch_around(picture: np.ndarray) -> Patch | str:
-    """Find the spot of a picture; the reason for refusal where there is not exactly one."""
+    """Find the spot of a picture, or return the reason for refusal where there is not exactly one."""
     import cv2
 
     height, width = picture.shape[:2]
     if min(height, width) < 2 * SHRINK:
         return "no-spot"
-    # OpenCV's weights of the colours are good enough to find the spot, and several times faster.
+    # OpenCV's weights of the colours suffice to find the spot, and are several times faster.
     small = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     small = cv2.resize(small, (width // SHRINK, height // SHRINK), interpolation=cv2.INTER_AREA)
-    # Lamps and gradients are wide, a spot is not: 11 cells of 8 px hold it several times.
+    # Lamps and gradients are wide; a spot is several times smaller than 11 cells of 8 px.
     background = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     background = cv2.resize(_wide_median(background), small.shape[::-1], interpolation=cv2.INTER_LINEAR)
     above = cv2.blur(cv2.subtract(small, background, dtype=cv2.CV_32F), (2, 2))
@@ -83,7 +83,7 @@ def patch_around(picture: np.ndarray) -> Patch | str:
     if peak < max(DETECTION_SIGMAS * noise, DETECTION_MIN_DN):
         return "no-spot"
     bright = (above > max(SECOND_SHARE * peak, DETECTION_SIGMAS / 2 * noise)).astype(np.uint8)
-    # The next steps need a few cells only: the whole picture would take much longer.
+    # The next steps need only a few cells; the whole picture would take much longer.
     column, row, columns, rows = cv2.boundingRect(bright)
     box = np.s_[row : row + rows, column : column + columns]
     count, labels, stats, centroids = cv2.connectedComponentsWithStats(bright[box], connectivity=8)
@@ -107,7 +107,7 @@ def patch_around(picture: np.ndarray) -> Patch | str:
         return "too-large"
     # A Gaussian is above a quarter of its peak within a radius of sqrt(2 ln 4) = 1.67 sds.
     sd = SHRINK * sqrt(area / pi) / 1.67
-    # The cell's centre, and the half cell that the 2 x 2 blur moved it by.
+    # The cell's centre, less the half cell by which the 2 x 2 blur moved it.
     start = (centroids[main] + (column, row) + 0.5) * SHRINK - 0.5 - SHRINK / 2
     block = max(1, int(sd / BLOCKS_PER_SD))
     half = int(min(max((4 if sd < WIDE_SD_PX else 6) * sd + 5, 14), max(height, width)))
@@ -142,16 +142,16 @@ def patch_around(picture: np.ndarray) -> Patch | str:
 def _lamps(
     small: np.ndarray, levels: Sequence[float], inside: Sequence[np.ndarray], heights: np.ndarray, flux: np.ndarray
 ) -> tuple[list[int], bool]:
-    """Bright areas that are lamps or windows in a picture with a spot, and whether there is a lamp and no spot.
+    """Find bright areas that are lamps or windows beside a spot, and whether there is a lamp but no spot.
 
-    With a spot: areas at the border or too large, and large or dim compared with it.
+    Beside a spot, lamps are areas at the border or too large, and large or dim compared with the spot.
 
     Args:
         small: the picture in cells, (h, w).
         levels: half way between the surroundings of each area and its peak, DN: all connected pixels above it belong to
             the area, also those that the median of the surroundings removed.
         inside: row and column of a cell of each area.
-        heights: over the background, DN, of the areas from the second on; (n + 1,).
+        heights: height over the background, DN, of the areas from the second on; (n + 1,).
         flux: sum over the area, likewise; (n + 1,).
     """
     import cv2
@@ -173,7 +173,7 @@ def _lamps(
 
 
 def _wide_median(picture: np.ndarray) -> np.ndarray:
-    """Median of 11 x 11; OpenCV has it for 8 bits."""
+    """Median over 11 x 11; OpenCV has it for 8 bits only."""
     import cv2
 
     if picture.dtype == np.uint8:
@@ -183,7 +183,7 @@ def _wide_median(picture: np.ndarray) -> np.ndarray:
 
 
 def block_means(values: np.ndarray, block: int) -> np.ndarray:
-    """Means of block x block pixels; what is left over at the far sides is dropped."""
+    """Means of block x block pixels; incomplete blocks at the far sides are dropped."""
     import cv2
 
     if block == 1:

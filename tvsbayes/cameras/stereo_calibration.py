@@ -1,8 +1,8 @@
-"""From board pictures to a stereo calibration with its covariance, and checks of its plausibility.
+"""From board pictures to a stereo calibration with its covariance, and plausibility checks.
 
-Type A: all corners of all views in one bundle adjustment, widened for errors that the corners of a picture share and
-for a board that is no perfect grid. Type B: the pitch of the board, to which all lengths are proportional. mm, px with
-the integer at a pixel's centre, parameters in the order of `STEREO_PARAMETER_NAMES`.
+Type A: all corners of all views in one bundle adjustment, widened for errors common to the corners of a picture and for
+an imperfect board. Type B: the pitch of the board, to which all lengths are proportional. mm, px with the integer at a
+pixel's centre, parameters in the order of `STEREO_PARAMETER_NAMES`.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ FINDING, ADJUSTING = "finding corners", "adjusting all corners"
 STAGES = {FINDING: 2.0, ADJUSTING: 3.0}
 """Stages of a calibration with their usual seconds, for the progress."""
 VIEWS_ADVISED = 10
-"""Zhang (2000), figure 3: the errors have fallen to a floor by about ten views."""
+"""Advised number of views: by Zhang (2000), figure 3, errors no longer fall beyond about ten views."""
 TILT_ADVISED_DEG = 15.0
 COVERAGE_ADVISED = 0.6
 CORNER_SD_ADVISED_PX = 0.5
 PAIR_RMS_RATIO = 1.5
-"""Ratio of the pair's rms to that of single cameras for a warning: pairs of one moment and one rig stay below 1.15."""
+"""Ratio of the pair's rms to that of single cameras above which a warning is given: correct pairs stay below 1.15."""
 PAIR_RMS_MIN_PX = 0.05
 CONTRADICTION_RATIO, CONTRADICTION_PX = 4.0, 1.0
-"""Above both the pictures are not of one pair of cameras, and no covariance would be valid."""
+"""Limits above which (both) the pictures are not of one pair of cameras, and no covariance would be valid."""
 
 
 @dataclass(frozen=True)
@@ -72,20 +72,20 @@ class StereoCalibration:
 
     Attributes:
         stereo: parameters and their full covariance (type A with `correlation_factor`, plus board and pitch).
-        board: as given.
+        board: the board.
         views: every view used, with its residuals.
-        left_rms_px, right_rms_px: rms over corners as OpenCV defines it; of both cameras in `stereo.rms_px`.
+        left_rms_px, right_rms_px: rms over corners as OpenCV defines it; `stereo.rms_px` is that of both cameras.
         noise_sd_px: standard deviation of one corner coordinate.
-        dof: its degrees of freedom.
+        dof: degrees of freedom of `noise_sd_px`.
         correlation_factor: factor on the covariance for errors that the corners of a picture share.
         covariance_independent: (24, 24), type A for independent corners, as OpenCV and most tools report it.
-        board_error_mm: deviation of the board's corners from a grid, sd of one coordinate, by the residuals.
-        covariance_board: (24, 24), from that.
+        board_error_mm: deviation of the board's corners from a grid, sd of one coordinate, from the residuals.
+        covariance_board: (24, 24), from these deviations.
         covariance_pitch: (24, 24), type B, from the pitch: scales T.
         coverage: share of the image inside the boards, by camera.
         triangulated_pitch_mm: mean and standard deviation of all sides of squares, triangulated.
         pictures: the folder of pictures; None where corners were given.
-        excluded: names of outlying views that were left out: no pairs at all, or by `robust`.
+        excluded: names of outlying views that were left out: not a pair, or excluded by `robust`.
         reordered: names of views whose right corners were reordered to match the left ones.
         alone_rms_px: rms over corners, as in `stereo.rms_px`, with each camera calibrated alone.
         warnings: implausible results, in words.
@@ -124,7 +124,7 @@ class StereoCalibration:
         return sum(view.left_rms_px is not None and view.right_rms_px is not None for view in self.views)
 
     def as_json(self) -> dict[str, object]:
-        """The document of `tvsbayes stereo --json`, without the paths of what was written."""
+        """The document of `tvsbayes stereo --json`, without the paths of written files."""
         total = np.sqrt(np.diag(self.stereo.parameter_covariance))
         parts = {
             "sd": total,
@@ -187,12 +187,12 @@ def calibrate_stereo(
     """Calibrates a stereo pair from corners.
 
     Args:
-        views: corners by view; those of one camera alone inform that camera.
-        board: whose corners they are.
+        views: corners by view; views of one camera alone inform that camera.
+        board: the board in the views.
         size: image width and height, px.
         fix_k3: keep both k3 at 0.
         robust: leave out outlying views and adjust again, once. Views whose two pictures cannot show one board (of
-            two moments, for example) are always left out.
+            different moments, for example) are always left out.
         pictures: the folder of pictures, for the report.
 
     Raises:
@@ -203,7 +203,7 @@ def calibrate_stereo(
     adjusted = _adjust_views(views, board, size, fix_k3, robust)
     adjustment = adjusted.adjustment
     pitch = np.zeros((24, 24))
-    # Pixels determine angles only: all lengths, T among them, are proportional to the pitch.
+    # Pixels determine only angles: all lengths, including T, are proportional to the pitch.
     shift = adjustment.vector[21:] * (board.pitch_u_mm / board.pitch_mm)
     pitch[21:, 21:] = np.outer(shift, shift)
     rms, zeros = _rms(adjustment.residuals_px), np.zeros(1)
@@ -246,7 +246,7 @@ class _Adjusted:
     Attributes:
         adjustment: the result.
         views: used views, right corners in the agreed order.
-        outliers: which of them are outliers.
+        outliers: mask of the outliers among them.
         excluded: names of views left out.
         turned: names of views with reordered right corners.
         alone_rms_px: rms over corners with each camera calibrated alone.
@@ -306,7 +306,7 @@ def _lowest_adjustment(start: Start, board: Board, size: tuple[int, int], free: 
 
 
 def _reordered(pictures: Views | None, turned: tuple[str, ...]) -> tuple[str, ...]:
-    """Views reordered by direction or by agreement, but not by both: two half turns cancel."""
+    """Names of views reordered by direction or by agreement, but not by both: two half turns cancel."""
     first = () if pictures is None else pictures.reordered
     return (*(name for name in first if name not in turned), *(name for name in turned if name not in first))
 
@@ -339,7 +339,7 @@ def _rms(residuals_px: np.ndarray) -> float:
 
 
 def _outliers(adjustment: Adjustment) -> np.ndarray:
-    """Which views are outliers by the rule of `OUTLIER_Z`, shape (views,)."""
+    """Mask of the views that are outliers by `OUTLIER_Z`, shape (views,)."""
     logs = np.log([max(_rms(r), 1e-12) for r in adjustment.residuals_px])
     middle = np.median(logs)
     spread = max(1.4826 * float(np.median(np.abs(logs - middle))), OUTLIER_SPREAD_MIN)

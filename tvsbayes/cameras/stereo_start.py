@@ -1,4 +1,4 @@
-"""The start of a stereo calibration: each camera alone (Zhang 2000), the median relative pose, a pose per board.
+"""Start values of a stereo calibration: each camera alone (Zhang 2000), the median relative pose, a pose per board.
 
 Poses are board to camera, (6,): Rodrigues vector, then mm; OpenCV's axes (x right, y down, z along the view);
 x_right = R x_left + T. px with the integer at a pixel's centre.
@@ -20,19 +20,19 @@ from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, rotation_vector
 
 VIEWS_MIN = 3
-"""Least views per camera: Zhang's method (2000) finds no focal length and principal point from fewer."""
+"""Least views per camera: Zhang's method (2000) cannot find focal length and principal point from fewer."""
 START_VIEWS = 30
 """Largest number of views for the start; further views enter the bundle adjustment only."""
 MISMATCH_RATIO, MISMATCH_SHARE = 5.0, 0.01
-"""A view is no pair if the distance of its right corners from those that the left ones and the relative pose of most
-pairs predict exceeds five times the median over views and 1 % of the image width."""
+"""A view is not a pair if its right corners are farther from those predicted by the left ones and the relative pose of
+most pairs than five times the median over views and than 1 % of the image width."""
 POSE_CORNERS_MIN = 6
-"""Least corners that both cameras see in a pair of OpenCV's start."""
+"""Least number of corners seen by both cameras in a pair for OpenCV's start."""
 DOUBTFUL_START_PX = 0.6
 """Rms of one camera above which it may be in a local minimum: corners are accurate to 0.05 to 0.3 px."""
 DISAGREE_SHARE = 0.05
-"""Median deviation of pairs, over the image width, above which they contradict one pose of the cameras: real pairs of a
-narrow or a wide lens have 0.1 to 1 %, pairs of different moments 5 to 50 %."""
+"""Median deviation of pairs, over the image width, above which they contradict one pose of the cameras: real pairs have
+0.1 to 1 % with narrow or wide lenses, pairs of different moments 5 to 50 %."""
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,14 @@ class CameraStart:
 
 @dataclass(frozen=True)
 class Start:
-    """The start of the adjustment.
+    """Start values of the adjustment.
 
     Attributes:
         vector: the 24 parameters.
-        poses: of the boards, (views, 6).
-        views: as given, right corners in the order in which most pairs agree.
+        poses: poses of the boards, (views, 6).
+        views: the given views, right corners in the order in which most pairs agree.
         turned: names of views with reordered right corners.
-        mismatched: which views are no pair at all, (views,).
+        mismatched: mask of views that are not a pair, (views,).
         alone_rms_px: rms over the corners of both cameras, each calibrated alone.
     """
 
@@ -72,7 +72,7 @@ class Start:
 
 
 def start_of(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3: bool) -> Start:
-    """The start of both cameras and of all boards.
+    """Find start values of both cameras and of all boards.
 
     Raises:
         NothingToEstimate: too few views of a camera, no pair, pairs that disagree, or no start that OpenCV can find.
@@ -110,10 +110,10 @@ def start_of(views: Sequence[View], board: Board, size: tuple[int, int], fix_k3:
 
 
 def opencv_start(start: Start, board: Board, size: tuple[int, int], fix_k3: bool) -> Start:
-    """The result of cv2.stereoCalibrate on up to `START_VIEWS` pairs: for views with more than one minimum.
+    """Run cv2.stereoCalibrate on up to `START_VIEWS` pairs, for views with more than one minimum.
 
     Raises:
-        NothingToEstimate: it finds no pair.
+        NothingToEstimate: OpenCV finds no pair.
     """
     pairs = [k for k, view in enumerate(start.views) if view.left is not None and view.right is not None]
     pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, START_VIEWS).astype(int))]
@@ -177,7 +177,7 @@ def camera_start(
     pixels = [np.ascontiguousarray(corners[k][visible_corners(corners[k])], np.float32) for k in chosen]
     start = _zhang(points, pixels, size, side, cv2.CALIB_FIX_K3 if fix_k3 else 0)
     if start.rms_px > DOUBTFUL_START_PX:
-        # Wide lenses have local minima: k1 alone first, then all from there.
+        # Wide lenses have local minima: fit k1 alone first, then all coefficients from there.
         simple = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_PRINCIPAL_POINT
         first = _zhang(points, pixels, size, side, simple)
         flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_FIX_K3 if fix_k3 else 0)
@@ -198,7 +198,7 @@ def _zhang(
     """cv2.calibrateCamera under `flags`, from `first` where given; no poses.
 
     Raises:
-        NothingToEstimate: OpenCV finds nothing.
+        NothingToEstimate: OpenCV finds no solution.
     """
     matrix, distortion = (None, None) if first is None else (first.matrix.copy(), first.distortion.copy())
     try:
@@ -217,7 +217,7 @@ class _Relation:
 
     Attributes:
         pose: rotation vector and translation.
-        misses: rms distance of the right corners from those predicted by the left ones, px, by pair.
+        misses: rms distance of the right corners from those predicted from the left ones, px, by pair.
         orders: the best of `corner_orders` for the right corners, by pair.
     """
 
@@ -232,11 +232,11 @@ class _Relation:
 
 
 def _relation(views: Sequence[View], board: Board, left: CameraStart, right: CameraStart, limit_px: float) -> _Relation:
-    """The relation in which most pairs agree.
+    """Find the relation in which most pairs agree.
 
-    First with the corners as ordered: the median over pairs, which is robust against one wrong pair. Where most misses
-    exceed `limit_px`, every pair in every order is tried, and the one with the least median miss is used (least median
-    of squares: Rousseeuw 1984): robust against half turns of a symmetric board and many wrong pairs.
+    First the corners keep their order: the median over pairs is robust against one wrong pair. Where most misses exceed
+    `limit_px`, every pair in every order is tried, and the one with the least median miss is used (least median of
+    squares: Rousseeuw 1984), which is robust against half turns of a symmetric board and many wrong pairs.
     """
     pairs = sorted(set(left.poses) & set(right.poses))
     if not pairs:
@@ -249,7 +249,7 @@ def _relation(views: Sequence[View], board: Board, left: CameraStart, right: Cam
     turns = np.linalg.lstsq(board.points_mm[:, :2], np.hstack([board.points_mm[order, :2] for order in orders]))[0]
 
     def relative(k: int, order: int) -> np.ndarray:
-        # Corner i in another order is another corner of the board, which is then turned in its plane.
+        # In another order, corner i is another corner of the board, i.e. the board is turned in its plane.
         turn = np.eye(3)
         turn[:2, :2] = turns[:, 2 * order : 2 * order + 2].T
         rotation = rotation_matrix(right.poses[k][:3]) @ turn @ rotation_matrix(left.poses[k][:3]).T
@@ -278,7 +278,7 @@ def _median_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _misses(view: View, board: Board, pose: np.ndarray, relation: np.ndarray, right: CameraStart) -> np.ndarray:
-    """Rms distance of the right corners from those predicted by a board's left pose, px, by corner order."""
+    """Rms distance of the right corners from those predicted from a board's left pose, px, by corner order."""
     rotation, shift = rotation_matrix(relation[:3]), relation[3:]
     predicted = rotation_vector(rotation @ rotation_matrix(pose[:3])), rotation @ pose[3:] + shift
     pixels, _ = cv2.projectPoints(board.points_mm, *predicted, right.matrix, right.distortion)
@@ -300,7 +300,7 @@ def board_pose(corners: np.ndarray, board: Board, matrix: np.ndarray, distortion
 
 
 def pose_of(view: View, board: Board, stereo: Stereo) -> np.ndarray:
-    """Board to left camera, from the picture of the left one where it saw the board."""
+    """Board to left camera, from the left camera's picture where it shows the board."""
     if view.left is not None:
         return board_pose(view.left, board, stereo.M1, stereo.D1)
     assert view.right is not None
@@ -314,10 +314,10 @@ def left_pose(right_pose: np.ndarray, turn: np.ndarray, shift: np.ndarray) -> np
 
 
 def visible_corners(*corners: np.ndarray | None) -> np.ndarray:
-    """Which corners (corners,) all of some pictures show."""
+    """Mask of the corners (corners,) that all given pictures show."""
     return np.logical_and.reduce([np.isfinite(points).all(axis=1) for points in corners if points is not None])
 
 
 def pixels_of(corners: np.ndarray) -> np.ndarray:
-    """Corners (corners, 2) as every OpenCV takes them: contiguous, of rank 3."""
+    """Corners (corners, 2) in the form that all versions of OpenCV accept: contiguous, of rank 3."""
     return np.ascontiguousarray(corners, float).reshape(-1, 1, 2)

@@ -37,17 +37,17 @@ from tvsbayes.single_axis.waves import WavePeriods
 
 FORMAT = "tvsbayes-axis/1"
 Approach = Literal["forward", "backward", "unknown"]
-"""Forward is a rising command, whatever the sign of the unit per command."""
+"""Forward means an increasing command, for either sign of the unit per command."""
 COMMAND_MAX = 1e12
 """Largest absolute command or reading."""
 TURNS = {**{unit: 360.0 / in_deg for unit, in_deg in DEGREES.items()}, "turn": 1.0}
-"""One turn in the units of angles."""
+"""One turn in each unit of angle."""
 _NEVER_ZERO = ("transmission_error_length", "reading_scale", "creep_minutes", "seeing_s")
-"""Log-normals that the model divides by: no density exists where they are fixed at 0."""
+"""Log-normal parameters by which the model divides: the density is undefined where they are fixed at 0."""
 PERIODS = ("periods", "periods_in", "period_between", "encoder_period")
 """Keys of `[axis]` that define waves."""
 PERIODS_MAX, RANGES_MAX = 8, 4
-"""Largest numbers of stated and of unknown periods: each adds two sampled coordinates."""
+"""Largest numbers of stated and of unknown periods; each period adds two sampled coordinates."""
 TEMPERATURE_MAX = 1000.0
 _MOVE = replace(MOVES["move"], names="")
 
@@ -57,7 +57,7 @@ class AxisMove:
     """A row of `moves.csv`: the command AFTER the move; `approach` in the first row of a segment, else empty."""
 
     move: Annotated[int, _MOVE]
-    # A run of a scanner is an experiment; of an axis, the moves between two homings.
+    # A run of a scanner is an experiment; a run of an axis is the moves between two homings.
     segment: Annotated[int, replace(MOVES["segment"], names=MOVES["segment"].names + " run lauf durchlauf")]
     time_s: Annotated[float, MOVES["time_s"]]
     command: Annotated[
@@ -91,9 +91,9 @@ class AxisMove:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A row of `readings.csv`: value and standard uncertainty in the folder's unit; u 0 is unknown.
+    """A row of `readings.csv`: value and standard uncertainty in the folder's unit; u = 0 means unknown.
 
-    `value` is a number where `status` is "ok", and may be None elsewhere.
+    `value` is a number where `status` is "ok", else it may be None.
     """
 
     reading: Annotated[int, Column("unique id", rule=unique)]
@@ -148,13 +148,13 @@ class AxisCampaign(Shown):
     """An axis folder, checked.
 
     Attributes:
-        unit: of readings.
-        moves: in time order.
-        readings: in the order of the file.
-        stated: entries of `[axis]`; names left out take the default, which scales with the travel.
+        unit: unit of the readings.
+        moves: moves in time order.
+        readings: readings in the order of the file.
+        stated: entries of `[axis]`; omitted names take the default, which scales with the travel.
         header: keys of `campaign.toml` outside `[axis]` but `format` and `unit`.
         periods: waves that `[axis]` defines.
-        path: the folder, None where it was never written.
+        path: the folder; None where it was never written.
     """
 
     unit: str
@@ -167,7 +167,7 @@ class AxisCampaign(Shown):
 
     @property
     def rate(self) -> float | None:
-        """Commands per second of a drive that never stops; None where the axis is read at stops."""
+        """Commands per second of a drive in continuous motion; None where the axis is read at stops."""
         rate = self.header.get("rate")
         return float(rate) if isinstance(rate, int | float) else None
 
@@ -177,7 +177,7 @@ class AxisCampaign(Shown):
         return powered_on_s(self.header)
 
     def shown(self) -> View:
-        """Counts, and the readings with the commands behind them."""
+        """Show counts, and the readings with their commands."""
         command_of = {move.move: move.command for move in self.moves}
         ok = sum(reading.status == "ok" for reading in self.readings)
         title = f"AxisCampaign in {self.unit}: {len(self.moves)} moves, {len(self.readings)} readings ({ok} ok)"
@@ -189,7 +189,7 @@ class AxisCampaign(Shown):
 
 _TEXTS = {**dict.fromkeys(("name", "operator", "instrument", "serial", "method"), 200), "notes": 4000}
 _FILES = {"moves.csv": CSV_BYTES_MAX, "readings.csv": CSV_BYTES_MAX, "campaign.toml": TOML_BYTES_MAX}
-"""campaign.toml is written last: a folder without it is unfinished."""
+"""campaign.toml is written last: a folder without it is incomplete."""
 
 
 def parse_axis_moves(data: bytes, file: str = "moves.csv") -> tuple[AxisMove, ...]:
@@ -205,14 +205,14 @@ def parse_readings(
     Args:
         data: content of the file.
         moves: number of moves, which `move` must name.
-        move_rows: the moves, where readings were taken `in_motion`: then each ok reading has its time.
+        move_rows: the moves, where readings were taken `in_motion`: each ok reading then has its time.
         in_motion: whether the folder states a `rate`.
     """
     return READINGS.parse(data, READINGS.file, follows_a_move(moves, "reading"), _times_in_motion(move_rows, in_motion))
 
 
 def _times_in_motion(moves: tuple[AxisMove, ...], in_motion: bool) -> Callable[[Table, Values], None]:
-    """Refuses times of readings at stops, and readings in motion without a time between their move and the next."""
+    """Refuse times of readings at stops, and readings in motion without a time between their move and the next."""
 
     def check(table: Table, values: Values) -> None:
         for row, (time_s, move, status) in enumerate(
@@ -331,10 +331,10 @@ def unit_of_folder(folder: Path) -> str | None:
 
 
 def read_axis(folder: Path | str) -> AxisCampaign:
-    """Reads and checks an axis folder (data/docs/campaign-files.md). Never `truth.json` or results.
+    """Read and check an axis folder (data/docs/campaign-files.md), without `truth.json` and results.
 
     Raises:
-        InputError: anything that is missing, malformed or contradicts itself, with file, line and column.
+        InputError: missing, malformed or contradictory entries, with file, line and column.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -379,7 +379,7 @@ def axis_toml(campaign: AxisCampaign) -> bytes:
 
 
 def write_axis(campaign: AxisCampaign, folder: Path) -> None:
-    """Writes the three files into a new or empty folder; reading them gives the same campaign.
+    """Write the three files into a new or empty folder; reading them returns the same campaign.
 
     Raises:
         InputError: the folder is not empty or cannot be written, or `read_axis` would refuse the files (then nothing is
@@ -410,7 +410,7 @@ def stops_csv(stops: Iterable[tuple[float | None, float, str]]) -> bytes:
     """`plan.csv` of an axis: step, command, direction, read (1 or 0).
 
     Args:
-        stops: the command visited before, None where there is none; the command; its direction of approach.
+        stops: the command visited before, or None; the command; its direction of approach.
     """
     rows: list[tuple[int, float, str, int]] = []
     for via, command, direction in stops:

@@ -1,4 +1,4 @@
-"""The posterior of an axis for samplers: density of its scales, with draws of the line that was integrated out."""
+"""The posterior of an axis for samplers: density of its scales, with draws of the analytically integrated line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 
 FUNCTIONALS: dict[str, Callable[[AxisModel], np.ndarray]] = {
-    # At command zero.
+    # The offset is that at command zero.
     "offset": lambda model: model.head(offset=1.0, slope=-model.middle),
     "per_command": lambda model: model.head(slope=1.0),
     "ratio_contrast": lambda model: model.head(contrast=1.0),
@@ -21,7 +21,7 @@ FUNCTIONALS: dict[str, Callable[[AxisModel], np.ndarray]] = {
     "per_command.forward": lambda model: model.head(slope=1.0, contrast=0.5),
     "per_command.backward": lambda model: model.head(slope=1.0, contrast=-0.5),
 }
-"""Functionals of the columns by quantity of `AXIS_QUANTITIES`; the same for all draws."""
+"""Functionals of the columns by quantity of `AXIS_QUANTITIES`; these do not depend on the draw."""
 HEADLINE_DRAWS = (*FUNCTIONALS, "effective_per_command")
 """Rows of `headline_functionals`."""
 
@@ -45,7 +45,7 @@ def blocks_of(w: np.ndarray) -> list[np.ndarray]:
 
 
 def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
-    """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns), or (n, ...) as those of `line_weights`."""
+    """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns), or (n, ...) as in `line_weights`."""
     lines, weights = line_functionals(model), line_weights(model, w)
     functionals = np.concatenate([lines, model.head(slope=1.0)[None]])
     if weights.ndim == 2:
@@ -55,7 +55,7 @@ def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
 
 
 def line_functionals(model: AxisModel) -> np.ndarray:
-    """Functionals of all but the last of `HEADLINE_DRAWS`; the same for all draws."""
+    """Functionals of all but the last of `HEADLINE_DRAWS`; independent of the draw."""
     return np.array([functional(model) for functional in FUNCTIONALS.values()])
 
 
@@ -98,7 +98,7 @@ class AxisDensity:
         """Draws of the sampled scales and of the linear quantities."""
         values, names = self.model.coordinates.values(points.w), self.model.coordinates.names
         linear = dict(zip(HEADLINE_DRAWS, points.parts["linear"].T, strict=False))
-        # A sampled backlash is part of the linear one.
+        # A sampled backlash is already part of the linear one.
         return {name: values[name] for name in names if name in values} | linear
 
     def first_proposal(self) -> StudentMixture:

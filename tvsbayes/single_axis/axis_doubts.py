@@ -18,16 +18,16 @@ SLOPE_SHARE, SLOPE_ERRORS = 0.2, 6.0
 """Least difference of a doubtful segment's slope from the others, as a share and in standard errors: errors by position
 change it by some per cent, miscounted steps by a factor of 2 or more."""
 PLAYS = 4.0
-"""Least shift of the segment's end by that difference, in plays and scatters: stops inside the play bend short
-segments."""
+"""Least shift of the segment's end by that difference, in plays and scatters: stops inside the play change the slope of
+short segments."""
 WILD = 6.0
 """Least deviation of an outlier among readings at one stop, in standard deviations."""
 STOPS_MIN = 5
-"""Least number of stops with several readings: with fewer, the scatter is too uncertain to call one wild."""
+"""Least number of stops with several readings: with fewer, the scatter is too uncertain for this test."""
 WILD_STOP, STOPS_JUDGED_MIN = 12.0, 8
 """Least deviation of a wild stop from the line, in typical deviations, and least number of stops for this test."""
 WILD_SHARE = 0.1
-"""Least deviation of a wild stop as a share of the travel: no gear error and no scatter of stops is so large."""
+"""Least deviation of a wild stop as a share of the travel: errors of gears and scatter of stops are smaller."""
 LINE_SLOPE = float(np.sqrt(12.0))
 """Largest sd of a line's slope over a range of 1 from errors of sd 1, for any dependence on position."""
 
@@ -56,7 +56,7 @@ def axis_warnings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
 
 
 def _warnings_in_motion(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """Doubts about a record of a drive that never stops."""
+    """Doubts about a record of a drive in continuous motion."""
     sentences = []
     if not any(r.u > 0 for r in campaign.readings):
         sentences.append(f"no reading has a stated u: {rows.reading_u:.2g} {rows.unit} by differences of neighbours")
@@ -82,7 +82,7 @@ def _odd_segments(rows: AxisRows) -> list[str]:
             lines[int(segment)] = fit_line(rows, of_segment)
     sentences = []
     for segment, line in lines.items():
-        # If two segments differ, the data do not show which is wrong: both are named.
+        # If two segments differ, the data do not show which one is wrong: both are named.
         others = [other for number, other in lines.items() if number != segment or len(lines) > 2]
         if not others:
             continue
@@ -120,7 +120,7 @@ def _odd_ratio(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
 
 
 def _wild_readings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
-    """Readings far from the others at their stop; if two differ, the one farther from the line."""
+    """Readings far from the others at their stop; if two differ, the reading farther from the line."""
     stops: dict[int, list[Reading]] = defaultdict(list)
     for reading in campaign.readings:
         if reading.status == "ok" and reading.value is not None:
@@ -142,7 +142,7 @@ def _wild_readings(campaign: AxisCampaign, rows: AxisRows) -> list[str]:
         u = [r.u for r in readings]
         sd = float(np.hypot(u[k], np.linalg.norm(np.delete(u, k)) / len(others))) if all(u) else 0.0
         candidates.append((readings[k], float(values[k] - np.median(others)), sd))
-    # Where no u is stated, the scale is their typical difference; a stated u may be too small.
+    # Without a stated u, the scale is their typical difference; a stated u may be too small.
     known = bool(candidates) and all(sd > 0 for _, _, sd in candidates)
     if len(candidates) < STOPS_MIN:
         return []
@@ -163,8 +163,8 @@ class _RobustLine:
     """A robust line with a reversal and an offset of each segment.
 
     Attributes:
-        deviations: of every row from it, unit, shape (rows,).
-        reversal: unit.
+        deviations: deviation of every row from the line, unit, shape (rows,).
+        reversal: the reversal, unit.
     """
 
     deviations: np.ndarray
@@ -174,7 +174,7 @@ class _RobustLine:
 def _robust_line(rows: AxisRows) -> _RobustLine:
     """Medians: the slope of pairs half the rows apart on one side, then each side of each segment.
 
-    All pairs (Theil, Sen) would determine the slope somewhat better, in a time that grows with the square of the rows.
+    All pairs (Theil, Sen) would determine the slope somewhat better, in a time quadratic in the rows.
     """
     slopes = []
     for side in np.unique(rows.side):

@@ -1,7 +1,7 @@
 """The fit of one axis: mode, sampled posterior, equal draws of all reported quantities.
 
-And priors that its readings contradict: the error and the play by position can absorb a wrong ratio or play, so that
-the posterior stays at the prior without a sign of conflict. The check fits a model without that prior.
+It also finds priors that the readings contradict: the error and the play by position can absorb a wrong ratio or play,
+so that the posterior shows no conflict with the prior. The check fits a model without that prior.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ class PriorConflict:
     """A prior that the readings contradict.
 
     Attributes:
-        name: of the parameter.
-        value, sd: by the readings without that prior; for a scale, by its posterior. Folder's unit.
-        prior: stated or default.
+        name: name of the parameter.
+        value, sd: estimate from the readings without that prior; for a scale, its posterior. Folder's unit.
+        prior: the prior, stated or default.
         stated: whether the prior was stated.
-        distance: of the value from the prior's centre, in prior sds; infinite where the prior fixes it.
+        distance: distance of the value from the prior's centre, in prior sds; infinite where the prior fixes it.
     """
 
     name: str
@@ -69,7 +69,7 @@ def prior_conflicts(
         model: the fitted model.
         w: coordinates of equal draws of its posterior, shape (n, d).
         stated: entries of `[axis]`.
-        defaults: complete priors, as if nothing were stated.
+        defaults: complete priors without the stated entries.
     """
     conflicts = [_absorbed_conflict(model, name, defaults[name]) for name in ABSORBED if name in stated]
     values = model.coordinates.values(w)
@@ -78,7 +78,7 @@ def prior_conflicts(
         if key.startswith("wave_"):
             continue
         z = float(w[:, k].mean())
-        # An axis far better than the default does not contradict what was stated.
+        # An axis much better than the default contradicts no statement of the user.
         if key not in ABSORBED and (z if key not in stated else abs(z)) > CONFLICT_LIMIT:
             draws = values[name]
             conflicts.append(
@@ -92,14 +92,14 @@ def conflict_text(conflict: PriorConflict) -> str:
     prior, key = conflict.prior, conflict.name.split(".")[0]
     origin = "of [axis]" if conflict.stated else "by default"
     entry = f"`{key} = {{ value = {prior.value:.10g}, u = {prior.u:.6g} }}` {origin}"
-    # To the second digit of its u.
+    # Digits down to the second digit of its u.
     digits = int(np.clip(2 + np.ceil(np.log10(max(abs(conflict.value), 1e-300) / conflict.sd)), 2, 12))
     quantity = f"{conflict.name} = {conflict.value:.{digits}g} (u = {conflict.sd:.2g})"
     return conflict_sentence(quantity, conflict.distance, entry, REMEDY)
 
 
 def _absorbed_conflict(model: AxisModel, name: str, default: AxisPrior) -> PriorConflict | None:
-    """The conflict of prior and readings beyond both u; None where there is none or it cannot be judged."""
+    """The conflict of prior and readings beyond both u; None where there is none or the test is not possible."""
     prior = model.priors[name]
     if prior.u >= default.u or (name == "backlash" and not model.rows.both_sides):
         return None
@@ -121,7 +121,7 @@ MODE, WEIGHING, WALKING, TELLING = "mode", "weighted draws", "chain", "summarisi
 EQUAL_DRAWS = 2000
 """Number of equally weighted draws kept of a sample."""
 ROUNDS_MAX = 32
-"""Largest number of rounds of weighted draws: an interval with thin tails takes more draws than a chain is worth."""
+"""Largest number of rounds of weighted draws: beyond it a chain costs less than the further draws."""
 PILOTS_MAX = 16
 """Largest number of rounds that adapt the proposal: waves, creep and drifts are nonlinear, the Laplace approximation is
 not."""
@@ -133,10 +133,10 @@ class AxisFit(Shown):
 
     Attributes:
         campaign, rows, model: data and model of the fit.
-        mode: of the sampled parameters.
+        mode: mode of the sampled parameters.
         sample: the sampled posterior; None where nothing was sampled.
-        w: coordinates of equal draws, (draws, d): of the Laplace approximation where no sample converged.
-        seed: of everything random.
+        w: coordinates of equal draws, (draws, d); from the Laplace approximation where no sample converged.
+        seed: seed of all random numbers.
     """
 
     campaign: AxisCampaign
@@ -171,7 +171,7 @@ class AxisFit(Shown):
 
     @property
     def tier(self) -> Tier | None:
-        """Tier of the posterior; None of a Laplace approximation."""
+        """Tier of the posterior; None for a Laplace approximation."""
         return None if self.sample is None or self.answer == "laplace" else self.sample.tier
 
     @property
@@ -184,7 +184,7 @@ class AxisFit(Shown):
 
     @property
     def error(self) -> TvsError | None:
-        """`NotConverged` where there is no mode: then nothing was sampled, or the sample did not converge."""
+        """`NotConverged` where there is no mode or the sample did not converge."""
         if self.estimator == "posterior" or not self.mode.missing:
             return None
         if not self.free:
@@ -229,10 +229,10 @@ class AxisFit(Shown):
 
 
 def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisModel:
-    """The model of a campaign; `more` as in `fit_axis`.
+    """Build the model of a campaign; `more` as in `fit_axis`.
 
     Raises:
-        NothingToEstimate: too few positions or moves, or readings that do not move.
+        NothingToEstimate: too few positions or moves, or readings without motion.
         InputError: too many moves, or angles that wrap.
     """
     rows = rows_of(campaign)
@@ -241,7 +241,7 @@ def model_of(campaign: AxisCampaign, more: np.ndarray | None = None) -> AxisMode
 
 
 def default_priors(rows: AxisRows) -> dict[str, AxisPrior]:
-    """Every prior of an axis, as if nothing were stated."""
+    """All default priors of an axis."""
     u = float(np.sqrt(fit_line(rows).covariance[1, 1]))
     return axis_priors({}, rows.travel, rows.line[1], u)
 
@@ -261,14 +261,14 @@ def fit_axis(
     Args:
         campaign: from `read_axis`.
         tier: "importance" for weighted draws alone, "emcee" for the chain that must agree with them.
-        sampled: sample the posterior; else the Laplace approximation alone.
+        sampled: sample the posterior; else only the Laplace approximation is used.
         max_minutes: time for the chain.
-        seed: of everything random.
+        seed: seed of all random numbers.
         progress: shows the progress.
         more: further commands at which the error will be evaluated, shape (n,).
 
     Raises:
-        NothingToEstimate: too few positions or moves, or readings that do not move.
+        NothingToEstimate: too few positions or moves, or readings without motion.
         InputError: too many moves, or angles that wrap.
     """
     model = model_of(campaign, more)

@@ -15,10 +15,10 @@ from tvsbayes.single_axis.waves import start_coordinate
 STEP, CURVATURE_STEP = 1e-2, 5e-2
 """Steps of differences, in expected widths of the coordinates: a third derivative of 1 changes a gradient by 2e-5."""
 CURVATURE_MIN = 0.3
-"""Least curvature, in units of the prior's: where a scale is not needed the density is convex."""
+"""Least curvature, in units of the prior's: where the data do not require a scale the density is convex."""
 
 BOUND = 5.0
-"""Standard normal coordinates beyond it have a probability of one in two million."""
+"""Limit of coordinates: a standard normal variable exceeds it with probability one in two million."""
 SDS_MAX = 1.0
 """Largest distance, in standard deviations, from the end of a search to the mode by slope and curvature there. A
 successful search ends within 0.01, at a kink of the play (8.1) within 0.7; a failed one beyond 3, 2.8 or more in log
@@ -32,7 +32,7 @@ class AxisMode:
     Attributes:
         w: coordinates, shape (d,).
         covariance: shape (d, d).
-        log_density: there; minus infinity where it is undefined.
+        log_density: log density at the mode; minus infinity where it is undefined.
         missing: sentences on why the approximation may not be used by itself; empty where it may.
     """
 
@@ -76,7 +76,7 @@ def _gradients(model: AxisModel, w: np.ndarray, width: np.ndarray, step: float) 
     d = w.shape[1]
     shift = np.concatenate([np.diag(step * width), np.diag(-step * width)])
     value = model.log_density((w[:, None] + shift).reshape(-1, d)).reshape(len(w), 2, d)
-    # Where the density is undefined, so is its slope.
+    # Where the density is undefined, its slope is undefined too.
     with np.errstate(invalid="ignore"):
         slopes = (value[:, 0] - value[:, 1]) / (2 * step)
     return np.where(np.isfinite(slopes), slopes, 0.0)
@@ -94,8 +94,8 @@ def _missing(log_density: float, distance: float = 0.0) -> tuple[str, ...]:
 def find_mode(model: AxisModel, guess: Mapping[str, float] | None = None) -> AxisMode:
     """The mode by a quasi-Newton search from the least-squares line and the scatter of repeats.
 
-    A failed search restarts with the scatter of rows about the line as that of stops: a single wild reading lies far
-    outside the scatter of repeats, where the density is very steep.
+    A failed search restarts with the scatter of rows about the line as that of stops: a single outlier is far outside
+    the scatter of repeats, where the density is very steep.
 
     Args:
         model: the model.

@@ -1,6 +1,6 @@
-"""The density of an axis' readings: linear quantities integrated out exactly, many draws of the scales at once.
+"""The density of an axis' readings: linear quantities are integrated out exactly, for many draws of the scales at once.
 
-A reading = offset + unit per command x command + contrast + place in the play x (backlash + its variation) / 2
+A reading = offset + unit per command x command + contrast + position in the play x (backlash + its variation) / 2
 + error by position + waves + creep + thermal shift + drift + stop error + noise (formulation 8.1). A Kalman filter of
 two states (drift, held stop error) over the rows whitens the columns of all other terms; its cost is linear in the
 rows. For a drive at constant rate time and position are equivalent: no error by position, and seeing in place of stop
@@ -25,13 +25,13 @@ from tvsbayes.statistics.gaussian_process import JITTER, matern52
 OFFSET_TRAVELS = 1.0
 """sd of the offset's prior about the least-squares line, in travels: nearly flat."""
 FLOOR = 1e-7
-"""Least scatter of a row as a share of the travel: a reading that repeats exactly was rounded."""
+"""Least scatter of a row as a share of the travel: readings that repeat exactly were rounded."""
 FARTHEST = 12.0
-"""Coordinates beyond it have density 0: a standard normal number exceeds it once in 1e32."""
+"""Coordinates beyond it have density 0: a standard normal variable exceeds it once in 1e32."""
 BLOCK_NUMBERS_MAX = 8_000_000
 """Largest number of values in a block of draws."""
 OFFSET, SLOPE, CONTRAST, BACKLASH = 0, 1, 2, 3
-"""First columns."""
+"""Indices of the first columns."""
 HEAD = 4
 
 
@@ -57,7 +57,7 @@ class LinearPosterior:
         return self.mean @ functionals.T, np.sqrt(np.maximum(variance, 0.0))
 
     def drawn(self, functionals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """One draw of functionals (t, columns) or (n, t, columns) for each of the n, shape (n, t)."""
+        """Draw functionals (t, columns) or (n, t, columns) once for each of the n, shape (n, t)."""
         covariance = functionals @ self.covariance @ np.swapaxes(functionals, -1, -2)
         values, vectors = np.linalg.eigh(covariance)
         normal = rng.standard_normal(values.shape) * np.sqrt(np.maximum(values, 0.0))
@@ -79,7 +79,7 @@ class Likelihood:
 
     @classmethod
     def undefined(cls, count: int, size: int) -> Likelihood:
-        """At coordinates where the density is undefined."""
+        """The likelihood at coordinates where the density is undefined."""
         return cls(np.full(count, -np.inf), LinearPosterior(np.zeros((count, size)), np.zeros((count, size, size))))
 
     @classmethod
@@ -95,9 +95,9 @@ class _Block:
     """Products of a block of draws.
 
     Attributes:
-        products: of whitened columns, shape (n, 1 + columns, 1 + columns).
+        products: products of whitened columns, shape (n, 1 + columns, 1 + columns).
         log_scatter: log-determinant of the innovations, shape (n,).
-        factor: of the prior covariance, shape (n, columns, columns).
+        factor: factor of the prior covariance, shape (n, columns, columns).
     """
 
     products: np.ndarray
@@ -111,10 +111,10 @@ class AxisModel:
 
     Attributes:
         rows: averaged readings.
-        priors: of every key of `[axis]`.
-        coordinates: of the sampled parameters, with those of the waves.
-        places: of the processes.
-        unknown_segments: numbers of segments with rows of unknown place in the play.
+        priors: prior of every key of `[axis]`.
+        coordinates: coordinates of the sampled parameters, with those of the waves.
+        places: places of the processes.
+        unknown_segments: numbers of segments with rows whose position in the play is unknown.
     """
 
     rows: AxisRows
@@ -144,7 +144,7 @@ class AxisModel:
             unused.add("creep_minutes")
         unused |= {"stop_sd.forward", "stop_sd.backward"} if rows.in_motion else {"seeing_scale", "seeing_s"}
         if rows.in_motion:
-            # Averaged readings hardly separate white noise from seeing: noise is as stated, the excess is seeing.
+            # Averaged readings hardly separate white noise from seeing: noise is as stated, excess counts as seeing.
             unused |= {"transmission_error", "transmission_error_length", "play_variation", "reading_scale"}
         if not np.any(rows.variance > 0):
             unused.add("reading_scale")
@@ -165,14 +165,14 @@ class AxisModel:
         unknown_segments = tuple(k for k in unknown_segments if np.any(spread[rows.segment == k] > 0))
         if legs_are_long(rows):
             unused.add("backlash")
-        # In motion at constant rate an error by position is a function of time: part of the drift.
+        # At constant rate an error by position is a function of time and therefore part of the drift.
         command = rows.command[:0] if rows.in_motion else rows.command
         places = process_places(command, np.zeros(0) if more is None else more)
         return cls(rows, dict(priors), AxisCoordinates.of(priors, frozenset(unused), waves), places, unknown_segments)
 
     @cached_property
     def homed(self) -> np.ndarray:
-        """Segments with readings after the first: each has its own zero."""
+        """Segments with readings, without the first; each has its own zero."""
         return np.unique(self.rows.segment)[1:]
 
     @property
@@ -218,7 +218,7 @@ class AxisModel:
         return play_places(self.rows, np.array([max(abs(reversal), min(error, self.rows.travel))])).spread
 
     def clock(self, wave: Wave, command: np.ndarray, time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
-        """Position, time or reading that a wave is periodic in, for commands, times and readings, each (t,)."""
+        """Position, time or reading in which a wave is periodic, for commands, times and readings, each (t,)."""
         clocks = {"position": abs(self.rows.line[1]) * command, "seconds": time_s, "encoder": value}
         return clocks[wave.clock]
 
@@ -248,7 +248,7 @@ class AxisModel:
         return columns
 
     def _columns(self, w: np.ndarray, values: Mapping[str, np.ndarray], extra: np.ndarray | None) -> np.ndarray:
-        """Readings less the prior means, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
+        """Readings minus the prior means, then all columns: shape (n or 1, rows, 1 + columns + extra)."""
         rows, backlash = self.rows, values["backlash"]
         shifts, waves = self._shift_columns(values), list(self._wave_columns(w))
         play = play_places(rows, backlash if self.play_is_sampled else np.zeros(1))
@@ -284,7 +284,7 @@ class AxisModel:
         return filled
 
     def _scatter(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Variances of stop errors (in motion of the seeing) and of readings, each (n, rows)."""
+        """Variances of stop errors (in motion: of seeing) and of readings, each (n, rows)."""
         rows = self.rows
         if rows.in_motion:
             seeing = (values["seeing_scale"] * rows.reading_u) ** 2
@@ -311,7 +311,7 @@ class AxisModel:
         return np.where(rows.redrawn, 0.0, np.minimum(carry, 1.0))
 
     def _between_nodes(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Variance (n,) of both processes midway between nodes that cubic interpolation does not represent."""
+        """Variance (n,) of both processes midway between nodes, as lost by cubic interpolation."""
         spacing = abs(self.rows.line[1]) * (self.places.command[1] - self.places.command[0])
         length = values["transmission_error_length"]
         weight = np.array([1.0, -0.0625, 0.5625, 0.5625, -0.0625])
@@ -328,10 +328,10 @@ class AxisModel:
         return np.flatnonzero(np.concatenate((np.ones(self.processes, bool), weighted, weighted)))
 
     def _factor(self, values: Mapping[str, np.ndarray], scales: Sequence[np.ndarray], reorder: bool) -> np.ndarray:
-        """Factor of the prior covariance of the columns, shape (n, columns, columns); `scales` (n,) are of the waves.
+        """Factor of the prior covariance of the columns, shape (n, columns, columns); `scales` (n,) are the waves'.
 
-        Cholesky's, places in order; with `reorder` places with influence on rows come before the others and do not
-        depend on the coordinates of these.
+        It is a Cholesky factor with places in order. With `reorder`, places with influence on rows precede the others
+        and do not depend on the coordinates of these.
         """
         count, n = len(self.places.command), len(values["backlash"])
         factor = np.zeros((n, self.columns, self.columns))
@@ -343,7 +343,7 @@ class AxisModel:
         homes = HEAD + np.arange(len(self.homed))
         factor[:, homes, homes] = values["home_sd"][:, None]
         unknown = HEAD + len(self.homed) + np.arange(len(self.unknown_segments))
-        # Uniform from -1 to 1.
+        # The sd of a uniform distribution from -1 to 1.
         factor[:, unknown, unknown] = np.sqrt(1 / 3)
         for k, name in enumerate(self.shifts, start=HEAD + len(self.homed) + len(self.unknown_segments)):
             factor[:, k, k] = self.priors[name].u
@@ -368,7 +368,7 @@ class AxisModel:
     def _blocks(
         self, w: np.ndarray, extra: np.ndarray | None = None, *, informed: bool = False
     ) -> Iterator[tuple[slice, _Block]]:
-        """The draws w (n, d) in blocks that fit into memory; `informed`: products only of columns of `informed`."""
+        """The draws w (n, d) in blocks that fit into memory; `informed`: products only of the columns in `informed`."""
         width = 1 + self.columns + (0 if extra is None else extra.shape[1])
         size = max(1, BLOCK_NUMBERS_MAX // (width * max(len(self.rows.move), width)))
         for start in range(0, len(w), size):
@@ -390,7 +390,7 @@ class AxisModel:
         return self._whitened(values, self._columns(w, values, None))[0][0], self._factor(values, scales, False)[0]
 
     def whitened_extra(self, w: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Further columns (rows, c), whitened as those of one draw w (1, d)."""
+        """Further columns (rows, c), whitened as the model's columns at one draw w (1, d)."""
         return self._whitened(self.coordinates.values(w), columns[None])[0][0]
 
     def _whitened(self, values: Mapping[str, np.ndarray], columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -402,7 +402,7 @@ class AxisModel:
         return self.likelihood(w, np.zeros((0, self.columns))).log_density
 
     def likelihood(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
-        """At coordinates (n, d), with the posterior of functionals (t, columns) of the linear quantities."""
+        """Likelihood at coordinates (n, d), with the posterior of functionals (t, columns) of the linear quantities."""
         rows, count = len(self.rows.move), len(functionals)
         log_density, mean, covariance = np.empty(len(w)), np.empty((len(w), count)), np.empty((len(w), count, count))
         for part, block in self._blocks(w):
@@ -435,7 +435,7 @@ class AxisModel:
         return self.posterior(w, np.zeros((0, self.columns))).log_density
 
     def posterior(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
-        """`likelihood` with the prior of the coordinates; zero density where it is undefined."""
+        """`likelihood` with the prior of the coordinates; -inf where the density is undefined."""
         count = len(functionals)
         likelihood = Likelihood.undefined(len(w), count)
         usable = np.flatnonzero(np.all(np.abs(w) < FARTHEST, axis=1))
@@ -453,7 +453,7 @@ class AxisModel:
         return likelihood
 
     def _possible(self, w: np.ndarray, functionals: np.ndarray) -> Likelihood:
-        """`likelihood`, -inf where a factorisation fails by rounding."""
+        """`likelihood`, -inf where rounding makes a factorisation fail."""
         try:
             return self.likelihood(w, functionals)
         except np.linalg.LinAlgError:
@@ -476,7 +476,7 @@ class AxisModel:
             means[part] = np.einsum("nij,njk,nk->ni", loading, inverse, right_side, optimize=True)
             covariances[part] = loading @ inverse @ np.swapaxes(loading, 1, 2)
             for group in (others[: len(others) // 2], others[len(others) // 2 :]):
-                # Of the error by position, then of the play: independent in the prior.
+                # Columns of the error by position, then of the play, which are independent in the prior.
                 factor = block.factor[:, group[:, None], group]
                 covariances[part, group[:, None], group] += factor @ np.swapaxes(factor, 1, 2)
         return LinearPosterior(means + self._prior_means(w), covariances)
@@ -485,7 +485,7 @@ class AxisModel:
         """Prediction of some rows by all others, given the scales.
 
         Each left-out row gets an additional unknown with a flat prior, so that it has no influence; the unknown is the
-        reading less its prediction.
+        reading minus its prediction.
 
         Args:
             w: coordinates (n, d).
@@ -527,10 +527,10 @@ class AxisModel:
     def functional(self, command: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Error that repeats by position at commands (t,): the process and the waves of the gear.
 
-        Functionals (t, columns); where a period is not known, one for each draw w (n, d): (n, t, columns).
+        Functionals (t, columns); with an unknown period one for each draw w (n, d): (n, t, columns).
 
         Raises:
-            ValueError: a period is not known, and no draws are given.
+            ValueError: a period is unknown, and no draws are given.
         """
         functionals = np.zeros((len(command), self.columns))
         functionals[:, self.processes : self.processes + len(self.places.command)] = self.places.weights(command)
@@ -578,7 +578,7 @@ def _equilibrated(information: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def rows_log_density(rows: AxisRows, reading_scale: np.ndarray) -> np.ndarray:
-    """Log density (n,) of the scatter of readings about the means of their rows; of constants only those of u."""
+    """Log density (n,) of the scatter of readings about the means of their rows; constants include only those of u."""
     known = rows.variance > 0
     freedom = float(np.sum(rows.count[known] - 1))
     return -freedom * np.log(reading_scale) - 0.5 * float(rows.within[known].sum()) / reading_scale**2

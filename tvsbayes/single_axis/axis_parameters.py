@@ -1,6 +1,6 @@
 """The parameters of one axis: names, priors, defaults that scale with its travel, coordinates.
 
-A coordinate w has a standard normal prior; a parameter is a monotone function of it. Linear quantities (offset, unit
+A coordinate w has a standard normal prior; a parameter is a monotonic function of it. Linear quantities (offset, unit
 per command, its contrast, the processes) have no coordinate here: they are integrated out exactly.
 Formulation 8.
 """
@@ -21,7 +21,7 @@ Kind = Literal["normal", "half-normal", "log-normal"]
 
 @dataclass(frozen=True)
 class AxisPrior:
-    """Value and standard uncertainty; of a log-normal the median and the sd of the log, of a half-normal 0 and u."""
+    """Value and standard uncertainty; for a log-normal the median and the sd of the log, for a half-normal 0 and u."""
 
     value: float
     u: float
@@ -29,13 +29,13 @@ class AxisPrior:
 
 @dataclass(frozen=True, kw_only=True)
 class AxisKey(Quantity):
-    """A key of `[axis]`; in its unit, {unit} is that of the folder.
+    """A key of `[axis]`; in its unit, {unit} stands for that of the folder.
 
     Attributes:
-        kind: of its prior.
-        share: of the travel, of the default's value (log-normal) or u; None where it does not scale.
+        kind: kind of its prior.
+        share: default value (log-normal) or u, as a share of the travel; None where it does not scale.
         u: sd of the log of a log-normal default.
-        median: of a log-normal default that does not scale.
+        median: median of a log-normal default that does not scale.
     """
 
     kind: Kind
@@ -74,19 +74,19 @@ AXIS_QUANTITIES: Quantities[Quantity] = Quantities(
 )
 """Reported quantities of an axis. `axis_density.FUNCTIONALS` has the functionals of the linear ones."""
 AXIS_KEYS = {name: key for name, key in AXIS_QUANTITIES.items() if isinstance(key, AxisKey)}
-"""Shares of the travel: half-normals and stop scatter by eleven stepper axes that others measured, where left-out
+"""Shares of the travel: half-normals and stop scatter come from eleven stepper axes measured by others, where left-out
 positions, with the scales integrated out, lie within 1.96 u in 95 % of cases. Backlash: cheap gears lose up to some per
-cent; any reversal measures it well, so a wide prior is harmless. Seeing: errors of readings in motion that last for
-seconds, of air, of a guider's loop, of the reader; its sd in units of a reading's u."""
+cent; any reversal determines it well, so a wide prior is harmless. Seeing: errors of readings in motion that last for
+seconds, caused by air, a guider's loop or the reader; its sd is in units of a reading's u."""
 CONTRAST_SHARE = 1e-4
-"""sd of the difference of both directions' ratios over the ratio: gears and screws have one ratio. A larger sd would
-explain a warming frame on a long path by two ratios."""
+"""sd of the difference of both directions' ratios over the ratio: gears and screws have one ratio. With a larger sd,
+two ratios would explain the warming of a machine on a long path."""
 SAMPLED = (
     *("backlash", "transmission_error", "transmission_error_length", "play_variation", "drift_per_root_hour"),
     *("stop_sd.forward", "stop_sd.backward", "home_sd", "reading_scale"),
     *("creep_minutes", "seeing_scale", "seeing_s"),
 )
-"""Everything that is not linear in the readings; `stop_sd` of `[axis]` is the prior of both."""
+"""Parameters in which the readings are not linear; `stop_sd` of `[axis]` is the prior of both directions."""
 
 
 def kind_of(name: str) -> Kind:
@@ -102,7 +102,7 @@ def axis_priors(
     Args:
         stated: entries of `[axis]`.
         travel: range of the readings' quantity, > 0: range of commands times |unit per command|.
-        per_command: of the least-squares line: centre and u of the default prior.
+        per_command: slope of the least-squares line, for centre and u of the default prior.
         u_per_command: its standard error, which widens that prior.
     """
     priors = {}
@@ -135,9 +135,9 @@ class AxisCoordinates:
     """Coordinates with standard normal priors of the sampled parameters, and the values of the fixed ones.
 
     Attributes:
-        names: free parameters, in the order of the coordinates; those of the waves last.
-        priors: of every name in `SAMPLED`.
-        waves: their scales and periods are sampled too, as `wave_scale.1`, `wave_period.1`, ...
+        names: free parameters, in the order of the coordinates; those of the waves come last.
+        priors: prior of every name in `SAMPLED`.
+        waves: waves whose scales and periods are also sampled, as `wave_scale.1`, `wave_period.1`, ...
     """
 
     names: tuple[str, ...]

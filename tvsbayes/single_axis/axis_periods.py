@@ -1,6 +1,6 @@
-"""Results for an axis' waves: period, amplitude, phase, the probability that there is one, and its curve.
+"""Results for an axis' waves: period, amplitude, phase, the probability of existence, and the curve.
 
-Numbers are conditional on the existence of the wave; `probability` is that of its existence. Amplitude and phase are
+Numbers are conditional on the existence of the wave; `probability` is that of existence. Amplitude and phase are
 those of the first harmonic.
 """
 
@@ -19,22 +19,22 @@ from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
 WITH_WAVE_MIN, WITH_WAVE = 200, 1000
-"""Least number of draws with a wave for its results; where the posterior has fewer, number of weighted draws."""
+"""Least number of draws with a wave for its results; number of weighted draws where the posterior has fewer."""
 SAME_SHARE = 0.02
 """Draws of a period farther apart than this share of it belong to different explanations."""
 
 
 @dataclass(frozen=True)
 class WaveSample:
-    """Draws of one wave, given that there is one.
+    """Draws of one wave, given that it exists.
 
     Attributes:
         wave: the wave of the model.
         period: on the model's clock, shape (n,).
         true_period: with the ratio's uncertainty, shape (n,).
-        coefficients: of the wave's columns, shape (n, `COLUMNS`).
-        probability: that there is one.
-        record: of the readings on the clock of the wave; the phase is known best at its middle.
+        coefficients: coefficients of the wave's columns, shape (n, `COLUMNS`).
+        probability: probability that the wave exists.
+        record: range of the readings on the clock of the wave; the phase is known best at its middle.
     """
 
     wave: Wave
@@ -65,20 +65,20 @@ class WaveSample:
         return (self.period >= low) & (self.period <= high)
 
     def curve(self, turn: np.ndarray) -> np.ndarray:
-        """The wave over one mean period from the middle of the record on, at shares `turn` (t,) of it: shape (n, t)."""
+        """The wave over one mean period from the middle of the record, at shares `turn` (t,) of it: shape (n, t)."""
         x = self.record.middle + turn * float(np.mean(self.period))
         return np.einsum("ntc,nc->nt", wave_columns(x, self.period, self.record), self.coefficients)
 
 
 def _with_wave(fit: AxisFit, k: int, rng: np.random.Generator) -> tuple[np.ndarray, LinearPosterior]:
-    """Draws (m, d) of the posterior given that wave k exists, and the linear quantities at them."""
+    """Draws (m, d) of the posterior given that wave k exists, with the linear quantities."""
     model, w = fit.model, fit.w
     present = model.coordinates.wave_draws(w)[k].scale > 0
     if present.sum() >= WITH_WAVE_MIN:
         return w[present], LinearPosterior(fit.linear.mean[present], fit.linear.covariance[present])
     from scipy.special import ndtri
 
-    # The wave is added to draws without it: all other coordinates keep their posterior without it.
+    # The wave is added to draws without it; all other coordinates keep their values.
     names = model.coordinates.names
     draws = w[rng.choice(len(w), WITH_WAVE, replace=len(w) < WITH_WAVE)].copy()
     without = draws.copy()
@@ -101,7 +101,7 @@ def _with_wave(fit: AxisFit, k: int, rng: np.random.Generator) -> tuple[np.ndarr
 def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
     """Every wave of a fit, given that it exists.
 
-    In order: stated ones, the strongest of every stated range, further ones by strength, the encoder's.
+    Order: stated waves, the strongest of every stated range, further waves by strength, the encoder's.
     """
     model, rng = fit.model, random_stream(fit.seed, AxisStream.PERIODS)
     samples = []
@@ -114,7 +114,7 @@ def wave_samples(fit: AxisFit) -> tuple[WaveSample, ...]:
         draws = linear.drawn(functionals, rng)
         coefficients, ratio = draws[:, :COLUMNS], draws[:, COLUMNS] / fit.rows.line[1]
         period = np.broadcast_to(model.coordinates.wave_draws(w)[k].period, len(w)).copy()
-        # Positions of the model are by the line; the true ratio makes them longer or shorter.
+        # Positions in the model follow the line's ratio; the true ratio scales them.
         true_period = period * ratio if wave.clock == "position" else period
         samples.append(WaveSample(wave, period, true_period, coefficients, probability, model.record(wave)))
     stated_samples = [sample for sample in samples if sample.wave.known is not None]
@@ -155,7 +155,7 @@ class PeriodGroup:
 
 
 def separate_periods(period: np.ndarray) -> list[PeriodGroup]:
-    """Separate groups of draws (n,) of a period, the most probable first; the rarest are omitted."""
+    """Separate groups of draws (n,) of a period, the most probable first; rare groups are omitted."""
     ordered = np.sort(period)
     cut = np.flatnonzero(np.diff(ordered) > SAME_SHARE * ordered[1:]) + 1
     groups = [group for group in np.split(ordered, cut) if len(group) >= SAME_SHARE * len(period)]
@@ -179,7 +179,7 @@ def weak_waves(fit: AxisFit, samples: tuple[WaveSample, ...]) -> list[str]:
 
 
 def strong_harmonics(samples: tuple[WaveSample, ...], unit: str) -> list[str]:
-    """Waves whose second harmonic is stronger than the first: the leading wave has half of the period."""
+    """Waves whose second harmonic is stronger than the first: the dominant wave has half the period."""
     sentences = []
     for sample in samples:
         likeliest = sample.likeliest

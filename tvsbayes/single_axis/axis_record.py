@@ -46,7 +46,7 @@ AXIS_FIT_FORMAT = "tvsbayes-axis-fit/1"
 type PeriodClock = Literal["unit", "seconds"]
 type BothSides[T] = Annotated[dict[str, T], Meta(extra_json_schema={"required": ("forward", "backward")})]
 POSITIONS_FEW = 5
-"""With fewer positions a process of position is mostly its prior."""
+"""With fewer positions the posterior of a process of position is mostly its prior."""
 REVERSED = 0.975
 """Least probability of a negative backlash for a warning."""
 POSITIONS_LISTED = 400
@@ -70,26 +70,26 @@ class AxisSummary(Shown, Record, frozen=True):
     """A fit in the terms of `fit.json`.
 
     Attributes:
-        unit: of everything but commands, hours and shares.
+        unit: unit of all values but commands, hours and shares.
         estimator: "laplace" or "posterior".
-        tier: method of the posterior's draws, weighted draws or a chain; None of a Laplace approximation.
-        converged: there is a mode, and an answer of the sampler, accepted or rough, where it ran.
+        tier: method of the posterior's draws, weighted draws or a chain; None for a Laplace approximation.
+        converged: whether there is a mode, and an accepted or rough answer of the sampler, where it ran.
         problems: why the answer is not accepted.
         per_command: ratio by direction, "forward" and "backward"; valid beyond the range read.
         effective_per_command: slope of the least-squares line through the positions read, by direction.
-        range_command: least and largest command read; `effective_per_command` belongs to it.
-        parameters: by name.
+        range_command: least and largest command read; `effective_per_command` refers to this range.
+        parameters: estimates by name.
         periods: waves of the gear, stated ones first.
-        encoder_periods: of the encoder.
-        periods_in: unit of the gear's: "unit", that of the readings, or "seconds".
-        deviations: from that line, by position read.
+        encoder_periods: waves of the encoder.
+        periods_in: unit of the gear's periods: "unit", that of the readings, or "seconds".
+        deviations: deviations from that line, by position read.
         classic: the classic estimate.
         moves, readings, positions: numbers used.
-        weak_directions, warnings: sentences.
+        weak_directions, warnings: as sentences.
         sampling: diagnosis of the draws.
         prior_conflicts: priors that the readings contradict, in words.
-        answer: kind of the intervals: of an accepted sample, of a rough one, of the Laplace approximation.
-        monte_carlo_error: of every headline, in its sd.
+        answer: source of the intervals: an accepted sample, a rough one, or the Laplace approximation.
+        monte_carlo_error: errors of every headline, in its sd.
     """
 
     unit: str
@@ -118,11 +118,11 @@ class AxisSummary(Shown, Record, frozen=True):
 
     @property
     def explained(self) -> bool:
-        """Whether there is a mode: sampling needs one."""
+        """Whether there is a mode, which sampling needs."""
         return self.converged or bool(self.sampling)
 
     def shown(self) -> View:
-        """Ratios by direction, then every parameter."""
+        """Show ratios by direction, then every parameter."""
         estimates = {f"per_command.{side}": e for side, e in self.per_command.items()}
         estimates |= {f"effective_per_command.{side}": e for side, e in self.effective_per_command.items()}
         estimates |= {name: e for name, e in self.parameters.items() if name != "per_command"}
@@ -158,7 +158,7 @@ def _estimate(
 
 
 def _diagnoses(fit: AxisFit) -> dict[str, tuple[float | None, float | None, float | None]]:
-    """R-hat, bulk and tail effective draws by quantity; "" has the worst of all, for other quantities."""
+    """R-hat, bulk and tail effective draws by quantity; "" has the worst values, used for other quantities."""
     if fit.sample is None or fit.answer == "laplace":
         return {"": (None, None, None)}
     state = fit.sample.convergence
@@ -233,9 +233,9 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
 
 
 def _prior_backlash(fit: AxisFit) -> dict[str, Estimate]:
-    """The backlash by its prior, where every stop was reached from one side.
+    """The backlash from its prior, where every stop was reached from one side.
 
-    Draws of it then depend on the treatment of a start of unknown side, which is no knowledge of the play.
+    Its draws would depend on how a start of unknown side is treated, which contains no information on the play.
     """
     prior = fit.model.priors["backlash"]
     if fit.rows.both_sides or not prior.u:
@@ -245,9 +245,9 @@ def _prior_backlash(fit: AxisFit) -> dict[str, Estimate]:
 
 
 def deviation_functionals(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
-    """Error that repeats by position at commands (t,), less its least-squares line over the rows.
+    """Error that repeats by position at commands (t,), minus its least-squares line over the rows.
 
-    Shape (t, columns); (n, t, columns) for `fit.w` where a period is not known.
+    Shape (t, columns); (n, t, columns) for `fit.w` where a period is unknown.
     """
     model = fit.model
     level = model.functional(fit.rows.command, fit.w).mean(axis=-2)
@@ -259,11 +259,11 @@ def deviation_functionals(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
 CURVE_DRAWS = 400
 """Number of draws of the error by position in a figure, and where functionals differ by draw."""
 STRATA = 16
-"""Quantiles of the normal distribution of one draw in a figure: its band is as smooth as that of thousands of draws."""
+"""Number of normal quantiles of each draw in a figure: the band is as smooth as that of thousands of draws."""
 
 
 def drawn_deviations(fit: AxisFit, commands: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draws of the error that repeats by position at commands (t,), less its line: (draws, t)."""
+    """Draws of the error that repeats by position at commands (t,), minus its line: (draws, t)."""
     if not fit.model.repeats_by_draw:
         return fit.linear.drawn(deviation_functionals(fit, commands), rng)
     parts = _curve_parts(fit)
@@ -330,7 +330,7 @@ def _reversed(fit: AxisFit) -> list[str]:
 
 
 def _weak(fit: AxisFit) -> list[str]:
-    """Quantities that the data do not determine, in words, with remedies."""
+    """Describe quantities that the data do not determine, with remedies."""
     rows, sentences = fit.rows, _weak_in_time(fit)
     if rows.in_motion:
         return [
@@ -356,11 +356,11 @@ def _weak(fit: AxisFit) -> list[str]:
 CREEP_SHARE = 0.5
 """Least correlation with the creep at which the contrast of the directions, or the play, counts as weak."""
 ORDER_SHARE = 0.9
-"""Least correlation of commands and travel at which the places count as read one after the other."""
+"""Least correlation of commands and travel at which the positions count as read one after the other."""
 
 
 def _weak_in_time(fit: AxisFit) -> list[str]:
-    """Quantities that are hardly separable from a shift of the zero in time."""
+    """Describe quantities that are hardly separable from a shift of the zero in time."""
     rows, sentences = fit.rows, []
     several = rows.both_sides and len(rows.positions) > 2
     in_turn = several and abs(np.corrcoef(rows.command, rows.path)[0, 1]) > ORDER_SHARE
@@ -397,7 +397,7 @@ def uninformed(summary: AxisSummary) -> TvsError | None:
 
 
 def keep_fit(fit: AxisFit, summary: AxisSummary, folder: Path) -> dict[str, str]:
-    """Write `fit.json` and `draws.npz`; their paths by kind.
+    """Write `fit.json` and `draws.npz`; return their paths by kind.
 
     Raises:
         InputError: the folder cannot be written.
@@ -417,7 +417,7 @@ class AxisResults(Shown):
     fit: AxisFit
 
     def shown(self) -> View:
-        """Its summary."""
+        """Show the summary."""
         return self.summary.shown()
 
 
@@ -425,12 +425,12 @@ def _stored_w(folder: Path, names: int, remedy: str) -> np.ndarray:
     """Coordinates (draws, names) in the `results/` of a folder; `remedy` is the remedy where they are damaged.
 
     Raises:
-        InputError: no file, or one that is damaged.
+        InputError: the file is missing or damaged.
     """
     place = "results/draws.npz"
     try:
         w = read_arrays(folder / place, RESULTS_BYTES_MAX)["w"]
-        # One draw alone has no covariance.
+        # A single draw has no covariance.
         if w.dtype.kind != "f" or w.ndim != 2 or w.shape[1] != names or len(w) < 2 or not np.all(np.isfinite(w)):
             raise ValueError(f"w of shape {w.shape}")
     except (KeyError, ValueError) as error:
@@ -450,13 +450,13 @@ def results_for(
     seed: int = 0,
     notify: Callable[[str], None] = lambda _: None,
 ) -> AxisResults:
-    """The results in `results/` if they are of these data and converged; else of a fit by weighted draws.
+    """The results in `results/` if they belong to these data and converged; else those of a fit by weighted draws.
 
     Args:
         campaign: from `read_axis`.
         more: further commands at which the error will be evaluated, shape (n,).
         progress: shows the progress of the fit.
-        seed: of that fit.
+        seed: seed of that fit.
         notify: reports that a fit runs first.
 
     Raises:

@@ -1,6 +1,6 @@
-"""An axis campaign as arrays: stops with readings, their sides of approach, the state of the play.
+"""An axis campaign as arrays: stops with readings, sides of approach, state of the play.
 
-A row is a move with its readings averaged; for a drive at constant rate, the readings of a short time
+A row is a move with its readings averaged; for a drive at constant rate, it is the mean over a short time
 (`rows_in_motion`). Positions are commands; `unit` is that of the readings. Formulation 8.1.
 """
 
@@ -21,11 +21,11 @@ SIDES = {"forward": 1, "backward": -1, "unknown": 0}
 DIRECTIONS = {1: "forward", -1: "backward", 0: "unknown"}
 HOUR_S = 3600.0
 ROWS_MAX = 2000
-"""Largest number of moves with readings: a fit of so many takes minutes."""
+"""Largest number of moves with readings: a fit with this number takes minutes."""
 LONG_LEGS, LONG_ERRORS = 2.0, 10.0
-"""No stop lies inside the play where the shortest leg exceeds so many reversals and standard errors of the reversal."""
+"""No stop lies inside the play where the shortest leg exceeds these numbers of reversals plus standard errors."""
 WRAP_SHARE = 0.7
-"""Share of a turn: a step of the readings with a larger deviation has jumped by whole turns."""
+"""Share of a turn: a step of the readings that deviates more counts as a jump by whole turns."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Legs:
     """Every move of the campaign, read or not; arrays (moves,).
 
     Attributes:
-        command: after the move.
+        command: command after the move.
         step: change of the command; 0 in the first row of a segment.
         first: whether a segment begins.
-        side: 1 arrived forward, -1 backward, 0 unknown; a move without motion has that of the previous one.
-        segment: number.
+        side: 1 arrived forward, -1 backward, 0 unknown; a move without motion keeps that of the previous one.
+        segment: number of the segment.
     """
 
     command: np.ndarray
@@ -52,24 +52,24 @@ class AxisRows:
     """Moves with readings; arrays (rows,).
 
     Attributes:
-        unit: of readings.
+        unit: unit of the readings.
         legs: all moves.
         move: number of the move.
         command, side, segment: as in `Legs`.
-        hours: since the previous row in the segment; since the segment's first move in its first row.
+        hours: time since the previous row in the segment, or since the segment's first move in its first row.
         path: commands travelled since the segment began.
         redrawn: whether the stop's error is new since the previous row.
         value: mean of the readings, unit.
-        variance: of that mean by the stated u, unit^2; 0 where no u is known.
+        variance: variance of that mean by the stated u, unit^2; 0 where no u is known.
         within: sum of squares of the readings about their mean, in units of their u.
         count: readings in the mean.
         line: offset and unit per command of the least-squares line with a reversal.
-        time_s: clock of moves.csv.
-        warm_s: since it was switched on; since the first move where that is unknown.
-        kelvin: temperature less that of the first move; None where none was recorded.
-        width_s: over which the readings of a row in motion were averaged; 0 at a stop.
-        rate: commands per second of a drive at constant rate; None of stops.
-        reading_u: of a typical reading, unit; 0 where no u is known.
+        time_s: time on the clock of moves.csv.
+        warm_s: time since the machine was switched on, or since the first move where that is unknown.
+        kelvin: temperature minus that of the first move; None where none was recorded.
+        width_s: time over which the readings of a row in motion were averaged; 0 at a stop.
+        rate: commands per second of a drive at constant rate; None for stops.
+        reading_u: u of a typical reading, unit; 0 where no u is known.
     """
 
     unit: str
@@ -95,7 +95,7 @@ class AxisRows:
 
     @property
     def in_motion(self) -> bool:
-        """Whether the readings are those of a drive at constant rate."""
+        """Whether the readings were taken on a drive at constant rate."""
         return self.rate is not None
 
     @property
@@ -110,7 +110,7 @@ class AxisRows:
 
     @property
     def both_sides(self) -> bool:
-        """Whether stops were reached forward and backward; stops of unknown side do not count."""
+        """Whether stops were reached forward and backward; stops of unknown side are ignored."""
         return {-1, 1} <= set(self.side.tolist())
 
     def without(self, left_out: np.ndarray) -> AxisRows:
@@ -148,7 +148,7 @@ def legs_of(moves: Sequence[AxisMove]) -> Legs:
 def _means(used: Sequence[Reading]) -> dict[int, tuple[float, float, float, int]]:
     """Mean, variance, scatter within and number of the readings of every move.
 
-    Where no u is stated, it comes from repeated readings of one move; without these it is unknown, 0.
+    Without a stated u, it comes from repeated readings of one move; without these it is unknown, 0.
     """
     by_move: dict[int, list[Reading]] = defaultdict(list)
     for reading in used:
@@ -175,9 +175,9 @@ def turn_jumps(command: np.ndarray, value: np.ndarray, turn: float) -> dict[int,
     """Jumps of the readings by row, turns; empty where there are none.
 
     Args:
-        command: of the readings in order of time, shape (rows,).
+        command: commands of the readings in time order, shape (rows,).
         value: readings, shape (rows,).
-        turn: in their unit.
+        turn: one turn in the unit of the readings.
     """
     step = np.diff(command)
     moving = step != 0
@@ -187,7 +187,7 @@ def turn_jumps(command: np.ndarray, value: np.ndarray, turn: float) -> dict[int,
     slope = float(np.median(rise[moving] / step[moving]))
     deviation = rise - slope * step
     jumps = np.flatnonzero(np.abs(deviation) > WRAP_SHARE * turn)
-    # With a slope wrong by a turn per step, every step jumps, or none; only rare jumps are wraps.
+    # With a slope wrong by a turn per step, all steps or none jump; only rare jumps are wraps.
     return {int(k) + 1: float(deviation[k] / turn) for k in jumps} if 2 * len(jumps) < len(step) else {}
 
 
@@ -214,7 +214,7 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
     """The rows of a campaign.
 
     Raises:
-        NothingToEstimate: fewer than two positions were read, fewer than three moves, or the readings do not move.
+        NothingToEstimate: fewer than two positions were read, fewer than three moves, or the readings do not change.
         InputError: too many moves, or angles that wrap.
     """
     if campaign.rate is not None:
@@ -279,14 +279,14 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
 ROWS_IN_MOTION, PER_PERIOD, READINGS_IN_MOTION = 2000, 5.0, 100_000
 """Largest number of rows of a drive, rows in the shortest stated period, largest number of readings."""
 WIDE_ROWS = 400
-"""Rows of a drive without stated periods; fewer readings are not averaged."""
+"""Number of rows of a drive without stated periods; fewer readings are not averaged."""
 
 
 def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
     """The rows of a drive at constant rate: means of the readings of equal short times.
 
     The model averages a wave over the same times, so that only detail shorter than a fifth of the shortest period is
-    lost. Where no u is stated, it comes from second differences of neighbouring readings.
+    lost. Without a stated u, it comes from second differences of neighbouring readings.
 
     Raises:
         NothingToEstimate, InputError: as `rows_of`.
@@ -384,10 +384,10 @@ def _width_s(campaign: AxisCampaign, speed: float, time_s: np.ndarray, move: np.
     """Time over which readings are averaged, s; 0 where they are not averaged.
 
     Args:
-        campaign: with the stated periods.
+        campaign: campaign with the stated periods.
         speed: unit per second.
-        time_s: of the readings, s.
-        move: of the readings.
+        time_s: times of the readings, s.
+        move: moves of the readings.
     """
     if len(time_s) <= WIDE_ROWS:
         return 0.0
@@ -431,14 +431,14 @@ def _redrawn(legs: Legs, moves: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PlayPlaces:
-    """Position of the output in the play; shapes (n or 1, rows).
+    """Positions of the output in the play; shapes (n or 1, rows).
 
-    While a leg is lost in the play the output stays where an earlier move left it: `anchor` is the command of that
+    While a leg is lost in the play, the output stays where an earlier move left it: `anchor` is the command of that
     move, `path` the commands travelled up to it, `side` its position in the play then, in halves of the play. Where
     the side at the start of a segment is unknown, all are means of the two possible ends.
 
     Attributes:
-        anchor, path, side: of the move that last moved the output.
+        anchor, path, side: values of the last move that moved the output.
         share: present position of the output in the play, in halves of it, -1 to 1.
         spread: half of the distance between the possible ends, unit.
     """
@@ -460,9 +460,9 @@ class _PlayEnd:
         return slope * self.anchor + self.side * half
 
     def follow(self, command: float, path: float, slope: float, half: np.ndarray) -> None:
-        """Applies a move: the wheel moves the output where the play is taken up."""
+        """Apply a move: the wheel moves the output once the play is taken up."""
         output, wheel = self.place(slope, half), slope * command
-        # Where there is no play the side is that of the leg, and both sides are one place.
+        # Without play the side is that of the leg, and both sides coincide.
         for side, is_moved in ((-1.0, output < wheel - half), (1.0, output > wheel + half)):
             self.anchor = np.where(is_moved, command, self.anchor)
             self.path = np.where(is_moved, path, self.path)
@@ -470,7 +470,7 @@ class _PlayEnd:
 
 
 def _places_in_motion(rows: AxisRows) -> PlayPlaces:
-    """Places of a drive that never reverses: the play is taken up on one side."""
+    """Positions of a drive that never reverses: the play is taken up on one side."""
     side = (-float(np.sign(rows.line[1])) * rows.side)[None].astype(float)
     return PlayPlaces(rows.command[None], rows.path[None], side, side, np.zeros_like(side))
 
@@ -478,7 +478,7 @@ def _places_in_motion(rows: AxisRows) -> PlayPlaces:
 def play_places(rows: AxisRows, backlash: np.ndarray) -> PlayPlaces:
     """The play operator for backlash (n,), unit; the least-squares line's slope decides which legs are lost in it.
 
-    A negative backlash is no play but an overshooting reversal: every stop lies on its own side at once.
+    A negative backlash is not play but an overshooting reversal: every stop is on its own side immediately.
     """
     if rows.in_motion:
         return _places_in_motion(rows)
@@ -533,7 +533,7 @@ def reversal_of(rows: AxisRows) -> tuple[float, float]:
 
 
 def legs_are_long(rows: AxisRows) -> bool:
-    """Whether every leg surely takes up the play, so that the backlash too is linear."""
+    """Whether every leg certainly takes up the play, so that the backlash is linear as well."""
     reversal, error = reversal_of(rows)
     motion = np.abs(rows.legs.step * rows.line[1])
     shortest = np.min(motion[motion > 0], initial=np.inf)

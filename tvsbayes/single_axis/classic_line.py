@@ -17,10 +17,10 @@ class ClassicAxis(Shown, Record, frozen=True):
     """The least-squares line with one reversal and independent stops, and the ISO 230-2 table.
 
     Attributes:
-        per_command: slope.
+        per_command: slope of the line.
         u_per_command: its standard error.
-        backlash, u_backlash: of the reversal; None where stops were reached from one side.
-        residual_sd: of the rows about it.
+        backlash, u_backlash: reversal and its standard error; None where stops were reached from one side only.
+        residual_sd: scatter of the rows about the line.
         iso230: figures by name; None where positions were not read twice from both sides.
     """
 
@@ -32,7 +32,7 @@ class ClassicAxis(Shown, Record, frozen=True):
     iso230: dict[str, float] | None
 
     def shown(self) -> View:
-        """Slope, backlash, scatter, ISO 230-2 figures."""
+        """Show slope, backlash, scatter and ISO 230-2 figures."""
         rows: list[tuple[str, float | None, float | None]] = [
             ("per_command", self.per_command, self.u_per_command),
             ("backlash", self.backlash, self.u_backlash),
@@ -47,9 +47,9 @@ class LineFit:
     """The line through some rows.
 
     Attributes:
-        solution: offset, unit per command, backlash; undetermined ones are 0.
-        covariance: shape (3, 3); 0 for undetermined ones.
-        scatter: of the rows about it, unit.
+        solution: offset, unit per command, backlash; undetermined values are 0.
+        covariance: shape (3, 3); 0 for undetermined values.
+        scatter: scatter of the rows about the line, unit.
     """
 
     solution: np.ndarray
@@ -58,7 +58,7 @@ class LineFit:
 
 
 def fit_line(rows: AxisRows, included: np.ndarray | None = None) -> LineFit:
-    """Least squares over the `included` rows (None: all)."""
+    """Fit a line by least squares to the `included` rows (None: all)."""
     used = np.ones(len(rows.value), dtype=bool) if included is None else included
     determined = np.array([True, np.ptp(rows.command[used]) > 0, np.ptp(rows.side[used]) > 0])
     design = line_design(rows)[used][:, determined]
@@ -71,7 +71,7 @@ def fit_line(rows: AxisRows, included: np.ndarray | None = None) -> LineFit:
 
 
 def classic_axis(rows: AxisRows) -> ClassicAxis:
-    """The least-squares line with a reversal, and ISO 230-2."""
+    """Compute the least-squares line with a reversal, and the ISO 230-2 figures."""
     line = fit_line(rows)
     u = np.sqrt(np.maximum(np.diag(line.covariance), 0.0))
     has_backlash = rows.both_sides
@@ -98,7 +98,7 @@ class PositionRuns:
 
 
 def position_runs(rows: AxisRows) -> PositionRuns:
-    """The runs of ISO 230-2."""
+    """The runs for ISO 230-2."""
     deviations = rows.value - rows.command * rows.line[1] - rows.line[0]
     by_side = [[deviations[(rows.command == p) & (rows.side == side)] for p in rows.positions] for side in (1, -1)]
     complete = [k for k in range(len(rows.positions)) if min(len(by_side[0][k]), len(by_side[1][k])) >= RUNS_MIN]

@@ -1,4 +1,4 @@
-"""The Kalman filter over the rows of an axis: drift, and held stop errors or the seeing of readings in motion.
+"""The Kalman filter over the rows of an axis: drift, and constant stop errors or the seeing of readings in motion.
 
 Two states, many draws at once; times in hours, variances in the square of the readings' unit. Formulation 8.2. NumPy.
 """
@@ -13,7 +13,7 @@ from tvsbayes.single_axis.axis_rows import AxisRows
 
 
 def averaged_variance(duration: np.ndarray) -> np.ndarray:
-    """Variance of the mean of an exponentially correlated process over its own; `duration` in correlation times."""
+    """Variance of the mean of an exponentially correlated process over its own; `duration` is in correlation times."""
     ratio = np.maximum(duration, 1e-3)
     return np.where(duration > 1e-3, 2 / ratio * (1 + np.expm1(-ratio) / ratio), 1.0 - duration / 3)
 
@@ -29,7 +29,7 @@ def whitened(
         drift: variance per hour, shape (n,).
         stop: variances of stop errors or seeing, shape (n, rows).
         reading: variances of readings, shape (n, rows).
-        carry: share of the previous row's stop error or seeing in each row; 0 where it is new, 1 where it is the same;
+        carry: share of the previous row's stop error or seeing in each row; 0 where it is new, 1 where it is unchanged;
             shape (n or 1, rows).
 
     Returns:
@@ -38,7 +38,7 @@ def whitened(
     n, count, width = len(drift), columns.shape[1], columns.shape[2]
     new_segment = np.append(False, rows.segment[1:] != rows.segment[:-1]).tolist()
     is_new = np.all(carry == 0, axis=0).tolist()
-    # Numbers of one draw are plain floats, without the overhead of array calls.
+    # For a single draw plain floats avoid the overhead of array calls.
     by_row = [_by_row(numbers, n) for numbers in (np.outer(drift, rows.hours), stop, reading, carry)]
     blocks = []
     p_zero = p_held = p_both = 0.0 * by_row[0][0]
@@ -54,7 +54,7 @@ def whitened(
         variance = p_zero + 2 * p_both + p_held + noise
         gain_zero, gain_held = (p_zero + p_both) / variance, (p_held + p_both) / variance
         blocks.append((variance, gain_zero, gain_held))
-        # Joseph's form: differences of large variances keep the rest positive.
+        # Joseph's form keeps variances positive when large ones are subtracted.
         rest_zero, rest_held = 1 - gain_zero, 1 - gain_held
         new_zero = rest_zero**2 * p_zero - 2 * rest_zero * gain_zero * p_both + gain_zero**2 * (p_held + noise)
         new_held = rest_held**2 * p_held - 2 * rest_held * gain_held * p_both + gain_held**2 * (p_zero + noise)

@@ -1,7 +1,7 @@
 """Content of the columns of a foreign table of an axis: runs in columns, deviations.
 
-A table with a column for each run is converted to one with a row for each reading; a column of actual less commanded
-position is no uncertainty.
+A table with a column for each run is converted to one with a row for each reading. A column of actual minus commanded
+position is recognised as a deviation, not an uncertainty.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ DIRECTIONS = {
 }
 """Words of columns with readings of one direction, without accents."""
 DEVIATION = {"deviation", "dev", "abweichung", "desviacion", "diff", "difference", "delta", "differenz", "ecart"}
-"""Words of columns that may be actual less commanded position, in addition to those of uncertainties."""
+"""Words of columns that may be actual minus commanded position, in addition to those of uncertainties."""
 LENGTHS_MM = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "thou": 0.0254, "inch": 25.4}
 SMALL_SHARE, LOOSE_SHARE = 0.05, 0.02
-"""Readings in the unit of the commands are no positions if they span less than the first share of the commands' range
+"""Readings in the unit of the commands are not positions if they span less than the first share of the commands' range
 and scatter by more than the second share of their own span about a line."""
 _ARROWS = str.maketrans({"\u2191": " forward ", "\u2193": " backward ", "\u2192": " forward ", "\u2190": " backward "})
 
@@ -54,16 +54,16 @@ class LongTable:
 
 
 def long_table(table: ForeignTable, stated: Mapping[str, str]) -> LongTable:
-    """A table with a column for each run converted to one with a row for each reading; any other unchanged.
+    """A table with a column for each run converted to one with a row for each reading; other tables are unchanged.
 
-    Forward runs rise, backward runs fall, in the order of their numbers.
+    Forward runs have increasing, backward runs decreasing commands, in the order of their numbers.
 
     Args:
         table: the foreign table.
         stated: column by field, as the user states it; with `value` or `approach` stated, the table is not converted.
 
     Raises:
-        InputError: no column, or several, of the positions; runs in several units.
+        InputError: no or several columns of positions; runs in several units.
     """
     runs = run_columns(table.columns)
     if not runs or stated.get("value") or stated.get("approach"):
@@ -102,7 +102,7 @@ def long_table(table: ForeignTable, stated: Mapping[str, str]) -> LongTable:
 
 
 def deviation_columns(table: ForeignTable, columns: Mapping[str, str]) -> dict[str, str]:
-    """Columns that are actual less commanded position in every row, by name, with their formula in words.
+    """Columns that are actual minus commanded position in every row, by name, with their formula in words.
 
     Args:
         table: the foreign table.
@@ -138,7 +138,7 @@ def _numbers(cells: Sequence[str]) -> list[float | None]:
 
 
 def _half_digit(cell: str) -> float:
-    """Half of the last digit of a written number, plus rounding of double numbers."""
+    """Half of the last digit of a written number, plus rounding in double precision."""
     decimals = len(cell.lower().partition("e")[0].partition(".")[2])
     return 0.5000001 * 10.0**-decimals + 1e-12
 

@@ -1,8 +1,8 @@
 """Moves and readings of a foreign table of an axis: one row is a move, a reading, or both; unit of the folder.
 
 Successive rows at the same command are readings of one stop; rows without a value are moves without a reading. A column
-of directions gives the side from which a stop was reached; where the previous rows lead to another side, the missing
-move is inserted. Assumptions about what the table does not state are listed in words.
+of directions gives the side of approach of a stop; where the previous rows lead to another side, the missing move is
+inserted. Assumptions about what the table does not state are listed in words.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ BITS = range(8, 33)
 OVERSHOOT_SHARE = 0.05
 """Assumed overshoot of an inserted move beyond a stop, as a share of the range of commands: more than any play."""
 CONTRARY_MIN = 4
-"""Least number of rows with a direction opposite to their commands', for all of them, to refuse the sign."""
+"""Least number of rows with a direction opposite to their commands', in all such rows, at which the sign is refused."""
 FORWARD = {
     *("forward", "forwards", "fwd", "f", "+", "+1", "1", "up", "rising", "increasing", "positive", "pos", "below"),
     *("from below", "vorwarts", "vor", "hin", "aufwarts", "adelante", "subida", "avant", "aller", "\u2191", "\u2192"),
@@ -66,31 +66,31 @@ _COLUMNS = {c.name: c for kind in (READINGS, AXIS_MOVES) for c in kind.columns.v
 AXIS_FIELDS = tuple(dict.fromkeys(("command", "value", *_COLUMNS)))
 """All fields of a table of an axis."""
 _READING_WORDS = {"position", "pos", "posicion", "counts", "zahler", "contador"}
-"""Words of commands that mean readings where another column is surely the command."""
+"""Words of commands that mean readings where another column is clearly the command."""
 _PERCENT = {"percent", "prozent", "pct"}
 _COVERAGE = re.compile(r"\bk\s*=?\s*([0-9]+(?:\.[0-9]+)?)\b")
 """Coverage factor in the name of a column of expanded uncertainties (GUM, 6.2)."""
 COVERAGE_USUAL = 2.0
 _TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura", "humidity"}
-"""Words of quantities whose degrees are no angle."""
+"""Words of quantities whose degrees are not angles."""
 
 
 def axis_field_of(name: str) -> str | None:
-    """The field of an axis that a column's name means: by its first known word; percentages are none."""
+    """The field of an axis by the first known word of a column's name; percentages have none."""
     if "%" in name or _PERCENT.intersection(words_of(name)):
         return None
     return field_by_word(words_of(name), _COLUMNS.values())
 
 
 def map_axis_columns(columns: Iterable[str], stated: Mapping[str, str] | None = None) -> ColumnMapping:
-    """Assigns columns of an axis to fields, as `map_columns`; some names depend on the other columns.
+    """Assign columns of an axis to fields, as `map_columns`; some names depend on the other columns.
 
     With a column "microsteps" a "position [um]" is a reading; without any other reading, so is "mm" alone, or the only
     other column with a unit of readings, as "dial gauge mm".
 
     Args:
         columns: their names.
-        stated: column by field of `AXIS_FIELDS`, as the user states it; an empty column: the table has none.
+        stated: column by field of `AXIS_FIELDS`, as the user states it; "" where the table has no such column.
 
     Raises:
         InputError: a field or column that does not exist.
@@ -121,7 +121,7 @@ def map_axis_columns(columns: Iterable[str], stated: Mapping[str, str] | None = 
 
 @dataclass(frozen=True)
 class LoggedDrive:
-    """A drive at constant rate, of a log whose readings were taken in motion.
+    """A drive at constant rate, from a log whose readings were taken in motion.
 
     Attributes:
         rate: commands per second.
@@ -141,12 +141,12 @@ class ForeignReadings:
     """Rows of `moves.csv` and `readings.csv`, and the assumptions about the table.
 
     Attributes:
-        moves: rows.
-        readings: rows.
-        assumed: in words, with the option that overrides the assumption, if any.
-        unit: of readings where cells or the log state it.
-        drive: of a log of readings in motion.
-        notes: on rows used and left out.
+        moves: rows of `moves.csv`.
+        readings: rows of `readings.csv`.
+        assumed: assumptions in words, with the option that overrides them, if any.
+        unit: unit of the readings where cells or the log state it.
+        drive: the drive of a log of readings in motion.
+        notes: remarks on rows used and left out.
     """
 
     moves: tuple[AxisMove, ...]
@@ -158,15 +158,15 @@ class ForeignReadings:
 
 
 def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: bool = False) -> ForeignReadings:
-    """Moves and readings of a table.
+    """Derive moves and readings from a table.
 
     Args:
         table: the foreign table.
         columns: its columns by field of `AXIS_FIELDS`, with "command" and "value".
-        deviations: whether the readings are actual less commanded position.
+        deviations: whether the readings are actual minus commanded position.
 
     Raises:
-        InputError: a cell that is no value of its field, or no row.
+        InputError: a cell that is no value of its field, or the table has no row.
     """
     table.require_rows()
     assumed: list[str] = []
@@ -200,14 +200,14 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: boo
 
 
 def _coverage_of(name: str) -> float | None:
-    """The coverage factor of a column of expanded uncertainties; None of a standard one."""
+    """The coverage factor of a column of expanded uncertainties; None for standard ones."""
     if stated := _COVERAGE.search(name.lower()):
         return float(stated[1]) or None
     return COVERAGE_USUAL if {"expanded", "erweiterte", "expandida", "elargie"}.intersection(words_of(name)) else None
 
 
 def _plain(table: ForeignTable, columns: Mapping[str, str], assumed: list[str]) -> tuple[ForeignTable, str | None]:
-    """A table with plain numbers for commands, readings and their u, and the unit in the cells of readings."""
+    """Convert a table to plain numbers for commands, readings and their u; also return the readings' unit."""
     units: dict[str, str | None] = {}
     plain_columns = dict(table.columns)
     for field in ("command", "value", "u"):
@@ -222,7 +222,7 @@ class _Stops:
     """Moves of a table, row by row, including those implied by its column of directions.
 
     Attributes:
-        moves: so far.
+        moves: moves so far.
     """
 
     def __init__(
@@ -245,10 +245,10 @@ class _Stops:
         self._refuse_contrary()
 
     def _went_past(self) -> bool:
-        """Whether the axis overshot and came back where the side changes at one command.
+        """Whether the axis overshot and returned where the side changes at one command.
 
-        The alternative is a second reading at standstill. The axis overshot if in most such rows the readings change as
-        they differ between the two sides elsewhere.
+        The alternative is a second reading at standstill. The axis overshot if, in most such rows, the readings change
+        as they differ between the two sides elsewhere.
         """
         values_at: dict[float, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
         for command, side, value in zip(self._commands, self._sides, self._values, strict=True):
@@ -275,7 +275,7 @@ class _Stops:
             raise self._cells.refuse(contrary[0], "approach", allowed, remedy)
 
     def go(self, row: int, command: float, at_s: float | None) -> None:
-        """Adds the moves of a row, at a time of the table or at the number of the move."""
+        """Add the moves of a row, timed by the table or by the number of the move."""
         homed = self._homings[row] or not self.moves
         side = self._sides[row]
         step = 0.0 if homed else command - self.moves[-1].command
@@ -364,10 +364,10 @@ def unwrapped(wrapped: ForeignReadings, unit: str, counts_per_turn: float | None
     Args:
         wrapped: moves and readings.
         unit: of the readings; other units than of angles are unchanged unless the readings count to a power of two.
-        counts_per_turn: period of the wrapping, in their unit; 0: no wrapping.
+        counts_per_turn: period of the wrapping, in the readings' unit; 0: no wrapping.
 
     Raises:
-        InputError: readings jump repeatedly by one number that is not stated as their period.
+        InputError: readings jump repeatedly by a number that is not stated as their period.
     """
     if counts_per_turn == 0:
         return wrapped
@@ -376,7 +376,7 @@ def unwrapped(wrapped: ForeignReadings, unit: str, counts_per_turn: float | None
     value = np.array([wrapped.readings[k].value for k in usable], dtype=float)
     turn = counts_per_turn or TURNS.get(unit) or _counts_of(command, value)
     jumps = turn_jumps(command, value, turn) if turn is not None else {}
-    # A wild reading jumps too, and back, but not by whole turns.
+    # An outlier also jumps, and back, but not by whole turns.
     if turn is None or not jumps or any(abs(jump - round(jump)) > TURN_TOLERANCE for jump in jumps.values()):
         return wrapped
     readings, turns = list(wrapped.readings), 0
@@ -390,10 +390,10 @@ def unwrapped(wrapped: ForeignReadings, unit: str, counts_per_turn: float | None
 
 
 def _counts_of(command: np.ndarray, value: np.ndarray) -> float | None:
-    """Period of wrapped whole numbers: the power of two that contains them all, if they jump by it.
+    """Period of wrapped whole numbers: the power of two that bounds them all, if they jump by it.
 
     Raises:
-        InputError: they jump by another number.
+        InputError: the readings jump by another number.
     """
     if len(value) < 3 or np.any(value != np.round(value)):
         return None

@@ -26,7 +26,7 @@ SIDEREAL_ARCSEC_PER_S = 1296000.0 / 86164.0905
 BEGINS, ENDS = "Guiding Begins at ", "Guiding Ends"
 NEEDED = ("Time", "RARawDistance", "RADuration", "RADirection")
 DECLINATION_MAX_DEG = 85.0
-"""Largest declination: above it 1 / cos(declination) magnifies the seeing over the errors of the axis."""
+"""Largest declination: above it 1 / cos(declination) magnifies the seeing beyond the errors of the axis."""
 RATES_DIFFER = 0.1
 """Least relative difference of two rates of a pulse for a remark."""
 PRIORS = {"per_command": (1.0, 1e-3), "transmission_error": (0.0, 10.0)}
@@ -59,20 +59,20 @@ _MOUNT, _PIER = re.compile(r"^Mount = ([^,]*)"), re.compile(r"\bPier side = (\w+
 
 @dataclass
 class GuideRun:
-    """A run of the log.
+    """A run of a log.
 
     Attributes:
-        number: from 1.
-        line: where it begins.
-        begins: local time as written, "" where there is none.
+        number: number of the run, from 1.
+        line: first line of the run.
+        begins: local time as written, "" if missing.
         mount: driver of the mount as logged.
         pier: side of the pier.
         header: numbers of the header by the names of `_HEADER`.
         frames: (line, time_s, raw distance px, pulse ms with W positive, settling) of frames with a star.
-        dropped: (line, time_s) of frames without one.
+        dropped: (line, time_s) of frames without a star.
         breaks: indices of `frames` with a new zero: after dithers, new lock positions, settling, pauses.
-        counts: of events by name.
-        ended: whether the log has its end.
+        counts: numbers of events by name.
+        ended: whether the log contains the end of the run.
     """
 
     number: int
@@ -104,7 +104,7 @@ def is_guide_log(text: str) -> bool:
 
 
 def read_runs(text: str, file: str) -> list[GuideRun]:
-    """The runs of a log, without those that have no frame.
+    """The runs of a log, without runs that have no frame.
 
     Raises:
         InputError: no run, or a table of frames without a required column.
@@ -163,7 +163,7 @@ def _header(run: GuideRun, line: str) -> None:
 
 
 def _event(run: GuideRun, line: str, settling: bool) -> bool:
-    """Applies an INFO line to the run; returns whether the mount settles from here on."""
+    """Apply an INFO line to the run; return whether the mount settles from here on."""
     if "Settling started" in line:
         run.breaks.add(len(run.frames))
         return True
@@ -182,7 +182,7 @@ def _event(run: GuideRun, line: str, settling: bool) -> bool:
 
 
 def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settling: bool) -> None:
-    """Adds a row of the table to the run; a truncated row, or one of another device, is only counted."""
+    """Add a row of the table to the run; a truncated row, or one of another device, is only counted."""
     try:
         cells = dict(zip(columns, next(csv.reader([line])), strict=False))
         time_s, device = float(cells["Time"]), cells.get("mount", "Mount")
@@ -203,7 +203,7 @@ def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settli
 
 
 def run_rows(runs: Sequence[GuideRun]) -> list[dict[str, object]]:
-    """A row for each run, for the printed list of a log with several."""
+    """A row for each run, for the printed list of a log with several runs."""
     return [
         {
             "run": run.number,
@@ -236,7 +236,7 @@ def _scale(run: GuideRun, stated: Mapping[str, float], file: str) -> _Scale:
     """The conversion of a run.
 
     Raises:
-        InputError: a number that the log does not state, with the option that does.
+        InputError: a number that the log does not state, with the option that states it.
     """
     known = {**run.header, **stated}
 
@@ -270,10 +270,10 @@ def _logged_pulse(run: GuideRun, known: Mapping[str, float], x_rate: float, cosi
     """Rate of the axis during a pulse, arcsec/s: xRate is that at the run's declination or at the calibration's.
 
     Args:
-        run: for its pulses.
+        run: the run, for its pulses.
         known: numbers of the header.
         x_rate: xRate times pixel scale, arcsec/s.
-        cosine: of the declination.
+        cosine: cosine of the declination.
         assumed: sentences, to which the source is added.
     """
     calibration = known.get("calibration_deg")
@@ -295,12 +295,12 @@ def readings_of_run(run: GuideRun, file: str, stated: Mapping[str, float]) -> Fo
     """A run as moves and readings: the drive's angle plus the star's uncorrected motion, both in arcsec of the axis.
 
     Args:
-        run: of the log.
+        run: a run of the log.
         file: its name.
         stated: numbers by the names of `ASSUMPTIONS`, which override those of the log.
 
     Raises:
-        InputError: a number that neither states, or fewer than three usable frames.
+        InputError: a number that neither `stated` nor the log contains, or fewer than three usable frames.
     """
     scale = _scale(run, stated, file)
     moves: list[AxisMove] = []
@@ -322,7 +322,7 @@ def readings_of_run(run: GuideRun, file: str, stated: Mapping[str, float]) -> Fo
     if used < 3:
         remedy = "name another run with --run"
         raise refusal("empty", file=file, line=run.line, found=f"{used} frames", allowed="three or more", remedy=remedy)
-    # A frame before the first stretch belongs to no move.
+    # Frames before the first stretch belong to no move.
     frames += [(time_s, -1, None, "dropped") for _, time_s in run.dropped]
     starts_s = [move.time_s for move in moves]
     rows = [
@@ -383,6 +383,6 @@ def _header_of(run: GuideRun, file: str) -> dict[str, object]:
 
 
 def _between(rows: Sequence[tuple[float, int, float | None, str]]) -> tuple[float, float] | None:
-    """Range of periods, s, for a search: from a minute to a third of the run; None of a short run."""
+    """Range of periods, s, for a search: from a minute to a third of the run; None for a short run."""
     span_s = rows[-1][0] - rows[0][0]
     return (60.0, round(span_s / 3.0, 0)) if span_s > 360.0 else None

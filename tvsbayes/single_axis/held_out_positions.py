@@ -1,4 +1,4 @@
-"""Hold-out of one axis: every commanded position is left out in turn and predicted by a fit of the others."""
+"""Hold-out of one axis: every commanded position is left out in turn and predicted from a fit of the others."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ DRAWS, ROUNDS_MIN = 300, 2
 """Number of draws of a prediction by a fit without the position, and least number of rounds of importance sampling."""
 POSITIONS_MIN, POSITIONS_MAX = 3, 200
 REFITTED_MAX, DRAWS_WEIGHTED, EFFECTIVE_MIN = 30, 400, 80
-"""Largest number of positions with a fit for each; for more, draws of one fit are weighted, if so many of them are
-effective. At most `POSITIONS_MAX` are predicted."""
+"""Largest number of positions with a fit for each; for more positions, draws of one fit are reweighted, if at least the
+last number of them are effective. At most `POSITIONS_MAX` are predicted."""
 
 
 def _means_of(rows: AxisRows, members: np.ndarray) -> tuple[np.ndarray, int]:
@@ -37,7 +37,7 @@ def _means_of(rows: AxisRows, members: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray) -> tuple[float, float]:
-    """Mean of rows `members` by offset, scale and play fitted to the rows that are not left out, and its u."""
+    """Mean of rows `members` from offset, scale and play fitted to the other rows, and its u."""
     line = fit_line(rows, ~left_out)
     weights, _ = _means_of(rows, members)
     design_row = weights @ line_design(rows)[members]
@@ -47,7 +47,7 @@ def classic_prediction(rows: AxisRows, left_out: np.ndarray, members: np.ndarray
 
 @dataclass(frozen=True)
 class _Prediction:
-    """Prediction of the rows left out: mean (rows,), covariance (rows, rows), and its fault in words, or ""."""
+    """Prediction of the rows left out: mean (rows,), covariance (rows, rows), and its fault in words, "" for none."""
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -55,10 +55,10 @@ class _Prediction:
 
 
 def _reweighted(model: AxisModel, w: np.ndarray, rows: np.ndarray) -> _Prediction | None:
-    """Prediction by draws (n, d) of the posterior of all rows, weighted for those left out.
+    """Prediction by draws (n, d) of the posterior of all rows, reweighted to omit the rows left out.
 
-    None where the weights cannot be trusted. Leave-one-out by importance (Vehtari, Gelman and Gabry, Stat. Comput. 27
-    (2017) 1413), whole positions left out.
+    None where the weights are unreliable. Leave-one-out by importance sampling (Vehtari, Gelman and Gabry, Stat.
+    Comput. 27 (2017) 1413), with whole positions left out.
     """
     stops = PredictedStops(*model.left_out(w, rows), {})
     smoothed = smoothed_weights(-stops.log_densities(model.rows.value[rows]))
@@ -68,7 +68,7 @@ def _reweighted(model: AxisModel, w: np.ndarray, rows: np.ndarray) -> _Predictio
 
 
 def _refitted(model: AxisModel, left_out: np.ndarray, seed: int) -> _Prediction:
-    """Prediction by a fit of the other rows."""
+    """Prediction from a fit of the other rows."""
     reduced = AxisModel.of(model.rows.without(left_out), model.priors, None, model.coordinates.waves)
     rng = random_stream(seed, AxisStream.HELD_OUT)
     sample = _equal_draws(reduced, DRAWS, seed, rng)
@@ -77,16 +77,16 @@ def _refitted(model: AxisModel, left_out: np.ndarray, seed: int) -> _Prediction:
 
 
 def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | None = None) -> AxisHoldOut:
-    """Every commanded position left out in turn, with all its readings from both sides.
+    """Leave out every commanded position in turn, with all its readings from both sides.
 
     Args:
         campaign: from `read_axis`.
-        seed: of everything random.
+        seed: seed of all random numbers.
         progress: shows the progress.
 
     Raises:
-        NothingToEstimate: fewer than three positions, or what `fit_axis` refuses.
-        InputError: what `fit_axis` refuses.
+        NothingToEstimate: fewer than three positions, or as `fit_axis`.
+        InputError: as `fit_axis`.
     """
     model = model_of(campaign)
     rows = model.rows
@@ -129,14 +129,14 @@ def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | N
 
 
 def _draws_of_all_rows(model: AxisModel, seed: int) -> np.ndarray:
-    """Coordinates (`DRAWS_WEIGHTED`, d) of the scales by all rows."""
+    """Coordinates (`DRAWS_WEIGHTED`, d) of the scales, from all rows."""
     rng = random_stream(seed, AxisStream.HELD_OUT_BY_WEIGHTS)
     return _equal_draws(model, DRAWS_WEIGHTED, seed, rng).w
 
 
 @dataclass(frozen=True)
 class _EqualDraws:
-    """Coordinates (n, d) of equal draws, and the fault of their sample in words, or ""."""
+    """Coordinates (n, d) of equal draws, and the fault of their sample in words, "" for none."""
 
     w: np.ndarray
     fault: str

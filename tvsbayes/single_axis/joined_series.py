@@ -1,6 +1,6 @@
 """Logs with the command and the reading of an axis as two series, each with its own times: EPICS, Klipper.
 
-A value is logged when it changes. A reading gets the command of its time: interpolated while the command changes, else
+Values are logged at changes. A reading gets the command at its time: interpolated while the command changes, else
 the last one. The result is a table, as that of `read_foreign`.
 """
 
@@ -21,11 +21,11 @@ from tvsbayes.files.foreign_table import ForeignTable, table_of
 from tvsbayes.instrument.column_names import words_of
 
 STANDSTILL_INTERVALS = 5.0
-"""An interval of so many typical ones means a standstill: the value did not change in between."""
+"""An interval of this many typical ones means standstill: the value did not change during it."""
 EQUAL_S = 1e-6
 """Times closer than this are equal."""
 ROWS_KEPT = 2000
-"""Largest number of joined rows, as many as a fit takes; of more rows, every n-th is used."""
+"""Largest number of joined rows, as many as a fit accepts; of more rows, every n-th is used."""
 INFLATED_BYTES_MAX = 256 * 2**20
 KLIPPER_TURN = 65536
 """Counts per turn of an angle sensor in Klipper (klippy/extras/angle.py, ANGLE_BITS)."""
@@ -78,7 +78,7 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
     """The pair of series of a camonitor log, joined in time.
 
     Args:
-        text: of the log.
+        text: text of the log.
         file: its name, for messages.
         stated: name of a series by `command` or `value`, as the user states it.
 
@@ -107,7 +107,7 @@ def camonitor_table(text: str, file: str, stated: Mapping[str, str]) -> ForeignT
 
 
 def _series(rows: Sequence[tuple[float, float]]) -> Series:
-    """Rows in order of time; the last of several at one time."""
+    """Rows in time order; only the last of several at one time."""
     ordered = sorted(enumerate(rows), key=lambda row: (row[1][0], row[0]))
     times = np.array([row[0] for _, row in ordered])
     is_last = np.r_[np.diff(times) > EQUAL_S, True]
@@ -144,7 +144,7 @@ def _pair(series: Mapping[str, Series], file: str, stated: Mapping[str, str]) ->
 
 
 def _joined(series: Mapping[str, Series], command: str, value: str, file: str, kind: str) -> ForeignTable:
-    """Samples of the reading with the command of their times.
+    """Samples of the reading with the command at their times.
 
     Raises:
         InputError: the series do not overlap in time.
@@ -164,7 +164,7 @@ def _joined(series: Mapping[str, Series], command: str, value: str, file: str, k
 def _pairs_table(
     file: str, notes: Sequence[str], commands: Series, values: np.ndarray, names: tuple[str, str]
 ) -> ForeignTable:
-    """Commands and readings at the same times as a table, every n-th of many; `names` are those of both."""
+    """Commands and readings at the same times as a table, every n-th of many; `names` are the names of both."""
     step = -(-len(values) // ROWS_KEPT)
     times = commands.times_s[::step] - commands.times_s[0]
     columns: dict[str, Sequence[object]] = {
@@ -181,10 +181,10 @@ INTERVAL_MAX_S = 2.0
 
 
 def command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]:
-    """Commands at times between the first and the last of a series, and how many had to be interpolated.
+    """Commands at times between the first and the last of a series, and the number of interpolated ones.
 
     Args:
-        commands: logged at changes.
+        commands: commands logged at changes.
         times_s: shape (n,).
     """
     k = np.clip(np.searchsorted(commands.times_s, times_s + EQUAL_S, side="right") - 1, 0, len(commands.times_s) - 1)
@@ -198,7 +198,7 @@ def command_at(commands: Series, times_s: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _saved_angles(data: bytes) -> tuple[str, list[float]] | None:
-    """The sensor and the table that SAVE_CONFIG wrote below "#*#" into a configuration; None where there is none."""
+    """The sensor and the table that SAVE_CONFIG wrote below "#*#" into a configuration; None if there is none."""
     if b"[angle" not in data:
         return None
     lines = [line.removeprefix("#*#").removeprefix(" ") for line in data.decode(errors="replace").splitlines()]
@@ -218,7 +218,7 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
     """Angles of a motor's shaft by Klipper: a log of its data logger, or the table that ANGLE_CALIBRATE saves.
 
     Args:
-        data: of the file; a log of the data logger may be compressed.
+        data: content of the file; a log of the data logger may be compressed.
         file: its name, for messages.
 
     Raises:
@@ -255,7 +255,7 @@ def klipper_table(data: bytes, file: str) -> ForeignTable:
     times, positions = (np.concatenate(part) for part in zip(*steps, strict=True))
     order = np.argsort(times, kind="stable")
     readings, counters = _series(angles_s), Series(times[order], positions[order])
-    # Steps are instantaneous commands, without interpolation.
+    # Steps are instantaneous commands and are not interpolated.
     latest = np.searchsorted(counters.times_s, readings.times_s, side="right") - 1
     inside = latest >= 0
     if not inside.any():

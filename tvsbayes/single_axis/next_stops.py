@@ -1,7 +1,7 @@
-"""The next stops to read on an axis: those that reduce the uncertainty of its ratio, or of positions, most per move.
+"""The next stops to read on an axis: those that most reduce the uncertainty of its ratio, or of positions, per move.
 
-The model is linear and normal given the scales, averaged over their posterior: a future reading changes covariances
-only. The variance by unknown scales stays constant: the plan begins at the u of the fit.
+The model is linear and normal given the scales, and averaged over their posterior: a future reading changes only
+covariances. The variance due to unknown scales stays constant: the plan begins at the u of the fit.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from tvsbayes.single_axis.axis_rows import AxisRows, reversal_of, rows_of
 TARGETS = (*(name for name, quantity in AXIS_QUANTITIES.items() if quantity.target), "position")
 """Targets of a plan; "position" is the mean uncertainty of the error by position over the range."""
 CANDIDATES, STOPS_DEFAULT, DRAWS = 17, 8, 24
-"""Candidate places along the range, default number of stops, draws of the scales."""
+"""Candidate positions along the range, default number of stops, draws of the scales."""
 MOVE_S = 60.0
 """Time of a move where the campaign has no times."""
 OVERRUN = 0.05
-"""Overrun beyond a place before the move back to it, as a share of the range."""
+"""Overrun beyond a position before the move back to it, as a share of the range."""
 
 
 def unit_of(target: str, unit: str) -> str:
@@ -43,10 +43,10 @@ class NextStop:
     """A stop to be read.
 
     Attributes:
-        command: of the stop.
-        direction: of approach, "forward" or "backward".
+        command: command of the stop.
+        direction: direction of approach, "forward" or "backward".
         via: command to visit first, without reading, for this direction; None where not needed.
-        u: of the target after it, unit; `gain`: its reduction; `gain_per_minute`.
+        u: u of the target after the stop, unit; `gain`: its reduction; `gain_per_minute`.
     """
 
     command: float
@@ -69,9 +69,9 @@ class AxisPlan(Shown):
 
     Attributes:
         target: name in `TARGETS`.
-        u_now: of the target, unit (`unit_of` it).
+        u_now: present u of the target, in the unit of `unit_of`.
         next: stops in order.
-        minutes: of all of them.
+        minutes: time of all stops.
     """
 
     target: str
@@ -80,13 +80,13 @@ class AxisPlan(Shown):
     minutes: float
 
     def shown(self) -> View:
-        """Stops to read next, in order."""
+        """Show the stops to read next, in order."""
         rows = [(stop.command, stop.direction, stop.via, stop.u, stop.gain_per_minute) for stop in self.next]
         columns = ("command", "direction", "go first to", "u afterwards", "gain a minute")
         return View(f"AxisPlan for {self.target}: {len(rows)} stops in {self.minutes:.0f} minutes", columns, rows)
 
     def as_json(self) -> dict[str, object]:
-        """Plain types; every stop with its actions in words."""
+        """The document in plain types; every stop has its actions in words."""
         steps = [{**plain(stop), "actions": stop.actions} for stop in self.next]
         return {**plain(self), "next": steps}
 
@@ -104,9 +104,9 @@ def _move_seconds(campaign: AxisCampaign) -> float:
 def _with_stop(
     campaign: AxisCampaign, rows: AxisRows, command: float, direction: str, seconds: float
 ) -> tuple[AxisCampaign, float | None]:
-    """The campaign with one more stop, reached in this direction, and the command visited before it, None without one.
+    """The campaign with one more stop, reached in this direction, and the command visited before it, or None.
 
-    Its reading lies on the line with a reversal through the `rows`: so it changes neither.
+    Its reading lies on the line with a reversal through the `rows`, and so does not change the line.
     """
     moves, last = list(campaign.moves), campaign.moves[-1]
     commands = [m.command for m in campaign.moves]
@@ -155,7 +155,7 @@ def _variance(fit: AxisFit, campaign: AxisCampaign, target: str, places: np.ndar
 
 
 def _with_linear_play(fit: AxisFit) -> AxisFit:
-    """The fit as if every reversal were longer than the play, which is then linear in the readings."""
+    """The fit with every reversal assumed longer than the play, in which the readings are then linear."""
     names = fit.model.coordinates.names
     remaining = tuple(name for name in names if name != "backlash")
     model = replace(fit.model, coordinates=replace(fit.model.coordinates, names=remaining))
@@ -173,7 +173,7 @@ def plan_next(
     """Greedy choice of the next stops to be read.
 
     Args:
-        fit: of the present readings.
+        fit: fit of the present readings.
         target: one of `TARGETS`.
         minutes: largest time of all moves; None for `count` stops.
         count: largest number of stops.
@@ -181,7 +181,7 @@ def plan_next(
 
     Raises:
         InputError: an unknown target.
-        NothingToEstimate: the folder is of a drive that never stops, or the target is held at its value.
+        NothingToEstimate: the drive never stops, or the target is fixed.
     """
     if fit.rows.in_motion:
         raise NothingToEstimate(
@@ -203,7 +203,7 @@ def plan_next(
     campaign, chosen, minutes_used = fit.campaign, [], 0.0
     start = _variance(fit, campaign, target, grid, fit.w)
     if target == "backlash" and fit.model.play_is_sampled:
-        # A sampled play has no variance given the scales: that of a linear play takes its place.
+        # A sampled play has no variance given the scales: that of a linear play replaces it.
         start, fit = _Variance(start.given + start.between, 0.0), _with_linear_play(fit)
         w = fit.w[np.linspace(0, len(fit.w) - 1, DRAWS).astype(int)]
     few = _variance(fit, campaign, target, grid, w)
@@ -212,7 +212,7 @@ def plan_next(
         raise NothingToEstimate("held", f"{target} is held at its value: no reading changes it", remedy=remedy)
 
     def u_of(after: AxisCampaign) -> float:
-        # With few draws the ratio is more accurate than the value.
+        # With few draws the ratio of variances is more accurate than the variance.
         return float(np.sqrt(start.between + start.given * _variance(fit, after, target, grid, w).given / few.given))
 
     u_now = now = float(np.sqrt(start.between + start.given))

@@ -1,8 +1,8 @@
-"""Evidence of a wave by period: on a grid fine against 1 / span, refined where the evidence is sharp.
+"""Evidence of a wave by period, on a frequency grid finer than 1 / span, refined where the evidence is sharp.
 
-The model is linear and normal given the scales of noise and errors: these are fixed at the mode, the readings and all
+The model is linear and normal given the scales of noise and errors. These are fixed at the mode, the readings and all
 columns are whitened once, and every period costs products with its own few columns. The result gives the tables of
-`waves.Wave`, from which the sampler starts; its weights use the density without these approximations.
+`waves.Wave`, from which the sampler starts; the sampler's weights use the density without these approximations.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ from tvsbayes.single_axis.waves import (
 )
 
 PER_RESOLUTION = 8
-"""Points of the grid in 1 / span of frequency."""
+"""Number of grid points per 1 / span of frequency."""
 GRID_MAX = 30_000
 """Largest number of points; a range that needs more is refused."""
 APART_MIN = 1e-9
 """Least distance of log periods in the grid before its refinement: `REFINEMENTS` halvings stay above rounding."""
 AT_ONCE = 400
-"""Periods in a block of columns."""
+"""Number of periods in a block of columns."""
 SCALES = 60
-"""Points of the grid of log s."""
+"""Number of grid points of log s."""
 STEEP, NEAR, REFINEMENTS = 0.5, 14.0, 12
 """Largest step of log evidence between neighbours, where it is within `NEAR` of the best; rounds of halving."""
 TEMPER, FLOOR = 0.6, 0.05
-"""Power of the evidence in a table, and its uniform share: tables are wider than the posterior."""
+"""Power of the evidence in a table, and its uniform share; both make tables wider than the posterior."""
 ABSENT_MIN, ABSENT_MAX = 0.03, 0.9
-"""Limits of a table's share without a wave."""
+"""Limits of a table's probability of no wave."""
 WAVES_MAX, FURTHER = 6, 3.0
-"""Largest number of inferred waves, with those beyond the stated ranges, and the least log Bayes factor of one more."""
+"""Largest number of inferred waves, with those beyond the stated ranges, and the least log Bayes factor of another."""
 RESOLVED, UNRESOLVED = 0.5, 1e3
 """Least difference of two waves in periods of the record, P / (2 N) of a period with N in it; reduction of the log
-evidence of an unresolved one, which would represent changes of the other."""
+evidence of an unresolved wave, which would represent changes of the other."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,10 @@ class _WhitenedModel:
     """Whitened readings and columns at the mode.
 
     Attributes:
-        model: with all other waves; the one of the search is not in it, or is absent at `w`.
+        model: model with all other waves; the searched wave is not in it, or is absent at `w`.
         w: coordinates, shape (1, d).
         base: whitened readings and columns in units of their priors, shape (rows, 1 + columns).
-        inverse: of the columns' information, shape (columns, columns).
+        inverse: inverse of the columns' information, shape (columns, columns).
         towards: right-hand side, shape (columns,).
     """
 
@@ -116,7 +116,7 @@ class _SearchResult:
 
 
 def _search(state: _WhitenedModel, wave: Wave, others: Sequence[Wave] = ()) -> _SearchResult:
-    """The wave, all others as in `state`; its period must be resolved from those of `others`."""
+    """Search one wave with all others as in `state`; its period must be resolved from those of `others`."""
     rows = state.model.rows
     span = float(np.ptp(state.model.clock(wave, rows.command, rows.time_s, rows.value)))
     low, high = (np.log(end * wave.unit) for end in SCALE_RANGE)
@@ -137,7 +137,7 @@ def _search(state: _WhitenedModel, wave: Wave, others: Sequence[Wave] = ()) -> _
         by_period = np.logaddexp.reduce(evidence + weights, axis=1)
         best = np.maximum(by_period[1:], by_period[:-1])
         steep = (np.abs(np.diff(by_period)) > STEEP) & (best > by_period.max() - NEAR)
-        # A peak between two points shows only in the curvature of its neighbours.
+        # A peak between two points appears only in the curvature of its neighbours.
         peak = int(np.argmax(by_period))
         steep[max(peak - 1, 0) : peak + 1] |= bool(np.diff(grid)[max(peak - 1, 0)] > _sharp(evidence, grid))
         if not steep.any() or len(grid) > 2 * GRID_MAX:
@@ -171,7 +171,7 @@ def _sharp(evidence: np.ndarray, grid: np.ndarray) -> float:
 
 
 def period_grid(wave: Wave, span: float) -> np.ndarray:
-    """Logs of periods, evenly in frequency, ascending; `span` of the readings on the clock of the wave.
+    """Logs of periods, evenly in frequency, ascending; `span` is that of the readings on the clock of the wave.
 
     Raises:
         InputError: the range is too wide for the span of the readings.
@@ -188,8 +188,8 @@ def period_grid(wave: Wave, span: float) -> np.ndarray:
             remedy="raise the lower end of the range, or fit a part of the record",
         )
     even = np.linspace(1 / wave.high, 1 / wave.low, max(count, 40))[1:-1]
-    # A slow wave, with few periods in the record, needs points by its log. The ends come from one list only: ends that
-    # differ by rounding would get a point between them.
+    # A slow wave, with few periods in the record, needs points by its log. The ends come from one list only: ends
+    # that differ by rounding would get a point between them.
     by_log = np.linspace(np.log(wave.low), np.log(wave.high), 60)
     grid = np.sort(np.concatenate([-np.log(even), by_log[1:-1]]))
     return np.concatenate([by_log[:1], grid[np.diff(grid, append=np.inf) > APART_MIN], by_log[-1:]])
@@ -200,11 +200,11 @@ def waves_of(rows: AxisRows, priors: Mapping[str, AxisPrior], periods: WavePerio
 
     Args:
         rows: averaged readings.
-        priors: complete; the scale of `transmission_error` is that of the waves.
+        priors: complete priors; the waves have the scale of `transmission_error`.
         periods: settings of the folder.
 
     Raises:
-        InputError: a range that is too wide for the record.
+        InputError: a range is too wide for the record.
     """
     if not periods:
         return ()
@@ -234,10 +234,10 @@ def _inferred(
     waves: Sequence[Wave],
     start: dict[str, float],
 ) -> tuple[list[Wave], list[Wave]]:
-    """The waves of unknown period, and each at its peak: one after the other, the strongest evidence first.
+    """Find the waves of unknown period, also fixed at their peaks: one after the other, the strongest evidence first.
 
     Every range gets the stated number of waves, and further ones while the evidence for another exceeds `FURTHER`: a
-    gear train may have unexpected periods that are stronger. `start` has the coordinates of the last mode by name.
+    gear train may have unexpected stronger periods. `start` has the coordinates of the last mode by name.
     """
     inferred: list[Wave] = []
     peaks: list[Wave] = []
@@ -265,13 +265,13 @@ def _inferred(
 RATIO_SDS = 3.0
 """Range of a stated period of position, in sds of the ratio on the line's clock."""
 ERROR_SLOPE = 1.7
-"""Typical slope of a line over a range of 1 by an error by position of sd 1: half of the largest, root 12."""
+"""Typical slope of a line over a range of 1 from an error by position of sd 1: half of the largest, root 12."""
 
 
 def _stated_wave(clock: Clock, period: float, unit: float, rows: AxisRows, priors: Mapping[str, AxisPrior]) -> Wave:
     """The wave of a stated period: a clock of position uses the line's ratio in place of the unknown true one.
 
-    So the period has a narrow range by the uncertainty of the ratio; where `per_command` is stated better, by that.
+    The period then has a narrow range from the uncertainty of the ratio, or of a better stated `per_command`.
     """
     if clock != "position":
         return replace(Wave.fixed(clock, period, unit), known=period)

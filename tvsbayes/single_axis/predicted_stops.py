@@ -1,7 +1,7 @@
-"""Readings of further moves, predicted by a fit: stops after another homing, with their complete uncertainty.
+"""Predict readings of further moves from a fit: stops after another homing, with their complete uncertainty.
 
-The moves are added to those of the fit, as their own segment, and their rows left out (formulation 8): so the
-prediction includes ratio, play, error by position, homing, drift, scatter of stops and of readings by the model.
+The moves are added to those of the fit, as their own segment, and their rows are left out (formulation 8). The
+prediction thus includes ratio, play, error by position, homing, drift, scatter of stops and of readings in the model.
 Commands as in the folder, readings in its unit.
 """
 
@@ -25,7 +25,7 @@ DRAWS = 160
 
 @dataclass(frozen=True)
 class PredictedStops:
-    """Readings of r stops by n draws of the scales, normal given each.
+    """Readings of r stops for n draws of the scales, normal given each draw.
 
     Attributes:
         mean: shape (n, r).
@@ -52,7 +52,7 @@ class PredictedStops:
         return self.mean[draw] + np.einsum("nij,nj->ni", vectors[draw], normal)
 
     def log_densities(self, value: np.ndarray, additional: np.ndarray | None = None) -> np.ndarray:
-        """Log density of readings (r,) by draw, shape (n,); `additional`: a covariance (r, r) that is added."""
+        """Log density of readings (r,) by draw, shape (n,); `additional` is a covariance (r, r) to be added."""
         covariance = self.covariance if additional is None else self.covariance + additional
         _, log_det = np.linalg.slogdet(covariance)
         deviations = value - self.mean
@@ -60,7 +60,7 @@ class PredictedStops:
         return -0.5 * (log_det + square + len(value) * np.log(2 * np.pi))
 
     def log_density(self, value: np.ndarray, additional: np.ndarray | None = None) -> float:
-        """Log density of readings (r,) by the mixture of equal draws; `additional` as in `log_densities`."""
+        """Log density of readings (r,) under the mixture of equal draws; `additional` as in `log_densities`."""
         return log_mean(self.log_densities(value, additional))
 
 
@@ -70,10 +70,10 @@ def log_mean(logs: Sequence[float] | np.ndarray) -> float:
 
 
 def transferred_scales(source: AxisModel, draws: np.ndarray, target: AxisModel, rng: np.random.Generator) -> np.ndarray:
-    """Coordinates (n, d) for a model of more rows, from draws (n, d) for one of fewer.
+    """Coordinates (n, d) for a model of more rows, from draws (n, d) for a model of fewer rows.
 
-    Scales without a coordinate in `source`, as the scatter of homings with a single one, get their prior, one draw in
-    each of n equal shares of it; a backlash that is linear in `source` is drawn given the scales.
+    Scales without a coordinate in `source`, such as the scatter of homings with a single homing, get their prior, one
+    draw from each of its n equal shares; a backlash that is linear in `source` is drawn given the scales.
     """
     from scipy.special import ndtri
 
@@ -90,7 +90,7 @@ def transferred_scales(source: AxisModel, draws: np.ndarray, target: AxisModel, 
 
 
 def _spread_draws(fit: AxisFit) -> np.ndarray:
-    """`DRAWS` equal draws (n, d) of a fit, even in the scatter of homings: few random ones may miss its long tail."""
+    """`DRAWS` equal draws (n, d) of a fit, evenly spaced in the scatter of homings, so as not to miss its long tail."""
     names = fit.model.coordinates.names
     order = np.argsort(fit.w[:, names.index("home_sd")]) if "home_sd" in names else np.arange(len(fit.w))
     return fit.w[order[((np.arange(DRAWS) + 0.5) * len(order) / DRAWS).astype(int)]]
@@ -99,17 +99,17 @@ def _spread_draws(fit: AxisFit) -> np.ndarray:
 def predicted_stops(
     fit: AxisFit, moves: Sequence[AxisMove], read: Sequence[int], u: np.ndarray, seed: int = 0
 ) -> PredictedStops:
-    """Readings of moves that come after those of a fit and after another homing.
+    """Predict readings of moves that follow those of a fit after another homing.
 
     Args:
-        fit: of an axis.
-        moves: of a separate campaign, in order of time; commands as sent to the mechanics.
+        fit: fit of an axis.
+        moves: moves of a separate campaign, in time order; commands as sent to the mechanics.
         read: numbers of the moves with readings, ascending, shape (r,).
         u: standard uncertainties of these readings, shape (r,); 0 where unknown.
-        seed: of quantities without draws in the fit.
+        seed: seed of quantities without draws in the fit.
 
     Raises:
-        NothingToEstimate: the fit is of a drive that never stops.
+        NothingToEstimate: the drive never stops.
     """
     if fit.rows.in_motion:
         raise NothingToEstimate(
@@ -130,7 +130,7 @@ def predicted_stops(
         )
         for move in moves
     ]
-    # A left-out row may have any value; one on the line changes nothing that depends on the line.
+    # The value of a left-out row is arbitrary; a value on the line leaves all that depends on the line unchanged.
     offset, slope = fit.rows.line
     readings = [
         Reading(number + k, count + m, offset + slope * moves[m].command, float(u[k])) for k, m in enumerate(read)

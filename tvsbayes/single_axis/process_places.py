@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 PLACES_MAX = 60
-"""Largest number of positions that are places themselves; for more, `NODES` nodes with cubic interpolation."""
+"""Largest number of positions that are places themselves; more are replaced by `NODES` interpolated nodes."""
 NODES = 41
 
 
@@ -16,8 +16,8 @@ class ProcessPlaces:
     """Places of the processes of position.
 
     Attributes:
-        command: of the places, ascending, shape (places,).
-        exact: whether every position with readings is a place; else places are even.
+        command: commands of the places, ascending, shape (places,).
+        exact: whether every position with readings is a place; else places are evenly spaced.
     """
 
     command: np.ndarray
@@ -27,7 +27,7 @@ class ProcessPlaces:
         """Weight of each place at commands (n,): shape (n, places).
 
         Raises:
-            ValueError: a command that is no place, where places are exact.
+            ValueError: a command is not a place, where places are exact.
         """
         weights = np.zeros((len(command), len(self.command)))
         if not len(self.command):

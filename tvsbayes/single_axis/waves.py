@@ -2,14 +2,14 @@
 
 A wave is A cos(2 pi x / P - phase) with a second harmonic. x is the position |unit per command| x command, the time in
 seconds, or the reading itself (a wave of the encoder). Cosines and sines are linear and have a normal prior of sd s,
-those of the second harmonic of `SECOND` times s; s is half-normal, and with probability 1/2 there is no wave at all.
+the second harmonic has `SECOND` times s; s is half-normal, and with probability 1/2 there is no wave at all.
 Turns of a gear differ slightly: cosine and sine of the first harmonic change over the record, linearly, by a normal
 share of sd `WANDER` of s at its ends. Without this the uncertainty of a period would be too small for real gears.
 
 The posterior has many peaks in s and P: their coordinates with a standard normal prior are quantiles of tables close to
-their posterior (`period_search`), and the ratio of prior to table is part of the density. So the draws have exact
-weights for any tables. Without a wave its period follows its table (pseudo-prior: Carlin and Chib, J. R. Stat. Soc. B
-57 (1995) 473). Periods in the unit of their clock. NumPy.
+their posterior (`period_search`), and the ratio of prior to table is part of the density. The draws therefore have
+exact weights for any tables. Without a wave its period follows its table (pseudo-prior: Carlin and Chib, J. R. Stat.
+Soc. B 57 (1995) 473). Periods in the unit of their clock. NumPy.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ import numpy as np
 
 Clock = Literal["position", "seconds", "encoder"]
 SECOND = 0.25
-"""sd of the second harmonic's cosine and sine over that of the first: with a larger one, twice the period would explain
-a wave nearly as well, by its second harmonic alone."""
+"""sd of the second harmonic's cosine and sine over that of the first: with a larger value, a wave of twice the period
+would explain the data nearly as well, by its second harmonic alone."""
 WAVE_PRIOR = 0.5
 """Prior probability of a wave."""
 WANDER = 0.1
-"""sd of the change of the first harmonic's cosine and sine at an end of the record, over s."""
+"""sd of the change of the first harmonic's cosine and sine at an end of the record, relative to s."""
 SHARES = (1.0, 1.0, SECOND, SECOND, WANDER, WANDER)
-"""sds of a wave's columns over s."""
+"""sds of a wave's columns relative to s."""
 COLUMNS = len(SHARES)
 """Number of columns: cosine and sine of both harmonics, then of the change of the first."""
 SCALE_RANGE = (1e-4, 4.0)
-"""Range of s over the scale of its half-normal prior, which has 1e-4 of its probability outside."""
+"""Range of s relative to the scale of its half-normal prior, which has 1e-4 of its probability outside."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class WavePeriods:
     """Periods of `[axis]`.
 
     Attributes:
-        stated: periods that are known.
-        between: ranges of unknown periods, each low and high; ranges are the same or do not overlap.
-        in_seconds: whether both are of time; else of position, unit of the readings.
+        stated: known periods.
+        between: ranges of unknown periods, each low and high; two ranges are identical or do not overlap.
+        in_seconds: whether both are in time; else in position, unit of the readings.
         encoder: period of the encoder's own wave, unit of the readings; None without it.
     """
 
@@ -68,7 +68,7 @@ class TabulatedDensity:
 
     Attributes:
         at: nodes, ascending, shape (nodes,).
-        density: there, positive; its integral is 1.
+        density: density at the nodes, positive, with integral 1.
     """
 
     at: np.ndarray
@@ -119,14 +119,14 @@ class Wave:
     """One wave of the model.
 
     Attributes:
-        clock: of its period.
-        low, high: of the period; equal where it is stated and its clock is known exactly.
+        clock: clock of its period.
+        low, high: range of the period; equal where it is stated and its clock is known exactly.
         unit: scale of the half-normal prior of s, in the unit of the readings, > 0.
-        log_scale: table of log s, given that there is a wave.
+        log_scale: table of log s, given that the wave exists.
         log_period: table of the log of the period; None where it is fixed.
-        absent: share of the coordinate's probability for no wave at all.
+        absent: share of the coordinate's probability for no wave.
         peak: period with the largest evidence.
-        known: the stated period; None of an unknown one.
+        known: the stated period; None for an unknown one.
     """
 
     clock: Clock
@@ -158,7 +158,7 @@ class WaveDraws:
     """One wave at draws: arrays (n,).
 
     Attributes:
-        scale: s; 0 where there is no wave.
+        scale: s; 0 where the wave is absent.
         period: in the unit of its clock; shape (1,) where it is stated.
         log_prior: log density of its coordinates relative to the standard normal.
     """
@@ -210,9 +210,9 @@ def start_coordinate(wave: Wave, name: str) -> float:
 
 
 def log_order(waves: Sequence[Wave], draws: Sequence[WaveDraws]) -> np.ndarray:
-    """Log prior (n or 1,) of the order of waves that share one range: their numbering is a convention.
+    """Log prior (n or 1,) of the order of waves that share one range, since their numbering is a convention.
 
-    If m of K waves are present, these are the first m, each the nearest to its own peak among the rest; such an order
+    If m of K waves are present, these are the first m, each nearest to its own peak among the rest; such an order
     represents K! / (K - m)! equivalent ones. -inf for all others.
     """
     order = np.zeros(1)
