@@ -1,4 +1,4 @@
-"""acquire: runs a plan at the bench or on its twin, optionally with a page in a browser."""
+"""Command acquire: runs a plan at the bench or on its twin, optionally with a page in a browser."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def report_line(text: str) -> None:
         typer.echo(styled("".join(c if c.isprintable() else "?" for c in text), sys.stderr), err=True)
     except OSError:
         # Ctrl-C also ends a `tee` that reads stderr: nobody reads it any more, and the work continues. The rest of the
-        # stream's buffer must not fail again while Python ends.
+        # stream's buffer must not cause another error when Python ends.
         sys.stderr = open(os.devnull, "w", encoding="utf-8")
 
 
@@ -81,16 +81,16 @@ def _print(text: str) -> None:
     try:
         typer.echo(styled(text, sys.stdout))
     except OSError as error:
-        # The rest of its buffer must not fail again while Python ends.
+        # The rest of its buffer must not cause another error when Python ends.
         sys.stdout = open(os.devnull, "w", encoding="utf-8")
         if isinstance(error, BrokenPipeError):
-            # The reader, such as `head`, has ended; the work is complete, and its exit code is kept.
+            # The reader, such as `head`, has ended; the work is complete and keeps its exit code.
             return
         raise OutputFailed(error.strerror or str(error)) from error
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """Print the only document on stdout; NaN is an error in the program, no value."""
+    """Print the only document on stdout; NaN is an error in the program, not a value."""
     _print(json.dumps(document, indent=1, allow_nan=False, ensure_ascii=True))
 
 
@@ -102,12 +102,12 @@ def error_document(error: TvsError) -> dict[str, Any]:
 
 
 def is_interactive() -> bool:
-    """Whether standard input is a terminal; a closed one (`<&-`) is None."""
+    """Whether standard input is a terminal; a closed standard input (`<&-`) is None."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 
 def confirmed(lines: list[str], to: Path, yes: bool, as_json: bool) -> bool:
-    """Whether an import may be written; an interactive user is shown the `lines`, which are then cleared."""
+    """Whether an import may be written; an interactive user first sees the `lines`, which are then cleared."""
     if yes or as_json or not is_interactive():
         return yes
     typer.echo("\n".join(lines))

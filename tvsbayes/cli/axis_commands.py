@@ -27,7 +27,7 @@ FITTING, PLANNING, PRINTING = "fit", "choosing stops", "printing to PDF"
 
 
 def new(out: Path, as_json: bool) -> None:
-    """An empty axis folder, explained in campaign.toml."""
+    """Write an empty axis folder, explained in campaign.toml."""
     from tvsbayes.single_axis.axis_campaign import axis_templates
 
     make_folder(out, empty=True)
@@ -65,7 +65,7 @@ def contents(folder: Path) -> dict[str, Any]:
 
 
 def classic(folder: Path, as_json: bool) -> None:
-    """The least-squares line with one reversal, and ISO 230-2."""
+    """Print the least-squares line with one reversal, and ISO 230-2."""
     from tvsbayes.single_axis.axis_campaign import read_axis
 
     document, text = _classic(read_axis(folder))
@@ -93,7 +93,7 @@ def fit(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Fit an axis; results into its folder or `out`."""
+    """Fit an axis; write results into its folder or `out`."""
     from tvsbayes.report.axis_document import axis_fit_text
     from tvsbayes.single_axis.axis_campaign import read_axis
 
@@ -119,7 +119,7 @@ class StoredFit:
 
 
 def _kept_fit(data: AxisCampaign, to: Path, quick: bool, no_sample: bool, max_minutes: float, seed: int) -> StoredFit:
-    """Fit an axis and write the results into a folder; options as of `fit`."""
+    """Fit an axis and write the results into a folder; options as in `fit`."""
     from tvsbayes.single_axis.axis_fit import fit_axis
     from tvsbayes.single_axis.axis_record import keep_fit, summarise_axis, uninformed
 
@@ -137,7 +137,7 @@ def _kept_fit(data: AxisCampaign, to: Path, quick: bool, no_sample: bool, max_mi
 
 
 def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool, as_json: bool) -> None:
-    """Check, classic, fit and report of an axis in one go."""
+    """Run check, classic, fit and report of an axis in one command."""
     from tvsbayes.report.axis_document import axis_fit_text
     from tvsbayes.report.command_text import check_text
     from tvsbayes.single_axis.axis_campaign import read_axis
@@ -158,7 +158,7 @@ def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed:
 
 
 def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_json: bool) -> None:
-    """Hold out each position in turn, for the fit and for the classic line."""
+    """Hold out each position in turn, for the fit and the classic line."""
     if other is not None:
         message = "B is a later campaign of a scanner; axes are compared one by one"
         raise InputError("usage", message, remedy="leave out B")
@@ -181,7 +181,7 @@ def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_j
 
 
 def report(folder: Path, *, issue: Issue, pdf: bool, out: Path | None, as_json: bool) -> None:
-    """The page of an axis."""
+    """Write the page of an axis."""
     from tvsbayes.single_axis.axis_campaign import read_axis
 
     data = read_axis(folder)
@@ -218,7 +218,7 @@ def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path |
 def plan(
     folder: Path, *, alone: bool, target: str | None, minutes: float | None, out: Path | None, seed: int, as_json: bool
 ) -> None:
-    """The next readings; `alone` where the folder is given alone, by --given."""
+    """Plan the next readings; `alone` where the folder is given alone, by --given."""
     if not alone:
         message, remedy = "an axis is planned from its folder alone", "give --given FOLDER without RIG"
         raise InputError("usage", message, remedy=remedy)
@@ -249,7 +249,7 @@ def plan(
 
 
 def simulate(folder: Path, *, moves: Path | None, out: Path, seed: int, as_json: bool) -> None:
-    """A random axis from the priors of a folder, with the listed moves."""
+    """Simulate a random axis from the priors of a folder, with the listed moves."""
     from tvsbayes.files.csv_table import CSV_BYTES_MAX
     from tvsbayes.files.disk import read_bytes
     from tvsbayes.single_axis.axis_campaign import parse_axis_moves, read_axis

@@ -32,7 +32,7 @@ class FileOptions:
     Attributes:
         kind: "auto" or one of `KINDS`.
         run: number of a run of a guide log.
-        deviations: whether readings are actual less commanded position.
+        deviations: whether readings are actual minus commanded position.
         counts_per_turn: counts after which readings restart.
         assume: numbers that a guide log does not state, by name.
     """
@@ -223,7 +223,7 @@ def _drive_lines(readings: ForeignReadings) -> list[str]:
 
 
 def _unit_line(to: Path, unit: str | None) -> str:
-    """The unit of the results, as a line: a reading in mm must not be reported in degrees."""
+    """The unit of the results, as a line, so that a reading in mm is not reported in degrees."""
     has_header = (to / "campaign.toml").is_file()
     if unit and not has_header:
         return f"unit: {unit}, as the file says; it goes into campaign.toml"

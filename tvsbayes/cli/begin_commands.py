@@ -79,7 +79,7 @@ def new(
 
 
 def _new_head(out: Path, sightings: bool, as_json: bool) -> None:
-    """An empty campaign of a pan-tilt head and its rig file."""
+    """Write an empty campaign of a pan-tilt head and its rig file."""
     from tvsbayes.instrument.campaign import head_templates
 
     make_folder(out, empty=True)
@@ -93,7 +93,7 @@ def _new_head(out: Path, sightings: bool, as_json: bool) -> None:
 
 
 def write_templates(out: Path) -> list[str]:
-    """The commented files of an empty campaign."""
+    """Write the commented files of an empty campaign."""
     from tvsbayes.instrument.campaign import campaign_templates
 
     files = campaign_templates()
@@ -103,7 +103,7 @@ def write_templates(out: Path) -> list[str]:
 
 
 def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_json: bool) -> None:
-    """Looks and frames of a folder of pictures, for a new campaign or for one without pictures."""
+    """Add looks and frames of a folder of pictures to a new campaign or one without pictures."""
     from tvsbayes.cameras.look_pictures import copy_frames, pair_looks, views_of
     from tvsbayes.instrument.campaign import spots_bytes
 
@@ -127,7 +127,7 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
     with waiting() as progress, Job({COPYING: 1.0}, progress) as job:
         job.begin(COPYING)
         copied = copy_frames(paired.pictures, out, job.at)
-    # Written last: a folder with listed looks has all their pictures.
+    # spots.csv is written last: a folder with listed looks then has all their pictures.
     write_atomically(out / "spots.csv", spots_bytes(paired.spots))
     lines = _unpaired_lines(views, paired, "spots" if rows else "moves")
     text = _paired_text(out, paired, copied, "pan_steps and tilt_steps" if moves_path is None else None, moves)
@@ -142,7 +142,7 @@ def _with_pictures(out: Path, folder: Path, pair: str | None, swap: bool, as_jso
 
 
 def moves_file(out: Path, folder: Path) -> Path | None:
-    """The file with the moves of the pictures: in the campaign or beside the pictures; None without one."""
+    """The file with the moves of the pictures: in the campaign or beside the pictures; None if none."""
     from tvsbayes.instrument.campaign import campaign_templates
 
     target, nearby = out / "moves.csv", folder / "moves.csv"
@@ -152,7 +152,7 @@ def moves_file(out: Path, folder: Path) -> Path | None:
 
 
 def _moves_of(file: Path | None) -> tuple[Move | None, ...]:
-    """The checked moves of a file; a None for each row of a file to fill in, which is only counted."""
+    """The checked moves of a file; None for each row of a file to fill in, which is only counted."""
     from tvsbayes.instrument.campaign import parse_moves
 
     if file is None:
@@ -197,7 +197,7 @@ def _refuse_other_size(out: Path, views: ViewedFolder) -> None:
 
 
 def _sizes_px(sizes: Mapping[str, tuple[int, int]]) -> str:
-    """Sizes of pictures in words; one where both cameras have the same."""
+    """Sizes of pictures in words; one where both cameras have the same size."""
     return " and ".join(f"{width} x {height} px" for width, height in dict.fromkeys(sizes.values()))
 
 

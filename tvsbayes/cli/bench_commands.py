@@ -179,7 +179,7 @@ def _output_paths(out: Path | None, export: Format | None) -> dict[str, Path]:
     places |= {name: folder / name for name in (() if export is None else EXPORT_NAMES[export])}
     for path in places.values():
         if os.path.lexists(path):
-            # Fits refer to a calibration by its hash.
+            # Fits refer to a calibration by its hash, so it is not overwritten.
             remedy = "name another file, or move this one away; nothing is overwritten"
             place = escaped(str(path), 200)
             raise refusal("occupied", file=place, found="a file that is there", allowed="a new file", remedy=remedy)
@@ -229,7 +229,7 @@ def _provenance(
     from tvsbayes.cameras.assumed_covariance import USUAL_PITCH_MM, Provenance
     from tvsbayes.cameras.boards import Board
 
-    # Checked like a board for pictures.
+    # The values are checked like a board for pictures.
     pattern = Board.named(board or "9x6", USUAL_PITCH_MM if pitch_mm is None else pitch_mm, pitch_u_mm or 0.0)
     size = None if board is None else (pattern.columns, pattern.rows)
     return Provenance(board=size, pitch_mm=pitch_mm, pitch_u_mm=pitch_u_mm, **made_by)  # type: ignore[arg-type]

@@ -61,7 +61,7 @@ def demo(
         campaign = read_campaign(folder)
         rig = read_truth(folder / "truth.json", campaign.stereo)
         classic_result = estimate_classic(campaign)
-        # Evidence for reports takes as long as the fit: only where the results are kept.
+        # Evidence for reports takes as long as the fit, and is made only where the results are kept.
         with waiting() as progress:
             if out is None:
                 summary = _sampled(campaign, progress)
@@ -77,7 +77,7 @@ def demo(
 
 
 def _sampled(campaign: Campaign, progress: Show | None) -> FitSummary:
-    """A fit and its posterior by importance sampling."""
+    """Fit a campaign and sample its posterior by importance sampling."""
     from tvsbayes.assessment.summary import summarise
     from tvsbayes.estimators.joint_fit import fit
     from tvsbayes.posterior.sampling import sample
@@ -232,7 +232,7 @@ def _contents(path: Path, plan_file: Path | None) -> dict[str, Any]:
         compile_for(report_line)
         with waiting() as progress:
             return check_plan(rig, steps, progress=progress).as_json()
-    # A part of a campaign cannot be checked without the others.
+    # A part of a campaign cannot be checked without the other parts.
     if is_part(path):
         found, remedy = f"{escaped(path.name)} is a part of a campaign", f"check {escaped(str(path.parent), 200)}"
         raise InputError("usage", f"{found}, checked as a whole", allowed="a campaign folder", remedy=remedy)
@@ -275,7 +275,7 @@ def _check_rig_and_plan(path: Path, plan_file: Path) -> None:
 def campaign_contents(path: Path, campaign: Campaign | None = None) -> dict[str, Any]:
     """The document of `check` for a campaign and its journal; for the journal alone before the first move.
 
-    `campaign` is the campaign of the path, if it was read already.
+    `campaign` is the campaign at the path, if it was read already.
     """
     from tvsbayes.estimators.plausibility import check_campaign
     from tvsbayes.instrument.campaign import read_campaign

@@ -85,7 +85,7 @@ def compensate(
 
     check_output(out)
     if (mechanism := _mechanism(campaign)) is not None:
-        # Counters of two axes follow from the whole calibration: it is the table.
+        # Counters of two axes follow from the whole calibration, which is the table.
         default = "urdf" if mechanism.terms else "header"
         if to != default:
             kind = "a pan-tilt head" if mechanism.terms else "a scanner"
@@ -197,7 +197,7 @@ def verify(
 
 
 def _verify_axis(folder: Path, fresh: Path, seed: int, _: float | None) -> tuple[Verification, dict[str, object]]:
-    """Verification of an axis, and the hashes of its data and table."""
+    """Verify an axis; also return the hashes of its data and table."""
     from tvsbayes.compensation.verification import stored_compensation, verify_axis
     from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis
 
@@ -211,7 +211,7 @@ def _verify_axis(folder: Path, fresh: Path, seed: int, _: float | None) -> tuple
 def _verify_scanner(
     folder: Path, fresh: Path, seed: int, distance_mm: float | None
 ) -> tuple[Verification, dict[str, object]]:
-    """Verification of a scanner or head, and the hashes of its data and calibration."""
+    """Verify a scanner or head; also return the hashes of its data and calibration."""
     from tvsbayes.calibration.calibration_file import calibration_json, content_sha256, load_calibration
     from tvsbayes.instrument.campaign import input_hashes, read_campaign
 
@@ -224,7 +224,7 @@ def _verify_scanner(
 
 
 def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bool) -> None:
-    """`plan FOLDER --verify`: the fewest readings that verify a table."""
+    """`plan FOLDER --verify`: plan the fewest readings that verify a table."""
     from tvsbayes.compensation.verification import plan_verification, stored_compensation
     from tvsbayes.report.compensation_text import verify_plan_text
     from tvsbayes.results.records import plain
@@ -252,7 +252,7 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
 
 
 def _plan_looks(folder: Path, out: Path | None, as_json: bool) -> None:
-    """The fewest looks that verify a scanner or head, at the target with most looks in the campaign."""
+    """Plan the fewest looks that verify a scanner or head, at the target with most looks in the campaign."""
     from collections import Counter
 
     from tvsbayes.comparison.verified_looks import accepted_calibration, plan_looks

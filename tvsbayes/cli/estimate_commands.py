@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from tvsbayes.results.estimates import FitSummary
 HOLDING_OUT = "hold-out"
 OVERRIDE_HINT = "--anyway fits it regardless"
-"""Hint for a certain finding of `check`."""
+"""Hint at a finding of which `check` is certain."""
 
 
 def _warn_implausible(campaign: Campaign, *, stops: bool = False) -> None:
-    """Print findings of `check` on impossible data, for a user who did not run it.
+    """Print findings of `check` on implausible data, for a user who did not run it.
 
     Raises:
         InputError: `stops`, and a finding is certain.
@@ -231,7 +231,7 @@ def _compare_positions(campaign: Path, as_json: bool) -> None:
 
 
 def _compare_pointing(data: Campaign, as_json: bool) -> None:
-    """Terms of a head by least squares without gears, and those of the fit."""
+    """Print the terms of a head by least squares without gears, and those of the fit."""
     import numpy as np
 
     from tvsbayes.head.pointing_model import pointing_model
@@ -258,10 +258,10 @@ def _no_experiments() -> NothingToEstimate:
 
 
 def _classic_against_joint(joint: JointFit, by: str, seed: int, progress: Show | None) -> ComparisonRecord:
-    """The difference of both estimators term by term, and their predictions of held-out looks.
+    """Compute the difference of both estimators term by term, and their predictions of held-out looks.
 
     Raises:
-        NothingToEstimate: no complete experiment has an angle.
+        NothingToEstimate: no complete experiment gives an angle.
     """
     from tvsbayes.comparison.gap import explain_gap
     from tvsbayes.comparison.held_out import hold_out

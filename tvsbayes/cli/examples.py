@@ -1,4 +1,4 @@
-"""Examples at the end of every command's help, and what `tvsbayes --help` begins with."""
+"""Examples at the end of every command's help, and at the beginning of `tvsbayes --help`."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ EXAMPLES = {
     ),
     "study": ("tvsbayes study rig.toml plan.csv --n 100 --engine processes",),
 }
-"""Examples by command; each runs unchanged with files of these names."""
+"""Examples by command; they run unchanged with files of these names."""
 FIRST = ("tvsbayes demo", "tvsbayes new mine", "tvsbayes calibrate mine")
 """First commands of a new user."""
 

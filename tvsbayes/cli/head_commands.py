@@ -34,7 +34,7 @@ FITTING, DRAWING = "fit", "drawing the page"
 HEAD_URDF = "head.urdf"
 """File in a campaign folder: the model from `import --urdf`."""
 TEMPLATE_FILES = ("campaign.toml", "moves.csv", "spots.csv")
-"""Files of a campaign as `new` writes it."""
+"""Files of a campaign written by `new`."""
 PRIOR_FILES = ("campaign.toml", "rig.toml")
 """Files with [rig.prior]."""
 RATIO_U = 0.01
@@ -42,7 +42,7 @@ RATIO_U = 0.01
 
 
 def refuse_sightings(sightings: bool) -> None:
-    """Refuse the rig file of a head with sightings for `acquire`: it has no stereo pair.
+    """Refuse the rig file of a head with sightings for `acquire`, since it has no stereo pair.
 
     Raises:
         InputError: `sightings`.
@@ -57,7 +57,7 @@ def refuse_head(calibration: Calibration) -> None:
     """Refuse a head for `locate`, which needs the scanner's aperture.
 
     Raises:
-        InputError: the calibration is one of a head.
+        InputError: the calibration belongs to a head.
     """
     from tvsbayes.calibration.pointing import INPUT_NAMES
 
@@ -162,17 +162,17 @@ def import_sightings(
 
 @dataclass(frozen=True)
 class _SightingFiles:
-    """Files of a head by name, and their assumptions, in words."""
+    """Files of a head by name, and the assumptions in words."""
 
     files: dict[str, bytes]
     assumed: list[str]
 
 
 def _sighting_files(rows: ForeignSightings, to: Path, table: str) -> _SightingFiles:
-    """The tables, and campaign and rig file with ratios where those of the folder state none.
+    """The tables, with campaign and rig file, whose ratios are added where the folder states none.
 
     Raises:
-        InputError: a folder of another instrument, with rows, or with stated ratios for angles of an encoder.
+        InputError: the folder has another instrument, rows, or stated ratios for angles of an encoder.
     """
     from tvsbayes.instrument.campaign import MOVES, head_templates
     from tvsbayes.instrument.campaign_header import mechanism_of
@@ -208,7 +208,7 @@ def _sighting_files(rows: ForeignSightings, to: Path, table: str) -> _SightingFi
 
 
 def _joints_of(folder: Path) -> HeadJoints | None:
-    """The joints of the URDF in a campaign folder; None without one."""
+    """The joints of the URDF in a campaign folder; None if none."""
     from tvsbayes.head.urdf import URDF_BYTES_MAX, head_joints
     from tvsbayes.instrument.campaign_header import header_values
 
@@ -268,7 +268,7 @@ def _is_prior_line(line: str, priors: Mapping[str, Prior]) -> bool:
 
 
 def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
-    """The model of the robot with the estimated terms, and YAML with their covariance."""
+    """Write the model of the robot with the estimated terms, and YAML with their covariance."""
     import hashlib
 
     import numpy as np
@@ -323,7 +323,7 @@ def compensate(folder: Path, out: Path | None, as_json: bool) -> None:
 
 
 def classic(folder: Path, as_json: bool) -> None:
-    """A pointing model by least squares, without gears."""
+    """Print a pointing model by least squares, without gears."""
     from tvsbayes.head.pointing_model import pointing_model
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.result_tables import pointing_table
@@ -333,7 +333,7 @@ def classic(folder: Path, as_json: bool) -> None:
 
 
 def report(folder: Path, issue: Issue, pdf: bool, out: Path | None, as_json: bool) -> None:
-    """The page of a head; fits first where results are missing."""
+    """Write the page of a head; fit first where results are missing."""
     from tvsbayes.estimators.plausibility import check_campaign
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.head_document import head_document

@@ -210,7 +210,7 @@ def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
 
 
 def _field_and_column(text: str) -> tuple[str, str]:
-    """The two sides of --column FIELD=NAME."""
+    """Split --column FIELD=NAME."""
     field, sign, name = text.partition("=")
     if not sign:
         remedy = "write --column u_left_px=XL; --column target= where the table has none"
@@ -230,7 +230,7 @@ def _axis_kind(kind: str) -> str:
 
 
 def _assumption(text: str, known: Mapping[str, str], example: str) -> tuple[str, float]:
-    """The two sides of --assume NAME=NUMBER, of names with their meanings."""
+    """Split --assume NAME=NUMBER; `known` holds the names with their meanings."""
     name, _, number = text.partition("=")
     allowed = ", ".join(f"{key}=NUMBER ({meaning})" for key, meaning in known.items())
     if name.strip() not in known or not NUMBER.fullmatch(number.strip()):
@@ -275,7 +275,7 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
 
 
 def _listed_moves(to: Path) -> tuple[Move, ...] | None:
-    """The moves of a campaign; None without any but the row of the template."""
+    """The moves of a campaign; None if there is only the template's row."""
     from tvsbayes.instrument.campaign import campaign_templates, parse_moves
     from tvsbayes.instrument.column_names import COUNTERS
 
@@ -360,7 +360,7 @@ def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
 
 
 def _mapping_document(table: ForeignTable, mapping: ColumnMapping, looks: ForeignLooks) -> dict[str, Any]:
-    """The same as `_mapping_text`, for programs."""
+    """The content of `_mapping_text`, for programs."""
     return {
         **table_document(table, mapping),
         "assumed": list(looks.assumed),

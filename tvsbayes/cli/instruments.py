@@ -1,7 +1,7 @@
-"""The instruments other than the scanner, and their dispatch: finds the instrument of a folder and runs its command.
+"""The instruments other than the scanner, with dispatch: find the instrument of a folder and run its command.
 
-Each instrument has a module with a function for each of its commands (`fit`, `plan`, `check` ...): the folder first,
-then the options by their names. Unknown options and commands are refused.
+Each instrument has a module with a function for each of its commands (`fit`, `plan`, `check` ...), which takes the
+folder first, then the options by their names. Unknown options and commands are refused.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ class Instrument:
 
     Attributes:
         words: its name in a sentence, with article.
-        folder: the same for its campaign folder.
+        folder: name of its campaign folder in a sentence, with article.
         commands: module of its commands.
-        served: remedy for a command that it does not have.
+        served: remedy for a command that it lacks.
         remedies: remedies for single commands and their options, by the name of the command.
         shared: commands of the scanner that it uses unchanged.
     """
@@ -37,14 +37,14 @@ class Instrument:
     shared: tuple[str, ...] = ()
 
     def command(self, name: str) -> Any:
-        """Its function for a command; None without one."""
+        """Its function for a command; None if none."""
         return getattr(import_module(self.commands), name.replace("-", "_"), None)
 
     def carry_out(self, name: str, path: Path, **options: object) -> None:
         """Run one of its commands.
 
         Args:
-            name: of the command.
+            name: name of the command.
             path: campaign folder.
             options: all options of the command; None or False where not given.
 
@@ -84,7 +84,7 @@ INSTRUMENTS = {
         ("import", "check", "fit", "compare", "steps-for", "watch", "plan"),
     ),
 }
-"""By mechanism, as `campaign.toml` states it."""
+"""Instruments by mechanism, as in `campaign.toml`."""
 
 
 def instrument_of(path: Path | None) -> Instrument | None:
@@ -95,7 +95,7 @@ def instrument_of(path: Path | None) -> Instrument | None:
 
 
 def serve(command: str, campaign: Path | None, **options: object) -> bool:
-    """Run a command if the folder is of an instrument of the list; returns whether it was run.
+    """Run a command if the folder belongs to an instrument of the list; return whether it was run.
 
     A command calls it first with `locals()`: its options by name.
 

@@ -1,4 +1,4 @@
-"""The progress bar: on stderr, if it is a terminal, after two seconds of waiting.
+"""The progress bar, shown on stderr if it is a terminal, after two seconds of waiting.
 
 After an interruption a line reports the files that were kept.
 """
@@ -44,7 +44,7 @@ def chain_progress(hint: str) -> Iterator[Show]:
 
             yield show
     except KeyboardInterrupt:
-        # The first announcement is the start of the chain: before the first block of steps there is nothing to keep.
+        # The first announcement is the start of the chain: before its first block of steps there is nothing to keep.
         if announced > 1:
             report_line(f"the chain so far is kept in chain.npz; {hint}")
         raise
@@ -57,7 +57,7 @@ def _bar() -> Write:
     from rich.progress import Progress as Bar
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}"))
-    # Standard output is for the result alone.
+    # Standard output receives only the result.
     bar = Bar(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False)
     task = bar.add_task("", total=1.0, left="")
 

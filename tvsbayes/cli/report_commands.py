@@ -132,7 +132,7 @@ def _issue(laboratory: str | None, customer: str | None) -> Issue:
 
 
 def _text(option: str, text: str | None) -> str:
-    """The text of an option, "" without it; an empty one is refused as a mistake."""
+    """The text of an option, "" if not given; an empty text is refused as a mistake."""
     if text is not None and not text.strip():
         remedy = "write the name, or leave the option out: the report says `not stated` then"
         raise InputError("usage", f"--{option} is empty", column=f"--{option}", allowed="a name", remedy=remedy)
@@ -147,7 +147,7 @@ def _countries(place: str | None, customer: str | None) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class PageOptions:
-    """Options for the page of a campaign; fields as the options of `report`."""
+    """Options for the page of a campaign; fields are the options of `report`."""
 
     campaign: Path
     issue: Issue
@@ -158,7 +158,7 @@ class PageOptions:
     out: Path | None = None
 
     def write(self, data: Campaign) -> WrittenPage:
-        """Gather evidence, draw and write the page, and print it if requested; fits first where results are missing."""
+        """Gather evidence, draw and write the page, and print it if requested; fit first where results are missing."""
         from tvsbayes.calibration.calibration_file import load_calibration
         from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page
         from tvsbayes.report.scanner_document import report_document
@@ -193,10 +193,10 @@ class WrittenPage:
 
     Attributes:
         record, evidence: its sources.
-        number: on its first page.
+        number: number on its first page.
         html: its bytes.
         path: its file.
-        files: the page and files made of it, by kind.
+        files: the page and the files made from it, by kind.
         removed: names of removed files of an earlier page.
     """
 
@@ -269,7 +269,7 @@ def calibrate(
     if pdf:
         from tvsbayes.report.page import find_browser
 
-        # Before the fit, which takes minutes.
+        # A missing browser is found before the fit, which takes minutes.
         find_browser()
     limits = {"limit_deg_per_step": limit_deg_per_step, "limit_mm": limit_mm, "anyway": anyway}
     limits["range_mm"] = range_mm if range_mm != RANGE_MM else None
@@ -316,7 +316,7 @@ def calibrate(
 
 
 def _classic(data: Campaign) -> tuple[dict[str, Any] | None, str]:
-    """Document and table of the four-point estimator; None, and the reason, without a complete experiment."""
+    """Document and table of the four-point estimator; without a complete experiment None and the reason."""
     from tvsbayes.estimators.four_point import classic
     from tvsbayes.report.fit_text import classic_text
 

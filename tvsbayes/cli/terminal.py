@@ -21,9 +21,9 @@ COLOUR_STARTS = (
     ("green", ("verdict: usable", "OK (p ")),
     ("cyan", ("next:", "what to do:", "what helps:")),
 )
-"""Colour, and the first words of lines of that colour."""
+"""Colours, with the first words of lines in that colour."""
 CELL_GAP = "  "
-"""Separates cells, never words of a sentence."""
+"""Separator of cells, which never separates words of a sentence."""
 LAST_CELL_MIN = 24
 """Least width of the last cell for which it is wrapped below itself."""
 BOLD_STARTS = ("error:", "verdict:", "next:", "VALIDATION FAILED", "MOVED (p ", "CANNOT TELL (p ", "OK (p ")

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 WORKERS = 2
 PLAN_DRAWS = 200
-"""Equal to that of `planning.planner`, which would import JAX."""
+"""Default equal to that of `planning.planner`, whose import would load JAX."""
 NEAREST_POINT_MM = 10.0
 """Least distance of a point from the middle of the baseline: smaller numbers are probably metres."""
 PLANNING, LOCATING = "plan", "points"
@@ -257,7 +257,7 @@ def plan(
     out = out or output
     check_output(out, rig)
     finite(minutes=minutes, confirm=confirm)
-    # Further options of a plan of looks for a target.
+    # Further options of a plan for a target.
     extra: dict[str, object] = {"criterion": criterion != "c", "draws": draws != PLAN_DRAWS, "aperture": aperture}
     onward = {"next": count, "confirm": confirm}
     if verify:

@@ -1,4 +1,4 @@
-"""view: a campaign as one HTML file for a browser."""
+"""Command view: a campaign as one HTML file for a browser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""watch: compares new looks with a stored calibration; also the table of a nightly job, and the plan of the looks."""
+"""Command watch: compares new looks with a stored calibration; appends to a nightly table, and plans the looks."""
 
 from __future__ import annotations
 
@@ -77,14 +77,14 @@ def _append(table: Path, result: Watch) -> InputError | None:
 def plan_watch(
     path: Path | None, given: Path | None, *, minutes: float | None, out: Path | None, seed: int, as_json: bool
 ) -> None:
-    """`plan CAMPAIGN --watch`, or `plan RIG --given CAMPAIGN --watch`: limits and costs of the rig file.
+    """`plan CAMPAIGN --watch`, or `plan RIG --given CAMPAIGN --watch` with limits and costs of the rig file.
 
     Args:
         path: the campaign, or the rig file where the campaign is given.
         given: the campaign, or None.
         minutes: longest duration of the plan.
         out: file of the plan.
-        seed: of the search.
+        seed: seed of the search.
         as_json: print the document.
     """
     from msgspec import structs

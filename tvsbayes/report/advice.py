@@ -17,7 +17,7 @@ from tvsbayes.results.estimates import FitSummary, Validation, WeakDirection
 from tvsbayes.results.metrology_tables import BudgetTable
 
 SPOTS_REMEDY = "look at those spots, or fit with --robust"
-"""Remedy for single spots that disagree; no factor on u covers these."""
+"""Remedy for single spots that disagree, which no factor on u covers."""
 REMEDIES = {
     "the cameras moved": "fix the cameras and measure again, or fit the looks before and after as two campaigns",
     "the cameras drifted": "let cameras and mount warm up for half an hour and measure again in less time",
@@ -37,7 +37,7 @@ SPOTS_LISTED = 20
 SHARE_NAMED = 0.05
 """Least share of a variance for naming its cause."""
 USUAL_SCALE = (0.5, 2.0)
-"""Pixel noise over the stated one without a remark."""
+"""Range of the estimated over the stated pixel noise without a remark."""
 
 
 def remedy(validation: Validation) -> str:
@@ -47,7 +47,7 @@ def remedy(validation: Validation) -> str:
 
 
 def factor_text(validation: Validation) -> str:
-    """The effect of a failed validation on every u; its factor is 1 where no result would move."""
+    """The effect of a failed validation on every u; the factor is 1 where no result would change."""
     if validation.widens:
         return f"multiply every u and half-width by {validation.inflation:.2f}"
     return "no factor on u covers it"

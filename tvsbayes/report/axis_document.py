@@ -1,6 +1,6 @@
 """Results of an axis: tables, texts of commands, the document of its page.
 
-Commands and values in the axis' own units, `escaped` where they come from a campaign.
+Commands and values in the axis' own units; texts of a campaign are `escaped`.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def period_table(summary: AxisSummary) -> TableView | None:
 
 
 def ratio_table(summary: AxisSummary) -> TableView:
-    """Unit per command by direction: of the gears, of the line through the readings, and the classic."""
+    """Unit per command by direction: of the gears, of the line through the readings, and from the classic estimate."""
     unit = escaped(summary.unit)
     low, high = summary.range_command
     rows = [_row(f"gears, {side}", e) for side, e in summary.per_command.items()]
@@ -129,7 +129,7 @@ def for_firmware(summary: AxisSummary) -> str:
 
 
 def result_lines(summary: AxisSummary) -> list[str]:
-    """Main results of a converged fit: numbers for firmware, the worst place, waves; only waves for a drive."""
+    """Main results of a converged fit: numbers for firmware, the worst position, waves; for a drive only waves."""
     waves = [*_waves(summary.periods, summary, summary.periods_in), *_waves(summary.encoder_periods, summary, "")]
     if "seeing_s" in summary.parameters:
         return waves
@@ -160,7 +160,7 @@ def worst_place(summary: AxisSummary) -> str:
 
 
 def deviation_table(deviations: Sequence[PositionDeviation], unit: str, limit: int) -> TableView:
-    """Errors that repeat by position, less the line; at most `limit` positions, evenly spread."""
+    """Errors that repeat by position, minus the line; at most `limit` positions, evenly spread."""
     rows = [[f"{d.position:.10g}", concise(d.value, d.sd), interval_text(*d.interval95, d.sd)] for d in deviations]
     caption = f"error that repeats by position, off the line through the stops, {escaped(unit)}"
     if len(rows) > limit:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def extrapolated_text(unseen: str) -> str:
-    """The warning of a result at counters without looks; `unseen` names them."""
+    """The warning of a result at counters without looks; `unseen` names these counters."""
     return f"EXTRAPOLATED: {unseen}, where looks were; errors of the gears are predicted there from their size only"
 
 
@@ -58,7 +58,7 @@ SIGHTING_WORDS = {
     "refused": "refused sightings, by reason",
     **dict.fromkeys(("aperture_readings", "experiments"), ""),
 }
-"""The same for a head with sightings; "" omits a key."""
+"""Words for a head with sightings; "" omits a key."""
 UNSEEN_SHOWN = 5
 """Largest number of notes on counters without looks, for a file of points."""
 PLAN_UNIT = {"contrast": "deg/step", "backlash": "deg", "mirror_offset": "mm"}
@@ -69,8 +69,8 @@ def check_text(document: Mapping[str, Any], sightings: bool = False) -> str:
     """The text of `check` for a campaign, rig, plan, axis or journal: a table, and warnings.
 
     Args:
-        document: of `check --json`.
-        sightings: whether the campaign is of a head with sightings.
+        document: document of `check --json`.
+        sightings: whether the campaign belongs to a head with sightings.
     """
     omitted = ("kind", "findings", "warnings", "faults", "expected", "contraction", "journal")
     words = KEY_WORDS | (SIGHTING_WORDS if sightings else {})
@@ -367,7 +367,7 @@ def gap_text(gaps: Mapping[str, Gap | None]) -> str:
 
 
 def hold_out_text(hold_out: HoldOut) -> str:
-    """Both estimators' predictions of left-out angles, and the uncertainty that no hold-out shows."""
+    """Both estimators' predictions of left-out angles, and the uncertainty that a hold-out cannot show."""
     u_text = ", ".join(f"{d} {u:.1e}" for d, u in hold_out.unseen.items())
     return terminal(
         hold_out_table(hold_out),

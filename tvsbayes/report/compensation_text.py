@@ -34,7 +34,7 @@ REMEDIES = {
     OTHER_MACHINE: "the table is of another machine, or this one changed: measure it again and compensate again",
     APPLIED: "readings lie farther off than the table allows: measure again, and compensate again if that persists",
 }
-"""Remedies by the most probable world, where the promise is broken."""
+"""Remedies by the most probable hypothesis, where the promise is broken."""
 SCANNER_REMEDIES = {
     NOT_APPLIED: "counters follow the nominal degrees per step, or come without the run-up that takes up the play: use "
     "those of `tvsbayes steps-for` with `via_pan_steps` and `via_tilt_steps`, or the header's",
@@ -44,7 +44,7 @@ SCANNER_REMEDIES = {
     "see `tvsbayes check FRESH` and `tvsbayes watch CAMPAIGN FRESH`",
     APPLIED: "looks lie farther off than the calibration allows: `tvsbayes watch CAMPAIGN FRESH` says what moved",
 }
-"""The same for a scanner."""
+"""Remedies for a scanner."""
 HELPS = {
     "homing": "the scatter of homings; read after several homings, or verify without homing in between",
     "stops": "the scatter of single stops; no table corrects that",
@@ -53,11 +53,11 @@ HELPS = {
     "drift": "the walk of the zero; home more often, or guide",
     "readings": "the readings themselves; a better reference",
 }
-"""The largest cause of the remaining error, with its remedy."""
+"""Remedies by the largest cause of the remaining error."""
 
 
 def promise_table(result: Compensation) -> TableView:
-    """Remaining error by side, and the part of each cause alone."""
+    """Remaining error by side, and the error that each cause alone would leave."""
     rows = []
     for side, remainder in result.promise.items():
         causes = [two_digits(remainder.causes[cause]) for cause in CAUSES]
@@ -214,7 +214,7 @@ def aim_plan_text(plan: AimPlan) -> str:
 
 
 def _power(plan: VerifyPlan | AimPlan) -> str:
-    """Whether a plan separates the worlds, in words."""
+    """Whether a plan separates the hypotheses, in words."""
     if plan.enough:
         return f"they separate the hypotheses in 95 % of cases: {plan.distance:.1f} standard deviations"
     return f"they do not separate the hypotheses: the nearest two are {plan.distance:.1f} standard deviations apart"

@@ -60,7 +60,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Number:
-    """One of the numbers at the top of the page."""
+    """A number at the top of the page."""
 
     label: str
     value: str
@@ -94,16 +94,16 @@ class Document:
     """A report of any instrument.
 
     Attributes:
-        results: number of its results; `number` is the document's own.
-        name: of the measured object.
+        results: number of its results; `number` is the document's own number.
+        name: name of the measured object.
         about: object, dates and operator of the measurement.
         verdict: whether the numbers may be used.
-        answer: the first table, beside `picture`; `numbers` and `why` are below it.
+        answer: the first table, beside `picture`; `numbers` and `why` follow below it.
         steps: next steps.
         criteria: limits with their verdicts.
         traceable: statement on traceability.
-        warnings: for the user of the numbers.
-        versions: of the programs that computed it.
+        warnings: warnings for the user of the numbers.
+        versions: versions of the programs that computed it.
     """
 
     results: str

@@ -1,7 +1,7 @@
 """The common style of all figures: size, colours, text, and a figure as an SVG document.
 
-Figures are one phone's width (4.6 inch) with text of 9 points. Colours are Okabe and Ito's (safe for colour-blind
-readers, jfly.uni-koeln.de/color); a colour with a meaning always has a marker or a label too. Importing the module
+Figures are as wide as a phone (4.6 inch) with text of 9 points. Colours are Okabe and Ito's (safe for colour-blind
+readers, jfly.uni-koeln.de/color); a colour with a meaning always has a marker or label too. Importing the module
 loads no matplotlib.
 """
 
@@ -32,7 +32,7 @@ DIRECTION_STYLE = {
 }
 """Marker and colour of each direction of a scanner and of an axis in every figure; "" for an unknown direction."""
 SMALLEST_SHARE = 0.005
-"""Least share of a variance with its own bar or row; smaller ones are only in fit.json."""
+"""Least share of a variance with its own bar or row; smaller shares appear only in fit.json."""
 DIVERGING, SEQUENTIAL = (BLUE, "#FFFFFF", RED), ("#FFFFFF", SKY, BLUE, "#00263E")
 """Colours of maps, from the lowest to the highest value."""
 RASTER_DPI = 150
@@ -54,7 +54,7 @@ STYLE: dict[Any, object] = {
 
 @contextmanager
 def drawing(height_in: float) -> Iterator[Figure]:
-    """A figure in the common style, one phone wide, filled by the caller."""
+    """A figure in the common style, as wide as a phone, filled by the caller."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -63,7 +63,7 @@ def drawing(height_in: float) -> Iterator[Figure]:
 
 
 def legend(figure: Figure, columns: int, panel: Axes | None = None) -> None:
-    """A legend below the panels: of one of them, else of all, without repetition."""
+    """Draw a legend below the panels, for one of them or for all, without repetition."""
     handles: dict[object, Artist] = {}
     for axes in figure.axes if panel is None else [panel]:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -72,7 +72,7 @@ def legend(figure: Figure, columns: int, panel: Axes | None = None) -> None:
 
 
 def colour_map(stops: Sequence[str]) -> Colormap:
-    """Colours between these, from the lowest to the highest value."""
+    """A map of colours between these, from the lowest to the highest value."""
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("-".join(stops), stops)
@@ -84,7 +84,7 @@ def svg(figure: Figure) -> bytes:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer, dpi = io.BytesIO(), figure.dpi
-    # Writing creates the identifiers in the file. The canvas draws only once; `savefig` would draw the layout before.
+    # Writing creates the identifiers in the file. The canvas draws once; `savefig` would draw the layout first.
     with rc_context(STYLE):
         figure.dpi = RASTER_DPI
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})

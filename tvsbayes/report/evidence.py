@@ -1,4 +1,4 @@
-"""All inputs of a report: stored results, the classic estimate, errors in 3D, judged limits.
+"""All inputs of a report: stored results, the classic estimate, errors in 3D, limits with verdicts.
 
 Ratios in deg/step, points and their errors in mm, frame T.
 """
@@ -35,11 +35,11 @@ class Criterion:
     """Whether an error stays within a limit.
 
     Attributes:
-        quantity: whose error.
+        quantity: quantity whose error is limited.
         limit: largest error allowed, in `unit`.
-        unit: of the limit.
-        probability: that the error lies within it.
-        verdict: "met" from a probability of 0.95 on, "not met" up to 0.05, else "cannot tell".
+        unit: unit of the limit.
+        probability: probability that the error is within the limit.
+        verdict: "met" for a probability of at least 0.95, "not met" up to 0.05, else "cannot tell".
     """
 
     quantity: str
@@ -50,16 +50,16 @@ class Criterion:
 
 
 def criterion(quantity: str, errors: np.ndarray, limit: float, unit: str) -> Criterion:
-    """Judges draws of an error (n,) by a limit (decision rule agreed in advance, ISO/IEC 17025 7.8.6)."""
+    """Compare draws of an error (n,) with a limit (decision rule agreed in advance, ISO/IEC 17025 7.8.6)."""
     probability = float(np.mean(np.abs(errors) <= limit))
     verdict = MET if probability >= MET_PROBABILITY else NOT_MET if probability <= 1 - MET_PROBABILITY else CANNOT_TELL
     return Criterion(quantity, limit, unit, probability, verdict)
 
 
 MAP_CELLS = 5
-"""Cells of a map per axis; odd, so that one is in the middle."""
+"""Number of cells of a map per axis; odd, so that one is in the middle."""
 MAP_DRAWS = 1000
-"""Draws of the maps: a probability near 0.95 is then known to 0.007."""
+"""Number of draws of the maps: a probability near 0.95 is then known to 0.007."""
 BAND_POINTS = 161
 """Number of counters of the curves of the gears' errors."""
 MAP_RANGES_MM = (300.0, 2000.0)
@@ -109,19 +109,19 @@ class Evidence:
         campaign: the data.
         fit: the content of `results/fit.json`.
         classic: the paper's estimator; None without complete experiments.
-        held_out: of `results/compare.json`, None where `compare` was not run on these data.
-        planned: of `results/plan.json`, None where `plan --given` was not run on these data.
-        criteria: limits of the calibration, judged.
+        held_out: hold-out in `results/compare.json`, None where `compare` was not run on these data.
+        planned: plan in `results/plan.json`, None where `plan --given` was not run on these data.
+        criteria: limits of the calibration with their verdicts.
         distances_mm: draws of the 3D error by estimator at `range_mm` and the middle of the counters.
         range_mm: stated range.
         simple_errors: errors of simple calibrations there, by their name.
         maps: error maps.
-        budget: of a point at that range.
-        point: the same for its least certain coordinate, by parameter.
+        budget: budget of a point at that range.
+        point: budget of its least certain coordinate, by parameter.
         gears: repeated errors over the counters, by axis; none where they do not vary.
-        crops: of a few spots, where there are frames.
+        crops: pictures of a few spots, where there are frames.
         doubts: warnings of `check`.
-        verified: the last result of `verify` for this calibration; None without one.
+        verified: the last result of `verify` for this calibration; None if none.
     """
 
     campaign: Campaign
@@ -157,15 +157,15 @@ def gather(
     limit_mm: float | None = None,
     doubts: Sequence[str] = (),
 ) -> Evidence:
-    """Computes all data of a report.
+    """Compute all data of a report.
 
     Args:
         campaign: the data.
         fit: its `fit.json`.
         calibration: its draws.
-        range_mm: at which millimetres are stated.
+        range_mm: range at which errors in mm are stated.
         limit_deg_per_step: largest error allowed of every effective ratio.
-        limit_mm: largest 3D error allowed at that range, pan and tilt in the middle of the counters seen.
+        limit_mm: largest 3D error allowed at that range, with pan and tilt in the middle of the counters seen.
         doubts: warnings of `check`.
     """
     classic_result = classic_of(campaign)

@@ -1,8 +1,8 @@
 """The paper's figures for any campaign, and the pictures of a calibration report, as matplotlib figures.
 
-Every function takes results and returns a `matplotlib.figure.Figure` without a window; no global setting of matplotlib
-changes, and importing the module does not load it. Frame S (X depth, Y left, Z up) in mm; ratios in deg/step; angles in
-deg. `drawing` has the common style.
+Every function takes results and returns a `matplotlib.figure.Figure` without a window. Global settings of matplotlib do
+not change, and importing the module does not load it. Frame S (X depth, Y left, Z up) in mm; ratios in deg/step; angles
+in deg. `drawing` defines the common style.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ EXPERIMENT = "experiment of this direction"
 
 
 def __dir__() -> list[str]:
-    """The figures: completions of a prompt after `tvsbayes.plots.`."""
+    """The names of the figures, completed at a prompt after `tvsbayes.plots.`."""
     return __all__
 
 
@@ -71,7 +71,7 @@ def _experiment(campaign: Campaign, experiment: int) -> tuple[np.ndarray, str, i
 
 
 def trajectories(campaign: Campaign, experiment: int) -> Figure:
-    """The beam before and after the steps of one experiment, in the plane of its angle (paper, Figures 10 and 12).
+    """Draw the beam before and after the steps of one experiment, in the plane of its angle (paper, Figures 10 and 12).
 
     Raises:
         ValueError: the experiment is not complete.
@@ -92,14 +92,14 @@ def trajectories(campaign: Campaign, experiment: int) -> Figure:
             axes.annotate(f"P{number}", (point[0], point[coordinate]), (4, 5), textcoords="offset points")
         title = f"experiment {experiment}: {axis} by {steps:+d} steps".replace("-", "\u2212")
         axes.set(xlabel="X (depth), mm", ylabel=f"{'Y (left)' if coordinate == 1 else 'Z (up)'}, mm", title=title)
-        # Equal scales: angles are true.
+        # Equal scales keep angles true.
         axes.set_aspect("equal", adjustable="datalim")
         legend(figure, 2)
     return figure
 
 
 def points_3d(campaign: Campaign, experiment: int | None = None) -> Figure:
-    """Spots in frame S: the four of one experiment, or all of a campaign (paper, Figure 11).
+    """Draw spots in frame S: the four of one experiment, or all of a campaign (paper, Figure 11).
 
     Raises:
         ValueError: the experiment is not complete.
@@ -122,12 +122,12 @@ def points_3d(campaign: Campaign, experiment: int | None = None) -> Figure:
 
 
 def direction_scatter(result: ClassicResult, direction: str, joint: Estimate | None = None) -> Figure:
-    """One direction's experiments with mean and bands of 1, 2, 3 sigma (paper, Figures 13 to 16).
+    """Draw one direction's experiments with mean and bands of 1, 2, 3 sigma (paper, Figures 13 to 16).
 
     Args:
-        result: of the classic estimator.
+        result: result of the classic estimator.
         direction: left, right, up or down.
-        joint: of the joint estimator, for comparison.
+        joint: estimate of the joint model, for comparison.
 
     Raises:
         ValueError: there is no such direction, or it has no experiment.
@@ -146,7 +146,7 @@ def direction_scatter(result: ClassicResult, direction: str, joint: Estimate | N
 
 
 def direction_scatters(result: ClassicResult, joint: FitSummary | None = None) -> Figure:
-    """`direction_scatter` of all four directions in one figure."""
+    """Draw `direction_scatter` of all four directions in one figure."""
     with drawing(5.2) as figure:
         panels = figure.subplots(2, 2).ravel()
         for axes, direction in zip(panels, DIRECTIONS, strict=True):
@@ -160,7 +160,7 @@ def direction_scatters(result: ClassicResult, joint: FitSummary | None = None) -
 
 
 def _scatter(axes: Axes, result: ClassicResult, direction: str, joint: Estimate | None) -> None:
-    """One direction's experiments into a panel."""
+    """Draw one direction's experiments into a panel."""
     summary = result.directions[direction]
     assert summary is not None
     experiments = [e for e in result.experiments if e.direction == direction]
@@ -179,12 +179,12 @@ def _scatter(axes: Axes, result: ClassicResult, direction: str, joint: Estimate 
 def setup(
     campaign: Campaign, translation_mm: Sequence[float] | None = None, baseline_mm: float | None = None
 ) -> Figure:
-    """The rig from above and from the side in frame S: cameras, positioner, spots.
+    """Draw the rig from above and from the side in frame S: cameras, positioner, spots.
 
     Args:
-        campaign: for spots and cameras.
-        translation_mm: origin of the positioner's frame P in S, (3,), as estimated; None omits it.
-        baseline_mm: of the TVS, for the caption of the positioner.
+        campaign: gives spots and cameras.
+        translation_mm: estimated origin of the positioner's frame P in S, (3,); None omits it.
+        baseline_mm: baseline of the TVS, for the caption of the positioner.
     """
     points = campaign.usable_points_mm
     right = -campaign.stereo.R.T @ campaign.stereo.T
@@ -210,7 +210,7 @@ def setup(
 
 
 def coverage(campaign: Campaign) -> Figure:
-    """Where the data lie: counters seen, and spots in both images."""
+    """Draw the coverage of the data: counters seen, and spots in both images."""
     from matplotlib.patches import Rectangle
 
     spots = [spot for spot in campaign.spots if spot.status == "ok"]
@@ -237,11 +237,11 @@ def intervals(
     joint: FitSummary | Mapping[str, Estimate | None],
     classic: ClassicResult | Mapping[str, DirectionResult | None] | None = None,
 ) -> Figure:
-    """Ratios of both estimators with their 95 % intervals by direction, deg/step.
+    """Draw the ratios of both estimators with their 95 % intervals by direction, deg/step.
 
     Args:
         joint: summary of a fit (`results.record.summary`, `read_fit(path).summary`), or estimates by direction.
-        classic: of the classic estimator; None draws the joint one alone.
+        classic: result of the classic estimator; None draws the joint one alone.
     """
     ratios: object = getattr(joint, "effective", joint)
     if not isinstance(ratios, Mapping):
@@ -254,7 +254,7 @@ def intervals(
     }
     with drawing(3.2) as figure:
         distance = 0.12 if four_point and fitted else 0.0
-        # Ratios of pan and tilt differ by more than the length of their intervals: each has its scale.
+        # Ratios of pan and tilt differ by more than the length of their intervals, so each has its scale.
         for axes, pair in zip(figure.subplots(len(SENSES), 1), SENSES.values(), strict=True):
             for offset, name, results in ((-distance, "classic", four_point), (distance, "joint", fitted)):
                 colour, marker = ESTIMATOR_STYLE[name]
@@ -272,7 +272,7 @@ def intervals(
 
 
 def gap_terms(gaps: ComparisonRecord | Mapping[str, Gap | None]) -> Figure:
-    """Terms of (classic - joint), deg/step, by direction; `gaps` as `compare` found them, or its record.
+    """Draw the terms of (classic - joint), deg/step, by direction; `gaps` come from `compare`, or are its record.
 
     Raises:
         ValueError: no direction has a gap.
@@ -300,7 +300,7 @@ def gap_terms(gaps: ComparisonRecord | Mapping[str, Gap | None]) -> Figure:
 
 
 def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
-    """Correlations with their values in the cells."""
+    """Draw correlations with their values in the cells."""
     count = len(names)
     with drawing(0.9 + 0.42 * count) as figure:
         axes = figure.add_subplot()
@@ -317,7 +317,7 @@ def correlations(names: Sequence[str], matrix: np.ndarray) -> Figure:
 
 
 def residuals(stops: Sequence[StopResidual], axis: Axis) -> Figure:
-    """Deviations of one axis' stops over time and against their counters."""
+    """Draw the deviations of one axis' stops over time and over their counters."""
     axis_stops = [stop for stop in stops if stop.axis == axis]
     directions = SENSES[axis]
     with drawing(4.6) as figure:
@@ -343,7 +343,7 @@ def residuals(stops: Sequence[StopResidual], axis: Axis) -> Figure:
 
 
 def causes(shares: Sequence[Cause], axis: str) -> Figure:
-    """Mean deviation by group of each cause, with two standard errors."""
+    """Draw the mean deviation by group of each cause, with two standard errors."""
     axis_causes = [cause for cause in shares if cause.axis == axis and len(cause.groups) > 1]
     rows = sum(len(cause.groups) for cause in axis_causes)
     with drawing(1.2 + 0.22 * max(rows, 2)) as figure:
@@ -364,11 +364,11 @@ def causes(shares: Sequence[Cause], axis: str) -> Figure:
 
 
 def error_maps(maps: ErrorMap, range_index: int) -> Figure:
-    """Root mean square 3D error of each estimator over pan and tilt at one range, mm."""
+    """Draw the root mean square 3D error of each estimator over pan and tilt at one range, mm."""
     names = [name for name in ESTIMATOR_STYLE if name in maps.rms_mm]
     with drawing(0.5 + 1.75 * len(names)) as figure:
         panels = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
-        # One scale for all: equal colours are equal errors.
+        # All panels have one scale: equal colours are equal errors.
         values_all = np.concatenate([maps.rms_mm[name][:, :, range_index].ravel() for name in names])
         finite = values_all[np.isfinite(values_all)]
         low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
@@ -387,7 +387,7 @@ def error_maps(maps: ErrorMap, range_index: int) -> Figure:
 
 
 def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, dark_above: float) -> None:
-    """Writes values into the cells of a map, white on dark ones."""
+    """Write values into the cells of a map, white on dark cells."""
     for row, yy in enumerate(y):
         for column, xx in enumerate(x):
             value = values[row, column]
@@ -397,7 +397,7 @@ def _cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, dark_ab
 
 
 def shares(budget: Budget) -> Figure:
-    """Shares of a point's variance by cause, largest first; those below `SMALLEST_SHARE` are one bar."""
+    """Draw the shares of a point's variance by cause, largest first; shares below `SMALLEST_SHARE` form one bar."""
     order = np.argsort(-budget.share)
     shown = [k for k in order if budget.share[k] >= SMALLEST_SHARE]
     names = [share_in_words(budget.causes[k]) for k in shown]
@@ -417,7 +417,7 @@ def shares(budget: Budget) -> Figure:
 
 
 def ratio_curves(curves: Curves) -> Figure:
-    """Local ratios along both axes with 95 % intervals."""
+    """Draw local ratios along both axes with 95 % intervals."""
     with drawing(5.4) as figure:
         panels = figure.subplots(2, 1)
         for axes, axis, directions in zip(panels, SENSES, SENSES.values(), strict=True):

@@ -40,13 +40,13 @@ CORRELATED = (
     *("degrees_per_step.pan", "degrees_per_step.tilt", "backlash_deg.pan", "backlash_deg.tilt"),
     *("mirror_offset_mm", "tilt_zero_deg", "laser_tilt_deg.x", "laser_tilt_deg.y", "focal_scale"),
 )
-"""Parameters of the correlation matrix, in order; those that are not estimated are omitted."""
+"""Parameters of the correlation matrix, in order; parameters that are not estimated are omitted."""
 
 
 LEAST_P = 0.001
-"""Least printed probability; smaller ones print as "below" it."""
+"""Least printed probability; smaller ones are printed as "below" it."""
 PRIORS_SHOWN = 8
-"""Largest number of priors in the table of sensitivities, the strongest first; fit.json has all."""
+"""Largest number of priors in the table of sensitivities, the most influential first; fit.json has all."""
 HEADER_SHOWN = ("method", "notes")
 """Keys of a campaign's header that are not on the first page."""
 
@@ -204,7 +204,7 @@ def _view(band: GearBand, stops: Sequence[StopResidual]) -> FigureView:
 
 
 def identifiability_section(e: Evidence) -> Section:
-    """Correlated parameters, and the stops and priors that matter."""
+    """Correlated parameters, and influential stops and priors."""
     names, matrix = e.fit.covariance.names, e.fit.covariance.matrix
     shown = [n for n in CORRELATED if n in names and matrix[names.index(n), names.index(n)] > 0]
     views, rows = [], []
@@ -247,7 +247,7 @@ def identifiability_section(e: Evidence) -> Section:
 
 
 def residuals_section(e: Evidence) -> Section:
-    """Whether the deviations of the stops depend on anything."""
+    """Whether the deviations of the stops depend on a cause."""
     summary, causes = e.fit.summary, e.shown.residual_causes
     text = [
         f"chi-square {summary.noise.chi2:.1f} for {summary.noise.dof:.1f} degrees of freedom; the pixel noise is "

@@ -28,12 +28,12 @@ from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
 from tvsbayes.results.tiers import CHAIN
 
 FINE_DEG = 1e-5
-"""Step of an encoder's angles in `head.foreign_sightings`; steps of motors are much larger."""
+"""Size of a step of an encoder in `head.foreign_sightings`; motor steps are much larger."""
 PARAMETERS = (*KEY_PARAMETERS, *MORE_PARAMETERS)
 
 
 def classic_text(result: ClassicResult) -> str:
-    """The classic estimator's table, and the experiments it left out."""
+    """The classic estimator's table, and the experiments that it left out."""
     skipped = [f"experiment {s.experiment} skipped: {s.reason}" for s in result.skipped]
     return terminal(classic_table(result), *skipped)
 
@@ -41,11 +41,11 @@ def classic_text(result: ClassicResult) -> str:
 def fit_text(
     summary: FitSummary, details: bool = False, written: Sequence[str] = (), causes: Sequence[Finding] = ()
 ) -> str:
-    """Remarks, the table, and one line of verdict at the end, where a terminal shows it.
+    """Remarks, the table, and one line of verdict at the end, where it stays visible on a terminal.
 
     Args:
         summary: the fit.
-        details: also the positioner, the gears, priors that matter, weak directions, single stops.
+        details: also show the positioner, the gears, influential priors, weak directions, single stops.
         written: files with all results.
         causes: explanations of a failed fit.
     """
@@ -54,7 +54,7 @@ def fit_text(
     lines: list[Part] = detail_lines(summary) if details else []
     validation = failed(summary)
     if validation is not None:
-        # Above and below the table: visible at both ends of the text.
+        # Lines above and below the table are visible at both ends of the text.
         tests = validation_lines(validation)
         lines = [tests[0], *lines, *tests[1:], f"what helps: {remedy(validation)}"]
     lines += answer_lines(summary)
@@ -106,7 +106,7 @@ def more_line(summary: FitSummary) -> str:
 
 
 def detail_lines(summary: FitSummary) -> list[Part]:
-    """Details of a fit: the positioner, the gears, tests, priors that matter, weak directions."""
+    """Details of a fit: the positioner, the gears, tests, influential priors, weak directions."""
     details = details_table(summary)
     # A head with sightings has no camera frame.
     lines: list[Part] = [details] if details.rows else []

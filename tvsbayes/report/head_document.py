@@ -35,9 +35,9 @@ def head_document(campaign: Campaign, record: FitRecord, issue: Issue, doubts: S
     """The document with its number.
 
     Args:
-        campaign: of a head, with sightings.
+        campaign: campaign of a head, with sightings.
         record: its `fit.json`.
-        issue: who issues it, for whom and when.
+        issue: laboratory, customer and day.
         doubts: warnings of `check`.
     """
     summary = record.summary

@@ -1,7 +1,7 @@
 """A document as one page: verdict, numbers and warnings at its top, the sections below; HTML and PDF.
 
-No script, no network access. Text of a campaign reaches it through jinja2's autoescape only; pictures are SVG inside
-`data:` images, which browsers open without scripts and without network. Its policy (CSP) allows only its own style
+The page has no script and no network access. Text of a campaign enters it only through jinja2's autoescape; pictures
+are SVG in `data:` images, which browsers open without scripts and network. Its policy (CSP) allows only its own style
 sheet, by hash, and such images.
 """
 
@@ -38,7 +38,7 @@ def find_browser() -> str:
     """The browser that prints pages.
 
     Raises:
-        InputError: none is installed.
+        InputError: no browser is installed.
     """
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
@@ -48,10 +48,10 @@ def find_browser() -> str:
 
 
 def print_to_pdf(page: Path) -> Path:
-    """Prints a report with an installed Chromium or Chrome; the PDF is beside it.
+    """Print a report to a PDF beside it, with an installed Chromium or Chrome.
 
     Raises:
-        InputError: none is installed, or it failed.
+        InputError: no browser is installed, or printing failed.
     """
     browser = find_browser()
     target = page.with_suffix(".pdf")
@@ -60,7 +60,7 @@ def print_to_pdf(page: Path) -> Path:
         pdf = Path(folder) / "report.pdf"
         flags = ["--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-sync"]
         if hasattr(os, "geteuid") and os.geteuid() == 0:
-            # Chromium's sandbox does not work as root; the page is ours and has no script.
+            # Chromium's sandbox does not work as root; the page is this program's and has no script.
             flags.append("--no-sandbox")
         flags += ["--no-pdf-header-footer", "--generate-pdf-document-outline", f"--user-data-dir={folder}/profile"]
         command = [browser, *flags, f"--print-to-pdf={pdf}", page.resolve().as_uri()]
@@ -80,12 +80,12 @@ def certificate_place(page: Path, out: Path | None) -> Path:
 
 
 def replace_page(page: Path, html: bytes, out: Path | None) -> list[str]:
-    """Writes a page, and removes PDF and certificate of a different previous page.
+    """Write a page, and remove PDF and certificate of a different previous page.
 
     Args:
-        page: its path; `results/` is made where it is missing.
+        page: its path; `results/` is created where it is missing.
         html: its bytes; nothing is removed where they equal the previous page.
-        out: path stated by the user; files beside it are removed only if the previous page is of this program.
+        out: path stated by the user; files beside it are removed only if this program wrote the previous page.
 
     Returns:
         Names of removed files.
@@ -152,11 +152,11 @@ def rendered(
     """A shipped template with its style and scripts in it, UTF-8; its policy (CSP) allows only those, by hash.
 
     Args:
-        folder: of the shipped data.
+        folder: folder in the shipped data.
         template: a file in it.
         style: its style sheet.
-        scripts: in the order of execution.
-        number: of the report, for the foot of its printed pages.
+        scripts: scripts in the order of execution.
+        number: number of the report, for the foot of its printed pages.
         content: values for the template.
     """
     directory = shipped_data() / folder
@@ -168,7 +168,7 @@ def rendered(
         loader=FileSystemLoader(str(directory)), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     environment.filters |= {"typeset": typeset, "prose": prose}
-    # Style sheet and scripts are ours; escaped quotes would change their hashes.
+    # Style sheet and scripts are shipped files; escaped quotes would change their hashes.
     page = environment.get_template(template).render(css=Markup(css), script=Markup(script), policy=policy, **content)
     return page.encode()
 

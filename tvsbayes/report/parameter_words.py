@@ -28,7 +28,7 @@ def name_in_words(name: str) -> str:
 
 
 def source_in_words(source: str) -> str:
-    """A row of a budget in words, with part and unit: a parameter, the prior of one; others are unchanged."""
+    """A row of a budget in words, with part and unit: a parameter or its prior; others are unchanged."""
     for prefix, article in (("prior of ln ", ""), ("prior of ", "the ")):
         if source.startswith(prefix):
             name = source.removeprefix(prefix)
@@ -38,7 +38,7 @@ def source_in_words(source: str) -> str:
 
 
 def share_in_words(cause: str) -> str:
-    """A cause of uncertainty in a table of shares: priors of a group of parameters as one; others are unchanged."""
+    """A cause of uncertainty in a table of shares: the priors of a group are one cause; others are unchanged."""
     name = cause.removeprefix("prior of ")
     return f"prior of {IN_WORDS[name]}" if cause != name and name in IN_WORDS else cause
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tvsbayes.single_axis.axis_periods import WaveSample
 
 CURVE_POINTS = 81
-"""Points of the curves of an axis' error and waves."""
+"""Number of points of the curves of an axis' error and waves."""
 PLAY_SHOWN = 0.1
 """Least variation of the play, over that of the error, for its own panel."""
 
@@ -41,7 +41,7 @@ def band_of(drawn: np.ndarray) -> np.ndarray:
 
 
 def gear_errors(band: GearBand, stops: Sequence[StopResidual]) -> Figure:
-    """Transmission error of an axis over its counters with a 95 % band, the stops on it; the play, where it varies."""
+    """Transmission error of an axis over its counters with a 95 % band and the stops; also the play, if it varies."""
     play = np.ptp(band.play_deg, axis=0).max() > PLAY_SHOWN * np.ptp(band.error_deg, axis=0).max()
     with drawing(4.6 if play else 3.2) as figure:
         panels = np.atleast_1d(figure.subplots(1 + play, 1, sharex=True, height_ratios=[2, 1] if play else [1]))
@@ -66,12 +66,12 @@ def gear_errors(band: GearBand, stops: Sequence[StopResidual]) -> Figure:
 
 
 def axis_errors(fit: AxisFit, commands: np.ndarray, values: np.ndarray) -> Figure:
-    """The error of an axis by position with its 95 % band, and the stops on it, less the line through them.
+    """The error of an axis by position with its 95 % band, and the stops, minus the line through them.
 
     Args:
-        fit: of the axis.
+        fit: fit of the axis.
         commands: shape (t,).
-        values: equally probable values of the error there, in the axis' unit, shape (n, t).
+        values: equally probable values of the error at the commands, in the axis' unit, shape (n, t).
     """
     rows = fit.rows
     design = np.column_stack([np.ones(len(rows.value)), rows.command - fit.model.middle])

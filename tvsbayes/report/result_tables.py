@@ -33,13 +33,13 @@ KEY_PARAMETERS = _rows(
     *(quantity.name for quantity in HEADLINES if quantity.label and not quantity.ratio),
     *names_of("stop_sd_deg", "look_scatter_deg", "pixel_scale"),
 )
-"""Parameters of the table that ends a fit: name, label, unit."""
+"""Parameters of the last table of a fit: name, label, unit."""
 HEAD_PARAMETERS = _rows(*(term.name for term in HEAD_TERMS.values()))
-"""The terms of a head, after them."""
+"""The terms of a head, which follow them."""
 MORE_PARAMETERS = _rows(*names_of("mirror_offset_mm", "extrinsics.rotation_rad", "extrinsics.translation_mm"))
 """Parameters of the table of details."""
 SHARE_SHOWN = 5e-4
-"""Least share of a variance in a table: smaller ones print as 0.0 %."""
+"""Least share of a variance in a table: smaller shares are printed as 0.0 %."""
 
 
 def classic_table(result: ClassicResult) -> TableView:
@@ -52,7 +52,7 @@ def classic_table(result: ClassicResult) -> TableView:
             continue
         optional = (r.sd_deg_per_step, r.u_type_a_deg_per_step)
         sd, u = ("-" if x is None else f"{x:.6f}" for x in optional)
-        # Digits of the interval follow its own u.
+        # The digits of the interval follow its own u.
         gum = "-" if r.interval95_gum is None else interval_text(*r.interval95_gum, r.u_gum_deg_per_step or 0.0)
         rows.append([direction, str(r.n), f"{r.mean_deg_per_step:.6f}", sd, u, gum])
     columns = ["direction", "n", "mean deg/step", "sd", "u type A", "95 % interval (GUM)"]
@@ -135,7 +135,7 @@ def wave_row(name: str, wave: PeriodEstimate, unit: str, period_unit: str) -> li
 
 
 def percent(probability: float) -> str:
-    """A probability from draws, never as 0 or 100 %."""
+    """A probability from draws, never printed as 0 or 100 %."""
     return "> 99.9 %" if probability > 0.999 else "< 0.1 %" if probability < 0.001 else f"{100 * probability:.1f} %"
 
 
@@ -146,7 +146,7 @@ def waves_table(summary: FitSummary) -> TableView | None:
 
 
 def gap_table(gaps: Mapping[str, Gap | None]) -> TableView:
-    """The gap between both estimators by its terms, of the directions that have one."""
+    """The gap between both estimators by its terms, for the directions that have one."""
     stated = {direction: gap for direction, gap in gaps.items() if gap is not None}
 
     def cell(term: GapTerm) -> str:
@@ -195,7 +195,7 @@ def point_budget_table(budget: Budget, caption: str = "uncertainty by cause") ->
 
 
 def pointing_table(model: PointingModel, joint: Mapping[str, tuple[float, float]] | None = None) -> TableView:
-    """The terms of a head by least squares, and those of a fit, value and sd, where there is one."""
+    """The terms of a head by least squares, and those of a fit, if any, with value and sd."""
     rows = []
     for name, value, error in zip(model.names, model.value.tolist(), model.standard_error.tolist(), strict=True):
         row = [name_in_words(name), concise(value, error)]

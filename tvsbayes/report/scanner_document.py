@@ -34,7 +34,7 @@ from tvsbayes.results.estimates import Estimate, FitSummary
 
 NO_CLASSIC = "cannot see it"
 ASYMMETRY_MAX = 1.5
-"""Largest ratio of the distances of an interval's ends from its value for stating half of it as U."""
+"""Largest ratio of the distances of an interval's ends from the value for which half the interval is stated as U."""
 CAUSES_LISTED = 3
 """Number of listed causes of a point's uncertainty; the section on budgets has all."""
 
@@ -111,7 +111,7 @@ def criteria_table(criteria: Sequence[Criterion]) -> TableView | None:
 
 
 def _chance(c: Criterion) -> str:
-    """The probability; where it is undecided, also the number of a hundred beyond the limit."""
+    """The probability; where the verdict is open, also the number in a hundred beyond the limit."""
     text = chance_text(c.probability)
     return text if c.verdict != CANNOT_TELL else f"{text}: {100 - round(100 * c.probability)} of 100 are off by more"
 
@@ -124,9 +124,9 @@ def measured_days(campaign: Campaign, issue: Issue) -> str:
 
 
 def answer_table(summary: FitSummary, classic: ClassicResult | None, object_name: str = "the beam") -> TableView:
-    """Ratios of the beam or sight, contrasts and both backlashes, with the classic where there are experiments.
+    """Ratios of the beam or sight, contrasts and both backlashes, with the classic ones where there are experiments.
 
-    Ratios of both directions that print equal share a row.
+    Ratios of both directions that are equal as printed share a row.
     """
     rows, applicable = [], classic is not None
     for direction in DIRECTIONS:
@@ -175,7 +175,7 @@ def _cells(estimate: Estimate | None) -> list[str]:
 
 
 def both_estimators(e: Evidence) -> FigureView:
-    """Ratios of both estimators with their intervals; only the joint ones without experiments."""
+    """Ratios of both estimators with their intervals; without experiments only the joint ones."""
     picture = figures.intervals(e.fit.summary, e.classic)
     if e.classic is None:
         caption = "Effective ratios. The classic method needs four-point experiments: the campaign has none."
@@ -195,7 +195,7 @@ def point_errors(e: Evidence) -> list[Number]:
 
 
 def error_sources(e: Evidence) -> list[str]:
-    """Causes of the joint calibration's error, and of the larger error of the last simple one."""
+    """Causes of the joint calibration's error, and of the larger error of the last simple calibration."""
     order = np.argsort(-e.budget.share)[:CAUSES_LISTED]
     causes = ", ".join(f"{cause_in_words(e.budget.causes[k])} {100 * e.budget.share[k]:.0f} %" for k in order)
     sentences = [f"Causes of the remaining error of the joint one, as shares of the variance: {causes}."]

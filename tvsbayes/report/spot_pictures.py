@@ -27,7 +27,7 @@ HALF_PX = 20
 
 @dataclass(frozen=True)
 class SpotCrop:
-    """The surroundings of a spot in one picture.
+    """The region around a spot in one picture.
 
     Attributes:
         spot: id of the look.
@@ -45,7 +45,7 @@ class SpotCrop:
 
 
 def spot_crops(campaign: Campaign, suspects: Sequence[int]) -> tuple[SpotCrop, ...]:
-    """Cut-outs of suspect spots first, then of others evenly chosen; none for missing or damaged frames."""
+    """Make cut-outs, of suspect spots first, then of others evenly chosen; none for missing or damaged frames."""
     if campaign.path is None or not (campaign.path / "frames").is_dir():
         return ()
     usable = [spot for spot in campaign.spots if spot.status == "ok"]
@@ -66,7 +66,7 @@ def _crops(folder: Path, spot: Spot) -> Iterator[SpotCrop]:
             continue
         u, v = float(getattr(spot, f"u_{camera}_px")), float(getattr(spot, f"v_{camera}_px"))
         left, top = max(round(u) - HALF_PX, 0), max(round(v) - HALF_PX, 0)
-        # A spot cut by the edge may have its centre outside; a negative index would count from the other edge.
+        # The centre of a spot cut by the edge may be outside; a negative index would count from the other edge.
         right, bottom = max(round(u) + HALF_PX + 1, 0), max(round(v) + HALF_PX + 1, 0)
         grey = picture[top:bottom, left:right].mean(axis=2)
         if grey.size:
@@ -74,7 +74,7 @@ def _crops(folder: Path, spot: Spot) -> Iterator[SpotCrop]:
 
 
 def spot_gallery(crops: Sequence[SpotCrop]) -> Figure:
-    """The cut-outs, a column per look, with a cross at each centre."""
+    """Draw the cut-outs, a column per look, with a cross at each centre."""
     looks = list(dict.fromkeys(crop.spot for crop in crops))
     with drawing(2.9) as figure:
         panels = figure.subplots(len(CAMERAS), len(looks), squeeze=False)

@@ -21,7 +21,7 @@ COLUMNS, GAP = 80, 2
 
 
 def two_digits(value: float) -> str:
-    """An uncertainty to two significant digits, a 0 among them, without an exponent (GUM 7.2.6)."""
+    """An uncertainty to two significant digits, including a 0, without an exponent (GUM 7.2.6)."""
     return f"{Decimal(f'{value:.1e}'):f}" if math.isfinite(value) and value else f"{value:g}"
 
 
@@ -72,12 +72,12 @@ class TableView:
         return not self.columns
 
     def text(self) -> str:
-        """The table without lines, for terminals and files; in parts one below the other where it is too wide."""
+        """The table without lines, for terminals and files; too wide a table is split into parts below each other."""
         title = textwrap.wrap(self.caption, COLUMNS, break_long_words=False, break_on_hyphens=False)
         return "\n".join([*title, *(self._part(columns) for columns in self._parts())])
 
     def _parts(self) -> list[list[int]]:
-        """Columns of every part: the first one and as many others as fit, about equally many in each part."""
+        """Columns of every part: the first column and as many others as fit, about equally many in each part."""
         cells = [self.columns, *self.rows]
         others = max(1, *map(len, cells)) - 1
         width = [max((cell_len(row[k]) for row in cells if k < len(row)), default=0) + GAP for k in range(others + 1)]
@@ -101,6 +101,6 @@ class TableView:
         for row in self.rows:
             table.add_row(*(Text(row[number] if number < len(row) else "") for number in columns))
         stream = io.StringIO()
-        # Plain text regardless of FORCE_COLOR and the like: it also goes into files. No folding.
+        # Plain text regardless of FORCE_COLOR, since it also goes into files; lines are not folded.
         Console(file=stream, width=1000, highlight=False, color_system=None, force_terminal=False).print(table)
         return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())

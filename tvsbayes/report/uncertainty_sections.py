@@ -127,7 +127,7 @@ def _pairs(tables: Sequence[BudgetTable]) -> list[list[BudgetTable]]:
 
 
 def _important_rows(table: BudgetTable) -> list[BudgetRow]:
-    """Single inputs with their own row; the last row, of correlations, is no input."""
+    """Single inputs with their own row; the last row, of correlations, is not an input."""
     return [row for row in table.rows[:-1] if row.u is not None and row.share >= SMALLEST_SHARE]
 
 
@@ -140,13 +140,13 @@ def _source_text(row: BudgetRow) -> str:
 
 
 def _others(table: BudgetTable, named: Collection[str]) -> tuple[str, str]:
-    """Contribution and share of all inputs without their own row; with them the shares add up to 100 %."""
+    """Contribution and share of all inputs without their own row; with them the shares sum to 100 %."""
     share = sum(row.share for row in table.rows[:-1] if row.quantity not in named)
     return two_digits(table.u * math.sqrt(share)), f"{100 * share:.1f}"
 
 
 def _gum_table(tables: Sequence[BudgetTable], caption: str) -> TableView:
-    """Budgets side by side, with every important input of any of them; a single one in all columns of GUM 7.2.7."""
+    """Budgets side by side, with every important input of any of them; a single budget has all columns of GUM 7.2.7."""
     is_single = len(tables) == 1
     row_maps = [{row.quantity: row for row in table.rows} for table in tables]
     rows_by_name = {name: [rows[name] for rows in row_maps if name in rows] for rows in row_maps for name in rows}
@@ -190,7 +190,7 @@ def _total(table: BudgetTable) -> str:
 
 
 def _gap_note(table: BudgetTable, result: Estimate | None) -> str:
-    """A note with the valid result, where the interval of a budget differs; "" where both agree to their digits."""
+    """A note with the valid result where the interval of a budget differs; "" where both agree to their digits."""
     if result is None:
         return ""
     low, high = result.interval95
@@ -212,13 +212,13 @@ def _freedom(dof: float | None) -> str:
 
 
 def axes_section(e: Evidence) -> Section:
-    """Figures of both axes as ISO 230-2 defines them, predicted for standard test cycles."""
+    """Figures of both axes by ISO 230-2, predicted for standard test cycles."""
     axes = [axis for axis in e.shown.positioning if axis.predicted]
     if not axes:
         return Section("ISO 230-2-style figures", ["Not computed: the fit has not converged."])
     items: list[str] = []
     for axis in axes:
-        # Notes on the campaign's own stops belong to other figures: fit.json has both.
+        # Notes on the campaign's own stops belong to other figures; fit.json has both.
         items += [note for note in axis.notes if note not in items and "plug-in" not in note]
     rows = []
     for name, (symbol, term) in FIGURES.items():
@@ -233,7 +233,7 @@ def axes_section(e: Evidence) -> Section:
 
 
 def _figure_cells(figure: Predicted | None) -> tuple[str, str]:
-    """Median and interval to the digits of the interval's uncertainty; empty where there is no figure."""
+    """Median and interval to the digits of the interval's uncertainty; empty if there is no figure."""
     if figure is None:
         return "", ""
     low, high = figure.interval95

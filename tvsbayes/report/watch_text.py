@@ -23,7 +23,7 @@ HELPS = {
     "play: pan": "each pan counter from both sides, several times",
     "play: tilt": "each tilt counter from both sides, several times",
 }
-"""Looks that reveal a change better, by change."""
+"""Looks that detect a change better, by change."""
 LINEAR = {"deg": 1.0, "mm": 10.0}
 """Largest change whose size is estimated correctly, by unit."""
 REMEDIES = {
@@ -39,7 +39,7 @@ REMEDIES = {
 
 
 def moved_text(part: MovedPart) -> str:
-    """`cameras: rotation about y 0.052(6) deg`."""
+    """Format a moved part, e.g. `cameras: rotation about y 0.052(6) deg`."""
     return f"{part.what} {concise(part.value, part.u)} {part.unit}"
 
 
@@ -48,7 +48,7 @@ def watch_text(watch: Watch, power_min: float) -> str:
 
     Args:
         watch: the result.
-        power_min: with less power a change counts as unseen.
+        power_min: with less power a change counts as undetectable.
     """
     rows = [
         [c.what, f"{c.size:g} {c.unit}", f"{100 * c.power:.0f} %", "< 1e-9" if c.p < 1e-9 else f"{c.p:.2g}"]

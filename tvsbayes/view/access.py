@@ -1,10 +1,10 @@
-"""Who may read the page of a run: browsers that were given its link, from the page itself, and nobody else.
+"""Access control of a run's page: only browsers with its link may read it, and only from the page itself.
 
-The link's token stands behind the #, which browsers send to nobody; the page gives it back once and gets a key of
-its own, which it sends as a header with every request. The first browser controls the run, the others watch, and may
-ask for what only makes it safer. A browser that controls and has not asked for `SILENT_S` loses control to the next one
-that asks. No cookie: what another page makes this browser ask for carries no key (CSRF). A name that somebody else
-points at 127.0.0.1 (DNS rebinding) is refused by the Host header, another page by Origin and Sec-Fetch-Site (Fetch
+The link's token stands after the #, which browsers do not send; the page returns it once and gets its own key, which it
+sends as a header with every request. The first browser controls the run; the others watch, and may make only requests
+that increase safety. A controlling browser that has sent no request for `SILENT_S` loses control to the next one that
+does. There is no cookie: requests that another page causes in this browser carry no key (CSRF). The Host header reveals
+a foreign name that resolves to 127.0.0.1 (DNS rebinding), Origin and Sec-Fetch-Site reveal another page (Fetch
 Metadata, W3C).
 """
 
@@ -19,9 +19,9 @@ HOSTS = ("127.0.0.1", "localhost")
 KEY_HEADER = "X-Tvsbayes-Key"
 TOKEN_BYTES = 32
 SILENT_S = 10.0
-"""A browser asks twice a second, in a tab that is not seen once a second."""
+"""Time without requests after which control may pass on; pages send two a second, in a hidden tab one."""
 BROWSERS_MAX = 64
-"""Whose keys are known: of more, the one that has been silent longest is forgotten."""
+"""Largest number of known keys; beyond it the key unused longest is dropped."""
 SECURITY_HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
@@ -34,13 +34,13 @@ SECURITY_HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""Of every answer. The policy lets the page load from its own server only: no request leaves the machine."""
+"""Headers of every answer. The policy lets the page load only from its own server: no request leaves the machine."""
 
 
 def _same(a: str, b: str) -> bool:
-    """Whether two texts are equal, in a time that does not tell where they differ.
+    """Compare two texts in a time independent of the position where they differ.
 
-    JSON may bring half a character, of which there is no UTF-8.
+    JSON may contain a lone surrogate, which UTF-8 cannot encode.
     """
     return hmac.compare_digest(a.encode(errors="replace"), b.encode(errors="replace"))
 
@@ -49,8 +49,8 @@ class Access:
     """Token, keys and address of one page.
 
     Args:
-        port: that the server listens on.
-        clock: a steady clock, seconds.
+        port: port of the server.
+        clock: monotonic clock, seconds.
     """
 
     def __init__(self, port: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -61,14 +61,14 @@ class Access:
 
     @property
     def link(self) -> str:
-        """What to open."""
+        """The address to open."""
         return f"http://{HOSTS[0]}:{self.port}/#{self._token}"
 
     def stranger(self, headers: Mapping[str, str]) -> str | None:
-        """Why a request does not come from the page itself, None where it may.
+        """Why a request is not from the page itself, None where it may be.
 
         Args:
-            headers: of the request.
+            headers: headers of the request.
         """
         hosts = [f"{host}:{self.port}" for host in HOSTS]
         if headers.get("Host", "") not in hosts:
@@ -81,7 +81,7 @@ class Access:
         return None
 
     def key_for(self, token: str) -> str | None:
-        """A key for a browser that brings the token, the first of which controls; None for a wrong one."""
+        """A key for a browser with the token, the first of which controls; None for a wrong token."""
         if not _same(token, self._token):
             return None
         key = secrets.token_urlsafe(TOKEN_BYTES)
@@ -93,7 +93,7 @@ class Access:
         return key
 
     def _key(self, headers: Mapping[str, str]) -> str | None:
-        """The known key that a request carries."""
+        """The known key in a request."""
         brought = headers.get(KEY_HEADER, "")
         return next((key for key in tuple(self._heard_s) if _same(key, brought)), None)
 
@@ -106,7 +106,7 @@ class Access:
         return self._key(headers) is not None
 
     def takes_over(self, headers: Mapping[str, str]) -> bool:
-        """Note that a browser asks; whether control passes to it by that."""
+        """Record the request of a browser; return whether control passes to it."""
         key, now_s = self._key(headers), self._clock()
         if key is None:
             return False

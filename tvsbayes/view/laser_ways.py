@@ -1,6 +1,6 @@
-"""Where the laser goes in a rig, look by look: over all mirrors and as far as the spot, in frame S, and its pixels.
+"""Paths of the laser in a rig, look by look: over all mirrors to the spot, in frame S, with its pixels.
 
-By the model itself (formulation 3), at the mode of a fit or at the centre of the priors. mm, rad, px.
+Computed by the model (formulation 3), at the mode of a fit or at the centre of the priors. mm, rad, px.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from tvsbayes.model.parameter_space import ParameterSpace
 
 
 class Ways(eqx.Module):
-    """Ways of the laser in frame S; the last axis of every array is the look, the one before x, y, z or the pixel.
+    """Paths of the laser in frame S; the last axis of every array is the look, the one before x, y, z or the pixel.
 
     Attributes:
-        origin_mm: of frame P, on the pan axis, shape (3, 1).
-        mirrors_mm, normals: where it meets the mirrors in their order, and their unit normals.
-        end_mm: of the beam, where it passes closest to the triangulated spot.
+        origin_mm: origin of frame P, on the pan axis, shape (3, 1).
+        mirrors_mm, normals: points where the laser meets the mirrors in order, and their unit normals.
+        end_mm: end of the beam, its closest point to the triangulated spot.
         predicted_px: u_left, v_left, u_right, v_right of that end, shape (4, looks).
     """
 
@@ -68,11 +68,11 @@ def _window(
 
 
 def laser_ways(z: np.ndarray, turned_rad: np.ndarray, space: ParameterSpace, arrays: CampaignArrays) -> Ways:
-    """Ways of all looks of a campaign, as NumPy arrays.
+    """Compute the paths of all looks of a campaign, as NumPy arrays.
 
     Args:
         z: coordinates, shape (p,).
-        turned_rad: added to the mirror angles (pan, tilt), shape (looks, 2): what gears repeat by position.
+        turned_rad: repeatable errors of the gears, added to the mirror angles (pan, tilt), shape (looks, 2).
         space: priors.
         arrays: the campaign.
     """

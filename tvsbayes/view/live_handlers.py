@@ -1,6 +1,6 @@
-"""Answers to a browser that looks at a run: every one, also to what does not exist, passes `Access` first. Tornado.
+"""Answers to a browser that watches a run: all requests, also for unknown paths, pass `Access` first. Tornado.
 
-No path of a request is ever a path on the disk, and nothing can be written.
+No path in a request is used as a path on the disk, and nothing can be written.
 """
 
 from __future__ import annotations
@@ -15,37 +15,37 @@ from tvsbayes.instrument.campaign import CAMERAS
 from tvsbayes.view.access import SECURITY_HEADERS, Access
 
 Files = Mapping[str, tuple[bytes, str]]
-"""Content and type of the page's own files, by path."""
+"""Content and MIME type of the page's own files, by path."""
 SAFER = ("pause", "laser off")
-"""What every browser with the link may ask for: it only makes a run safer."""
+"""Requests allowed to every browser with the link, since they only make a run safer."""
 
 
 class Watched(Protocol):
-    """What a page reads of a run and asks of it; called by the server's thread, so no call may wait for the run."""
+    """Interface of a run for its page; called by the server's thread, so no call may wait for the run."""
 
     def document(self) -> dict[str, Any]:
-        """The newest snapshot, as JSON holds it."""
+        """The newest snapshot as a JSON document."""
 
     def picture(self, spot: int, camera: str, kind: str) -> bytes | None:
-        """JPEG of the last look: "whole", or "spot" for its surroundings; None where there is none."""
+        """JPEG of the last look: "whole", or "spot" for the region around it; None if there is none."""
 
     def ask(self, what: str) -> bool:
-        """Puts a request in the queue; False once the run has ended.
+        """Put a request in the queue; return False once the run has ended.
 
         Raises:
-            ValueError: nothing that can be asked for.
+            ValueError: not an allowed request.
         """
 
     def control_passed(self) -> None:
-        """Another browser controls the run from now on."""
+        """Record that another browser controls the run from now on."""
 
 
 class Guarded(web.RequestHandler):
-    """What all answers share.
+    """Base of all answers.
 
     Attributes:
-        access: who may ask.
-        files: of the page.
+        access: the access control.
+        files: files of the page.
         live: the run.
         read: called with the number of every snapshot that is sent.
         open_to_all: whether the page's own browser is answered without the key.
@@ -54,17 +54,17 @@ class Guarded(web.RequestHandler):
     open_to_all = False
 
     def initialize(self, access: Access, files: Files, live: Watched, read: Callable[[int], None]) -> None:
-        """Called by Tornado for every request."""
+        """Initialise the handler; Tornado calls it for every request."""
         self.access, self.files, self.live, self.read = access, files, live, read
 
     def set_default_headers(self) -> None:
-        """Those of `SECURITY_HEADERS`, and nothing of the server's make."""
+        """Set `SECURITY_HEADERS`, without the server's name."""
         self.clear_header("Server")
         for name, value in SECURITY_HEADERS.items():
             self.set_header(name, value)
 
     def prepare(self) -> None:
-        """Refuse strangers before anything else; control passes on where who had it is silent."""
+        """Refuse foreign requests first; pass control on where its holder is silent."""
         reason = self.access.stranger(self.request.headers)
         if reason is None and not self.open_to_all and not self.access.knows(self.request.headers):
             reason = "this browser has no key: open the link that the terminal shows"
@@ -74,39 +74,39 @@ class Guarded(web.RequestHandler):
             self.live.control_passed()
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """In words, without a traceback."""
+        """Write the error in words, without a traceback."""
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(f"{status_code}: {self._reason}\n")
 
 
 class Unknown(Guarded):
-    """Any other path."""
+    """Answers any other path."""
 
     def prepare(self) -> None:
-        """Not found, for those who may ask."""
+        """Answer "not found" to requests with access."""
         super().prepare()
         raise web.HTTPError(404)
 
 
 class File(Guarded):
-    """A file of the page: holds nothing of a run, and browsers cannot send our header for a script."""
+    """A file of the page; it contains no data of a run, and browsers cannot send the key's header for a script."""
 
     open_to_all = True
 
     def get(self) -> None:
-        """The file of this very path."""
+        """Send the file of exactly this path."""
         content, kind = self.files[self.request.path]
         self.set_header("Content-Type", kind)
         self.finish(content)
 
 
 class Key(Guarded):
-    """A key for the token of the link."""
+    """Gives a key for the token of the link."""
 
     open_to_all = True
 
     def post(self) -> None:
-        """`{"token": ...}` to `{"key": ...}`."""
+        """Answer `{"token": ...}` with `{"key": ...}`."""
         try:
             token = json.loads(self.request.body)["token"]
         except (ValueError, KeyError, TypeError, RecursionError):
@@ -118,10 +118,10 @@ class Key(Guarded):
 
 
 class Now(Guarded):
-    """The newest snapshot."""
+    """Gives the newest snapshot."""
 
     def get(self) -> None:
-        """As JSON; `controls` says whether this browser may ask for everything."""
+        """Send it as JSON; `controls` states whether this browser may make all requests."""
         self.set_header("Content-Type", "application/json")
         document = {**self.live.document(), "controls": self.access.controls(self.request.headers)}
         self.finish(json.dumps(document, allow_nan=False))
@@ -129,10 +129,10 @@ class Now(Guarded):
 
 
 class Ask(Guarded):
-    """A request to the run."""
+    """Takes a request to the run."""
 
     def post(self) -> None:
-        """`{"what": ...}`, put in the queue; what becomes of it stands in the snapshots."""
+        """Put `{"what": ...}` in the queue; the snapshots contain its outcome."""
         try:
             what = json.loads(self.request.body)["what"]
             if not self.access.controls(self.request.headers) and what not in SAFER:
@@ -148,13 +148,13 @@ class Ask(Guarded):
 
 
 class LivePicture(Guarded):
-    """A picture of the last look."""
+    """Gives a picture of the last look."""
 
     def get(self, spot: str, camera: str, kind: str) -> None:
-        """As JPEG; nothing where there is none any more."""
+        """Send it as JPEG; nothing if it no longer exists."""
         picture = self.live.picture(int(spot), camera, kind)
         if picture is None:
-            # A newer look has taken its place meanwhile: no fault of anybody's.
+            # A newer look has replaced it, which is not an error.
             self.set_status(204)
             self.finish()
             return
@@ -163,7 +163,7 @@ class LivePicture(Guarded):
 
 
 def application(files: Files, access: Access, live: Watched, read: Callable[[int], None]) -> web.Application:
-    """All of them by path."""
+    """The application with all handlers by path."""
     given: dict[str, Any] = {"access": access, "files": files, "live": live, "read": read}
     pictures = rf"/live/([0-9]{{1,10}})/({'|'.join(CAMERAS)})/(whole|spot)"
     routes: list[Any] = [(path.replace(".", r"\."), File, given) for path in files]

@@ -1,6 +1,6 @@
-"""The server of a run's page: 127.0.0.1 alone, in a thread beside the run, which goes on however slow or dead it is.
+"""The server of a run's page: on 127.0.0.1 only, in a separate thread, whose delay or failure does not affect the run.
 
-The server shares the file descriptors of the run, so it holds few connections, none for long without a request.
+The server shares the file descriptors of the run, so it keeps few connections, and none for long without a request.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ PAGE_FILES = {
     "/drawing.js": ("drawing.js", SCRIPT),
     "/live.js": ("live.js", SCRIPT),
 }
-"""Paths of the page, their files in `data/view` and what they are."""
+"""Paths of the page, with their files in `data/view` and MIME types."""
 REQUEST_BYTES_MAX = 4096
 CONNECTIONS_MAX, DESCRIPTORS_SHARE = 64, 4
-"""Open connections: so many, and at most one in so many of the descriptors that the process may have."""
+"""Largest number of open connections, also at most the process' limit of descriptors over the second number."""
 IDLE_S = 5.0
-"""A connection without a request for so long is closed; the page asks twice a second."""
+"""Time without a request after which a connection is closed; the page sends two a second."""
 LINGER_S, LINGER_POLL_S = 2.0, 0.05
-"""Longest wait at the end for browsers to fetch the last snapshot: they ask twice a second."""
+"""Longest wait at the end for browsers to fetch the last snapshot, and interval of checking."""
 PICTURES_S = 0.5
-"""For the pictures that they fetch after it."""
+"""Further wait for the pictures that they fetch after it."""
 READER_S = 2.0
-"""Anyone who has not asked for so long has gone."""
+"""Time without a request after which a reader counts as gone."""
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
-    """The files of the page and what they are, by path.
+    """The files of the page with their MIME types, by path.
 
     Raises:
-        InputError: without the extra.
+        InputError: the extra is not installed.
     """
     try:
         import tornado  # noqa: F401
@@ -59,7 +59,7 @@ def page_files() -> dict[str, tuple[bytes, str]]:
 
 
 def connections_max() -> int:
-    """How many connections may be open at a time."""
+    """Largest number of connections open at a time."""
     try:
         import resource
     except ImportError:
@@ -73,8 +73,8 @@ async def serving(live: Watched, port: int, started: Callable[[str], None], read
 
     Args:
         live: the run.
-        port: to listen on; 0 takes a free one.
-        started: given the link once the server listens.
+        port: port to listen on; 0 selects a free one.
+        started: called with the link once the server listens.
         read: called with the number of every snapshot that is sent.
 
     Raises:
@@ -87,7 +87,7 @@ async def serving(live: Watched, port: int, started: Callable[[str], None], read
     from tvsbayes.view.live_handlers import application
 
     class Server(HTTPServer):
-        """Closes the connection that was opened first where there are too many: who comes new is heard."""
+        """Closes the oldest connection where there are too many, so that new ones are served."""
 
         def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
             still = [one for one in connections if not one.closed()]
@@ -114,22 +114,22 @@ async def serving(live: Watched, port: int, started: Callable[[str], None], read
         await asyncio.Event().wait()
     finally:
         server.stop()
-        # A browser that waits on a connection kept open would else wait for ever.
+        # Otherwise a browser would wait without end on a connection kept open.
         await server.close_all_connections()
 
 
 class LivePage:
-    """A page served beside a run; a context manager, entered once it listens.
+    """A page served beside a run, as a context manager, entered once the server listens.
 
     Args:
         live: the run.
-        port: to listen on; 0 takes a free one.
+        port: port to listen on; 0 selects a free one.
 
     Attributes:
-        link: what to open.
+        link: the address to open.
 
     Raises:
-        InputError: on entering: the port is taken or forbidden, or the extra is missing.
+        InputError: when entered: the port is taken or forbidden, or the extra is missing.
     """
 
     def __init__(self, live: Watched, port: int):
@@ -138,7 +138,7 @@ class LivePage:
         self._link: Future[str] = Future()
         self._loop = asyncio.new_event_loop()
         self._task = self._loop.create_task(serving(live, port, self._link.set_result, self._was_read))
-        # A daemon: a server that hangs must not keep the process, and so the laser's port, alive.
+        # A daemon thread: a hanging server must not keep the process alive, and with it the laser's port.
         self._thread = threading.Thread(target=self._serve, name="live page", daemon=True)
 
     def __enter__(self) -> LivePage:
@@ -152,12 +152,12 @@ class LivePage:
         self._thread.join(LINGER_S)
 
     def end(self) -> None:
-        """Serve no longer, whatever the run does."""
+        """Stop serving, in any state of the run."""
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._task.cancel)
 
     def _serve(self) -> None:
-        """Until it is ended or fails; what fails before it listens is raised to who waits for the link."""
+        """Serve until ended or failed; an error before listening is raised where the link is awaited."""
         try:
             self._loop.run_until_complete(self._task)
         except asyncio.CancelledError:
@@ -172,7 +172,7 @@ class LivePage:
         self._read_s, self._number = time.monotonic(), number
 
     def _linger(self) -> None:
-        """Let the browsers that are there see how it ended."""
+        """Give connected browsers time to fetch the final snapshot."""
         until = time.monotonic() + LINGER_S
         last = self._live.document()["number"]
         while time.monotonic() < until and self._thread.is_alive():

@@ -1,7 +1,7 @@
-"""The page of a campaign: one HTML file with its style, scripts and document, which asks nobody for anything.
+"""The page of a campaign: one HTML file with its style, scripts and document, without network requests.
 
-The document is scenes as JSON, its columns of numbers little-endian arrays in base64. Single precision, enough to draw
-by: 1e-4 px of 2000 px. Not a number stays what it is.
+The document contains scenes as JSON, with columns of numbers as little-endian arrays in base64. They have single
+precision, sufficient for drawing: 1e-4 px of 2000 px. NaN is kept.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ from tvsbayes.view.scene import LookColumns, Looked, Scene, numbers_of
 from tvsbayes.view.shapes import PROBABILITY
 
 SCRIPTS = ("drawing.js", "columns.js", "plots.js", "rig.js", "page.js")
-"""In `data/view`, in the order in which they run; the page of a run draws with the first of them too."""
+"""Scripts in `data/view`, in the order of execution; the page of a run also uses the first."""
 KINDS = {"f": "<f4", "i": "<i4", "b": "u1"}
-"""How a column is sent, by the kind of its array."""
+"""Encoding of a column, by the kind of its array."""
 
 
 def packed(values: np.ndarray) -> dict[str, object]:
-    """An array as the page unpacks it: type, shape, content."""
+    """Pack an array for the page: type, shape, content."""
     kind = KINDS[values.dtype.kind]
     content = np.ascontiguousarray(values, dtype=kind).tobytes()
     return {"type": kind, "shape": list(values.shape), "base64": base64.b64encode(content).decode("ascii")}
 
 
 def _looks(looks: LookColumns) -> dict[str, object]:
-    """The columns; residuals are taken in double precision."""
+    """Pack the columns; residuals are computed in double precision."""
     numbers = numbers_of(looks) | {"residual_px": looks.pixels_px - looks.predicted_px}
     texts = {"target": list(looks.target), "status": list(looks.status), "direction": list(looks.direction)}
     return {**{name: packed(values) for name, values in numbers.items()}, **texts}
 
 
 def _bare(values: np.ndarray) -> list[float] | None:
-    """A short list of numbers, None where they are not known."""
+    """A short list of numbers, None where they are unknown."""
     return values.tolist() if np.isfinite(values).all() else None
 
 
 Pictures = Mapping[int, Mapping[str, PagePicture]]
-"""By look and camera."""
+"""Pictures by look and camera."""
 
 
 def _scene(shown: Scene, pictures: Pictures) -> dict[str, object]:
-    """One campaign."""
+    """The entry of one campaign."""
     gears = [{**plain(band), "seen_steps": list(band.seen_steps)} for band in shown.gears]
     return {
         "name": shown.name,
@@ -69,11 +69,11 @@ def _scene(shown: Scene, pictures: Pictures) -> dict[str, object]:
 
 
 def document(looked: Looked, pictures: Sequence[Pictures] = ()) -> bytes:
-    """The document of everything that a page shows.
+    """Make the document of all content of a page.
 
     Args:
         looked: the scenes.
-        pictures: of each of them; none by default.
+        pictures: pictures of each scene; none by default.
     """
     held = pictures or [{}] * len(looked.scenes)
     content = {
@@ -87,11 +87,11 @@ def document(looked: Looked, pictures: Sequence[Pictures] = ()) -> bytes:
 
 
 def page_html(document: bytes) -> bytes:
-    """The page of a document of scenes, UTF-8; its policy lets nothing but its own script run.
+    """The page of a document of scenes, UTF-8; its policy lets only its own script run.
 
     Args:
         document: JSON, from `document`.
     """
-    # No text of a campaign can end the element that holds the document (HTML standard 4.12.1.3).
+    # No text of a campaign can end the element that contains the document (HTML standard 4.12.1.3).
     held = Markup(document.decode().replace("<", "\\u003c"))
     return rendered("view", "page.html", "page.css", scripts=SCRIPTS, version=version("tvsbayes"), document=held)

@@ -1,4 +1,4 @@
-"""The pictures that the page of a campaign carries: every look's, reduced, as data URIs within a limit for all of them.
+"""Pictures in the page of a campaign: every look's, reduced, as data URIs within a limit of total size.
 
 px of the sensor with the integer at the centre of a pixel.
 """
@@ -18,9 +18,9 @@ from tvsbayes.progress import Advance
 from tvsbayes.view.scene import LookColumns
 
 WIDTH_PX = 320
-"""Of a whole picture."""
+"""Width of a whole picture."""
 PICTURES_BYTES_MAX = 24_000_000
-"""Of all pictures of a page: 600 looks by two cameras in a lit room, 3800 in the dark."""
+"""Limit for all pictures of a page: 600 looks of two cameras in a lit room, 3800 in the dark."""
 GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -29,10 +29,10 @@ class PagePicture:
     """One picture of a look.
 
     Attributes:
-        whole: data URI of all of it, reduced.
-        spot: data URI of the surroundings of the spot as they were taken; None without a spot in the picture.
-        corner_px: (u, v) of the outer corner of these surroundings.
-        side_px: their side.
+        whole: data URI of the whole picture, reduced.
+        spot: data URI of the region around the spot, unreduced; None without a spot in the picture.
+        corner_px: (u, v) of the outer corner of this region.
+        side_px: side of this region.
     """
 
     whole: str
@@ -42,24 +42,24 @@ class PagePicture:
 
     @property
     def size(self) -> int:
-        """Bytes in the page."""
+        """Size in the page, bytes."""
         return len(self.whole) + len(self.spot or "")
 
 
 def look_pictures(
     folder: Path | None, looks: LookColumns, bytes_max: int = PICTURES_BYTES_MAX, advance: Advance = lambda share: None
 ) -> dict[int, dict[str, PagePicture]]:
-    """Pictures by look and camera: of unlikely looks first, then of looks evenly chosen until the limit is reached.
+    """Select pictures by look and camera: suspect looks first, then looks evenly chosen until the limit is reached.
 
     Args:
-        folder: of the campaign; a link that leads out of it is not followed.
-        looks: which have pictures, and where their spots are.
-        bytes_max: of all data URIs.
-        advance: called with the share that is done.
+        folder: folder of the campaign; links that lead out of it are not followed.
+        looks: the looks, with their pictures and spots.
+        bytes_max: largest total size of data URIs.
+        advance: called with the share done.
     """
     pictures: dict[int, dict[str, PagePicture]] = {}
     kept = np.flatnonzero(looks.pictures.any(axis=1))
-    # Multiples of the golden ratio lie evenly however few of them there are (Weyl).
+    # Multiples of the golden ratio modulo 1 are evenly distributed for any number of them (Weyl).
     order = sorted(kept.tolist(), key=lambda row: (not looks.suspect[row], row * GOLDEN % 1.0))
     size = 0
     for count, row in enumerate(order if folder is not None else ()):
@@ -74,7 +74,7 @@ def look_pictures(
 
 
 def _pictures(folder: Path, looks: LookColumns, row: int) -> dict[str, PagePicture]:
-    """Those of one look; what is damaged or leads out of the folder is left out."""
+    """Pictures of one look; damaged ones, and links out of the folder, are left out."""
     pictures = {}
     for k, camera in enumerate(CAMERAS):
         if not looks.pictures[row, k]:

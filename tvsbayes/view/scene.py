@@ -1,7 +1,7 @@
-"""What a page shows of a campaign: the looks as columns, the rig around them, what a fit says; no browser.
+"""Content of a campaign's page: the looks as columns, the rig, the results of a fit; independent of a browser.
 
-Computed from a campaign and, where there is one, its fit; nothing here knows how it is served. Frame S, mm; px; deg;
-counters in steps. What nobody knows is not a number.
+It is computed from a campaign and its fit, if any; the module does not depend on how a page is served. Frame S, mm; px;
+deg; counters in steps. Unknown values are NaN.
 """
 
 from __future__ import annotations
@@ -49,22 +49,22 @@ from tvsbayes.view.shapes import (
 
 @dataclass(frozen=True)
 class LookColumns:
-    """All looks of a campaign in the order of `spots.csv`, a row each.
+    """All looks of a campaign in the order of `spots.csv`, one row each.
 
     Attributes:
-        spot, move: their numbers, shape (n,).
-        target, status: of the table, n texts.
-        direction: of the moves of (pan, tilt) that led there, n pairs; "" where the approach is unknown.
+        spot, move: numbers of spot and move, shape (n,).
+        target, status: entries of the table, n texts.
+        direction: directions of the preceding moves of (pan, tilt), n pairs; "" where the approach is unknown.
         steps: counters (pan, tilt), shape (n, 2).
         pictures: whether the left and the right picture is kept, shape (n, 2).
         pixels_px, sd_px: centres found and their standard uncertainties, shape (n, 4).
-        predicted_px: where the fitted rig puts them, at the range seen, shape (n, 4).
+        predicted_px: centres predicted by the fitted rig, at the observed range, shape (n, 4).
         point_mm: triangulated spot, shape (n, 3).
-        ellipsoid_mm: half axes of its 95 % ellipsoid by pixel noise, shape (n, 3, 3).
-        mirrors_mm, normals: where the laser meets the mirrors, and their unit normals, shape (n, mirrors, 3).
-        end_mm: where it passes the spot, shape (n, 3).
-        deviation_deg, u_deg: of the stops of (pan, tilt): seen less fitted mirror angle, and its sd, shape (n, 2).
-        suspect: whether the fit finds it unlikely, or left it out, shape (n,).
+        ellipsoid_mm: half axes of its 95 % ellipsoid from pixel noise, shape (n, 3, 3).
+        mirrors_mm, normals: points where the laser meets the mirrors, and their unit normals, shape (n, mirrors, 3).
+        end_mm: point of the beam at the spot, shape (n, 3).
+        deviation_deg, u_deg: observed minus fitted mirror angle of the stops of (pan, tilt), and its sd, shape (n, 2).
+        suspect: whether the fit flags the look as suspect, or left it out, shape (n,).
     """
 
     spot: np.ndarray
@@ -89,9 +89,9 @@ class LookColumns:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """A parameter as the page lists it: its fit, or its prior where nothing is fitted.
+    """A parameter in the list of a page: its estimate, or its prior without a fit.
 
-    `contraction` is the share of the prior's variance that the data took away; None of priors and of what is fixed.
+    `contraction` is the share of the prior's variance that the data removed; None for priors and fixed parameters.
     """
 
     name: str
@@ -103,18 +103,18 @@ class ParameterRow:
 
 @dataclass(frozen=True)
 class Scene:
-    """A campaign to be looked at.
+    """A campaign for display.
 
     Attributes:
-        name: of the campaign.
-        fitted: whether results lend it residuals, a fitted rig and correlations; else the rig is the stated one.
-        notes: what to know before reading it.
+        name: name of the campaign.
+        fitted: whether results give residuals, a fitted rig and correlations; else the rig is the stated one.
+        notes: remarks for the reader.
         image_px: width and height of the pictures.
-        looks: all of them.
+        looks: all looks.
         cameras: left and right.
-        sheets: as far as spots show them.
-        origin_mm: of the positioner on its pan axis, shape (3,); not a number without a usable look.
-        gears: what the gears repeat over the counters; none where they do not vary.
+        sheets: sheets estimated from spots.
+        origin_mm: origin of the positioner on its pan axis, shape (3,); NaN without a usable look.
+        gears: repeatable errors of the gears over the counters; none where they do not vary.
         parameters: values with their uncertainty.
         correlated: names of the rows and columns of `correlation`.
         correlation: of the estimated parameters, shape (p, p).
@@ -136,7 +136,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Looked:
-    """What a page shows: one campaign, or two with what has changed between them."""
+    """Content of a page: one campaign, or two with the changes between them."""
 
     scenes: tuple[Scene, ...]
     changes: Comparison | None = None
@@ -144,7 +144,7 @@ class Looked:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What results lend a scene.
+    """Results of a fit used in a scene.
 
     Attributes:
         fit: mode, residuals, linearised campaign.
@@ -160,12 +160,12 @@ class Fitted:
 
 
 def scene(campaign: Campaign, fitted: Fitted | None = None, notes: Sequence[str] = ()) -> Scene:
-    """A campaign as a page shows it.
+    """Make the scene of a campaign.
 
     Args:
         campaign: with or without usable spots.
-        fitted: of exactly this campaign; None shows the rig as `campaign.toml` states it.
-        notes: what to know before reading it.
+        fitted: results of exactly this campaign; None shows the rig stated in `campaign.toml`.
+        notes: remarks for the reader.
     """
     ways = _ways(campaign, fitted)
     looks = _looks(campaign, ways, fitted)
@@ -190,7 +190,7 @@ def scene(campaign: Campaign, fitted: Fitted | None = None, notes: Sequence[str]
 
 
 def _ways(campaign: Campaign, fitted: Fitted | None) -> Ways | None:
-    """Of the usable spots in the order of the filter; of no spot there is none."""
+    """Paths of the usable spots in the order of the filter; None without spots."""
     if not any(spot.status == "ok" for spot in campaign.spots):
         return None
     if fitted is None:
@@ -203,11 +203,11 @@ def _ways(campaign: Campaign, fitted: Fitted | None) -> Ways | None:
 
 
 _WAY_SHAPES = {"mirrors_mm": (0, 3), "normals": (0, 3), "end_mm": (3,), "predicted_px": (4,)}
-"""Of a look without any usable spot beside it."""
+"""Shapes of values of a look, where the campaign has no usable spot."""
 
 
 def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> LookColumns:
-    """The columns."""
+    """Compute the columns."""
     spots, count = campaign.spots, len(campaign.spots)
     row_of = {spot.spot: row for row, spot in enumerate(spots)}
     used = ordered_spots(campaign)
@@ -224,7 +224,7 @@ def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> Look
     suspect = np.zeros(count, dtype=bool)
     scale = 1.0
     if fitted is None:
-        # Residuals against a rig that nobody fitted are those of its mounting.
+        # Residuals of an unfitted rig would only show its mounting.
         laid["predicted_px"][:] = np.nan
     else:
         scale = fitted.record.summary.parameters["pixel_scale"].value
@@ -266,7 +266,7 @@ def _steps(campaign: Campaign) -> np.ndarray:
 
 
 def _directions(campaign: Campaign) -> tuple[tuple[str, str], ...]:
-    """From which side each axis came to each look."""
+    """Directions of approach of each axis, by look."""
     by_axis = []
     for axis in AXES:
         rests = rests_of(campaign.moves, axis)
@@ -275,7 +275,7 @@ def _directions(campaign: Campaign) -> tuple[tuple[str, str], ...]:
 
 
 def _pictures(campaign: Campaign) -> np.ndarray:
-    """Which pictures lie in the folder, shape (n, 2)."""
+    """Whether each picture is in the folder, shape (n, 2)."""
     kept: set[str] = set()
     if campaign.path is not None and (campaign.path / "frames").is_dir():
         kept = {f"frames/{path.name}" for path in (campaign.path / "frames").iterdir()}
@@ -284,7 +284,7 @@ def _pictures(campaign: Campaign) -> np.ndarray:
 
 
 def _deviations(row_of: dict[int, int], stops: Sequence[StopResidual]) -> tuple[np.ndarray, np.ndarray]:
-    """Deviation of the stops behind each look and its sd, deg, shapes (n, 2)."""
+    """Deviations of each look's stops and their sds, deg, shapes (n, 2)."""
     deviation, u = np.full((len(row_of), 2), np.nan), np.full((len(row_of), 2), np.nan)
     for stop in stops:
         rows = [row_of[spot] for spot in stop.spots]
@@ -293,7 +293,7 @@ def _deviations(row_of: dict[int, int], stops: Sequence[StopResidual]) -> tuple[
 
 
 def _parameters(campaign: Campaign, fitted: Fitted | None) -> tuple[ParameterRow, ...]:
-    """Of the record, headlines first; else the stated priors."""
+    """Parameters of the record, headlines first; else the stated priors."""
     if fitted is None:
         stated = campaign.rig.priors
         return tuple(ParameterRow(n, unit_of(n), stated[n].value, stated[n].u, None) for n in RIG_NAMES)
@@ -302,7 +302,7 @@ def _parameters(campaign: Campaign, fitted: Fitted | None) -> tuple[ParameterRow
 
 
 def _correlation(fitted: Fitted | None) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names and correlations of what is estimated, the cameras' own parameters left out."""
+    """Names and correlations of the estimated parameters, without those of the cameras."""
     if fitted is None:
         return (), np.zeros((0, 0))
     names, matrix = fitted.record.covariance.names, np.asarray(fitted.record.covariance.matrix, dtype=float)
@@ -325,7 +325,7 @@ NOT_OF_THESE = (
 
 @dataclass(frozen=True)
 class StoredCampaign:
-    """A campaign with what its results say; `fitted` is None, and `note` says why, where there are none to use."""
+    """A campaign with its results; where these cannot be used, `fitted` is None and `note` gives the reason."""
 
     campaign: Campaign
     fitted: Fitted | None
@@ -333,7 +333,7 @@ class StoredCampaign:
 
 
 def stored_campaign(folder: Path) -> StoredCampaign:
-    """A campaign folder and its results.
+    """Read a campaign folder and its results.
 
     Raises:
         InputError: no campaign, or damaged results.
@@ -351,12 +351,12 @@ def stored_campaign(folder: Path) -> StoredCampaign:
 
 
 def look_at(folder: Path, beside: Path | None = None, tell: Tell = no_output) -> Looked:
-    """What a page shows of a campaign, beside another where one is named.
+    """Make the content of a campaign's page, with a second campaign where one is named.
 
     Args:
-        folder: of the campaign.
-        beside: of a later one of the same instrument.
-        tell: shows what takes long.
+        folder: folder of the campaign.
+        beside: folder of a later campaign of the same instrument.
+        tell: shows a line before long work.
 
     Raises:
         InputError: no campaign, or damaged results.

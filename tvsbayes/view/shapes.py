@@ -1,4 +1,4 @@
-"""Shapes of what stands in a rig: cameras as pyramids, sheets as rectangles, errors of spots as ellipsoids. NumPy.
+"""Shapes of the parts of a rig: cameras as pyramids, sheets as rectangles, errors of spots as ellipsoids. NumPy.
 
 Frame S: X depth, Y left, Z up, origin in the left camera's centre; mm, px.
 """
@@ -15,19 +15,19 @@ from tvsbayes.instrument.stereo_pair import Stereo, project_pair, undistort
 from tvsbayes.model.geometry import CV_FROM_S
 
 STEP_MM = 0.1
-"""Of differences along a point: its square over that of the range is far below the rounding of a pixel."""
+"""Step of differences by a point's coordinates: its squared ratio to the range is far below the rounding of a pixel."""
 PYRAMID_SHARE, PYRAMID_MM = 0.1, 100.0
-"""Depth of a camera's pyramid: share of the median range of the spots, and where there are none."""
+"""Depth of a camera's pyramid: as a share of the spots' median range, and without spots."""
 SHEET_SPOTS = 3
-"""Spots that a plane needs."""
+"""Least number of spots for a plane."""
 SHEET_MARGIN = 0.08
-"""By which a sheet is drawn beyond its outermost spots, of its longer side."""
+"""Margin of a sheet beyond its outermost spots, as a share of its longer side."""
 PROBABILITY = 0.95
 
 
 @dataclass(frozen=True)
 class Pyramid:
-    """What a camera sees.
+    """The field of view of a camera.
 
     Attributes:
         camera: left or right.
@@ -39,13 +39,13 @@ class Pyramid:
 
 
 def pyramids(stereo: Stereo, depth_mm: float) -> tuple[Pyramid, Pyramid]:
-    """Both cameras, as deep as stated."""
+    """Pyramids of both cameras with the given depth."""
     width, height = stereo.image_width - 0.5, stereo.image_height - 0.5
     corners_px = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)])
     rays = []
     for matrix, distortion in ((stereo.M1, stereo.D1), (stereo.M2, stereo.D2)):
         rays_cv = undistort(corners_px, matrix, distortion)
-        # A lens model need not reach the corners of its image.
+        # A lens model may be invalid at the corners of its image.
         pinhole = (corners_px - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
         rays.append(np.column_stack([np.where(np.isfinite(rays_cv), rays_cv, pinhole), np.ones(4)]))
     left, right = (np.vstack([np.zeros(3), depth_mm * ray]) for ray in rays)
@@ -55,11 +55,11 @@ def pyramids(stereo: Stereo, depth_mm: float) -> tuple[Pyramid, Pyramid]:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A sheet as its spots show it.
+    """A sheet estimated from its spots.
 
     Attributes:
         target: its name.
-        corners_mm: of a rectangle around its spots, in turn, shape (4, 3).
+        corners_mm: corners of a rectangle around its spots, in turn, shape (4, 3).
     """
 
     target: str
@@ -67,11 +67,11 @@ class Sheet:
 
 
 def sheets(targets: Sequence[str], points_mm: np.ndarray) -> tuple[Sheet, ...]:
-    """Planes through the spots of each name (total least squares); none for fewer than three spots.
+    """Fit planes to the spots of each name (total least squares); none for fewer than three spots.
 
     Args:
-        targets: of the spots.
-        points_mm: where they are, shape (n, 3); not a number where nobody knows.
+        targets: targets of the spots.
+        points_mm: their positions, shape (n, 3); NaN where unknown.
     """
     names, known = np.array(targets, dtype=str), np.isfinite(points_mm).all(axis=1)
     planes = []
@@ -80,7 +80,7 @@ def sheets(targets: Sequence[str], points_mm: np.ndarray) -> tuple[Sheet, ...]:
         if len(spots) < SHEET_SPOTS:
             continue
         middle = spots.mean(axis=0)
-        # Rows: along the longer side, along the shorter, across the sheet.
+        # Rows: along the longer side, along the shorter side, normal to the sheet.
         along = np.linalg.svd(spots - middle, full_matrices=False)[2][:2]
         flat = (spots - middle) @ along.T
         low, high = flat.min(axis=0), flat.max(axis=0)
@@ -91,15 +91,15 @@ def sheets(targets: Sequence[str], points_mm: np.ndarray) -> tuple[Sheet, ...]:
 
 
 def point_covariance_mm2(stereo: Stereo, points_mm: np.ndarray, covariance_px2: np.ndarray) -> np.ndarray:
-    """Covariance of triangulated points by the noise of their pixels, the cameras taken as known.
+    """Covariance of triangulated points from the noise of their pixels, with known cameras.
 
     Args:
         stereo: the cameras.
         points_mm: shape (n, 3).
-        covariance_px2: of u_left, v_left, u_right, v_right, shape (n, 4, 4).
+        covariance_px2: covariance of u_left, v_left, u_right, v_right, shape (n, 4, 4).
 
     Returns:
-        Shape (n, 3, 3); not a number where a point is not.
+        Shape (n, 3, 3); NaN where a point is NaN.
     """
     steps = STEP_MM * np.eye(3)
     ahead, behind = (np.stack([project_pair(stereo, points_mm + s * step) for step in steps], axis=2) for s in (1, -1))
@@ -112,9 +112,9 @@ def point_covariance_mm2(stereo: Stereo, points_mm: np.ndarray, covariance_px2: 
 
 
 def ellipsoid_axes_mm(covariance_mm2: np.ndarray) -> np.ndarray:
-    """Half axes of the ellipsoids that hold points with 95 %, shape (n, 3, 3): axis, then x, y, z.
+    """Half axes of the 95 % ellipsoids of points, shape (n, 3, 3): axis, then x, y, z.
 
-    `covariance_mm2` has shape (n, 3, 3); not a number gives axes that are none.
+    `covariance_mm2` has shape (n, 3, 3); NaN gives axes of NaN.
     """
     axes = np.full(covariance_mm2.shape, np.nan)
     known = np.isfinite(covariance_mm2).all(axis=(1, 2))
