@@ -1,6 +1,6 @@
-"""Uncertainty budgets as the GUM asks for: input quantities, their contributions, effective degrees of freedom, U.
+"""Uncertainty budgets by the GUM: input quantities, their contributions, effective degrees of freedom, U.
 
-Any unit; each row says its own. GUM = JCGM 100:2008.
+Any unit, stated in each row. GUM = JCGM 100:2008.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ class Source:
 
     Attributes:
         quantity, unit: its name and the unit of estimate and u; unit "1" for a standardised effect.
-        estimate: its value, None where it is no single quantity.
+        estimate: its value, None where it is not a single quantity.
         u: standard uncertainty.
         kind: "A" by statistics of the campaign, "B" otherwise (GUM 4.2, 4.3), "A, B" for a parameter fitted from both.
-        distribution: from which u comes.
+        distribution: distribution of u.
         dof: degrees of freedom of u (GUM G.4), infinite where it is taken as known.
         sensitivity: change of the result per unit of the quantity.
     """
@@ -49,7 +49,7 @@ INDEPENDENCE = (
 
 
 def _finite(dof: float) -> float | None:
-    """JSON has no infinity."""
+    """Replace infinity by None, as JSON has none."""
     return dof if math.isfinite(dof) else None
 
 
@@ -69,10 +69,10 @@ def budget_table(
         quantity: name of the result.
         unit: its unit.
         estimate: its value.
-        u: its combined standard uncertainty, correlations and all: what the rows do not reach is the correlation row.
+        u: its combined standard uncertainty, correlations included: the remainder of the rows is the correlation row.
         sources: input quantities.
-        probability: of U.
-        notes: put before the standing one.
+        probability: coverage probability of U.
+        notes: notes before the default one.
 
     Returns:
         The table.

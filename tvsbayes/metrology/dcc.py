@@ -1,8 +1,8 @@
-"""The calibration certificate as DCC XML (schema 3.3.0 of PTB): unsigned, not accredited, of a campaign's own words.
+"""The calibration certificate as DCC XML (schema 3.3.0 of PTB): unsigned, not accredited, as the campaign declares.
 
 `data/export/certificate.xml` is its template. Ratios in degrees per step, backlash in degrees, lengths in mm;
-uncertainties to two digits (GUM 7.2.6). Every text is escaped and stays text. A certificate is held against the schema
-that its reader names on this machine, without any network.
+uncertainties to two digits (GUM 7.2.6). Every text is escaped. A certificate is validated against a local schema that
+its reader names, without network.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from tvsbayes.results.metrology_tables import FIGURES, AxisPositioning
 from tvsbayes.statistics.intervals import NORMAL_95
 
 COUNTRY_NOT_STATED = "ZZ"
-"""User-assigned in ISO 3166-1: valid for the schema, named by PTB's Schematron."""
+"""User-assigned code of ISO 3166-1: valid for the schema, reported by PTB's Schematron."""
 NOT_ACCREDITED = (
     "This document is not an accredited calibration certificate. It was written by software from a campaign of its "
     "user in the format of the DCC schema; it is not signed, and its user alone is responsible for it."
@@ -61,15 +61,15 @@ METHOD = (
     "U is half the 95 % interval, k = U/u."
 )
 DEG_PER_STEP, DEG, MM = r"\degree\per\one", r"\degree", r"\milli\metre"
-"""Units in the notation of D-SI, which has none for a count: steps are `\\one`."""
+"""Units in the notation of D-SI, which has no unit of a count: steps are `\\one`."""
 CONDITIONS = {
     "basic_temperature": ("temperature_degC", "temperature", r"\degreecelsius"),
     "basic_humidityRelative": ("humidity_percent", "relative humidity", r"\percent"),
 }
 """Key of `[environment]`, name and unit of the conditions that a certificate states, by their kind in the DCC."""
 EXPANDED_SYMMETRY = 0.25
-"""Standard uncertainties by which the middle of the 95 % interval may lie off the value before an interval is given
-instead of an expanded uncertainty."""
+"""Largest distance of the middle of the 95 % interval from the value, in standard uncertainties, for an expanded
+uncertainty instead of an interval."""
 _RELEASE = re.compile(r"(?:[0-9]{1,3}\.){0,3}[0-9]{1,3}(?![0-9])")
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML 1.0 cannot hold, escaped or not."""
@@ -77,13 +77,13 @@ _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 
 @dataclass(frozen=True)
 class Parties:
-    """Who issues a certificate for whom.
+    """Issuer and customer of a certificate.
 
     Attributes:
-        laboratory: name of who measured.
-        customer: name of for whom.
-        country: ISO 3166-1 code of the place where it was measured, two capital letters.
-        customer_country: the same of the customer.
+        laboratory: name of the laboratory.
+        customer: name of the customer.
+        country: ISO 3166-1 code of the place of measurement, two capital letters.
+        customer_country: code of the customer's country.
     """
 
     laboratory: str = NOT_STATED
@@ -101,13 +101,13 @@ class Embedded:
 
     @property
     def encoded(self) -> str:
-        """The report in base64."""
+        """Return the report in base64."""
         return base64.b64encode(self.html).decode()
 
 
 @dataclass(frozen=True)
 class _Statement:
-    """A declaration with its name; `traceable` where it says whether the results are."""
+    """A declaration with its name; `traceable` if it states whether the results are."""
 
     name: str
     text: str
@@ -116,7 +116,7 @@ class _Statement:
 
 @dataclass(frozen=True)
 class _Real:
-    """An `si:real` of D-SI 2.2.1, and the entries of its uncertainty in the element `kind`; "" for none."""
+    """An `si:real` of D-SI 2.2.1, with the entries of its uncertainty in the element `kind`; "" for none."""
 
     value: str
     unit: str
@@ -148,7 +148,7 @@ def dcc_real(
     interval95: tuple[float, float] | None = None,
     distribution: str = "normal",
 ) -> _Real:
-    """A number with no, a standard, an expanded uncertainty or an interval, two digits of uncertainty."""
+    """Build a number with no, a standard or an expanded uncertainty or an interval, to two digits of uncertainty."""
     numbers = [value, *(() if u is None else (u,)), *(interval95 or ())]
     if not all(map(math.isfinite, numbers)):
         raise ValueError(f"a certificate needs finite numbers, not {numbers}")
@@ -157,9 +157,9 @@ def dcc_real(
     low, high = interval95 or (value, value)
     expanded, middle = 0.5 * (high - low), 0.5 * (high + low)
     k = expanded / u
-    # A coverage factor below 1 is no D-SI coverage factor.
+    # D-SI does not allow coverage factors below 1.
     symmetric = interval95 is not None and k >= 1 and abs(middle - value) <= EXPANDED_SYMMETRY * u
-    # Decimals at which the uncertainty keeps two significant digits (GUM 7.2.6).
+    # Decimals that give the uncertainty two significant digits (GUM 7.2.6).
     places = max(0, 1 - int(f"{expanded if symmetric else u:.1e}".split("e")[1]))
     text, standard = f"{value:.{places}f}", f"{u:.{places}f}"
     covered = {"coverageProbability": f"{PROBABILITY:.2f}", "distribution": distribution}
@@ -191,7 +191,7 @@ def _statements(campaign: Campaign, fit: FitRecord, when: Performance, parties: 
 
 
 def _cameras(campaign: Campaign) -> str:
-    """The camera pair in words."""
+    """Describe the camera pair in words."""
     declared, stereo = header_table(campaign, "traceability"), campaign.stereo
     text = f"2 x {stereo.image_width} x {stereo.image_height} px, calibration residual {stereo.rms_px:.3g} px rms"
     if stereo.assumed:
@@ -202,13 +202,13 @@ def _cameras(campaign: Campaign) -> str:
 
 
 def _stated(campaign: Campaign, table: str, key: str, unit: str) -> _Real | None:
-    """A quantity of a table of `campaign.toml`; None where it is not stated."""
+    """Return a quantity of a table of `campaign.toml`; None where it is not stated."""
     stated = stated_value(campaign, table, key)
     return None if stated is None else dcc_real(unit, stated.value, stated.u)
 
 
 def _results(fit: FitRecord) -> Iterator[_Result]:
-    """Ratios, backlash, and the ISO 230-2-style figures that were predicted."""
+    """List ratios, backlash, and the predicted ISO 230-2-style figures."""
     summary = fit.summary
     shape = "normal" if summary.estimator == "laplace" else "sampled posterior"
 
@@ -238,13 +238,13 @@ def _figures(table: AxisPositioning) -> Iterator[_Quantity]:
     for name, (symbol, term) in FIGURES.items():
         figure = (table.predicted or {})[name]
         low, high = figure.interval95
-        # Medians and intervals of a simulation: the half width over 1.96 stands for u.
+        # Medians and intervals of a simulation: u is the half width over 1.96.
         u = (high - low) / (2 * NORMAL_95)
         yield _Quantity(f"{symbol}, {term}", dcc_real(DEG, figure.median, u, figure.interval95, "simulated tests"))
 
 
 def _check_certifiable(campaign: Campaign, fit: FitRecord, parties: Parties) -> None:
-    """Refuse what no certificate may be made of; errors as in `dcc_bytes`."""
+    """Refuse inputs that allow no certificate; errors as in `dcc_bytes`."""
     where = "in which the campaign was measured", "of the customer"
     for country, place in zip((parties.country, parties.customer_country), where, strict=True):
         if not re.fullmatch("[A-Z]{2}", country):
@@ -273,27 +273,27 @@ def dcc_bytes(
     parties: Parties = Parties(),
     report: Embedded | None = None,
 ) -> bytes:
-    """DCC-schema XML of a fit: unsigned, not accredited, traceable only as far as the campaign declares.
+    """Write DCC-schema XML of a fit: unsigned, not accredited, traceable only as far as the campaign declares.
 
     Args:
-        campaign: what was fitted; names are taken as given and stay text.
-        fit: its `results/fit.json`.
+        campaign: the fitted campaign; names are used as given, as text.
+        fit: content of its `results/fit.json`.
         issued: date of issue; the same inputs and date give the same bytes.
         identifier: unique identifier; None makes one from results, name, date, parties and report.
         parties: laboratory, customer, countries.
-        report: the HTML report to embed; its number stands among the core data.
+        report: the HTML report to embed; its number is part of the core data.
 
     Returns:
         UTF-8 XML, DCC 3.3.0.
 
     Raises:
-        InputError: a country that is no code, or results of other data or priors than the campaign's.
-        NotConverged: the fit behind the results has not converged.
+        InputError: a country is not a code, or the results belong to other data or priors.
+        NotConverged: the fit of the results has not converged.
     """
     _check_certifiable(campaign, fit, parties)
     summary, made, when = fit.summary, fit.provenance, performed(campaign, issued)
     besides = [campaign.title, *astuple(parties), None if report is None else report.number]
-    # PTB's Schematron wants a letter and up to four numbers; the whole version stands in the description.
+    # PTB's Schematron requires a letter and up to four numbers; the whole version is in the description.
     release = _RELEASE.match(made.versions["tvsbayes"])
     listed = ", ".join(f"{name} {version}" for name, version in made.versions.items())
     pose = summary.reference_pose_deg
@@ -325,12 +325,12 @@ def dcc_bytes(
 
 
 def _text(value: object) -> Markup:
-    """A value as the schema takes it: escaped, on one line, never empty, no character that XML cannot hold."""
+    """Convert a value for the schema: escaped, on one line, never empty, without characters that XML cannot hold."""
     return value if isinstance(value, Markup) else Markup(escape(plain_text(_FORBIDDEN.sub("\ufffd", str(value)))))
 
 
 def _rendered(**content: object) -> bytes:
-    """The template with its content, indented; that it is well-formed is seen on the way."""
+    """Fill the template with its content and indent it; parsing checks that it is well-formed."""
     environment = Environment(
         loader=FileSystemLoader(str(shipped_data() / "export")),
         autoescape=True,
@@ -338,7 +338,7 @@ def _rendered(**content: object) -> bytes:
         undefined=StrictUndefined,
     )
     builder = ET.TreeBuilder()
-    # Not ElementTree's parser: it would take the prefixes for names of its own.
+    # Not ElementTree's parser, which would replace the prefixes.
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     parser.CharacterDataHandler = builder.data
@@ -353,7 +353,7 @@ XSD_SECONDS = 60
 
 @dataclass(frozen=True)
 class SchemaCheck:
-    """What a schema validator said: `valid` is None where nothing could be checked, and `messages` say why."""
+    """Result of a schema validator: `valid` is None where nothing could be checked, for the reason in `messages`."""
 
     tool: str | None
     valid: bool | None
@@ -363,12 +363,12 @@ class SchemaCheck:
 def check_dcc(data: bytes, schema: Path) -> SchemaCheck:
     """Validate a certificate against the schema that the user names.
 
-    xmllint where it is installed, else lxml; neither is a dependency. PTB's schema loads D-SI by URL: point to a folder
-    in which the imports are relative paths.
+    It uses xmllint if installed, else lxml; neither is a dependency. PTB's schema loads D-SI by URL: use a folder in
+    which the imports are relative paths.
 
     Args:
-        data: of `dcc_bytes`.
-        schema: `dcc.xsd`.
+        data: output of `dcc_bytes`.
+        schema: path of `dcc.xsd`.
 
     Raises:
         InputError: there is no such file.

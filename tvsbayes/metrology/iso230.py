@@ -1,8 +1,8 @@
 """Figures of ISO 230-2 from positioning deviations: reversal, repeatability, systematic deviation, accuracy.
 
-Any unit; fields say degrees, since axes of rotation are what is measured here. "Up" is the approach from below (left,
-up). Clause numbers 2.11 to 2.20 of ISO 230-2:2006 are those that an independent implementation carries; neither
-edition's text was at hand, and further definitions have no number here.
+Any unit; fields are named in degrees, since the measured axes rotate. "Up" is the approach from below (left, up).
+Clause numbers 2.11 to 2.20 of ISO 230-2:2006 are quoted from an independent implementation; the text of neither edition
+was available, and further definitions have no number here.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ import numpy as np
 from tvsbayes.results.metrology_tables import Positioning
 
 RUNS_MIN = 2
-"""A standard deviation needs two runs."""
+"""Least number of runs: a standard deviation needs two."""
 
 
 def figures_of(up_deg: np.ndarray, down_deg: np.ndarray) -> Positioning:
-    """ISO 230-2 figures from positioning deviations x_ij = actual - target.
+    """Compute ISO 230-2 figures from positioning deviations x_ij = actual - target.
 
-    A common offset of all deviations changes no figure. "Up" is the approach from below (left, up).
+    A common offset of all deviations does not change a figure. "Up" is the approach from below (left, up).
 
     Args:
-        up_deg: deviations of runs that arrived upwards, shape (..., m, n); NaN marks a run that was not made.
-        down_deg: the same downwards, shape (..., m, n').
+        up_deg: deviations of upward runs, shape (..., m, n); NaN marks a missing run.
+        down_deg: deviations of downward runs, shape (..., m, n').
 
     Returns:
-        The figures; any unit will do, all come back in the unit of the deviations.
+        The figures, in the unit of the deviations.
 
     Raises:
         ValueError: shapes do not agree, or a target has fewer than two runs from one side.

@@ -1,4 +1,4 @@
-"""What the uncertainty of one located point comes from: by cause, and by parameter with correlations.
+"""Uncertainty budget of one located point: by cause, and by parameter with correlations.
 
 Frame T, mm; law of propagation of uncertainty (GUM 5.1, 5.2).
 """
@@ -17,22 +17,22 @@ from tvsbayes.instrument.parameters import unit_of
 from tvsbayes.metrology.budget_tables import BudgetTable, Source, budget_table
 
 STOP_HERE, APERTURE_HERE, PLAY_HERE = "stop error here", "aperture noise here", "unknown approach here"
-"""Causes that belong to the one look and not to the calibration."""
+"""Causes that belong to the look and not to the calibration."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What the variance of one point consists of, by the law of propagation.
+    """Parts of the variance of one point, by the law of propagation.
 
     Attributes:
         causes: pixel noise, stop errors of the campaign, stereo calibration, focal scale, every prior, transmission
-            error and play variation, and what this one look adds.
-        share: of the total variance (sum over x, y, z), shape (causes,); sums to 1.
-        variance_mm2: by cause and coordinate, shape (causes, 3).
+            error and play variation, and the noises of this look.
+        share: shares of the total variance (sum over x, y, z), shape (causes,); sum 1.
+        variance_mm2: variance by cause and coordinate, shape (causes, 3).
         parameters: names of the calibration's `look_inputs` and of this look's noises.
         contribution_mm: sensitivity times standard uncertainty, shape (parameters, 3).
-        correlation: of the parameters, shape (parameters, parameters); their contributions do not add up without it.
-        covariance_mm2: of the point, shape (3, 3).
+        correlation: correlation of the parameters, needed to add up contributions, shape (parameters, parameters).
+        covariance_mm2: covariance of the point, shape (3, 3).
         steps: counters (pan, tilt) of the look.
     """
 
@@ -46,7 +46,7 @@ class Budget:
     steps: tuple[float, float]
 
     def as_json(self) -> dict[str, object]:
-        """Causes with share and standard uncertainty, parameters with signed contributions and correlations."""
+        """Return causes with share and u, and parameters with signed contributions and correlations."""
         u = np.sqrt(self.variance_mm2)
         return {
             "causes": [
@@ -68,18 +68,18 @@ def budget(
     aperture_deg: float,
     approach: tuple[str, str] = HOME_APPROACH,
 ) -> Budget:
-    """The uncertainty budget of one point (GUM 7.2.7 asks for it): by cause, and by parameter with correlations.
+    """Compute the uncertainty budget of one point (GUM 7.2.7), by cause, and by parameter with correlations.
 
     Args:
-        calibration: with causes, as a fit keeps them.
+        calibration: calibration with causes, as a fit stores them.
         pan_steps: absolute counter.
         tilt_steps: absolute counter.
         aperture_deg: reading B.
         approach: last move of (pan, tilt): left or right, up or down, or unknown.
 
     Raises:
-        ValueError: a calibration that does not know its causes.
-        InputError: an approach that does not exist, or beam and line of sight do not meet.
+        ValueError: the calibration has no causes.
+        InputError: there is no such approach, or beam and line of sight do not meet.
     """
     if not calibration.causes:
         raise ValueError("this calibration has no causes of uncertainty: fit the campaign again")
@@ -95,7 +95,7 @@ def budget(
     by_cause += [noise_variance[:, :2].sum(axis=1), noise_variance[:, 2:4].sum(axis=1), noise_variance[:, 4]]
     variance = np.array(by_cause)
     u = np.sqrt(np.diag(covariance))
-    # What does not vary correlates with nothing.
+    # Constants have correlation 0.
     safe = np.where(u > 0, u, 1.0)
     return Budget(
         causes=(*calibration.causes, STOP_HERE, PLAY_HERE, APERTURE_HERE),
@@ -114,11 +114,11 @@ _KINDS = {"stop": ("A", "normal"), "place": ("B", "uniform"), "aperture": ("B", 
 
 
 def coordinate_budget(budget: Budget, calibration: Calibration, xyz_mm: Sequence[float], component: str) -> BudgetTable:
-    """The budget of x, y or z of one located point, by parameter of the calibration and noise of the look.
+    """Build the budget of x, y or z of one located point, by parameter of the calibration and noise of the look.
 
     Args:
-        budget: of the look.
-        calibration: behind it.
+        budget: budget of the look.
+        calibration: its calibration.
         xyz_mm: the point, frame T, mm.
         component: "x", "y" or "z".
 

@@ -1,7 +1,7 @@
-"""The ISO 230-2-style table of an axis: what tests on the rigs that the data allow would find, beside its own stops.
+"""The ISO 230-2-style table of an axis: posterior predictive figures, and those of the campaign's own stops.
 
-Angles in degrees of the beam about the axis that turns (azimuth for pan, elevation for tilt); counters in steps.
-Nothing is fitted here and no angle standard is involved: the notes of a table say what it rests on. No JAX.
+Angles in degrees of the beam about the moving axis (azimuth for pan, elevation for tilt); counters in steps. Nothing is
+fitted here and no angle standard is involved: the notes of a table state its basis. No JAX.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ class StopReadings:
         axis: pan or tilt.
         steps: counter of each stop, shape (n,).
         side: +1 reached left or up, -1 right or down, shape (n,).
-        mirror_deg: mirror angle, shape (n,); stop errors and home offsets are in it.
+        mirror_deg: mirror angle, stop errors and home offsets included, shape (n,).
         u_deg: its standard uncertainty from pixel noise alone, shape (n,).
-        play_left_out: stops whose last move may not have taken up the play.
+        play_left_out: number of stops left out, whose last move may not have taken up the play.
         reference_pose_deg: pan and tilt of the fit's reference pose.
         values: parameters at the mode, by name.
     """
@@ -74,7 +74,7 @@ class StopReadings:
 
 
 def _with_own_stops(table: AxisPositioning, readings: StopReadings, wanted: int) -> AxisPositioning:
-    """A table with the figures of the campaign's stops, or why there are none, where ISO wants so many targets."""
+    """Add the figures of the campaign's stops, or why there are none; `wanted` is ISO's number of targets."""
     u = float(np.sqrt(np.mean(readings.u_deg**2))) if len(readings.u_deg) else None
     left_out, few = readings.play_left_out, []
     unplayed = [f"plug-in: {left_out} stops left out whose play was not taken up for certain"] if left_out else []
@@ -117,7 +117,7 @@ def _with_own_stops(table: AxisPositioning, readings: StopReadings, wanted: int)
 
 
 def _predicted(runs: Runs) -> dict[str, Predicted]:
-    """Median and interval of every figure over simulated tests."""
+    """Compute median and interval of every figure over simulated tests."""
     figures = figures_of(runs.up_deg, runs.down_deg)
     predicted = {}
     for name in FIGURES:
@@ -127,7 +127,7 @@ def _predicted(runs: Runs) -> dict[str, Predicted]:
 
 
 def _middle_deg_per_step(calibration: Calibration, axis: str) -> float:
-    """The beam's mean ratio of both directions at the middle of the counters, in mid-play."""
+    """Compute the beam's mean ratio of both directions at the middle of the counters, in mid-play."""
     middle_pan, middle_tilt = calibration.range_steps.mean(axis=1).tolist()
     estimates = calibration.estimates_at((middle_pan, middle_tilt))
     pan, tilt = (
@@ -149,26 +149,25 @@ def positioning(
     contrast_deg_per_step: np.ndarray | None = None,
     seed: int = 0,
 ) -> AxisPositioning:
-    """The ISO 230-2-style table of an axis: posterior predictive, beside the campaign's own stops.
+    """Build the ISO 230-2-style table of an axis: posterior predictive, and of the campaign's own stops.
 
     Args:
         calibration: with draws.
         axis: pan or tilt.
-        readings: of `stop_readings`; None leaves the plug-in table out.
-        deg_per_step: what turns counters into target angles: None takes the calibrated mean of both directions at the
-            middle of the counters, as a user of the calibration would; give the design ratio to see the uncalibrated
-            axis.
+        readings: from `stop_readings`; None omits the plug-in table.
+        deg_per_step: ratio of target angles to counters. None is the calibrated mean of both directions at the middle
+            of the counters, as a user of the calibration would take; the design ratio gives the uncalibrated axis.
         targets: counters of the simulated tests; None spreads them over the campaign's range.
         runs: as in `simulated_runs`, like the next three.
         tests: number of simulated tests.
         contrast_deg_per_step: draws of the ratio contrast.
-        seed: of targets and stop errors.
+        seed: seed of targets and stop errors.
 
     Returns:
-        The table, with what it does not cover.
+        The table, with notes on effects that it does not cover.
 
     Raises:
-        ValueError: the calibration holds no draws.
+        ValueError: the calibration has no draws.
     """
     if not len(calibration.inputs):
         raise ValueError("this calibration has no draws: read it from results/draws.npz")

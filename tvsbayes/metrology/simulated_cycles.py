@@ -1,6 +1,6 @@
-"""Test cycles of ISO 230-2 on an axis, simulated on the rigs that the data allow.
+"""Simulated test cycles of ISO 230-2 on an axis, for the draws of a calibration.
 
-Counters in steps, angles in degrees of the beam about the axis that turns (azimuth for pan, elevation for tilt).
+Counters in steps, angles in degrees of the beam about the moving axis (azimuth for pan, elevation for tilt).
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from tvsbayes.statistics.streams import Stream, random_stream
 RUNS = 5
 """Runs per side of the standard test cycle of ISO 230-2."""
 TARGETS_MIN = 2
-"""A systematic deviation needs two targets."""
+"""Least number of targets for a systematic deviation."""
 LONG_TRAVEL_DEG, TARGETS, TARGETS_LONG = 180.0, 5, 8
 """Targets of a rotary axis by its travel (ISO 230-2, by secondary sources): see `targets_wanted`."""
 SIMULATED_TESTS = 1000
-"""Tests drawn for a predictive interval: its ends then scatter by 0.1 sd."""
+"""Number of simulated tests for a predictive interval, whose ends then scatter by 0.1 sd."""
 
 
 def targets_wanted(travel_deg: float) -> int:
-    """Number of targets that ISO 230-2 asks for over a travel of a rotary axis."""
+    """Return the number of targets that ISO 230-2 requires over a travel of a rotary axis."""
     return TARGETS_LONG if abs(travel_deg) > LONG_TRAVEL_DEG else TARGETS
 
 
 def target_steps(low: float, high: float, deg_per_step: float, seed: int = 0) -> tuple[int, ...]:
-    """Target counters over a range: equal cells, a place in each that no gear tooth repeats.
+    """Choose target counters over a range: a random place in each of equal cells, so that no gear tooth repeats.
 
-    ISO 230-2 wants targets P_i = (i - 1) p + r with random r.
+    ISO 230-2 requires targets P_i = (i - 1) p + r with random r.
 
     Args:
-        low: lower end of the range, steps; both ends are turn-round points and no targets.
+        low: lower end of the range, steps; both ends are turning points, not targets.
         high: upper end.
-        deg_per_step: decides with the range how many targets there are.
-        seed: of the places.
+        deg_per_step: ratio, which with the range determines the number of targets.
+        seed: seed of the places.
 
     Returns:
-        Rising counters, at least two where the range has three steps; empty for a smaller range.
+        Ascending counters, at least two where the range has three steps; empty for a smaller range.
     """
     count = targets_wanted((high - low) * deg_per_step)
     places = np.arange(count) + 0.5 + random_stream(seed, Stream.CYCLE_COUNTERS).uniform(-0.2, 0.2, count)
@@ -52,7 +52,7 @@ def target_steps(low: float, high: float, deg_per_step: float, seed: int = 0) ->
 
 @dataclass(frozen=True)
 class Runs:
-    """Deviations of the runs of a test from their target angles, deg, by the side from which targets are approached.
+    """Deviations of runs from their target angles, deg, by the side from which targets are approached.
 
     Attributes:
         up_deg, down_deg: arrays (m, n) or (tests, m, n) of m targets and n runs; not a number where a run is missing.
@@ -73,23 +73,23 @@ def simulated_runs(
     contrast_deg_per_step: np.ndarray | None = None,
     seed: int = 0,
 ) -> Runs:
-    """Deviations of ISO 230-2 test cycles on the rigs that the data allow.
+    """Simulate deviations of ISO 230-2 test cycles for the draws of a calibration.
 
-    A test is homed once at a turn-round point below the targets; each run goes up through them, turns round above
-    them and comes back; play is taken up at every target; every stop draws its error. Runs follow each other without
-    homing, so that unequal ratios of the two directions carry every run on by c times the travel. The other axis rests
-    in mid-play at the middle of its counters.
+    A test is homed once at a turning point below the targets. Each run goes up through them, turns above them and comes
+    back; play is taken up at every target, and every stop has a new error. There is no homing between runs, so that
+    unequal ratios of the two directions shift every run by c times the travel. The other axis is in mid-play at the
+    middle of its counters.
 
     Args:
         calibration: with draws.
         axis: pan or tilt.
         targets: counters, shape (m,).
         deg_per_step: target angles are this times the counters.
-        runs: per side.
-        tests: number of tests, each on a draw of its own.
-        contrast_deg_per_step: draws of the axis' ratio contrast in the order of `calibration.inputs`, shape (n,);
-            None is none. Coordinates never see it, since a counter stands for its mean ratio after homing.
-        seed: of the stop errors.
+        runs: runs per side.
+        tests: number of tests, each with its own draw.
+        contrast_deg_per_step: draws of the axis' ratio contrast in the order of `calibration.inputs`, shape (n,); None
+            is zero. Coordinates do not depend on it, since a counter has its mean ratio after homing.
+        seed: seed of the stop errors.
 
     Returns:
         Arrays of shape (tests, m, runs).
@@ -103,12 +103,12 @@ def simulated_runs(
     other = AXES[1 - AXES.index(axis)]
     middle = float(calibration.range_steps[AXES.index(other)].mean())
     at = (steps[:, 0], np.full(len(steps), middle)) if axis == AXES[0] else (np.full(len(steps), middle), steps[:, 0])
-    # What repeats by position is taken at the counter: what the contrast has gained by then moves it by far less.
+    # Errors by position are taken at the counter: the shift by the contrast changes them far less.
     gear_errors = calibration.gears.at(calibration.inputs[rows, len(INPUT_NAMES) :], at)
     values |= {name: errors[..., None] for name, errors in gear_errors.items()}
     other_deg = output_deg(values, other, middle, 0.0, calibration.period_deg.get(other))
     ratio = values[f"degrees_per_step.{axis}"]
-    # Upwards a step is k + c/2, downwards k - c/2 (formulation 3.1): a whole cycle of 2 L steps gains c L.
+    # An upward step is k + c/2, a downward one k - c/2 (formulation 3.1): a cycle of 2 L steps gains c L.
     before = contrast * (high - low) * np.arange(runs)
     gained = {1.0: before + 0.5 * contrast * (steps - low), -1.0: before + 0.5 * contrast * (2 * high - low - steps)}
     generator = random_stream(seed, Stream.CYCLES)

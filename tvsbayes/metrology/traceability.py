@@ -1,4 +1,4 @@
-"""What a campaign states of its date, its length standard and its conditions, passed on and never checked.
+"""Statements of a campaign on its date, length standard and conditions, passed on without any check.
 
 Lengths in mm, temperatures in degC, relative humidity in %, each with its standard uncertainty.
 """
@@ -23,11 +23,11 @@ class StatedValue:
 
 @dataclass(frozen=True)
 class Traceability:
-    """What may be said of traceability.
+    """Statement on traceability.
 
     Attributes:
         statement: a sentence for certificates and reports.
-        declared: the campaign names the certificate of its length standard, which nobody checks here.
+        declared: whether the campaign names the certificate of its length standard, which is not checked here.
     """
 
     statement: str
@@ -44,13 +44,13 @@ class Performance:
 
 
 def performed(campaign: Campaign, issued: datetime.date) -> Performance:
-    """When the campaign was measured; the date of issue where it does not say."""
+    """Return when the campaign was measured; the date of issue where it does not state it."""
     created = campaign.header.get("created")
     if not isinstance(created, datetime.date):
         return Performance(issued, issued, False)
     if not isinstance(created, datetime.datetime):
         return Performance(created, created, True)
-    # Times of moves count from any instant: a clock, or the start of the campaign.
+    # Times of moves count from any instant: that of a clock, or the start of the campaign.
     seconds = campaign.moves[-1].time_s - campaign.moves[0].time_s if campaign.moves else 0.0
     try:
         return Performance(created.date(), (created + datetime.timedelta(seconds=seconds)).date(), True)
@@ -59,23 +59,23 @@ def performed(campaign: Campaign, issued: datetime.date) -> Performance:
 
 
 def header_table(campaign: Campaign, name: str) -> dict[str, object]:
-    """`[environment]` or `[traceability]` of `campaign.toml`; empty where it is left out."""
+    """Return `[environment]` or `[traceability]` of `campaign.toml`; empty where it is missing."""
     table = campaign.header.get(name)
     return table if isinstance(table, dict) else {}
 
 
 def stated_value(campaign: Campaign, name: str, key: str) -> StatedValue | None:
-    """A quantity of such a table."""
+    """Return a quantity of such a table."""
     entry = header_table(campaign, name).get(key)
     return StatedValue(entry["value"], entry["u"]) if isinstance(entry, dict) else None
 
 
 UNITS = {"degC": "degC", "percent": "%", "mm": "mm"}
-"""By the end of a key."""
+"""Units by the suffix of a key."""
 
 
 def stated_text(campaign: Campaign, name: str, key: str) -> tuple[str, str]:
-    """An entry of such a table for readers: its name, a quantity's without the unit, and what it says."""
+    """Return an entry of such a table for readers: its name, without the unit of a quantity, and its text."""
     stated = stated_value(campaign, name, key)
     if stated is None:
         return key, str(header_table(campaign, name)[key])
@@ -84,12 +84,12 @@ def stated_text(campaign: Campaign, name: str, key: str) -> tuple[str, str]:
 
 
 def plain_text(value: object) -> str:
-    """Text on one line, with a word for none."""
+    """Return text on one line, "not stated" if empty."""
     return " ".join(str(value).split()) or NOT_STATED
 
 
 def traceability(campaign: Campaign) -> Traceability:
-    """The campaign's word on its length standard, passed on, not checked; simulated data are never traceable."""
+    """Return the campaign's statement on its length standard, not checked; simulated data are never traceable."""
     certificate = plain_text(header_table(campaign, "traceability").get("board_certificate", ""))
     if campaign.header.get("synthetic"):
         return Traceability("Simulated data: not traceable.", False)

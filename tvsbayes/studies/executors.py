@@ -1,7 +1,7 @@
-"""Where the rows of a study are made: in this process, in spawned processes, or on a Dask cluster.
+"""Execution of a study's rows: in this process, in spawned processes, or on a Dask cluster.
 
-Workers started here have one thread each, so that the sums of a row are the same in all of them; this process and the
-workers of a cluster that runs already have what their owner gave them.
+Workers started here have one thread each, so that a row has the same sums in all of them. This process and workers of a
+running cluster keep their settings.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
 }
-"""Read by XLA and OpenBLAS when a process starts: one thread per worker, and the same sums on every engine."""
+"""Variables for XLA and OpenBLAS at the start of a process: one thread per worker, and equal sums on every engine."""
 
 
 def _in_worker(job: StudyJob, index: int) -> StudyRow:
-    """`study_row` in a process of its own, which may keep compiled functions."""
+    """Compute `study_row` in a process of its own, which may use the compilation cache."""
     use_compilation_cache()
     return study_row(job, index)
 
@@ -36,19 +36,19 @@ def _in_worker(job: StudyJob, index: int) -> StudyRow:
 def made_rows(
     job: StudyJob, indices: Sequence[int], engine: str = "serial", workers: int = 2, address: str | None = None
 ) -> Generator[StudyRow, None, None]:
-    """Rows of a study in the order in which they are finished.
+    """Compute rows of a study, in the order in which they are finished.
 
-    Close the iterator where it is left early: it ends the workers that it started.
+    Close the iterator if it is left early, which ends the workers that it started.
 
     Args:
         job: what is studied.
-        indices: of the rows.
+        indices: indices of the rows.
         engine: one of `ENGINES`.
-        workers: processes; of a Dask cluster only where it is started here.
-        address: scheduler of a Dask cluster that runs already.
+        workers: number of processes; for Dask only where the cluster is started here.
+        address: scheduler of a running Dask cluster.
 
     Raises:
-        InputError: an engine that does not exist, Dask without its extra, or a worker that died.
+        InputError: there is no such engine, Dask is not installed, or a worker died.
     """
     if engine not in ENGINES:
         allowed = ", ".join(ENGINES)
@@ -69,7 +69,7 @@ def _worker_died(what: str) -> InputError:
 
 
 def _by_processes(job: StudyJob, indices: Sequence[int], workers: int, address: str | None) -> Iterator[StudyRow]:
-    """Spawned processes of this machine, one thread each; JAX must not be forked."""
+    """Compute rows in spawned processes, one thread each; JAX must not be forked."""
     pool = futures.ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
     try:
         for future in futures.as_completed([pool.submit(_in_worker, job, index) for index in indices]):
@@ -81,7 +81,7 @@ def _by_processes(job: StudyJob, indices: Sequence[int], workers: int, address: 
 
 
 def _by_dask(job: StudyJob, indices: Sequence[int], workers: int, address: str | None) -> Iterator[StudyRow]:
-    """A Dask cluster; the rows of a worker that dies are made again by another."""
+    """Compute rows on a Dask cluster; another worker repeats the rows of one that dies."""
     try:
         from distributed import Client, KilledWorker, LocalCluster, as_completed
         from distributed.comm import CommClosedError
@@ -91,7 +91,7 @@ def _by_dask(job: StudyJob, indices: Sequence[int], workers: int, address: str |
     local = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
     try:
         with LocalCluster(**local) if address is None else nullcontext(address) as place, Client(place) as client:
-            # Not `Client.get_executor`: it waits without end for a row that is fetched while the scheduler dies.
+            # Not `Client.get_executor`: it waits forever for a row that is fetched while the scheduler dies.
             for future in as_completed([client.submit(_in_worker, job, i, pure=False, retries=3) for i in indices]):
                 yield future.result()
     except KilledWorker as error:
@@ -106,7 +106,7 @@ ENGINES = ("serial", *_WORKERS)
 
 @contextmanager
 def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Environment variables for processes started inside."""
+    """Set environment variables for processes started inside."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:

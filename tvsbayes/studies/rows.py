@@ -1,7 +1,7 @@
-"""Rows of studies: one simulated and fitted campaign each, kept in a file of JSON lines.
+"""Rows of studies, one simulated and fitted campaign each, in a file of JSON lines.
 
-Headlines in deg/step, deg and mm, the target in its own unit, seconds of computing. A row belongs to a design, the hash
-of everything that decides it, and to the number of its campaign.
+Headlines in deg/step, deg and mm, the target in its unit, seconds of computing. A row is identified by its design, the
+hash of all its inputs, and the number of its campaign.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from tvsbayes.results.records import plain
 STUDY_FORMAT = "tvsbayes-study/1"
 ROWS_BYTES_MAX = 128 * 1024 * 1024
 _LINE_BEGINS = b'{"format": "tvsbayes-study/'
-"""As every line of every edition does, before what may be torn."""
+"""Beginning of every line in all versions, before a part that may be torn."""
 
 
 @dataclass(frozen=True)
 class HeadlineRow:
-    """How one headline fared in one campaign.
+    """Result of one headline in one campaign.
 
     Attributes:
         truth: true value.
         value: estimate.
         sd: its reported standard deviation.
-        interval95: as reported.
+        interval95: reported 95 % interval.
         pit: weight of the estimator's draws below the truth.
-        predicted_sd: what the planner predicted at that truth.
+        predicted_sd: sd predicted by the planner at that truth.
     """
 
     truth: float
@@ -53,16 +53,16 @@ class StudyRow:
     """One campaign of a study; a fit that failed has no headlines.
 
     Attributes:
-        design: hash of what it belongs to.
+        design: hash of its design.
         index: number of the campaign.
-        seed: of the campaign.
-        converged: the fit ended well, and so did its sampling.
+        seed: seed of the campaign.
+        converged: whether the fit and its sampling converged.
         unseen: looks without a spot.
-        problems: of the fit, in words.
-        seconds: simulation and fit.
-        headlines: by name.
+        problems: problems of the fit, in words.
+        seconds: time of simulation and fit.
+        headlines: results by name.
         target: reported value of the target, None where the fit has none.
-        estimator: "importance" or "laplace", which rows without the word are of.
+        estimator: "importance" or "laplace", which is that of rows without this entry.
     """
 
     design: str
@@ -77,16 +77,16 @@ class StudyRow:
     estimator: str = "laplace"
 
     def as_json(self) -> dict[str, object]:
-        """Its line in a file of rows, less the format."""
+        """Return its line in a file of rows, without the format."""
         absent = () if self.headlines else ("headlines", "target")
         return {name: value for name, value in plain(self).items() if name not in absent}
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> StudyRow:
-        """The row of a line.
+        """Build the row of a line.
 
         Raises:
-            msgspec.ValidationError: a document of another shape.
+            msgspec.ValidationError: the document has another structure.
         """
         return msgspec.convert(document, cls)
 
@@ -94,7 +94,7 @@ class StudyRow:
 class StudyRows:
     """Rows of studies in a file of JSON lines: appended one by one, each on disk before the next.
 
-    A process that is killed while it writes leaves a torn last line; it is cut off before the next row is added.
+    A process that is killed while it writes leaves a torn last line, which is removed before the next row is added.
     """
 
     def __init__(self, path: Path) -> None:
@@ -104,13 +104,13 @@ class StudyRows:
         rows = (self._row(line, number) for number, line in enumerate(whole.splitlines(), 1))
         self.rows = {(row.design, row.index): row for row in rows}
         self.torn, self._size = len(data) - len(whole), len(data)
-        # Of a file without one whole row: else somebody's only line, which never ended, would be cut off as torn.
+        # A file without one whole row is checked, or somebody else's only unterminated line would be removed as torn.
         if not whole and not (data.startswith(_LINE_BEGINS) or _LINE_BEGINS.startswith(data)):
             raise self._no_row(1)
         self._try()
 
     def _try(self) -> None:
-        """Refuse a file that cannot be written, before the first campaign is fitted; nothing is left of the trial."""
+        """Refuse a file that cannot be written before the first campaign is fitted; the test leaves no file."""
         try:
             if self.path.exists():
                 self.path.open("ab").close()
@@ -125,7 +125,7 @@ class StudyRows:
 
     @contextmanager
     def _open(self) -> Iterator[BinaryIO]:
-        """The file, for whole lines at its end, no matter who else writes there; made where there is none."""
+        """Open the file for appending whole lines, even if others write to it; it is created where missing."""
         try:
             with self.path.open("ab") as file:
                 yield file
@@ -152,14 +152,14 @@ class StudyRows:
         )
 
     def of(self, design: str) -> dict[int, StudyRow]:
-        """Rows of one design by index."""
+        """Return rows of one design by index."""
         return {index: row for (key, index), row in self.rows.items() if key == design}
 
     def append(self, row: StudyRow) -> None:
-        """Add a row and wait until the disk has it."""
+        """Add a row and wait until it is on disk."""
         line = json.dumps({"format": STUDY_FORMAT, **row.as_json()}, allow_nan=False).encode() + b"\n"
         with self._open() as file:
-            # Where the file has another size, its last line was no torn one but that of a second study.
+            # If the file size has changed, its last line was not torn but that of a second study.
             if self.torn and self.path.stat().st_size == self._size:
                 file.truncate(self._size - self.torn)
             self.torn = 0

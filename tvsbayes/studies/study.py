@@ -1,7 +1,7 @@
-"""Studies: the twin runs a plan many times, every campaign is fitted, coverage, power and assurance are counted.
+"""Studies: the twin runs a plan many times, every campaign is fitted, and coverage, power and assurance are counted.
 
-Rows that are kept already are not made again: a study goes on where it was interrupted, and its numbers do not depend
-on the engine. Headlines in deg/step, deg and mm.
+Stored rows are not computed again, so that an interrupted study continues. Its numbers do not depend on the engine.
+Headlines in deg/step, deg and mm.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ CAMPAIGNS = "campaigns"
 
 @dataclass(frozen=True)
 class HeadlineStudy:
-    """How one headline fared over the campaigns of a study.
+    """Results of one headline over the campaigns of a study.
 
     Attributes:
-        coverage: share of intervals that hold the truth, by level; `bounds`: what an honest share stays within.
-        rms_z: RMS of (estimate - truth) / reported sd; `rms_bounds` likewise.
-        rms_predicted: the same over the sd that the planner predicted at each truth.
+        coverage: share of intervals that hold the truth, by level; `bounds`: bounds of a correct share.
+        rms_z: RMS of (estimate - truth) / reported sd; `rms_bounds`: its bounds.
+        rms_predicted: the same with the sd that the planner predicted at each truth.
         predicted_over_rms: root mean square of the predicted sd over RMS of (estimate - truth).
         power: share of campaigns whose estimate differs from its null (0, or the stated ratio) by 1.96 sd.
         sd: median reported sd.
@@ -51,7 +51,7 @@ class HeadlineStudy:
 
     @property
     def within(self) -> bool:
-        """All of coverage and z inside their bounds."""
+        """Whether coverage and z are within their bounds."""
         low, high = self.rms_bounds
         covered = all(a <= self.coverage[level] <= b for level, (a, b) in self.bounds.items())
         return covered and low <= self.rms_z <= high
@@ -59,14 +59,14 @@ class HeadlineStudy:
 
 @dataclass(frozen=True, repr=False)
 class StudyResult(Shown):
-    """Coverage, power and assurance of a plan, measured.
+    """Measured coverage, power and assurance of a plan.
 
     Attributes:
-        design: its hash.
-        estimator: what the values of the rows come from, "importance" or "laplace".
-        campaigns, converged: how many were simulated, and how many fits ended well.
-        headlines: by name; one that the priors hold fixed is not estimated and left out.
-        target: what was wanted.
+        design: hash of the design.
+        estimator: estimator of the rows, "importance" or "laplace".
+        campaigns, converged: number of simulated campaigns, and of converged fits.
+        headlines: results by name; one fixed by the priors is not estimated and left out.
+        target: target of the plan.
         assurance, assurance_interval95: share of ALL campaigns whose fit reports the target as met (Clopper-Pearson).
         reported: 5, 50 and 95 % quantiles of the reported value.
         seconds: median time of a row.
@@ -86,7 +86,7 @@ class StudyResult(Shown):
     problems: tuple[str, ...]
 
     def shown(self) -> View:
-        """Coverage and power by quantity."""
+        """Show coverage and power by quantity."""
         rows = [
             (name, h.sd, h.rms_z, h.rms_predicted, 100 * h.coverage["95"], h.power)
             for name, h in self.headlines.items()
@@ -96,7 +96,7 @@ class StudyResult(Shown):
         return View(title, columns, rows)
 
     def as_json(self) -> dict[str, object]:
-        """The document of `study --json`."""
+        """Return the document of `study --json`."""
         document = {key: value for key, value in vars(self).items() if key not in ("headlines", "target", "problems")}
         document["headlines"] = {
             name: {**vars(h), "bounds": {k: list(v) for k, v in h.bounds.items()}, "within": h.within}
@@ -106,7 +106,7 @@ class StudyResult(Shown):
 
 
 def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
-    """Count rows of a study.
+    """Evaluate the rows of a study.
 
     Raises:
         NotConverged: not one fit ended well.
@@ -147,7 +147,7 @@ def study_result(job: StudyJob, rows: Sequence[StudyRow]) -> StudyResult:
         converged=n,
         headlines=headlines,
         target=job.target,
-        # A fit that failed met nothing.
+        # A failed fit does not meet the target.
         assurance=hits / len(rows),
         assurance_interval95=share_interval95(hits, len(rows)),
         reported=(float(low), float(middle), float(high)) if len(reported) else None,
@@ -166,16 +166,16 @@ def study(
     address: str | None = None,
     progress: Show | None = None,
 ) -> StudyResult:
-    """Make the rows 0 ... count - 1 of a study that are not there yet, and count them all.
+    """Compute the missing rows among 0 ... count - 1 of a study, and evaluate all.
 
     Args:
         job: what is studied.
         count: number of campaigns.
-        rows: where rows are kept; what is there is not made again.
-        engine: where they are made; the numbers are the same on each.
-        workers: processes.
-        address: of a Dask scheduler.
-        progress: told how far it is, after every row.
+        rows: stored rows, which are not computed again.
+        engine: where rows are computed; the numbers are the same on each.
+        workers: number of processes.
+        address: address of a Dask scheduler.
+        progress: called with the share that is done after every row.
 
     Raises:
         InputError: no such engine.

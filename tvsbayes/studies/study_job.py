@@ -1,4 +1,4 @@
-"""What a study asks, and one row of it: a plan simulated and fitted once, beside the truth and the planner's forecast.
+"""A study's job, and one row: a plan simulated and fitted once, with the truth and the planner's forecast.
 
 Headlines in deg/step, deg and mm; coordinates z have prior N(0, 1) each.
 """
@@ -40,14 +40,14 @@ from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import Truth
 
 ESTIMATORS = ("importance", "laplace")
-"""What a row's values come from: the sampled posterior (`posterior_of`), or the Laplace approximation."""
+"""Estimators of a row's values: the sampled posterior (`posterior_of`), or the Laplace approximation."""
 ITERATIONS = 6
-"""Of slope and width of a backlash: the width's error falls at least threefold each."""
+"""Iterations of slope and width of a backlash; each reduces the width's error at least threefold."""
 
 
 @dataclass(frozen=True)
 class StudyJob:
-    """What a worker needs to make any row of a study; `estimator` is one of `ESTIMATORS`."""
+    """Inputs of a worker for any row of a study; `estimator` is one of `ESTIMATORS`."""
 
     rig: Rig
     steps: tuple[PlanStep, ...]
@@ -58,7 +58,7 @@ class StudyJob:
 
     @cached_property
     def key(self) -> str:
-        """SHA-256 of what decides the rows: program, rig, truth, cameras, plan, target, seed, reading, estimator."""
+        """Compute the SHA-256 of all inputs: program, rig, truth, cameras, plan, target, seed, reading, estimator."""
         rig = self.rig
         parts = [
             STUDY_FORMAT,
@@ -69,22 +69,22 @@ class StudyJob:
             json.dumps([sorted(rig.sheets_mm.items()), rig.look_sd, sorted(rig.costs_s.items())]),
             json.dumps([[s.action, s.pan_steps, s.tilt_steps, s.target, s.experiment, s.point] for s in self.steps]),
             json.dumps([self.target.text, self.seed, self.aperture]),
-            # Rows of the days when there was no other keep their design.
+            # Older rows, when there was no other estimator, keep their design.
             *([] if self.estimator == "laplace" else [self.estimator]),
         ]
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
     def campaign_seed(self, index: int) -> int:
-        """Seed of campaign `index`: independent of order, engine and number of campaigns."""
+        """Compute the seed of campaign `index`, independent of order, engine and number of campaigns."""
         high, low = np.random.SeedSequence([self.seed, index]).generate_state(2)
         return (int(high) >> 10) << 32 | int(low)
 
 
 def true_headlines(truth: Truth, campaign: Campaign, pose_rad: np.ndarray) -> np.ndarray:
-    """`TARGETS` of a true rig by the twin's formulas: ratios over the looks of a campaign, others at a pose.
+    """Compute `TARGETS` of a true rig by the twin's formulas: ratios over a campaign's looks, others at a pose.
 
     Raises:
-        NothingToEstimate: a campaign without looks.
+        NothingToEstimate: the campaign has no looks.
     """
     pan_deg, tilt_deg = np.degrees(pose_rad).tolist()
     true = truth.headlines(campaign, (pan_deg, tilt_deg))
@@ -94,9 +94,9 @@ def true_headlines(truth: Truth, campaign: Campaign, pose_rad: np.ndarray) -> np
 
 
 def study_row(job: StudyJob, index: int) -> StudyRow:
-    """Simulate one campaign, fit and sample it, compare with the truth and with what the planner predicted there.
+    """Simulate one campaign, fit and sample it, and compare with the truth and the planner's prediction there.
 
-    Whatever fails is a row as well, a chain that has not converged among it: failures are counted, never dropped.
+    Every failure is a row too, such as a chain that has not converged: failures are counted, never dropped.
     """
     start, seed = time.perf_counter(), job.campaign_seed(index)
     run = simulate(job.rig, job.steps, seed, aperture=job.aperture)
@@ -121,21 +121,21 @@ def study_row(job: StudyJob, index: int) -> StudyRow:
 
 
 def posterior_of(result: JointFit, seed: int) -> Posterior:
-    """By importance sampling; where its weights are not sound by a chain, with which `tvsbayes fit` ends as well."""
+    """Sample by importance sampling, or by a chain if its weights are not reliable, as `tvsbayes fit` does."""
     posterior = sample(result, IMPORTANCE, seed=seed)
     return posterior if posterior.converged else sample(result, CHAIN, seed=seed)
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """What an estimator says of coordinates and headlines.
+    """Estimates of coordinates and headlines.
 
     Attributes:
         z: centre of the coordinates, shape (p,).
-        covariance: theirs, shape (p, p).
-        value: of `TARGETS`, shape (9,).
-        draws: of them, shape (n, 9).
-        weights: of the draws, sum 1, shape (n,).
+        covariance: covariance of the coordinates, shape (p, p).
+        value: estimates of `TARGETS`, shape (9,).
+        draws: draws of `TARGETS`, shape (n, 9).
+        weights: weights of the draws, sum 1, shape (n,).
     """
 
     z: np.ndarray
@@ -146,7 +146,7 @@ class Estimates:
 
 
 def reported(job: StudyJob, result: JointFit, estimates: Estimates) -> float | None:
-    """The target's value by an estimator; None where no beam reaches its point."""
+    """Compute the target's value by an estimator; None where no beam reaches its point."""
     target = job.target
     if target.point_mm is None:
         return target.factor * float(spread(estimates)[list(target.indices)].max())
@@ -160,12 +160,12 @@ def reported(job: StudyJob, result: JointFit, estimates: Estimates) -> float | N
 
 
 def spread(estimates: Estimates) -> np.ndarray:
-    """Sd of every headline, shape (9,)."""
+    """Compute the sd of every headline, shape (9,)."""
     return np.sqrt(estimates.weights @ (estimates.draws - weighted_mean(estimates.draws, estimates.weights)) ** 2)
 
 
 def laplace_estimates(result: JointFit) -> Estimates:
-    """Of the mode and the approximation's draws."""
+    """Return estimates by the mode and the draws of the Laplace approximation."""
     mode, draws = (
         _headline_draws(jax.tree.map(lambda part: np.asarray(part)[None], result.mode)),
         _headline_draws(result.draws),
@@ -174,7 +174,7 @@ def laplace_estimates(result: JointFit) -> Estimates:
 
 
 def sampled_estimates(posterior: Posterior) -> Estimates:
-    """Of a posterior's draws."""
+    """Return estimates by a posterior's draws."""
     z, weights = posterior.z.reshape(-1, posterior.z.shape[-1]), posterior.weights.ravel()
     draws = _headline_draws(posterior.joined)
     covariance = np.cov(z, rowvar=False, aweights=weights, ddof=0)
@@ -182,11 +182,11 @@ def sampled_estimates(posterior: Posterior) -> Estimates:
 
 
 def _compared(job: StudyJob, result: JointFit, estimates: Estimates, true: Truth) -> dict[str, HeadlineRow]:
-    """Every headline beside the truth, and beside what the planner predicts at that truth."""
+    """Compare every headline with the truth and with the planner's prediction at that truth."""
     bare, pose = prior_knowledge(job.rig), result.reference_pose_rad
     instruments = instruments_in(bare, [true])
     z, space = instruments.z[0], instruments.space_of(0)
-    # Ratios are the lines that the fit's are, over gears as good as the true ones.
+    # Ratios are slopes of the fit's lines, with gear errors of the true scales.
     knowledge = bare.with_places(replace(fit_places(result), scales=expected_scales(z, space, True)))
     information = information_of(job.steps, knowledge, aperture=job.aperture, z=z, space=space)
     at_truth = knowledge.gears.headlines(z, space, pose)
@@ -208,13 +208,13 @@ def _compared(job: StudyJob, result: JointFit, estimates: Estimates, true: Truth
 
 
 def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Sd of quantities at a truth, the backlashes linearised over the width of their posteriors, not at a point.
+    """Predict sds of quantities at a truth, with backlashes linearised over the width of their posteriors.
 
-    Near no backlash its slope against its coordinate vanishes: linearised there, a ratio would seem free of the
-    exchange with it. The slope is taken as sd(backlash) / sd(coordinate), the posterior's width found by iteration.
+    Near zero backlash its slope by its coordinate vanishes: linearised there, a ratio would seem uncorrelated with it.
+    The slope is taken as sd(backlash) / sd(coordinate), with the posterior's width found by iteration.
 
     Args:
-        knowledge: before the plan.
+        knowledge: knowledge before the plan.
         fisher: information of the plan at the truth, shape (p + e, p + e).
         gradient: d(quantity)/d(coordinates, errors of gears) there, shape (q, p + e).
         z: coordinates of the truth, shape (p,).
@@ -233,5 +233,5 @@ def predicted_sds(knowledge: Knowledge, fisher: np.ndarray, gradient: np.ndarray
 
 
 def _headline_draws(draws: Derived) -> np.ndarray:
-    """`TARGETS` of draws, shape (draws, 9)."""
+    """Return `TARGETS` of draws, shape (draws, 9)."""
     return np.column_stack([draws[quantity.name] for quantity in TARGETS.values()])

@@ -1,8 +1,8 @@
-"""Pictures of a checkerboard as the twin's cameras take them, in visible light.
+"""Pictures of a checkerboard by the twin's cameras, in visible light.
 
-A board's edges are area-sampled, its corners lie at `Camera.project` of their places. Poses take the board's axes to
+A board's edges are area-sampled; its corners are at `Camera.project` of their positions. Poses take the board's axes to
 the left camera's (x right, y down, z along the view); mm; px with the integer at the centre of a pixel; DN = grey
-levels of 8 bits. Everything random follows from the seeds given.
+levels of 8 bits. All random numbers follow from the given seeds.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from tvsbayes.twin.physics import Camera, CameraPair
 from tvsbayes.twin.spot_pictures import Sensor, ambient_level, expose, random_stream
 
 SUBPIXELS = 8
-"""Samples per axis in a pixel that an edge of the board may cross: levels to 1/64."""
+"""Samples per axis in a pixel that an edge of the board may cross, for levels to 1/64."""
 SHADING = 0.15
-"""Relative fall of the light on a board from the upper left to the lower right corner of the picture."""
+"""Relative decrease of the light on a board from the upper left to the lower right corner of the picture."""
 BORDER_PX = 8.0
 """Least distance of a board's outer squares from the image's border."""
 DEPTHS_MM = (280.0, 520.0)
-"""For lenses up to `LENS` times as long as the picture is high, in px; longer ones see a board whole further off."""
+"""Depths of boards for focal lengths up to `LENS` picture heights, in px; for longer ones they are increased."""
 LENS = 1.25
-"""The shipped rigs have 1.11."""
+"""Focal length over picture height; the shipped rigs have 1.11."""
 TILT_MAX_DEG = 40.0
 
 
@@ -35,8 +35,8 @@ TILT_MAX_DEG = 40.0
 class Board:
     """A checkerboard by its INNER corners, as OpenCV counts them; corner (0, 0) is the board's origin.
 
-    Inner corner (i, j) lies at (i, j, 0) * pitch; squares reach one pitch further on every side, a white margin
-    `margin` pitches further still.
+    Inner corner (i, j) is at (i, j, 0) * pitch. Squares extend by one pitch on every side, a white margin by another
+    `margin` pitches.
     """
 
     columns: int = 9
@@ -48,21 +48,21 @@ class Board:
     surround_dn: float = 70.0
 
     def corners_mm(self) -> np.ndarray:
-        """Inner corners (rows * columns, 3) in the board's axes, row by row, as OpenCV's finder orders them."""
+        """Return inner corners (rows * columns, 3) in the board's axes, row by row, in OpenCV's order."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         return np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size))) * self.pitch_mm
 
 
 @dataclass(frozen=True)
 class BoardPose:
-    """Where a board stands: `rotation` (3, 3), `translation_mm` (3,) take its axes to the left camera's."""
+    """Pose of a board: `rotation` (3, 3), `translation_mm` (3,) from its axes to the left camera's."""
 
     rotation: np.ndarray
     translation_mm: np.ndarray
 
 
 def _fine_levels(x: np.ndarray, y: np.ndarray, board: Board) -> np.ndarray:
-    """Reflectance in DN at board coordinates in units of the pitch."""
+    """Return reflectance in DN at board coordinates in units of the pitch."""
     squares = (x >= -1) & (x < board.columns) & (y >= -1) & (y < board.rows)
     dark = (np.floor(x).astype(np.int64) + np.floor(y).astype(np.int64)) % 2 == 0
     m = board.margin
@@ -72,7 +72,7 @@ def _fine_levels(x: np.ndarray, y: np.ndarray, board: Board) -> np.ndarray:
 
 
 def _rays(camera: Camera) -> np.ndarray:
-    """Undistorted normalised coordinates (height, width, 2) of every pixel; NaN where the lens gives none."""
+    """Return undistorted normalised coordinates (height, width, 2) of every pixel; NaN where there are none."""
     return _rays_of(
         camera.width,
         camera.height,
@@ -87,7 +87,7 @@ def _rays_of(width: int, height: int, pinhole: tuple[float, ...], distortion: tu
     k1, k2, p1, p2, k3 = distortion
     u, v = np.meshgrid((np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy)
     x, y = u.copy(), v.copy()
-    for _ in range(30):  # Newton with the radial slope alone: linear convergence by the tangential part, 1e-4 a step
+    for _ in range(30):  # Newton with the radial slope alone: the tangential part converges linearly, by 1e-4 a step
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         slope = radial + 2 * r2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
@@ -105,7 +105,7 @@ def _rays_of(width: int, height: int, pinhole: tuple[float, ...], distortion: tu
 
 
 def board_irradiance(camera: Camera, pose: BoardPose, board: Board) -> np.ndarray:
-    """Irradiance (height, width) of a checkerboard in DN: area-sampled at its edges, without blur."""
+    """Compute the irradiance (height, width) of a checkerboard in DN, area-sampled at its edges, without blur."""
     rotation = camera.rotation @ pose.rotation
     translation = camera.rotation @ pose.translation_mm + camera.translation_mm
     homography = np.column_stack((rotation[:, 0], rotation[:, 1], translation))
@@ -140,7 +140,7 @@ def board_irradiance(camera: Camera, pose: BoardPose, board: Board) -> np.ndarra
 
 
 def _board_window(camera: Camera, pose: BoardPose, board: Board) -> tuple[slice, slice]:
-    """Rows and columns that the board's paper covers; the whole image where part of it forms none."""
+    """Return the rows and columns of the board's paper; the whole image where part of it cannot be projected."""
     m, along = board.margin, np.linspace(0.0, 1.0, 60)
     x, y = (-1 - m + (count + 1 + 2 * m) * along for count in (board.columns, board.rows))
     ends = [np.column_stack((x, np.full(60, edge))) for edge in y[[0, -1]]]
@@ -150,21 +150,21 @@ def _board_window(camera: Camera, pose: BoardPose, board: Board) -> tuple[slice,
     size = np.array([camera.width, camera.height])
     if not np.isfinite(pixels).all():
         return slice(0, camera.height), slice(0, camera.width)
-    # Between two of the 60 points an edge bulges by less than a pixel; gradients need two more.
+    # Between two of the 60 points an edge deviates by less than a pixel; gradients need two more.
     low = np.clip(np.floor(pixels.min(axis=0)) - 4, 0, size).astype(int)
     high = np.clip(np.ceil(pixels.max(axis=0)) + 5, 0, size).astype(int)
     return slice(low[1], high[1]), slice(low[0], high[0])
 
 
 def render_board(camera: Camera, pose: BoardPose, board: Board, sensor: Sensor, seed: Sequence[int]) -> np.ndarray:
-    """One picture of a checkerboard; its corners lie at `camera.project` of the board's corners.
+    """Render a picture of a checkerboard; its corners are at `camera.project` of the board's corners.
 
     Args:
         camera: the camera, in visible light: focal scale 1.
-        pose: of the board to the left camera.
+        pose: pose of the board to the left camera.
         board: the board.
-        sensor: the sensor; in visible light its three colours respond alike here.
-        seed: whole numbers that name view and camera.
+        sensor: the sensor; in visible light its three colours respond equally.
+        seed: whole numbers that identify view and camera.
     """
     import cv2
 
@@ -175,10 +175,10 @@ def render_board(camera: Camera, pose: BoardPose, board: Board, sensor: Sensor, 
 
 
 def board_poses(cameras: CameraPair, board: Board, views: int, seed: int) -> list[BoardPose]:
-    """Poses that a careful user would take: tilted up to 40 degrees, all over the part that both cameras see.
+    """Draw poses as a careful user would take them: tilted up to 40 degrees, all over the common field of view.
 
     Raises:
-        InputError: the board fits hardly anywhere into both images.
+        InputError: the board rarely fits into both images.
     """
     rng = random_stream("board", seed)
     corners = board.corners_mm()

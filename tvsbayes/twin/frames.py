@@ -1,7 +1,7 @@
-"""The pictures of a simulated campaign on disk: a pair per look, and board views to calibrate the cameras from.
+"""Pictures of a simulated campaign on disk: a pair per look, and board views for calibrating the cameras.
 
 Spots are seen by the true cameras at the laser's wavelength, boards in visible light (focal scale 1). Light and sensors
-are those of `Scene()` and `Sensor()`, the board is the paper's.
+are `Scene()` and `Sensor()`, the board is the paper's.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tvsbayes.twin.simulated_campaign import SimulatedCampaign
 from tvsbayes.twin.spot_pictures import Scene, Sensor, render_spots
 
 BOARD_VIEWS = 20
-"""Views of the checkerboard, as the paper took (section 2.3)."""
+"""Number of views of the checkerboard, as in the paper (section 2.3)."""
 WORKERS_MAX = 8
 
 
@@ -39,12 +39,12 @@ def write_with_frames(
 ) -> int:
     """Write a campaign and its pictures, campaign.toml last: a folder without it is not finished.
 
-    In a folder that the same simulation began, pictures that are there stay and the others follow.
+    In a folder that the same simulation began, existing pictures are kept and the others are added.
 
     Args:
         folder: new, empty, or begun by the same simulation.
         simulated: what the twin did.
-        seed: see `write_frames`, as the others.
+        seed: see `write_frames`.
         views: how many board views.
         progress: told how far it is.
 
@@ -54,7 +54,7 @@ def write_with_frames(
     Raises:
         InputError: the folder holds anything else, cannot be written, or the cameras see no board together.
     """
-    # What cannot be rendered is refused before anything is written.
+    # Scenes that cannot be rendered are refused before anything is written.
     poses = _board_poses(simulated, seed, views)
     files = simulated.files()
     declaration = files.pop("campaign.toml")
@@ -67,7 +67,7 @@ def write_with_frames(
 
 
 def _begun(folder: Path, files: Mapping[str, bytes]) -> bool:
-    """Whether a folder holds nothing but what this simulation wrote before it was interrupted."""
+    """Whether a folder holds only files that this simulation wrote before it was interrupted."""
     if not folder.is_dir():
         return False
     # Hidden files are those that a killed process was writing.
@@ -87,13 +87,13 @@ def write_frames(
 ) -> int:
     """Write `frames/000000_left.png`, `_right.png` of every look and `boards/left01.png`, `right01.png` ...
 
-    Pairs that are there already stay: pictures are written whole or not at all.
+    Existing pairs are kept: pictures are written whole or not at all.
 
     Args:
         folder: the campaign's folder, which exists.
         simulated: what the twin did.
-        seed: of speckle, noise and board poses.
-        views: how many board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
+        seed: seed of speckle, noise and board poses.
+        views: number of board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
         progress: told how far it is.
 
     Returns:
@@ -106,7 +106,7 @@ def write_frames(
 
 
 def _board_poses(simulated: SimulatedCampaign, seed: int, views: int | None) -> list[BoardPose]:
-    """Where the board stands, view by view."""
+    """Draw the poses of the board, view by view."""
     views = BOARD_VIEWS if views is None else views
     return board_poses(cameras_of(simulated.truth.stereo), Board(), views, seed) if views else []
 
@@ -114,7 +114,7 @@ def _board_poses(simulated: SimulatedCampaign, seed: int, views: int | None) -> 
 def _render(
     folder: Path, simulated: SimulatedCampaign, seed: int, poses: list[BoardPose], progress: Show | None
 ) -> int:
-    """See `write_frames`, for boards at these poses."""
+    """Write the pictures of `write_frames`, for boards at these poses."""
     visible, board = cameras_of(simulated.truth.stereo), Board()
     make_folder(folder / "frames")
     if poses:
@@ -123,7 +123,7 @@ def _render(
     looks, boards = _Looks(folder, simulated, infrared, seed), _Boards(folder, board, poses, visible, seed)
     jobs = [partial(boards.write, number) for number in range(len(poses))]
     jobs += [partial(looks.write, row) for row in range(len(simulated.campaign.spots))]
-    # NumPy's generators, OpenCV and the writing of files leave Python's lock: threads are enough.
+    # NumPy's generators, OpenCV and file writing release Python's lock, so threads suffice.
     pool = ThreadPoolExecutor(min(WORKERS_MAX, cpu_count() or 1))
     try:
         with Job({"rendering": 1.0}, progress) as work:
@@ -144,7 +144,7 @@ class _Looks:
     seed: int
 
     def write(self, row: int) -> None:
-        """Both pictures of a row of spots.csv."""
+        """Write both pictures of a row of spots.csv."""
         number = self.simulated.campaign.spots[row].spot
         paths = [self.folder / frame_name(number, camera) for camera in CAMERAS]
         if all(path.is_file() for path in paths):
@@ -165,7 +165,7 @@ class _Boards:
     seed: int
 
     def write(self, number: int) -> None:
-        """Both pictures of a pose."""
+        """Write both pictures of a pose."""
         for side, (name, camera) in enumerate(zip(CAMERAS, (self.cameras.left, self.cameras.right), strict=True)):
             path = self.folder / "boards" / f"{name}{number + 1:02d}.png"
             if not path.is_file():

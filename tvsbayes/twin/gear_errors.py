@@ -1,8 +1,7 @@
-"""Errors that true gears repeat: of the output's angle and of the play by position, of the zero with time.
+"""Errors of true gears: of the output's angle and of the play by position, of the zero with time.
 
-Functions of an axis' angle, mean ratio x counter, in degrees: fixed for a rig, whatever is measured on it and however
-often. Written from data/docs/formulation.md alone; the estimators' covariances of the same errors are written
-elsewhere, so that an error in one of them shows.
+They are functions of an axis' angle, mean ratio x counter, in degrees, and fixed for a rig. They are written from
+data/docs/formulation.md alone, independently of the estimators' covariances, so that a mistake in either is found.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ from tvsbayes.instrument.conditions import TimedMove
 from tvsbayes.instrument.parameters import PERIODS_MAX
 
 FEATURES = 200
-"""Waves that an error is the sum of: its covariance, given their lengths, is that of a Matern process to 1 part in 14,
-and exactly on average."""
+"""Number of waves in the sum of an error: given their lengths, its covariance is that of a Matern process to 1 part in
+14, and exactly on average."""
 MATERN_FREEDOM = 5
 """Frequencies of a Matern process of smoothness 5/2, times its length, have Student's t with 2 x 5/2 degrees of freedom
 (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, 4.15: its spectral density)."""
 SECONDS_PER_HOUR = 3600.0
 ErrorFunction = Callable[[np.ndarray], np.ndarray]
-"""Degrees at places (n,), in degrees of the output; of time: at hours (n,) since switching on."""
+"""Error in degrees at places (n,), in degrees of the output, or at hours (n,) since switching on."""
 
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """A sum of waves; without any, 0 everywhere.
+    """A sum of waves; 0 everywhere without waves.
 
     Attributes:
         rate_rad_per_deg: (m,) phase per degree of the output.
@@ -41,8 +40,8 @@ class Waves:
     sine_deg: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __call__(self, angle_deg: np.ndarray) -> np.ndarray:
-        """The sum at angles, their shape."""
-        # Campaigns come back to few places: to the same value there, and in little memory.
+        """Evaluate the sum at angles, in their shape."""
+        # Campaigns return to few places, which are evaluated once: equal values, and little memory.
         places, at = np.unique(np.asarray(angle_deg, float), return_inverse=True)
         phase = np.multiply.outer(places, self.rate_rad_per_deg)
         values = np.sum(self.cosine_deg * np.cos(phase) + self.sine_deg * np.sin(phase), axis=-1)
@@ -51,13 +50,13 @@ class Waves:
 
 @dataclass(frozen=True, eq=False)
 class Tabulated:
-    """An error known at some places (n,), between them on straight lines, outside as at the last one: from a file."""
+    """An error tabulated at places (n,), linear between them and constant outside, read from a file."""
 
     angle_deg: np.ndarray
     error_deg: np.ndarray
 
     def __call__(self, angle_deg: np.ndarray) -> np.ndarray:
-        """The error at angles, their shape; 0 where nothing is known at all."""
+        """Evaluate the error at angles, in their shape; 0 for an empty table."""
         order = np.argsort(self.angle_deg)
         if not order.size:
             return np.zeros(np.shape(angle_deg))
@@ -66,12 +65,12 @@ class Tabulated:
 
 @dataclass(frozen=True, eq=False)
 class AxisErrors:
-    """What one axis repeats.
+    """Repeating errors of one axis.
 
     Attributes:
-        error_deg: of the output's angle, by place.
-        play_deg: what the play is wider by than its mean, by place.
-        warming_deg: of the zero, by hours since switching on; a homing finds the zero of its time.
+        error_deg: error of the output's angle, by place.
+        play_deg: play less its mean, by place.
+        warming_deg: error of the zero, by hours since switching on; a homing resets it.
     """
 
     error_deg: ErrorFunction = field(default_factory=Waves)
@@ -79,18 +78,18 @@ class AxisErrors:
     warming_deg: ErrorFunction = field(default_factory=Waves)
 
     def play_at(self, backlash_deg: float, angle_deg: np.ndarray) -> np.ndarray:
-        """Width of the play at places (n,); gears may touch, not overlap."""
+        """Compute the width of the play at places (n,); it cannot be negative."""
         return np.maximum(backlash_deg + self.play_deg(angle_deg), 0.0)
 
 
 GearErrors = Mapping[str, AxisErrors]
-"""By axis."""
+"""Errors by axis."""
 PERFECT: GearErrors = {axis: AxisErrors() for axis in AXES}
-"""Gears that repeat no error."""
+"""Gears without repeating errors."""
 
 
 def matern_waves(sd_deg: float, length_deg: float, rng: np.random.Generator) -> Waves:
-    """A draw of a Matern process of smoothness 5/2; the generator advances alike whatever the scales.
+    """Draw a Matern process of smoothness 5/2; the generator advances equally for any scales.
 
     Random Fourier features (Rahimi and Recht, NIPS 2007) with normal parts: Gaussian for given frequencies.
     """
@@ -100,7 +99,7 @@ def matern_waves(sd_deg: float, length_deg: float, rng: np.random.Generator) -> 
 
 
 def _joined(*waves: Waves) -> Waves:
-    """Their sum."""
+    """Concatenate sums of waves."""
     return Waves(
         np.concatenate([wave.rate_rad_per_deg for wave in waves]),
         np.concatenate([wave.cosine_deg for wave in waves]),
@@ -109,7 +108,7 @@ def _joined(*waves: Waves) -> Waves:
 
 
 def periodic_waves(amplitude_deg: Mapping[float, float], parts: np.ndarray) -> Waves:
-    """Waves of any phase: `amplitude_deg` maps periods to the sd of either part, `parts` (2, n) are standard normal."""
+    """Build waves of any phase; `amplitude_deg` maps periods to the sd of parts, `parts` (2, n) are standard normal."""
     rate = 2 * np.pi / np.array(list(amplitude_deg), float)
     scale = np.array(list(amplitude_deg.values()), float)
     return Waves(rate, *(scale * parts[:, : len(scale)]))
@@ -118,12 +117,12 @@ def periodic_waves(amplitude_deg: Mapping[float, float], parts: np.ndarray) -> W
 def draw_gear_errors(
     parameters: Mapping[str, float], period_deg: Mapping[str, tuple[float, ...]], rng: np.random.Generator
 ) -> GearErrors:
-    """Errors of both axes with the scales of a true rig; a rig that names none has perfect gears.
+    """Draw errors of both axes with the scales of a true rig; a rig without scales has perfect gears.
 
     Args:
         parameters: of the true rig, by contract name.
         period_deg: stated periods of each axis, in the order of `harmonic_amplitude_deg`.
-        rng: advances alike whatever the scales.
+        rng: generator, which advances equally for any scales.
     """
     errors: dict[str, AxisErrors] = {}
     for axis in AXES:
@@ -144,13 +143,13 @@ def draw_gear_errors(
 def zero_shift_deg(
     parameters: Mapping[str, float], axis: str, warm_minutes: np.ndarray, kelvin: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """How far the zero of an axis has crept while the machine warmed up, and shifted with its temperature.
+    """Compute the shift of an axis' zero by creep during warm-up and by temperature.
 
     Args:
-        parameters: of the true rig; one that names none stays where it is.
+        parameters: parameters of the true rig; missing ones cause no shift.
         axis: "pan" or "tilt".
-        warm_minutes: since switching on, any shape.
-        kelvin: temperature less that at which the zero holds.
+        warm_minutes: time since switching on, any shape.
+        kelvin: temperature less the reference temperature of the zero.
     """
     creep = parameters.get(f"creep_deg.{axis}", 0.0), parameters.get("creep_minutes", 1.0)
     return zero_shift(*creep, warm_minutes, parameters.get(f"thermal_deg_per_K.{axis}", 0.0), kelvin)
@@ -159,14 +158,14 @@ def zero_shift_deg(
 def zero_shift(
     creep: float, creep_minutes: float, warm_minutes: np.ndarray | float, per_kelvin: float, kelvin: np.ndarray | float
 ) -> np.ndarray:
-    """The same of any axis, in the unit of its `creep`: what has crept so far, and what the temperature adds."""
+    """Compute the shift of any zero by creep and temperature, in the unit of `creep`."""
     still = np.exp(np.asarray(warm_minutes, float) / -creep_minutes)
     shift: np.ndarray = creep * (1.0 - still) + per_kelvin * kelvin
     return shift
 
 
 def kelvin_of(moves: Sequence[TimedMove]) -> np.ndarray:
-    """Temperatures less the first, interpolated in time; 0 where fewer than two are recorded."""
+    """Return temperatures less the first, interpolated in time; 0 where fewer than two are recorded."""
     known = [m for m in moves if m.temperature_degC is not None]
     if len(known) < 2:
         return np.zeros(len(moves))
@@ -179,13 +178,13 @@ def kelvin_of(moves: Sequence[TimedMove]) -> np.ndarray:
 def drift_deg(
     time_s: np.ndarray, first: np.ndarray, scale_deg_per_root_hour: float, draws: np.ndarray, warming_deg: ErrorFunction
 ) -> np.ndarray:
-    """How far the zero of one axis has drifted at each move (n,), 0 at every homing.
+    """Compute the drift of the zero of one axis at each move (n,), 0 at every homing.
 
     Args:
-        time_s: (n,) of the moves, since switching on.
+        time_s: (n,) times of the moves, since switching on.
         first: (n,) True at the first row of a segment.
-        scale_deg_per_root_hour: of the random walk.
-        draws: (n,) standard normal.
+        scale_deg_per_root_hour: scale of the random walk.
+        draws: (n,) standard normal numbers.
         warming_deg: see `AxisErrors`.
     """
     hours = np.asarray(time_s, float) / SECONDS_PER_HOUR

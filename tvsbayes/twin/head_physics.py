@@ -1,4 +1,4 @@
-"""The twin's own optics of a pan-tilt head: rotation matrices about the axes where they stand, one after the other.
+"""The twin's own optics of a pan-tilt head: successive rotations about the axes.
 
 It shares parameter names with the estimators, but no formula. Degrees and radians by suffix, mm; x at azimuth 0, y at
 azimuth 90 deg, z up.
@@ -12,12 +12,12 @@ import numpy as np
 
 
 def tilt_zero_deg(parameters: Mapping[str, float]) -> float:
-    """Angle of the second axis at counter 0, of a scanner or a head."""
+    """Return the angle of the second axis at counter 0, of a scanner or a head."""
     return parameters["elevation_zero_deg" if "elevation_zero_deg" in parameters else "tilt_zero_deg"]
 
 
 def about(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) about a unit vector, counter-clockwise seen from its end."""
+    """Compute rotation matrices (..., 3, 3) about a unit vector, counter-clockwise seen from its end."""
     c, s = np.cos(angle_rad)[..., None, None], np.sin(angle_rad)[..., None, None]
     x, y, z = axis
     across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -27,15 +27,15 @@ def about(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
 def head_beam(
     pan_rad: np.ndarray | float, tilt_rad: np.ndarray | float, geometry: Mapping[str, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Origin (..., 3) mm and direction (..., 3) of the beam for angles of both axes, the zero of elevation in `tilt`.
+    """Compute origin (..., 3) mm and direction (..., 3) of the beam; `tilt_rad` includes the zero of elevation.
 
-    The beam is set off against its axis, bent, turned about the elevation axis, then about the azimuth axis, then
-    with the azimuth axis to where that leans.
+    The beam is offset from its axis, bent, rotated about the elevation axis, then about the azimuth axis, then tilted
+    with the azimuth axis.
     """
     pan, tilt = np.broadcast_arrays(np.asarray(pan_rad, float), np.asarray(tilt_rad, float))
     skew, off = (np.radians(geometry[f"{name}_not_square_deg"]) for name in ("axes", "beam"))
     elevation_axis = np.array([0.0, np.cos(skew), np.sin(skew)])
-    # At elevation 0 the beam is square to its axis and level but for the angle that is wrong.
+    # At elevation 0 the beam is square to its axis and level, except for `beam_not_square_deg`.
     beam = np.array([np.cos(off), 0.0, 0.0]) - np.sin(off) * elevation_axis
     start = np.array([0.0, 0.0, 0.0]) + geometry["beam_offset_mm.y"] * elevation_axis
     start = start + geometry["beam_offset_mm.z"] * np.cross(np.array([1.0, 0.0, 0.0]), elevation_axis)
@@ -43,7 +43,7 @@ def head_beam(
     tangent = np.radians(geometry["tangent_flexure_deg"])
     if tangent:
         bend = bend + tangent / np.tan(tilt)
-    # Up is a turn from x to z, against the sense of the axis along y.
+    # Upwards is a rotation from x to z, negative about the axis along y.
     raised = about(elevation_axis, -(tilt - bend))
     turned = about(np.array([0.0, 0.0, 1.0]), pan + np.radians(geometry["azimuth_zero_deg"]))
     north, east = (np.radians(geometry[f"azimuth_axis_tilt_deg.{side}"]) for side in ("north", "east"))
@@ -55,7 +55,7 @@ def head_beam(
 
 
 def sighted_angles(directions: np.ndarray, noise_deg: np.ndarray) -> np.ndarray:
-    """Azimuth and elevation (n, 2), deg, of directions (n, 3) that are sighted with noise (n, 2) on the sphere."""
+    """Compute azimuth and elevation (n, 2), deg, of directions (n, 3) sighted with noise (n, 2) on the sphere."""
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
     side = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=1)
     sighted = directions + np.tan(np.radians(noise_deg[:, :1])) * side

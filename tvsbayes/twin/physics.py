@@ -1,6 +1,6 @@
 """The twin's own physics: gears with play, stop errors, mirrors, the beam on a sheet, cameras, the aperture's angle.
 
-It shares formats and parameter names with the estimators, but no formula: all of it is written here a second time,
+It shares formats and parameter names with the estimators, but no formula: everything is implemented here a second time,
 from data/docs/formulation.md alone, so that an error in the estimators' model cannot hide in the twin. Frames S
 (stereo), P (positioner), Q (pan stage) and T (TVS) as in `data/docs/conventions.md`; mm; degrees and radians by suffix;
 pixels with the integer at the centre of a pixel.
@@ -21,15 +21,14 @@ from tvsbayes.twin.head_physics import head_beam
 
 
 def take_up(output_deg: float, driving_deg: float, backlash_deg: float) -> float:
-    """Where a gear with play stands once its driver has come to `driving_deg`: it moves when the play is used up."""
+    """Compute the output of a gear with play after its driver has moved to `driving_deg`."""
     return min(max(output_deg, driving_deg - backlash_deg / 2), driving_deg + backlash_deg / 2)
 
 
 def play(q_deg: Sequence[float], start_deg: float, backlash_deg: float | np.ndarray) -> np.ndarray:
-    """Output of a gear with play for driving angles q (n,), from output `start_deg` on.
+    """Compute outputs of a gear with play for driving angles q (n,), from output `start_deg` on.
 
-    Play (n,) that varies is that of the place: a move takes up what it finds at its end, as long as the play changes
-    by less than the angle does.
+    Play (n,) that varies by place is that at the end of each move, valid while the play changes by less than the angle.
     """
     output, y = np.empty(len(q_deg)), start_deg
     for i, (q, width) in enumerate(zip(q_deg, np.broadcast_to(backlash_deg, len(q_deg)), strict=True)):
@@ -47,12 +46,12 @@ def transmission(
     harmonics_deg: Sequence[complex] = (),
     period_deg: float = FULL_TURN_DEG,
 ) -> np.ndarray:
-    """Output angle (n,) in degrees of one axis after each move, stop errors excluded (formulation 3.1).
+    """Compute the output angle (n,) of one axis after each move, degrees, without stop errors (formulation 3.1).
 
     Args:
         counters: (n,) absolute counters.
         first: (n,) True at the first row of a segment.
-        start_fraction: (n,) where the play stands at such a row, -1/2 (left, up) to +1/2; unused elsewhere.
+        start_fraction: (n,) position in the play at such a row, -1/2 (left, up) to +1/2; unused elsewhere.
         home_deg: (n,) home offset of the row's segment.
         ratios_deg_per_step: mean ratio and contrast; positive moves turn by mean + contrast / 2 per step.
         backlash_deg: full width of the play, everywhere or (n,) where each move ends.
@@ -75,13 +74,13 @@ def transmission(
 
 
 def harmonics_deg(parameters: Mapping[str, float], axis: str) -> list[complex]:
-    """Transmission error of an axis as `transmission` takes it; a rig that names none has none."""
+    """Return the transmission error of an axis as an argument of `transmission`; missing parameters are 0."""
     names = [f"harmonic_deg.{axis}.{order}" for order in HARMONIC_ORDERS]
     return [complex(parameters.get(f"{name}.cos", 0.0), -parameters.get(f"{name}.sin", 0.0)) for name in names]
 
 
 def wobble_deg(angle_deg: np.ndarray | float, harmonics_deg: Sequence[complex], period_deg: float) -> np.ndarray:
-    """Transmission error at angles, their shape: the real part of sum_o (c_o - i s_o) e^(i o phase)."""
+    """Compute the transmission error at angles: the real part of sum_o (c_o - i s_o) e^(i o phase)."""
     turn = np.exp(2j * np.pi * np.asarray(angle_deg) / period_deg)
     parts = (part * turn**order for order, part in enumerate(harmonics_deg, start=1))
     return np.real(sum(parts, np.zeros(turn.shape)))
@@ -94,11 +93,11 @@ def stop_errors(
     draws: np.ndarray,
     sds: Mapping[str, float],
 ) -> np.ndarray:
-    """Stop error (n,) of one axis as held after each move, in the unit of `sds`.
+    """Compute the stop error (n,) of one axis after each move, in the unit of `sds`.
 
-    Redrawn when this axis' counter changes, even if play absorbs the motion, and at first rows; held
-    while only the other axis moves. `sds` maps "+", "-" to the standard deviation of positive and negative
-    moves; an unknown approach takes their root mean square. `approach` (n,) is read at first rows.
+    It is drawn again when this axis' counter changes, even if play absorbs the motion, and at first rows. It is kept
+    while only the other axis moves. `sds` maps "+", "-" to the standard deviation of positive and negative moves; an
+    unknown approach takes their root mean square. `approach` (n,) is read at first rows.
     """
     errors, error = np.empty(len(counters)), 0.0
     mean_sd = float(np.sqrt((sds["+"] ** 2 + sds["-"] ** 2) / 2))
@@ -114,10 +113,10 @@ def stop_errors(
 def mirror_chain(
     psi_rad: np.ndarray | float, beta_rad: np.ndarray | float, geometry: Mapping[str, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The beam for angles psi, beta of both axes: origin (..., 3) mm and direction (..., 3) in P.
+    """Compute the beam for angles psi, beta of both axes: origin (..., 3) mm and direction (..., 3) in P.
 
-    True reflections at true intersections (formulation 3.2). The laser is turned into the pan stage Q instead
-    of the mirrors out of it. `geometry` maps contract names to values; a head's are those of `head_beam`.
+    True reflections at true intersections (formulation 3.2). The laser is rotated into the pan stage Q instead of the
+    mirrors out of it. `geometry` maps parameter names to values; for a head see `head_beam`.
     """
     if "azimuth_zero_deg" in geometry:
         return head_beam(psi_rad, beta_rad, geometry)
@@ -142,7 +141,7 @@ def mirror_chain(
 
 
 def _about_z(vector: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) turned about z, positive = counter-clockwise from above."""
+    """Rotate vectors (..., 3) about z, positive = counter-clockwise from above."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     x, y, z = np.moveaxis(vector, -1, 0)
     return np.stack((c * x - s * y, s * x + c * y, z), axis=-1)
@@ -151,7 +150,7 @@ def _about_z(vector: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
 def _reflect(
     point: np.ndarray, direction: np.ndarray, on_plane: np.ndarray, normal: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays meet a mirror plane, and their directions after it."""
+    """Compute where rays meet a mirror plane, and their directions after it."""
     along = np.sum(direction * normal, axis=-1, keepdims=True)
     distance = np.sum((on_plane - point) * normal, axis=-1, keepdims=True) / along
     return point + distance * direction, direction - 2 * along * normal
@@ -170,7 +169,7 @@ class Sheet:
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Where beams meet their sheets, one (3,) or many (n, 3): what pictures of them are made from.
+    """Points where beams meet their sheets, one (3,) or many (n, 3), from which pictures are rendered.
 
     Attributes:
         points_mm: (..., 3) on the sheet, frame S; NaN where there is no light or the beam never meets the sheet.
@@ -185,14 +184,14 @@ class Light:
     points_P_mm: np.ndarray
 
     def of(self, row: int) -> Light:
-        """That of one of many."""
+        """Return the light of one of many beams."""
         return Light(self.points_mm[row], self.directions[row], self.normals[row], self.points_P_mm[row])
 
 
 def light_on_sheet(
     psi_rad: np.ndarray | float, beta_rad: np.ndarray | float, parameters: Mapping[str, float], sheet: Sheet
 ) -> Light:
-    """The light that mirrors at (...) angles throw on (...) sheets."""
+    """Compute the light from mirrors at (...) angles on (...) sheets."""
     rotation = rotation_matrix(np.array([parameters[f"extrinsics.rotation_rad.{a}"] for a in "xyz"]))
     translation = np.array([parameters[f"extrinsics.translation_mm.{a}"] for a in "xyz"])
     origin_P, direction_P = mirror_chain(psi_rad, beta_rad, parameters)
@@ -206,7 +205,7 @@ def light_on_sheet(
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera: `rotation`, `translation_mm` take points of the left camera's axes to its own."""
+    """One camera; `rotation` and `translation_mm` transform points from the left camera's axes to its own."""
 
     matrix: np.ndarray
     distortion: np.ndarray
@@ -216,9 +215,10 @@ class Camera:
     height: int
 
     def project(self, points_mm: np.ndarray) -> np.ndarray:
-        """Pixels (n, 2) of points (n, 3) in the left camera's axes, by pinhole and Brown-Conrady distortion.
+        """Project points (n, 3) in the left camera's axes to pixels (n, 2), by pinhole and Brown-Conrady distortion.
 
-        Beyond the image's borders too; NaN behind the camera and beyond the radius where distortion turns back.
+        Pixels outside the image are included; NaN behind the camera and beyond the radius up to which distortion is
+        monotone.
         """
         in_camera = points_mm @ self.rotation.T + self.translation_mm
         k1, k2, p1, p2, k3 = self.distortion
@@ -242,7 +242,7 @@ class CameraPair:
 
 
 def cameras_of(stereo: Stereo, focal_scale: float = 1.0) -> CameraPair:
-    """Both cameras of a calibration; `focal_scale` multiplies fx and fy (1 in visible light, formulation 3.3)."""
+    """Build both cameras of a calibration; `focal_scale` multiplies fx and fy (1 in visible light, formulation 3.3)."""
     scale = np.array([[focal_scale, 1.0, 1.0], [1.0, focal_scale, 1.0], [1.0, 1.0, 1.0]])
     size = stereo.image_width, stereo.image_height
     left = Camera(stereo.M1 * scale, np.asarray(stereo.D1, float).ravel(), np.eye(3), np.zeros(3), *size)
@@ -251,49 +251,49 @@ def cameras_of(stereo: Stereo, focal_scale: float = 1.0) -> CameraPair:
 
 
 def camera_axes(vectors_S: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) of frame S in the left camera's axes: x right, y down, z along the view."""
+    """Transform vectors (..., 3) from frame S to the left camera's axes: x right, y down, z along the view."""
     x, y, z = np.moveaxis(np.asarray(vectors_S, float), -1, 0)
     return np.stack((-y, -z, x), axis=-1)
 
 
 def project(points_S_mm: np.ndarray, stereo: Stereo, focal_scale: float = 1.0) -> np.ndarray:
-    """Pixels (n, 4: u_left, v_left, u_right, v_right) of points (n, 3) in frame S; NaN where not seen.
+    """Project points (n, 3) in frame S to pixels (n, 4: u_left, v_left, u_right, v_right); NaN where not visible.
 
-    `focal_scale` multiplies fx and fy of both cameras. Not seen: where `Camera.project` gives none, or outside the
-    image, whose outermost pixel centres are 0 and width - 1.
+    `focal_scale` multiplies fx and fy of both cameras. A point is not visible where `Camera.project` gives NaN, or
+    outside the image, whose outermost pixel centres are 0 and width - 1.
     """
     cameras, points = cameras_of(stereo, focal_scale), camera_axes(np.reshape(points_S_mm, (-1, 3)))
     return inside_images(np.hstack([camera.project(points) for camera in (cameras.left, cameras.right)]), stereo)
 
 
 def inside_images(pixels: np.ndarray, stereo: Stereo) -> np.ndarray:
-    """Pixels (n, 4) with NaN rows where one of the two centres is not on its image."""
+    """Return pixels (n, 4), with NaN rows where one of the two centres is outside its image."""
     last = np.tile([stereo.image_width - 1, stereo.image_height - 1], 2)
     inside = ((pixels >= 0) & (pixels <= last)).all(axis=1, keepdims=True)
     return np.where(inside, pixels, np.nan)
 
 
 def _turning_radius_squared(k1: float, k2: float, k3: float) -> float:
-    """Square of the normalised radius up to which radial distortion grows, infinite if it always does."""
+    """Compute the square of the normalised radius up to which radial distortion is monotone, infinite if always."""
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = roots[np.abs(roots.imag) < 1e-12].real
     return float(min(real[real > 0], default=np.inf))
 
 
 def to_tvs(points_P_mm: np.ndarray, baseline_mm: float, pan_zero_emission_deg: float) -> np.ndarray:
-    """Points (..., 3) from frame P to frame T: p_T = Rz(C0 - 90 deg) p_P + (0, a/2, 0)."""
+    """Transform points (..., 3) from frame P to frame T: p_T = Rz(C0 - 90 deg) p_P + (0, a/2, 0)."""
     turned = _about_z(np.asarray(points_P_mm, float), np.radians(pan_zero_emission_deg - 90.0))
     return turned + np.array([0.0, baseline_mm / 2, 0.0])
 
 
 def aperture_angle_deg(points_T_mm: np.ndarray, baseline_mm: float, convention: str) -> np.ndarray:
-    """Angle B (...,) at the aperture between +y and the spot, "in-plane" or its "azimuth" (formulation 5)."""
+    """Compute angle B (...,) at the aperture between +y and the spot, "in-plane" or its "azimuth" (formulation 5)."""
     x, y, z = np.moveaxis(np.asarray(points_T_mm, float) + np.array([0.0, baseline_mm / 2, 0.0]), -1, 0)
     return np.degrees(np.arctan2(np.hypot(x, z) if convention == "in-plane" else x, y))
 
 
 def beam_jacobian(geometry: Mapping[str, float], pose_deg: tuple[float, float]) -> np.ndarray:
-    """d(azimuth, elevation)/d(psi, beta) (2, 2) of the beam in P at a pose, by central differences."""
+    """Compute d(azimuth, elevation)/d(psi, beta) (2, 2) of the beam in P at a pose, by central differences."""
     step = 1e-5  # rad: truncation 1e-10, rounding 1e-11
     psi, beta = np.radians(pose_deg)
     directions = mirror_chain(psi + step * np.array([1, -1, 0, 0]), beta + step * np.array([0, 0, 1, -1]), geometry)[1]
@@ -302,9 +302,9 @@ def beam_jacobian(geometry: Mapping[str, float], pose_deg: tuple[float, float]) 
 
 
 def local_deg_per_step(parameters: Mapping[str, float], reference_pose_deg: tuple[float, float]) -> dict[str, float]:
-    """Degrees of the beam per step at a pose: k_dir d(az)/d(psi) and k_dir d(el)/d(beta) (formulation 3.2).
+    """Compute degrees of the beam per step at a pose: k_dir d(az)/d(psi), k_dir d(el)/d(beta) (formulation 3.2).
 
-    Of the mirrors alone, without the slope of a transmission error.
+    They are those of the mirrors alone, without the slope of a transmission error.
     """
     slope = dict(zip(AXES, np.diagonal(beam_jacobian(parameters, reference_pose_deg)), strict=True))
     return {
@@ -313,10 +313,10 @@ def local_deg_per_step(parameters: Mapping[str, float], reference_pose_deg: tupl
 
 
 def effective_mirror_offset_mm(parameters: Mapping[str, float], pose_deg: tuple[float, float]) -> float:
-    """Signed distance of the beam line from the pan axis at a pose, +L for the nominal rig, mm.
+    """Compute the signed distance of the beam line from the pan axis at a pose, +L for the nominal rig, mm.
 
-    (d_y o_x - d_x o_y) / sqrt(d_x^2 + d_y^2) with origin o and direction d in P: the beam's moment about
-    the pan axis over its horizontal length.
+    (d_y o_x - d_x o_y) / sqrt(d_x^2 + d_y^2) with origin o and direction d in P is the beam's moment about the pan axis
+    over its horizontal length.
     """
     psi, beta = np.radians(pose_deg)
     o, d = mirror_chain(psi, beta, parameters)

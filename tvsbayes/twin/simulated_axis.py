@@ -1,7 +1,7 @@
-"""An axis that is drawn, not measured: true gears from the priors, moved by a list of moves, read with noise.
+"""A simulated axis: true gears drawn from the priors, moved by a list of moves, read with noise.
 
-Written from the definition (formulation 8.1), one stop after the other; it shares no formula with the model. A folder
-that states a `rate` is read in motion, at the times of the template's readings or evenly.
+It is written from the definition (formulation 8.1), stop by stop, and shares no formula with the model. A folder that
+states a `rate` is read in motion, at the times of the template's readings or at equal intervals.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from tvsbayes.single_axis.waves import SECOND, WANDER, WavePeriods
 from tvsbayes.twin.gear_errors import kelvin_of, zero_shift
 
 READING_SHARE = 5e-5
-"""Stated u of simulated readings, of the travel, where nothing else is known."""
+"""Stated u of simulated readings as a share of the travel, where nothing else is known."""
 IN_TIME = ("creep", "creep_minutes", "thermal_per_K", "seeing_scale", "seeing_s")
-"""Parameters of what shifts in time."""
+"""Parameters of shifts in time."""
 TRUTH_FORMAT = "tvsbayes-axis-truth/1"
 
 
@@ -34,12 +34,12 @@ class TrueWave:
     """A true wave; amplitude 0 where there is none.
 
     Attributes:
-        of: "position", "seconds" or "encoder".
-        period: of that.
-        amplitude, phase_deg: of the first harmonic; `second`, `second_phase_deg` of the second, highest at the phase.
-        change, change_phase_deg: what is added to the first harmonic at the end of the record, and taken off it at the
+        of: variable of the wave: "position", "seconds" or "encoder".
+        period: period in that variable.
+        amplitude, phase_deg: first harmonic, highest at the phase; `second`, `second_phase_deg`: second harmonic.
+        change, change_phase_deg: wave added to the first harmonic at the end of the record and subtracted at its
             beginning, linearly in between.
-        begin, end: of the record.
+        begin, end: ends of the record.
     """
 
     of: str
@@ -54,7 +54,7 @@ class TrueWave:
     end: float
 
     def at(self, x: float) -> float:
-        """Its value at a place."""
+        """Evaluate the wave at a place."""
         turn = 360.0 * x / self.period
         first = self.amplitude * math.cos(math.radians(turn - self.phase_deg))
         share = (2 * x - self.begin - self.end) / (self.end - self.begin)
@@ -67,10 +67,10 @@ class AxisTruth:
     """A true axis.
 
     Attributes:
-        parameters: by the names of `[axis]`, stop scatter by direction, with `ratio_contrast`.
+        parameters: values by the names of `[axis]`, stop scatter by direction, with `ratio_contrast`.
         command: positions at which both curves are given, ascending, shape (n,).
-        error: of the position, and `play_variation`: about the mean play; unit, each (n,).
-        waves: of the gear and, with `encoder`, of the encoder.
+        error: error of the position; `play_variation`: deviation from the mean play; unit, each (n,).
+        waves: waves of the gear and, with `encoder`, of the encoder.
     """
 
     parameters: dict[str, float]
@@ -80,7 +80,7 @@ class AxisTruth:
     waves: tuple[TrueWave, ...] = ()
 
     def as_json(self) -> dict[str, object]:
-        """The content of `truth.json`."""
+        """Return the content of `truth.json`."""
         curves = {"command": self.command, "error": self.error, "play_variation": self.play_variation}
         lists = {name: values.tolist() for name, values in curves.items()}
         waves = [asdict(wave) for wave in self.waves]
@@ -89,18 +89,18 @@ class AxisTruth:
 
 @dataclass(frozen=True, repr=False)
 class SimulatedAxis(Shown):
-    """A campaign and the truth behind it."""
+    """A simulated campaign and its truth."""
 
     campaign: AxisCampaign
     truth: AxisTruth
 
     def shown(self) -> View:
-        """Its campaign; the truth stands in `truth`."""
+        """Show the campaign; the truth is in `truth`."""
         view = self.campaign.shown()
         return replace(view, title=f"Simulated {view.title}; the truth is in .truth")
 
     def write(self, folder: Path) -> None:
-        """Campaign folder with `truth.json`."""
+        """Write the campaign folder with `truth.json`."""
         write_axis(self.campaign, folder)
         write_atomically(folder / "truth.json", json.dumps(self.truth.as_json(), indent=1, allow_nan=False).encode())
 
@@ -112,12 +112,12 @@ def _drawn(name: str, prior: AxisPrior, rng: np.random.Generator) -> float:
         return prior.value * float(np.exp(prior.u * normal))
     if name in ("ratio_contrast", "creep", "thermal_per_K"):
         return prior.value + prior.u * normal
-    # True play is never negative, whatever a fit allows for.
+    # True play is never negative, although a fit may allow it.
     return abs(prior.value + prior.u * normal) if kind == "half-normal" or name == "backlash" else prior.value
 
 
 def _curve(distance: np.ndarray, length: float, sd: float, rng: np.random.Generator) -> np.ndarray:
-    """A smooth curve at points of these mutual distances (n, n)."""
+    """Draw a smooth curve at points of these mutual distances (n, n)."""
     a = np.sqrt(5.0) * np.abs(distance) / length
     values, vectors = np.linalg.eigh((1 + a + a * a / 3) * np.exp(-a))
     return sd * (vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values))))
@@ -132,15 +132,15 @@ def draw_axis(
     periods: WavePeriods | None = None,
     between_s: tuple[float, float] = (0.0, 1.0),
 ) -> AxisTruth:
-    """A true axis for a list of commands.
+    """Draw a true axis for a list of commands.
 
     Args:
-        commands: of all moves.
+        commands: commands of all moves.
         stated: entries of `[axis]`.
-        per_command: true unit per command; `[axis]` says only how well it is known beforehand.
-        travel: range of what is read, unit, with which default scales grow.
-        rng: source of everything random.
-        periods: half of them are there, with the scale of `transmission_error`.
+        per_command: true unit per command; `[axis]` states only its prior uncertainty.
+        travel: range of the readings, unit, to which default scales are proportional.
+        rng: source of all random numbers.
+        periods: stated periods; half of them have a wave, with the scale of `transmission_error`.
         between_s: least and greatest time of the readings, for waves of time.
     """
     at = np.unique(np.asarray(commands, dtype=float))
@@ -151,7 +151,7 @@ def draw_axis(
         "stop_sd.backward",
     ]
     true = {name: _drawn(name, priors[name.split(".")[0]], rng) for name in names}
-    # Of their own, so that the same seed draws the same gears whatever is asked for.
+    # A separate generator, so that a seed always draws the same gears.
     [gear_rng] = rng.spawn(1)
     true |= {name: _drawn(name, priors[name], gear_rng) for name in IN_TIME}
     true["per_command"] = per_command
@@ -175,7 +175,7 @@ def _drawn_waves(
     record: Mapping[str, tuple[float, float]],
     rng: np.random.Generator,
 ) -> tuple[TrueWave, ...]:
-    """Waves of the periods that are asked for; of an unknown one log-uniform in its range."""
+    """Draw waves of the stated periods; an unknown period is log-uniform in its range."""
     clock = "seconds" if stated.in_seconds else "position"
     periods = [(clock, period) for period in stated.stated]
     periods += [(clock, float(low * (high / low) ** rng.random())) for low, high in stated.between]
@@ -195,7 +195,7 @@ def _drawn_waves(
 
 
 def _encoder_reads(truth: AxisTruth, stand: float) -> float:
-    """What the encoder says where the output stands so: its waves go with what it reads."""
+    """Compute the encoder's reading of a position; its waves are functions of the reading."""
     value = stand
     for _ in range(20):
         value = stand + sum(wave.at(value) for wave in truth.waves if wave.of == "encoder")
@@ -203,7 +203,7 @@ def _encoder_reads(truth: AxisTruth, stand: float) -> float:
 
 
 def _time_shift(truth: AxisTruth, warm_s: float, kelvin: float, time_s: float) -> float:
-    """What the zero has shifted by creep, temperature and waves of time."""
+    """Compute the shift of the zero by creep, temperature and waves of time."""
     true = truth.parameters
     shift = zero_shift(true["creep"], true["creep_minutes"], warm_s / 60.0, true["thermal_per_K"], kelvin)
     return float(shift) + sum(wave.at(time_s) for wave in truth.waves if wave.of == "seconds")
@@ -212,7 +212,7 @@ def _time_shift(truth: AxisTruth, warm_s: float, kelvin: float, time_s: float) -
 def stops_of(
     truth: AxisTruth, moves: Sequence[AxisMove], rng: np.random.Generator, powered_on_s: float | None = None
 ) -> np.ndarray:
-    """Where the output stands after every move, unit, (moves,), warming since `powered_on_s` or the first move."""
+    """Compute the output after every move, unit, (moves,), warming since `powered_on_s` or the first move."""
     true = truth.parameters
     ratio, contrast, backlash = true["per_command"], true["ratio_contrast"], true["backlash"]
     stops = np.empty(len(moves))
@@ -253,7 +253,7 @@ def stops_of(
 def drive_of(
     truth: AxisTruth, move: AxisMove, rate: float, times_s: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Where the output of a drive at constant rate is at times (n,), ascending, after a move; shape (n,)."""
+    """Compute the output of a drive at constant rate at ascending times (n,) after a move; shape (n,)."""
     true = truth.parameters
     positions = np.empty(len(times_s))
     seeing, zero, last = 0.0, 0.0, None
@@ -273,16 +273,16 @@ def drive_of(
 
 
 def simulate_axis(template: AxisCampaign, moves: Sequence[AxisMove] | None = None, seed: int = 0) -> SimulatedAxis:
-    """An axis with the priors of a folder, moved as listed and read after every move.
+    """Simulate an axis with the priors of a folder, moved as listed and read after every move.
 
     Args:
-        template: unit, `[axis]`; its readings, where there are any, say how far a command goes and how well it is read.
-        moves: to make; None for those of the template, read where it has readings (everywhere if it has none).
-        seed: of the true axis, its stops and the noise.
+        template: unit, `[axis]`; its readings, if any, give the unit per command and the u of readings.
+        moves: moves to make; None for those of the template, read where it has readings (everywhere if it has none).
+        seed: seed of the true axis, its stops and the noise.
 
     Raises:
-        InputError: neither `[axis]` nor readings say what one command does.
-        NothingToEstimate: the readings do not say it.
+        InputError: neither `[axis]` nor readings determine the unit per command.
+        NothingToEstimate: the readings do not determine it.
     """
     rng = np.random.default_rng([seed, 11])
     if template.rate is not None:
@@ -316,7 +316,7 @@ DRIVE_READINGS, DRIVE_S = 1000, 4.0
 
 
 def _simulated_drive(template: AxisCampaign, rate: float, seed: int, rng: np.random.Generator) -> SimulatedAxis:
-    """A drive at constant rate, with one segment, read at the template's times."""
+    """Simulate a drive at constant rate, with one segment, read at the template's times."""
     per_command = _per_command(template)
     move = template.moves[0]
     used = sorted(r.time_s for r in template.readings if r.time_s is not None and r.status == "ok")

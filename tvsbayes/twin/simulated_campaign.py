@@ -1,8 +1,8 @@
-"""A true rig drawn, a plan run on it, and what a stranger would get: the campaign, with the truth beside it.
+"""Simulation of a plan on a drawn true rig: the campaign as a user would get it, with its truth.
 
 Frames S (stereo) and P (positioner), mm; degrees where a name says `_deg`; pixels with the integer at the centre of a
-pixel. The parts of chance (rig, stop errors, home offsets, sheets, pixels, aperture, drift, errors of gears, homing
-sides, scatter of looks) have their own random streams: changing one leaves the others as they were.
+pixel. Rig, stop errors, home offsets, sheets, pixels, aperture, drift, errors of gears, homing sides and scatter of
+looks have separate random streams: changing one does not change the others.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ from tvsbayes.twin.physics import (
 from tvsbayes.twin.true_rig import Truth, draw_truth, pan_and_tilt
 
 SHEET_DEPTH_SD_MM = 1.0
-"""Standard deviation of a placed sheet's depth about its nominal X: a hand against a stop."""
+"""Standard deviation of a sheet's depth about its nominal X, placed by hand against a stop."""
 SHEET_TILT_SD_DEG = 0.5
 """Standard deviation of a placed sheet's rotation about Y and about Z, each."""
 HOME_SIDE_CHANCES = 0.45, 0.45, 0.1
-"""That a machine homes always from the left (up), always from the right (down), anywhere anew (formulation 3.1)."""
+"""Probabilities that homings always end from the left (up), from the right (down), or anywhere (formulation 3.1)."""
 
 
 @dataclass(frozen=True, repr=False)
 class SimulatedCampaign(Shown):
-    """What the twin wrote: the campaign as a stranger would get it, and the truth and the light behind it."""
+    """Result of a simulation: the campaign as a user would get it, its truth, and the light for pictures."""
 
     campaign: Campaign
     truth: Truth
@@ -68,12 +68,12 @@ class SimulatedCampaign(Shown):
         return replace(view, title=f"Simulated {view.title}; the truth is in .truth")
 
     def undetected(self) -> SimulatedCampaign:
-        """The same run before anybody has looked at its pictures: no pixels, status "undetected"."""
+        """Return the same run before detection in its pictures: no pixels, status "undetected"."""
         spots = tuple(with_pixels(spot, UNDETECTED) for spot in self.campaign.spots)
         return replace(self, campaign=replace(self.campaign, spots=spots))
 
     def files(self) -> dict[str, bytes]:
-        """Contents of the campaign folder and of truth.json by name, campaign.toml last."""
+        """Return the contents of the campaign folder and of truth.json by name, campaign.toml last."""
         entries = (
             f' "{key}": {json.dumps(value, indent=2 if isinstance(value, dict) else None, allow_nan=False)}'
             for key, value in self.truth.as_json(self.campaign).items()
@@ -90,7 +90,7 @@ class SimulatedCampaign(Shown):
 
 @dataclass(frozen=True)
 class _Streams:
-    """The parts of chance in a simulated campaign."""
+    """Random streams of a simulated campaign."""
 
     truth: np.random.Generator
     stops: np.random.Generator
@@ -117,24 +117,24 @@ def simulate(
     header: Mapping[str, object] | None = None,
     temperature_degC: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> SimulatedCampaign:
-    """Run a plan on a true rig and return the campaign a stranger would see, with its truth.
+    """Run a plan on a true rig and return the campaign as a user would get it, with its truth.
 
     Args:
         rig: declared rig; its table and stereo calibration go into the campaign.
         plan: plan steps in order.
-        seed: of everything random; recorded in the campaign.
+        seed: seed of all random numbers; recorded in the campaign.
         truth: the true rig; None draws one with `draw_truth`.
         aperture: whether each look also reads the aperture angle.
         spot_sd_px: standard uncertainty stated for every coordinate, by default `[cameras] spot_sd_px`;
             true noise is this times pixel_scale.
-        home_approach: side from which each homing ends, (pan, tilt); "unknown" is anywhere in the play, anew each
+        home_approach: side from which each homing ends, (pan, tilt); "unknown" is anywhere in the play, drawn each
             time; None draws one of the three per axis, by `HOME_SIDE_CHANCES`.
-        sides_recorded: whether the campaign says so; False writes "unknown" whatever the side is.
+        sides_recorded: whether the campaign records it; False writes "unknown" for any side.
         header: further keys of campaign.toml; the zeros creep from `powered_on` on, by default from the first move.
-        temperature_degC: of the machine at times (n,) in s, recorded with every move; None where nobody reads it.
+        temperature_degC: temperature of the machine at times (n,) in s, recorded with every move; None for no records.
 
     Raises:
-        InputError: the plan looks before a sheet is placed, or names a sheet the rig does not have; the true
+        InputError: the plan looks before a sheet is placed, or names a sheet that the rig does not have; or the true
             rig has a transmission error whose period the declared one does not state.
     """
     streams = _Streams(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(10)))
@@ -184,7 +184,7 @@ def simulate(
 
 
 def draw_home_approach(rng: np.random.Generator) -> tuple[PanApproach, TiltApproach]:
-    """How a machine homes: always from one side, always from the other, or anywhere anew, for each axis."""
+    """Draw how a machine homes: always from one side, always from the other, or anywhere, for each axis."""
     pan: tuple[PanApproach, ...] = ("left", "right", "unknown")
     tilt: tuple[TiltApproach, ...] = ("up", "down", "unknown")
     one, two = (int(number) for number in rng.choice(3, 2, p=HOME_SIDE_CHANCES))
@@ -192,7 +192,7 @@ def draw_home_approach(rng: np.random.Generator) -> tuple[PanApproach, TiltAppro
 
 
 def _unrecorded(move: Move) -> Move:
-    """A row of moves.csv of a campaign that does not say where homing ended."""
+    """Return a row of moves.csv that does not record where homing ended."""
     return replace(move, pan_approach="unknown", tilt_approach="unknown") if move.pan_approach else move
 
 
@@ -211,7 +211,7 @@ def _drive(
     streams: _Streams,
     on_s: float | None,
 ) -> _Driven:
-    """Realise the mirror angles of all moves of a machine switched on at `on_s`, by default at the first."""
+    """Compute the mirror angles of all moves of a machine switched on at `on_s`, by default at the first."""
     p = truth.parameters
     counters = np.array([(m.pan_steps, m.tilt_steps) for m in moves], float).reshape(-1, 2)
     segments = np.array([m.segment for m in moves], int)
@@ -259,19 +259,19 @@ def _drive(
 
 
 def placed_sheet(nominal_mm: np.ndarray | float, draws: np.ndarray) -> Sheet:
-    """Sheets (...) as a hand puts them at their nominal X; `draws` (..., 3) are standard normal."""
+    """Place sheets (...) by hand at their nominal X; `draws` (..., 3) are standard normal."""
     slope = np.tan(np.radians(SHEET_TILT_SD_DEG * draws[..., 1:]))
     normal = np.concatenate((np.ones((*draws.shape[:-1], 1)), slope), axis=-1)
     return Sheet(nominal_mm + SHEET_DEPTH_SD_MM * draws[..., 0], normal)
 
 
 def look_scatter_deg(parameters: Mapping[str, float], normal: np.ndarray) -> np.ndarray:
-    """What looks (..., pan and tilt) are off from where the axes stand; `normal` (..., 2) are standard normal."""
+    """Compute deviations of looks (..., pan and tilt) from the axes; `normal` (..., 2) are standard normal."""
     return normal * np.array([parameters.get(f"look_scatter_deg.{axis}", 0.0) for axis in SIDES])
 
 
 def _light(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> Light:
-    """Where each look's beam meets its sheet; NaN where it never does."""
+    """Compute where each look's beam meets its sheet; NaN where it never does."""
     nominal_mm = np.array([rig.sheets_mm[name] for name in log.targets])
     sheets = placed_sheet(nominal_mm, streams.sheets.standard_normal((len(log.targets), 3)))
     move, placement = np.array([(look.move, look.placement) for look in log.looks], int).reshape(-1, 2).T
@@ -281,7 +281,7 @@ def _light(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> Light:
 
 
 def _sightings(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> tuple[Sighting, ...]:
-    """Where the head is found to point at each look; the noise is that of `[cameras] sighting_sd_deg`."""
+    """Compute the sighting of each look; the noise is that of `[cameras] sighting_sd_deg`."""
     move = np.array([look.move for look in log.looks], int)
     off_deg = look_scatter_deg(truth.parameters, streams.looks.standard_normal((len(move), 2)))
     psi, beta = np.radians(np.array(truth.mirror_angles_deg).reshape(-1, 2)[move] + off_deg).T
@@ -295,7 +295,7 @@ def _sightings(log: PlanLog, rig: Rig, truth: Truth, streams: _Streams) -> tuple
 
 
 def _aperture_deg(light: Light, p: Mapping[str, float], rig: Rig, rng: np.random.Generator) -> list[float]:
-    """What the aperture reads of each look, its zero and noise included."""
+    """Compute the aperture's reading of each look, its zero and noise included."""
     points_T = to_tvs(light.points_P_mm, p["baseline_mm"], p["pan_zero_emission_deg"])
     angle = aperture_angle_deg(points_T, p["baseline_mm"], rig.table.aperture_convention)
     noise = p["aperture_sd_deg"] * rng.standard_normal(len(angle))
@@ -305,7 +305,7 @@ def _aperture_deg(light: Light, p: Mapping[str, float], rig: Rig, rng: np.random
 def _spot(
     number: int, look: PlannedLook, target: str, pixels: np.ndarray, sd_px: float, aperture_deg: float | None
 ) -> Spot:
-    """A row of spots.csv; the aperture sees what a camera sees, so an unseen spot has no reading."""
+    """Build a row of spots.csv; a spot that the cameras do not see has no aperture reading either."""
     step = look.step
     row = Spot(
         spot=number,

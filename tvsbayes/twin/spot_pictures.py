@@ -1,14 +1,14 @@
-"""Pictures of a laser spot on a sheet, as the twin's cameras take them.
+"""Pictures of a laser spot on a sheet by the twin's cameras.
 
-The order is that of a real camera: irradiance at the sensor (spot, speckle, ambient light, optical blur, integrated
+The steps are those of a real camera: irradiance at the sensor (spot, speckle, ambient light, optical blur, integrated
 over the pixel), Bayer mosaic, shot and read noise, clipping, 8 bits, demosaicing by OpenCV. Frame S (stereo) and the
 cameras' own axes; mm; px with the integer at the centre of a pixel; DN = grey levels of 8 bits. Pictures are (height,
-width, 3) uint8, blue, green, red. Everything random follows from the seeds given, whatever the order or the number of
+width, 3) uint8, blue, green, red. All random numbers follow from the given seeds, independently of order and number of
 threads.
 
 The spot is the image of a round Gaussian beam on an oblique sheet through the camera's linearised map at the point
-where the beam's axis meets the sheet: an elliptic Gaussian whose centroid IS the projection of that point. What the
-linear map leaves out (curvature of distortion and perspective across the spot) would shift a centroid by 0.002 px at a
+where the beam's axis meets the sheet: an elliptic Gaussian whose centroid IS the projection of that point. The
+neglected nonlinearity (curvature of distortion and perspective across the spot) would shift a centroid by 0.002 px at a
 spot sd of 2 px and 0.01 px at 4 px (`experiments/cameras/detection.md`). NumPy and OpenCV only, never the model under
 test.
 """
@@ -25,18 +25,18 @@ import numpy as np
 from tvsbayes.twin.physics import Camera, CameraPair, Light, camera_axes
 
 WINDOW_SDS = 6.0
-"""Half side of the rendered window in spot sds: a spot ten times overexposed ends at 4e-5 DN."""
+"""Half side of the rendered window in spot sds: a spot overexposed tenfold has 4e-5 DN there."""
 _STREAMS = {"speckle": 0, "noise": 1, "board": 2}
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A low-cost colour sensor behind no IR-cut filter, its exposure included.
+    """A low-cost colour sensor without IR-cut filter, its exposure included.
 
     Attributes:
         gain_dn_per_electron: 0.04 puts 255 DN at 6300 electrons, a pixel of about 2 um.
-        read_noise_dn: sd of everything that does not depend on light, in a raw pixel.
+        read_noise_dn: sd of all noise independent of light, in a raw pixel.
         black_dn: level without light.
         response: relative response of blue, green, red: dyes pass 808 nm about equally (Sensors 2020, 20(19),
             5578), so that the spot is near white, slightly violet.
@@ -52,16 +52,16 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Scene:
-    """What laser and room put on the sheet.
+    """Light of laser and room on the sheet.
 
     Attributes:
         beam_sd_mm: sd of the round Gaussian beam, across its axis.
-        peak_dn: irradiance at the centre for a sheet across the beam; an oblique one gets the cosine of it. Above
+        peak_dn: irradiance at the centre for a sheet normal to the beam; an oblique one gets the cosine of it. Above
             255 - black the core is clipped.
         ambient_dn: ambient light at the image's centre.
         ambient_gradient_dn: its change from the lower right to the upper left corner.
         speckle_contrast: sd over mean of the speckle in one pixel; 0 = none.
-        speckle_grain_px: sd of the smoothing that gives speckle its grain; 0 = every pixel on its own.
+        speckle_grain_px: sd of the smoothing that gives speckle its grain; 0 = independent pixels.
     """
 
     beam_sd_mm: float = 0.8
@@ -78,7 +78,7 @@ class Footprint:
 
     Attributes:
         centre_px: (2,) projection of the point where the beam's axis meets the sheet.
-        covariance_px2: (2, 2) of the irradiance, blur included, pixel integration not.
+        covariance_px2: (2, 2) covariance of the irradiance, with blur, without pixel integration.
         peak_dn: irradiance at the centre.
     """
 
@@ -103,13 +103,13 @@ def footprint(
     scene: Scene,
     blur_px: float,
 ) -> Footprint | None:
-    """Image of a beam on a sheet, or None where it never meets the sheet or forms no image.
+    """Compute the image of a beam on a sheet; None where it never meets the sheet or forms no image.
 
     Args:
         camera: the camera.
         point_S_mm: (3,) where the beam's axis meets the sheet, frame S.
-        direction_S: (3,) along the beam.
-        normal_S: (3,) of the sheet, any length.
+        direction_S: (3,) direction of the beam.
+        normal_S: (3,) normal of the sheet, any length.
         scene: beam and exposure.
         blur_px: sd of the lens' point spread.
     """
@@ -130,9 +130,9 @@ def footprint(
 
 
 def spot_irradiance(spot: Footprint, width: int, height: int) -> tuple[tuple[slice, slice], np.ndarray]:
-    """Irradiance of a spot integrated over the pixels of a window: (rows, columns) of the image, and values.
+    """Integrate a spot's irradiance over the pixels of a window; return (rows, columns) of the image, and values.
 
-    Three Gauss-Legendre nodes per pixel and axis: exact to the fifth order of the irradiance within a pixel.
+    Three Gauss-Legendre nodes per pixel and axis are exact to the fifth order of the irradiance within a pixel.
     """
     half = WINDOW_SDS * np.sqrt(np.diag(spot.covariance_px2)) + 1
     low = np.clip(np.floor(spot.centre_px - half), 0, [width, height]).astype(int)
@@ -150,9 +150,9 @@ def spot_irradiance(spot: Footprint, width: int, height: int) -> tuple[tuple[sli
 
 
 def speckle(shape: tuple[int, int], contrast: float, grain_px: float, rng: np.random.Generator) -> np.ndarray:
-    """Field of mean 1 and sd `contrast`: gamma-distributed, as the sum of independent speckle patterns is.
+    """Draw a field of mean 1 and sd `contrast`, gamma-distributed as a sum of independent speckle patterns.
 
-    With a grain, independent values of higher contrast are smoothed down to the contrast wanted.
+    With a grain, independent values of higher contrast are smoothed to the required contrast.
     """
     if contrast <= 0:
         return np.ones(shape)
@@ -170,7 +170,7 @@ def speckle(shape: tuple[int, int], contrast: float, grain_px: float, rng: np.ra
 
 @lru_cache(maxsize=8)
 def mosaic_response(width: int, height: int, response: tuple[float, float, float]) -> np.ndarray:
-    """Response (height, width) of an RGGB mosaic: red at even rows and columns."""
+    """Return the response (height, width) of an RGGB mosaic: red at even rows and columns."""
     blue, green, red = response
     tile = np.array([[red, green], [green, blue]], np.float32)
     return np.tile(tile, ((height + 1) // 2, (width + 1) // 2))[:height, :width]
@@ -178,16 +178,16 @@ def mosaic_response(width: int, height: int, response: tuple[float, float, float
 
 @lru_cache(maxsize=8)
 def ambient_level(width: int, height: int, level_dn: float, gradient_dn: float) -> np.ndarray:
-    """Light of the room (height, width) in DN: `level_dn` in the middle, a plane over the picture, never negative."""
+    """Return the room's light (height, width) in DN: linear, `level_dn` in the middle, not negative."""
     u = np.linspace(-0.5, 0.5, width, dtype=np.float32)
     v = np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None]
     return np.maximum(level_dn - gradient_dn * (u + v) / 2, 0)
 
 
 def expose(irradiance_dn: np.ndarray, sensor: Sensor, rng: np.random.Generator | None) -> np.ndarray:
-    """The picture of an irradiance (height, width), in DN above black: mosaic, noise, clipping, 8 bits, colours.
+    """Expose an irradiance (height, width), in DN above black: mosaic, noise, clipping, 8 bits, colours.
 
-    Shot noise is drawn as normal: at the hundreds of electrons of any lit pixel it is. `rng` None: no noise.
+    Shot noise is drawn as normal, which it is at the hundreds of electrons of any lit pixel; `rng` None adds no noise.
     """
     import cv2
 
@@ -203,7 +203,7 @@ def expose(irradiance_dn: np.ndarray, sensor: Sensor, rng: np.random.Generator |
 
 
 def random_stream(name: str, *numbers: int) -> np.random.Generator:
-    """The generator of one part of chance, a key of `_STREAMS`, of what the whole numbers name."""
+    """Return the generator of one random stream, a key of `_STREAMS`, for a scene identified by whole numbers."""
     return np.random.default_rng(np.random.SeedSequence([_STREAMS[name], *map(int, numbers)]))
 
 
@@ -216,15 +216,15 @@ def render_spot(
     seed: Sequence[int],
     frame: int = 0,
 ) -> np.ndarray:
-    """One picture of a spot, or of the ambient light alone where `spot` is None.
+    """Render a picture of a spot, or of the ambient light alone where `spot` is None.
 
     Args:
         spot: the spot's image before the sensor.
-        width: of the picture, px.
-        height: of the picture, px.
+        width: width of the picture, px.
+        height: height of the picture, px.
         scene: ambient light and speckle.
         sensor: the sensor.
-        seed: whole numbers that name the look and the camera: the speckle of a still scene.
+        seed: whole numbers that identify look and camera, which have their own speckle.
         frame: number of the exposure: frames of one look share the speckle, not the noise.
     """
     irradiance = ambient_level(width, height, scene.ambient_dn, scene.ambient_gradient_dn).copy()
@@ -241,11 +241,11 @@ def render_spot(
 def render_spots(
     cameras: CameraPair, light: Light, scene: Scene, sensor: Sensor, seed: int, spot: int, frame: int = 0
 ) -> SpotFrames:
-    """Both pictures of one look; speckle and noise of the two cameras are independent.
+    """Render both pictures of one look; speckle and noise of the two cameras are independent.
 
     Args:
         cameras: the true cameras at the laser's wavelength (`cameras_of` with the focal scale).
-        light: of one beam; where it meets no sheet there is ambient light only.
+        light: light of one beam; where it meets no sheet there is ambient light only.
         scene: beam, exposure, ambient light, speckle.
         sensor: both sensors.
         seed: of the campaign.

@@ -1,8 +1,8 @@
 """The true headlines of a simulated campaign: the line through its looks (formulation 3.2).
 
-Degrees of the beam per step over the looks used: slope of the least-squares line of the beam's azimuth (elevation) on
-the pan (tilt) counter, each look once, with mirrors and transmission error, without play, stop error and drift, the
-other axis at its mean. Written for the twin alone; the estimators have formulas of their own.
+Degrees of the beam per step are the slope of the least-squares line of the beam's azimuth (elevation) on the pan (tilt)
+counter over the looks used. Each look counts once, with mirrors and transmission error, without play, stop error and
+drift, the other axis at its mean. The estimators have their own formulas.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from tvsbayes.twin.head_physics import tilt_zero_deg
 from tvsbayes.twin.physics import effective_mirror_offset_mm, harmonics_deg, mirror_chain, wobble_deg
 
 SLOPE_STEP_RAD = 1e-5
-"""Of central differences of the mirrors: truncation 1e-10, rounding 1e-11."""
+"""Step of central differences of the mirrors: truncation 1e-10, rounding 1e-11."""
 AT_POSE: dict[str, Callable[[Mapping[str, float], tuple[float, float]], float]] = {
     "effective_mirror_offset_mm": effective_mirror_offset_mm,
 }
-"""True headlines of parameters and a pose (psi, beta), deg, by contract name."""
+"""Formulas of true headlines of parameters and a pose (psi, beta), deg, by public name."""
 
 
 def looks_steps(campaign: Campaign) -> np.ndarray:
-    """Counters (n, 2) of pan and tilt at the looks that every estimator uses, those with status ok."""
+    """Return counters (n, 2) of pan and tilt at the looks that every estimator uses, those with status ok."""
     at = {move.move: (move.pan_steps, move.tilt_steps) for move in campaign.moves}
     return np.array([at[spot.move] for spot in campaign.spots if spot.status == "ok"], float).reshape(-1, 2)
 
@@ -37,17 +37,17 @@ def effective_deg_per_step(
     campaign: Campaign,
     pose_deg: tuple[float, float] | None = None,
 ) -> dict[str, float] | None:
-    """True headline of every direction over the looks of a campaign; None where it has none.
+    """Compute the true headline of every direction over the looks of a campaign; None without looks.
 
-    The line's slope, plus or minus half the contrast times the mean slope of the mirrors over the looks. An axis that
-    all looks see at one counter has no line: the mirrors' slope times the mean ratio takes its place.
+    It is the line's slope, plus or minus half the contrast times the mean slope of the mirrors over the looks. For an
+    axis at one counter in all looks the mirrors' slope times the mean ratio replaces the line's.
 
     Args:
         parameters: of the true rig, by contract name.
-        errors: of its gears.
-        campaign: whose looks count; its rig states the period of `harmonic_deg`.
-        pose_deg: mean angles of (pan, tilt), where either axis stands for the line of the other; by default those of
-            the mean ratio.
+        errors: errors of its gears.
+        campaign: campaign of the looks; its rig states the period of `harmonic_deg`.
+        pose_deg: mean angles of (pan, tilt), at which either axis is for the line of the other; by default those by the
+            mean ratio.
     """
     steps = looks_steps(campaign)
     if not len(steps):
@@ -75,14 +75,14 @@ def effective_deg_per_step(
 def _mirror_deg(
     parameters: Mapping[str, float], errors: GearErrors, axis: str, counters: np.ndarray, period_deg: float
 ) -> np.ndarray:
-    """Mirror angle (n,) of an axis by mean ratio and transmission error alone."""
+    """Compute the mirror angle (n,) of an axis by mean ratio and transmission error alone."""
     angle_deg = parameters[f"degrees_per_step.{axis}"] * counters
     error_deg = errors[axis].error_deg(angle_deg) + wobble_deg(angle_deg, harmonics_deg(parameters, axis), period_deg)
     return angle_deg + error_deg + (tilt_zero_deg(parameters) if axis == "tilt" else 0.0)
 
 
 def _beam_deg(parameters: Mapping[str, float], axis: int, angle_deg: np.ndarray, others_deg: float) -> np.ndarray:
-    """Azimuth or elevation (n,) of the beam for mirror angles of that axis, counted on over full turns and zenith."""
+    """Compute azimuth or elevation (n,) of the beam for mirror angles of an axis, continued over turns and zenith."""
     moving, other = np.radians(angle_deg), np.full(len(angle_deg), np.radians(others_deg))
     psi, beta = (moving, other) if axis == 0 else (other, moving)
     direction = mirror_chain(psi, beta, parameters)[1]
@@ -91,14 +91,14 @@ def _beam_deg(parameters: Mapping[str, float], axis: int, angle_deg: np.ndarray,
         beam = np.arcsin(direction[:, 2])
         folded = np.abs(np.angle(np.exp(1j * (np.pi - beam - moving)))) < np.abs(np.angle(np.exp(1j * (beam - moving))))
         beam[folded] = np.pi - beam[folded]
-    # The beam follows its mirror to some degrees, but for the azimuth of a head's zero.
+    # The beam follows its mirror to some degrees, except for a constant such as a head's azimuth zero.
     ahead = np.exp(1j * (beam - moving))
     constant = np.angle(ahead.mean())
     return np.degrees(moving + constant + np.angle(ahead * np.exp(-1j * constant)))
 
 
 def _mirror_slope(parameters: Mapping[str, float], axis: int, angle_deg: np.ndarray, others_deg: float) -> np.ndarray:
-    """d(azimuth)/d(psi) or d(elevation)/d(beta) (n,) at mirror angles of that axis."""
+    """Compute d(azimuth)/d(psi) or d(elevation)/d(beta) (n,) at mirror angles of that axis."""
     step = np.degrees(SLOPE_STEP_RAD)
     ahead, behind = (_beam_deg(parameters, axis, angle_deg + sign * step, others_deg) for sign in (1, -1))
     return (ahead - behind) / (2 * step)

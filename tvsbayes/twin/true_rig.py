@@ -1,4 +1,4 @@
-"""A true rig: its parameters, cameras and gears drawn, what a run makes of them, and `truth.json`.
+"""A true rig: its drawn parameters, cameras and gears, their realisation in a run, and `truth.json`.
 
 Degrees where a name says `_deg`, mm, pixels. No estimator reads any of it.
 """
@@ -34,11 +34,11 @@ from tvsbayes.twin.true_headlines import AT_POSE, effective_deg_per_step
 
 TRUTH_FORMAT = "tvsbayes-truth/1"
 Pair = tuple[float, float]
-"""Of pan and tilt."""
+"""Numbers for pan and tilt."""
 
 
 class GearErrorTable(TypedDict):
-    """What an axis repeats, at the counters of a campaign: error of the output, play beyond its mean."""
+    """Repeating errors of an axis at the counters of a campaign: error of the output, play less its mean."""
 
     steps: list[int]
     error_deg: list[float]
@@ -46,7 +46,7 @@ class GearErrorTable(TypedDict):
 
 
 class TruthDocument(TypedDict):
-    """truth.json; see `Truth`. What `AT_POSE` gives stands there under its names."""
+    """Content of truth.json; see `Truth`. Quantities of `AT_POSE` are added by their names."""
 
     format: str
     note: str
@@ -65,19 +65,19 @@ class TruthDocument(TypedDict):
 
 @dataclass(frozen=True)
 class Truth:
-    """A true rig: what no estimator may read.
+    """A true rig, which no estimator may read.
 
     Attributes:
-        parameters: every physical parameter by its contract name, derived ones included.
+        parameters: every physical parameter by its public name, derived ones included.
         stereo: the true cameras (the campaign carries the stated ones).
         mirror_angles_deg: (psi, beta) of each move as realised, stop errors included; empty before a run.
-        stop_errors_deg: (pan, tilt) stop error of each move, as held.
-        home_offsets_deg: (pan, tilt) per segment.
-        drift_deg: (pan, tilt) of the zero at each move, since its homing.
-        homing_side: side from which each homing of pan and tilt ends, "unknown" for anywhere anew; None before a run.
+        stop_errors_deg: (pan, tilt) stop error after each move.
+        home_offsets_deg: (pan, tilt) home offset of each segment.
+        drift_deg: (pan, tilt) drift of the zero at each move, since its homing.
+        homing_side: side from which each homing of pan and tilt ends, "unknown" for anywhere; None before a run.
         reference_pose_deg: mean (psi, beta) over the ok spots without stop errors, None before a run.
-        gear_errors: what the gears repeat by position; None leaves it to each run to draw it by the scales in
-            `parameters`. As read from a truth.json it is known at the counters of its campaign.
+        gear_errors: errors of the gears by position; None lets each run draw them by the scales in `parameters`. From a
+            truth.json they are tabulated at the counters of its campaign.
         note: what a reader of truth.json should know.
     """
 
@@ -93,19 +93,19 @@ class Truth:
     note: str = "The true rig of a simulated campaign; no estimator reads this file."
 
     def with_gears(self, errors: GearErrors = PERFECT) -> Truth:
-        """The rig with these errors of its gears and no others: all scales that errors are drawn by at 0."""
+        """Return the rig with these gear errors only: all scales by which errors are drawn are 0."""
         scales = {name: 0.0 for name in GEAR_ERROR_NAMES if REGISTRY[name].prior.distribution == "half-normal"}
         return replace(self, parameters={**self.parameters, **scales}, gear_errors=errors)
 
     def effective_deg_per_step(self, campaign: Campaign) -> dict[str, float] | None:
-        """Of every direction over the looks of a campaign, see `true_headlines`; None where it has no looks."""
-        # A difference of directions turns a head's axes by degrees over long travel, and where they lean its lines
-        # depend on where the other one stands; a scanner's do by 1e-5 of themselves.
+        """Compute the effective ratios over the looks of a campaign, see `true_headlines`; None without looks."""
+        # A ratio contrast rotates a head's axes by degrees over long travel, and with a tilted axis its lines depend on
+        # the other one's angle. For a scanner this effect is 1e-5.
         pose_deg = self.reference_pose_deg if campaign.rig.mechanism.terms else None
         return effective_deg_per_step(self.parameters, self.gear_errors or PERFECT, campaign, pose_deg)
 
     def headlines(self, campaign: Campaign, pose_deg: Pair) -> dict[str, float] | None:
-        """Parameters and all that follows from them by contract name, over the looks of a campaign and at a pose."""
+        """Compute parameters and derived quantities by public name, over the looks of a campaign and at a pose."""
         ratio = self.effective_deg_per_step(campaign)
         if ratio is None:
             return None
@@ -118,7 +118,7 @@ class Truth:
         }
 
     def as_json(self, campaign: Campaign) -> TruthDocument:
-        """The document of truth.json of a campaign of this rig, with the effective ratios where there are looks."""
+        """Return the document of truth.json for a campaign of this rig, with effective ratios if it has looks."""
         mechanism = campaign.rig.mechanism
         constants = mechanism.fixed
         cameras = dict(zip(STEREO_PARAMETER_NAMES, map(float, self.stereo.vector), strict=True))
@@ -159,7 +159,7 @@ class Truth:
     def from_json(cls, document: TruthDocument, stated: Stereo) -> Truth:
         """Rebuild from truth.json; image size and covariance come from the campaign's `stated` stereo."""
         pose, known = document["reference_pose_deg"], document["stereo"]
-        # Files from before the gears repeated errors, looks scattered and zeros shifted are of perfect ones.
+        # Older files without errors of gears, scatter of looks and shifts of zeros have none of them.
         perfect = {name: RIG_PRIORS[name].value for name in (*GEAR_ERROR_NAMES, *LATE_NAMES)}
         parameters = {name: float(value) for name, value in document["parameters"].items()}
         parameters |= {name: value for name, value in perfect.items() if name not in parameters}
@@ -181,7 +181,7 @@ class Truth:
 
 
 def _tabulated(tables: Mapping[str, GearErrorTable], parameters: Mapping[str, float]) -> GearErrors:
-    """The errors that a truth.json knows."""
+    """Build gear errors from the tables of a truth.json."""
     errors: dict[str, AxisErrors] = {}
     for axis in AXES:
         table = tables[axis]
@@ -194,7 +194,7 @@ def _tabulated(tables: Mapping[str, GearErrorTable], parameters: Mapping[str, fl
 
 
 def pan_and_tilt(rows: Iterable[Sequence[float]]) -> tuple[Pair, ...]:
-    """Rows of two numbers as a `Truth` holds them."""
+    """Convert rows of two numbers to the form of `Truth`."""
     return tuple((float(pan), float(tilt)) for pan, tilt in rows)
 
 
@@ -202,13 +202,13 @@ def read_truth(path: str | Path, stated: Stereo) -> Truth:
     """Read a truth.json; `stated` is the stereo calibration of its campaign.
 
     Raises:
-        InputError: unreadable, or not a truth file of this format.
+        InputError: the file cannot be read, or is not a truth file of this format.
     """
     path = Path(path)
     keys = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name)
     keys.word("format", (TRUTH_FORMAT,))
     try:
-        # What stands in the entries is converted, or refused below.
+        # Entries are converted, or refused below.
         return Truth.from_json(cast("TruthDocument", keys.values), stated)
     except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(
@@ -221,12 +221,12 @@ def read_truth(path: str | Path, stated: Stereo) -> Truth:
 
 
 def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
-    """Draw a true rig: every quantity of `rig.truth` anew, the cameras from their own covariance.
+    """Draw a true rig: every quantity from `rig.truth`, the cameras from their own covariance.
 
-    Nothing is left at its stated value unless its `u` is 0: a study whose cameras were exact would
-    report a coverage that no real calibration has.
+    No quantity keeps its stated value unless its `u` is 0: with exact cameras a study would report a coverage that no
+    real calibration has.
     """
-    # Of a stream of its own: rigs with perfect gears are the same rigs whatever is drawn here.
+    # A separate stream, so that rigs with perfect gears do not depend on these draws.
     (gears,) = rng.spawn(1)
 
     def drawn(names: Iterable[str], stream: np.random.Generator) -> dict[str, float]:
@@ -236,20 +236,20 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
 
     late = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
     parameters = drawn((n for n in rig_names if n not in late), rng)
-    # Through the eigenvectors: fixed parameters give a semi-definite covariance that Cholesky refuses.
+    # By eigenvectors, since fixed parameters give a semi-definite covariance, for which Cholesky fails.
     variances, vectors = np.linalg.eigh(np.asarray(rig.stereo.parameter_covariance, float))
     offset = vectors @ (np.sqrt(np.clip(variances, 0.0, None)) * rng.standard_normal(len(variances)))
-    # Last: rigs without transmission error are the same rigs whatever is drawn here.
+    # Last, so that rigs without transmission error do not depend on these draws.
     parameters |= drawn(HARMONIC_NAMES, rng) | drawn(GEAR_ERROR_NAMES, gears)
     stereo = rig.stereo.with_vector(rig.stereo.vector + offset)
     errors = draw_gear_errors(parameters, rig.table.harmonic_period_deg, gears)
-    # Behind the gears' errors, which are the same whatever is drawn here.
+    # After the gears' errors, which must not depend on these draws.
     parameters |= drawn(LATE_NAMES, gears)
     return Truth(with_derived(parameters), stereo, gear_errors=errors)
 
 
 def _draw(prior: Prior, rng: np.random.Generator) -> float:
-    """One draw; the generator always advances by one, so that fixing a parameter moves no other."""
+    """Draw one number; the generator always advances by one, so that fixing a parameter changes no other."""
     z = rng.standard_normal()
     if prior.distribution == "log-normal":
         return float(prior.value * np.exp(prior.u * z))
