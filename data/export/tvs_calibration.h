@@ -3,11 +3,11 @@
  * @EXPECTED_ERROR@
  * Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner, z up; mm.
  * Counters are absolute steps after homing; a side is +1 (reached left or up) or -1 (right or down).
- * tvs_beam and tvs_locate go from counters to the beam and to a point; tvs_steps_for_point and tvs_steps_for_direction
- * back, with the counters to go to first: the move on from there takes up the play. Counters that the machine must not
- * leave may be defined before this file is included: TVS_LIMIT_PAN_LOW, TVS_LIMIT_PAN_HIGH, and likewise TILT.
- * Errors of the gears (transmission error, change of play) are interpolated in tables over the counters; ask
- * tvs_extrapolated whether the campaign looked there: outside, tvs_error_u_deg tells how little is known.
+ * tvs_beam and tvs_locate compute the beam and a point from counters; tvs_steps_for_point and tvs_steps_for_direction
+ * compute counters, with intermediate counters to visit first: the move from there takes up the play. Limits of the
+ * counters may be defined before this file is included: TVS_LIMIT_PAN_LOW, TVS_LIMIT_PAN_HIGH, and likewise TILT.
+ * Errors of the gears (transmission error, change of play) are interpolated in tables over the counters. Outside the
+ * counters observed in the campaign (see tvs_extrapolated) they are unknown within tvs_error_u_deg.
  *
  *     const double wanted[3] = {800.0, 100.0, 20.0};
  *     struct tvs_steps go;
@@ -43,7 +43,7 @@ static inline double tvs_output_deg(double steps, int side, double ratio, double
     return angle;
 }
 
-/* A table of regular counters at a counter (cubic interpolation), and what holds beyond the table. */
+/* Value at a counter, by cubic interpolation in a table of regular counters; `beyond` outside the table. */
 static inline double tvs_table(const double *table, int size, double first, double last, double steps, double beyond)
 {
     double found = 0, at = last > first ? (steps - first) * (size - 1) / (last - first) : 0;
@@ -62,14 +62,14 @@ static inline double tvs_table(const double *table, int size, double first, doub
     return found;
 }
 
-/* Whether no look of the campaign reached these counters. */
+/* Whether these counters are outside those of the campaign's looks. */
 static inline int tvs_extrapolated(double pan_steps, double tilt_steps)
 {
     return !(pan_steps >= TVS_SEEN_PAN_LOW && pan_steps <= TVS_SEEN_PAN_HIGH && tilt_steps >= TVS_SEEN_TILT_LOW &&
              tilt_steps <= TVS_SEEN_TILT_HIGH);
 }
 
-/* What errors of the gears add to the mirror angle of pan (0) or tilt (1) at a counter, degrees. */
+/* Contribution of gear errors to the mirror angle of pan (0) or tilt (1) at a counter, degrees. */
 static inline double tvs_gear_deg(int tilt, double steps, int side)
 {
     if (tilt)
@@ -81,7 +81,7 @@ static inline double tvs_gear_deg(int tilt, double steps, int side)
                tvs_table(TVS_PLAY_PAN_DEG, TVS_TABLE_PAN_SIZE, TVS_TABLE_PAN_FIRST, TVS_TABLE_PAN_LAST, steps, 0);
 }
 
-/* Standard uncertainty of the transmission error and of half the change of play there, degrees. */
+/* Combined standard uncertainty of the transmission error and half the change of play at a counter, degrees. */
 static inline double tvs_error_u_deg(int tilt, double steps)
 {
     double error = tilt ? tvs_table(TVS_ERROR_U_TILT_DEG, TVS_TABLE_TILT_SIZE, TVS_TABLE_TILT_FIRST,
@@ -155,15 +155,15 @@ static inline void tvs_mirror_beam(double pan_deg, double tilt_deg, double origi
     }
 }
 
-/* The beam at counters that were reached from the given sides: origin in mm and unit direction, frame T. */
+/* The beam at counters reached from the given sides: origin in mm and unit direction, frame T. */
 static inline void tvs_beam(double pan_steps, double tilt_steps, int pan_side, int tilt_side, double origin[3],
                             double direction[3])
 {
     tvs_mirror_beam(tvs_pan_deg(pan_steps, pan_side), tvs_tilt_deg(tilt_steps, tilt_side), origin, direction);
 }
 
-/* The point where the beam meets what the aperture read, frame T, mm; returns 0 where they do not meet or
- * meet behind the scanner, 1 where they do, 2 where they do at counters at which the campaign never looked. */
+/* The point where the beam meets the surface of the aperture's reading, frame T, mm. Returns 0 where they do not meet,
+ * or meet behind the scanner; 1 where they meet; 2 where they meet at counters outside those of the campaign. */
 static inline int tvs_locate(double pan_steps, double tilt_steps, int pan_side, int tilt_side, double aperture_deg,
                       double xyz[3])
 {
@@ -182,7 +182,7 @@ static inline int tvs_locate(double pan_steps, double tilt_steps, int pan_side, 
             return 0;
         reach = (y * y - cb * cb * (o[0] * o[0] + y * y + o[2] * o[2])) /
                 (cb * sqrt(inside) - (y * d[1] - cb * cb * (o[0] * d[0] + y * d[1] + o[2] * d[2])));
-        /* The other nappe of the cone is what the aperture would see under 180 deg - B. */
+        /* The other nappe of the cone belongs to the reading 180 deg - B. */
         if ((y + reach * d[1]) * cb < -1e-12 * fabs(reach * cb))
             return 0;
     }
@@ -195,19 +195,19 @@ static inline int tvs_locate(double pan_steps, double tilt_steps, int pan_side, 
     return tvs_extrapolated(pan_steps, tilt_steps) ? 2 : 1;
 }
 
-/* What the aperture reads for a point of frame T, degrees. */
+/* Reading of the aperture for a point of frame T, degrees. */
 static inline double tvs_reading_deg(const double xyz[3])
 {
     double lateral = TVS_AZIMUTH_CONVENTION ? xyz[0] : hypot(xyz[0], xyz[2]);
     return atan2(lateral, xyz[1] + 0.5 * TVS_BASELINE_MM) / TVS_RAD + TVS_APERTURE_ZERO_DEG;
 }
 
-/* Where to go, in whole steps. */
+/* Counters to move to, in whole steps. */
 struct tvs_steps {
-    long via_pan_steps, via_tilt_steps; /* first: the move on from there takes up the play */
-    long pan_steps, tilt_steps;         /* then */
+    long via_pan_steps, via_tilt_steps; /* visited first: the move from there takes up the play */
+    long pan_steps, tilt_steps;         /* visited second */
     int pan_side, tilt_side;            /* sides on which these are reached: +1 left or up, -1 right or down */
-    int extrapolated;                   /* whether no look of the campaign reached them */
+    int extrapolated;                   /* whether they are outside those of the campaign's looks */
 };
 
 #define TVS_NO_ANGLES 0
@@ -226,8 +226,8 @@ struct tvs_steps {
 #define TVS_LIMIT_TILT_HIGH TVS_UNLIMITED
 #endif
 
-/* Mirror angles (pan, tilt) that send the beam through a point (mm, frame T), or with a null pointer along azimuth and
- * elevation, degrees; returns whether there are some. */
+/* Mirror angles (pan, tilt) that send the beam through a point (mm, frame T), or for a null pointer along azimuth and
+ * elevation, degrees; returns whether such angles exist. */
 static inline int tvs_aim(const double *point, double azimuth_deg, double elevation_deg, double mirror_deg[2])
 {
     int ahead = point ? isfinite(point[0]) && isfinite(point[1]) && isfinite(point[2]) && point[0] > 0
@@ -253,7 +253,7 @@ static inline int tvs_aim(const double *point, double azimuth_deg, double elevat
     return 0;
 }
 
-/* The whole counter of pan (0) or tilt (1) whose mirror angle, reached on a side, is nearest to the wanted one. */
+/* The integer counter of pan (0) or tilt (1) whose mirror angle, reached from a side, is nearest to the wanted one. */
 static inline double tvs_counter(int tilt, double mirror_deg, int side)
 {
     double steps = 0;
@@ -267,7 +267,7 @@ static inline double tvs_counter(int tilt, double mirror_deg, int side)
     return rint(steps);
 }
 
-/* How an axis comes to a mirror angle on a side, 0 for left or up unless limits forbid it; returns whether it may. */
+/* Counters for a mirror angle reached from a side; 0 means left or up unless limits forbid it. Returns success. */
 static inline int tvs_arrive(int tilt, double mirror_deg, int *side, long *steps, long *via)
 {
     double low = tilt ? TVS_LIMIT_TILT_LOW : TVS_LIMIT_PAN_LOW, high = tilt ? TVS_LIMIT_TILT_HIGH : TVS_LIMIT_PAN_HIGH;
@@ -302,15 +302,15 @@ static inline int tvs_steps_to(const double *point, double azimuth_deg, double e
     return found->extrapolated ? 2 : 1;
 }
 
-/* Counters that send the beam to a point of frame T, mm. Sides are +1, -1, or 0 for left and up unless limits forbid it.
- * Returns 1, or 2 where no look of the campaign reached these counters, TVS_NO_ANGLES where no mirror angles do it, or
- * TVS_OUTSIDE_LIMITS; `found` is whole after 1 and 2 alone. */
+/* Counters that send the beam to a point of frame T, mm. Sides are +1, -1, or 0: left and up unless limits forbid it.
+ * Returns 1, or 2 where the counters are outside those of the campaign's looks, TVS_NO_ANGLES without suitable mirror
+ * angles, or TVS_OUTSIDE_LIMITS; `found` is complete only after 1 and 2. */
 static inline int tvs_steps_for_point(const double xyz[3], int pan_side, int tilt_side, struct tvs_steps *found)
 {
     return tvs_steps_to(xyz, 0, 0, pan_side, tilt_side, found);
 }
 
-/* The same for a direction: azimuth atan2(y, x) and elevation above the horizontal, degrees. */
+/* As tvs_steps_for_point, for a direction: azimuth atan2(y, x) and elevation above the horizontal, degrees. */
 static inline int tvs_steps_for_direction(double azimuth_deg, double elevation_deg, int pan_side, int tilt_side,
                                           struct tvs_steps *found)
 {

@@ -216,7 +216,7 @@ class DeviceModel:
         self._last_sequence, self._last_request = sequence, line
         refused, extra = self._command(sequence, words[1:], now_us)
         self._refused = refused is not None
-        # Only new, accepted requests feed the laser watchdog.
+        # Only numbered, accepted requests feed the laser watchdog.
         self._heard_us = self._heard_us if self._refused else now_us
         self._last_reply = self._reply(sequence, refused, extra)
         return self._write(self._last_reply)

@@ -1,4 +1,4 @@
-// What the sketch needs of Arduino and of the Teensy's registers, on the emulated board: see board.cpp.
+// The parts of Arduino and of the Teensy's registers that the sketch uses, for the emulated board: see board.cpp.
 #pragma once
 
 #include <stddef.h>
@@ -28,7 +28,7 @@ class HostSerial {
 };
 extern HostSerial Serial;
 
-// The processor of a Teensy 4.1, as far as the sketch touches it: fault vectors and watchdog WDOG1. Registers are
+// The parts of a Teensy 4.1's processor that the sketch uses: fault vectors and watchdog WDOG1. Registers are
 // objects that drive the emulated board's own watchdog.
 #define __IMXRT1062__
 extern "C" {

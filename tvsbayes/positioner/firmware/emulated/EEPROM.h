@@ -1,4 +1,4 @@
-// The EEPROM of the emulated board: memory that a reset leaves alone.
+// The EEPROM of the emulated board: memory that a reset leaves unchanged.
 #pragma once
 
 #include <stdint.h>

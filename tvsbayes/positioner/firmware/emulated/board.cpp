@@ -1,4 +1,4 @@
-// The unchanged sketch on QEMU's mps2-an500: pins, clock, watchdog, and motors with switches behind the pins.
+// The unchanged sketch on QEMU's mps2-an500: pins, clock, watchdog, and motors with switches at the pins.
 //
 // UART 0 is the host's line, LED 0 the laser, LED 1 the trigger. UART 1 is a hand at the bench. Orders, a line each:
 //   h AXIS N     the home switch of an axis (0 pan, 1 tilt) closes at N steps and below
@@ -7,12 +7,12 @@
 //   b AXIS N     the next N readings of the home switch are wrong
 //   c AXIS 0|1   the limit circuit is whole or cut
 //   e AXIS 0|1   the home switch is alive or dead
-//   s MS         the main loop hangs for so long
-//   g            the main loop hangs for ever
+//   s MS         the main loop hangs for this time
+//   g            the main loop hangs without end
 //   f            a fault of the processor
 //   r            reset
 // Answers, a byte each: + - steps of pan, ^ v of tilt, L l laser on and off, T t trigger, B a start, V a direction that
-// stood too short before its step.
+// was set too late before its step.
 #include <Arduino.h>
 #include <EEPROM.h>
 #include <IntervalTimer.h>
@@ -30,7 +30,7 @@ volatile uint32_t& at(uint32_t address) { return *reinterpret_cast<volatile uint
 const uint32_t kHostLine = 0x40004000, kHandLine = 0x40005000, kWatchdog = 0x40008000, kFpga = 0x40028000;
 const uint32_t kSysTick = 0xE000E010, kVectors = 0xE000ED08, kReset = 0xE000ED0C;
 
-// What a reset of the processor leaves alone: motors, switches, wires, EEPROM. Zero when the emulator starts.
+// State that a reset of the processor leaves unchanged: motors, switches, wires, EEPROM. Zero when the emulator starts.
 struct Bench {
   uint32_t known, boots;
   int32_t steps[2], home[2], limit, missing[2], wrong_reads[2], limit_cut[2], home_dead[2];
@@ -161,8 +161,8 @@ uint8_t digitalReadFast(uint8_t pin) {
 // The counter of the FPGA, divided to microseconds in main().
 uint32_t micros() { return at(kFpga + 0x18); }
 
-// From the same counter, over its wraps. The tick asks too, maybe between reading and remembering: a step back of less
-// than half the counter's range is that, and no wrap.
+// Time from the same counter, over its wraps. The tick calls it too, possibly between reading and storing: a backward
+// step of less than half the counter's range has this cause and is not a wrap.
 uint32_t millis() {
   static uint32_t last_us = 0, wraps = 0;
   const uint32_t now_us = micros();
@@ -196,7 +196,7 @@ void IntervalTimer::begin(void (*function)(), uint32_t period_us) {
   at(kSysTick) = 7;
 }
 
-// The board's watchdog warns after its load and resets after another: half of the time each.
+// The board's watchdog warns after its load and resets after another: each takes half of the time.
 void WatchdogControl::operator=(unsigned value) const {
   if ((value & WDOG_WCR_WDE) == 0) return;
   at(kWatchdog + 0xC00) = 0x1ACCE551;

@@ -1,8 +1,8 @@
-// Runs the core without a board: reads a script from stdin, writes what happened to stdout.
+// Runs the core without a board: reads a script from stdin, writes the events to stdout.
 // The motors drive a counter of true steps per axis, with a home switch below a position and limit switches outside a
 // range. One order per line:
 //   a US         advance to a time, with a main loop that is never late
-//   j US         the main loop hangs until then and comes round once
+//   j US         the main loop hangs until then and runs once
 //   d            the board's guard has switched the laser off
 //   x HEX        bytes from the host, all at the present time
 //   k AXIS N     the motor misses its next N steps

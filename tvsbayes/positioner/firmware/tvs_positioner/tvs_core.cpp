@@ -17,7 +17,7 @@ struct Setting {
   const char* name;
   int32_t low, high, boot;
 };
-// As SETTINGS in protocol.py, in the order of Core's enum.
+// The settings of SETTINGS in protocol.py, in the order of Core's enum.
 const Setting kSettingTable[] = {
     {"vmax", 10, 20000, 800},
     {"amax", 10, 100000, 4000},
@@ -62,7 +62,7 @@ bool parse_signed(const char* text, int32_t* value) {
   return true;
 }
 
-// What may come with sequence 0, at any time and as often as wanted: it makes no light and starts no motion.
+// Requests allowed with sequence 0, at any time and any number of times: they start neither laser nor motion.
 bool unnumbered(const char* words[], int count) {
   if (count == 3) return strcmp(words[1], "L") == 0 && strcmp(words[2], "0") == 0;
   if (count != 2) return false;
@@ -142,7 +142,7 @@ void Core::receive(uint8_t byte, uint64_t now_us) {
     request_size_ = 0;
     overlong_ = false;
   } else if (request_size_ < kRequestMax + 1) {
-    // One more than allowed: a carriage return before the line feed does not count.
+    // One byte more than allowed, since a carriage return before the line feed does not count.
     request_[request_size_++] = static_cast<char>(byte);
   } else {
     overlong_ = true;
@@ -214,7 +214,7 @@ void Core::send(const char* body, size_t size) {
 void Core::execute(uint32_t sequence, const char* words[], int count, uint64_t now_us) {
   char extra[64] = "";
   const char* error = command(sequence, words, count, now_us, extra);
-  // Only a host that counts on and is obeyed keeps the light on.
+  // Only numbered, accepted requests feed the laser watchdog.
   if (sequence != 0) refused_ = error != nullptr;
   if (sequence != 0 && !refused_) heard_us_ = now_us;
   reply(sequence, error, extra);

@@ -1,8 +1,8 @@
 // Core of the positioner's firmware: frames and commands in tvs_core.cpp, motion in tvs_motion.cpp.
-// Portable C++11: no Arduino include, no heap, no floating point. The board is reached through Hooks only, so the
-// same core runs natively and on an emulated processor in the tests, where it must agree byte by byte with
+// Portable C++11: no Arduino include, no heap, no floating point. The core accesses the board only through Hooks, so
+// that it also runs natively and on an emulated processor in the tests, where it must agree byte by byte with
 // tvsbayes/positioner/firmware_model.py.
-// The protocol is described in tvsbayes/positioner/protocol.py. Times are microseconds since start, positions motor steps.
+// Protocol: tvsbayes/positioner/protocol.py. Times are microseconds since start, positions motor steps.
 #pragma once
 
 #include <stddef.h>
@@ -12,7 +12,7 @@ namespace tvs {
 
 enum { kPan = 0, kTilt = 1, kAxes = 2 };
 
-// What the core needs from a board. Called from start(), receive(), loop() and darkened() only, never from an interrupt.
+// Interface of a board to the core. Called only from start(), receive(), loop() and darkened(), never in an interrupt.
 class Hooks {
  public:
   virtual void step(int axis, bool positive) = 0;
@@ -28,17 +28,17 @@ class Hooks {
 
 class Core {
  public:
-  // boot_id: a number that differs between starts; a host tells by it that counters were lost.
+  // boot_id: a number that differs between starts; it shows a host that counters were lost.
   Core(Hooks& hooks, uint32_t boot_id);
-  // Laser off, banner out. Call once, before anything else.
+  // Switches the laser off and sends the banner. Call once, before all other functions.
   void start(uint64_t now_us);
-  // Takes one byte from the host.
+  // Receives one byte from the host.
   void receive(uint8_t byte, uint64_t now_us);
-  // Does what is due by now: one step of an axis at most, laser and trigger off. To be called all the time.
+  // Performs the actions due by now: at most one step of an axis, laser and trigger off. Must be called continuously.
   void loop(uint64_t now_us);
-  // When loop() has something to do again, should nothing happen before.
+  // Time at which loop() is due next, if no request arrives before.
   uint64_t next_us() const;
-  // The board has switched the laser off by itself, because loop() did not come round.
+  // Records that the board has switched the laser off because loop() was late.
   void darkened();
 
  private:

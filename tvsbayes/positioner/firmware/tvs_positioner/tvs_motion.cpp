@@ -1,20 +1,20 @@
-// Motion of tvs_core: ramps, limit switches, homing, laser and trigger on time. Every delay counts from the moment of
-// the step before it, so a main loop that was held up goes on late and never makes steps up in a burst.
+// Motion of tvs_core: ramps, limit switches, homing, timing of laser and trigger. Every delay counts from the preceding
+// step, so that a delayed main loop continues late and never catches up with a burst of steps.
 #include "tvs_core.h"
 
 namespace tvs {
 
 namespace {
 
-// Speed at which the motors start and stop without a ramp, and that of homing; steps per second.
+// Speed at which the motors start and stop without a ramp, and speed of the last approach in homing; steps per second.
 const uint32_t kStartSpeed = 200, kHomeSlowSpeed = 50;
-// Steps beyond the release of a home switch; the most that one axis may travel while homing, and the most of it with a
-// limit switch open from the start: back from behind a switch, not into the stop with a broken wire.
+// Steps beyond the release of a home switch; largest travel of one axis while homing; the same with a limit switch
+// open from the start: it leaves the switch without reaching the end stop, should a wire be broken.
 const int32_t kHomeClear = 20, kHomeTravelMax = 20000, kHomeOpenMax = 200;
-// A home switch counts as pressed after one reading and this many more, so far apart (us): spikes are not zeros.
+// A home switch counts as pressed after one reading and this many more at this interval (us): spikes are rejected.
 const int32_t kHomeReads = 4;
 const uint32_t kHomeReadUs = 500;
-// A limit switch that opens at rest counts after this long (us).
+// A limit switch that opens at rest counts after this time (us).
 const uint32_t kLimitOpenUs = 5000;
 
 uint32_t square_root(uint32_t value) {
@@ -152,10 +152,10 @@ void Core::step_axis(int index, uint64_t now_us) {
     axis.direction = 0;
     return finish_if_at_rest();
   }
-  // A motor that was left waiting stands: it starts up the ramp again.
+  // A motor whose step is late has stopped: the ramp restarts.
   const bool stalled = now_us - axis.due_us > delay_us(0);
   int32_t level = stalled ? 0 : axis.level + 1;
-  // Slow down so that the last step is done at the starting speed.
+  // Decelerate so that the last step is done at the starting speed.
   if (level > top_level()) level = top_level();
   if (level > remaining - 1) level = remaining - 1;
   axis.level = level;
@@ -221,8 +221,8 @@ void Core::home_step(uint64_t now_us) {
   hooks_.step(home_axis_, positive);
   axis.position += positive ? 1 : -1;
   axis.target = axis.position;
-  // Homing also leads back from an open limit, a little way; one that opens on the way means that no home switch will
-  // come.
+  // Homing may begin behind an open limit switch and leave it; a limit switch that opens on the way means that the home
+  // switch was missed.
   const bool limit = hooks_.limit_switch(home_axis_);
   ++home_travel_;
   if (limit && (!home_limit_ || home_travel_ > kHomeOpenMax)) return halt(kAlarm, "limit");
@@ -253,7 +253,7 @@ void Core::home_read(uint64_t now_us) {
 }
 
 void Core::home_found(uint64_t now_us) {
-  // Behind an open limit the switch of a homed axis cannot lie: a wire is broken, or the wrong switch was found.
+  // The home switch is never beyond an open limit: a wire is broken, or the wrong switch was found.
   if (home_axis_ == kTilt ? limit_open() : hooks_.limit_switch(kPan)) return halt(kAlarm, "limit");
   Axis& axis = axes_[home_axis_];
   const int32_t home = settings_[home_axis_ == kPan ? kHp : kHt];

@@ -1,5 +1,5 @@
-// Positioner firmware for the Teensy 4.1: the board's side of tvs_core. See ../README.md for wiring and flashing.
-// Adapt the pin numbers and the senses below; everything else belongs into the core.
+// Positioner firmware for the Teensy 4.1: the board interface of tvs_core. See ../README.md for wiring and flashing.
+// Adapt the pin numbers and the senses below; all else belongs in the core.
 #include <EEPROM.h>
 #include <IntervalTimer.h>
 
@@ -10,13 +10,13 @@ namespace {
 const uint8_t kStepPin[] = {2, 4}, kDirectionPin[] = {3, 5};  // pan, tilt
 const uint8_t kHomePin[] = {6, 7};   // switch to ground, closed at home
 const uint8_t kLimitPin[] = {8, 9};  // switch to ground, normally closed: a broken wire reads as a limit
-const uint8_t kLaserPin = 10;        // high = light; a 10 kOhm resistor to ground keeps it dark while the board resets
-const uint8_t kTriggerPin = 11;      // high while the order TRIG says so: the cameras' trigger input
+const uint8_t kLaserPin = 10;        // high = laser on; a 10 kOhm resistor to ground keeps it off during a reset
+const uint8_t kTriggerPin = 11;      // high during a pulse of the order TRIG: the cameras' trigger input
 const bool kDirectionHighIsPositive[] = {true, true};
-// Length of a step pulse, and how long the direction stands before it: 0.65 us for a DRV8825, 5 us for a DM542.
+// Length of a step pulse, and set-up time of the direction before it: 0.65 us for a DRV8825, 5 us for a DM542.
 const unsigned kPulseUs = 3, kDirectionSetupUs = 5;
 const uint32_t kStuckMs = 100;
-// Half seconds in which loop() must come round, or the processor resets itself.
+// Number of half seconds within which loop() must be called, or the processor resets itself.
 const unsigned kWatchdogHalfSeconds = 2;
 
 volatile uint32_t alive_ms = 0;
@@ -40,15 +40,15 @@ class Board : public tvs::Hooks {
   void laser(bool on) override { digitalWriteFast(kLaserPin, on ? HIGH : LOW); }
   void trigger(bool on) override { digitalWriteFast(kTriggerPin, on ? HIGH : LOW); }
   void write(const char* data, size_t size) override {
-    // Without a listening host the line is dropped: waiting would stop the motors in mid-ramp.
+    // Without a listening host the line is dropped: waiting would stop the motors within a ramp.
     if (Serial && static_cast<size_t>(Serial.availableForWrite()) >= size) Serial.write(data, size);
   }
 
  private:
-  uint8_t direction_[tvs::kAxes] = {0xFF, 0xFF};  // neither level: the first step sets it
+  uint8_t direction_[tvs::kAxes] = {0xFF, 0xFF};  // neither level, so that the first step sets it
 };
 
-// A number that no earlier start had: a counter in the EEPROM.
+// A number that no earlier start had, from a counter in the EEPROM.
 uint32_t next_boot_id() {
   uint32_t id = 0;
   EEPROM.get(0, id);
@@ -67,7 +67,7 @@ uint64_t now_us() {
   return wraps + now;
 }
 
-// Beside the core's own watchdog: no light when the main loop hangs. The core is told when the loop comes round again.
+// In addition to the core's watchdog: laser off when the main loop hangs. The loop reports it to the core afterwards.
 void dark_when_stuck() {
   if (millis() - alive_ms <= kStuckMs) return;
   digitalWriteFast(kLaserPin, LOW);
@@ -75,7 +75,7 @@ void dark_when_stuck() {
 }
 
 #if defined(__IMXRT1062__)
-// A fault stops every interrupt: the pin goes low here, and the processor's own watchdog resets the board.
+// A fault stops all interrupts: the pin is set low here, and the processor's watchdog resets the board.
 void dark_in_fault() {
   digitalWriteFast(kLaserPin, LOW);
   for (;;) {
@@ -95,7 +95,7 @@ void start_watchdog() {
   feed_watchdog();
 }
 #else
-// Another board has another watchdog: put it here. Without it a crashed processor leaves the laser on.
+// Insert the watchdog of another board here. Without it a crashed processor leaves the laser on.
 void feed_watchdog() {}
 void start_watchdog() {}
 #endif
@@ -136,7 +136,7 @@ void loop() {
   feed_watchdog();
   tell_if_darkened();
   core->loop(now_us());
-  // A flood of bytes must not keep the loop from coming round.
+  // A flood of bytes must not delay the end of loop().
   for (int i = 0; i < 64 && Serial.available() > 0; ++i) {
     core->receive(static_cast<uint8_t>(Serial.read()), now_us());
     core->loop(now_us());
