@@ -142,8 +142,8 @@ def calibrate(
             commands read them from `results` in the campaign's folder.
         model: options beyond the rig's priors.
         sampled: sample the posterior; else only the Laplace approximation is used.
-        tier: "importance" for weighted draws alone, which take seconds, without `posterior.nc` and `chain.npz`; "emcee"
-            for a chain that must agree with them.
+        tier: one of `TIERS`: "importance" for weighted draws alone, which take seconds, without `posterior.nc` and
+            `chain.npz`; else a chain that must agree with them.
         max_minutes: time for sampling.
         resume: continue the chain in the folder.
         seed: seed of all random numbers.
@@ -198,7 +198,7 @@ def _later_stages(sampled: bool, tier: Tier, folder: Path | None) -> dict[str, f
     from tvsbayes.posterior.sampling import sampling_stages
 
     sampling = sum(sampling_stages(tier).values()) if sampled else 0.0
-    filing = WRITING_SECONDS if sampled and tier == CHAIN and folder is not None else 0.0
+    filing = WRITING_SECONDS if sampled and tier != IMPORTANCE and folder is not None else 0.0
     return {SAMPLING: sampling, WRITING: filing, SUMMARISING: SUMMARISING_SECONDS}
 
 

@@ -157,12 +157,13 @@ def test_interrupt_after_the_command_is_130_too(monkeypatch):
 def test_an_interrupted_fit_says_how_to_go_on_where_a_chain_is_kept(say, monkeypatch, blocks, kept):
     """The chain is told of once when it begins; before its first block of steps there is none to keep."""
     from tvsbayes.pipeline import SAMPLING
-    from tvsbayes.posterior.sampling import WALKING
+    from tvsbayes.posterior.sampling import walking
     from tvsbayes.progress import Progress
+    from tvsbayes.results.tiers import CHAIN
 
     def interrupted(*_, progress, **__):
         for _ in range(1 + blocks):
-            progress(Progress(f"{SAMPLING}: {WALKING}", 0.5, 1.0, None))
+            progress(Progress(f"{SAMPLING}: {walking(CHAIN)}", 0.5, 1.0, None))
         raise KeyboardInterrupt
 
     monkeypatch.setattr("tvsbayes.cli.estimate_commands.compile_for", lambda tell: None)

@@ -16,8 +16,9 @@ from support.pseudo_terminal import needs_pseudo_terminals
 
 from tvsbayes.cli.progress_bar import chain_progress
 from tvsbayes.pipeline import FITTING, SAMPLING
-from tvsbayes.posterior.sampling import WALKING
+from tvsbayes.posterior.sampling import walking
 from tvsbayes.progress import Progress, time_left
+from tvsbayes.results.tiers import CHAIN
 
 SCRIPT = """
 import sys, threading
@@ -140,6 +141,6 @@ def test_an_interrupted_fit_says_that_its_chain_is_kept_where_there_is_one(capsy
     with pytest.raises(KeyboardInterrupt), chain_progress("go on with --resume") as show:
         show(Progress(FITTING, 0.5, 1.0, None))
         for _ in range(blocks):
-            show(Progress(f"{SAMPLING}: {WALKING}", 0.7, 2.0, None))
+            show(Progress(f"{SAMPLING}: {walking(CHAIN)}", 0.7, 2.0, None))
         raise KeyboardInterrupt
     assert ("chain.npz; go on with --resume" in capsys.readouterr().err) == said

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from support.two_parameters import AT_MODE, BACKLASH, RATIO, STRETCH, autoregressive, route
 
-from tvsbayes.inference.chain import Chain
+from tvsbayes.inference.chain import GROUPS, Chain
 from tvsbayes.inference.density import Points
-from tvsbayes.inference.diagnosis import AGREEMENT_LIMIT, GROUPS, autocorrelation_steps, diagnose, grouped
+from tvsbayes.inference.diagnosis import AGREEMENT_LIMIT, autocorrelation_steps, diagnose, grouped
 from tvsbayes.inference.importance import Sample
 from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.results.convergence import Importance, NamedValue, Reweighted

@@ -15,8 +15,9 @@ from tvsbayes.errors import InputError, NotConverged
 from tvsbayes.inference.diagnosis import diagnose
 from tvsbayes.posterior.chain import stored_chain
 from tvsbayes.posterior.importance import importance_run
-from tvsbayes.posterior.sampling import DRAWING, WALKING, sample
+from tvsbayes.posterior.sampling import DRAWING, sample, walking
 from tvsbayes.posterior.target import Target
+from tvsbayes.results.tiers import CHAIN
 
 LONG, SHORT, BLOCK = 96, 12, 6
 SEED = 3
@@ -53,8 +54,8 @@ def only_when_long(patch: pytest.MonkeyPatch) -> None:
     """`sample` looks at a resumed chain at once, and under `limits` any chain has converged."""
     judge = diagnose
 
-    def strict(start, chain):
-        result = judge(start, chain)
+    def strict(start, chain, tier):
+        result = judge(start, chain, tier)
         missing = () if len(chain.w) >= SHORT else ("too short",)
         return replace(result, convergence=replace(result.convergence, missing=missing))
 
@@ -88,12 +89,12 @@ def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, mo
     unbroken = sample(fitted, seed=SEED, checkpoint=tmp_path / "unbroken.npz", progress=whole_wait.append)
     assert unbroken.convergence.steps == SHORT
     check_forward(whole_wait)
-    assert doings(whole_wait) == [DRAWING, WALKING] and len(whole_wait) > SHORT // BLOCK
+    assert doings(whole_wait) == [DRAWING, walking(CHAIN)] and len(whole_wait) > SHORT // BLOCK
 
     def interrupt(state):
         told.append(state.doing)
         # Told of once when the chain begins, then after every block.
-        if told.count(WALKING) == 2:
+        if told.count(walking(CHAIN)) == 2:
             raise KeyboardInterrupt
 
     broken = tmp_path / "broken.npz"
@@ -179,6 +180,12 @@ def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
     said = "; ".join(result.convergence.missing)
     for word in ("R-hat", "autocorrelation times"):
         assert word in said
+
+
+@pytest.mark.thorough
+def test_a_chain_of_another_tier_is_not_resumed(fitted, long):
+    with pytest.raises(InputError, match="sampled from other data"):
+        stored_chain(long[1], fitted, SEED, "other")
 
 
 @pytest.mark.thorough

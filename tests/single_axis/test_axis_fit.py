@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from support.axes import FIRST_EDITION, campaign, drawn, random_moves, runs
 
+from tvsbayes.inference import ensemble
+from tvsbayes.results.tiers import CHAIN, RUNS
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove
 from tvsbayes.single_axis.axis_fit import fit_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
@@ -42,6 +44,22 @@ def test_both_tiers_agree_and_a_seed_gives_the_same():
     quick, again = (fit_axis(made, tier="importance", seed=1) for _ in range(2))
     np.testing.assert_array_equal(quick.draws["backlash"], again.draws["backlash"])
     json.dumps(summarise_axis(one).as_json(), allow_nan=False)
+
+
+class OtherRun(ensemble.Run):
+    """The chain of emcee by the name of another tier."""
+
+    tier = "other"
+
+
+@pytest.mark.thorough
+def test_another_tier_is_an_entry_of_runs(monkeypatch):
+    monkeypatch.setitem(RUNS, OtherRun.tier, "ensemble:OtherRun")
+    monkeypatch.setattr(ensemble, "OtherRun", OtherRun, raising=False)
+    made = drawn(3, runs(2), backlash=AxisPrior(0.0, 0.1)).campaign
+    one, other = (fit_axis(made, tier=tier, seed=1) for tier in (CHAIN, OtherRun.tier))
+    assert (one.tier, other.tier) == (CHAIN, OtherRun.tier)
+    np.testing.assert_array_equal(one.draws["backlash"], other.draws["backlash"])
 
 
 def test_nothing_left_to_sample():

@@ -154,7 +154,7 @@ def _print_first(summary: FitSummary) -> None:
     """Print the result of importance sampling on stderr, before the chain that must agree with it."""
     from tvsbayes.report.fit_text import first_text
 
-    for line in first_text(summary).splitlines():
+    for line in first_text(summary, CHAIN).splitlines():
         report_line(line)
 
 

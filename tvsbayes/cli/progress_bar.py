@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from tvsbayes.cli.app import report_line
 from tvsbayes.pipeline import SAMPLING
 from tvsbayes.progress import DelayedDisplay, Progress, Show, Write, time_left
+from tvsbayes.results.tiers import CHAIN
 
 
 @contextmanager
@@ -30,7 +31,7 @@ def waiting() -> Iterator[Show | None]:
 @contextmanager
 def chain_progress(hint: str) -> Iterator[Show]:
     """`waiting` for a fit; after Ctrl-C a line reports that the chain is kept, and how to continue it."""
-    from tvsbayes.posterior.sampling import WALKING
+    from tvsbayes.posterior.sampling import walking
 
     announced = 0
     try:
@@ -38,7 +39,7 @@ def chain_progress(hint: str) -> Iterator[Show]:
 
             def show(state: Progress) -> None:
                 nonlocal announced
-                announced += state.doing == f"{SAMPLING}: {WALKING}"
+                announced += state.doing == f"{SAMPLING}: {walking(CHAIN)}"
                 if show_progress is not None:
                     show_progress(state)
 

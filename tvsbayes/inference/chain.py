@@ -1,10 +1,24 @@
-"""The state of an ensemble chain, from which it continues bit for bit. Arrays are ordered (step, walker, ...)."""
+"""The state of a chain, from which it continues bit for bit; its run by tier; the choice of the better answer.
+
+Arrays of a chain are ordered (step, walker, ...).
+"""
 
 from __future__ import annotations
 
+import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+
+from tvsbayes.inference.importance import Sample
+from tvsbayes.results.convergence import Convergence, Reweighted
+from tvsbayes.results.records import Tier
+from tvsbayes.results.tiers import RUNS
+
+GROUPS = 4
+"""Number of groups of walkers that share no partners: independent chains for R-hat."""
 
 
 @dataclass(frozen=True)
@@ -27,3 +41,35 @@ class Chain:
     invalid: int
     seconds: float
     goal: int
+
+
+class ChainRun(Protocol):
+    """A run of a chain, made with the arguments of `ensemble.Run`."""
+
+    def until_converged(self, seconds: float) -> Sample: ...  # noqa: D102
+
+
+def run_of(tier: Tier) -> Callable[..., ChainRun]:
+    """Load the class that runs a chain of a tier."""
+    module, _, name = RUNS[tier].partition(":")
+    run: Callable[..., ChainRun] = getattr(importlib.import_module(f"tvsbayes.inference.{module}"), name)
+    return run
+
+
+class Judged(Protocol):
+    """A result with a convergence record."""
+
+    @property
+    def convergence(self) -> Convergence | Reweighted: ...  # noqa: D102
+
+
+def better[J: Judged](early: J, walked: J) -> J:
+    """Choose weighted draws or a chain by the better answer, the chain where both are equally good.
+
+    A chain that contradicts the weighted draws leaves neither accepted.
+    """
+    chain, order = walked.convergence, ("accepted", "rough", "laplace")
+    assert isinstance(chain, Convergence)
+    if chain.agreement is not None and not chain.agreement.agrees:
+        return walked
+    return early if order.index(early.convergence.answer) < order.index(chain.answer) else walked

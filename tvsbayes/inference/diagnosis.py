@@ -9,19 +9,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import emcee
 import numpy as np
 
-from tvsbayes.inference.chain import Chain
+from tvsbayes.inference.chain import GROUPS, Chain
 from tvsbayes.inference.density import Density, columns_of
 from tvsbayes.inference.importance import ImportanceRun, Sample, uncertain
 from tvsbayes.inference.summaries import monte_carlo_errors, propagated
+from tvsbayes.inference.walkers import autocorrelation_time
 from tvsbayes.results.convergence import Agreement, Convergence, MonteCarloError, extreme
+from tvsbayes.results.records import Tier
 from tvsbayes.results.tiers import CHAIN
 from tvsbayes.statistics.streams import Stream, random_stream
 
-GROUPS = 4
-"""Number of groups of walkers that share no partners: independent chains for R-hat."""
 RHAT_LIMIT = 1.01
 ESS_LIMIT = 400
 TAU_LIMIT = 50
@@ -88,8 +87,7 @@ def autocorrelation_steps(w: np.ndarray) -> float:
     moved = np.ptp(w, axis=0) > 0
     if not moved.any(axis=0).all():
         return float("inf")
-    every = (w[:, movers, k][:, :, None] for k, movers in enumerate(moved.T))
-    return float(max(emcee.autocorr.integrated_time(x, tol=0, quiet=True)[0] for x in every))
+    return max(autocorrelation_time(w[:, movers, k]) for k, movers in enumerate(moved.T))
 
 
 def steps_wanted(chain: Chain) -> float:
@@ -188,7 +186,7 @@ def chain_errors(
     return monte_carlo_errors(names, propagated(np.stack([quantities[name].reshape(shape) for name in names], axis=-1)))
 
 
-def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
+def diagnose[D: Density](start: ImportanceRun[D], chain: Chain, tier: Tier = CHAIN) -> Sample:
     """Discard the warm-up, thin, draw the quantities integrated out, and judge the remaining chain."""
     density, first = start.density, start.sample
     discarded = len(chain.w) // WARM_UP
@@ -209,7 +207,7 @@ def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
         errors = errors if same.agrees else errors | beside.gaps
     if same is not None and not same.agrees:
         gap = f"by {same.worst.value:.1f} Monte Carlo errors, wanted below {AGREEMENT_LIMIT:g}"
-        missing.append(f"{CHAIN} and importance sampling differ on {same.worst.quantity} {gap}")
+        missing.append(f"{tier} and importance sampling differ on {same.worst.quantity} {gap}")
     convergence = Convergence(
         steps=len(chain.w),
         discarded=discarded,
@@ -230,6 +228,7 @@ def diagnose[D: Density](start: ImportanceRun[D], chain: Chain) -> Sample:
             and not quality.stuck.any()
             and all(error.roughly_known for error in errors.values())
         ),
+        tier=tier,
     )
     weights = np.full(shape, 1 / (walkers * draws))
     return Sample(points, quantities, weights, convergence, chain.seconds)

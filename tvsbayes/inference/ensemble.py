@@ -1,24 +1,23 @@
-"""The ensemble of walkers: its moves, and the run that extends a chain until it has converged.
-
-The walkers form groups that never use one another, so that R-hat compares
-independent chains.
-"""
+"""The run of a chain: extended by steps of its walkers until it has converged."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Protocol
+from dataclasses import replace
+from typing import ClassVar
 
-import emcee
 import numpy as np
 
 from tvsbayes.inference.chain import Chain
 from tvsbayes.inference.density import Density, Proposal
-from tvsbayes.inference.diagnosis import ESS_LIMIT, GROUPS, TAU_LIMIT, diagnose, steps_wanted
+from tvsbayes.inference.diagnosis import ESS_LIMIT, TAU_LIMIT, diagnose, steps_wanted
 from tvsbayes.inference.importance import ImportanceRun, Sample
+from tvsbayes.inference.walkers import Walkers
 from tvsbayes.progress import Advance, OpenEnded
-from tvsbayes.results.convergence import Convergence, Reweighted
+from tvsbayes.results.convergence import Convergence
+from tvsbayes.results.records import Tier
+from tvsbayes.results.tiers import CHAIN
 
 FIRST_CHECK = 200
 GROWTH_RANGE = 1.1, 1.6
@@ -31,40 +30,6 @@ SETTLED = 4
 """A chain with this many times the required effective draws that still disagrees will not come to agree."""
 BLOCK = 50
 CHECKPOINT_SECONDS = 20.0
-
-
-class GroupEvolution(emcee.moves.DEMove):
-    """Differential evolution (ter Braak, Statistics and Computing 16 (2006) 239) within groups of neighbours.
-
-    Both halves of the ensemble, the walkers of even and of odd number, hold the same share of every group: a walker's
-    partners are those of its group in the other half.
-    """
-
-    def __init__(self):
-        # With fewer walkers than twice the dimension, differential evolution explores a subspace only; all other moves
-        # leave it.
-        super().__init__(randomize_split=False, live_dangerously=True)
-
-    def get_proposal(
-        self, s: np.ndarray, c: list[np.ndarray], random: np.random.RandomState
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Propose new positions for the half s, given the other, as `emcee.moves.RedBlueMove` requires."""
-        others = np.split(np.concatenate(c), GROUPS)
-        moved = [
-            super(GroupEvolution, self).get_proposal(half, [other], random)[0]
-            for half, other in zip(np.split(s, GROUPS), others, strict=True)
-        ]
-        return np.concatenate(moved), np.zeros(len(s))
-
-
-def moves(proposal: Proposal) -> list[tuple[emcee.moves.Move, float]]:
-    """Return the proposal's steps and, for the remaining share, differential evolution, which needs no proposal.
-
-    Never emcee 3.1.6's snooker or full-covariance Gaussian: both are biased.
-    """
-    steps = [(emcee.moves.MHMove(step), share) for step, share in proposal.steps]
-    rest = 1 - sum(share for _, share in steps)
-    return [*steps, (GroupEvolution(), rest)] if rest > 0 else steps
 
 
 def lengthening(convergence: Convergence) -> float:
@@ -84,7 +49,12 @@ def next_look(chain: Chain, convergence: Convergence) -> int:
 
 
 class Run[D: Density]:
-    """One call of a sampler: steps in blocks, tests of convergence on a schedule that depends on the chain alone."""
+    """One call of a sampler: steps in blocks, tests of convergence on a schedule that depends on the chain alone.
+
+    A chain of another tier states its name in `tier` and the steps of its walkers in `proposal`.
+    """
+
+    tier: ClassVar[Tier] = CHAIN
 
     def __init__(
         self,
@@ -96,33 +66,28 @@ class Run[D: Density]:
     ):
         self.start, self.keep, self.told, self.began = start, keep, advance, began
         density = start.density
-        self.positions = start.starts(density.walkers)
-        walkers, dimension = self.positions.shape
+        positions = start.starts(density.walkers)
+        walkers, dimension = positions.shape
         if chain is None:
             state = np.random.RandomState(start.seed).get_state()
             empty = np.zeros((0, walkers, dimension))
             chain = Chain(empty, np.zeros((0, walkers)), np.zeros(walkers), state, 0, 0.0, FIRST_CHECK)
         self.before, self.goal, self.saved_at = chain, chain.goal, began
         self.invalid = density.invalid
-        self.sampler = emcee.EnsembleSampler(walkers, dimension, density, moves=moves(start.proposal), vectorize=True)
-        # emcee's wrapper prints the walkers and a traceback for every exception, Ctrl-C among them.
-        self.sampler.log_prob_fn = density
+        self.walkers = Walkers(density, self.proposal, positions, chain)
+
+    @property
+    def proposal(self) -> Proposal:
+        """The proposal whose steps the walkers take."""
+        return self.start.proposal
 
     def chain(self) -> Chain:
         """Return all steps so far, earlier runs included."""
+        chain = replace(self.walkers.chain, goal=self.goal)
+        if len(chain.w) == len(self.before.w):
+            return chain
         seconds = self.before.seconds + time.monotonic() - self.began
-        if self.sampler.iteration == 0:
-            return Chain(**{**vars(self.before), "goal": self.goal})
-        backend = self.sampler.backend
-        return Chain(
-            np.concatenate([self.before.w, backend.get_chain()]),
-            np.concatenate([self.before.log_density, backend.get_log_prob()]),
-            self.before.accepted + backend.accepted,
-            backend.random_state,
-            self.before.invalid + self.start.density.invalid - self.invalid,
-            seconds,
-            self.goal,
-        )
+        return replace(chain, invalid=self.before.invalid + self.start.density.invalid - self.invalid, seconds=seconds)
 
     def save(self) -> None:
         """Write the checkpoint, if one is kept."""
@@ -130,23 +95,10 @@ class Run[D: Density]:
             self.keep(self.chain())
         self.saved_at = time.monotonic()
 
-    def advance(self, steps: int) -> None:
-        """Continue from the last whole step, with the generator's state there."""
-        if self.sampler.iteration:
-            state = self.sampler.get_last_sample()
-        elif len(self.before.w):
-            state = emcee.State(
-                self.before.w[-1], log_prob=self.before.log_density[-1], random_state=self.before.random_state
-            )
-        else:
-            state = emcee.State(self.positions, random_state=self.before.random_state)
-        for _ in self.sampler.sample(state, iterations=steps, skip_initial_state_check=True):
-            pass
-
     def look(self) -> tuple[Sample, bool]:
         """Diagnose the sample so far and say whether it is final; else set the next test."""
         chain = self.chain()
-        sample = diagnose(self.start, chain)
+        sample = diagnose(self.start, chain, self.tier)
         convergence = sample.convergence
         assert isinstance(convergence, Convergence)
         if not convergence.missing or hopeless(convergence):
@@ -175,7 +127,7 @@ class Run[D: Density]:
         try:
             while True:
                 steps = min(BLOCK, self.goal - done)
-                self.advance(steps)
+                self.walkers.advance(steps)
                 done += steps
                 elapsed = time.monotonic() - self.began
                 over = elapsed > seconds
@@ -196,22 +148,3 @@ def hopeless(convergence: Convergence) -> bool:
     """Whether a chain far longer than required fails by its disagreement with importance sampling alone."""
     disagrees = convergence.agreement is not None and not convergence.agreement.agrees
     return disagrees and len(convergence.missing) == 1 and SETTLED * lengthening(convergence) <= 1
-
-
-class Judged(Protocol):
-    """A result with a convergence record."""
-
-    @property
-    def convergence(self) -> Convergence | Reweighted: ...  # noqa: D102
-
-
-def better[J: Judged](early: J, walked: J) -> J:
-    """Choose weighted draws or a chain by the better answer, the chain where both are equally good.
-
-    A chain that contradicts the weighted draws leaves neither accepted.
-    """
-    chain, order = walked.convergence, ("accepted", "rough", "laplace")
-    assert isinstance(chain, Convergence)
-    if chain.agreement is not None and not chain.agreement.agrees:
-        return walked
-    return early if order.index(early.convergence.answer) < order.index(chain.answer) else walked

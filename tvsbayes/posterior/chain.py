@@ -25,6 +25,7 @@ from tvsbayes.inference.tables import Followers, Tables
 from tvsbayes.instrument.campaign import input_hashes
 from tvsbayes.posterior.target import Target
 from tvsbayes.posterior.transport import transport
+from tvsbayes.results.records import Tier
 from tvsbayes.results.tiers import CHAIN
 
 CHAIN_KIND = "tvsbayes-chain/"
@@ -33,14 +34,16 @@ CHAIN_BYTES_MAX = 2**32
 """Largest chain file read; it is the user's own and fitted into memory when it was written."""
 
 
-def fingerprint(fit: JointFit) -> str:
-    """Hash all that a chain depends on: data, weights, model options and priors, versions of the packages."""
+def fingerprint(fit: JointFit, tier: Tier = CHAIN) -> str:
+    """Hash all that a chain depends on: data, weights, model options and priors, tier, versions of the packages."""
     digest = hashlib.sha256(json.dumps(input_hashes(fit.campaign), sort_keys=True).encode())
     for array in (*jax.tree.leaves(fit.space), *jax.tree.leaves(fit.arrays), fit.free):
         array = np.asarray(array)
         digest.update(f"{array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes())
     for package in ("tvsbayes", CHAIN, "jax", "numpy"):
         digest.update(f"{package} {version(package)}".encode())
+    if tier != CHAIN:
+        digest.update(tier.encode())
     return digest.hexdigest()
 
 
@@ -86,7 +89,7 @@ def _pool_of(stored: dict[str, np.ndarray], target: Target) -> Pool:
     return Pool(Points(w, log_target, parts), every[:-1], counts, every[-1], int(stored["pool_invalid"]))
 
 
-def write_chain(path: Path, fit: JointFit, start: ImportanceRun[Target], chain: Chain) -> None:
+def write_chain(path: Path, fit: JointFit, start: ImportanceRun[Target], tier: Tier, chain: Chain) -> None:
     """Write a chain and its start, whole or not at all."""
     buffer = io.BytesIO()
     kind, keys, position, has_gauss, gauss = chain.random_state
@@ -94,7 +97,7 @@ def write_chain(path: Path, fit: JointFit, start: ImportanceRun[Target], chain: 
         buffer,
         allow_pickle=False,
         format=CHAIN_FORMAT,
-        fingerprint=fingerprint(fit),
+        fingerprint=fingerprint(fit, tier),
         seed=start.seed,
         **_pool_arrays(start.pool),
         start_seconds=start.sample.seconds,
@@ -111,8 +114,8 @@ def write_chain(path: Path, fit: JointFit, start: ImportanceRun[Target], chain: 
     write_atomically(path, buffer.getvalue())
 
 
-def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun[Target], Chain]:
-    """Read a chain; refuse one of other data, model, priors, versions or seed."""
+def stored_chain(path: Path, fit: JointFit, seed: int, tier: Tier = CHAIN) -> tuple[ImportanceRun[Target], Chain]:
+    """Read a chain; refuse one of other data, model, priors, tier, versions or seed."""
     name = escaped(path.name)
     if not path.exists():
         raise InputError("no-chain", f"{name}: there is no chain to resume", file=name, remedy="run without --resume")
@@ -129,7 +132,7 @@ def stored_chain(path: Path, fit: JointFit, seed: int) -> tuple[ImportanceRun[Ta
             )
         if stored_format != CHAIN_FORMAT:
             raise ValueError(f"format {stored_format!r}")
-        same = str(stored["fingerprint"]) == fingerprint(fit) and int(stored["seed"]) == seed
+        same = str(stored["fingerprint"]) == fingerprint(fit, tier) and int(stored["seed"]) == seed
         target = Target(fit, transport(fit))
         pool, chain, spent = _pool_of(stored, target), _chain_of(stored), float(stored["start_seconds"])
         if not pool.drawn.w.shape[1] == chain.w.shape[2] == target.dimension:

@@ -12,6 +12,7 @@ import numpy as np
 
 from tvsbayes.errors import NotConverged, require_kind
 from tvsbayes.estimators.joint_fit import JointFit
+from tvsbayes.inference.chain import better, run_of
 from tvsbayes.inference.importance import ImportanceRun
 from tvsbayes.posterior.chain import stored_chain, write_chain
 from tvsbayes.posterior.draws import Posterior
@@ -25,14 +26,19 @@ from tvsbayes.results.tiers import CHAIN, IMPORTANCE, TIERS
 MIXTURE_ROUNDS, MIXTURE_MARGIN = 16, 1.5
 """Largest number of rounds of the most probable way of homing where the mixture of all would be rough, and the factor
 on the rounds that the errors of the mixture require."""
-DRAWING, WALKING = "drawing weighted samples", f"sampling with {CHAIN}"
+DRAWING = "drawing weighted samples"
 DRAWN_SECONDS, WALKED_SECONDS = 3.0, 8.0
 """Seconds of the stages, for the progress display."""
 
 
 def sampling_stages(tier: Tier) -> dict[str, float]:
     """Return the stages of sampling with their seconds."""
-    return {DRAWING: DRAWN_SECONDS, WALKING: WALKED_SECONDS if tier == CHAIN else 0.0}
+    return {DRAWING: DRAWN_SECONDS, walking(tier): WALKED_SECONDS if tier != IMPORTANCE else 0.0}
+
+
+def walking(tier: Tier) -> str:
+    """Return the name of the stage of a chain."""
+    return f"sampling with {tier}"
 
 
 def sample(
@@ -50,8 +56,8 @@ def sample(
 
     Args:
         fit: a converged fit.
-        tier: "importance" for weighted independent draws, seconds; "emcee" for a chain that starts from them, is
-            extended until it has converged, and must agree with them.
+        tier: one of `TIERS`: "importance" for weighted independent draws, seconds; else a chain that starts from them,
+            is extended until it has converged, and must agree with them.
         max_minutes: time for this call; a chain that has not converged by then is returned as it is.
         seed: seed of all random numbers. The same fit, seed and versions give the same draws bit for bit.
         checkpoint: file in which the chain is kept as it grows (written whole or not at all), also on Ctrl-C.
@@ -85,7 +91,7 @@ def sample(
     began = time.monotonic()
     with jax.enable_x64(True), Job(sampling_stages(tier), progress) as job:
         if resume and checkpoint is not None:
-            start, chain = stored_chain(checkpoint, fit, seed)
+            start, chain = stored_chain(checkpoint, fit, seed, tier)
         else:
             job.begin(DRAWING)
             start, chain = importance_run(fit, seed, job.at), None
@@ -98,11 +104,10 @@ def sample(
             return early
         if first is not None:
             first(early)
-        from tvsbayes.inference.ensemble import Run, better
-
-        job.begin(WALKING)
-        keep = None if checkpoint is None else partial(write_chain, checkpoint, fit, start)
-        walked = start.density.posterior(Run(start, chain, keep, job.at, began).until_converged(60 * max_minutes), seed)
+        run = run_of(tier)
+        job.begin(walking(tier))
+        keep = None if checkpoint is None else partial(write_chain, checkpoint, fit, start, tier)
+        walked = start.density.posterior(run(start, chain, keep, job.at, began).until_converged(60 * max_minutes), seed)
         convergence = walked.convergence
         assert isinstance(convergence, Convergence)
         agrees = convergence.agreement is None or convergence.agreement.agrees

@@ -303,7 +303,7 @@ def validation_section(e: Evidence) -> Section:
     if sampling is None:
         text.append("The posterior was not sampled: intervals are those of the Laplace approximation.")
     else:
-        checks = sampling_line(sampling), agreement_line(sampling)
+        checks = sampling_line(sampling), agreement_line(sampling, e.fit.summary.tier)
         text += [f"{line}." for line in checks if line is not None]
         items += [f"not reached: {sentence}" for sentence in sampling.missing]
     tables.append(_predicted(e))

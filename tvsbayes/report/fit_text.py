@@ -25,6 +25,7 @@ from tvsbayes.report.result_tables import (
 from tvsbayes.report.tables import TableView
 from tvsbayes.results.convergence import Importance, Sampling
 from tvsbayes.results.estimates import FitSummary, LostMotion, Validation
+from tvsbayes.results.records import Tier
 from tvsbayes.results.tiers import CHAIN
 
 FINE_DEG = 1e-5
@@ -121,7 +122,7 @@ def detail_lines(summary: FitSummary) -> list[Part]:
     if classic_texts:
         lines.append(f"the classic estimator should report, deg/step: {', '.join(classic_texts)}")
     if summary.sampling is not None and summary.sampling.converged:
-        agreement = agreement_line(summary.sampling)
+        agreement = agreement_line(summary.sampling, summary.tier)
         lines += [sampling_line(summary.sampling), *([] if agreement is None else [agreement])]
     if summary.curves is not None:
         lines += lost_motion_lines(summary.curves.lost_motion)
@@ -237,7 +238,7 @@ def importance_line(importance: Importance) -> str:
     return f"{text}Pareto k {importance.pareto_k:.2f}, of results at most {worst.value:.2f}"
 
 
-def agreement_line(sampling: Sampling) -> str | None:
+def agreement_line(sampling: Sampling, tier: Tier | None) -> str | None:
     """Whether chain and importance sampling agree; None without a chain."""
     if sampling.steps is None or sampling.importance is None:
         return None
@@ -245,18 +246,18 @@ def agreement_line(sampling: Sampling) -> str | None:
         return "importance sampling was not accepted: results are those of the chain"
     words = "agree on every result" if sampling.agreement.agrees else "DISAGREE"
     worst = sampling.agreement.worst
-    text = f"{CHAIN} and importance sampling {words}: the largest difference is {worst.value:.1f} Monte Carlo errors"
-    return f"{text} ({worst.quantity})"
+    text = f"{tier or CHAIN} and importance sampling {words}: the largest difference is"
+    return f"{text} {worst.value:.1f} Monte Carlo errors ({worst.quantity})"
 
 
-def first_text(summary: FitSummary) -> str:
-    """Results of importance sampling while the chain runs."""
+def first_text(summary: FitSummary, tier: Tier) -> str:
+    """Results of importance sampling while the chain of a tier runs."""
     sampling = summary.sampling
     if sampling is None or sampling.importance is None:
         return ""
     if not sampling.converged:
-        return f"importance sampling has no answer: {'; '.join(sampling.missing)}; {CHAIN} goes on ..."
-    return terminal(headline_table(summary), f"{importance_line(sampling.importance)}; {CHAIN} goes on ...")
+        return f"importance sampling has no answer: {'; '.join(sampling.missing)}; {tier} goes on ..."
+    return terminal(headline_table(summary), f"{importance_line(sampling.importance)}; {tier} goes on ...")
 
 
 def lost_motion_lines(motions: Mapping[str, Sequence[LostMotion]]) -> list[str]:

@@ -15,11 +15,12 @@ import numpy as np
 
 from tvsbayes.display import Shown, View
 from tvsbayes.errors import NotConverged, TvsError
+from tvsbayes.inference.chain import better, run_of
 from tvsbayes.inference.importance import Sample, weighted_run
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.estimates import CONFLICT_LIMIT, conflict_sentence
 from tvsbayes.results.records import AnswerKind, EstimatorName, Tier
-from tvsbayes.results.tiers import CHAIN
+from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 from tvsbayes.single_axis.axis_campaign import AxisCampaign
 from tvsbayes.single_axis.axis_density import HEADLINE_DRAWS, AxisDensity, headline_functionals
 from tvsbayes.single_axis.axis_mode import AxisMode, find_mode
@@ -260,7 +261,7 @@ def fit_axis(
 
     Args:
         campaign: from `read_axis`.
-        tier: "importance" for weighted draws alone, "emcee" for the chain that must agree with them.
+        tier: one of `TIERS`: "importance" for weighted draws alone, else a chain that must agree with them.
         sampled: sample the posterior; else only the Laplace approximation is used.
         max_minutes: time for the chain.
         seed: seed of all random numbers.
@@ -272,7 +273,7 @@ def fit_axis(
         InputError: too many moves, or angles that wrap.
     """
     model = model_of(campaign, more)
-    stages = {MODE: 1.0, WEIGHING: 2.0 * sampled, WALKING: 8.0 * (sampled and tier == CHAIN), TELLING: 0.5}
+    stages = {MODE: 1.0, WEIGHING: 2.0 * sampled, WALKING: 8.0 * (sampled and tier != IMPORTANCE), TELLING: 0.5}
     with Job(stages, progress) as job:
         job.begin(MODE)
         mode, sample = find_mode(model), None
@@ -281,11 +282,10 @@ def fit_axis(
             run = weighted_run(AxisDensity(model, mode), seed, job.at, ROUNDS_MAX, pilots_max=PILOTS_MAX)
             start_time = time.monotonic()
             sample = run.sample
-            if tier == CHAIN:
-                from tvsbayes.inference.ensemble import Run, better
-
+            if tier != IMPORTANCE:
+                walk = run_of(tier)
                 job.begin(WALKING)
-                sample = better(sample, Run(run, None, None, job.at, start_time).until_converged(60.0 * max_minutes))
+                sample = better(sample, walk(run, None, None, job.at, start_time).until_converged(60.0 * max_minutes))
         job.begin(TELLING)
         rng = random_stream(seed, AxisStream.RESAMPLING)
         if sample is not None and sample.convergence.converged:
