@@ -75,7 +75,7 @@ def examine(
 
     Args:
         rig: the rig file.
-        folder: where campaigns will be written.
+        folder: folder into which campaigns will be written.
         laser: whether the laser may be switched on for one picture; the caller has stated the hazard.
         open_positioner: replaces the rig file's positioner.
         open_camera: replaces the rig file's cameras.

@@ -39,7 +39,7 @@ class EmulatedInstrument(Instrument):
     """A true rig behind an emulated board.
 
     Args:
-        rig, seed, start: as of `Instrument`.
+        rig, seed, start: as in `Instrument`.
         board: runs the firmware.
     """
 

@@ -1,8 +1,8 @@
 """The engine that runs a plan on an instrument: home, place, move, look, each recorded on the disk before the next.
 
-However a run ends (the plan's end, Ctrl-C, a fault of device, camera or disk), the laser is switched off, the end is
-recorded, and the folder is a readable campaign as soon as the first homing is logged. `recorded` derives the completed
-steps from the journal; a resumed run homes into a new segment, asks for the sheet, repeats reference looks and
+However a run ends (the plan's end, Ctrl-C, a fault of device, camera or disk), the laser is switched off and the end is
+recorded. The folder is a readable campaign as soon as the first homing is logged. `recorded` derives the completed
+steps from the journal. A resumed run homes into a new segment, asks for the sheet, repeats reference looks and
 continues with the first step that is not done.
 
 Counters in motor steps, seconds where a name says `_s`, raw px.
@@ -421,7 +421,7 @@ class Acquisition:
         self._log.write(structs.replace(event, time_s=self._log.now_s()))
 
     def _begin_live(self) -> None:
-        """Publishes what does not change during the run."""
+        """Publishes values that do not change during the run."""
         stereo, created = self.rig.stereo, self.journal.records[0].data
         self._live.publish(
             name=str(created.get("name", "")),

@@ -1,6 +1,6 @@
 """Requests to a run: served between two looks; laser off is served at every exchange with the device.
 
-Requests wait in a short queue between a page's thread and the engine's: the page never waits for the engine, and the
+Requests wait in a short queue between a page's thread and the engine's. The page never waits for the engine, and the
 engine reads the queue between two looks; only a paused run waits for the next request.
 
 Each request goes to the device first: it is acknowledged once the device has answered and the journal holds an `asked`

@@ -78,7 +78,7 @@ class Snapshot:
         estimates: oldest first.
         aim: aim of the estimates.
         remarks: events outside the plan, newest last.
-        warnings: for the user.
+        warnings: warnings for the user.
         fault: fault that ended the run.
         reason: reason of the end, "" before.
     """

@@ -1,7 +1,7 @@
 """One look: a picture without laser light, one with it, and the spot found in them by a detector.
 
 The laser is on only between the two pictures, and off afterwards in every case. Light also proves that no picture is
-older than the look, for buffers of any depth: pictures arrive in the order of exposure, so a look waits for the spot to
+older than the look, for buffers of any depth. Pictures arrive in the order of exposure: a look waits for the spot to
 appear after laser-on and to vanish after laser-off. The next look then begins with no lit picture in the buffers, and a
 picture with a spot was exposed during it. A vanished spot also shows that the laser is off; a spot before laser-on is a
 fault.
@@ -50,9 +50,9 @@ class Sighting:
 
     Attributes:
         status: "ok", "undetected", or the reason of refusal.
-        pixels_px: u_left, v_left, u_right, v_right; None where there is no spot.
+        pixels_px: u_left, v_left, u_right, v_right; None without a spot.
         sds_px: their standard uncertainties.
-        correlations: of u and v, left and right.
+        correlations: correlation of u and v, left and right.
     """
 
     status: str

@@ -2,7 +2,7 @@
 
 The result of `plan --given --next` is computed in another process, as is the running estimate: one process fits the
 campaign on the disk and proposes the next looks. A proposal outside the rig's limits is ignored. Where the Laplace
-approximation meets the target, the same process samples the posterior, and only that ends the run: with few looks the
+approximation meets the target, the same process samples the posterior, and only that ends the run. With few looks the
 scales of the noise are uncertain, and Laplace's sds too small. Every change of plan is an event of the journal, so that
 a resumed run has the same plan as the interrupted one.
 """

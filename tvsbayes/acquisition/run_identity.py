@@ -2,8 +2,8 @@
 
 A campaign has one rig: the meaning of its rows must not change between two of its runs. This concerns the content of
 its files ([rig], the stereo calibration) and the meaning of a counter (the driver with its options, the counters at the
-home switches); for a simulated campaign also the definition of the twin ([truth], sheets, the sd of its spots). The
-journal's first event lists these entries, so that a refusal can name the changed one.
+home switches). For a simulated campaign it also concerns the twin ([truth], sheets, the sd of its spots). The journal's
+first event lists these entries, so that a refusal can name the changed one.
 
 Everything else concerns how the instrument is connected and driven: port, baud, devices of the cameras, exposure,
 limits, speeds, settling, watchdog, on the bench also the nominal positions of the sheets, which no estimate uses. It is

@@ -38,7 +38,7 @@ class Outcome:
             all others.
         retries: looks repeated in this run.
         lost_segments: segments in which steps were lost.
-        warnings: for the user.
+        warnings: warnings for the user.
         estimate: the last running estimate, None for none.
     """
 
@@ -73,7 +73,7 @@ class RunLog:
     Attributes:
         recorder: the campaign so far, of all runs.
         behind: why the campaign files lag the journal, "" where they do not.
-        warnings: for the user.
+        warnings: warnings for the user.
     """
 
     def __init__(self, journal: Journal, rig: Rig, utc: Callable[[], datetime.datetime]):

@@ -59,7 +59,7 @@ def acquire(
         estimate: whether the looks so far are fitted while it runs. A simulation waits for every fit.
         adapt: chooses the remaining looks from that fit; `estimate` must have a target.
         vision: how pictures are made and searched; by default left to `detect`, and a simulation gives centroids.
-        terminal: for messages and questions; by default nothing is shown.
+        terminal: output of messages and questions; by default nothing is shown.
         live: publishes the run and receives requests.
         place_command: a program that places the sheet instead of a person.
 

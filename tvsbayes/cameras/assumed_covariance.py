@@ -24,7 +24,7 @@ from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix, rotation_ve
 CORRELATION_FACTOR = 1.1
 """Factor on the sds that hold for independent corners."""
 GUESS_FACTOR = 2.0
-"""Uncertainty of all sds together, as a factor: errors of simulated calibrations are 0.5 to 1.3 times the sds assumed
+"""Uncertainty of all sds together, as a factor. Errors of simulated calibrations are 0.5 to 1.3 times the sds assumed
 from RMS, views and board; halves of two public sets differ by 1.0 to 1.7 times these, focal lengths to T
 (experiments/cameras/assumed_covariance.md)."""
 USUAL_RMS_PX, USUAL_VIEWS, USUAL_BOARD = 0.3, 12, (9, 6)

@@ -1,7 +1,7 @@
 """The effect of an imperfect board on a calibration: corners displaced by micrometres, equally in all views.
 
 Printed and glued boards have such errors. All pictures agree, so the residuals of single views do not show them, but
-the mean residual of each corner over all views does. The estimate stays that of least squares with a perfect grid; its
+the mean residual of each corner over all views does. The estimate stays that of least squares with a perfect grid. Its
 covariance gets the effect of independent displacements of the corners, of the size found in the residuals. mm, px; z
 are the whitened coordinates of `bundle_adjustment`.
 """

@@ -1,13 +1,13 @@
 """The bundle adjustment of a stereo calibration, with the 24 x 24 covariance of its cameras.
 
-Frames: the board's x runs along its columns, y along its rows, z away from the viewer; poses are board to left camera
+Frames: the board's x runs along its columns, y along its rows, z away from the viewer. Poses are board to left camera
 (OpenCV's axes: x right, y down, z along the view), x_right = R x_left + T. mm, rad, px with the integer at a pixel's
 centre.
 
-Board poses are nuisance parameters. At every trial of the camera parameters each board is moved to its own optimum, and
-the remaining derivative is (1 - P) J, P being the projector on the columns of that board's pose (variable projection:
-Golub and Pereyra 1973, in Kaufman's form of 1975). Its normal matrix is the Schur complement of the whole bundle
-adjustment: least squares have 24 parameters for any number of views, and their covariance is marginal.
+Board poses are nuisance parameters. At every trial of the camera parameters each board is moved to its own optimum. The
+remaining derivative is (1 - P) J, P being the projector on the columns of that board's pose (variable projection: Golub
+and Pereyra 1973, in Kaufman's form of 1975). Its normal matrix is the Schur complement of the whole bundle adjustment:
+least squares have 24 parameters for any number of views, and their covariance is marginal.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def reduced_residuals(z: Float[Array, "24"], arrays: BoardArrays) -> Float[Array
 
 
 class _Linear(eqx.Module):
-    """`reduced_residuals` at a point and their Jacobian there."""
+    """`reduced_residuals` and their Jacobian at a point."""
 
     residuals: Float[Array, " residuals"]
     jacobian: Float[Array, "residuals 24"]

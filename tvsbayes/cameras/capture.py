@@ -1,11 +1,11 @@
 """The stereo cameras on OpenCV.
 
 A picture is valid only if its exposure began after the request. Drivers keep old frames in their buffers, and frames
-have no time stamp. Every `grab` therefore first empties the buffers: a buffered frame arrives as fast as it can be
-decoded, a live one at the rate of the camera, which is measured at opening; the first live frames, which may be older,
-are dropped. A camera whose frames never need a wait is refused: they could be of any age. Where decoding takes as long
-as the camera's period, both cases look the same; then the laser driver's test by light decides. Network streams are
-read continuously (`network_stream`).
+have no time stamp. Every `grab` therefore first empties the buffers. A buffered frame arrives as fast as it can be
+decoded, a live one at the camera's rate, which is measured at opening. The first live frames may be older and are
+dropped. A camera whose frames never need a wait is refused: they could be of any age. Where decoding takes as long as
+the camera's period, both cases look the same; then the laser driver's test by light decides. Network streams are read
+continuously (`network_stream`).
 
 Pictures are (height, width, 3), blue, green, red, uint8 or uint16 from the camera: raw pixels, not rectified,
 with full depth. Names with `_s` are in seconds.

@@ -5,7 +5,7 @@ Raw image px with the integer at the centre of a pixel. Two methods: `fit` (`cam
 of the binary region, here taken back to the raw pixels of the format.
 
 Gain and contrast are estimated from the campaign itself, per camera, from third-order (skew) residuals, which a
-symmetric fit does not remove: they have the scale of the spot, are pure noise for any symmetric spot, and average
+symmetric fit does not remove. They have the scale of the spot, are pure noise for any symmetric spot, and average
 demosaicing and the grain of speckle as the centre does. A skewed beam counts as noise and increases the sd. The sd of
 an intensity centroid under speckle alone is contrast / sqrt(8 pi) = 0.2 contrast px for any size of the spot (Gaussian
 spot, independent pixels).

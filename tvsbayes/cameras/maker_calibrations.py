@@ -1,8 +1,8 @@
 """Calibrations in the formats of the makers of stereo cameras, converted to the names of `calibration_names`.
 
-These formats need more than names: cameras are given by the number of a socket and poses by a chain (DepthAI), there is
-one calibration for each size of the pictures (ZED, RealSense), or a pose is in components. Each becomes tables `left`
-and `right` with the pose between them; numbers change only by the transformation that the format defines.
+These formats need more than names. Cameras are given by the number of a socket and poses by a chain (DepthAI), each
+size of the pictures has its calibration (ZED, RealSense), or a pose is in components. Each becomes tables `left` and
+`right` with the pose between them; numbers change only by the transformation that the format defines.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ SPECKLE_CONTRAST_MIN = 0.1
 WIDE_FLOOR_SHARE = 0.02
 """Share of the height that replaces the background in the weights of wide spots, whose noise is mostly shot noise."""
 REACH, REACH_PX = 4.0, 9.0
-"""Distance at which the weights of pixels fade to 0, in sds of the spot plus px: no real beam is Gaussian in its wings,
+"""Distance at which the weights of pixels fade to 0, in sds of the spot plus px. No real beam is Gaussian in its wings,
 and with a sharp edge the centre would depend on the pixels that happen to be inside."""
 
 

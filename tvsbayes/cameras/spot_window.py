@@ -34,7 +34,7 @@ LAMP_SHARE = 0.01
 """Least area, over the picture, of a bright area at the border that counts as a lamp or a window."""
 LAMP_AREA_RATIO, LAMP_HEIGHT_SHARE = 4.0, 0.8
 """A bright area at the border, or larger than any spot, is a lamp or a window if the picture has a spot and the area is
-this many times larger or has at most this share of its height: a laser spot at the border would be brighter than its
+this many times larger or has at most this share of its height. A laser spot at the border would be brighter than its
 own reflections, and not larger."""
 
 
@@ -107,7 +107,7 @@ def patch_around(picture: np.ndarray) -> Patch | str:
         return "too-large"
     # A Gaussian is above a quarter of its peak within a radius of sqrt(2 ln 4) = 1.67 sds.
     sd = SHRINK * sqrt(area / pi) / 1.67
-    # The cell's centre, less the half cell by which the 2 x 2 blur moved it.
+    # The cell's centre, minus the half cell by which the 2 x 2 blur moved it.
     start = (centroids[main] + (column, row) + 0.5) * SHRINK - 0.5 - SHRINK / 2
     block = max(1, int(sd / BLOCKS_PER_SD))
     half = int(min(max((4 if sd < WIDE_SD_PX else 6) * sd + 5, 14), max(height, width)))

@@ -24,8 +24,8 @@ VIEWS_MIN = 3
 START_VIEWS = 30
 """Largest number of views for the start; further views enter the bundle adjustment only."""
 MISMATCH_RATIO, MISMATCH_SHARE = 5.0, 0.01
-"""A view is not a pair if its right corners are farther from those predicted by the left ones and the relative pose of
-most pairs than five times the median over views and than 1 % of the image width."""
+"""Limits of the distance of right corners from those predicted by the left ones and the relative pose of most pairs. A
+view beyond both (medians over views, share of the image width) is not a pair."""
 POSE_CORNERS_MIN = 6
 """Least number of corners seen by both cameras in a pair for OpenCV's start."""
 DOUBTFUL_START_PX = 0.6

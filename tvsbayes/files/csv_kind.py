@@ -126,7 +126,7 @@ class CsvKind[Row]:
         """The checked cells of a table by column.
 
         Raises:
-            InputError: a cell is no value of its column, or its rule refuses it.
+            InputError: a cell is not a value of its column, or its rule refuses it.
         """
         values = {name: column.values(table) for name, column in self.columns.items()}
         for column in self.columns.values():

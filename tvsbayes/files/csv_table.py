@@ -274,7 +274,7 @@ def append_line(path: Path, columns: Sequence[str], row: Sequence[object]) -> No
     newline at its end gets one first.
 
     Args:
-        path: of the table.
+        path: file of the table.
         columns: names in its first line.
         row: one cell per column; None is empty.
 

@@ -1,8 +1,8 @@
 """Strict TOML and JSON: values read key by key, each error with its line and dotted key; and TOML written.
 
 A TOML file of 40 kB with one key of 20 000 dotted parts occupies `tomllib` for seconds, and deep brackets exhaust the
-stack (CPython gh-149231), so both formats are scanned in linear time before they are parsed. The module does not depend
-on the content of campaigns; lines count from 1.
+stack (CPython gh-149231). Both formats are therefore scanned in linear time before they are parsed. The module does not
+depend on the content of campaigns; lines count from 1.
 """
 
 from __future__ import annotations

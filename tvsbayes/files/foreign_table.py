@@ -105,7 +105,7 @@ def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
 
     Args:
         path: a CSV or XLSX file of at most 64 MiB and 200 000 rows.
-        sheet: of an XLSX file; by default the first that holds anything.
+        sheet: sheet of an XLSX file; by default the first with content.
 
     Raises:
         InputError: unreadable, no table, too large, or another kind of file.
@@ -136,11 +136,11 @@ def read_foreign(path: Path, sheet: str | None = None) -> ForeignTable:
 
 
 def table_of(file: str, kind: str, columns: Mapping[str, Sequence[object]], lines: Sequence[int]) -> ForeignTable:
-    """A table of the values of another kind of log, as `read_foreign` makes it.
+    """Make a table from the values of another kind of log, as `read_foreign` does.
 
     Args:
         file: name of the log, for messages.
-        kind: what it is, in words.
+        kind: kind of log, in words.
         columns: values by name; None is an empty cell.
         lines: the line of the log for each row.
     """
@@ -149,7 +149,7 @@ def table_of(file: str, kind: str, columns: Mapping[str, Sequence[object]], line
 
 
 def is_foreign(head: bytes) -> bool:
-    """Whether the first bytes are those of a foreign table: a workbook, UTF-16, other separators."""
+    """Whether the first bytes show a foreign table: a workbook, UTF-16, other separators."""
     marks = (b"PK\x03\x04", *(mark for mark, codec, _ in _MARKS if codec != "utf-8-sig"))
     return head.startswith(marks) or re.search(rb"[;\t|]", head.partition(b"\n")[0]) is not None
 
@@ -157,7 +157,7 @@ def is_foreign(head: bytes) -> bool:
 def text_of(
     data: bytes, file: str, allowed: str = "a table as CSV (text) or XLSX", remedy: str = "export the table as CSV"
 ) -> tuple[str, str]:
-    """The text and the name of its encoding; `allowed` and `remedy` are those of its refusal of binary data."""
+    """Decode a text and name its encoding; `allowed` and `remedy` are used in the refusal of binary data."""
     marked = [(codec, name) for mark, codec, name in _MARKS if data.startswith(mark)]
     codec, name = marked[0] if marked else ("utf-8", "UTF-8")
     if not marked and b"\0" in data[:200]:
@@ -165,7 +165,7 @@ def text_of(
     try:
         text = data.decode(codec)
     except UnicodeDecodeError:
-        # Every byte is a letter in it: only names of columns can come out wrong.
+        # In this encoding every byte is a character: only column names can be decoded wrongly.
         text, name = data.decode("cp1252", errors="replace"), "Windows-1252"
     if control := CONTROL.search(text):
         line = text.count("\n", 0, control.start()) + 1
@@ -174,9 +174,9 @@ def text_of(
 
 
 def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | None:
-    """Rows of a file whose lines are "name: value" pairs, as a serial monitor shows them; None of any other file.
+    """Rows of a file whose lines are "name: value" pairs, as in a serial monitor; None for any other file.
 
-    A repeated name begins a new row; a clock before the lines becomes seconds since the first row.
+    A repeated name begins a new row; a time of day before the lines becomes seconds since the first row.
     """
     names: dict[str, None] = {}
     rows: list[tuple[int, dict[str, str]]] = []
@@ -217,9 +217,9 @@ def _paired_rows(text: str) -> tuple[list[tuple[int, list[str]]], list[str]] | N
 
 
 def _without_heading(rows: list[tuple[int, list[str]]]) -> tuple[list[tuple[int, list[str]]], list[str]]:
-    """The rows from the names of the columns on, and a note on the lines above them.
+    """The rows from the column names on, and a note on the lines above them.
 
-    The names are in the first row that is at least as wide as most rows, and are no numbers. It may be wider: a last
+    The names are in the first row that is at least as wide as most rows, and are not numbers. It may be wider: a last
     column of remarks is empty in most rows.
     """
 
@@ -246,7 +246,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
-    """Rows with their lines, and the name of the separator; lines that begin with # or % are remarks."""
+    """Rows with their line numbers, and the name of the separator; lines that begin with # or % are remarks."""
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
     declared = next((line[4:5] for _, line in lines[:1] if line.lower().startswith("sep=")), None)
     body = [(n, line) for n, line in lines if line.strip() and not line.startswith(("#", "%"))][declared is not None :]
@@ -276,10 +276,10 @@ def _csv_rows(text: str, file: str) -> tuple[list[tuple[int, list[str]]], str]:
 
 
 def _refuse_wide(rows: Sequence[tuple[int, list[str]]], separator: str, file: str) -> None:
-    """Refuse rows with more cells than the first row has: every cell after a divided one is under a wrong name.
+    """Refuse rows with more cells than the first row: all cells after a divided one are under wrong names.
 
     Raises:
-        InputError: such a row; empty cells at its end do not count.
+        InputError: there is such a row; empty cells at its end do not count.
     """
     filled = [(line, cells) for line, cells in rows if any(cells)]
     width = len(filled[0][1]) if filled else 0
@@ -299,8 +299,8 @@ def _refuse_wide(rows: Sequence[tuple[int, list[str]]], separator: str, file: st
 def _separator(lines: Sequence[str]) -> str:
     """The first separator that gives nine of ten lines the same number of cells, two or more.
 
-    The first lines are tried, then the last. If none fits, some row is damaged: then the first separator that divides
-    most lines and the names, else commas.
+    The first lines are tried, then the last. If none fits, some row is damaged; the result is then the first separator
+    that divides most lines and the names, else commas.
     """
     for sample in (lines[:ROWS_TRIED], lines[-ROWS_TRIED:]):
         widths = {s: [len(line.split(None if s == " " else s)) for line in sample] for s in SEPARATORS}
@@ -309,14 +309,14 @@ def _separator(lines: Sequence[str]) -> str:
         frequent = (s for s, (cells, count) in modes.items() if 1 < cells == widths[s][0] and 2 * count > len(sample))
         if separator := next(regular, None) or next(frequent, None):
             return separator
-    # A short table below a heading: names and rows alone are divided.
+    # In a short table below a heading only names and rows are divided.
     totals = {s: Counter(len(line.split(None if s == " " else s)) for line in lines) for s in SEPARATORS}
     divided = {s: max(((n, c) for c, n in w.items() if c > 1), default=(0, 0)) for s, w in totals.items() if s != " "}
     return next((s for s, (count, _) in divided.items() if 2 * count > len(lines)), ",")
 
 
 def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[int, list[str]]], list[str]]:
-    """Rows of one sheet of an XLSX file: values, not formulas."""
+    """Read the rows of one sheet of an XLSX file: values, not formulas."""
     refuse = partial(refusal, file=file)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -330,7 +330,7 @@ def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[i
     import openpyxl
 
     with warnings.catch_warnings():
-        # Warnings of unknown styles and validation rules.
+        # The warnings concern unknown styles and validation rules.
         warnings.simplefilter("ignore")
         try:
             book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
@@ -340,7 +340,7 @@ def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[i
                 listed = ", ".join(escaped(name) for name in names)
                 raise refuse("sheet", found=f"no sheet {escaped(sheet)}", allowed=listed, remedy="name one of them")
             for name in [sheet] if sheet is not None else names:
-                # Else the size that a sheet states is believed, and rows are filled up to it.
+                # Otherwise rows would be filled up to the size that the sheet states.
                 book[name].reset_dimensions()
                 rows = _cells(book[name].iter_rows(values_only=True), file)
                 if any(any(cells) for _, cells in rows):
@@ -348,7 +348,7 @@ def _sheet_rows(data: bytes, file: str, sheet: str | None) -> tuple[list[tuple[i
         except InputError:
             raise
         except Exception as error:
-            # A damaged file can make the library raise anything.
+            # A damaged file can make the library raise any exception.
             found = escaped(str(error), 120)
             raise refuse("kind", found=found, allowed="CSV or XLSX", remedy="save it as CSV") from error
     return rows, [f"XLSX, sheet {escaped(str(name))}"]
@@ -367,7 +367,7 @@ def _cells(rows: Iterable[tuple[object, ...]], file: str) -> list[tuple[int, lis
 
 
 class _Number(str):
-    """A cell that a workbook holds as a number: it has a decimal point whatever the notation of texts."""
+    """A cell stored as a number in a workbook: it has a decimal point for any notation of texts."""
 
 
 def _cell(value: object) -> str:
@@ -385,7 +385,7 @@ def _cell(value: object) -> str:
 
 
 def _table(file: str, rows: Sequence[tuple[int, list[str]]], description: list[str]) -> ForeignTable:
-    """Rows of equal length under their names, numbers with points."""
+    """Make a table of rows of equal length under their names, with decimal points."""
     width = max(len(cells) for _, cells in rows)
     if width > COLUMNS_MAX:
         allowed, remedy = f"at most {COLUMNS_MAX} columns", "save the table alone in a file"
@@ -399,7 +399,7 @@ def _table(file: str, rows: Sequence[tuple[int, list[str]]], description: list[s
         description, body = [*description, "units in the row below the names"], body[1:]
     cells = [cell for _, row in body for cell in row if not isinstance(cell, _Number)]
     commas = any(_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell) for cell in cells)
-    # No notation has both "1.5" and "1,5": such cells stay as they are and are refused where a number is needed.
+    # No notation has both "1.5" and "1,5": such cells are unchanged and refused where a number is needed.
     mixed = commas and any("." in cell and NUMBER.fullmatch(cell) for cell in cells)
     if commas and not mixed:
         description = [*description, "decimal commas"]
@@ -428,7 +428,7 @@ def _unique(names: Sequence[str]) -> list[str | None]:
 
 
 def _with_point(cell: str, commas: bool) -> str:
-    """A number with a decimal point and no marks between thousands; any other cell as it is."""
+    """A number with a decimal point and no marks between thousands; other cells are unchanged."""
     if isinstance(cell, _Number):
         return str(cell)
     if commas and (_COMMA.fullmatch(cell) or _GROUPED_COMMA.fullmatch(cell)):

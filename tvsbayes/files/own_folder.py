@@ -27,7 +27,7 @@ class OwnFolder:
     """A folder of sealed files.
 
     Attributes:
-        path: of the folder; `make` creates it.
+        path: path of the folder; `make` creates it.
         file_bytes_max: larger files are not read.
         bytes_max: largest total size; `write` removes the files used longest ago.
     """
@@ -71,7 +71,7 @@ class OwnFolder:
                 if not stat.S_ISREG(status.st_mode) or _others_may_change(status):
                     return None
                 data = stream.read(self.file_bytes_max + 1)
-            # The time of last use, by which `write` chooses what to remove.
+            # The time of last use, by which `write` chooses the files to remove.
             os.utime(self.path / name)
         except OSError:
             return None

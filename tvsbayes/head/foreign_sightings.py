@@ -105,7 +105,7 @@ def sightings_of_table(
         falling: axes whose joint angle decreases where azimuth or elevation grows; such angles are joint angles.
 
     Raises:
-        InputError: a cell that is no value of its field, or the table has no row.
+        InputError: a cell is not a value of its field, or the table has no row.
     """
     table.require_rows()
     assumed: list[str] = []

@@ -312,7 +312,7 @@ def with_pixels(
         status: "ok", or the reason for no spot.
         pixels_px: u_left, v_left, u_right, v_right.
         sds_px: their standard uncertainties.
-        correlations: of u and v, left and right.
+        correlations: correlation of u and v, left and right.
     """
     columns = (*PIXELS, *PIXEL_SDS, "ruv_left", "ruv_right")
     values = dict(zip(columns, (*pixels_px, *sds_px, *correlations), strict=True))

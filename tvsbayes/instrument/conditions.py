@@ -33,7 +33,7 @@ def check_power(keys: Keys, header: Mapping[str, object]) -> None:
     """Refuse a `powered_on` that cannot be placed on the clock of the moves.
 
     Raises:
-        InputError: `powered_on` or `created` is no time, only one has a time zone, or `created` is earlier.
+        InputError: `powered_on` or `created` is not a time, only one has a time zone, or `created` is earlier.
     """
     if "powered_on" not in header:
         return
@@ -65,7 +65,7 @@ def warm_minutes(moves: Sequence[TimedMove], switched_on_s: float | None = None)
 
 
 def kelvin(moves: Sequence[TimedMove]) -> np.ndarray:
-    """Temperatures less that of the first move, shape (moves,), as of `kelvin_at`; zero where none are known."""
+    """Temperatures minus that of the first move, shape (moves,), as in `kelvin_at`; zero where none are known."""
     times_s = np.array([move.time_s for move in moves], dtype=float)
     clock = times_s if np.ptp(times_s) > 0 else np.arange(len(moves), dtype=float)
     temperatures = kelvin_at(moves, clock, clock)
@@ -73,12 +73,12 @@ def kelvin(moves: Sequence[TimedMove]) -> np.ndarray:
 
 
 def kelvin_at(moves: Sequence[TimedMove], times: np.ndarray, clock: np.ndarray) -> np.ndarray | None:
-    """Temperatures at times (n,) less that of the first move, linear in time between those recorded.
+    """Temperatures at times (n,) minus that of the first move, linear in time between those recorded.
 
     Constant before the first and after the last recorded one; None where fewer than two were recorded.
 
     Args:
-        moves: with their temperatures.
+        moves: moves with their temperatures.
         times: shape (n,), on the same clock as `clock`.
         clock: times of the moves.
     """

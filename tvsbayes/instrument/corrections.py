@@ -52,7 +52,7 @@ class CorrectedTables:
 
     Attributes:
         moves, spots: rows of `moves.csv` and `spots.csv`; None where the table is missing.
-        changes: what was changed, in words.
+        changes: the changes, in words.
     """
 
     moves: tuple[Move, ...] | None

@@ -295,7 +295,7 @@ def readable(text: str, prefix: str, chars_max: int) -> str:
     """A cell's text as this package's tables allow it: printable, on one line, not a spreadsheet formula.
 
     Args:
-        text: of the cell.
+        text: text of the cell.
         prefix: put before a text that begins with = + - or @; removing the signs would make "-50" and "50" equal.
         chars_max: longer texts are cut.
     """

@@ -90,7 +90,7 @@ def looks_of(
         known_moves: existing moves, for a table of looks alone.
 
     Raises:
-        InputError: a cell that is no value of its field; looks whose moves are unknown.
+        InputError: a cell is not a value of its field, or the moves of looks are unknown.
     """
     cells = FieldCells(table, columns)
     table.require_rows()
@@ -135,7 +135,7 @@ def moves_of_rows(cells: FieldCells, notation: Notation, assumed: list[str]) -> 
     """Derive the moves of a table with counters; assumptions are appended to `assumed`.
 
     Raises:
-        InputError: a cell that is no value of its field.
+        InputError: a cell is not a value of its field.
     """
     count = len(cells.table)
     counters = list(zip(*(cells.read(MOVES[field]) for field in COUNTERS), strict=True))

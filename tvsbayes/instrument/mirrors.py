@@ -33,7 +33,7 @@ class Vectors(NamedTuple):
 
     @classmethod
     def of(cls, stacked: Numbers) -> Vectors:
-        """From one array of shape (3, ...) whose first axis is x, y, z."""
+        """Build from one array of shape (3, ...) whose first axis is x, y, z."""
         return cls(stacked[0], stacked[1], stacked[2])
 
     def stacked(self) -> Numbers:

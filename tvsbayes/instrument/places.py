@@ -1,7 +1,7 @@
 """Places of the gears: counters at which errors that repeat by position are estimated. NumPy.
 
 With a few counters, each is exactly a place of its own. With many, the processes are defined at regular places over the
-observed range, and each counter has shares in the four nearest (cubic interpolation): places 2.7 deg apart represent an
+observed range, and each counter has shares in the four nearest (cubic interpolation). Places 2.7 deg apart represent an
 error of correlation length 8 deg within 4 % of its sd, a thousandth of its variance.
 """
 
@@ -55,7 +55,7 @@ class SeenPlaces:
 
     @property
     def none(self) -> SeenPlaces:
-        """No place, of the same looks."""
+        """The same looks without any place."""
         return SeenPlaces(self.steps[:0], self.on_tilt[:0], self.error_share[:, :0], self.play_share[:, :0])
 
 

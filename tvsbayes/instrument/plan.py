@@ -96,7 +96,7 @@ def read_plan(path: Path, sheets: bool = True) -> tuple[PlanStep, ...]:
     """Read `plan.csv`: home (counters default to 0), place, move and look steps in order.
 
     Args:
-        path: of the file.
+        path: the file.
         sheets: looks need placed sheets; a head with sightings has no sheets.
 
     Raises:

@@ -288,7 +288,7 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
     """The `[rig]` table with its `[rig.prior]`; absent entries take their defaults.
 
     Args:
-        table: of a campaign or rig file.
+        table: table of a campaign or rig file.
         sightings: for a head with sightings, which has no spots and no stereo pair.
 
     Raises:

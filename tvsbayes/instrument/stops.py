@@ -136,7 +136,7 @@ def one_sided(stops: Sequence[Stop], axis: str) -> str | None:
 def separation(stops: Sequence[Stop], axis: str) -> str | None:
     """Why a ratio and its backlash cannot be separated well, and the simplest remedy.
 
-    With equal errors at every stop the angle is zero(segment) + k n - b sign / 2: the correlation of k and b in this
+    With equal errors at every stop the angle is zero(segment) + k n - b sign / 2. The correlation of k and b in this
     straight line predicts, before any fit, whether the stops separate them.
 
     Returns:

@@ -1,10 +1,10 @@
 """A positioner on a GRBL board: pan is X, tilt is Y, spindle or coolant output switches the laser (`driver = "grbl"`).
 
 Counters are motor steps: machine position times `$100` (`$101`). The board's homing defines zero. GRBL 1.1 has no
-checksum, no sequence numbers and no boot id, so it promises less than this package's firmware: lost steps are not found
-at the next homing, and a computer that dies leaves the laser on, because no watchdog of the board switches it off. The
-driver uses all that GRBL reports: every order waits for its `ok`, arrival is read back, a greeting in mid-run is a
-reset that has lost the counters, an alarm ends the run, and the laser's mode is read back by `$G`.
+checksum, no sequence numbers and no boot id, so it promises less than this package's firmware. Lost steps are not found
+at the next homing; a computer that crashes leaves the laser on, because no watchdog of the board switches it off. The
+driver uses all that GRBL reports. Every order waits for its `ok`, arrival is read back, and `$G` reads back the laser's
+mode; a greeting in mid-run is a reset that has lost the counters, and an alarm ends the run.
 
 Counters in motor steps; seconds where a name says `_s`. Time from a `Clock`, bytes from a `Link`.
 """
@@ -67,7 +67,7 @@ class GrblSettings:
     Attributes:
         laser: the order that switches it on.
         laser_power: `S` of a spindle order, None for the board's full power.
-        unwatched: whether the user accepts that the laser may stay on when the computer dies.
+        unwatched: whether the user accepts that the laser may stay on when the computer crashes.
         limits: soft limits, enforced by this driver.
         speed_steps_per_s: speed of the faster axis, None for the board's own.
     """

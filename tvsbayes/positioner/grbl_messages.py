@@ -105,7 +105,7 @@ class BoardSettings:
     """The settings of `$$` on which this package depends.
 
     Attributes:
-        steps_per_mm: of pan (X) and tilt (Y).
+        steps_per_mm: steps per mm of pan (X) and tilt (Y).
         rate_mm_per_min: top speeds of both axes.
         power_max: `S` of full spindle power.
         ramps_s: time of the slower axis to reach full speed and to stop again.

@@ -96,7 +96,7 @@ class HoldOut(Shown, Record, frozen=True):
         classic: score of the classic estimator.
         joint: score of the joint estimate.
         ratio: rms_block_deg of the classic / that of the joint.
-        interval95: of the ratio, for correlated errors (Pitman, Biometrika 31 (1939) 9; Morgan, ibid. 13;
+        interval95: interval of the ratio, for correlated errors (Pitman, Biometrika 31 (1939) 9; Morgan, ibid. 13;
             about zero, blocks as independent normal pairs); None with fewer than `BLOCKS_MIN` blocks.
         verdict: which estimator predicts better, or "cannot tell".
         reason: reason for the verdict.
@@ -226,7 +226,7 @@ class Change(Record, frozen=True):
 
     Attributes:
         quantity: its key in JSON; an effective ratio there is the local ratio at the pose of the comparison.
-        unit: of the values.
+        unit: unit of the values.
         first, second: estimates of A and B.
         difference: second - first.
         u: its standard uncertainty; errors that both calibrations share are not in it.

@@ -235,7 +235,7 @@ class PeriodEstimate(Record, frozen=True):
 
     Attributes:
         period: for an axis in the unit of the readings, or s; for a scanner in deg of the output.
-        amplitude: of the first harmonic, in the unit of the output; half the difference from crest to trough.
+        amplitude: amplitude of the first harmonic, in the unit of the output; half the difference from crest to trough.
         phase_deg: the wave is highest where 360 x / period is the phase; x is |unit per command| x command, `time_s`,
             or the reading for a wave of the encoder. About its circular mean: intervals may leave -180 to 180.
         source: whether the period was stated or inferred.

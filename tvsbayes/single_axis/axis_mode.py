@@ -1,4 +1,4 @@
-"""Mode of the density of an axis' scales, and its curvature there."""
+"""Mode of the density of an axis' scales, and its curvature at the mode."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CURVATURE_MIN = 0.3
 BOUND = 5.0
 """Limit of coordinates: a standard normal variable exceeds it with probability one in two million."""
 SDS_MAX = 1.0
-"""Largest distance, in standard deviations, from the end of a search to the mode by slope and curvature there. A
+"""Largest distance, in standard deviations, from the end of a search to the mode predicted from slope and curvature. A
 successful search ends within 0.01, at a kink of the play (8.1) within 0.7; a failed one beyond 3, 2.8 or more in log
 density too low."""
 

@@ -31,7 +31,7 @@ class WaveSample:
     Attributes:
         wave: the wave of the model.
         period: on the model's clock, shape (n,).
-        true_period: with the ratio's uncertainty, shape (n,).
+        true_period: period with the ratio's uncertainty, shape (n,).
         coefficients: coefficients of the wave's columns, shape (n, `COLUMNS`).
         probability: probability that the wave exists.
         record: range of the readings on the clock of the wave; the phase is known best at its middle.

@@ -433,7 +433,7 @@ def _redrawn(legs: Legs, moves: np.ndarray) -> np.ndarray:
 class PlayPlaces:
     """Positions of the output in the play; shapes (n or 1, rows).
 
-    While a leg is lost in the play, the output stays where an earlier move left it: `anchor` is the command of that
+    While a leg is lost in the play, the output stays where an earlier move left it. `anchor` is the command of that
     move, `path` the commands travelled up to it, `side` its position in the play then, in halves of the play. Where
     the side at the start of a segment is unknown, all are means of the two possible ends.
 

@@ -166,7 +166,7 @@ def readings_of(table: ForeignTable, columns: Mapping[str, str], deviations: boo
         deviations: whether the readings are actual minus commanded position.
 
     Raises:
-        InputError: a cell that is no value of its field, or the table has no row.
+        InputError: a cell is not a value of its field, or the table has no row.
     """
     table.require_rows()
     assumed: list[str] = []
@@ -363,7 +363,7 @@ def unwrapped(wrapped: ForeignReadings, unit: str, counts_per_turn: float | None
 
     Args:
         wrapped: moves and readings.
-        unit: of the readings; other units than of angles are unchanged unless the readings count to a power of two.
+        unit: unit of the readings; non-angles are unchanged unless the readings count to a power of two.
         counts_per_turn: period of the wrapping, in the readings' unit; 0: no wrapping.
 
     Raises:

@@ -1,12 +1,12 @@
 """Waves of known or unknown period in addition to the error by position: their settings and coordinates.
 
 A wave is A cos(2 pi x / P - phase) with a second harmonic. x is the position |unit per command| x command, the time in
-seconds, or the reading itself (a wave of the encoder). Cosines and sines are linear and have a normal prior of sd s,
-the second harmonic has `SECOND` times s; s is half-normal, and with probability 1/2 there is no wave at all.
+seconds, or the reading itself (a wave of the encoder). Cosines and sines are linear and have a normal prior of sd s;
+the second harmonic has `SECOND` times s. s is half-normal, and with probability 1/2 there is no wave.
 Turns of a gear differ slightly: cosine and sine of the first harmonic change over the record, linearly, by a normal
 share of sd `WANDER` of s at its ends. Without this the uncertainty of a period would be too small for real gears.
 
-The posterior has many peaks in s and P: their coordinates with a standard normal prior are quantiles of tables close to
+The posterior has many peaks in s and P. Their coordinates with a standard normal prior are quantiles of tables close to
 their posterior (`period_search`), and the ratio of prior to table is part of the density. The draws therefore have
 exact weights for any tables. Without a wave its period follows its table (pseudo-prior: Carlin and Chib, J. R. Stat.
 Soc. B 57 (1995) 473). Periods in the unit of their clock. NumPy.

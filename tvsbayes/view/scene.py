@@ -117,7 +117,7 @@ class Scene:
         gears: repeatable errors of the gears over the counters; none where they do not vary.
         parameters: values with their uncertainty.
         correlated: names of the rows and columns of `correlation`.
-        correlation: of the estimated parameters, shape (p, p).
+        correlation: correlation of the estimated parameters, shape (p, p).
     """
 
     name: str
@@ -163,7 +163,7 @@ def scene(campaign: Campaign, fitted: Fitted | None = None, notes: Sequence[str]
     """Make the scene of a campaign.
 
     Args:
-        campaign: with or without usable spots.
+        campaign: campaign with or without usable spots.
         fitted: results of exactly this campaign; None shows the rig stated in `campaign.toml`.
         notes: remarks for the reader.
     """
