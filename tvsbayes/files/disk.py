@@ -333,8 +333,7 @@ def read_arrays(path: Path, bytes_max: int) -> dict[str, np.ndarray]:
 
     Raises:
         InputError: as `read_bytes`.
-        ValueError: not an .npz of plain numbers and text as NumPy writes it, or more than `bytes_max` bytes, packed or
-            unpacked.
+        ValueError: not an .npz of plain numbers and text as NumPy writes it, or above `bytes_max`, packed or unpacked.
     """
     data = read_bytes(path, bytes_max)
     arrays = {}

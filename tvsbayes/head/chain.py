@@ -1,10 +1,9 @@
 """The line of sight of a head with two geared axes by exact rotations, for Python floats, NumPy and JAX.
 
 Lengths in mm, angles in rad. The frame is P of `instrument.mirrors`: z up, azimuth counted from x towards y, as the pan
-counter. Two small angles give the direction of the azimuth axis in it; elevation axis and beam depend on that axis. To
-first order the additions to the axes' angles are TPOINT's terms (P. T. Wallace, TPOINT - Telescope Pointing Analysis
-System, terms IA IE AN AW NPAE CA TF TX), with their signs, A the azimuth from north (x) through east (y) and E the
-elevation:
+counter. Two small angles tilt the azimuth axis in it; elevation axis and beam follow that axis. To first order the
+additions to the axes' angles are TPOINT's terms (P. T. Wallace, TPOINT - Telescope Pointing Analysis System, terms
+IA IE AN AW NPAE CA TF TX), with their signs, A the azimuth from north (x) through east (y) and E the elevation:
 
     dA = -IA - AN sin A tan E - AW cos A tan E - CA sec E - NPAE tan E
     dE = IE - AN cos A + AW sin A - TF cos E - TX cot E

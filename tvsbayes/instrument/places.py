@@ -44,8 +44,7 @@ class SeenPlaces:
         steps: counters, shape (c,).
         on_tilt: places of the tilt axis, shape (c,).
         error_share: share of each look in the transmission error at each place, shape (looks, c).
-        play_share: share of each look in the play at each place: half of it, with the sign opposite to the side of
-            approach.
+        play_share: likewise in the play: half of it, with the sign opposite to the side of approach.
     """
 
     steps: np.ndarray
