@@ -75,7 +75,7 @@ def calibration_of_draws(
     if gears is not None:
         inputs = np.concatenate([inputs, gears.expected + gears.left_open], axis=1)
     mean = inputs.mean(axis=0)
-    # Means of errors without any information are zero but for rounding.
+    # Means of errors without any information are zero except for rounding.
     mean[len(INPUT_NAMES) + np.array([part.stop - 1 for part in table.parts.values()], dtype=int)] = 0.0
     return Calibration(
         mean=mean,

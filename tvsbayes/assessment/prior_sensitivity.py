@@ -45,8 +45,8 @@ class NormalModel:
     Attributes:
         mean: shape (d,).
         precision: precision, including that of the priors (the identity), shape (d, d).
-        gradient: of the headlines, shape (quantities, d).
-        sd: of the headlines, shape (quantities,).
+        gradient: gradients of the headlines, shape (quantities, d).
+        sd: standard deviations of the headlines, shape (quantities,).
     """
 
     mean: np.ndarray

@@ -83,7 +83,7 @@ def _seen_rests(fit: JointFit, axis: str, residual: np.ndarray) -> list[_SeenRes
         rows_of.setdefault(rests[spot.move], []).append(row)
     entries = []
     for rest, every in rows_of.items():
-        # A variance of 0: the spot tells neither angle.
+        # A variance of 0: the spot determines neither angle.
         rows = np.array([row for row in every if valid[row] > 0 and variance[row] > 0], dtype=int)
         if len(rows):
             weight = 1 / variance[rows]

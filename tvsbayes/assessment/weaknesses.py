@@ -44,7 +44,7 @@ def _backlash_direction(fit: JointFit, axis: str, direction: str) -> WeakDirecti
         return None
     ratio = fit.draws.effective_deg_per_step[:, DIRECTIONS.index(direction)]
     if np.ptp(ratio) == 0:
-        # Fixed by the priors, hence uncorrelated with the backlash.
+        # Fixed by the priors and so uncorrelated with the backlash.
         return None
     correlation = float(np.corrcoef(ratio, fit.draws.physical[:, index])[0, 1])
     stops = observed_stops(fit.campaign.moves, _used_moves(fit), axis)

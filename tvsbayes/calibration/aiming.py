@@ -1,4 +1,4 @@
-"""The optics backwards: mirror angles and counters that send the beam to a point or along a direction.
+"""Inverse optics: mirror angles and counters that aim the beam at a point or along a direction.
 
 Frame T (see `optics`), mm, degrees, counters in steps; best estimates in Python floats, one target at a time.
 """
@@ -21,20 +21,20 @@ AIM_STEPS, AIM_RAD = 40, 1e-11
 
 @dataclass(frozen=True, repr=False)
 class Steps(Shown):
-    """Counters that send the beam where it is wanted.
+    """Counters that aim the beam at a target.
 
     Attributes:
         pan_steps, tilt_steps: absolute counters.
         approach: last move of each axis, (left or right, up or down).
-        via_pan_steps, via_tilt_steps: go there first: the move on from there takes up all play with a probability of
-            `CLEARED_PROBABILITY`.
+        via_pan_steps, via_tilt_steps: counters to go to first; the move from there takes up all play with a probability
+            of `CLEARED_PROBABILITY`.
         ray: the beam at these counters.
-        xyz_mm: the point on it that is nearest to the wanted one, or None for a wanted direction.
-        aperture_deg: what the aperture should read there, or None.
-        rounding_mm, rounding_deg: distance from the wanted point or direction that whole steps leave.
+        xyz_mm: the point on it nearest to the target, or None for a direction.
+        aperture_deg: expected reading of the aperture there, or None.
+        rounding_mm, rounding_deg: distance from the target due to whole steps.
         u95_mm, u95_deg: 95 % half widths of the beam's position at the point (3,), or of its azimuth and elevation.
-        extrapolated: no look of the campaign reached these counters: errors of the gears are extrapolated.
-        unseen: which axis is outside which counters then, in words.
+        extrapolated: whether the counters are outside those of the campaign's looks; gear errors are extrapolated then.
+        unseen: the axis and range concerned, in words.
     """
 
     pan_steps: int
@@ -53,7 +53,7 @@ class Steps(Shown):
     unseen: str = ""
 
     def shown(self) -> View:
-        """Where to go, and by which way."""
+        """Show the counters to go to, in order."""
         pan, tilt = self.approach
         title = f"Steps: arrive by moving {pan} and {tilt}"
         title += f", EXTRAPOLATED: {self.unseen}, where looks were" * self.extrapolated
@@ -64,7 +64,7 @@ class Steps(Shown):
         return View(title, ("go to", "pan, steps", "tilt, steps"), rows)
 
     def as_json(self) -> dict[str, object]:
-        """The document of `steps-for`."""
+        """Return the document of `steps-for`."""
 
         def plain(value: object) -> object:
             return value.tolist() if isinstance(value, np.ndarray) else value
@@ -77,62 +77,62 @@ class Steps(Shown):
 
 @dataclass(frozen=True)
 class Direction:
-    """A wanted direction: azimuth atan2(d_y, d_x), the emission angle C less 90 deg, and elevation asin(d_z)."""
+    """A target direction: azimuth atan2(d_y, d_x), the emission angle C less 90 deg, and elevation asin(d_z)."""
 
     azimuth_deg: float
     elevation_deg: float
 
     @property
     def finite(self) -> bool:
-        """No number is no direction."""
+        """Whether both angles are finite."""
         return math.isfinite(self.azimuth_deg) and math.isfinite(self.elevation_deg)
 
     @property
     def ahead(self) -> bool:
-        """Whether it leaves the baseline forwards."""
+        """Whether it points away from the baseline forwards."""
         return self.finite and abs(self.azimuth_deg) < 90
 
     def seen_from(self, origin: Vector) -> Direction:
-        """The same from everywhere."""
+        """Return the direction itself, which does not depend on the origin."""
         return self
 
 
 @dataclass(frozen=True)
 class Point:
-    """A wanted point (3,), mm."""
+    """A target point (3,), mm."""
 
     xyz_mm: np.ndarray
 
     @property
     def finite(self) -> bool:
-        """No number is no point."""
+        """Whether all coordinates are finite."""
         return bool(np.all(np.isfinite(self.xyz_mm)))
 
     @property
     def ahead(self) -> bool:
-        """Whether it is a point before the baseline."""
+        """Whether the point is in front of the baseline."""
         return self.finite and bool(ahead(float(self.xyz_mm[0])))
 
     def seen_from(self, origin: Vector) -> Direction:
-        """The direction that leads to it from the origin of a beam."""
+        """Compute the direction to it from the origin of a beam."""
         x, y, z = (float(t) - c for t, c in zip(self.xyz_mm, origin, strict=True))
         return Direction(math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))))
 
 
 def mirror_angles(values: Mapping[str, float], target: Point | Direction) -> tuple[float, float]:
-    """Mirror angles (pan, tilt) whose beam passes through a point or along a direction, degrees.
+    """Compute mirror angles (pan, tilt) of the beam through a point or along a direction, degrees.
 
-    A mirror angle moves the beam by nearly as much, so that plain correction converges.
+    A mirror angle rotates the beam by nearly as much, so that plain correction converges.
 
     Args:
         values: best estimates by name.
-        target: where to.
+        target: point or direction.
 
     Raises:
-        InputError: no mirror angles send the beam there.
+        InputError: no mirror angles aim the beam there.
     """
     pan_deg = tilt_deg = 0.0
-    # A head turns all round; behind a scanner's baseline there is nothing to be seen.
+    # A head turns all round; a scanner cannot locate points behind its baseline.
     for _ in range(AIM_STEPS if target.ahead or (is_head(values) and target.finite) else 0):
         beam = beam_components(values, pan_deg, tilt_deg, math)
         goal, (x, y, z) = target.seen_from(beam.origin), beam.direction
@@ -153,7 +153,7 @@ def mirror_angles(values: Mapping[str, float], target: Point | Direction) -> tup
 
 @dataclass(frozen=True)
 class Arrival:
-    """How an axis comes to a counter: `via_steps` first, then on to `steps`, reached on `side`."""
+    """Approach of an axis to a counter: `via_steps` first, then `steps`, reached on `side`."""
 
     side: str
     steps: int
@@ -162,7 +162,7 @@ class Arrival:
 
 @dataclass(frozen=True)
 class Drive:
-    """One axis between counters and mirror angles.
+    """Conversion of one axis between counters and mirror angles.
 
     Attributes:
         axis: pan or tilt.
@@ -178,11 +178,11 @@ class Drive:
 
     @property
     def ratio(self) -> float:
-        """Mean degrees per step."""
+        """Return the mean degrees per step."""
         return self.values_at(0.0)[f"degrees_per_step.{self.axis}"]
 
     def counter(self, angle_deg: float, side: int) -> int:
-        """The counter whose mirror angle is nearest to the wanted one, reached on a side (+1 left or up, -1)."""
+        """Compute the counter whose mirror angle is nearest to a given one, reached on a side (+1 left or up, -1)."""
         ratio, steps = self.ratio, 0.0
         for _ in range(AIM_STEPS):
             at = output_deg(self.values_at(steps), self.axis, steps, side, self.period_deg, math)
@@ -193,7 +193,7 @@ class Drive:
         return round(steps)
 
     def arrival(self, angle_deg: float, side: str | None, limits: tuple[float, float] | None) -> Arrival:
-        """How to reach a mirror angle; without a wanted side left or up, the other one where limits forbid it.
+        """Plan the approach to a mirror angle; the default side is left or up, else the other one within limits.
 
         Args:
             angle_deg: wanted mirror angle.
@@ -201,7 +201,7 @@ class Drive:
             limits: lowest and highest counter, or None.
 
         Raises:
-            InputError: no such side, or counters outside the limits.
+            InputError: there is no such side, or counters are outside the limits.
         """
         negative, positive = SIDES[self.axis]
         low, high = (-math.inf, math.inf) if limits is None else limits

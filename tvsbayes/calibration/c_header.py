@@ -1,6 +1,6 @@
-"""A calibration as a C header for a microcontroller: its numbers, of what it is, and the shipped functions (C99).
+"""A calibration as a C header for a microcontroller: its numbers, its origin, and the shipped functions (C99).
 
-Degrees, mm, steps as the names say; literals with as many digits as a double keeps.
+Degrees, mm, steps by suffix; literals have as many digits as a double holds.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from tvsbayes.instrument.axes import AXES
 
 _TABLED = ("transmission_error_deg", "u_transmission_error_deg", "play_variation_deg", "u_play_variation_deg")
 _UNCOMMENTED = re.compile(r"[^A-Za-z0-9 .,:()+=_-]")
-"""What a comment of C does not hold as it is: its end, trigraphs, backslashes, other than ASCII."""
+"""Characters not allowed in a comment of C: its end, trigraphs, backslashes, non-ASCII."""
 
 
 def calibration_header(calibration: Calibration, origin: Origin | None = None) -> str:
-    """A C header with the estimates and the beam as a function of the counters, for a Teensy and its like.
+    """Write a C header with the estimates and the beam as a function of the counters, for a Teensy or similar.
 
-    `origin` stands in its first lines, with the SHA-256 of the same calibration as JSON.
+    Its first lines have `origin` and the SHA-256 of the same calibration as JSON.
 
     Raises:
-        InputError: the calibration is one of a head, whose line of sight the header does not know.
+        InputError: the calibration is of a head, for which there is no header.
     """
     if calibration.names != INPUT_NAMES:
         remedy = "take --export json, whose estimates are the terms of the head"
@@ -58,13 +58,13 @@ def calibration_header(calibration: Calibration, origin: Origin | None = None) -
 
 
 def _double(value: float) -> str:
-    """A floating literal of C with as many digits as a double keeps."""
+    """Format a floating literal of C with as many digits as a double holds."""
     text = f"{value:.{DIGITS}g}"
     return text if set(text) & set(".en") else f"{text}.0"
 
 
 def _origin_lines(calibration: Calibration, origin: Origin | None) -> str:
-    """Lines of the comment that say of what the header is; names come from strangers."""
+    """Return the comment lines on the origin of the header; names are untrusted."""
     if origin is None:
         return " * Of a calibration without a campaign."
     name = _UNCOMMENTED.sub("_", origin.campaign)
@@ -75,7 +75,7 @@ def _origin_lines(calibration: Calibration, origin: Origin | None) -> str:
 
 
 def _header_gears(calibration: Calibration) -> list[str]:
-    """Counters seen, and the table of the gears' errors; of gears that do not vary a table of zero."""
+    """Return the counters seen and the table of gear errors; zeros without repeating errors."""
     lines: list[str] = []
     errors: Mapping[str, Mapping[str, Any]] = gear_errors(calibration)
     none: Mapping[str, Any] = {

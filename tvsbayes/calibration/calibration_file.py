@@ -1,7 +1,7 @@
 """Calibrations on disk: `draws.npz` of `results/`, and JSON for another language.
 
-NumPy alone. What is read comes from a stranger: caps, shapes and finite numbers are checked before a calibration is
-made of it. Units as in the names; matrices in the order of `INPUT_NAMES`.
+NumPy alone. Files are untrusted: size limits, shapes and finite numbers are checked before a calibration is built.
+Units as in the names; matrices in the order of `INPUT_NAMES`.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from tvsbayes.instrument.mechanisms import MECHANISMS
 
 CALIBRATION_FORMAT = "tvsbayes-calibration/2"
 FORMATS = ("tvsbayes-calibration/1", CALIBRATION_FORMAT)
-"""What is read; the first one knows no errors of the gears."""
+"""Formats that can be read; the first one has no errors of the gears."""
 NO_CALIBRATION = "no-calibration"
-"""Code of the refusal of results that are whole but hold no calibration."""
+"""Code of the refusal of valid results without a calibration."""
 NAME_CHARS_MAX = 200
 _ARRAYS = ("mean", "covariance", "range_steps", "inputs", "noise", "cause_covariance")
 
 
 class _Tables(TypedDict):
-    """What `draws.npz` keeps as JSON beside the arrays; fields as in `Calibration`."""
+    """JSON part of `draws.npz` beside the arrays; fields as in `Calibration`."""
 
     noise_variance: Mapping[str, float]
     overshoot_steps: Mapping[str, int]
@@ -88,7 +88,7 @@ class CalibrationDocument(TypedDict):
 
 
 def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
-    """The content of `draws.npz`: a calibration and further arrays."""
+    """Write the content of `draws.npz`: a calibration and further arrays."""
     tables = _Tables(
         noise_variance=calibration.noise_variance,
         overshoot_steps=calibration.overshoot_steps,
@@ -115,11 +115,11 @@ def calibration_bytes(calibration: Calibration, **more: np.ndarray) -> bytes:
 KNOWN_INPUTS = {each.named(INPUT_NAMES) for each in MECHANISMS.values()}
 """Names of inputs that a stored calibration may have."""
 DIGITS = 15
-"""Significant digits that a double keeps of any decimal number: one more would print what is only rounding."""
+"""Significant digits of any decimal number that a double holds: one more would print rounding errors."""
 
 
 def _plain(value: Any) -> Any:
-    """A document whose numbers have as many digits as a double keeps."""
+    """Round the numbers of a document to `DIGITS`."""
     if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}")
     if isinstance(value, Mapping):
@@ -129,11 +129,11 @@ def _plain(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Origin:
-    """Of what an exported calibration is, so that anyone who finds it on a controller knows.
+    """Origin of an exported calibration, so that it can be identified on a controller.
 
     Attributes:
-        campaign: its name.
-        measured: its date as `campaign.toml` has it; "" where it does not say.
+        campaign: name of the campaign.
+        measured: its date in `campaign.toml`; "" where it is not stated.
         exported: day of the export (UTC).
         tvsbayes: version that exported it.
     """
@@ -145,22 +145,22 @@ class Origin:
 
     @classmethod
     def of(cls, campaign: Campaign) -> Origin:
-        """Of a campaign, exported today."""
+        """Build the origin of a campaign's calibration exported today."""
         created, today = campaign.header.get("created"), datetime.datetime.now(datetime.UTC).date()
         measured = created.isoformat() if isinstance(created, datetime.date) else ""
         return cls(campaign.title, measured, today.isoformat(), version("tvsbayes"))
 
 
 def content_sha256(document: Mapping[str, object]) -> str:
-    """SHA-256 of an exported calibration, no matter who exports it and when."""
+    """Compute the SHA-256 of an exported calibration, without its origin."""
     content = {key: value for key, value in document.items() if key != "origin"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def calibration_json(calibration: Calibration, origin: Origin | None = None) -> CalibrationDocument:
-    """A calibration without its draws, for a ROS node or another language; `load_calibration` reads it.
+    """Build the JSON of a calibration without its draws, for a ROS node or another language.
 
-    `origin` goes into it with the SHA-256 of all else. Numbers have `DIGITS`.
+    `load_calibration` reads it. `origin` is added with the SHA-256 of all other content. Numbers have `DIGITS`.
     """
     document = _plain(_document(calibration))
     if origin is not None:
@@ -189,12 +189,12 @@ def _document(calibration: Calibration) -> CalibrationDocument:
 
 
 def _gear_steps(calibration: Calibration) -> dict[str, list[float]]:
-    """Table counters by axis."""
+    """Return table counters by axis."""
     return {axis: list(steps) for axis, steps in zip(AXES, calibration.gears.steps, strict=True)}
 
 
 def gear_errors(calibration: Calibration) -> dict[str, GearErrors]:
-    """The table by axis; empty where gears do not vary."""
+    """Return the table of gear errors by axis; empty without repeating errors."""
     first, table = len(INPUT_NAMES), calibration.gears
     u = np.sqrt(np.maximum(np.diag(calibration.covariance)[first:], 0.0))
     errors: dict[str, GearErrors] = {}
@@ -216,7 +216,7 @@ def gear_errors(calibration: Calibration) -> dict[str, GearErrors]:
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """95 % half widths of the beam at counters: of its azimuth and elevation, and of its position at 1 m (x, y, z)."""
+    """95 % half widths of the beam at counters: azimuth, elevation, and position at 1 m (x, y, z)."""
 
     pan_steps: int
     tilt_steps: int
@@ -226,7 +226,7 @@ class ExpectedError:
 
 
 def expected_error(calibration: Calibration) -> ExpectedError:
-    """What remains with this calibration at the middle of its campaign's counters, reached from left and up."""
+    """Compute the error of a calibration at the middle of its campaign's counters, reached from left and up."""
     pan, tilt = (round(float(value)) for value in calibration.range_steps.mean(axis=1))
     counters, sides = (float(pan), float(tilt)), (1.0, 1.0)
     azimuth, elevation = calibration.beam_u95_deg(counters, sides).tolist()
@@ -235,7 +235,7 @@ def expected_error(calibration: Calibration) -> ExpectedError:
 
 
 def load_calibration(path: Path | str) -> Calibration:
-    """Load what a robot needs, with NumPy alone.
+    """Load a calibration with NumPy alone.
 
     Args:
         path: a campaign folder with `results/`, its `results` folder, a `draws.npz`, or the JSON that
@@ -247,7 +247,7 @@ def load_calibration(path: Path | str) -> Calibration:
         `tvsbayes.locate` needs.
 
     Raises:
-        InputError: there is no such file, or it is not what tvsbayes wrote.
+        InputError: there is no such file, or tvsbayes did not write it.
     """
     path = Path(path)
     if path.is_dir():
@@ -264,7 +264,7 @@ def load_calibration(path: Path | str) -> Calibration:
 
 
 def damaged_calibration(path: Path, reason: object) -> InputError:
-    """The refusal of a file that is not what tvsbayes wrote."""
+    """Build the refusal of a file that tvsbayes did not write."""
     return InputError(
         "damaged-results",
         f"{escaped(path.name)} is not a calibration that tvsbayes wrote: {escaped(str(reason), 200)}",
@@ -286,7 +286,7 @@ def _shaped(calibration: Calibration) -> Calibration:
         if array.shape != shape or array.dtype != np.float64 or not np.all(np.isfinite(array)):
             raise ValueError(f"{name} has shape {array.shape}, wanted {shape} of finite numbers")
     for text in (calibration.estimator, *calibration.causes):
-        # They are printed: on terminals, in reports.
+        # These texts are printed on terminals and in reports.
         if not (isinstance(text, str) and len(text) <= NAME_CHARS_MAX and text.isprintable()):
             raise ValueError("a name of an estimator or cause is no plain text")
     if not set(NOISE_NAMES) <= set(calibration.noise_variance) or not set(AXES) <= set(calibration.overshoot_steps):
@@ -333,7 +333,7 @@ def read_draws(path: Path) -> Calibration:
                 causes=tuple(tables["causes"]),
                 cause_covariance=file["cause_covariance"],
                 gears=NO_GEARS if str(file["format"]) == FORMATS[0] else table_of(tables["gear_steps"]),
-                # They stand among the draws behind `fit.json`, row by row with the inputs.
+                # They are among the draws of `fit.json`, row by row with the inputs.
                 extrinsics=extrinsics_of(file["names"].tolist(), file["physical"]) if "names" in file else NO_POSE,
                 names=names,
             )
@@ -343,7 +343,7 @@ def read_draws(path: Path) -> Calibration:
 
 
 def _tables(text: str, path: Path) -> _Tables:
-    """Unchecked but for being JSON: `_shaped` refuses what does not fit."""
+    """Parse the tables as JSON without further checks; `_shaped` refuses invalid ones."""
     try:
         return cast(_Tables, parse_json(text.encode(), escaped(path.name)).values)
     except InputError as error:
@@ -355,7 +355,7 @@ def _from_json(path: Path) -> Calibration:
     known = keys.word("format", FORMATS)
     convention = keys.word("aperture_convention", ("in-plane", "azimuth"))
     try:
-        # What does not fit its type fails below or in `_shaped`.
+        # Wrong types fail below or in `_shaped`.
         d = cast(CalibrationDocument, keys.values)
         errors = {} if known == FORMATS[0] else d["gear_errors"]
         gears = table_of({axis: errors[axis]["steps"] for axis in AXES}) if errors else NO_GEARS
@@ -366,7 +366,7 @@ def _from_json(path: Path) -> Calibration:
         mean = [d["estimates"][name] for name in names]
         for name in gears.inputs:
             kind, axis = name.split(".")
-            # Beyond the table no error is expected.
+            # Beyond the table the expected error is zero.
             mean += [*(errors[axis]["transmission_error_deg" if kind == ERROR_AT else "play_variation_deg"]), 0.0]
         return _shaped(
             Calibration(
@@ -390,12 +390,12 @@ def _from_json(path: Path) -> Calibration:
 
 
 def stored_calibration(campaign: Campaign) -> Calibration | None:
-    """The calibration in `results/` of a campaign folder, if it was made from exactly these data and priors.
+    """Read the calibration in `results/` of a campaign folder, if it was made from exactly these data and priors.
 
-    None also where the results hold no calibration (`NO_CALIBRATION`).
+    It is None also where the results have no calibration (`NO_CALIBRATION`).
 
     Raises:
-        InputError: there are results, but damaged.
+        InputError: the results are damaged.
     """
     path = None if campaign.path is None else campaign.path / "results" / "draws.npz"
     if path is None or not path.exists():
@@ -410,10 +410,10 @@ def stored_calibration(campaign: Campaign) -> Calibration | None:
 
 
 def stored_ratios(campaign: Campaign) -> np.ndarray:
-    """Draws (n, 4) of the effective ratios left, right, up, down in `results/`, deg/step.
+    """Read draws (n, 4) of the effective ratios left, right, up, down from `results/`, deg/step.
 
     Raises:
-        InputError: missing or damaged.
+        InputError: the draws are missing or damaged.
     """
     if campaign.path is None:
         raise damaged_calibration(Path("draws.npz"), "the campaign has no folder")

@@ -1,4 +1,4 @@
-"""Rigs that the data allow, drawn from a calibration's stored draws, each with the noises of one look. NumPy."""
+"""Rigs drawn from a calibration's stored draws, each with the noises of one look. NumPy."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from tvsbayes.statistics.streams import Stream, random_stream
 
 @dataclass(frozen=True)
 class Drawn:
-    """Rigs that the data allow, each with the unit noises of one look.
+    """Drawn rigs, each with the unit noises of one look.
 
     Attributes:
-        inputs: shape (draws, columns), ordered as `INPUT_NAMES`, then `NOISE_NAMES`.
+        inputs: draws of `INPUT_NAMES`, then `NOISE_NAMES`, shape (draws, columns).
         gears: columns of the gears' errors, shape (draws, columns).
         noise: standard-normal stop errors (pan, tilt), uniform places in the play in [-1/2, 1/2] (pan, tilt), the
             aperture's standard-normal noise, shape (draws, `NOISES`).
@@ -30,13 +30,13 @@ class Drawn:
     noise: np.ndarray
 
     def values_at(self, calibration: Calibration, steps: Counters) -> dict[str, Number]:
-        """Parameters by name of `look_inputs` and `NOISE_NAMES` at counters (n,), arrays (draws, 1) or (draws, n)."""
+        """Return `look_inputs` and `NOISE_NAMES` by name at counters (n,), arrays (draws, 1) or (draws, n)."""
         names = (*calibration.names, *NOISE_NAMES)
         return {**dict(zip(names, self.inputs.T[..., None], strict=True)), **calibration.gears.at(self.gears, steps)}
 
 
 def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
-    """Draws of parameters, evenly chosen, with noises of their own; the same for every point of a call.
+    """Choose draws of parameters evenly, each with its own noises; the same for every point of a call.
 
     Raises:
         InputError: a calibration without draws.
@@ -49,7 +49,7 @@ def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
             remedy="locate from the campaign folder, or use calibration.locate, which needs no draws",
         )
     generator = random_stream(seed, Stream.LOOKS)
-    # Fewer draws than are stored: evenly chosen; more: all, again and again, with new noises.
+    # Fewer draws than stored are chosen evenly; for more, all are repeated with new noises.
     chosen = np.arange(draws) % stored if draws > stored else np.linspace(0, stored - 1, draws).astype(int)
     inputs, gears = np.split(calibration.inputs[chosen], [len(INPUT_NAMES)], axis=1)
     normal = generator.standard_normal((draws, NOISES))
@@ -58,9 +58,9 @@ def drawn(calibration: Calibration, draws: int, seed: int) -> Drawn:
 
 
 def noise_of_a_look(values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Sds by `NOISE_NAMES`, last axis, from parameters by name: a robot looks once at a stop, and meets both errors.
+    """Compute sds by `NOISE_NAMES` (last axis): a single look at a stop has stop error and scatter of looks.
 
-    Without a scatter of looks among them, as in results before 0.3.0, there is none.
+    A missing scatter of looks, as in results before 0.3.0, counts as zero.
     """
     variances = [values[name] for name in NOISE_NAMES]
     for axis, sides in SIDES.items():

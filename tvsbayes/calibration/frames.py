@@ -1,6 +1,6 @@
 """The frames of a ray (formulation 2): T and P of the positioner, S of the stereo pair, the left camera's in OpenCV.
 
-S and camera stand to P by the extrinsics of the fit: rotation vector, rad, and translation, mm, of T_SP. NumPy.
+S and camera are related to P by the extrinsics of the fit: rotation vector, rad, and translation, mm, of T_SP. NumPy.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from tvsbayes.instrument.stereo_pair import rotation_matrix
 FRAMES = ("T", "P", "S", "camera")
 EXTRINSICS_NAMES = names_of("extrinsics.rotation_rad", "extrinsics.translation_mm")
 NO_POSE = np.zeros((0, len(EXTRINSICS_NAMES)))
-"""Draws of a calibration that keeps moments alone."""
+"""Empty draws, of a calibration with moments only."""
 P_INPUTS: Mapping[str, float] = {"pan_zero_emission_deg": 90.0, "baseline_mm": 0.0}
-"""Of inputs with which frame T is frame P: p_T = Rz(C0 - 90 deg) p_P + (0, a/2, 0)."""
+"""Inputs for which frame T equals frame P: p_T = Rz(C0 - 90 deg) p_P + (0, a/2, 0)."""
 OPENCV_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """From S to OpenCV's axes of the left camera, x right, y down, z along its view: X = z_cv, Y = -x_cv, Z = -y_cv."""
 ROTATION_STEP_RAD = 1e-5
-"""Of central differences of a rotation: cut off at 1e-11, rounding 1e-11."""
+"""Step of central differences of a rotation: truncation 1e-11, rounding 1e-11."""
 
 
 def extrinsics_of(names: Sequence[str], physical: np.ndarray) -> np.ndarray:
-    """Those of draws (n, names), shape (n, 6); (0, 6) where they are not among the names."""
+    """Select the extrinsics of draws (n, names), shape (n, 6); (0, 6) where they are not among the names."""
     if not set(EXTRINSICS_NAMES) <= set(names):
         return NO_POSE
     return physical[:, [names.index(name) for name in EXTRINSICS_NAMES]]
 
 
 def refuse_frame(frame: str, extrinsics: np.ndarray) -> None:
-    """Refuses a frame that there is not, or that this calibration cannot give.
+    """Refuse an unknown frame, or one that this calibration cannot give.
 
     Raises:
         InputError: either.
@@ -51,19 +51,19 @@ def refuse_frame(frame: str, extrinsics: np.ndarray) -> None:
 
 
 def camera_rotation(extrinsics: np.ndarray, frame: str) -> np.ndarray:
-    """From P to S or to the camera's axes, shape (3, 3); `extrinsics` are a rotation vector and a translation, (6,)."""
+    """Compute the rotation (3, 3) from P to S or the camera's axes; `extrinsics` (6,): rotation vector, translation."""
     rotation = rotation_matrix(extrinsics[:3])
     return OPENCV_AXES @ rotation if frame == "camera" else rotation
 
 
 def in_cameras(ray: np.ndarray, extrinsics: np.ndarray, frame: str) -> np.ndarray:
-    """A ray of frame P, origin and direction (6,), in frame S or the camera's."""
+    """Transform a ray of frame P, origin and direction (6,), to frame S or the camera's."""
     turn, shift = camera_rotation(extrinsics, frame), extrinsics[3:]
     return np.r_[turn @ ray[:3] + (OPENCV_AXES @ shift if frame == "camera" else shift), turn @ ray[3:]]
 
 
 def camera_slopes(ray: np.ndarray, extrinsics: np.ndarray, frame: str) -> np.ndarray:
-    """Derivatives of `in_cameras` by the ray, then by the extrinsics, shape (6, 12)."""
+    """Compute derivatives of `in_cameras` by the ray, then by the extrinsics, shape (6, 12)."""
     turn = camera_rotation(extrinsics, frame)
     slopes = np.zeros((6, 12))
     slopes[:3, :3] = slopes[3:, 3:6] = turn

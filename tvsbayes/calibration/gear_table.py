@@ -1,8 +1,8 @@
-"""Errors of the gears over their counters, as a robot keeps them: columns at regular counters, and one beyond them.
+"""Tables of gear errors for robots: columns at regular counters, and one for counters beyond.
 
 Transmission error e and change of play d of both axes, deg, of the output's angle (formulation 3.1). Between table
-counters both are interpolated with fixed weights; beyond the table nothing is known of them but how large they are:
-one column each stands for every counter there. NumPy.
+counters both are interpolated with fixed weights. Beyond the table only their sds are known, and one column each serves
+all counters there. NumPy.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.places import NEAREST, interpolation
 
 COUNTERS_MAX = 64
-"""Counters of a table, at most, by axis."""
+"""Largest number of counters of a table, by axis."""
 BEYOND = "beyond"
-"""Ends the name of the column for counters beyond the table."""
+"""Last part of the name of the column for counters beyond the table."""
 
 
 @dataclass(frozen=True)
 class GearTable:
-    """Where a calibration tells errors of the gears; its columns follow `GEAR_INPUTS`, counters and beyond of each.
+    """Counters of tabulated gear errors; columns are ordered as `GEAR_INPUTS`, each with its counters, then beyond.
 
     Attributes:
-        steps: counters of (pan, tilt), regular, ascending; both empty where gears do not vary.
+        steps: counters of (pan, tilt), regular, ascending; both empty without repeating errors.
     """
 
     steps: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
     @property
     def size(self) -> int:
-        """Number of columns."""
+        """Return the number of columns."""
         return sum(2 * (len(steps) + 1) for steps in self.steps if len(steps))
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """`GEAR_INPUTS`, or none where gears do not vary."""
+        """Return `GEAR_INPUTS`, or none without repeating errors."""
         return GEAR_INPUTS if self.size else ()
 
     @cached_property
     def parts(self) -> dict[str, slice]:
-        """Columns of each of `inputs`; the last one of each stands for counters beyond the table."""
+        """Return the columns of each of `inputs`; the last one of each is for counters beyond the table."""
         parts, begin = {}, 0
         for name in self.inputs:
             end = begin + len(self.steps[_axis(name)]) + 1
@@ -56,7 +56,7 @@ class GearTable:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of the columns: `transmission_error_at_deg.pan.-120`, the last part a counter or `beyond`."""
+        """Return column names: `transmission_error_at_deg.pan.-120`, the last part a counter or `beyond`."""
         return tuple(
             f"{name}.{place}"
             for name in self.inputs
@@ -64,7 +64,7 @@ class GearTable:
         )
 
     def shares(self, axis: int, counters: Number) -> np.ndarray:
-        """Share of the columns of one error of an axis in its value at counters (...), shape (..., columns)."""
+        """Compute the weights of an axis error's columns in its value at counters (...), shape (..., columns)."""
         nodes, flat = np.array(self.steps[axis]), np.ravel(counters).astype(float)
         inside = (flat >= nodes[0]) & (flat <= nodes[-1])
         shares = np.zeros((len(flat), len(nodes) + 1))
@@ -73,7 +73,7 @@ class GearTable:
         return shares.reshape(*np.shape(counters), -1)
 
     def _near(self, axis: int, counter: float) -> tuple[slice, list[float]]:
-        """Columns of one error that have a share in its value at a counter, and their shares, as `shares` has them."""
+        """Return the columns of one error with weight at a counter, and their weights, as in `shares`."""
         nodes = self.steps[axis]
         if not nodes[0] <= counter <= nodes[-1]:
             return slice(len(nodes), len(nodes) + 1), [1.0]
@@ -88,7 +88,7 @@ class GearTable:
         return slice(begin, begin + NEAREST), weights
 
     def estimates_at(self, columns: np.ndarray, steps: tuple[float, float]) -> dict[str, float]:
-        """The same as `at` of one row of columns (size,) at one pair of counters, sooner: a robot asks often."""
+        """Compute `at` for one row of columns (size,) at one pair of counters, faster, since robots call it often."""
         estimates, places = {}, [self._near(axis, n) for axis, n in enumerate(steps)] if self.size else []
         for name, part in self.parts.items():
             chosen, share = places[_axis(name)]
@@ -97,24 +97,24 @@ class GearTable:
         return estimates
 
     def at(self, columns: np.ndarray, steps: tuple[Number, Number]) -> dict[str, np.ndarray]:
-        """Errors at counters, by name of `inputs`.
+        """Compute errors at counters, by name of `inputs`.
 
         Args:
-            columns: of the table, shape (..., size).
+            columns: columns of the table, shape (..., size).
             steps: counters (pan, tilt), numbers or arrays of shape (n,).
 
         Returns:
-            Arrays (...) or (..., n), deg; none where gears do not vary.
+            Arrays (...) or (..., n), deg; empty without repeating errors.
         """
         shares = [self.shares(axis, n) for axis, n in enumerate(steps)] if self.size else []
         return {name: columns[..., part] @ shares[_axis(name)].T for name, part in self.parts.items()}
 
     def look_covariance(self, covariance: np.ndarray, steps: tuple[Number, Number]) -> np.ndarray:
-        """Covariance of other inputs and of the errors at the counters of looks.
+        """Compute the covariance of other inputs and of the errors at the counters of looks.
 
         Args:
-            covariance: of the others and the columns, shape (..., others + size, others + size); two axes for arrays of
-                counters.
+            covariance: covariance of the others and the columns, shape (..., others + size, others + size); two axes
+                for arrays of counters.
             steps: counters as for `at`.
 
         Returns:
@@ -127,7 +127,7 @@ class GearTable:
             share[..., row, part] = shares[_axis(name)]
         rows = covariance[..., others:, :]
         if shape:
-            # One product of matrices for all looks.
+            # One matrix product for all looks.
             moved = (share.reshape(-1, self.size) @ rows).reshape(*shape, count, -1)
         else:
             moved = share @ rows
@@ -140,7 +140,7 @@ class GearTable:
 
 
 NO_GEARS = GearTable()
-"""Of gears that do not vary."""
+"""Table without repeating errors."""
 
 
 def _axis(name: str) -> int:
@@ -149,16 +149,16 @@ def _axis(name: str) -> int:
 
 
 def regular_counters(first: float, last: float, spacing: float) -> np.ndarray:
-    """Counters of a table from a first to a last one, not much farther apart than `spacing` and not too many."""
+    """Choose counters of a table from a first to a last one, spaced by about `spacing`, at most `COUNTERS_MAX`."""
     count = int(np.clip(np.ceil((last - first) / spacing) + 1, 4, COUNTERS_MAX))
     return np.linspace(first, last, count)
 
 
 def table_of(steps: Mapping[str, object]) -> GearTable:
-    """A table from a file, by axis.
+    """Build a table from a file, by axis.
 
     Raises:
-        ValueError: counters that are no regular, ascending, finite ones.
+        ValueError: counters are not regular, ascending and finite.
         KeyError: an axis is missing.
     """
     steps_of_axes = [np.array(steps[axis], dtype=float) for axis in AXES]

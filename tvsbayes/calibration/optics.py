@@ -1,8 +1,8 @@
 """The optics in components: counters to mirror angles, beams, ranges and aperture readings, in NumPy.
 
-The same lines serve one pose in Python floats (`m` = `math`) and many parameter sets in arrays (`m` = `numpy`, also
-complex, for derivatives). Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2,
-z up; mm, degrees, steps. Parameters come by name with the units of their names.
+The same functions take one pose in Python floats (`m` = `math`) and many parameter sets in arrays (`m` = `numpy`, also
+complex, for derivatives). Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2, z
+up; mm, degrees, steps. Parameters are given by name, in the units of their names.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from tvsbayes.instrument.parameters import BLOCKS, HARMONIC_ORDERS
 
 ERROR_AT, PLAY_AT = "transmission_error_at_deg", "play_variation_at_deg"
 GEAR_INPUTS: tuple[str, ...] = tuple(f"{kind}.{axis}" for kind in (ERROR_AT, PLAY_AT) for axis in AXES)
-"""What the gears add to a look: transmission error and change of play at its counters, deg."""
+"""Gear errors of a look: transmission error and change of play at its counters, deg."""
 ROUNDING = 1e-12
-"""Of coordinates, relative to the range."""
+"""Rounding of coordinates, relative to the range."""
 TO_RAD = math.pi / 180
 type Number = float | np.ndarray
 """One pose in Python floats, or arrays of one shape."""
@@ -38,8 +38,8 @@ type Values = Mapping[str, Number]
 class Ray:
     """A beam: it leaves the positioner at `origin_mm` along the unit vector `direction`; shape (3, ...).
 
-    `extrapolated` says that no look of the campaign reached its counters, `frame` in which frame it is. `covariance`,
-    where it was asked for, is that of origin and direction of a single arrival, shape (6, 6): mm, and none.
+    `extrapolated` is whether its counters are outside those of the campaign's looks, `frame` its frame. `covariance`,
+    where requested, is that of origin (mm) and direction (no unit) of a single arrival, shape (6, 6).
     """
 
     origin_mm: np.ndarray
@@ -50,7 +50,7 @@ class Ray:
 
 
 def _harmonic(values: Values, axis: str, angle_deg: Number, period_deg: float, m: ModuleType) -> Number:
-    """Transmission error at an angle, degrees (formulation 3.1)."""
+    """Compute the transmission error at an angle, degrees (formulation 3.1)."""
     total: Number = 0.0
     for order in HARMONIC_ORDERS:
         phase = 2 * math.pi * order * angle_deg / period_deg
@@ -62,14 +62,14 @@ def _harmonic(values: Values, axis: str, angle_deg: Number, period_deg: float, m
 def output_deg(
     values: Values, axis: str, steps: Number, side: Number, period_deg: float | None, m: ModuleType = np
 ) -> Number:
-    """Mirror angle of an axis after homing: q = k n, play taken up on the approach side (formulation 3.1).
+    """Compute the mirror angle of an axis after homing: q = k n, play taken up on the approach side (formulation 3.1).
 
     Args:
-        values: parameters by name; floats, or arrays of one shape. Where gears vary, also their errors at this counter,
+        values: parameters by name; floats, or arrays of one shape. With repeating errors, also those at this counter,
             by `GEAR_INPUTS`.
         axis: pan or tilt.
         steps: absolute counter.
-        side: +1 reached left or up, -1 right or down, any number between for a place in the play.
+        side: +1 reached left or up, -1 right or down, any number between for a position in the play.
         period_deg: period of the transmission error, None without one.
         m: `math` for floats, `numpy` for arrays.
     """
@@ -90,29 +90,29 @@ def is_head(values: Values) -> bool:
 
 
 def ahead(x_mm: Number) -> bool | np.ndarray:
-    """Whether a depth lies before the baseline: behind it there is no triangle for the aperture to close."""
+    """Whether a depth is in front of the baseline, as required for triangulation."""
     return x_mm.real > 0
 
 
 class Components(NamedTuple):
-    """A beam in components."""
+    """Origin and direction of a beam, in components."""
 
     origin: Vector
     direction: Vector
 
     def at(self, range_mm: Number) -> np.ndarray:
-        """Points at ranges along it, first axis x, y, z."""
+        """Compute points at ranges along it, first axis x, y, z."""
         return np.array([o + range_mm * d for o, d in zip(self.origin, self.direction, strict=True)])
 
     def met(self, range_mm: Number) -> np.ndarray:
-        """Points at ranges; not a number where the range is none or the point lies behind the baseline."""
+        """Compute points at ranges; NaN where the range is invalid or the point is behind the baseline."""
         points = self.at(np.where((np.asarray(range_mm).real > 0) & np.isfinite(range_mm), range_mm, np.nan))
-        # In both parts, where a derivative rides along.
+        # In both parts of complex numbers, which carry derivatives.
         return np.where(ahead(points[0]), points, complex(np.nan, np.nan) if np.iscomplexobj(points) else np.nan)
 
 
 def _optics(values: Values) -> Optics | HeadOptics:
-    """Laser and mirrors, or the terms of a head, of parameters by name."""
+    """Build laser and mirrors, or the terms of a head, from parameters by name."""
     if is_head(values):
         return HeadOptics.of(lambda name: values[name] * (TO_RAD if "_deg" in name else 1.0))
 
@@ -124,11 +124,11 @@ def _optics(values: Values) -> Optics | HeadOptics:
 
 
 def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: ModuleType = np) -> Components:
-    """Origin and unit direction of the beam in frame T for mirror angles (formulation 3.2 and 2); see `output_deg`."""
+    """Compute origin and unit direction of the beam in frame T for mirror angles (formulation 3.2 and 2)."""
     psi, beta, to_t = pan_deg * TO_RAD, tilt_deg * TO_RAD, (values["pan_zero_emission_deg"] - 90.0) * TO_RAD
     optics = _optics(values)
     if isinstance(optics, Optics):
-        # From Q to P and on to T in one turn.
+        # From Q through P to T in one rotation.
         beam, turn = beam_path(optics, psi, beta, m).rays[-1], Turn.by(psi + to_t, m)
     else:
         beam, turn = optics.leaving(psi, beta, m), Turn.by(to_t, m)
@@ -139,16 +139,16 @@ def beam_components(values: Values, pan_deg: Number, tilt_deg: Number, m: Module
 def range_components(
     origin: Vector, direction: Vector, baseline_mm: Number, aperture_deg: Number, azimuth: bool, m: ModuleType = np
 ) -> Number:
-    """Range along the beam at which the aperture sees it under angle B, mm (formulation 5); closed form.
+    """Compute the range along the beam at which the aperture sees it under angle B, mm (formulation 5), in closed form.
 
-    With w the beam's origin seen from the aperture and c = cos B, the in-plane reading asks for (w + r d)_y =
-    c |w + r d|. Squared this is a quadratic in r whose discriminant is c^2 S^2, S^2 = |m|^2 sin^2 B - m_y^2 with the
-    moment m = w x d. The root on B's own nappe is r = (w_y^2 - c^2 |w|^2) / (c S - w_y d_y + c^2 w.d), which has no
-    0/0 at B = 90 deg, nor where the beam runs parallel to the cone's opposite side; the denominator vanishes where
-    beam and line of sight are parallel. On the baseline's plane it is a sin B / sin(B + C). It is the right root for
-    beams that start on the positioner's side of the aperture (w_y > 0).
+    With w the beam's origin seen from the aperture and c = cos B, the in-plane reading requires (w + r d)_y = c |w + r
+    d|. Squared this is a quadratic in r whose discriminant is c^2 S^2, S^2 = |m|^2 sin^2 B - m_y^2 with the moment m =
+    w x d. The root on B's own nappe is r = (w_y^2 - c^2 |w|^2) / (c S - w_y d_y + c^2 w.d), which has no 0/0 at B = 90
+    deg, nor where the beam runs parallel to the cone's opposite side; the denominator vanishes where beam and line of
+    sight are parallel. On the baseline's plane it is a sin B / sin(B + C). It is the right root for beams that start on
+    the positioner's side of the aperture (w_y > 0).
 
-    Not a number where the beam misses the cone or half-plane of B; zero, negative or minus infinite where only its
+    It is NaN where the beam misses the cone or half-plane of B, and zero, negative or minus infinite where only its
     backward extension or the other nappe is met.
     """
     x, y, z = origin
@@ -172,7 +172,7 @@ def range_components(
             return math.nan
         root = math.sqrt(inside)
     else:
-        # A complex step would find a root of a negative number.
+        # For complex numbers NumPy would return a root of a negative number.
         root = np.sqrt(np.where(np.real(inside) < 0, np.nan, inside))
     across = x * u + y * v + z * w
     reach = y * y - cos_b * cos_b * (x * x + y * y + z * z)
@@ -181,13 +181,13 @@ def range_components(
         return math.inf
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = reach / closing
-        # At B = 90 deg both nappes are one plane, and y is zero but for rounding.
+        # At B = 90 deg both nappes are one plane, and y is zero except for rounding.
         faces = (y + reach * v) * cos_b >= -ROUNDING * abs(reach * cos_b)
     return (reach if faces else -math.inf) if m is math else np.where(faces | np.isnan(reach), reach, -np.inf)
 
 
 def aperture_angle_deg(point: Vector, baseline_mm: Number, azimuth: bool, m: ModuleType = np) -> Number:
-    """The angle B of a point (x, y, z) of frame T at the aperture, degrees, without the aperture's zero."""
+    """Compute the angle B of a point (x, y, z) of frame T at the aperture, degrees, without the aperture's zero."""
     x, y, z = point
     lateral = x if azimuth else m.hypot(x, z)
     arc_tangent = math.atan2 if m is math else np.arctan2
@@ -195,14 +195,14 @@ def aperture_angle_deg(point: Vector, baseline_mm: Number, azimuth: bool, m: Mod
 
 
 def unit_vector(azimuth_deg: Number, elevation_deg: Number) -> np.ndarray:
-    """Unit vectors of directions in frame T, first axis x, y, z; azimuth atan2(y, x), elevation asin(z)."""
+    """Compute unit vectors in frame T, first axis x, y, z; azimuth atan2(y, x), elevation asin(z)."""
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     level = np.cos(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
 
 
 def beam_angle_deg(values: Values, axis: str, mirror_deg: Number, other_deg: Number) -> np.ndarray:
-    """Beam angle about one axis: azimuth less its value C0 - 90 deg, or elevation; whole turns are kept.
+    """Compute the beam angle about one axis: azimuth less its value C0 - 90 deg, or elevation; full turns are kept.
 
     Args:
         values: parameters by name.
@@ -220,7 +220,7 @@ def beam_angle_deg(values: Values, axis: str, mirror_deg: Number, other_deg: Num
 
 
 def beam_deg_per_step(values: Mapping[str, float], axis: str, pose_deg: tuple[float, float]) -> float:
-    """Mean of both directions' effective degrees per step at mirror angles (pan, tilt) (formulation 3.2)."""
+    """Compute both directions' mean effective degrees per step at mirror angles (pan, tilt) (formulation 3.2)."""
     index, half = AXES.index(axis), 1e-3
     pose, other = pose_deg[index], pose_deg[1 - index]
     ends = [beam_angle_deg(values, axis, pose + s * half, other) for s in (1, -1)]

@@ -1,6 +1,6 @@
-"""What a robot loads: estimates and covariance that carry counters to rays and points, and points to counters.
+"""The calibration for robots: estimates and covariance, from counters to rays and points, and from points to counters.
 
-No JAX, no fit, less than a millisecond a call. Frame T: origin mid-baseline, x depth, y along the baseline towards the
+No JAX, no fit, under a millisecond a call. Frame T: origin mid-baseline, x depth, y along the baseline towards the
 positioner at +a/2, z up. mm; degrees where a name says `_deg`; counters in steps, absolute, after homing.
 """
 
@@ -45,20 +45,20 @@ INPUT_NAMES: tuple[str, ...] = (
     *OPTICS_NAMES,
     *names_of("baseline_mm", "pan_zero_emission_deg", "aperture_zero_deg"),
 )
-"""What a coordinate depends on. Contrasts do not enter: after homing a counter stands for its mean ratio."""
+"""Inputs of a coordinate. Contrasts are not among them: after homing a counter has its mean ratio."""
 NO_INPUTS: Values = {}
 NOISE_NAMES = names_of("stop_sd_deg", "aperture_sd_deg")
-"""Noises of a look; those of stops hold the scatter of the look, see `drawn_looks.noise_of_a_look`."""
+"""Noises of a look; those of stops include the scatter of the look, see `drawn_looks.noise_of_a_look`."""
 UNIT_NOISES: dict[str, float] = {
     **{f"stop error {axis}": 1.0 for axis in AXES},
     **{f"place in the play, {axis}": 1 / 12 for axis in AXES},
     "aperture noise": 1.0,
 }
-"""Noises of a look in units of their own scale, with their variances: a place in the play is uniform."""
+"""Noises of a look in units of their scale, with variances; a position in the play is uniform."""
 NOISES = len(UNIT_NOISES)
 COMPLEX_STEP = 1e-30
-"""Imaginary step of derivatives: nothing is subtracted, so it may be as small as it likes (Squire and Trapp, SIAM
-Review 40 (1998) 110)."""
+"""Imaginary step of derivatives: nothing is subtracted, so it may be arbitrarily small (Squire and Trapp, SIAM Review
+40 (1998) 110)."""
 type Counters = tuple[Number, Number]
 """Absolute counters (pan, tilt), steps."""
 type Sides = tuple[float, float]
@@ -67,9 +67,9 @@ type Sides = tuple[float, float]
 
 @dataclass(frozen=True)
 class _Moved:
-    """Parameters by name, what the gears add to them, and unit noises, each moved by an imaginary step.
+    """Parameters by name, gear errors and unit noises, each changed by an imaginary step.
 
-    The moves are one of `Calibration.look_inputs` or of the noises each; `gears` holds moves alone, by name.
+    Each set changes one of `Calibration.look_inputs` or of the noises; `gears` has the changes alone, by name.
     """
 
     values: Values
@@ -79,26 +79,26 @@ class _Moved:
 
 @dataclass(frozen=True, repr=False)
 class Calibration(Shown):
-    """Estimates and uncertainty of everything that a coordinate depends on.
+    """Estimates and uncertainty of all inputs of a coordinate.
 
     Attributes:
         mean: best estimates, shape (inputs,), ordered as `INPUT_NAMES`, then the columns of `gears`; units of the
             names.
         covariance: their covariance, shape (inputs, inputs).
         noise_variance: mean variance of each of `NOISE_NAMES`, deg^2.
-        overshoot_steps: by axis, steps that take up all play with a probability of `CLEARED_PROBABILITY`.
-        azimuth: the aperture reads the azimuth of the spot, not the angle in the plane of beam and baseline.
+        overshoot_steps: steps by axis that take up all play with a probability of `CLEARED_PROBABILITY`.
+        azimuth: whether the aperture reads the azimuth of the spot, not the angle in the plane of beam and baseline.
         period_deg: period of the transmission error by axis, where there is one.
         estimator: "posterior" or "laplace".
         range_steps: lowest and highest counter per axis at which the campaign looked, shape (2, 2).
         inputs_sha256: hashes of the campaign's data.
-        inputs: draws (n, inputs) behind the moments; none where only the moments were kept.
+        inputs: draws (n, inputs) of the moments; none where only the moments were stored.
         noise: draws (n, 5) of `NOISE_NAMES`, likewise.
-        causes: names of the causes of uncertainty behind `cause_covariance`; empty where unknown.
-        cause_covariance: what each contributes to `covariance`, shape (causes, inputs, inputs).
-        gears: counters at which errors of the gears are tabulated; none where gears do not vary.
+        causes: names of the causes of uncertainty in `cause_covariance`; empty where unknown.
+        cause_covariance: contribution of each to `covariance`, shape (causes, inputs, inputs).
+        gears: counters at which errors of the gears are tabulated; none without repeating errors.
         extrinsics: draws (n, 6) of `EXTRINSICS_NAMES`, row by row with `inputs`; none where only the moments were kept.
-        names: of the inputs: `INPUT_NAMES`, or what a head has in their places.
+        names: names of the inputs: `INPUT_NAMES`, or those of a head in their places.
     """
 
     mean: np.ndarray
@@ -119,7 +119,7 @@ class Calibration(Shown):
     names: tuple[str, ...] = INPUT_NAMES
 
     def shown(self) -> View:
-        """Estimates with their standard uncertainties, and the counters that looks reached."""
+        """Show estimates with their standard uncertainties, and the range of the looks' counters."""
         (left, right), (low, high) = self.range_steps.tolist()
         title = f"Calibration ({self.estimator}), seen at pan {left:g} to {right:g}, tilt {low:g} to {high:g} steps"
         u = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).tolist()
@@ -128,16 +128,16 @@ class Calibration(Shown):
 
     @cached_property
     def estimates(self) -> dict[str, float]:
-        """Best estimates by name, without the errors of the gears."""
+        """Return best estimates by name, without the errors of the gears."""
         return dict(zip(self.names, self.mean[: len(INPUT_NAMES)].tolist(), strict=True))
 
     @property
     def look_inputs(self) -> tuple[str, ...]:
-        """What the point of one look depends on besides its noises: `INPUT_NAMES`, then the gears' errors there."""
+        """Return the inputs of one look besides its noises: `INPUT_NAMES`, then the gears' errors there."""
         return (*self.names, *self.gears.inputs)
 
     def estimates_at(self, steps: Counters) -> dict[str, Any]:
-        """Best estimates by name of `look_inputs`, floats, or for arrays of counters arrays of their shape."""
+        """Return best estimates by name of `look_inputs`: floats, or for arrays of counters arrays of their shape."""
         pan, tilt = steps
         columns = self.mean[len(INPUT_NAMES) :]
         if isinstance(pan, np.ndarray) or isinstance(tilt, np.ndarray):
@@ -157,14 +157,14 @@ class Calibration(Shown):
 
     @cached_property
     def covariance_with_noise(self) -> np.ndarray:
-        """Covariance of `mean` and the unit noises of a look, shape (inputs + NOISES, inputs + NOISES)."""
+        """Return the covariance of `mean` and the unit noises of a look, shape (inputs + NOISES, inputs + NOISES)."""
         count = len(self.mean)
         covariance = np.diag([*np.zeros(count), *UNIT_NOISES.values()])
         covariance[:count, :count] = self.covariance
         return covariance
 
     def look_covariance(self, steps: Counters) -> np.ndarray:
-        """Covariance of `look_inputs` and the unit noises at counters, numbers or arrays (n,): shape (..., k, k)."""
+        """Compute the covariance of `look_inputs` and unit noises at counters, numbers or arrays (n,): (..., k, k)."""
         if not self.gears.size:
             return self.covariance_with_noise
         looks = self.gears.look_covariance(self.covariance, steps)
@@ -175,24 +175,24 @@ class Calibration(Shown):
         return whole
 
     def covers(self, pan_steps: float, tilt_steps: float) -> bool:
-        """Whether looks of the campaign reached as far as these counters."""
+        """Whether these counters are within those of the campaign's looks."""
         return not self.unseen(pan_steps, tilt_steps)
 
     @property
     def seen_steps(self) -> dict[Axis, list[float]]:
-        """Lowest and highest counter at which the campaign looked, by axis."""
+        """Return the lowest and highest counter of the campaign's looks, by axis."""
         return dict(zip(AXES, self.range_steps.tolist(), strict=True))
 
     def unseen(self, pan_steps: float, tilt_steps: float) -> str:
-        """Which of these counters lies outside those that looks reached, in words; "" where none does."""
+        """Say which of these counters are outside those of the looks; "" where none is."""
         return unseen((pan_steps, tilt_steps), self.range_steps)
 
     def beam_at(
         self, steps: Counters, sides: tuple[Number, Number], m: ModuleType = np, frame: Values = NO_INPUTS
     ) -> Components:
-        """The beam of the best estimates at counters and approach sides; `m` as in `output_deg`.
+        """Compute the beam of the best estimates at counters and approach sides; `m` as in `output_deg`.
 
-        In frame T, or with `P_INPUTS` as `frame` in P.
+        It is in frame T, or with `P_INPUTS` as `frame` in P.
         """
         values = self.estimates_at(steps)
         pan_deg, tilt_deg = (
@@ -210,19 +210,19 @@ class Calibration(Shown):
         frame: str = "T",
         covariance: bool = False,
     ) -> Ray:
-        """The beam at counters that were reached from a side.
+        """Compute the beam at counters reached from a side.
 
         Args:
             pan_steps: absolute counter.
             tilt_steps: absolute counter.
             approach: last move of (pan, tilt): left or right, up or down, or unknown.
-            frame: "T", "P", "S", or "camera" for OpenCV's axes of the left camera. S and camera stand where the fit
-                found the positioner before the cameras (its extrinsics).
-            covariance: also that of origin and direction, by the law of propagation (GUM 5.2): of every parameter, of
-                the extrinsics where the frame is the cameras', and of stop errors.
+            frame: "T", "P", "S", or "camera" for OpenCV's axes of the left camera. S and camera are related to P by the
+                extrinsics of the fit.
+            covariance: also compute the covariance of origin and direction, by the law of propagation (GUM 5.2), from
+                all parameters, stop errors, and for the cameras' frames the extrinsics.
 
         Raises:
-            InputError: an approach or a frame that does not exist, or a calibration without extrinsics.
+            InputError: there is no such approach or frame, or the calibration has no extrinsics.
         """
         refuse_frame(frame, self.extrinsics)
         steps, sides = (pan_steps, tilt_steps), sides_of(approach)
@@ -235,12 +235,12 @@ class Calibration(Shown):
 
     @cached_property
     def _pose(self) -> np.ndarray:
-        """Best estimates of the extrinsics, shape (6,)."""
+        """Return the best estimates of the extrinsics, shape (6,)."""
         return self.extrinsics.mean(axis=0)
 
     @cached_property
     def _covariance_with_pose(self) -> np.ndarray:
-        """Covariance of `INPUT_NAMES`, the extrinsics, and the columns of the gears."""
+        """Compute the covariance of `INPUT_NAMES`, the extrinsics, and the columns of the gears."""
         first, pose = len(INPUT_NAMES), len(EXTRINSICS_NAMES)
         drawn = np.column_stack([self.inputs[:, :first], self.extrinsics, self.inputs[:, first:]])
         drawn_covariance = np.cov(drawn, rowvar=False)
@@ -249,7 +249,7 @@ class Calibration(Shown):
         return drawn_covariance
 
     def _ray_covariance(self, ray: np.ndarray, steps: Counters, sides: Sides, frame: str) -> np.ndarray:
-        """Covariance (6, 6) of a ray (6,) that is in T where the frame is T, else in P."""
+        """Compute the covariance (6, 6) of a ray (6,), given in T for frame T, else in P."""
         moved = self._moved_beam(steps, sides, NO_INPUTS if frame == "T" else P_INPUTS)
         slopes = np.array([*moved.origin, *moved.direction]).imag / COMPLEX_STEP
         if frame in ("T", "P"):
@@ -268,10 +268,10 @@ class Calibration(Shown):
     def locate(
         self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = HOME_APPROACH
     ) -> Located:
-        """The point that beam and aperture reading agree on, with its covariance by the law of propagation (GUM 5.2).
+        """Locate the point of beam and aperture reading, with covariance by the law of propagation (GUM 5.2).
 
-        Stop errors, aperture noise and the uncertainty of every parameter are in it. `tvsbayes.locate` carries the
-        draws themselves through the geometry instead.
+        The covariance includes stop errors, aperture noise and all parameters. `tvsbayes.locate` propagates the draws
+        through the geometry instead.
 
         Args:
             pan_steps: absolute counter.
@@ -280,8 +280,8 @@ class Calibration(Shown):
             approach: as in `ray`.
 
         Raises:
-            InputError: an approach that does not exist, or beam and line of sight do not meet, or more than 0.1 % of
-                what the data allow would not (formulation 5).
+            InputError: there is no such approach, or beam and line of sight do not meet, or do not with a probability
+                above 0.1 % (formulation 5).
         """
         sides = sides_of(approach)
         steps = (float(pan_steps), float(tilt_steps))
@@ -300,10 +300,10 @@ class Calibration(Shown):
         return Located(point, covariance, u95, not self.covers(*steps), self.unseen(*steps))
 
     def refusal(self, pan_steps: float, tilt_steps: float, aperture_deg: float, sides: Sides) -> InputError:
-        """Why beam and line of sight of a look have no point in common, or none of finite uncertainty: by name.
+        """Explain why beam and line of sight of a look have no common point, or none of finite uncertainty.
 
-        "grazing" where the estimated beam passes the aperture's cone without touching it, "behind" where it meets the
-        reading behind the baseline, else "diverging".
+        The code is "grazing" where the estimated beam misses the aperture's cone, "behind" where it meets the reading
+        behind the baseline, else "diverging".
         """
         where = f"pan {pan_steps:g}, tilt {tilt_steps:g} steps, aperture {aperture_deg:g} deg"
         refused, meet_mm = partial(InputError, column="aperture_deg", found=f"{aperture_deg:g}"), math.nan
@@ -336,10 +336,10 @@ class Calibration(Shown):
         )
 
     def noisy_beam(self, values: Values, noise: np.ndarray, steps: Counters, sides: Sides) -> Components:
-        """The beam with stop errors, and from somewhere in the play where the side is unknown.
+        """Compute the beam with stop errors, and with a random position in the play where the side is unknown.
 
         Args:
-            values: by name, of `look_inputs` at these counters and `NOISE_NAMES`; arrays of one shape.
+            values: `look_inputs` at these counters and `NOISE_NAMES`, by name; arrays of one shape.
             noise: `NOISES` unit noises, first axis, arrays of that shape (`Drawn`).
             steps: counters.
             sides: approach sides.
@@ -348,7 +348,7 @@ class Calibration(Shown):
         for k, (axis, side) in enumerate(zip(AXES, sides, strict=True)):
             low, high = (values[f"stop_sd_deg.{name}"] for name in SIDES[axis])
             stop_sd = high if side > 0 else low if side < 0 else np.sqrt(0.5 * (low**2 + high**2))
-            # Where the side is unknown, the play is taken up by any part of it.
+            # If the side is unknown, the position in the play is uniform.
             place = side if side else -2 * noise[2 + k]
             angles.append(output_deg(values, axis, steps[k], place, self.period_deg.get(axis)) + stop_sd * noise[k])
         return beam_components(values, angles[0], angles[1])
@@ -356,7 +356,7 @@ class Calibration(Shown):
     def derivatives(
         self, pan_steps: float, tilt_steps: float, aperture_deg: float, approach: tuple[str, str] = HOME_APPROACH
     ) -> np.ndarray:
-        """Sensitivities of a point to `look_inputs` (their units) and to the unit noises of the look, mm.
+        """Compute sensitivities of a point to `look_inputs` (their units) and to the unit noises of the look, mm.
 
         Noises have the root mean square of their standard deviations.
 
@@ -381,12 +381,12 @@ class Calibration(Shown):
     def points(
         self, values: Values, noise: np.ndarray, steps: Counters, sides: Sides, aperture_deg: np.ndarray
     ) -> np.ndarray:
-        """Points where beams meet the aperture's readings, x, y, z first; not a number where they do not.
+        """Compute points where beams meet the aperture's readings, first axis x, y, z; NaN where they do not.
 
         Args:
             values: as for `noisy_beam`, as are the next three.
             noise: unit noises.
-            steps: counters; their shape and that of the readings is broadcast with that of the values.
+            steps: counters; they and the readings broadcast with the values.
             sides: approach sides.
             aperture_deg: readings B.
         """
@@ -396,10 +396,10 @@ class Calibration(Shown):
         return beam.met(reach)
 
     def moved_points(self, steps: Counters, sides: Sides, aperture_deg: np.ndarray) -> np.ndarray:
-        """Points of many looks of one approach, complex, shape (3, look inputs + NOISES, n).
+        """Compute points of many looks of one approach, complex, shape (3, look inputs + NOISES, n).
 
-        The real part is the point, the same in every row of the second axis or not a number where there is none; the
-        imaginary part over `COMPLEX_STEP` its derivative by that input or unit noise.
+        The real part is the point, equal along the second axis, NaN where there is none. The imaginary part over
+        `COMPLEX_STEP` is its derivative by that input or unit noise.
 
         Args:
             steps: counters (pan, tilt), each (n,).
@@ -411,7 +411,7 @@ class Calibration(Shown):
         return self.points(values, self._moved.noise[..., None], steps, sides, aperture_deg)
 
     def _moved_gears(self, steps: Counters) -> dict[str, np.ndarray]:
-        """Moved errors of the gears at counters, numbers or arrays (n,); shape (look inputs + NOISES, ...)."""
+        """Return changed gear errors at counters, numbers or arrays (n,); shape (look inputs + NOISES, ...)."""
         estimates = self.estimates_at(steps) if self.gears.size else {}
         return {name: np.add.outer(self._moved.gears[name], estimates[name]) for name in self.gears.inputs}
 
@@ -424,17 +424,17 @@ class Calibration(Shown):
         approach: tuple[str, str] | None = None,
         limits: Mapping[str, tuple[float, float]] | None = None,
     ) -> Steps:
-        """Counters that send the beam to a point, or along a direction, of frame T.
+        """Compute counters that aim the beam at a point, or along a direction, of frame T.
 
         Args:
-            xyz_mm: wanted point; or give a wanted direction by
+            xyz_mm: target point; or give a direction by
             azimuth_deg: atan2(d_y, d_x), the emission angle C less 90 deg, and
             elevation_deg: asin(d_z).
             approach: side from which each axis arrives; None takes left and up where the limits allow.
             limits: lowest and highest counter by axis ("pan", "tilt").
 
         Raises:
-            InputError: neither or both targets, no mirror angle reaches it, or it lies outside the limits.
+            InputError: neither or both targets are given, no mirror angle reaches it, or it is outside the limits.
         """
         target = self._target(xyz_mm, azimuth_deg, elevation_deg)
         arrivals = []
@@ -467,12 +467,12 @@ class Calibration(Shown):
         )
 
     def _values_on(self, index: int, counter: float) -> dict[str, Any]:
-        """Best estimates with one axis at a counter."""
+        """Return best estimates with one axis at a counter."""
         return self.estimates_at((counter, 0.0) if index == 0 else (0.0, counter))
 
     @staticmethod
     def _target(xyz_mm: ArrayLike | None, azimuth_deg: float | None, elevation_deg: float | None) -> Point | Direction:
-        """The one target of `steps_for`."""
+        """Return the target of `steps_for`."""
         if xyz_mm is not None and azimuth_deg is None and elevation_deg is None:
             return Point(np.asarray(xyz_mm, dtype=float))
         if xyz_mm is None and azimuth_deg is not None and elevation_deg is not None:
@@ -481,19 +481,19 @@ class Calibration(Shown):
         raise InputError("no-target", "steps_for needs one target, a point or a direction", remedy=remedy)
 
     def reading(self, point: np.ndarray) -> float:
-        """What the aperture reads for a point of frame T, degrees."""
+        """Compute the aperture's reading for a point of frame T, degrees."""
         x, y, z = point.tolist()
         angle = aperture_angle_deg((x, y, z), self.estimates["baseline_mm"], self.azimuth, math)
         return float(angle) + self.estimates["aperture_zero_deg"]
 
     def beam_u95_deg(self, steps: Counters, sides: Sides) -> np.ndarray:
-        """95 % half widths of the beam's azimuth and elevation (2,), degrees."""
+        """Compute 95 % half widths of the beam's azimuth and elevation (2,), degrees."""
         _, (u, v, w) = self._moved_beam(steps, sides)
-        # Of the azimuth atan2(y, x), whose derivatives those of atan(y / x) are.
+        # The derivatives of the azimuth atan2(y, x) are those of atan(y / x).
         return self._u95(np.array([np.arctan(v / u), np.arcsin(w)]) / TO_RAD, steps)
 
     def beam_u95_mm(self, steps: Counters, sides: Sides, range_mm: float) -> np.ndarray:
-        """95 % half widths of the beam's position at a range (3,), mm."""
+        """Compute 95 % half widths of the beam's position at a range (3,), mm."""
         return self._u95(self._moved_beam(steps, sides).at(range_mm), steps)
 
     def _moved_beam(self, steps: Counters, sides: Sides, frame: Values = NO_INPUTS) -> Components:
@@ -501,6 +501,6 @@ class Calibration(Shown):
         return self.noisy_beam(values, self._moved.noise, steps, sides)
 
     def _u95(self, moved: np.ndarray, steps: Counters) -> np.ndarray:
-        """Half widths (q,) of quantities (q, look inputs + NOISES) of the moved parameters."""
+        """Compute half widths (q,) of quantities (q, look inputs + NOISES) of the changed parameters."""
         jacobian = moved.imag / COMPLEX_STEP
         return NORMAL_95 * np.sqrt(np.diag(jacobian @ self.look_covariance(steps) @ jacobian.T))

@@ -59,7 +59,7 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
     changes = []
     for k, name in enumerate(COMPARED):
         a, b = float(before[0, k]), float(after[0, k])
-        # A quantity fixed in both has changed if the stated values differ; its variance is zero but for rounding.
+        # A quantity fixed in both has changed if the stated values differ; its variance is zero except for rounding.
         fixed = np.ptp(before[1:, k]) == np.ptp(after[1:, k]) == 0
         u = 0.0 if fixed else float(np.sqrt(max(variance[k], 0.0)))
         ratio = (b - a) / u if u > 0 else None

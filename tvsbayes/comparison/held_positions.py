@@ -31,7 +31,7 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
 
     Args:
         fit_of_all: a converged fit; its campaign and model are used.
-        progress: told how far it is.
+        progress: receives the progress.
 
     Raises:
         NothingToEstimate: neither axis was seen at three counters.

@@ -220,7 +220,7 @@ def verify_looks(
         calibration: calibration in force.
         looks: a campaign with all its moves, whose counters `steps-for` or the header computed.
         distance_mm: distance along the beams at which errors are stated in mm.
-        seed: of what is drawn.
+        seed: seed of all draws.
 
     Raises:
         NothingToEstimate: fewer than `LOOKS_MIN` usable looks.

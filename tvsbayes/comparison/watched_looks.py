@@ -375,7 +375,7 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
     Args:
         departure: only its information is used, so it may be that of a plan.
         limit: of log p.
-        seed: of the directions.
+        seed: seed of the directions.
         times: size of the change as a multiple of the stated one.
     """
     from scipy import special

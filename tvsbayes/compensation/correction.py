@@ -1,6 +1,6 @@
-"""What is added to a command so that the reading comes where it should: a two-sided table, as a controller holds it.
+"""Corrections added to commands so that readings meet their aim: a two-sided table, as a controller holds it.
 
-Commands as the campaign counts them; forward is a rising command. No JAX.
+Commands in the campaign's unit; forward is a rising command. No JAX.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from tvsbayes.single_axis.axis_rows import legs_of
 
 @dataclass(frozen=True)
 class Correction:
-    """Corrections by side, linear between commands, constant beyond the ends.
+    """Corrections by side, linear between commands, constant outside the table.
 
     Attributes:
-        command: ascending, shape (n,).
-        forward, backward: what is added to the command, shape (n,).
-        resolution: least command that is carried out; 0 where it is fine.
+        command: commands of the table, ascending, shape (n,).
+        forward, backward: corrections added to the command, shape (n,).
+        resolution: resolution of executed commands; 0 where it is negligible.
     """
 
     command: np.ndarray
@@ -32,25 +32,25 @@ class Correction:
 
     @classmethod
     def of(cls, made: Compensation) -> Correction:
-        """That of a compensation."""
+        """Return the correction of a compensation."""
         command, forward, backward = np.array([(r.command, r.add_forward, r.add_backward) for r in made.table]).T
         return cls(command, forward, backward, made.resolution)
 
     def sent(self, command: np.ndarray, side: np.ndarray, common: float = 1.0, play: float = 1.0) -> np.ndarray:
-        """What the mechanics get for commands (m,) that are arrived at from sides (m,), 1, -1 or 0 for unknown.
+        """Compute the corrected commands for commands (m,) reached from sides (m,), 1, -1 or 0 for unknown.
 
         Args:
-            command: asked for.
-            side: of the arrival.
-            common: factor of what both sides have in common.
-            play: factor of half of what they differ by.
+            command: command before the correction.
+            side: side of the arrival.
+            common: factor on the mean correction of both sides.
+            play: factor on half of their difference.
         """
         ahead, back = (np.interp(command, self.command, add) for add in (self.forward, self.backward))
         command_sent = command + 0.5 * common * (ahead + back) + 0.5 * play * side * (ahead - back)
         return np.round(command_sent / self.resolution) * self.resolution if self.resolution else command_sent
 
     def moved(self, moves: Sequence[AxisMove], common: float = 1.0, play: float = 1.0) -> list[AxisMove]:
-        """Moves as the mechanics get them."""
+        """Return the moves with corrected commands."""
         legs = legs_of(moves)
         sent = self.sent(legs.command, legs.side, common, play)
         return [replace(move, command=float(to)) for move, to in zip(moves, sent, strict=True)]
@@ -58,12 +58,12 @@ class Correction:
 
 @dataclass(frozen=True)
 class Cycles:
-    """Runs up and down through some commands, which are read in turn.
+    """Runs up and down through some commands, with readings distributed over the runs.
 
     Attributes:
-        moves: in order of time, of one segment.
-        read: numbers of those that are read, ascending, shape (r,): every command once from each side.
-        index, side: of each its command's number, and 1 or -1, shape (r,).
+        moves: moves in order of time, of one segment.
+        read: numbers of moves with a reading, ascending, shape (r,): every command once from each side.
+        index, side: index of the command, and 1 or -1, of each reading, shape (r,).
     """
 
     moves: tuple[AxisMove, ...]
@@ -73,7 +73,7 @@ class Cycles:
 
 
 def cycles(commands: np.ndarray, overrun: float, hours: float, count: int) -> Cycles:
-    """So many runs up and down through ascending commands, beyond both ends by `overrun`.
+    """Build `count` runs up and down through ascending commands, beyond both ends by `overrun`.
 
     Command k is read in run k modulo count.
     """

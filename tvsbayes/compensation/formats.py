@@ -1,7 +1,7 @@
-"""Formats of controllers and models: what each can hold, and how it is written, as a table of entries.
+"""Formats of controllers and models: a table of what each can hold and how it is written.
 
-A format holds a two-sided table, or one ratio with one play, or one ratio, or one period. The rest stays with the
-machine, and the promise says how much that is. Numbers have a decimal point, whatever the locale.
+A format holds a two-sided table, or one ratio with one play, or one ratio, or one period. The remaining errors are part
+of the promise. Numbers have a decimal point in any locale.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ LINUXCNC_DECIMALS = 7
 
 @dataclass(frozen=True)
 class Origin:
-    """What a file was made from: `text` names program and folder, `data_sha256` is that of the folder's data."""
+    """Origin of a file: `text` names program and folder, `data_sha256` is the hash of the folder's data."""
 
     text: str
     data_sha256: str
 
 
 _UNCOMMENTED = re.compile(r"[^A-Za-z0-9 .,:=_+%/$\[\]-]")
-"""What a name from a file is not written with: the end of a comment, control characters, other than ASCII."""
+"""Characters replaced in names: those that end a comment, control characters, non-ASCII."""
 
 
 def plainly(text: str) -> str:
-    """Text from a file as a comment may hold it."""
+    """Return text from a file with characters that a comment may hold."""
     return _UNCOMMENTED.sub("_", text)
 
 
 def number(value: float, digits: int = 9) -> str:
-    """A number with so many digits, zero without a sign."""
+    """Format a number with this many digits, zero without a sign."""
     return f"{value + 0.0:.{digits}g}"
 
 
 def stated(made: Compensation, origin: Origin) -> list[str]:
-    """What every file says first: of what it is, in which sense it is added, what is left, what it cannot say."""
+    """Return the first lines of every file: origin, sense of addition, remaining errors, limits of the format."""
     low, high = made.range_command
     unit = plainly(made.unit)
     lines = [
@@ -87,10 +87,10 @@ def _csv(made: Compensation, origin: Origin) -> str:
 
 
 def _linuxcnc(made: Compensation, origin: Origin) -> str:
-    """Triplets nominal, forward, reverse, nominal rising: the controller subtracts what stands there less nominal.
+    """Write triplets nominal, forward, reverse with rising nominal; the controller subtracts entry minus nominal.
 
-    LinuxCNC counts in units: nominal = per_command x command. Where the unit falls as the command rises, forward and
-    reverse change places. Its reader stops at the first line that is no triplet, so that what is said stands behind.
+    LinuxCNC counts in units: nominal = per_command x command. If per_command is negative, forward and reverse are
+    exchanged. Its reader stops at the first line that is not a triplet, so comments follow the table.
     """
     scale, rows = made.per_command, []
     for row in made.table:
@@ -179,7 +179,7 @@ def _urdf(made: Compensation, origin: Origin) -> str:
 
 
 def _urdf_yaml(made: Compensation, origin: Origin) -> str:
-    """The same for programs: joint and its covariance, in the unit of readings."""
+    """Write the joint and its covariance for programs, in the unit of readings."""
     import yaml
 
     settings = made.settings
@@ -204,7 +204,7 @@ def _urdf_yaml(made: Compensation, origin: Origin) -> str:
 
 
 PHASES = 64
-"""Lines of a period's table."""
+"""Number of lines of a period's table."""
 
 
 def _pec(made: Compensation, origin: Origin) -> str:
@@ -219,15 +219,15 @@ def _pec(made: Compensation, origin: Origin) -> str:
 
 @dataclass(frozen=True)
 class Format:
-    """A format.
+    """A format of compensation files.
 
     Attributes:
-        holds: what it can say.
-        write: content of the file, from a compensation and what made it.
-        zero_free: whether controllers leave open by which half of the play a first move is off.
-        in_force: name of the setting whose value in force a new one is made from, "" of none.
-        unsaid: what it cannot say, in words.
-        beside: content of a second file, for programs, YAML; None of most formats.
+        holds: errors that it can represent.
+        write: function that returns the content of the file from a compensation and its origin.
+        zero_free: whether the zero is undetermined, by half of the play at a first move.
+        in_force: name of the setting whose present value is changed, "" for none.
+        unsaid: errors that it cannot correct, in words.
+        beside: the same for a second file for programs, YAML; None for most formats.
     """
 
     holds: Holds
@@ -277,17 +277,17 @@ FORMATS: Mapping[str, Format] = {
 
 @dataclass(frozen=True)
 class Wish:
-    """What a compensation is to be; fields as the options of `compensate`.
+    """Options of a compensation; fields as the options of `compensate`.
 
     Attributes:
-        target: format, a name in `FORMATS`.
+        target: name of the format in `FORMATS`.
         applied_by: who adds the corrections.
-        per_command: reading per command that is aimed at; None for that of `[axis]`, 1 or -1 where commands count in
-            the unit of readings, else the fit's.
+        per_command: aimed reading per command; None for that of `[axis]`, for 1 or -1 where commands are in the unit of
+            readings, else for the fit's.
         resolution: least command that is carried out; 0 where it is fine.
-        in_force: setting in force, of formats that change one.
-        letter: of the axis, in the settings of grbl: X, Y, Z, A, B or C.
-        period: of a period's table, in commands; None for that of the strongest wave.
+        in_force: present value of the setting, for formats that change one.
+        letter: letter of the axis in the settings of grbl: X, Y, Z, A, B or C.
+        period: period of a period's table, in commands; None for that of the strongest wave.
     """
 
     target: str = "csv"
@@ -300,10 +300,10 @@ class Wish:
 
 
 def checked(wish: Wish) -> Format:
-    """The format that is wanted.
+    """Check the options and return the format.
 
     Raises:
-        InputError: it is unknown, or a number that it needs is missing or impossible.
+        InputError: it is unknown, or a required number is missing or impossible.
     """
     form = FORMATS.get(wish.target)
     if form is None:

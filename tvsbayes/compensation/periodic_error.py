@@ -1,9 +1,9 @@
-"""The table of a drive at constant rate: what repeats with one period of its command, and what is left of that.
+"""Compensation of a drive at constant rate: a table of errors that repeat with one period, and the remaining errors.
 
-A drive that tracks never stops and never turns back: a controller can take out what repeats with a turn of its worm.
-The table is the expected wave over one period in the middle of the record, where its phase is known best. The promise
-is of errors off the drive's own line, but for one shift, within a period of its slowest wave. Commands as the campaign
-counts them, the rest in its unit. No JAX.
+A tracking drive never stops or reverses; its controller can correct errors that repeat with a turn of its worm. The
+table is the expected wave over one period in the middle of the record, where its phase is best determined. The promise
+bounds errors from the drive's own line, up to one shift, within a period of its slowest wave. Commands in the
+campaign's counts, all else in its unit. No JAX.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from tvsbayes.single_axis.waves import wave_columns
 from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
 
 NODES = 129
-"""Of the table, both ends of the period included."""
+"""Number of nodes of the table, both ends of the period included."""
 DRAWS, TRIED, TRIED_MAX = 200, 24, 4000
-"""Draws over which the promise is taken, and commands of a period; of the record at most."""
+"""Draws for the promise, commands evaluated per period, and the largest number over the record."""
 HARMONICS = 8
-"""Parts of a period that a table holds: waves of P, P/2 ... P/8."""
+"""Harmonics of a period in a table: waves of P, P/2 ... P/8."""
 SLIP_TURNS = 0.25
-"""Of a wave against the table, over the record, below which it repeats with the period."""
+"""Largest phase difference in turns between wave and table over the record for a wave to be in the table."""
 LIKELY = 0.95
-"""Probability above which a wave counts."""
+"""Probability above which a wave is corrected."""
 
 
 def known_waves(fit: AxisFit) -> list[WaveSample]:
-    """Waves of the gear that are there, the strongest first."""
+    """Return the probable waves of the gear, the strongest first."""
     likely = (each for each in wave_samples(fit) if each.probability >= LIKELY and each.wave.clock != "encoder")
     return sorted(likely, key=lambda each: -float(each.amplitude.mean()))
 
 
 def commands_of(rows: AxisRows, sample: WaveSample) -> float:
-    """Period of a wave in commands, mean."""
+    """Compute the mean period of a wave in commands."""
     period = float(np.mean(sample.period[sample.likeliest]))
     return period * abs(rows.rate or 0.0) if sample.wave.clock == "seconds" else period / abs(rows.line[1])
 
 
 def strongest_period(rows: AxisRows, waves: Sequence[WaveSample]) -> float:
-    """Of the strongest wave that repeats with the command, in commands; `waves` as `known_waves` has them.
+    """Return the period of the strongest wave by command, in commands; `waves` are from `known_waves`.
 
     Raises:
         InputError: there is none.
@@ -61,7 +61,7 @@ def strongest_period(rows: AxisRows, waves: Sequence[WaveSample]) -> float:
 
 
 def _waves(fit: AxisFit, samples: Sequence[WaveSample], command: np.ndarray) -> np.ndarray:
-    """Sum of waves at commands (m,), by draws: shape (`DRAWS`, m)."""
+    """Compute the sum of waves at commands (m,), by draws: shape (`DRAWS`, m)."""
     rows = fit.rows
     order = np.argsort(rows.command)
     time_s = np.interp(command, rows.command[order], rows.time_s[order])
@@ -75,7 +75,7 @@ def _waves(fit: AxisFit, samples: Sequence[WaveSample], command: np.ndarray) -> 
 
 
 def _creep(fit: AxisFit, values: dict[str, np.ndarray], drawn: np.ndarray, command: np.ndarray) -> np.ndarray:
-    """Of the zero while the drive warms up, at commands (m,): shape (`DRAWS`, m), zero where there is none."""
+    """Compute the creep of the zero during warm-up at commands (m,): shape (`DRAWS`, m), zero without creep."""
     if "creep" not in fit.draws:
         return np.zeros((DRAWS, len(command)))
     rows = fit.rows
@@ -85,23 +85,22 @@ def _creep(fit: AxisFit, values: dict[str, np.ndarray], drawn: np.ndarray, comma
 
 
 def _off_their_mean(errors: np.ndarray, spans: int) -> np.ndarray:
-    """Errors (n, m) of so many spans, less the mean of each: a shift is none of the table's errors."""
+    """Subtract from errors (n, m) the mean of each span, since a shift is not an error of the table."""
     each = errors.reshape(len(errors), spans, -1)
     return (each - each.mean(axis=-1, keepdims=True)).reshape(errors.shape)
 
 
 def _span(period: float, record: float, waves: Sequence[float]) -> float:
-    """Commands within which the promise is: whole periods as long as the slowest wave, where the record has them."""
+    """Return the range of the promise in commands: whole periods as long as the slowest wave, within the record."""
     count = max(1, round(max(waves) / period + 0.25))
     return period * min(count, int(record / period))
 
 
 def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
-    """The table of one period and its promise.
+    """Build the table of one period and its promise.
 
     Raises:
-        InputError: the format holds no period, a ratio is given, no wave is known, or the period is longer than the
-            record.
+        InputError: the format has no period, a ratio is given, no wave is known, or the period exceeds the record.
         NothingToEstimate: no known wave repeats with the period.
     """
     form = FORMATS[wish.target]
@@ -148,7 +147,7 @@ def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
     without = _waves(fit, every, tried) + _creep(fit, values, drawn, tried)
     before, after = (_off_their_mean(errors, spans) for errors in (without, without + sent))
     hours = span / abs(rows.rate or 1.0) / HOUR_S
-    # A random walk of variance s^2 t scatters by s^2 T / 6 about its own mean within T.
+    # A random walk of variance s^2 t has the variance s^2 T / 6 about its own mean within T.
     drift = values["drift_per_root_hour"] * np.sqrt(hours / 6.0)
     reading = np.hypot(values["reading_scale"], values["seeing_scale"]) * rows.reading_u
     promise = _promise(before, after, drift, reading)
@@ -177,7 +176,7 @@ def drive_compensation(fit: AxisFit, wish: Wish) -> Compensation:
 
 
 def _promise(before: np.ndarray, after: np.ndarray, drift: np.ndarray, reading: np.ndarray) -> SidePromise:
-    """What is left by draws of the waves (n, m), of drift (n,) and reading (n,): of either side, as there is one."""
+    """Compute the promise from draws of waves (n, m), drift (n,) and reading (n,), equal for both sides."""
     noise = np.sqrt(drift**2 + reading**2)[:, None] * np.ones(after.shape[1])
     mean, zero = after.mean(axis=0), np.zeros_like(after)
     alone = {

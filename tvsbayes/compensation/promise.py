@@ -1,8 +1,8 @@
-"""A two-sided table made of a fit, in the terms of a format, and the promise of what is left after applying it.
+"""A two-sided table from a fit in the terms of a format, and the promise: the bound of errors after applying it.
 
-The promise is a prediction of readings, not of means: error by position, play and its variation, scatter of stops,
-homing, drift since then, the uncertainty of all of them, what the format cannot hold, rounding to what the controller
-carries out. Commands as the campaign counts them, the rest in its unit. No JAX.
+The promise is a prediction of readings, not of means. It includes error by position, play and its variation, scatter of
+stops, homing, drift since then, the uncertainty of all of them, limits of the format, and rounding by the controller.
+Commands in the campaign's counts, all else in its unit. No JAX.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
 from tvsbayes.statistics.streams import Stream, random_stream
 
 NODES_FEW, NODES_MANY = 13, 41
-"""Fewest and most lines of a table: positions read, and halfway between where these are few."""
+"""Least and largest number of lines of a table: positions read, and midpoints where these are few."""
 PERIOD_NODES = 129
-"""Of a period's table over the range."""
+"""Nodes of a period's table over the range."""
 TRIED = 20
-"""Commands at which the promise is tried, from each side."""
+"""Number of commands at which the promise is evaluated, from each side."""
 UNIT_COMMANDS = 0.2
-"""Share by which the ratio may differ from 1 or -1 where commands count in the unit of readings."""
+"""Largest difference of the ratio from 1 or -1 for commands to count in the unit of readings."""
 ONE_SIDED = "every stop was read from one side: the play is not determined; its prior sets the error on the other side"
 RUNS_MAX = 20
-"""Up and down, in a prediction: a longer travel is not followed."""
+"""Largest number of runs up and down in a prediction; a longer travel is not predicted."""
 SIDES = (("forward", 1), ("backward", -1))
 
 
 @dataclass(frozen=True)
 class _Expected:
-    """Readings expected at commands (m,): mean and u by side, (2, m) each, forward first; was it read from both?"""
+    """Readings expected at commands (m,): mean and u by side, (2, m) each, forward first; whether both were read."""
 
     command: np.ndarray
     mean: np.ndarray
@@ -56,7 +56,7 @@ class _Expected:
 
 
 def _expected(fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, seed: int) -> _Expected:
-    """At the table's commands, without the noise of a reading."""
+    """Predict readings at the table's commands, without the noise of a reading."""
     stops, run = _run(fit, commands, overrun, since, None, 0.0, seed)
     mean, covariance = stops.pooled()
     order = [np.flatnonzero(run.side == side)[np.argsort(run.index[run.side == side])] for _, side in SIDES]
@@ -66,14 +66,14 @@ def _expected(fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, 
 
 @dataclass(frozen=True)
 class Since:
-    """What a machine does between two homings: hours, and commands travelled."""
+    """Use of a machine between two homings: hours, and commands travelled."""
 
     hours: float
     travel: float
 
     @classmethod
     def of(cls, moves: Sequence[AxisMove]) -> Since:
-        """The longest of a campaign's segments."""
+        """Return the largest values over a campaign's segments."""
         legs = legs_of(moves)
         time_s = np.array([move.time_s for move in moves])
         each = [np.flatnonzero(legs.segment == segment) for segment in np.unique(legs.segment)]
@@ -81,7 +81,7 @@ class Since:
         return cls(hours, max(float(np.abs(legs.step[members]).sum()) for members in each))
 
     def cycles(self, commands: np.ndarray, overrun: float) -> Cycles:
-        """Runs through commands, as many as make up the travel."""
+        """Build as many runs through commands as make up the travel."""
         once = 2.0 * (float(np.ptp(commands)) + 2.0 * overrun)
         return cycles(commands, overrun, self.hours, max(1, min(round(self.travel / once), RUNS_MAX)))
 
@@ -89,18 +89,18 @@ class Since:
 def _run(
     fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, applied: Correction | None, u: float, seed: int
 ) -> tuple[PredictedStops, Cycles]:
-    """Runs up and down, under a correction."""
+    """Predict runs up and down, under a correction."""
     run = since.cycles(commands, overrun)
     moves = run.moves if applied is None else applied.moved(run.moves)
     return predicted_stops(fit, moves, run.read.tolist(), np.full(len(run.read), u), seed), run
 
 
 def refuse_answer(answer: str, remedy: str = "run `tvsbayes fit` again, without --no-sample or --quick") -> None:
-    """A table is made of an accepted answer alone: it moves a machine.
+    """Refuse a fit without an accepted answer, since its table would move a machine.
 
     Args:
-        answer: of the fit.
-        remedy: what makes it an accepted one.
+        answer: answer of the fit.
+        remedy: how to obtain an accepted one.
 
     Raises:
         NotConverged: the answer is rough, or a Laplace approximation.
@@ -112,7 +112,7 @@ def refuse_answer(answer: str, remedy: str = "run `tvsbayes fit` again, without 
 
 
 def _nominal(campaign: AxisCampaign, fitted: float, wish: Wish) -> float:
-    """Reading per command that is aimed at."""
+    """Return the aimed reading per command."""
     if wish.per_command is not None:
         return wish.per_command
     if "per_command" in campaign.stated:
@@ -123,7 +123,7 @@ def _nominal(campaign: AxisCampaign, fitted: float, wish: Wish) -> float:
 
 
 def table_commands(rows: AxisRows) -> np.ndarray:
-    """Commands of a table: those read, thinned where they are many, halved where they are few."""
+    """Choose commands of a table: those read, thinned if many, with midpoints if few."""
     commands = rows.positions
     if len(commands) > NODES_MANY:
         commands = commands[np.linspace(0, len(commands) - 1, NODES_MANY).round().astype(int)]
@@ -134,14 +134,14 @@ def table_commands(rows: AxisRows) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Shaped:
-    """What a format makes of the errors: a correction without its rounding, and the format's numbers."""
+    """Errors in the terms of a format: a correction without rounding, and the format's numbers."""
 
     correction: Correction
     settings: dict[str, float] = field(default_factory=dict)
 
 
 def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wish, line: np.ndarray) -> _Shaped:
-    """The errors in the terms of a format, as what is added to a command."""
+    """Express the errors in the terms of a format, as corrections of commands."""
     command = at.command
     if form.holds == "table":
         offset = _offset(at, nominal)
@@ -150,7 +150,7 @@ def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wi
     middle = at.mean.mean(axis=0)
     if form.holds == "period":
         return _folded(at, fitted, float(wish.period or 0.0), wish.resolution)
-    # The line that the format knows, through command 0: what is left over is one shift.
+    # The line of the format, through command 0, up to one shift.
     slope = float(np.polyfit(command, middle, 1)[0])
     play = float(np.mean(at.mean[1] - at.mean[0])) * float(np.sign(slope))
     factor, taken, settings = nominal / slope, 0.0, {}
@@ -171,7 +171,7 @@ def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wi
 
 
 def _line_draws(fit: AxisFit) -> np.ndarray:
-    """Zero at command 0 and slope of the line through what was read, (draws, 2)."""
+    """Draw zero at command 0 and slope of the line through the readings, (draws, 2)."""
     model = fit.model
     slope = model.head(slope=1.0) + line_weights(model, fit.w)
     level = model.head(offset=1.0) + model.functional(fit.rows.command, fit.w).mean(axis=-2)
@@ -180,7 +180,7 @@ def _line_draws(fit: AxisFit) -> np.ndarray:
 
 
 def _joint(line: np.ndarray) -> dict[str, float]:
-    """Zero and reduction of a joint with their covariance, from draws (n, 2) of zero and unit per command."""
+    """Compute zero and reduction of a joint with their covariance, from draws (n, 2) of zero and unit per command."""
     joint = np.column_stack([line[:, 0], 1.0 / line[:, 1]])
     covariance = np.cov(joint.T)
     return {
@@ -193,23 +193,23 @@ def _joint(line: np.ndarray) -> dict[str, float]:
 
 
 def _rounded(added: np.ndarray, nominal: float, target: str) -> np.ndarray:
-    """Corrections (2, m) as the file holds them: LinuxCNC's are in units, with a fixed number of decimals."""
+    """Round corrections (2, m) as in the file: LinuxCNC's are in units, with a fixed number of decimals."""
     if target == "linuxcnc":
         return np.round(added * nominal, LINUXCNC_DECIMALS) / nominal
     return np.array([[float(number(v)) for v in side] for side in added])
 
 
 def _offset(at: _Expected, nominal: float) -> float:
-    """Of the line that is aimed at: both sides' middle at command 0, or at the nearest to it, needs no correction."""
+    """Compute the offset of the aimed line, for which both sides' mean at the command nearest to 0 is correct."""
     nearest = int(np.argmin(np.abs(at.command)))
     return float(at.mean[:, nearest].mean() - nominal * at.command[nearest])
 
 
 def _folded(at: _Expected, fitted: float, period: float, resolution: float) -> _Shaped:
-    """Both sides' middle error, off its line, averaged over periods.
+    """Average both sides' mean error from its line over periods.
 
     Raises:
-        InputError: the range is shorter than a period, or the table is coarse against it.
+        InputError: the range is shorter than a period, or the table too coarse for it.
     """
     low, high = float(at.command[0]), float(at.command[-1])
     spacing = float(np.max(np.diff(at.command)))
@@ -221,7 +221,7 @@ def _folded(at: _Expected, fitted: float, period: float, resolution: float) -> _
     middle = at.mean.mean(axis=0)
     off = middle - np.polyval(np.polyfit(at.command, middle, 1), at.command)
     phase = 2 * np.pi * at.command / period
-    # The mean over periods by harmonics: as many as the positions can tell of, four at most.
+    # The mean over periods is fitted by four harmonics.
     waves = np.column_stack([f(k * phase) for k in range(1, 5) for f in (np.cos, np.sin)])
     amplitudes = np.linalg.lstsq(waves, off, rcond=None)[0]
     command = np.linspace(low, high, PERIOD_NODES)
@@ -231,13 +231,13 @@ def _folded(at: _Expected, fitted: float, period: float, resolution: float) -> _
 
 
 def bound_of(stops: PredictedStops, aim: np.ndarray, members: np.ndarray, shift: bool = False) -> float:
-    """What 95 % of the errors of some stops do not exceed.
+    """Compute the bound of 95 % of the errors of some stops.
 
     Args:
         stops: predicted stops.
-        aim: readings aimed at, shape (r,).
+        aim: aimed readings, shape (r,).
         members: numbers of the stops.
-        shift: errors count but for one shift common to all.
+        shift: whether one shift common to all stops is removed.
     """
     mean, covariance = stops.mean - aim, stops.covariance
     if shift:
@@ -250,7 +250,7 @@ def bound_of(stops: PredictedStops, aim: np.ndarray, members: np.ndarray, shift:
 def _promise(
     after: PredictedStops, before: PredictedStops, run: Cycles, aim: np.ndarray, u: float, shift: bool
 ) -> dict[str, SidePromise]:
-    """By side: what is left, and what each cause alone would leave."""
+    """Compute the remaining errors by side, and those due to each cause alone."""
     sides = {}
     scales = after.scales
     pooled, covariance = after.pooled()
@@ -284,21 +284,21 @@ def _promise(
 
 
 def reading_u(campaign: AxisCampaign) -> float:
-    """Of a reading as the campaign has them, median."""
+    """Return the median u of the campaign's readings."""
     return float(np.median([r.u for r in campaign.readings if r.status == "ok"]))
 
 
 def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress: Show | None = None) -> Compensation:
-    """The table and its promise.
+    """Build the table and its promise.
 
     Args:
-        results: of an accepted fit.
-        wish: what it is to be.
-        seed: of what is drawn.
-        progress: told how far it is.
+        results: results of an accepted fit.
+        wish: options of the compensation.
+        seed: seed of all draws.
+        progress: receives the progress.
 
     Raises:
-        InputError: the format is unknown, or lacks a number.
+        InputError: the format is unknown, or a number is missing.
         NotConverged: the fit is not accepted.
     """
     refuse_answer(results.summary.answer)
@@ -326,7 +326,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         shaped = _shaped(form, at, nominal, fitted, wish, _line_draws(fit))
         job.begin("promise")
         u = reading_u(campaign)
-        # Between the lines of the table as well as on them.
+        # Commands between the lines of the table too.
         tried = low + (high - low) * (np.arange(TRIED) + 0.5) / TRIED
         after, run = _run(fit, tried, max(far, overrun), since, shaped.correction, u, seed)
         job.at(0.5)
@@ -357,7 +357,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
 
 
 def _table(at: _Expected, correction: Correction) -> tuple[TableRow, ...]:
-    """Lines at the commands of the correction."""
+    """Build the lines of the table at the commands of the correction."""
     mean = [np.interp(correction.command, at.command, side) for side in at.mean]
     u = [np.interp(correction.command, at.command, side) for side in at.u]
     columns = (correction.command, *mean, *u, correction.forward, correction.backward)
@@ -367,19 +367,19 @@ def _table(at: _Expected, correction: Correction) -> tuple[TableRow, ...]:
 def compensate(
     folder: AxisCampaign | Path | str, to: str = "csv", *, seed: int = 0, progress: Show | None = None, **wish: object
 ) -> Compensation:
-    """A compensation of an axis folder: its table, the promise, and in `text` the file for a controller.
+    """Compensate an axis folder: its table, the promise, and in `text` the file for a controller.
 
     Args:
-        folder: of an axis, or what `read_axis` made of it; its `results/` are used where they are of its data.
+        folder: folder of an axis, or the result of `read_axis`; its `results/` are used if they belong to its data.
         to: "csv", "linuxcnc", "grbl", "grblhal", "klipper", "header", "urdf" or "pec".
-        seed: of what is drawn.
-        progress: told how far it is.
+        seed: seed of all draws.
+        progress: receives the progress.
         wish: further fields of `Wish`.
 
     Raises:
-        InputError: the folder or a wish cannot be used.
+        InputError: the folder or an option cannot be used.
         NotConverged: the fit is not accepted.
-        NothingToEstimate: the folder holds too little.
+        NothingToEstimate: the folder has too few readings.
     """
     campaign = folder if isinstance(folder, AxisCampaign) else read_axis(folder)
     wanted = Wish(target=to, **wish)  # type: ignore[arg-type]
@@ -397,11 +397,11 @@ def _origin(campaign: AxisCampaign) -> Origin:
 
 
 def file_text(made: Compensation, campaign: AxisCampaign) -> str:
-    """Content of the file."""
+    """Return the content of the file."""
     return FORMATS[made.target].write(made, _origin(campaign))
 
 
 def file_beside(made: Compensation, campaign: AxisCampaign) -> str | None:
-    """Content of the second file, YAML; None where the format has none."""
+    """Return the content of the second file, YAML; None where the format has none."""
     beside = FORMATS[made.target].beside
     return None if beside is None else beside(made, _origin(campaign))

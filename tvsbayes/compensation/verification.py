@@ -1,8 +1,8 @@
-"""Fresh readings against a table in force: whether its promise is kept, and if not, what became of the table.
+"""Verification of a table in force by fresh readings: whether its promise is kept, and if not, why.
 
-Every world is the same mechanics under other commands: those that the controller sends if the table was applied, not
-applied, applied twice, or with the wrong sign; each also where that befell the play alone. Another machine is off by
-shift, ratio, play and scatter of a size that nobody knows. Commands as the campaign counts them. No JAX.
+The hypotheses ("worlds") are the same mechanics under other commands: the table was applied, not applied, applied
+twice, or with the wrong sign, or so for the play alone. A further one is another machine, which differs by shift,
+ratio, play and scatter of unknown size. Commands in the campaign's counts. No JAX.
 """
 
 from __future__ import annotations
@@ -45,35 +45,35 @@ from tvsbayes.single_axis.predicted_stops import PredictedStops, log_mean, predi
 from tvsbayes.statistics.streams import Stream, random_stream
 
 SURE, UNLIKELY, P_MIN = 0.95, 0.01, 0.003
-"""Probability with which a world is named; below which the table counts as not applied as promised; of readings this
-far off. The last two leave less than one false BROKEN in a hundred."""
+"""Least probability of a hypothesis for KEPT; probability of `APPLIED`, and p-value of the readings, below which the
+verdict is BROKEN. The last two give fewer than one false BROKEN in a hundred."""
 REPLICATES = 4000
-"""Simulated readings behind p."""
+"""Number of simulated readings for p."""
 SCENARIOS = {
     APPLIED: ((1.0, 1.0),),
     NOT_APPLIED: ((0.0, 0.0), (1.0, 0.0)),
     TWICE: ((2.0, 2.0), (1.0, 2.0)),
     WRONG_SIGN: ((-1.0, -1.0), (1.0, -1.0)),
 }
-"""Factors of what both sides have in common and of what they differ by."""
+"""Factors on the common part of both sides and on their difference."""
 SEPARATE = 16.0
-"""Squared distance, in standard deviations of the readings, from which a fault of the play alone is one of its own: a
-smaller one harms no promise."""
+"""Squared distance, in standard deviations of the readings, from which a fault of the play alone is a separate case; a
+smaller one does not affect the promise."""
 TELLING = 25.0
-"""Squared distance of two worlds at which readings name the right one in 95 of 100: half of it less 1.645 of its roots
-exceeds ln(76), the odds of 0.95 against four others."""
+"""Squared distance of two hypotheses at which readings identify the true one in 95 of 100 cases: half of it less 1.645
+times its root exceeds ln(76), the odds of 0.95 against four others."""
 OTHERS, OTHER_LEAST = 12, 3.0
-"""Sizes by which another machine may be off, from so many uncertainties of a reading to half of the travel: one that is
-off by less keeps the promise."""
+"""Number of sizes of another machine's deviation, and the least, in uncertainties of a reading; the largest is half of
+the travel. A machine with a smaller deviation keeps the promise."""
 BEYOND = 1.5
-"""Share of the promise's hours or travel from which it is said that the readings go on for longer."""
+"""Multiple of the promise's hours or travel above which the readings get a remark that they last longer."""
 CANDIDATES, SPREAD, PLANNED_MAX = 17, 3, 40
-"""Of a plan: commands tried, commands visited whatever they tell, stops at most."""
+"""For a plan: commands tried, commands always visited, largest number of stops."""
 
 
 @dataclass(frozen=True)
 class _Fresh:
-    """Fresh stops: moves, numbers of those read, commands, sides, readings, their u; (r,) each."""
+    """Fresh stops: moves, numbers of moves read, commands, sides, readings, their u; (r,) each."""
 
     moves: tuple[AxisMove, ...]
     read: list[int]
@@ -84,21 +84,21 @@ class _Fresh:
 
     @classmethod
     def of(cls, campaign: AxisCampaign) -> _Fresh:
-        """Of a folder of fresh readings."""
+        """Collect the stops of a folder of fresh readings."""
         rows = rows_of(campaign)
         u = np.sqrt(rows.variance)
         return cls(campaign.moves, rows.move.tolist(), rows.command, rows.side, rows.value, u)
 
 
 def _distance(off: np.ndarray, covariance: np.ndarray) -> float:
-    """Squared distance in standard deviations."""
+    """Compute the squared distance in standard deviations."""
     return float(off @ np.linalg.solve(covariance, off))
 
 
 def other_axis(command: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Shape (r, r) of the covariance of what another axis adds to stops at commands (r,), reached from sides (r,).
+    """Compute the relative covariance (r, r) of another axis' deviations at commands (r,) reached from sides (r,).
 
-    Shift and ratio, and half as large play and scatter.
+    It has shift and ratio, and half as large play and scatter.
     """
     centre = command - command.mean()
     span = centre / max(float(np.max(np.abs(centre))), 1e-300)
@@ -107,21 +107,21 @@ def other_axis(command: np.ndarray, side: np.ndarray) -> np.ndarray:
 
 
 def _shift(made: Compensation, travel: float, count: int) -> np.ndarray:
-    """Covariance of one shift common to all readings, of formats that leave the zero open."""
+    """Compute the covariance of one shift common to all readings, for formats with an undetermined zero."""
     return (travel**2 if made.zero_free else 0.0) * np.ones((count, count))
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Fresh readings and what each world predicts of them, of an axis or of the two of a scanner.
+    """Fresh readings and their predictions by each hypothesis, of one axis or of both of a scanner.
 
     Attributes:
-        at: predicted readings where the common part and the play of the correction act so many times; a cached one.
-        value, aim: readings, and those aimed at, shape (r,).
-        other: shape (r, r) of the covariance of what another machine adds.
-        travel: of the readings.
-        shift: covariance (r, r) of one shift that the format leaves open.
-        noise: variances that every visit draws anew, shape (r,).
+        at: cached function: readings predicted for factors on the common part and the play of the correction.
+        value, aim: readings, and aimed readings, shape (r,).
+        other: relative covariance (r, r) of another machine's deviations.
+        travel: range of the readings.
+        shift: covariance (r, r) of one shift that the format does not determine.
+        noise: variances of the noise drawn at each visit, shape (r,).
     """
 
     at: Callable[[float, float], PredictedStops]
@@ -135,7 +135,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Judged:
-    """What readings say: verdict, p, probabilities of the worlds, readings that would tell (as in `Verification`).
+    """Result of a verification: verdict, p, probabilities of the hypotheses, readings needed (as in `Verification`).
 
     `promised` and `without` are the predictions if the correction is applied and if it is not.
     """
@@ -149,7 +149,7 @@ class Judged:
 
 
 def _log_densities(trial: Trial) -> dict[str, float]:
-    """Of the readings, by world."""
+    """Compute the log density of the readings by hypothesis."""
     promised = trial.at(1.0, 1.0)
     mean, covariance = promised.pooled()
     play_matters = _distance(trial.at(1.0, 0.0).pooled()[0] - mean, covariance + trial.shift) > SEPARATE
@@ -164,7 +164,7 @@ def _log_densities(trial: Trial) -> dict[str, float]:
 
 
 def judged(trial: Trial, seed: int) -> Judged:
-    """Verdict over readings, by the probabilities of the worlds and by how far off the readings are."""
+    """Decide by the probabilities of the hypotheses and the distance of the readings from the prediction."""
     promised, without = trial.at(1.0, 1.0), trial.at(0.0, 0.0)
     logs = _log_densities(trial)
     total = float(np.logaddexp.reduce(list(logs.values())))
@@ -177,7 +177,7 @@ def judged(trial: Trial, seed: int) -> Judged:
 
 
 def _p_value(promised: PredictedStops, value: np.ndarray, shift: np.ndarray, seed: int) -> float:
-    """Of the readings' squared distance, by readings drawn from the prediction."""
+    """Compute the p-value of the readings' squared distance, from readings drawn from the prediction."""
     mean, covariance = promised.pooled()
     inverse = np.linalg.inv(covariance + shift)
     drawn = promised.drawn(REPLICATES, random_stream(seed, Stream.WORLDS))
@@ -190,7 +190,7 @@ def _p_value(promised: PredictedStops, value: np.ndarray, shift: np.ndarray, see
 
 
 def size_of(error: np.ndarray, shift: bool = False) -> ErrorSize:
-    """Of errors (r,); but for their mean where a shift is free."""
+    """Compute the size of errors (r,), without their mean where a shift is free."""
     left = error - error.mean() if shift else error
     return ErrorSize(float(np.sqrt(np.mean(left**2))), float(np.max(np.abs(left))))
 
@@ -202,12 +202,12 @@ def _verdict(worlds: dict[str, float], p: float) -> Verdict:
 
 
 def needed_readings(promised: PredictedStops, off: np.ndarray, noise: np.ndarray) -> int | None:
-    """Readings, of such stops again and again, that part two worlds; None where no number does.
+    """Compute the number of repeated readings that discriminates two hypotheses; None where none does.
 
     Args:
-        promised: of r stops, if the table is applied.
-        off: what the other world adds to their readings, shape (r,).
-        noise: variances that every visit draws anew, shape (r,).
+        promised: prediction of r stops, if the table is applied.
+        off: deviation of the other hypothesis at these stops, shape (r,).
+        noise: variances of the noise drawn at each visit, shape (r,).
     """
     _, covariance = promised.pooled()
     kept = covariance - np.diag(0.999 * np.minimum(noise, np.diag(covariance)))
@@ -218,7 +218,7 @@ def needed_readings(promised: PredictedStops, off: np.ndarray, noise: np.ndarray
 
 
 def _visit_noise(promised: PredictedStops, side: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Variance that a visit draws anew: scatter of stops, and of readings."""
+    """Compute the variance that is independent at every visit: scatter of stops, and of readings."""
     scales = promised.scales
     ahead, back = (float(np.mean(scales[f"stop_sd.{name}"] ** 2)) for name in ("forward", "backward"))
     reading = float(np.mean(scales["reading_scale"] ** 2)) * u**2
@@ -226,7 +226,7 @@ def _visit_noise(promised: PredictedStops, side: np.ndarray, u: np.ndarray) -> n
 
 
 def _remarks(made: Compensation, fresh: _Fresh, campaign: AxisCampaign) -> tuple[str, ...]:
-    """What else is to be said."""
+    """Return further remarks for the user."""
     low, high = made.range_command
     outside = int(np.sum((fresh.command < low) | (fresh.command > high)))
     remarks = []
@@ -250,14 +250,14 @@ def _remarks(made: Compensation, fresh: _Fresh, campaign: AxisCampaign) -> tuple
 def verify_readings(
     fit: AxisFit, made: Compensation, campaign: AxisCampaign, *, seed: int = 0, progress: Show | None = None
 ) -> Verification:
-    """Fresh readings under a table in force.
+    """Verify a table in force by fresh readings.
 
     Args:
-        fit: that the table was made of.
+        fit: fit of the table.
         made: the table and its promise.
-        campaign: fresh readings; commands as asked for, before the correction.
-        seed: of what is drawn.
-        progress: told how far it is.
+        campaign: fresh readings; commands before the correction.
+        seed: seed of all draws.
+        progress: receives the progress.
 
     Raises:
         InputError: the readings have another unit.
@@ -303,7 +303,7 @@ AGAIN = "run `tvsbayes compensate` on this folder, and apply what it writes"
 
 
 def compensation_in(campaign: AxisCampaign) -> Compensation | None:
-    """What `compensate` left in a folder's `results/`, if it is of these data.
+    """Read the compensation in a folder's `results/`, if it belongs to these data.
 
     Raises:
         InputError: it is damaged.
@@ -313,10 +313,10 @@ def compensation_in(campaign: AxisCampaign) -> Compensation | None:
 
 
 def stored_compensation(campaign: AxisCampaign) -> Compensation:
-    """The same where there has to be one.
+    """Read the compensation, which must exist.
 
     Raises:
-        InputError: there is none, it is of other data, or it is damaged.
+        InputError: there is none, it belongs to other data, or it is damaged.
     """
     compensation = compensation_in(campaign)
     if compensation is None:
@@ -333,19 +333,19 @@ def verify_axis(
     seed: int = 0,
     progress: Show | None = None,
 ) -> Verification:
-    """Whether an axis keeps the promise of its table.
+    """Verify that an axis keeps the promise of its table.
 
     Args:
-        folder: that the table was made of.
-        fresh: readings with the table in force; commands as asked for, before the correction.
+        folder: folder of the table.
+        fresh: readings with the table in force; commands before the correction.
         made: the table; None for the one in `results/compensation.json`.
-        seed: of what is drawn.
-        progress: told how far it is.
+        seed: seed of all draws.
+        progress: receives the progress.
 
     Raises:
         InputError: a folder cannot be used, or there is no table.
         NotConverged: the fit is not accepted.
-        NothingToEstimate: too few fresh readings.
+        NothingToEstimate: there are too few fresh readings.
     """
     known = folder if isinstance(folder, AxisCampaign) else read_axis(folder)
     new = fresh if isinstance(fresh, AxisCampaign) else read_axis(fresh)
@@ -358,13 +358,13 @@ def verify_axis(
 
 @dataclass(frozen=True)
 class VerifyPlan:
-    """Stops to be read with the table in force, to be made in this order.
+    """Stops to read with the table in force, in this order.
 
     Attributes:
-        stops: command and side, 1 or -1, of each that is read.
-        overrun: how far beyond a command the axis goes before it comes back to it.
-        enough: whether they part the worlds in 95 of 100.
-        distance: of the nearest two worlds, standard deviations.
+        stops: command and side, 1 or -1, of each stop.
+        overrun: distance by which the axis moves beyond a command before it returns to it.
+        enough: whether they discriminate the hypotheses in 95 of 100 cases.
+        distance: distance of the nearest two hypotheses, standard deviations.
     """
 
     stops: tuple[tuple[float, int], ...]
@@ -373,7 +373,7 @@ class VerifyPlan:
     distance: float
 
     def plan_bytes(self) -> bytes:
-        """`plan.csv`: step, command, direction, read (1 or 0)."""
+        """Return `plan.csv`: step, command, direction, read (1 or 0)."""
         before = [side * math.inf for _, side in self.stops[:1]] + [command for command, _ in self.stops]
         return stops_csv(
             (command - side * self.overrun if side * (command - at) < self.overrun else None, command, DIRECTIONS[side])
@@ -382,7 +382,7 @@ class VerifyPlan:
 
 
 def _parting(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarray, visits: np.ndarray) -> float:
-    """Squared distance of the nearest world, of candidates (m,) visited so many times each."""
+    """Compute the squared distance of the nearest hypothesis, for numbers of visits to candidates (m,)."""
     used = np.flatnonzero(visits)
     scatter = covariance[np.ix_(used, used)] + np.diag(noise[used] / visits[used])
     return min(_distance(o[used], scatter) for o in off)
@@ -390,7 +390,7 @@ def _parting(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarra
 
 @dataclass(frozen=True)
 class TellingVisits:
-    """How often each candidate is visited, shape (m,), and the squared distance of the nearest world then."""
+    """Number of visits to each candidate, shape (m,), and the squared distance of the nearest hypothesis by them."""
 
     visits: np.ndarray
     reached: float
@@ -399,13 +399,13 @@ class TellingVisits:
 def telling_visits(
     off: Sequence[np.ndarray], common: np.ndarray, noise: np.ndarray, first: np.ndarray
 ) -> TellingVisits:
-    """The fewest visits that tell worlds apart, by greedy choice.
+    """Choose the fewest visits that discriminate the hypotheses, by greedy choice.
 
     Args:
-        off: what each other world adds to the readings of candidates, shape (m,) each.
-        common: covariance (m, m) of what is the same at every visit.
-        noise: variances that every visit draws anew, shape (m,).
-        first: mask of candidates that are visited whatever they tell.
+        off: deviation of each other hypothesis at the candidates, shape (m,) each.
+        common: covariance (m, m) of errors common to all visits.
+        noise: variances of the noise drawn at each visit, shape (m,).
+        first: mask of candidates that are always visited.
     """
     visits = first.astype(float)
     reached = _parting(off, common, noise, visits)
@@ -418,7 +418,7 @@ def telling_visits(
 
 
 def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> VerifyPlan:
-    """The fewest stops that tell the worlds apart, by greedy choice among the table's commands.
+    """Plan the fewest stops that discriminate the hypotheses, by greedy choice among the table's commands.
 
     Raises:
         NothingToEstimate: the table corrects nothing.
@@ -426,7 +426,7 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
     applied = Correction.of(made)
     overrun, (low, high) = made.reversal_command, made.range_command
     nodes = np.array([row.command for row in made.table])
-    # Where both sides are reached without leaving the range, if there are such commands.
+    # Commands whose both sides can be reached within the range, if there are enough.
     inside = nodes[(nodes - overrun >= low) & (nodes + overrun <= high)]
     nodes = inside if len(inside) >= SPREAD else nodes
     nodes = nodes[np.linspace(0, len(nodes) - 1, min(len(nodes), CANDIDATES)).round().astype(int)]
@@ -446,7 +446,7 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         off.append(play)
     if not np.any(off[0]):
         raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
-    # Over the range first: what befell a part of the table shows nowhere else.
+    # Stops over the whole range first: a fault in a part of the table shows only there.
     spread = np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)
     chosen = telling_visits(off, common, noise, np.isin(run.index, spread))
     visits, reached = chosen.visits, chosen.reached

@@ -1,6 +1,6 @@
-"""Point clouds with error bars: looks in, block by block, points out with what simpler calibrations make of them.
+"""Point clouds with error bars, computed from looks block by block, and points by simpler calibrations.
 
-Frame T, mm. Standard uncertainties by the law of propagation, a part of the points checked by draws. Memory does not
+Frame T, mm. Standard uncertainties are by the law of propagation, validated for some points by draws. Memory does not
 grow with the number of points. NumPy.
 """
 
@@ -19,12 +19,12 @@ from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_be
 from tvsbayes.errors import InputError
 
 CHECKED_MAX = 200
-"""Most looks kept for a check by draws."""
+"""Largest number of looks validated by draws."""
 
 
 @dataclass(frozen=True)
 class Refused:
-    """A look without a point: its line in the file, and why."""
+    """A look without a point: its line in the file, and the reason."""
 
     line: int
     error: InputError
@@ -32,14 +32,14 @@ class Refused:
 
 @dataclass(frozen=True)
 class CloudBlock:
-    """Points of one block of looks; arrays over the n points that exist.
+    """Points of one block of looks; arrays over the n existing points.
 
     Attributes:
-        lines: of the file, shape (n,).
-        xyz_mm: shape (n, 3).
-        covariance_mm2: by the law of propagation, shape (n, 3, 3).
-        extrapolated: no look of the campaign reached the counters, shape (n,).
-        simple_xyz_mm: what simpler calibrations say, by name, shapes (n, 3); not a number where they have no point.
+        lines: lines in the file, shape (n,).
+        xyz_mm: points, shape (n, 3).
+        covariance_mm2: covariance by the law of propagation, shape (n, 3, 3).
+        extrapolated: whether the counters are outside those of the campaign's looks, shape (n,).
+        simple_xyz_mm: points by simpler calibrations, by name, shapes (n, 3); NaN where they have none.
         refused: the other looks.
     """
 
@@ -52,18 +52,18 @@ class CloudBlock:
 
     @property
     def sd_mm(self) -> np.ndarray:
-        """Standard uncertainties of x, y, z, shape (n, 3)."""
+        """Return the standard uncertainties of x, y, z, shape (n, 3)."""
         return np.sqrt(np.einsum("pii->pi", self.covariance_mm2))
 
 
 def cloud(
     calibration: Calibration, looks: Iterable[LookRows], simple: Mapping[str, SimpleCalibration]
 ) -> Iterator[CloudBlock]:
-    """Points of looks, a block for each block.
+    """Compute points of looks, a block for each block.
 
     Args:
         calibration: from `load_calibration` or `calibration_of`.
-        looks: from `looks_file.look_blocks`, or made by hand.
+        looks: blocks of looks, such as from `looks_file.look_blocks`.
         simple: further calibrations by name, such as "nominal", from `simple_calibration`.
 
     Raises:
@@ -93,7 +93,7 @@ def cloud(
 
 
 def _meets(calibration: Calibration, settings: Settings, linear: Linear) -> np.ndarray:
-    """Which looks have a point, shape (n,): those that `Calibration.locate` does not refuse."""
+    """Mark looks with a point, shape (n,): those that `Calibration.locate` does not refuse."""
     pan, tilt = settings.steps.T
     pan_side, tilt_side = settings.side.T
     beam = calibration.beam_at((pan, tilt), (pan_side, tilt_side))
@@ -109,14 +109,14 @@ def _refusal(calibration: Calibration, settings: Settings, row: int) -> InputErr
 
 
 class EvenSample:
-    """Looks spread evenly over a stream of unknown length, at most `CHECKED_MAX`: pass the stream through `of`."""
+    """At most `CHECKED_MAX` looks, evenly spread over a stream of unknown length, which is passed through `of`."""
 
     def __init__(self) -> None:
         self.looks: list[tuple[float, float, float, tuple[str, str]]] = []
         self._stride, self._passed = 1, 0
 
     def of(self, blocks: Iterable[LookRows]) -> Iterator[LookRows]:
-        """The same blocks."""
+        """Collect looks and pass the blocks on."""
         for rows in blocks:
             for k in range(-self._passed % self._stride, len(rows.lines), self._stride):
                 if (self._passed + k) % self._stride:
@@ -131,12 +131,12 @@ class EvenSample:
 
 @dataclass(frozen=True)
 class LawChecked:
-    """How many points were carried by draws too, and how far the law of propagation held there.
+    """Validation of the law of propagation by draws at some points.
 
     Attributes:
-        points: how many.
-        held: at how many of them it held to one digit of u.
-        off_mm: by how much an end of a 95 % interval differs at half of the points; `most_off_mm` at the worst.
+        points: number of validated points.
+        held: number of them at which it held to one digit of u.
+        off_mm: median difference of an end of a 95 % interval; `most_off_mm`: the largest.
     """
 
     points: int
@@ -146,7 +146,7 @@ class LawChecked:
 
 
 def checked(calibration: Calibration, sample: EvenSample, draws: int, seed: int) -> LawChecked:
-    """Some of the points again, draw by draw (JCGM 101, 8)."""
+    """Validate some of the points by draws (JCGM 101, 8)."""
     pan, tilt, reading, approach = zip(*sample.looks, strict=True)
     located = locate(calibration, pan, tilt, reading, approach, draws=draws, seed=seed)
     accepted = np.array([error is None for error in located.refused])

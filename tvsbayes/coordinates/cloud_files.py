@@ -1,7 +1,7 @@
-"""Clouds as files: CSV, or PLY with properties that CloudCompare and MeshLab show. mm, frame T.
+"""Files of clouds: CSV, or PLY with properties that CloudCompare and MeshLab show. mm, frame T.
 
-A file is written whole or not at all, in memory that does not grow with it. Looks without a point stand in a table
-beside it; where every look has one, no table of an earlier cloud stays.
+A file is written whole or not at all, in constant memory. Looks without a point are listed in a table beside it; if
+every look has one, a table of an earlier cloud is removed.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from tvsbayes.files.disk import written_whole
 
 AXIS_NAMES = "x", "y", "z"
 DIGITS = 4
-"""After the point, mm, in CSV: a thousandth of what the best point is known to."""
+"""Decimals in CSV, mm: a thousandth of the least uncertainty of a point."""
 REFUSED_COLUMNS = "line", "code", "message"
 
 
 @dataclass(frozen=True)
 class CloudFile:
-    """What was written.
+    """Summary of a written cloud.
 
     Attributes:
-        path: the cloud.
+        path: file of the cloud.
         columns: its properties, in order.
-        points: in it.
-        extrapolated: of them, beyond the counters that the campaign saw.
-        refused: looks without a point, by the code of the reason.
-        refused_path: the table of these; None where there is none.
+        points: number of points.
+        extrapolated: number of them outside the counters of the campaign's looks.
+        refused: number of looks without a point, by the code of the reason.
+        refused_path: table of these; None if there are none.
     """
 
     path: Path
@@ -50,7 +50,7 @@ class CloudFile:
     refused_path: Path | None
 
     def as_json(self) -> dict[str, object]:
-        """As `locate --cloud` tells it."""
+        """Return the part of the document of `locate --cloud`."""
         return {
             "cloud": str(self.path),
             "columns": list(self.columns),
@@ -62,7 +62,7 @@ class CloudFile:
 
 
 def columns_of(names: Sequence[str]) -> tuple[str, ...]:
-    """Properties of a point: line, coordinates, sds, what calibrations of these names say, the flag.
+    """Return the properties of a point: coordinates, sds, quality, points by named calibrations, flag, line.
 
     `quality` is the root of the summed variances, the property by which MeshLab colours points.
     """
@@ -71,7 +71,7 @@ def columns_of(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _numbers(block: CloudBlock, names: Sequence[str]) -> np.ndarray:
-    """What stands in `columns_of` but the last two, shape (n, columns - 2)."""
+    """Return the values of `columns_of` except the last two, shape (n, columns - 2)."""
     sd = block.sd_mm
     parts = [block.xyz_mm, sd, np.linalg.norm(sd, axis=1, keepdims=True)]
     return np.concatenate([*parts, *(block.simple_xyz_mm[name] for name in names)], axis=1)
@@ -85,7 +85,7 @@ class _Csv:
         writer = csv.writer(text, lineterminator="\n")
         numbers = _numbers(block, names).tolist()
         for row, outside, line in zip(numbers, block.extrapolated.tolist(), block.lines.tolist(), strict=True):
-            # An empty cell where a simpler calibration has no point.
+            # A cell is empty where a simpler calibration has no point.
             cells = ["" if value != value else f"{value:.{DIGITS}f}" for value in row]
             writer.writerow([*cells, int(outside), line])
         stream.write(text.getvalue().encode())
@@ -123,14 +123,14 @@ FORMATS: dict[str, type[_Csv] | type[_Ply]] = {".csv": _Csv, ".ply": _Ply}
 
 
 def cloud_place(path: Path, looks: Path | None = None) -> Path:
-    """The same path, whose ending names a format.
+    """Return the path after checking that its ending names a format.
 
     Args:
-        path: of the cloud.
-        looks: the file that its looks are read from, which neither the cloud nor its table of refusals may replace.
+        path: path of the cloud.
+        looks: file of its looks, which neither the cloud nor its table of refusals may replace.
 
     Raises:
-        InputError: it names no format, or the looks would be lost.
+        InputError: it names no format, or the looks would be replaced.
     """
     shown = escaped(str(path), 200)
     if path.suffix.lower() not in FORMATS:
@@ -144,12 +144,12 @@ def cloud_place(path: Path, looks: Path | None = None) -> Path:
 
 
 def _written(path: Path) -> tuple[Path, Path]:
-    """The cloud, and the table of looks without a point."""
+    """Return the paths of the cloud and of the table of looks without a point."""
     return path, path.with_name(f"{path.stem}.refused.csv")
 
 
 def _removed_if_ours(table: Path) -> None:
-    """Remove the table of an earlier cloud of this name, whose looks are not refused any more."""
+    """Remove the table of an earlier cloud of this name, which is out of date."""
     head = csv_bytes(REFUSED_COLUMNS, ())
     if table.is_file():
         with table.open("rb") as stream:
@@ -164,16 +164,15 @@ def write_cloud(blocks: Iterable[CloudBlock], path: Path, names: Sequence[str]) 
     Args:
         blocks: from `cloud.cloud`.
         path: ending in .csv or .ply.
-        names: of the simpler calibrations in the blocks.
+        names: names of the simpler calibrations in the blocks.
 
     Raises:
-        InputError: of another ending, or the place cannot be written to or is full; what the blocks raise passes
-            through.
+        InputError: the ending is unknown, the place cannot be written to or is full, or a block raises it.
     """
     body = FORMATS[cloud_place(path).suffix.lower()]()
     points = extrapolated = 0
     refused: list[tuple[int, str, str]] = []
-    # How many points there are stands before them and is known after. They wait on the disk that must hold them anyway.
+    # The header has the number of points, which is known at the end. They are kept on the same disk until then.
     with written_whole(path) as stream, tempfile.TemporaryFile(dir=path.parent) as kept:
         for block in blocks:
             body.add(kept, block, names)

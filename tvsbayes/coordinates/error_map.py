@@ -1,7 +1,7 @@
-"""Errors over the work space of the nominal, the classic and the joint calibration, on the rigs that the data allow.
+"""Errors over the work space of the nominal, classic and joint calibration, over the draws of a calibration.
 
-Frame T, mm; counters in steps. The beam of each drawn rig is followed to a range, the aperture reads it, and every
-estimator is asked where the spot is. NumPy.
+Frame T, mm; counters in steps. The beam of each drawn rig is computed to a range, the aperture reads it, and every
+calibration locates the spot. NumPy.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from tvsbayes.coordinates.simple_calibration import Belief, SimpleCalibration, s
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Errors over pan, tilt and range; arrays (pan, tilt, range), not a number where nothing can be located.
+    """Errors over pan, tilt and range; arrays (pan, tilt, range), NaN where nothing can be located.
 
     Attributes:
         pan_steps, tilt_steps, range_mm: the axes; ranges along the beam.
         rms_mm: root mean square distance from the true point, by estimator.
         bias_mm: mean error vector, by estimator, shape (pan, tilt, range, 3).
-        inside: counters within those at which the campaign looked.
-        valid: every estimator asked finds a point in all but `DIVERGING_SHARE` of the draws.
+        inside: whether counters are within those of the campaign's looks.
+        valid: whether every estimator finds a point in all but `DIVERGING_SHARE` of the draws.
         distance_mm: 3D errors by estimator, arrays (draws, pan, tilt, range), infinite where there is no point.
     """
 
@@ -44,7 +44,7 @@ class ErrorMap:
 
 @dataclass(frozen=True)
 class _Truth:
-    """What happened on every rig: points reached (3, draws, points), mm, and what the aperture read there, deg."""
+    """Truth of every drawn rig: points reached (3, draws, points), mm, and the aperture's readings there, deg."""
 
     xyz_mm: np.ndarray
     aperture_deg: np.ndarray
@@ -86,12 +86,12 @@ def _errors(belief: Belief, truth: _Truth, azimuth: bool) -> _Errors:
 
 @dataclass(frozen=True)
 class SimpleError:
-    """Why a simple calibration is off at counters and a range, by the best estimates.
+    """Error of a simple calibration at counters and a range, split by cause, by the best estimates.
 
     Attributes:
         azimuth_deg, elevation_deg: its beam's direction less that of the joint calibration.
-        by_direction_mm: 3D error if that alone were wrong.
-        by_place_mm: 3D error if the places of beam and aperture and its zero alone were.
+        by_direction_mm: 3D error due to the direction alone.
+        by_place_mm: 3D error due to the positions of beam and aperture and its zero alone.
     """
 
     azimuth_deg: float
@@ -103,9 +103,9 @@ class SimpleError:
 def simple_error(
     calibration: Calibration, simple: SimpleCalibration, steps: tuple[float, float], range_mm: float
 ) -> SimpleError:
-    """The error of a simple calibration taken apart, at counters reached from left and up; no noise.
+    """Split the error of a simple calibration by cause, at counters reached from left and up, without noise.
 
-    A part is not a number where beam and reading do not meet.
+    A part is NaN where beam and reading do not meet.
     """
     best, azimuth = calibration.estimates, calibration.azimuth
     beam = calibration.beam_at(steps, (1.0, 1.0))
@@ -122,7 +122,7 @@ def simple_error(
 
 
 def _angles(direction: np.ndarray) -> tuple[float, float]:
-    """Azimuth and elevation of a unit vector (3,), rad."""
+    """Compute azimuth and elevation of a unit vector (3,), rad."""
     x, y, z = direction.tolist()
     return math.atan2(y, x), math.asin(z)
 
@@ -138,17 +138,17 @@ def error_map(
     draws: int = 500,
     seed: int = 0,
 ) -> ErrorMap:
-    """Expected errors of the joint calibration and of simple ones, over the rigs that the data allow.
+    """Compute expected errors of the joint calibration and of simple ones, over the draws of the calibration.
 
     Args:
-        calibration: with draws.
+        calibration: calibration with draws.
         pan_steps: counters, shape (p,).
         tilt_steps: counters, shape (t,).
         range_mm: ranges along the beam, shape (r,).
         simple: further calibrations by name, such as "nominal" and "classic", from `simple_calibration`.
         approach: sides, +1 left or up, -1 right or down.
-        draws: rigs.
-        seed: of their stop errors and aperture noise.
+        draws: number of drawn rigs.
+        seed: seed of their stop errors and aperture noise.
 
     Returns:
         The map; the joint calibration is "joint".

@@ -1,8 +1,8 @@
-"""TVS coordinates: points where beam and aperture reading meet, in mm, and how sure that is; NumPy.
+"""TVS coordinates: points where beam and aperture reading meet, in mm, with their uncertainty; NumPy.
 
-Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2, z up; the aperture stands
-at (0, -a/2, 0). Uncertainty is propagated by the law (GUM 5) and by distributions (JCGM 101, 102), and the one is
-validated by the other.
+Frame T: origin mid-baseline, x depth, y along the baseline towards the positioner at +a/2, z up; the aperture is at (0,
+-a/2, 0). Uncertainty is propagated by the law (GUM 5) and by distributions (JCGM 101, 102), and the first is validated
+by the second.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from tvsbayes.progress import Job, Show
 from tvsbayes.statistics.intervals import NORMAL_95, Validation, symmetric_interval, validate
 
 DRAWS = 1000
-"""Draws carried to a point unless the caller wants others; formulation 5 asks for 500 at least."""
+"""Default number of draws for a point; formulation 5 requires at least 500."""
 BLOCK = 2**15
-"""Numbers per array while draws are carried to points: more than a processor's own memory holds takes longer."""
+"""Numbers per array while draws are propagated to points: larger arrays exceed the processor's cache."""
 
 
 @dataclass(frozen=True, repr=False)
 class Locations(Shown):
-    """Points of frame T with their uncertainty; arrays over points, not a number where a point is refused.
+    """Points of frame T with their uncertainty; arrays over points, NaN where a point is refused.
 
     Attributes:
         xyz_mm: means of the draws, shape (n, 3).
@@ -44,10 +44,10 @@ class Locations(Shown):
         interval95_mm: equal-tailed intervals, shape (n, 2, 3).
         u95_mm: their half widths, shape (n, 3).
         diverging_share: share of draws without a point, shape (n,).
-        extrapolated: no look of the campaign reached the counters of the point, shape (n,).
-        unseen: which counters those are and what looks reached, in words; "" where looks did.
-        linear_xyz_mm, linear_covariance_mm2: by the law of propagation, shapes (n, 3) and (n, 3, 3).
-        validation: of the law of propagation by the draws (JCGM 101 clause 8), fields of shape (n, 3).
+        extrapolated: whether the counters are outside those of the campaign's looks, shape (n,).
+        unseen: these counters and the range of the looks, in words; "" where not extrapolated.
+        linear_xyz_mm, linear_covariance_mm2: results of the law of propagation, shapes (n, 3) and (n, 3, 3).
+        validation: validation of the law by the draws (JCGM 101 clause 8), fields of shape (n, 3).
         refused: the refusal of each point, or None.
         estimator: "posterior" or "laplace".
         draws: number of draws.
@@ -68,7 +68,7 @@ class Locations(Shown):
     draws: int
 
     def shown(self) -> View:
-        """Points with their uncertainty, refused ones with the reason."""
+        """Show points with their uncertainty, refused ones with the reason."""
         columns = ("point", *(f"{axis}, mm" for axis in "xyz"), *(f"U95({axis}), mm" for axis in "xyz"))
         rows = []
         for k, error in enumerate(self.refused):
@@ -81,16 +81,16 @@ class Locations(Shown):
 
     @cached_property
     def law_off_mm(self) -> np.ndarray:
-        """By how much an end of the law's 95 % interval differs from that of the draws, at most, shape (n,)."""
+        """Return the largest difference of an end of the law's 95 % interval from that of the draws, shape (n,)."""
         return self.validation.deviation.max(axis=1)
 
     @cached_property
     def digits_held(self) -> np.ndarray:
-        """Significant digits of u, two at most, to which the law of propagation holds, shape (n, 3)."""
+        """Count the significant digits of u, at most two, to which the law of propagation holds, shape (n, 3)."""
         return self.validation.digits_held(np.sqrt(np.diagonal(self.linear_covariance_mm2, 0, 1, 2)))
 
     def as_json(self, index: int) -> dict[str, object]:
-        """One point; null where it is refused."""
+        """Return the document of one point; null where it is refused."""
         error = self.refused[index]
         if error is not None:
             empty = dict.fromkeys(("xyz_mm", "covariance_mm2", "u95_mm"))
@@ -123,7 +123,7 @@ class Locations(Shown):
 
 @dataclass(frozen=True)
 class Settings:
-    """Where the machine stood and what the aperture read.
+    """Counters, approaches and aperture readings of looks.
 
     Attributes:
         steps: counters (pan, tilt), shape (n, 2).
@@ -139,7 +139,7 @@ class Settings:
         return Settings(self.steps[chosen], self.side[chosen], self.aperture_deg[chosen])
 
     def of_one_approach(self) -> Iterator[np.ndarray]:
-        """Rows of the points that were reached from the same sides."""
+        """Group the rows of points by their sides."""
         _, kind = np.unique(self.side, axis=0, return_inverse=True)
         for number in range(kind.max() + 1):
             yield np.flatnonzero(kind == number)
@@ -150,8 +150,8 @@ class Linear:
     """The law of propagation of uncertainty: y = f(x), J = df/dx, U_y = J U_x J^T (GUM 5.2.2, JCGM 102 6.2).
 
     Attributes:
-        value: points, shape (n, 3), not a number where there is none.
-        jacobian: by the calibration's `look_inputs` and the unit noises, shape (n, 3, inputs + NOISES).
+        value: points, shape (n, 3), NaN where there is none.
+        jacobian: derivatives by the calibration's `look_inputs` and the unit noises, shape (n, 3, inputs + NOISES).
         covariance: shape (n, 3, 3).
     """
 
@@ -166,7 +166,7 @@ def settings_of(
     aperture_deg: float | Sequence[float] | np.ndarray,
     approach: tuple[str, str] | Sequence[tuple[str, str]] = HOME_APPROACH,
 ) -> Settings:
-    """Settings of many points; arguments and errors as in `locate`."""
+    """Build the settings of many points; arguments and errors as in `locate`."""
     numbers = [np.atleast_1d(np.asarray(x, dtype=float)) for x in (pan_steps, tilt_steps, aperture_deg)]
     pan, tilt, reading = np.broadcast_arrays(*numbers)
     single = len(approach) == 2 and isinstance(approach[0], str)
@@ -177,7 +177,7 @@ def settings_of(
 
 
 def carry(calibration: Calibration, rigs: Drawn, settings: Settings) -> np.ndarray:
-    """Every draw through the geometry for every point: (draws, points, 3), not a number where nothing meets."""
+    """Propagate every draw through the geometry for every point: (draws, points, 3), NaN where nothing meets."""
     noise = rigs.noise.T[:, :, None]
     xyz = np.empty((len(rigs.inputs), len(settings.steps), 3))
     for rows in settings.of_one_approach():
@@ -189,9 +189,9 @@ def carry(calibration: Calibration, rigs: Drawn, settings: Settings) -> np.ndarr
 
 
 def locate_linear(calibration: Calibration, settings: Settings) -> Linear:
-    """The law of propagation alone: fields with a leading axis of points, not a number where there is no point.
+    """Apply the law of propagation alone: fields with a leading axis of points, NaN where there is no point.
 
-    No draws: a million points a minute. Validate some of them with `locate`.
+    Without draws it computes a million points a minute. Validate some of them with `locate`.
     """
     count, inputs = len(settings.steps), len(calibration.look_inputs) + NOISES
     value, jacobian = np.empty((count, 3)), np.empty((count, 3, inputs))
@@ -218,10 +218,10 @@ def locate(
     seed: int = 0,
     progress: Show | None = None,
 ) -> Locations:
-    """Where the scanner points: a calibration carried into frame T, draw by draw and by the law of propagation.
+    """Locate points of looks in frame T, by the draws of a calibration and by the law of propagation.
 
-    Frame T: origin half way between positioner and aperture, x depth, y towards the positioner, z up. Aperture noise
-    and the scatter of the stop are in the uncertainty, besides that of every parameter.
+    Frame T: origin half way between positioner and aperture, x depth, y towards the positioner, z up. The uncertainty
+    includes aperture noise and the scatter of the stop, besides that of every parameter.
 
     Args:
         calibration: from `load_calibration` or `calibration_of`.
@@ -229,18 +229,18 @@ def locate(
         tilt_steps: absolute counters, one or n.
         aperture_deg: readings B of the aperture, deg, one or n.
         approach: last move of (pan, tilt): left, right or unknown; up, down or unknown; one pair or n pairs.
-        draws: number of draws, at least 500; 1000 give a 95 % half width to about 3 %.
-        seed: of stop errors and aperture noise; they are the same for every point, so that a point does not depend
-            on its neighbours in the list.
-        progress: called with the progress.
+        draws: number of draws, at least 500; 1000 determine a 95 % half width to about 3 %.
+        seed: seed of stop errors and aperture noise, which are the same for every point, so that a point does not
+            depend on its neighbours in the list.
+        progress: called with the share that is done.
 
     Returns:
-        Points with covariance and intervals; look at `refused`.
+        Points with covariance and intervals; check `refused`.
 
     Raises:
-        TypeError: an argument of another kind.
-        InputError: a calibration without draws, or an approach that does not exist.
-        ValueError: fewer than 500 draws (formulation 5), or lists of different lengths.
+        TypeError: an argument has the wrong type.
+        InputError: the calibration has no draws, or there is no such approach.
+        ValueError: there are fewer than 500 draws (formulation 5), or lists differ in length.
     """
     require_kind(calibration, "moved_points", "a calibration, of calibration_of(posterior) or load_calibration(folder)")
     if draws < 500:
@@ -270,7 +270,7 @@ def locate(
 
 
 def _together[T: (Locations, Validation)](parts: Sequence[T]) -> T:
-    """Blocks of points as one: arrays follow each other, all else is the same in every block."""
+    """Join blocks of points: arrays are concatenated, other fields are the same in every block."""
 
     def joined(values: list[Any]) -> Any:
         if isinstance(values[0], Validation):
@@ -282,11 +282,11 @@ def _together[T: (Locations, Validation)](parts: Sequence[T]) -> T:
 
 
 def _statistics(settings: Settings, xyz: np.ndarray, law: Linear, given: Drawn, calibration: Calibration) -> Locations:
-    """Moments, intervals and validation of one block of points; none of them is refused by name yet."""
+    """Compute moments, intervals and validation of one block of points, without the reasons of refusals."""
     meets = np.isfinite(xyz).all(axis=-1)
     lost = (~meets).mean(axis=0)
     count = len(meets)
-    # The few draws without a point take the point's median place: at most one in a thousand, or the point is refused.
+    # The few draws without a point get the median position: at most one in a thousand, or the point is refused.
     for point in np.flatnonzero(~meets.all(axis=0) & meets.any(axis=0)):
         valid = meets[:, point]
         xyz[~valid, point] = np.median(xyz[valid, point], axis=0)

@@ -1,6 +1,6 @@
-"""Looks whose points are wanted: a CSV of counters, approaches and aperture readings, whole or block by block.
+"""Files of looks to locate: a CSV of counters, approaches and aperture readings, read whole or block by block.
 
-steps, deg. Semicolons, decimal commas and workbooks are read too, with the same names of columns.
+steps, deg. Semicolons, decimal commas and workbooks are read too, with the same column names.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.progress import Advance, unshown
 
 HEAD_BYTES = 4096
-"""From which the kind of a file is known."""
+"""Bytes that determine the kind of a file."""
 BLOCK_ROWS = 8192
-"""Lines read at a time: 10 MB with everything that is made of them."""
+"""Lines read at a time: 10 MB with all derived arrays."""
 
 
 def _direction(table: Table, column: Column, values: Values) -> None:
-    """Refuses anything but one of the words of a column."""
+    """Refuse cells other than the words of a column."""
     for row, word in enumerate(values[column.name]):
         if word not in column.words:
             remedy = "name the direction of the last move of the axis"
@@ -56,7 +56,7 @@ class LookRows:
     """Rows of a file of looks.
 
     Attributes:
-        lines: of the file, from 1.
+        lines: lines in the file, from 1.
         pan_steps, tilt_steps: absolute counters.
         aperture_deg: readings.
         approach: directions of the last moves of (pan, tilt).
@@ -70,12 +70,12 @@ class LookRows:
 
     @property
     def settings(self) -> Settings:
-        """As arrays."""
+        """Return the looks as arrays."""
         return settings_of(self.pan_steps, self.tilt_steps, self.aperture_deg, self.approach)
 
 
 def _rows(table: Table) -> LookRows:
-    """Checked cells of a table."""
+    """Check the cells of a table and return its rows."""
     cells_of = {name: tuple(cells) for name, cells in LOOKS.values(table).items()}
     pairs = zip(cells_of.pop("pan_approach"), cells_of.pop("tilt_approach"), strict=True)
     return LookRows(lines=tuple(table.lines), approach=tuple(pairs), **cells_of)
@@ -87,27 +87,27 @@ def _no_points(path: Path) -> InputError:
 
 
 def _foreign(path: Path) -> Table | None:
-    """A table that a spreadsheet wrote otherwise than we do, its numbers with points; None of one of ours."""
+    """Read a table in the notation of a spreadsheet, its numbers with points; None for our own format."""
     with opened(path, "a readable file") as stream:
         if not is_foreign(stream.read(HEAD_BYTES)):
             return None
     table = read_foreign(path)
-    # The same columns are asked for, with the same words.
+    # The same columns are required, with the same messages.
     parse_table(csv_bytes(list(table.columns), ()), table.file, LOOKS.required)
     return Table(table.file, list(table.lines), dict(table.columns))
 
 
 def _part(table: Table, begin: int) -> Table:
-    """`BLOCK_ROWS` of a table's rows."""
+    """Return `BLOCK_ROWS` of a table's rows."""
     end = begin + BLOCK_ROWS
     return Table(table.file, table.lines[begin:end], {name: cells[begin:end] for name, cells in table.columns.items()})
 
 
 def read_looks(path: Path) -> LookRows:
-    """All looks of a file.
+    """Read all looks of a file.
 
     Raises:
-        InputError: unreadable, no such columns, a cell that is none, or no row.
+        InputError: the file cannot be read, columns are missing, a cell is invalid, or there is no row.
     """
     table = _foreign(path)
     if table is None:
@@ -118,14 +118,14 @@ def read_looks(path: Path) -> LookRows:
 
 
 def look_blocks(path: Path, advance: Advance = unshown) -> Iterator[LookRows]:
-    """The looks of a file of any length, block by block.
+    """Read the looks of a file of any length, block by block.
 
     Args:
         path: the file.
-        advance: called with the share of it that is read.
+        advance: called with the share of the file that has been read.
 
     Raises:
-        InputError: as `read_looks`, in the block where it stands.
+        InputError: as in `read_looks`, at the block concerned.
     """
     empty, whole = True, _foreign(path)
     if whole is None:

@@ -1,7 +1,7 @@
-"""What a user of the published equations takes for true: counters times degrees per step, and where that points.
+"""Calibrations of users of the published equations: counters times degrees per step, and the beam by these.
 
-Nominal and classic users are given what is fair: a baseline shortened by the mirror offset, its middle moved by half of
-that, and readings in the convention that their equations expect. Frame T, mm; counters in steps. NumPy.
+For a fair comparison, nominal and classic users have a baseline shortened by the mirror offset, its middle shifted by
+half of that, and readings in the convention of their equations. Frame T, mm; counters in steps. NumPy.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from tvsbayes.instrument.parameters import RIG_PRIORS, Prior
 
 @dataclass(frozen=True)
 class SimpleCalibration:
-    """What a user of published equations knows: C = C0 + k n, beta = k n, no backlash (formulation 5).
+    """A calibration by the published equations: C = C0 + k n, beta = k n, no backlash (formulation 5).
 
     Attributes:
-        deg_per_step: by direction (left, right, up, down): counters above zero were reached left or up.
+        deg_per_step: ratio by direction (left, right, up, down); counters above zero were reached left or up.
         baseline_mm: distance from the aperture to where the beam leaves the positioner, a - L.
-        origin_y_mm: where it leaves it in frame T, a/2 - L: the middle between both is moved by -L/2.
+        origin_y_mm: y of that point in frame T, a/2 - L; the middle of the baseline is shifted by -L/2.
         pan_zero_emission_deg: C0.
-        aperture_zero_deg: what the aperture's readings are corrected by.
+        aperture_zero_deg: correction of the aperture's readings.
     """
 
     deg_per_step: Mapping[str, float]
@@ -39,7 +39,7 @@ class SimpleCalibration:
 def simple_calibration(
     priors: Mapping[str, Prior] = RIG_PRIORS, classic: ClassicResult | None = None
 ) -> SimpleCalibration:
-    """The nominal calibration of stated priors, or with the classic estimator's ratios.
+    """Build the nominal calibration of stated priors, or with the classic estimator's ratios.
 
     Directions that the classic estimator did not measure keep their nominal ratio.
     """
@@ -52,16 +52,16 @@ def simple_calibration(
 
 
 def simple_calibrations(priors: Mapping[str, Prior], classic: ClassicResult | None) -> dict[str, SimpleCalibration]:
-    """By name: nominal, and classic where there is a result."""
+    """Return the calibrations by name: nominal, and classic where there is a result."""
     calibrations = {"nominal": simple_calibration(priors)}
     return calibrations if classic is None else {**calibrations, "classic": simple_calibration(priors, classic)}
 
 
 def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Ray:
-    """Beams, fields of shape (3, points), of a simple calibration at counters (points, 2).
+    """Compute beams, fields of shape (3, points), of a simple calibration at counters (points, 2).
 
-    The azimuth C0 + k n and the elevation k n are turned into a direction, so that either convention of the
-    aperture's angle meets it as it should.
+    The azimuth C0 + k n and the elevation k n are converted to a direction, so that it is correct for either convention
+    of the aperture's angle.
     """
     steps = np.asarray(steps, dtype=float)
     k = simple.deg_per_step
@@ -75,22 +75,22 @@ def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Ray:
 
 @dataclass(frozen=True)
 class Belief:
-    """What an estimator takes for true: its beams (points,), twice the aperture's distance from y = 0, its zero."""
+    """Geometry assumed by an estimator: beams (points,), twice the aperture's distance from y = 0, its zero."""
 
     beam: Components
     baseline_mm: float
     aperture_zero_deg: float
 
     def points(self, aperture_deg: np.ndarray, azimuth: bool) -> np.ndarray:
-        """Where the beams meet readings (..., points): shape (3, ..., points), mm; not a number where they do not."""
+        """Compute where the beams meet readings (..., points): shape (3, ..., points), mm; NaN where they do not."""
         reach = range_components(*self.beam, self.baseline_mm, aperture_deg - self.aperture_zero_deg, azimuth)
         return self.beam.met(reach)
 
 
 def simple_belief(simple: SimpleCalibration, pan: np.ndarray, tilt: np.ndarray) -> Belief:
-    """What it says at counters (points,)."""
+    """Compute the geometry of a simple calibration at counters (points,)."""
     ray = simple_rays(simple, np.stack([pan, tilt], axis=1))
     (x, y, z), (u, v, w) = ray.origin_mm, ray.direction
-    # `range_components` puts the aperture at half the distance given; a simple user's stands at origin - baseline.
+    # `range_components` puts the aperture at half the given distance; that of a simple user is at origin - baseline.
     aperture_mm = 2 * (simple.baseline_mm - simple.origin_y_mm)
     return Belief(Components((x, y, z), (u, v, w)), aperture_mm, simple.aperture_zero_deg)

@@ -277,8 +277,8 @@ def _by_homing(first: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
         first: fit under "anywhere" for every axis.
         problem: problem of that fit.
         axes: whose sides nobody recorded.
-        seed: of the Laplace draws.
-        advance: told how far it is.
+        seed: seed of the Laplace draws.
+        advance: receives the progress.
     """
     start = Mode(first.z, first.covariance, -first.log_density, ())
     modes: dict[tuple[tuple[str, str], ...], tuple[Problem, Mode]] = {}
@@ -404,7 +404,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
         campaign: campaign of `problem`.
         problem: model, priors and the weights of the spots.
         mode: converged, or with the problems that `JointFit.problems` then states.
-        seed: of the Laplace draws.
+        seed: seed of the Laplace draws.
         prior_draws: those of a fit of the same campaign and seed; by default they are drawn.
     """
     used = np.asarray(problem.arrays.spots.valid)[: len(problem.spots)] > 0

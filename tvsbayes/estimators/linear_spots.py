@@ -105,7 +105,7 @@ def linearise(
     """Linearise residuals and ideal observations at the observed ranges in the coordinates, at fixed noise scales.
 
     Args:
-        at: coordinates and the values that they stand for.
+        at: coordinates and their values.
         space: priors.
         arrays: the campaign.
         inflation: factor on pixel and aperture noise.

@@ -51,7 +51,7 @@ def look_jacobian(at: Point, space: ParameterSpace, looks: Looks, arrays: Campai
     """Compute d(predicted)/d(coordinates) at fixed ranges, shape (parameters, spots) for each of five components.
 
     Args:
-        at: coordinates and the values that they stand for.
+        at: coordinates and their values.
         space: priors.
         looks: ideal looks at these coordinates.
         arrays: the campaign.

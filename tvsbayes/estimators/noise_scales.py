@@ -34,7 +34,7 @@ class NoiseDraws:
     Attributes:
         centre: the most probable scales, shape (p,).
         z: drawn, shape (n, p).
-        weights: of the draws, their sum 1, shape (n,).
+        weights: weights of the draws, their sum 1, shape (n,).
     """
 
     centre: np.ndarray
@@ -79,7 +79,7 @@ def noise_draws(fit: JointFit, count: int, seed: int) -> NoiseDraws:
     Args:
         fit: a converged fit.
         count: number of draws, even.
-        seed: of the draws.
+        seed: seed of the draws.
     """
     alone = ScalesAlone(fit)
     columns, centre = alone.columns, fit.z.copy()

@@ -54,7 +54,7 @@ class Density(Protocol):
     Attributes:
         dimension: d.
         headlines: names of the quantities by which a sample is judged.
-        fixed: quantities that are constant but for rounding.
+        fixed: quantities that are constant except for rounding.
         walkers: number of walkers in an ensemble.
         log_constant: log model evidence less the log of the integral of exp(log density).
         invalid: number of evaluations so far without a value.

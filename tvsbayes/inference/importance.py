@@ -149,7 +149,7 @@ class Sample:
     Attributes:
         points: draws, chains joined.
         quantities: quantities of all draws by name, shapes (n,).
-        weights: of the draws, sum 1, shape (chain, draw).
+        weights: weights of the draws, sum 1, shape (chain, draw).
         convergence: the diagnosis.
         seconds: time spent on it.
     """
@@ -360,7 +360,7 @@ def weighted_run[D: Density](
 
     Args:
         density: density about a mode.
-        seed: of the draws.
+        seed: seed of the draws.
         advance: called with the share that is done.
         rounds_max: rounds of all proposals together, by default `ROUNDS_MAX`.
         rounds_least: rounds of the proposal that gives the answer, by default `ROUNDS_LEAST`.

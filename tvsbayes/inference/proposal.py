@@ -261,7 +261,7 @@ class Independence:
 
     @property
     def steps(self) -> tuple[tuple[Step, float], ...]:
-        """Of a chain, with their shares."""
+        """Moves of a chain, with their shares."""
         return tuple(zip((self, self.renewed), SHARES, strict=True))
 
     def renewed(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:

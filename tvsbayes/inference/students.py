@@ -73,7 +73,7 @@ class StudentMixture:
 
     @property
     def steps(self) -> tuple[tuple[Step, float], ...]:
-        """Of a chain, with their shares."""
+        """Moves of a chain, with their shares."""
         return (self, SHARE), (self.walked, 1 - SHARE)
 
     def walked(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:

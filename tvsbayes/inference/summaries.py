@@ -25,7 +25,7 @@ class Propagated(Shown):
         mcse_mean, mcse_sd, mcse_interval95: Monte Carlo standard errors of the above.
         ess: effective draws behind the mean.
         draws: the values, shape (chain, draw, ...).
-        weights: of the draws, sum 1, shape (chain, draw).
+        weights: weights of the draws, sum 1, shape (chain, draw).
     """
 
     mean: np.ndarray

@@ -136,10 +136,10 @@ def place_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray,
     """Compute `place_root` in independent blocks: places of pan, then of tilt, then padding; NumPy.
 
     Args:
-        scales: of the processes, fields with any leading axes.
+        scales: scales of the processes, fields with any leading axes.
         angle_rad: k n of the places, shape (..., places).
         on_tilt: as in `Places`.
-        valid: likewise.
+        valid: as in `Places`.
     """
     kinds = np.where(valid, on_tilt, 2)
     if np.any(np.diff(kinds) < 0):
@@ -164,10 +164,10 @@ def place_root(
     It works with NumPy and JAX.
 
     Args:
-        scales: of the processes, fields with any leading axes.
+        scales: scales of the processes, fields with any leading axes.
         angle_rad: k n of the places, shape (..., places).
         on_tilt: as in `Places`.
-        valid: likewise.
+        valid: as in `Places`.
         functions: jax.numpy or numpy.
 
     Returns:

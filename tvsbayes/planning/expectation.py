@@ -378,7 +378,7 @@ def information_of(
 
     Args:
         steps: the plan; every target is a sheet of the rig.
-        knowledge: of the instrument before the plan.
+        knowledge: knowledge of the instrument before the plan.
         aperture: looks also read the aperture.
         z: another point of evaluation (a drawn truth), shape (p,).
         space: priors of that point, where they differ.

@@ -283,7 +283,7 @@ def check_plan(rig: Rig, steps: Sequence[PlanStep], *, progress: Show | None = N
     Args:
         rig: priors, sheets, limits.
         steps: the plan.
-        progress: shows the progress.
+        progress: receives the progress.
 
     Raises:
         InputError: a plan that looks at nothing or places an unknown sheet.

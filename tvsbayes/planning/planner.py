@@ -83,7 +83,7 @@ class PlanResult(Shown):
     """A plan with its curve and advice.
 
     Attributes:
-        target: of the plan.
+        target: target of the plan.
         steps: the recommended plan; empty where the target is met already.
         experiments, looks, minutes: its size.
         expected: the target's value after it at the most probable instrument; `now`: before it.
@@ -200,15 +200,15 @@ def plan(
 
     Args:
         rig: sheets, limits, costs; its priors where there is no campaign.
-        target: of the plan.
+        target: target of the plan.
         given: a fit of earlier data.
         minutes: the plan must not take longer.
         criterion: criterion of the search: "c" the target, "D" or "A" ratios and backlashes together.
         aperture: looks also read the aperture.
         draws: number of instruments for the assurance.
         largest: largest number of experiments (of four looks) of a plan.
-        seed: of the draws.
-        progress: shows the progress.
+        seed: seed of the draws.
+        progress: receives the progress.
 
     Returns:
         The plan, its curve and the advice.

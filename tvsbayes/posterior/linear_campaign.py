@@ -132,8 +132,8 @@ class Products:
     """Products of a linearised campaign's columns and states by the inverse noise covariance of n points.
 
     Attributes:
-        gram: of the columns with each other, shape (n, c, c).
-        by_states: of the states with the columns, shape (n, m, c).
+        gram: products of the columns with each other, shape (n, c, c).
+        by_states: products of the states with the columns, shape (n, m, c).
         of_states: of states with each other where they are `StopStates.overlapping`, shape (n, k).
     """
 

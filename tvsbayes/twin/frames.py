@@ -46,7 +46,7 @@ def write_with_frames(
         simulated: what the twin did.
         seed: see `write_frames`.
         views: how many board views.
-        progress: told how far it is.
+        progress: receives the progress.
 
     Returns:
         How many pictures lie there.
@@ -94,7 +94,7 @@ def write_frames(
         simulated: what the twin did.
         seed: seed of speckle, noise and board poses.
         views: number of board views, by default `BOARD_VIEWS`; 0 writes no `boards/`.
-        progress: told how far it is.
+        progress: receives the progress.
 
     Returns:
         How many pictures lie there.

@@ -120,7 +120,7 @@ def draw_gear_errors(
     """Draw errors of both axes with the scales of a true rig; a rig without scales has perfect gears.
 
     Args:
-        parameters: of the true rig, by contract name.
+        parameters: parameters of the true rig, by contract name.
         period_deg: stated periods of each axis, in the order of `harmonic_amplitude_deg`.
         rng: generator, which advances equally for any scales.
     """

@@ -63,7 +63,7 @@ class SimulatedCampaign(Shown):
     light: Light
 
     def shown(self) -> View:
-        """Its campaign; the truth stands in `truth`."""
+        """Show the campaign; the truth is in `truth`."""
         view = self.campaign.shown()
         return replace(view, title=f"Simulated {view.title}; the truth is in .truth")
 

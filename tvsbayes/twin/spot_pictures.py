@@ -248,7 +248,7 @@ def render_spots(
         light: light of one beam; where it meets no sheet there is ambient light only.
         scene: beam, exposure, ambient light, speckle.
         sensor: both sensors.
-        seed: of the campaign.
+        seed: seed of the campaign.
         spot: number of the look.
         frame: number of the exposure of this look.
     """

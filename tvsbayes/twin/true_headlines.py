@@ -43,7 +43,7 @@ def effective_deg_per_step(
     axis at one counter in all looks the mirrors' slope times the mean ratio replaces the line's.
 
     Args:
-        parameters: of the true rig, by contract name.
+        parameters: parameters of the true rig, by contract name.
         errors: errors of its gears.
         campaign: campaign of the looks; its rig states the period of `harmonic_deg`.
         pose_deg: mean angles of (pan, tilt), at which either axis is for the line of the other; by default those by the
