@@ -1,7 +1,7 @@
 """Waves of stated period in the gears of a scanner: amplitude, phase, and the probability that there is one.
 
-A wave is a cos(2 pi x / P) + b sin(2 pi x / P) of the output's angle x = k n, with a and b normal of sd A, half-normal
-itself (formulation 3.1). Given the errors at the places, a and b are normal too. deg.
+A wave is a cos(2 pi x / P) + b sin(2 pi x / P) of the output's angle x = k n; a and b are normal with sd A, which is
+half-normal (formulation 3.1). Given the errors at the places, a and b are normal too. deg.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class WaveDraws:
     def probability(self) -> float:
         """Compute the probability of a wave, for prior odds of one.
 
-        The mean over the posterior of p(errors | no wave) / p(errors | wave) is the ratio of both evidences, since the
-        looks depend on the wave through the errors alone.
+        The posterior mean of p(errors | no wave) / p(errors | wave) is the ratio of both evidences, since looks depend
+        on the wave through the errors alone.
         """
         none = float(np.mean(np.exp(self.log_evidence_ratio)))
         return 1 / (1 + none)

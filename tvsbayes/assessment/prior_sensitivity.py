@@ -1,8 +1,8 @@
 """Sensitivity of the headlines to each stated prior: its u doubled and halved.
 
-Draws of a posterior are weighted by the ratio of the priors, which is exact. Where too few draws have weight (a prior
-of many coordinates, or a parameter with little information), and for the Laplace approximation, the normal distribution
-with the same moments is changed instead.
+Draws of a posterior are weighted by the ratio of the priors, which is exact. The normal distribution with the same
+moments is changed instead for the Laplace approximation, and where too few draws have weight (a prior of many
+coordinates, or a parameter with little information).
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class SampledHeadlines:
     def changed(self, members: np.ndarray, factor: float) -> Change | None:
         """Compute the change by the ratio of the priors; None where too few draws have weight."""
         z = self.z[:, members]
-        # In units of the stated u: the value of a half-normal quantity, the coordinate of all others.
+        # The prior is in units of the stated u: the value of a half-normal quantity, the coordinate of all others.
         stated = np.where(self.half[members], half_normal(z), z)
         log_ratio = -0.5 * (factor**-2 - 1) * np.sum(stated**2, axis=1)
         weights = smoothed_weights(np.log(np.maximum(self.weights, np.finfo(float).tiny)) + log_ratio)

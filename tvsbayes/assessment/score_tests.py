@@ -145,7 +145,7 @@ def _defects_in_place(fit: JointFit, axes: Sequence[_SeenAxis]) -> list[_Defect]
     places, waves = [], []
     for axis in axes:
         stops = len(np.unique(axis.counter))
-        # Fewer stops fit any wave; a search that failed may end where an axis does not turn.
+        # Any wave fits three stops; a search that failed may end where an axis does not turn.
         reach = 2 * float(np.ptp(axis.angle_deg)) if stops > 3 else 0.0
         periods = reach / np.arange(1, min(WAVES, 2 * stops) + 1) if reach else ()
         for period in [*periods, *fit.campaign.rig.harmonic_period_deg.get(axis.name, ())]:

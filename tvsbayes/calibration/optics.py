@@ -107,7 +107,7 @@ class Components(NamedTuple):
     def met(self, range_mm: Number) -> np.ndarray:
         """Compute points at ranges; NaN where the range is invalid or the point is behind the baseline."""
         points = self.at(np.where((np.asarray(range_mm).real > 0) & np.isfinite(range_mm), range_mm, np.nan))
-        # In both parts of complex numbers, which carry derivatives.
+        # Complex numbers carry derivatives: both parts are NaN.
         return np.where(ahead(points[0]), points, complex(np.nan, np.nan) if np.iscomplexobj(points) else np.nan)
 
 

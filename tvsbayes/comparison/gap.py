@@ -146,7 +146,7 @@ def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Ideal
     from tvsbayes.posterior.predictive import by_way, looks, repeated_rad
 
     z, errors_rad = chosen.z, chosen.place_errors_rad
-    # Without play there is none that varies.
+    # Without play there is no variation of play either.
     straight_rad = np.where(np.arange(errors_rad.shape[1]) < errors_rad.shape[1] // 2, errors_rad, 0.0)
 
     spaces = [found.space]

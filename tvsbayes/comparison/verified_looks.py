@@ -112,7 +112,7 @@ class AimedLooks:
         if is_head(values):
             aims = [Direction(*map(float, row)) for row in zip(azimuth, elevation, strict=True)]
             angles = np.array([mirror_angles(nominal, aim) for aim in aims]) - [0.0, nominal["elevation_zero_deg"]]
-            # The turn that is nearest to the axis' own.
+            # Add the whole turns that bring the angle nearest to the axis.
             angles[:, 0] += FULL_TURN_DEG * np.round((pan - angles[:, 0]) / FULL_TURN_DEG)
         else:
             angles = np.stack([azimuth + 90.0 - nominal["pan_zero_emission_deg"], elevation], axis=1)

@@ -86,7 +86,7 @@ CHANGES = (*_pose("cameras", "stereo"), *_pose("positioner", "extrinsics"), *_GE
 """All tested changes, with the sizes that must be detected."""
 _LEAN = tuple(f"azimuth_axis_tilt_deg.{side}" for side in ("north", "east"))
 SIGHTED_CHANGES = (
-    # Above the uncertainty of a homing.
+    # These sizes exceed the uncertainty of a homing.
     *(_single(f"zero: {angle}", f"{angle}_zero_deg", 5 * HOME_SD_DEG, "deg") for angle in ("azimuth", "elevation")),
     StatedChange("base: lean", _LEAN, ("base: lean to azimuth 0", "base: lean to azimuth 90"), 0.1, "deg"),
     _single("beam: not square", "beam_not_square_deg", 0.1, "deg"),
@@ -246,7 +246,7 @@ class WatchedLooks:
         self.looks = int(used[self.first :].sum())
         readings = sum(s.aperture_deg is not None for s, use in zip(later, used[self.first :], strict=True) if use)
         self.changes = changes_of(table.mechanism)
-        # Four pixels less the range are three residuals. A sighting has two angles.
+        # Four pixels give three residuals after elimination of the range; a sighting gives two angles.
         self.dof = 2 * self.looks if table.mechanism.sightings else 3 * self.looks + readings
 
     def departure(self, z: np.ndarray, *, angles: bool = False) -> Departure:

@@ -1,8 +1,8 @@
 """A two-sided table from a fit in the terms of a format, and the promise: the bound of errors after applying it.
 
 The promise is a prediction of readings, not of means. It includes error by position, play and its variation, scatter of
-stops, homing, drift since then, the uncertainty of all of them, limits of the format, and rounding by the controller.
-Commands in the campaign's counts, all else in its unit. No JAX.
+stops, homing and drift since then, and the uncertainty of all of them. Limits of the format and rounding by the
+controller are included too. Commands in the campaign's counts, all else in its unit. No JAX.
 """
 
 from __future__ import annotations
@@ -326,7 +326,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         shaped = _shaped(form, at, nominal, fitted, wish, _line_draws(fit))
         job.begin("promise")
         u = reading_u(campaign)
-        # Commands between the lines of the table too.
+        # Commands between the lines of the table are tested too.
         tried = low + (high - low) * (np.arange(TRIED) + 0.5) / TRIED
         after, run = _run(fit, tried, max(far, overrun), since, shaped.correction, u, seed)
         job.at(0.5)

@@ -1,7 +1,7 @@
 """Calibrations of users of the published equations: counters times degrees per step, and the beam by these.
 
-For a fair comparison, nominal and classic users have a baseline shortened by the mirror offset, its middle shifted by
-half of that, and readings in the convention of their equations. Frame T, mm; counters in steps. NumPy.
+For a fair comparison, nominal and classic users have a baseline shortened by the mirror offset, with its middle shifted
+by half of that. Their readings are in the convention of their equations. Frame T, mm; counters in steps. NumPy.
 """
 
 from __future__ import annotations

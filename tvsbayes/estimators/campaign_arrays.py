@@ -47,7 +47,7 @@ class SpotArrays(eqx.Module):
     stop error since the previous spot, with variance `redraw_mix[axis] @ (sd_right^2, sd_left^2)` (or down, up).
     `hours` is the time since the previous spot, or since a later homing.
 
-    For sightings `triangulated_mm` is the direction of the head, a unit vector of frame P, and `tangents` are the unit
+    For sightings `triangulated_mm` is the direction of the head, a unit vector of frame P; `tangents` are the unit
     vectors along azimuth and elevation there (None for a stereo pair). The pixels are then angles on the sphere about
     that direction, rad, in the columns of `SIGHTED`.
     """

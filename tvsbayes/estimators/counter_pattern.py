@@ -1,7 +1,7 @@
 """Tests of counters against spots: the wrong sign, steps of each move, columns exchanged, rows shifted.
 
 Spots move across when a counter grows. Their angles across and up, deg, are regressed on the counters, steps, and the
-distance of their sheet, in the axes of frame P as far as the campaign states them. A counter is tested only where its
+sheet's distance. The axes are those of frame P as far as the campaign states them. A counter is tested only where its
 spread is large against the play and scatter that the priors allow; a smaller motion need not be visible. The limits are
 far from the values of correct campaigns (experiments/robustness/mistakes.md). No JAX.
 """

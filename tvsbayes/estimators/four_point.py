@@ -208,8 +208,8 @@ def ratio_slopes(pixels: np.ndarray, steps: np.ndarray, axis: str | np.ndarray, 
 def select_experiments(campaign: Campaign) -> Selection:
     """Collect the complete four-point experiments; the others are listed with a reason.
 
-    An experiment is complete with one ok spot for each point 1 to 4, points 1 and 2 at the same counters, also 3 and 4,
-    exactly one axis moved and no homing between them.
+    A complete experiment has one ok spot for each point 1 to 4, points 1 and 2 at the same counters, as are 3 and 4.
+    Between them exactly one axis has moved, without homing.
     """
     moves = {move.move: move for move in campaign.moves}
     rows: dict[int, list[int]] = {}

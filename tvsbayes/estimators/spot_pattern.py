@@ -163,7 +163,7 @@ def _knock_doubts(pattern: SpotPattern) -> tuple[str, ...]:
     kept = np.clip(off, np.median(off) - limit, np.median(off) + limit)
     n = np.arange(1, len(kept))
     mean = kept.mean()
-    # The likeliest single step of a mean.
+    # Find the most likely row of a single step in the mean.
     gain = np.cumsum(kept - mean)[:-1] ** 2 / (n * (len(kept) - n))
     row = int(np.argmax(gain[SPOTS_MIN - 1 : 1 - SPOTS_MIN])) + SPOTS_MIN
     names = np.array([spot.target for spot in pattern.spots])

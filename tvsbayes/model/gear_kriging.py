@@ -1,7 +1,7 @@
 """Prediction of the gears' repeating errors at other counters from those at some counters (kriging). NumPy.
 
-The factor of the joint covariance gives the prediction. The rows of the other counters hold the weights of the known
-errors, in units in which these are N(0, 1) a priori, and the conditional sd (Rasmussen and Williams, Gaussian Processes
+The factor of the joint covariance gives the prediction. Its rows for the other counters hold the conditional sd and the
+weights of the known errors, in units in which these are N(0, 1) a priori (Rasmussen and Williams, Gaussian Processes
 for Machine Learning, MIT Press 2006, 2.2). Counters in steps, angles in rad.
 """
 

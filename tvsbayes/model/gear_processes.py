@@ -1,7 +1,7 @@
 """Errors of gears that repeat by position: transmission error and play as Gaussian processes of the output's angle.
 
-Looks identify both at the counters where they found the axes; rad. Arrays over axes are ordered (pan, tilt), arrays
-over places as `Places` lists them (formulation 3.1).
+Looks determine both at their own counters; rad. Arrays over axes are ordered (pan, tilt), arrays over places as
+`Places` lists them (formulation 3.1).
 """
 
 from __future__ import annotations

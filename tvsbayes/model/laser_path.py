@@ -103,9 +103,8 @@ class MoveArrays(eqx.Module):
 class MirrorAngles(eqx.Module):
     """Mirror angles after each move, without stop error and home offset.
 
-    Where the approach of a segment's first row is unknown the play may lie anywhere in its band: `angle_rad`
-    is then the middle of the possible angles and `play_sd_rad` the standard deviation of a uniform
-    distribution over them (zero as soon as a move has taken the play up).
+    Where the approach of a segment's first row is unknown, the position in the play is uniform in its band. `angle_rad`
+    is then the mean angle and `play_sd_rad` the standard deviation, zero as soon as a move has taken the play up.
     """
 
     angle_rad: Float[Array, "moves 2"]

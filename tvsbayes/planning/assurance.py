@@ -43,9 +43,9 @@ def judged_z(
     """Compute the coordinates at which fits evaluate their uncertainty: the true ones, with estimated noise scales.
 
     n stops determine a standard deviation to 1 / sqrt(2 n). The log of each scale has the expected information 2 sum
-    (s^2 m / (1 + s^2 m))^2 over the stops of its direction, m the information of the pixels on one stop, less the share
-    used by the geometry. Its estimate is the weighted mean of prior and truth, with scatter. A sampled fit averages its
-    variance over the scale: E s^2 of a log-normal, not s^2 of its median.
+    (s^2 m / (1 + s^2 m))^2 over the stops of its direction, less the share used by the geometry; m is the information
+    of the pixels on one stop. The estimated scale is the weighted mean of prior and truth, with scatter. A sampled fit
+    averages its variance over the scale: E s^2 of a log-normal, not s^2 of its median.
 
     Args:
         instruments: n true instruments.
@@ -157,7 +157,7 @@ class Assurance:
 
     def __init__(self, family: Family, target: Target, instruments: Instruments, seed: int):
         self.family, self.target, self.instruments, self.seed = family, target, instruments, seed
-        # After data a fit's line goes through earlier and new looks; the places only know the sum.
+        # After data a fit's line goes through earlier and new looks, which the errors at places do not separate.
         before_data = not family.knowledge.after_data
         self._of_lines = before_data and target.point_mm is None and family.knowledge.gears.size > 0
         self.noise = random_stream(seed, Stream.INSTRUMENT_SCALES).standard_normal((len(instruments), len(SCALES)))
@@ -257,7 +257,7 @@ class Assurance:
             return (seen.slope * np.radians(sd_deg)[:, :, None] ** 2) @ np.swapaxes(seen.slope, -1, -2)
 
         scatter = of_angles(instruments.physical[:, None, SCATTER_COLUMNS])
-        # The transform rotates the rows too, not only their scale.
+        # The transform also rotates the rows; it is not only a scale.
         old_root, new_root = (
             p[:, None, None, None] ** 2 * (np.eye(4) - scatter)
             + scatter

@@ -63,7 +63,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         stereo = rig.stereo.with_vector(physical[len(RIG_NAMES) :])
         simulated = simulate(rig, plan, 0, Truth(with_derived({**parameters, **noise_free}), stereo))
         selection = select_experiments(simulated.campaign)
-        # The second experiment of each direction, as its start is reached as in all later ones.
+        # The second experiment of each direction starts like all later ones, unlike the first.
         second_experiments = np.flatnonzero(selection.experiments % 2 == 1)
         pose = simulated.truth.reference_pose_deg
         if len(second_experiments) < len(DIRECTIONS) or pose is None:
@@ -84,7 +84,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
     by_pixel = np.sum(slopes.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
     stop_variance = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]] + 2 * factor * np.array(looks)
     variance = by_pixel * np.array(spot_sds) ** 2 + stop_variance * (ratio / np.array(local) / np.array(steps)) ** 2
-    # Every direction has experiments, since other draws were skipped.
+    # Draws with a direction without experiments were skipped before.
     stereo_u = np.array([r.u_stereo_deg_per_step for r in classic(campaign).directions.values() if r is not None])
     return ClassicForecast(np.sqrt(variance), ratio - np.array(local), stereo_u)
 

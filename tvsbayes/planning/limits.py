@@ -99,7 +99,7 @@ def _needed_at_point(aim: Sensitivity, target: Target) -> str | None:
     """Write the required improvement at the target's point itself; None where its variance permits the target."""
     total = aim.own_variance
     gears = aim.own.get(GEARS_AT_POINT, np.zeros_like(total))
-    # The worst quantity, for each of these parts.
+    # The worst quantity is taken for each part.
     stop, gear, worst = (target.factor * math.sqrt(max(variance)) for variance in (total - gears, gears, total))
     unit = target.unit
     if stop > target.limit:

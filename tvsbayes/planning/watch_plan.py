@@ -1,9 +1,9 @@
 """`plan --watch`: the fewest looks that detect every stated change, within a budget, and undetectable changes.
 
 Candidates are the looks of the campaign itself: within the limits, in both images, at counters with known gear errors.
-A pattern of them on every sheet is repeated after further homings, since the error of a homing masks the same part of a
-positioner's rotation in all looks after it. The search assumes independent stops, so that information adds up; the
-final powers are computed from the plan's own moves. Counters in steps, minutes by `[costs]`.
+A pattern of them on every sheet is repeated after further homings: the error of a homing masks the same part of a
+positioner's rotation in all its looks. The search assumes independent stops, so that information adds up; the final
+powers are computed from the plan's own moves. Counters in steps, minutes by `[costs]`.
 """
 
 from __future__ import annotations

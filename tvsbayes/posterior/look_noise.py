@@ -2,9 +2,9 @@
 
 In units of the noise at the mode a spot's components have the covariance p^2 (1 + U T U') at a point of noise scales: p
 the scale of pixels over that at the mode, U their derivatives by the angles, T diagonal, the variances of the angles
-over p^2 less those at the mode. Its inverse is p^-2 (1 - U K U') with K = T (1 + U'U T)^-1 (Woodbury), which is smooth
-in two numbers of the point and few of the spot. Therefore a few functions of the spots span it at all points, and
-products of columns by the inverse are sums of as many precomputed matrices.
+over p^2 less those at the mode. Its inverse is p^-2 (1 - U K U') with K = T (1 + U'U T)^-1 (Woodbury), smooth in two
+numbers of the point and few of the spot. Therefore a few functions of the spots span it at all points, and products of
+columns by the inverse are sums of as many precomputed matrices.
 """
 
 from __future__ import annotations

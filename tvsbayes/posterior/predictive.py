@@ -284,7 +284,7 @@ def looks_again(
     drift_rad = np.radians(physical[:, DRIFT_COLUMNS])
     walked = drift_rad[:, None] * np.sqrt(arrays.hours)[:, None] * generator.standard_normal(home.shape)
     total = np.cumsum(walked, axis=1)
-    # The zero walks from its homing on.
+    # The zero drifts as a random walk from its homing on.
     error = error + home[:, segment] + total - (total - walked)[:, segment]
     error = error + repeated_rad(fit, place_errors_rad)
     # The position in the play is Gaussian after an unknown approach, as in the filter.

@@ -24,8 +24,8 @@ from tvsbayes.results.records import Tier
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE, TIERS
 
 MIXTURE_ROUNDS, MIXTURE_MARGIN = 16, 1.5
-"""Largest number of rounds of the most probable way of homing where the mixture of all would be rough, and the factor
-on the rounds that the errors of the mixture require."""
+"""Largest number of rounds of the most probable way of homing where the mixture of all would be rough; factor on the
+rounds that the errors of the mixture require."""
 DRAWING = "drawing weighted samples"
 DRAWN_SECONDS, WALKED_SECONDS = 3.0, 8.0
 """Seconds of the stages, for the progress display."""

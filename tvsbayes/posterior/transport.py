@@ -388,7 +388,7 @@ def centred_count(moved: np.ndarray) -> int:
         The number with the least sum of remaining variances, in posterior variances.
     """
     count = len(moved)
-    # Variances of products of standard normal numbers: 1, and of half a square 1/2.
+    # A product of two standard normal numbers has the variance 1, half a square 1/2.
     pairs = np.triu(np.ones((count, count)), 1) + 0.5 * np.eye(count)
     variance = pairs[..., None] * moved**2
     left = [variance[..., :wide].sum() + variance[wide:, wide:, wide:].sum() for wide in range(count, -1, -1)]

@@ -104,7 +104,7 @@ class StudyRows:
         rows = (self._row(line, number) for number, line in enumerate(whole.splitlines(), 1))
         self.rows = {(row.design, row.index): row for row in rows}
         self.torn, self._size = len(data) - len(whole), len(data)
-        # A file without one whole row is checked, or somebody else's only unterminated line would be removed as torn.
+        # Without a complete row the file may not be a study's; its unterminated line must not be removed as torn.
         if not whole and not (data.startswith(_LINE_BEGINS) or _LINE_BEGINS.startswith(data)):
             raise self._no_row(1)
         self._try()

@@ -8,9 +8,8 @@ threads.
 
 The spot is the image of a round Gaussian beam on an oblique sheet through the camera's linearised map at the point
 where the beam's axis meets the sheet: an elliptic Gaussian whose centroid IS the projection of that point. The
-neglected nonlinearity (curvature of distortion and perspective across the spot) would shift a centroid by 0.002 px at a
-spot sd of 2 px and 0.01 px at 4 px (`experiments/cameras/detection.md`). NumPy and OpenCV only, never the model under
-test.
+neglected curvature of distortion and perspective across the spot would shift a centroid by 0.002 px at a spot sd of 2
+px and 0.01 px at 4 px (`experiments/cameras/detection.md`). NumPy and OpenCV only, never the model under test.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ class Truth:
     def effective_deg_per_step(self, campaign: Campaign) -> dict[str, float] | None:
         """Compute the effective ratios over the looks of a campaign, see `true_headlines`; None without looks."""
         # A ratio contrast rotates a head's axes by degrees over long travel, and with a tilted axis its lines depend on
-        # the other one's angle. For a scanner this effect is 1e-5.
+        # the other axis' angle. For a scanner this effect is 1e-5.
         pose_deg = self.reference_pose_deg if campaign.rig.mechanism.terms else None
         return effective_deg_per_step(self.parameters, self.gear_errors or PERFECT, campaign, pose_deg)
 
@@ -208,7 +208,7 @@ def read_truth(path: str | Path, stated: Stereo) -> Truth:
     keys = parse_json(read_bytes(path, JSON_BYTES_MAX), path.name)
     keys.word("format", (TRUTH_FORMAT,))
     try:
-        # Entries are converted, or refused below.
+        # Entries that cannot be converted are refused below.
         return Truth.from_json(cast("TruthDocument", keys.values), stated)
     except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(
