@@ -144,7 +144,7 @@ NO_GEARS = GearTable()
 
 
 def _axis(name: str) -> int:
-    """Index of the axis of one of `GEAR_INPUTS`."""
+    """Return the index of the axis of one of `GEAR_INPUTS`."""
     return AXES.index(name.split(".")[1])
 
 

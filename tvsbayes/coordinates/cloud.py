@@ -59,7 +59,7 @@ class CloudBlock:
 def cloud(
     calibration: Calibration, looks: Iterable[LookRows], simple: Mapping[str, SimpleCalibration]
 ) -> Iterator[CloudBlock]:
-    """Compute points of looks, a block for each block.
+    """Compute points of looks, one block of points for each block of looks.
 
     Args:
         calibration: from `load_calibration` or `calibration_of`.

@@ -25,7 +25,7 @@ from tvsbayes.instrument.stereo_pair import rotation_matrix
 PRIOR_SDS = 3.0
 """Standard uncertainties of a prior up to which play, scatter and the cameras' mounting are considered possible."""
 EXPECTED = 3.0
-"""Least ratio of a counter's spread to motion that play and scatter may hide: a correct one then explains 0.9 of it."""
+"""Least ratio of a counter's spread to the motion possible by play and scatter; a correct one then explains 0.9."""
 UNEXPLAINED = 1.5
 """Least ratio of unexplained motion to that of play and scatter for other rows to be tried."""
 FOLLOWED, LOST = 0.8, 0.5

@@ -28,7 +28,7 @@ class Points:
     parts: dict[str, np.ndarray]
 
     def __len__(self) -> int:
-        """Number of points."""
+        """Return the number of points."""
         return len(self.w)
 
     def taken(self, places: np.ndarray | slice) -> Points:
@@ -98,11 +98,11 @@ class Proposal(Protocol):
     """A proposal density, which can be fitted to its draws."""
 
     def draw(self, count: int, generator: np.random.RandomState) -> np.ndarray:
-        """Independent draws, shape (count, d)."""
+        """Draw independent points, shape (count, d)."""
         ...
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
-        """Log density, shape (n,)."""
+        """Compute the log density, shape (n,)."""
         ...
 
     def fitted(self, w: np.ndarray, log_target: np.ndarray, log_weights: np.ndarray) -> Proposal:
@@ -111,7 +111,7 @@ class Proposal(Protocol):
 
     @property
     def steps(self) -> tuple[tuple[Step, float], ...]:
-        """Metropolis-Hastings steps of a chain with their shares, which sum to at most 1."""
+        """Return Metropolis-Hastings steps of a chain with their shares, which sum to at most 1."""
         ...
 
 
@@ -119,7 +119,7 @@ class Step(Protocol):
     """A Metropolis-Hastings step of a chain."""
 
     def __call__(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """New points for w (n, d), and ln q(old | new) - ln q(new | old)."""
+        """Propose new points for w (n, d), with ln q(old | new) - ln q(new | old)."""
         ...
 
 

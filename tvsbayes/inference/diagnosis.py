@@ -33,10 +33,10 @@ AGREEMENT_LIMIT = 4.0
 """Monte Carlo errors by which a headline's mean or interval end may differ from importance sampling's. In two of a
 thousand fits one of some thirty comparisons differs more by chance."""
 STUCK_ACCEPTANCE = 0.25
-"""A walker is stuck that accepts less than this share of what the median walker accepts ..."""
+"""Share of the median walker's acceptance below which a walker is stuck."""
 STUCK_DEVIATION = 8.0
-"""... or whose mean log density lies this many median absolute deviations, and a standard deviation of a single draw,
-off the others': means of long chains scatter so little that a rare excursion exceeds the first limit."""
+"""Median absolute deviations of mean log densities beyond which a walker is stuck, if also beyond a standard
+deviation of a single draw: means of long chains scatter so little that a rare excursion exceeds the first limit."""
 WARM_UP = 10
 """The first 1/10 of the steps is discarded: more than five autocorrelation times at `TAU_LIMIT`."""
 STORED_DRAWS = 48

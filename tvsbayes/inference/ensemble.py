@@ -78,7 +78,7 @@ class Run[D: Density]:
 
     @property
     def proposal(self) -> Proposal:
-        """The proposal whose steps the walkers take."""
+        """Return the proposal whose steps the walkers take."""
         return self.start.proposal
 
     def chain(self) -> Chain:

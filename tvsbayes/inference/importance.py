@@ -55,9 +55,9 @@ ROUNDS_LEAST = 3
 PATIENCE = 3
 """A new proposal is fitted if the present one would need more than this many times its rounds so far."""
 K_MAX = 0.7
-"""Tail index from which weighted means cannot be trusted, however many the draws ..."""
+"""Tail index from which weighted means are unreliable for any number of draws (Vehtari et al. 2024, as below)."""
 ROUGH_K_MAX = 1.0
-"""... and from which they do not exist (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72)."""
+"""Tail index from which weighted means do not exist (Vehtari et al., J. Mach. Learn. Res. 25 (2024) 72)."""
 HEAVIEST_MAX, ROUGH_HEAVIEST_MAX = 0.05, 0.2
 """Share of the weight that one draw may have."""
 

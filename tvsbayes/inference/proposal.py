@@ -174,7 +174,7 @@ class Independence:
 
     @cached_property
     def _log_volume(self) -> float:
-        """Ln |dw/dv|."""
+        """Compute ln |dw/dv|."""
         return float(np.linalg.slogdet(self.turn)[1])
 
     def to_v(self, w: np.ndarray) -> np.ndarray:
@@ -196,7 +196,7 @@ class Independence:
         return log_density
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
-        """Log density, shape (n,)."""
+        """Compute the log density, shape (n,)."""
         v = self.to_v(w)
         each, log_sd, some = self._each(v), np.log(self.sd), self.coupled
         distance2 = ((v - self.mean) / self.sd) ** 2
@@ -208,7 +208,7 @@ class Independence:
         return np.logaddexp.reduce(shares[:, None] + np.stack([alone, partly, whole]), axis=0) - self._log_volume
 
     def draw(self, count: int, generator: np.random.RandomState) -> np.ndarray:
-        """Independent draws, shape (count, d)."""
+        """Draw independent points, shape (count, d)."""
         per_place, one = (count, len(self.places)), (count, 1)
         normal = generator.standard_normal((count, len(self.mean)))
         single = np.sqrt(generator.chisquare(HEAVY_DOF, per_place) / HEAVY_DOF)
@@ -261,7 +261,7 @@ class Independence:
 
     @property
     def steps(self) -> tuple[tuple[Step, float], ...]:
-        """Moves of a chain, with their shares."""
+        """Return the moves of a chain with their shares."""
         return tuple(zip((self, self.renewed), SHARES, strict=True))
 
     def renewed(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:

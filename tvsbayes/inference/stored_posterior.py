@@ -134,7 +134,7 @@ def _answer(keys: Keys) -> AnswerKind:
 
 
 def _draws(path: Path) -> dict[str, np.ndarray]:
-    """All named columns."""
+    """Return all named columns."""
     draws: dict[str, np.ndarray] = {}
     try:
         file = read_arrays(path, RESULTS_BYTES_MAX)

@@ -51,14 +51,14 @@ class StudentMixture:
         return cls(means, np.linalg.cholesky(covariances), shares, width)
 
     def draw(self, count: int, generator: np.random.RandomState) -> np.ndarray:
-        """Independent draws, shape (count, d)."""
+        """Draw independent points, shape (count, d)."""
         which = generator.choice(len(self.shares), size=count, p=self.shares)
         normal = generator.standard_normal((count, self.means.shape[1]))
         normal /= np.sqrt(generator.chisquare(DEGREES, (count, 1)) / DEGREES)
         return self.means[which] + np.einsum("nij,nj->ni", self.roots[which], normal)
 
     def log_density(self, w: np.ndarray) -> np.ndarray:
-        """Log density, shape (n,)."""
+        """Compute the log density, shape (n,)."""
         parts = []
         for mean, root, share in zip(self.means, self.roots, self.shares, strict=True):
             square = np.sum(np.linalg.solve(root, (w - mean).T) ** 2, axis=0)
@@ -73,7 +73,7 @@ class StudentMixture:
 
     @property
     def steps(self) -> tuple[tuple[Step, float], ...]:
-        """Moves of a chain, with their shares."""
+        """Return the moves of a chain with their shares."""
         return (self, SHARE), (self.walked, 1 - SHARE)
 
     def walked(self, w: np.ndarray, generator: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:

@@ -68,7 +68,7 @@ class Walkers:
 
     @property
     def chain(self) -> Chain:
-        """The chain with all steps, earlier runs included."""
+        """Return the chain with all steps, earlier runs included."""
         before, backend = self.before, self.sampler.backend
         if backend.iteration == 0:
             return before
@@ -82,5 +82,5 @@ class Walkers:
 
 
 def autocorrelation_time(x: np.ndarray) -> float:
-    """Integrated autocorrelation time of a coordinate (steps, walkers), steps."""
+    """Compute the integrated autocorrelation time of a coordinate (steps, walkers), steps."""
     return float(emcee.autocorr.integrated_time(x[:, :, None], tol=0, quiet=True)[0])

@@ -77,7 +77,7 @@ def _residuals(at: Float[Array, " parameters"], linear: Linear) -> tuple[Float[A
 
 
 def _initial(linear: Linear, tolerance: Float[Array, ""]) -> Any:
-    """State of the solver before its first step."""
+    """Return the state of the solver before its first step."""
     shape = jax.ShapeDtypeStruct(linear.value.shape, linear.value.dtype)
     return _solver(tolerance).init(_residuals, linear.point, linear, {}, shape, None, frozenset())
 

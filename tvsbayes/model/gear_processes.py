@@ -20,7 +20,7 @@ from tvsbayes.instrument.parameters import PERIODS_MAX
 from tvsbayes.statistics.gaussian_process import JITTER, matern52, with_waves
 
 FLOOR_RAD2 = 1e-24
-"""Variance added at a place: above zero, yet below every measurable angle."""
+"""Variance added at a place: positive, but below every measurable angle."""
 
 
 class GearScales(eqx.Module):

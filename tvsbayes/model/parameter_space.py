@@ -171,7 +171,7 @@ class ParameterSpace(eqx.Module):
         return MECHANISMS[self.key]
 
     def physical(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
-        """Coordinates -> values in the units of `NAMES`."""
+        """Convert coordinates to values in the units of `NAMES`."""
         return _values(self, z, jnp, _half_normal)
 
     def values(self, z: Float[Array | np.ndarray, "*points parameters"]) -> np.ndarray:

@@ -220,7 +220,7 @@ class Posterior(Shown):
 def derived_of(
     fit: JointFit, z: np.ndarray, place_errors_rad: np.ndarray, pose_rad: np.ndarray | None = None
 ) -> Derived:
-    """Parameters and headlines of draws (..., p) with their errors at places (..., e), by default at the fit's pose."""
+    """Compute quantities of draws (..., p) with errors at places (..., e), by default at the fit's pose."""
     line = fit.seen_line if pose_rad is None else replace(fit.seen_line, pose_rad=pose_rad)
     points = z.reshape(-1, z.shape[-1])
     # Gears without repeating errors have no places, for which -1 would not work.

@@ -81,7 +81,7 @@ def chi2_quantile(readings: np.ndarray, probability: float) -> np.ndarray:
 
 
 def student_log_density(errors: np.ndarray, dof: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Log density of a scaled Student's t, normal where the degrees of freedom are infinite; equal shapes."""
+    """Compute the log density of a scaled Student's t, normal for infinite degrees of freedom; equal shapes."""
     from scipy import special
 
     ratio2 = (errors / scale) ** 2
