@@ -244,9 +244,8 @@ class Assurance:
     def rescaled(self, seen: Seen, instruments: Instruments, z: np.ndarray) -> Seen:
         """Whiten looks (n, m) again with the noise scales of other coordinates (n, p) and the same scatter of looks.
 
-        Rows and slope J are in units of pixel noise and scatter of looks D together: the scatter's part of I is J D
-        J^T, the rest scales with the pixel scale s. With stop errors S the covariance is s^2 (I - J D J^T) + J (D + S)
-        J^T.
+        Rows and slope J are in units of pixel noise plus scatter of looks D: the scatter's part of I is J D J^T, the
+        rest scales with the pixel scale s. With stop errors S the covariance is s^2 (I - J D J^T) + J (D + S) J^T.
         """
         u, true = np.asarray(self.family.knowledge.space.u)[SCALES], instruments.value[:, SCALES]
         old_sd, new_sd = (true * np.exp(u * point[:, SCALES]) for point in (instruments.z, z))
