@@ -5,12 +5,14 @@ The modules of the commands contain their options; `cli/instruments` calls these
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import command_line, finish, keep, print_part, report_line, report_removed
+from tvsbayes.cli.app import command_line, finish, keep, report_line
 from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.cli.report_page import DRAWING, Part, WrittenPage, print_parts, written_page
 from tvsbayes.errors import InputError, NothingToEstimate, TvsError, escaped
 from tvsbayes.files.disk import make_folder, output_place, write_atomically
 from tvsbayes.pipeline import MAX_MINUTES
@@ -19,11 +21,11 @@ from tvsbayes.results.records import plain
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
-    from tvsbayes.report.document import Issue
+    from tvsbayes.report.document import Document, Issue
     from tvsbayes.single_axis.axis_campaign import AxisCampaign
     from tvsbayes.single_axis.axis_record import AxisSummary
 
-FITTING, PLANNING, PRINTING = "fit", "choosing stops", "printing to PDF"
+FITTING, PLANNING = "fit", "choosing stops"
 
 
 def new(out: Path, as_json: bool) -> None:
@@ -138,23 +140,25 @@ def _kept_fit(data: AxisCampaign, to: Path, quick: bool, no_sample: bool, max_mi
 
 def calibrate(folder: Path, *, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool, as_json: bool) -> None:
     """Run check, classic, fit and report of an axis in one command."""
+    print_parts(_parts(folder, issue, quick, no_sample, seed, pdf), as_json)
+
+
+def _parts(folder: Path, issue: Issue, quick: bool, no_sample: bool, seed: int, pdf: bool) -> Iterator[Part]:
+    """The parts of `calibrate`; options as of it."""
     from tvsbayes.report.axis_document import axis_fit_text
     from tvsbayes.report.command_text import check_text
     from tvsbayes.single_axis.axis_campaign import read_axis
 
     data = read_axis(folder)
-    documents: dict[str, Any] = {"check": contents(folder)}
-    print_part(check_text(documents["check"]), as_json)
-    documents["classic"], text = _classic(data)
-    print_part(text, as_json)
+    check = contents(folder)
+    yield "check", check, check_text(check), None
+    yield "classic", *_classic(data), None
     stored = _kept_fit(data, output_place(folder, "results"), quick, no_sample, MAX_MINUTES, seed)
-    documents["fit"] = stored.as_json(seed)
     text = axis_fit_text(stored.summary, written=list(stored.files.values()))
-    if stored.error is not None:
-        finish({**documents, "report": None}, text, as_json, stored.error)
-    print_part(text, as_json)
-    page = documents["report"] = _page(data, folder, issue, pdf)
-    finish(documents, f"next: open {', '.join(page['files'].values())} in a browser", as_json)
+    yield "fit", stored.as_json(seed), text, stored.error
+    page = _page(data, folder, issue, pdf)
+    page.report_removed()
+    yield page.part()
 
 
 def compare(folder: Path, *, other: Path | None, by: str | None, seed: int, as_json: bool) -> None:
@@ -184,35 +188,23 @@ def report(folder: Path, *, issue: Issue, pdf: bool, out: Path | None, as_json: 
     """Write the page of an axis."""
     from tvsbayes.single_axis.axis_campaign import read_axis
 
-    data = read_axis(folder)
-    page = _page(data, folder, issue, pdf, out)
-    finish(page, f"report {page['number']}\nwritten: {', '.join(page['files'].values())}", as_json)
+    _page(read_axis(folder), folder, issue, pdf, out).finish(as_json)
 
 
-def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path | None = None) -> dict[str, Any]:
-    """Write the page of an axis, and print it with `pdf`: the document of `report --json`."""
+def _page(data: AxisCampaign, folder: Path, issue: Issue, pdf: bool, out: Path | None = None) -> WrittenPage:
+    """Write the page of an axis, and print it with `pdf`."""
     from tvsbayes.report.axis_document import axis_document, curve_commands
-    from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page
     from tvsbayes.single_axis.axis_record import results_for
     from tvsbayes.single_axis.axis_rows import rows_of
 
-    if pdf:
-        find_browser()
-    path = out or output_place(folder, "results") / "report.html"
-    files = {"report": str(path)}
-    commands = rows_of(data).command
-    stages = {FITTING: 3.0, "drawing the page": 1.5, PRINTING: 3.0 if pdf else 0.0}
-    with waiting() as progress, Job(stages, progress) as job:
+    def make(job: Job) -> Document:
+        commands = rows_of(data).command
         shown = curve_commands(float(commands.min()), float(commands.max()))
         results = results_for(data, shown, job.part(FITTING), notify=report_line)
-        job.begin("drawing the page")
-        page = axis_document(results, issue)
-        removed = replace_page(path, page_html(page), out)
-        if pdf:
-            job.begin(PRINTING)
-            files["pdf"] = str(print_to_pdf(path))
-    report_removed(removed, files, certificates=False)
-    return {"criteria": [], "number": page.number, "files": files}
+        job.begin(DRAWING)
+        return axis_document(results, issue)
+
+    return written_page(folder, out, pdf, {FITTING: 3.0, DRAWING: 1.5}, make)
 
 
 def plan(

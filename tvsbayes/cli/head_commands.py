@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import check_output, command_line, confirmed, finish, report_line, report_removed
-from tvsbayes.cli.progress_bar import waiting
+from tvsbayes.cli.app import check_output, command_line, confirmed, finish, report_line
+from tvsbayes.cli.report_page import DRAWING, written_page
 from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, import_ending, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
-from tvsbayes.files.disk import make_folder, output_place, read_bytes, write_atomically
+from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.counter_limits import LIMIT_KEYS
-from tvsbayes.pipeline import StoredOrFitted
+from tvsbayes.pipeline import FITTING, StoredOrFitted
 from tvsbayes.progress import Job
 
 if TYPE_CHECKING:
@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.corrections import Correction
     from tvsbayes.instrument.foreign_looks import Notation
     from tvsbayes.instrument.parameters import Prior
-    from tvsbayes.report.document import Issue
+    from tvsbayes.report.document import Document, Issue
 
-FITTING, DRAWING = "fit", "drawing the page"
 HEAD_URDF = "head.urdf"
 """File in a campaign folder: the model from `import --urdf`."""
 TEMPLATE_FILES = ("campaign.toml", "moves.csv", "spots.csv")
@@ -337,19 +336,11 @@ def report(folder: Path, issue: Issue, pdf: bool, out: Path | None, as_json: boo
     from tvsbayes.estimators.plausibility import check_campaign
     from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.head_document import head_document
-    from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page
 
-    if pdf:
-        find_browser()
-    data, path = read_campaign(folder), out or output_place(folder, "results") / "report.html"
-    files = {"report": str(path)}
-    with waiting() as progress, Job({FITTING: 3.0, DRAWING: 1.0}, progress) as job:
+    def make(job: Job) -> Document:
+        data = read_campaign(folder)
         record = StoredOrFitted(data, report_line, job.part(FITTING)).record
         job.begin(DRAWING)
-        document_page = head_document(data, record, issue, check_campaign(data).warnings)
-        removed = replace_page(path, page_html(document_page), out)
-        if pdf:
-            files["pdf"] = str(print_to_pdf(path))
-    report_removed(removed, files, certificates=False)
-    document = {"criteria": [], "number": document_page.number, "files": files}
-    finish(document, f"report {document_page.number}\nwritten: {', '.join(files.values())}", as_json)
+        return head_document(data, record, issue, check_campaign(data).warnings)
+
+    written_page(folder, out, pdf, {FITTING: 3.0, DRAWING: 1.0}, make).finish(as_json)

@@ -5,7 +5,8 @@ Reads options, calls the library, prints a table or JSON; heavy imports are insi
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,15 +23,14 @@ from tvsbayes.cli.app import (
     command_line,
     finish,
     finite,
-    print_part,
     refuse_options,
     report_line,
-    report_removed,
 )
 from tvsbayes.cli.campaign_commands import campaign_contents
 from tvsbayes.cli.estimate_commands import OVERRIDE_HINT
 from tvsbayes.cli.instruments import serve
-from tvsbayes.cli.progress_bar import chain_progress, waiting
+from tvsbayes.cli.progress_bar import chain_progress
+from tvsbayes.cli.report_page import DRAWING, Part, WrittenPage, print_parts, written_page
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.files.disk import output_place, write_atomically
 from tvsbayes.pipeline import FITTING, StoredOrFitted, compile_for
@@ -40,14 +40,14 @@ from tvsbayes.results.tiers import CHAIN, IMPORTANCE
 
 if TYPE_CHECKING:
     from tvsbayes.instrument.campaign import Campaign
-    from tvsbayes.report.document import Issue
+    from tvsbayes.report.document import Document, Issue
     from tvsbayes.report.evidence import Evidence
     from tvsbayes.results.fit_record import FitRecord
 
 DCC_MESSAGES = 20
 """Largest number of messages of a schema validator to show."""
 RANGE_MM = 1e3
-GATHERING, DRAWING, PRINTING = "gathering evidence", "drawing the page", "printing to PDF"
+GATHERING = "gathering evidence"
 
 LimitRatio = Annotated[
     float | None, typer.Option("--limit-deg-per-step", min=0, help="Largest error allowed of any ratio: for a verdict.")
@@ -101,25 +101,25 @@ def report(
     if serve("report", campaign, issue=issue, pdf=pdf, out=out, as_json=as_json, **limits, **certificate):
         return
     data = read_campaign(campaign)
-    options = PageOptions(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf, out)
-    page = options.write(data)
-    missed, lines, result = page.missed, page.lines(), page.as_json()
+    content = PageContent(campaign, data, issue, limit_deg_per_step, limit_mm, range_mm)
+    page = content.written(pdf, out)
+    missed, lines, result = content.missed, content.lines(page), page.as_json(content.evidence.criteria)
     if dcc or dcc_schema:
         from tvsbayes.report.page import certificate_place
 
-        content = _certificate(data, page, issue, countries)
+        certificate_xml = content.certificate(page, countries)
         path = certificate_place(page.path, out)
-        write_atomically(path, content)
+        write_atomically(path, certificate_xml)
         page.files["dcc"] = str(path)
         if dcc_schema:
             from tvsbayes.metrology.dcc import check_dcc
 
-            check = check_dcc(content, dcc_schema)
+            check = check_dcc(certificate_xml, dcc_schema)
             verdict = {True: "valid", False: "NOT VALID", None: "could not be checked"}[check.valid]
             lines += [f"DCC by {check.tool} against {dcc_schema}: {verdict}", *check.messages[:DCC_MESSAGES]]
             result["dcc_schema"] = asdict(check)
             missed |= not check.valid
-    report_removed(page.removed, page.files)
+    page.report_removed(certificates=True)
     finish(result, "\n".join([*lines, f"written: {', '.join(page.files.values())}"]), as_json)
     if missed:
         raise Ended(TARGET_MISSED)
@@ -145,68 +145,44 @@ def _countries(place: str | None, customer: str | None) -> dict[str, str]:
     return {name: text for name, text in stated.items() if text}
 
 
-@dataclass(frozen=True)
-class PageOptions:
-    """Options for the page of a campaign; fields are the options of `report`."""
+@dataclass
+class PageContent:
+    """What the page of a scanner shows; `record` and `evidence` are there once it is written.
+
+    Attributes:
+        campaign, data: folder and content of the campaign.
+        issue, limit_deg_per_step, limit_mm, range_mm: as the options of `report`.
+        record, evidence: sources of the page.
+    """
 
     campaign: Path
+    data: Campaign
     issue: Issue
     limit_deg_per_step: float | None
     limit_mm: float | None
     range_mm: float
-    pdf: bool
-    out: Path | None = None
+    record: FitRecord = field(init=False)
+    evidence: Evidence = field(init=False)
 
-    def write(self, data: Campaign) -> WrittenPage:
-        """Gather evidence, draw and write the page, and print it if requested; fit first where results are missing."""
+    def written(self, pdf: bool, out: Path | None = None) -> WrittenPage:
+        """Write the page; options as of `report`."""
+        stages = {FITTING: 3.0, GATHERING: 1.5, DRAWING: 1.5}
+        return written_page(self.campaign, out, pdf, stages, self._document)
+
+    def _document(self, job: Job) -> Document:
+        """Gather evidence for a document; fits first where results are missing."""
         from tvsbayes.calibration.calibration_file import load_calibration
-        from tvsbayes.report.page import find_browser, page_html, print_to_pdf, replace_page
+        from tvsbayes.report.evidence import gather
         from tvsbayes.report.scanner_document import report_document
 
-        if self.pdf:
-            find_browser()
-        from tvsbayes.report.evidence import gather
-
         limits = {"limit_deg_per_step": self.limit_deg_per_step, "limit_mm": self.limit_mm}
-        path = self.out or output_place(self.campaign, "results") / "report.html"
-        files = {"report": str(path)}
-        stages = {FITTING: 3.0, GATHERING: 1.5, DRAWING: 1.5, PRINTING: 3.0 if self.pdf else 0.0}
-        with waiting() as progress, Job(stages, progress) as job:
-            record = StoredOrFitted(data, report_line, job.part(FITTING)).record
-            job.begin(GATHERING)
-            warnings = campaign_contents(self.campaign, data)["warnings"]
-            calibration = load_calibration(self.campaign)
-            evidence = gather(data, record, calibration, range_mm=self.range_mm, doubts=warnings, **limits)
-            job.begin(DRAWING)
-            page = report_document(evidence, self.issue)
-            html = page_html(page)
-            removed = replace_page(path, html, self.out)
-            if self.pdf:
-                job.begin(PRINTING)
-                files["pdf"] = str(print_to_pdf(path))
-        return WrittenPage(record, evidence, page.number, html, path, files, removed)
-
-
-@dataclass(frozen=True)
-class WrittenPage:
-    """A page on disk.
-
-    Attributes:
-        record, evidence: its sources.
-        number: number on its first page.
-        html: its bytes.
-        path: its file.
-        files: the page and the files made from it, by kind.
-        removed: names of removed files of an earlier page.
-    """
-
-    record: FitRecord
-    evidence: Evidence
-    number: str
-    html: bytes
-    path: Path
-    files: dict[str, str]
-    removed: list[str]
+        self.record = StoredOrFitted(self.data, report_line, job.part(FITTING)).record
+        job.begin(GATHERING)
+        warnings = campaign_contents(self.campaign, self.data)["warnings"]
+        calibration = load_calibration(self.campaign)
+        self.evidence = gather(self.data, self.record, calibration, range_mm=self.range_mm, doubts=warnings, **limits)
+        job.begin(DRAWING)
+        return report_document(self.evidence, self.issue)
 
     @property
     def missed(self) -> bool:
@@ -215,8 +191,8 @@ class WrittenPage:
 
         return any(c.verdict != MET for c in self.evidence.criteria)
 
-    def lines(self) -> list[str]:
-        """Verdicts on the limits, for a terminal."""
+    def lines(self, page: WrittenPage) -> list[str]:
+        """Verdicts on the limits and the page's number, for a terminal."""
         from tvsbayes.report.fit_text import validation_lines
         from tvsbayes.report.tables import chance_text
 
@@ -227,24 +203,15 @@ class WrittenPage:
         validation = self.record.summary.validation
         failed = validation is not None and not validation.passed
         tests = validation_lines(validation)[:1] if validation is not None and failed else []
-        return [*tests, *lines, f"report {self.number}"]
+        return [*tests, *lines, f"report {page.number}"]
 
-    def as_json(self) -> dict[str, Any]:
-        """The document of `report --json`."""
-        return {
-            "criteria": [asdict(c) for c in self.evidence.criteria],
-            "number": self.number,
-            "files": self.files,
-        }
+    def certificate(self, page: WrittenPage, countries: dict[str, str]) -> bytes:
+        """DCC-schema XML with the page inside, issued on its day (UTC)."""
+        from tvsbayes.metrology.dcc import Embedded, Parties, dcc_bytes
 
-
-def _certificate(campaign: Campaign, page: WrittenPage, issue: Issue, countries: dict[str, str]) -> bytes:
-    """DCC-schema XML with the page inside, issued on its day (UTC)."""
-    from tvsbayes.metrology.dcc import Embedded, Parties, dcc_bytes
-
-    stated = {name: text for name in ("laboratory", "customer") if (text := getattr(issue, name))}
-    parties = Parties(**stated, **countries)
-    return dcc_bytes(campaign, page.record, issued=issue.day, parties=parties, report=Embedded(page.number, page.html))
+        stated = {name: text for name in ("laboratory", "customer") if (text := getattr(self.issue, name))}
+        parties, report = Parties(**stated, **countries), Embedded(page.number, page.html)
+        return dcc_bytes(self.data, self.record, issued=self.issue.day, parties=parties, report=report)
 
 
 def calibrate(
@@ -276,19 +243,27 @@ def calibrate(
     sampling = {"quick": quick, "no_sample": no_sample, "seed": seed}
     if serve("calibrate", campaign, issue=issue, **sampling, pdf=pdf, as_json=as_json, **limits):
         return
+    from tvsbayes.instrument.campaign import read_campaign
+
+    content = PageContent(campaign, read_campaign(campaign), issue, limit_deg_per_step, limit_mm, range_mm)
+    print_parts(_parts(content, quick, no_sample, seed, pdf, anyway), as_json)
+    if content.missed:
+        raise Ended(TARGET_MISSED)
+
+
+def _parts(content: PageContent, quick: bool, no_sample: bool, seed: int, pdf: bool, anyway: bool) -> Iterator[Part]:
+    """The parts of `calibrate`; options as of it."""
     from tvsbayes.estimators.findings import stop_at
     from tvsbayes.estimators.plausibility import implausible
-    from tvsbayes.instrument.campaign import read_campaign
     from tvsbayes.report.command_text import check_text
     from tvsbayes.report.fit_text import fit_text
 
-    data = read_campaign(campaign)
-    documents: dict[str, Any] = {"check": campaign_contents(campaign, data)}
-    print_part(check_text(documents["check"]), as_json)
+    campaign, data = content.campaign, content.data
+    check = campaign_contents(campaign, data)
+    yield "check", check, check_text(check), None
     if not anyway:
         stop_at(implausible(data), OVERRIDE_HINT)
-    documents["classic"], printed = _classic(data)
-    print_part(printed, as_json)
+    yield "classic", *_classic(data), None
     compile_for(report_line)
     with chain_progress(f"go on with `{command_line('fit', campaign)} --resume`") as progress:
         results = calibrate_campaign(
@@ -301,18 +276,11 @@ def calibrate(
             progress=progress,
         )
     summary = results.record.summary
-    documents["fit"] = {**summary.as_json(), "seed": seed, "files": results.files}
-    printed = fit_text(summary, written=list(results.files.values()), causes=results.causes)
-    if results.error is not None:
-        finish({**documents, "report": None}, printed, as_json, results.error)
-    print_part(printed, as_json)
-    page = PageOptions(campaign, issue, limit_deg_per_step, limit_mm, range_mm, pdf).write(data)
-    report_removed(page.removed, page.files)
-    documents["report"] = page.as_json()
-    text = "\n".join([*page.lines(), f"next: open {', '.join(page.files.values())} in a browser"])
-    finish(documents, text, as_json)
-    if page.missed:
-        raise Ended(TARGET_MISSED)
+    text = fit_text(summary, written=list(results.files.values()), causes=results.causes)
+    yield "fit", {**summary.as_json(), "seed": seed, "files": results.files}, text, results.error
+    page = content.written(pdf)
+    page.report_removed(certificates=True)
+    yield page.part(content.lines(page), content.evidence.criteria)
 
 
 def _classic(data: Campaign) -> tuple[dict[str, Any] | None, str]:

@@ -1,0 +1,51 @@
+"""The page of a report on its way to disk: stages of the work, files."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import pytest
+
+from tvsbayes.cli.report_page import DRAWING, PRINTING, written_page
+from tvsbayes.errors import InputError
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    """What the progress bar shows, of a page that is drawn and printed at once."""
+    states = []
+
+    @contextmanager
+    def waiting():
+        yield states.append
+
+    monkeypatch.setattr("tvsbayes.cli.report_page.waiting", waiting)
+    monkeypatch.setattr("tvsbayes.report.page.find_browser", lambda: "chromium")
+    monkeypatch.setattr("tvsbayes.report.page.page_html", lambda document: document.number.encode())
+    monkeypatch.setattr("tvsbayes.report.page.print_to_pdf", lambda page: page.with_suffix(".pdf"))
+    return states
+
+
+@pytest.mark.parametrize("pdf", [False, True])
+def test_printing_is_a_stage_of_the_work(shown, tmp_path, pdf):
+    """A bar that stands at its end while a browser prints is taken for a program that hangs."""
+
+    def make(job):
+        job.begin(DRAWING)
+        return SimpleNamespace(number="N1")
+
+    page = written_page(tmp_path, None, pdf, {"fit": 3.0, DRAWING: 1.0}, make)
+    share = {state.doing: state.share for state in shown[:-1]}
+    assert share == {DRAWING: pytest.approx(3 / 7), PRINTING: pytest.approx(4 / 7)} if pdf else {DRAWING: 0.75}
+    assert shown[-1].share == 1.0
+    path = tmp_path / "results" / "report.html"
+    assert path.read_bytes() == page.html == b"N1" and page.path == path
+    assert page.files == {"report": str(path), **({"pdf": str(path.with_suffix(".pdf"))} if pdf else {})}
+    assert page.as_json() == {"criteria": [], "number": "N1", "files": page.files}
+
+
+def test_a_missing_browser_is_known_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr("tvsbayes.report.page.BROWSERS", ())
+    with pytest.raises(InputError, match="--pdf needs one of"):
+        written_page(tmp_path, None, True, {DRAWING: 1.0}, lambda job: pytest.fail("made"))
