@@ -390,9 +390,9 @@ def read_campaign(folder: Path | str) -> Campaign | AxisCampaign:
         InputError: missing, malformed or contradictory entries, with file, line and column.
     """
     from tvsbayes.instrument.campaign import read_campaign as read_scanner
-    from tvsbayes.instrument.campaign_header import mechanism_of
+    from tvsbayes.instrument.campaign_header import mechanism_key
 
-    if mechanism_of(Path(folder)) == "axis":
+    if mechanism_key(Path(folder)) == "axis":
         from tvsbayes.single_axis.axis_campaign import read_axis
 
         return read_axis(folder)

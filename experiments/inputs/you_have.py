@@ -23,6 +23,7 @@ import numpy as np
 from experiments.common.command_line import print_only
 from experiments.common.console import console, quietly
 from experiments.common.rows import ROOT
+from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.plan import PlanBuilder, write_plan
 
 FOREIGN, DATA = ROOT / "tests" / "data" / "foreign", ROOT / "data"
@@ -144,7 +145,7 @@ def sightings() -> None:
         for place in places:
             plan.move(*place)
             plan.look()
-        write_plan(plan.steps, Path("plan.csv"), sheets=False)
+        write_plan(plan.steps, Path("plan.csv"), SIGHTING_HEAD)
         quietly("simulate", "nominal/rig.toml", "plan.csv", name, "--seed", str(SEED))
     seen = {row["move"]: row for row in rows_of(Path("measured/sightings.csv"))}
     lines = ["time_s,pan_steps,tilt_steps,azimuth_deg,elevation_deg,u_deg"]

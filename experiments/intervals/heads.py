@@ -24,7 +24,6 @@ from tvsbayes.instrument.mechanisms import HEAD, SIGHTING_HEAD
 from tvsbayes.instrument.parameters import HEAD_TERMS, Prior, names_of
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.rig import Rig, RigTable
-from tvsbayes.instrument.stereo_pair import NO_STEREO
 from tvsbayes.twin.simulated_campaign import simulate
 
 ROWS = output(__file__, "heads.jsonl")
@@ -37,9 +36,7 @@ def head_of(kind: str) -> Rig:
     if kind == "sightings":
         ratios = dict.fromkeys(names_of("degrees_per_step"), Prior(0.05, 0.002))
         table = RigTable(ratios, mechanism=SIGHTING_HEAD)
-        return Rig(
-            table, NO_STEREO, dict(table.priors), {}, {}, {"sighting_sd_deg": 0.005}, {"move_s": 20.0, "look_s": 5.0}
-        )
+        return Rig(table, None, dict(table.priors), {}, {}, {"sighting_sd_deg": 0.005}, {"move_s": 20.0, "look_s": 5.0})
     mounted = mounted_rig()
     stated = {n: p for n, p in mounted.table.priors.items() if n in HEAD.documented}
     table = RigTable(stated, mechanism=HEAD)

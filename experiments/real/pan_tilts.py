@@ -21,7 +21,7 @@ import numpy as np
 
 from experiments.common.command_line import parser
 from tvsbayes.head.pointing_model import pointing_model
-from tvsbayes.instrument.campaign import Campaign, Move, sighted_campaign
+from tvsbayes.instrument.campaign import Campaign, Move
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.parameters import Prior, names_of
 from tvsbayes.instrument.rig import RigTable
@@ -65,7 +65,7 @@ def head_of(rows: np.ndarray, angles_deg: np.ndarray) -> Campaign:
         for k, (azimuth, elevation) in enumerate(angles_deg.tolist())
     ]
     ratios = dict.fromkeys(names_of("degrees_per_step"), Prior(1.0, 0.2))
-    return sighted_campaign(moves, looks, RigTable(ratios, mechanism=SIGHTING_HEAD))
+    return Campaign(tuple(moves), tuple(looks), None, RigTable(ratios, mechanism=SIGHTING_HEAD))
 
 
 def camera(rows: np.ndarray) -> None:

@@ -15,7 +15,7 @@ from support.varying_gears import perfect_rig
 from tvsbayes.acquisition.bench import Vision
 from tvsbayes.acquisition.journal import read_journal
 from tvsbayes.acquisition.journal_check import verify
-from tvsbayes.acquisition.observation import Sighting, live_detector, twin_renderer
+from tvsbayes.acquisition.observation import DetectedSpot, live_detector, twin_renderer
 from tvsbayes.acquisition.operator import Terminal
 from tvsbayes.acquisition.session import acquire
 from tvsbayes.acquisition.simulated_instrument import Instrument
@@ -34,15 +34,15 @@ def blob(shape, u, v, peak):
     return np.repeat(np.clip(20 + spot, 0, 255)[..., None], 3, axis=2)
 
 
-def centroids(lit: StereoImage, dark: StereoImage) -> Sighting:
+def centroids(lit: StereoImage, dark: StereoImage) -> DetectedSpot:
     pixels = []
     for side in ("left", "right"):
         light = np.clip(getattr(lit, side).astype(float) - getattr(dark, side), 12, None).mean(axis=2) - 12
         if light.max() < 50:
-            return Sighting("no-spot")
+            return DetectedSpot("no-spot")
         y, x = np.mgrid[: light.shape[0], : light.shape[1]]
         pixels += [float((light * x).sum() / light.sum()), float((light * y).sum() / light.sum())]
-    return Sighting("ok", tuple(pixels), (0.1,) * 4)
+    return DetectedSpot("ok", tuple(pixels), (0.1,) * 4)
 
 
 def centroids_of_the_twin(mounted_rig, truth: dict, move: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from tvsbayes.acquisition.campaign_files import check_journal, repair_campaign
 from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK, _approach
 from tvsbayes.acquisition.journal import LOG, read_journal
 from tvsbayes.acquisition.journal_check import verify
-from tvsbayes.acquisition.observation import Observation, Sighting, TwinObserver
+from tvsbayes.acquisition.observation import DetectedSpot, Observation, TwinObserver
 from tvsbayes.acquisition.operator import SimulatedOperator, Terminal
 from tvsbayes.acquisition.recorder import LOST_STEPS, recorded
 from tvsbayes.acquisition.session import acquire, begin
@@ -337,7 +337,7 @@ class Undetected:
         self.left -= 1
         if self.left == 0:
             self.instrument.mechanics.missing_steps = [5, 0]
-        return Observation(Sighting(UNDETECTED))
+        return Observation(DetectedSpot(UNDETECTED))
 
 
 def test_pictures_of_a_segment_with_lost_steps_no_longer_wait_for_detection(mounted_rig, tmp_path):
@@ -386,7 +386,7 @@ def test_looks_without_a_spot_are_repeated_and_then_refused(mounted_rig, tmp_pat
             self.calls += 1
             found = self.inner.observe(positioner, spot)
             blind = spot == 2 or (spot == 4 and self.calls % 2 == 0)
-            return replace(found, sighting=Sighting("no-spot")) if blind else found
+            return replace(found, spot=DetectedSpot("no-spot")) if blind else found
 
     run_ = Run(mounted_rig, tmp_path / "c", observer=Blind)
     outcome = run_.engine.run()

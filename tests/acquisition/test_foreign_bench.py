@@ -13,7 +13,7 @@ from support.grbl_board import BoardLink, GrblBoard
 from tvsbayes.acquisition.bench import Bench
 from tvsbayes.acquisition.engine import Acquisition
 from tvsbayes.acquisition.journal import read_journal
-from tvsbayes.acquisition.observation import Observation, Sighting
+from tvsbayes.acquisition.observation import DetectedSpot, Observation
 from tvsbayes.acquisition.recorder import recorded
 from tvsbayes.acquisition.session import begin
 from tvsbayes.errors import DeviceFault
@@ -57,7 +57,7 @@ class Eye:
         depth = self.sheets_mm[self.hand.target]
         u = self.stereo.M1[0, 2], self.stereo.M2[0, 2] - self.stereo.M2[0, 0] * np.linalg.norm(self.stereo.T) / depth
         pixels = u[0], self.stereo.M1[1, 2], u[1], self.stereo.M2[1, 2]
-        return Observation(Sighting("ok", tuple(map(float, pixels)), (0.1,) * 4))
+        return Observation(DetectedSpot("ok", tuple(map(float, pixels)), (0.1,) * 4))
 
 
 def engine(rig, folder, board, resume=False, plan=None, **happening):

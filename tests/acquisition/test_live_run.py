@@ -11,7 +11,7 @@ import pytest
 from support.bench_runs import Failing, Run, raise_error
 
 from tvsbayes.acquisition.live_run import ESTIMATES_MAX, REMARKS_MAX, TRAIL_MAX, LiveRun, SeenLook, temperature
-from tvsbayes.acquisition.observation import Observation, Sighting, TwinObserver
+from tvsbayes.acquisition.observation import DetectedSpot, Observation, TwinObserver
 from tvsbayes.acquisition.running_estimate import Estimate
 from tvsbayes.errors import DeviceFault
 from tvsbayes.files.images import png_bytes
@@ -53,7 +53,7 @@ def test_faults_and_repeated_looks_are_told_in_words(mounted_rig, tmp_path):
 
     class Blind(TwinObserver):
         def observe(self, positioner, spot):
-            return Observation(Sighting("no-spot"))
+            return Observation(DetectedSpot("no-spot"))
 
     gone = DeviceFault("no-frame", "the left camera delivers nothing", remedy="plug it in")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tvsbayes.acquisition.engine import ATTEMPTS_PER_LOOK
-from tvsbayes.acquisition.observation import CameraObserver, Sighting, live_detector, rises_dn, twin_renderer
+from tvsbayes.acquisition.observation import CameraObserver, DetectedSpot, live_detector, rises_dn, twin_renderer
 from tvsbayes.acquisition.simulated_instrument import Instrument
 from tvsbayes.cameras.capture import StereoImage
 from tvsbayes.errors import DeviceFault
@@ -71,7 +71,7 @@ def test_pictures_without_a_visible_spot_wait_for_detection(mounted_rig):
     positioner.home()
     camera = Scripted(instrument.clock, lambda n: n % 30)
     found = CameraObserver(camera).observe(positioner, 3)
-    assert found.sighting.status == "undetected" and camera.count == 22
+    assert found.spot.status == "undetected" and camera.count == 22
     assert sorted(found.pictures)[0] == "dark/000003_left.png" and len(found.pictures) == 4
 
 
@@ -106,7 +106,7 @@ def test_changed_background_is_refused(mounted_rig):
     positioner = instrument.positioner()
     positioner.home()
     camera = Scripted(instrument.clock, lambda n: 90 if n == 1 else n % 30)
-    assert CameraObserver(camera).observe(positioner, 3).sighting.status == "unsteady"
+    assert CameraObserver(camera).observe(positioner, 3).spot.status == "unsteady"
 
 
 @pytest.mark.parametrize("known", [None, 4095])
@@ -126,9 +126,9 @@ def test_noise_of_twelve_bits_is_no_light(mounted_rig, known):
             return StereoImage(*pair, *stated)
 
     observer, seen = CameraObserver(Camera(), keep_pictures=False), []
-    observer.detector = lambda lit, dark: seen.append((lit.white, rises_dn(dark, lit))) or Sighting("no-spot")
+    observer.detector = lambda lit, dark: seen.append((lit.white, rises_dn(dark, lit))) or DetectedSpot("no-spot")
     for look in range(3):
-        assert observer.observe(positioner, look).sighting.status == "no-spot"
+        assert observer.observe(positioner, look).spot.status == "no-spot"
     # 3000 less 90 to 190 counts, in 255 of 4095.
     assert all(white == 4095 and 174 <= min(rises) <= max(rises) <= 181 for white, rises in seen) and len(seen) == 3
 
@@ -159,7 +159,7 @@ def test_old_frames_never_become_a_spot_whatever_the_buffer(mounted_rig, depth):
     def detector(lit, dark):
         light = lit.left[1].astype(int).sum(axis=1) - dark.left[1].astype(int).sum(axis=1)
         u = float(light.argmax())
-        return Sighting("ok", (u,) * 4, (0.1,) * 4) if light.max() > 300 else Sighting("no-spot")
+        return DetectedSpot("ok", (u,) * 4, (0.1,) * 4) if light.max() > 300 else DetectedSpot("no-spot")
 
     observer, found = CameraObserver(Camera(), detector, keep_pictures=False), []
     for step in range(12):
@@ -167,7 +167,7 @@ def test_old_frames_never_become_a_spot_whatever_the_buffer(mounted_rig, depth):
         # The spot is where the positioner is.
         moved_to[0] = 3 * step
         for _ in range(ATTEMPTS_PER_LOOK):
-            seen = observer.observe(positioner, step).sighting
+            seen = observer.observe(positioner, step).spot
             if seen.status == "ok":
                 found.append(seen.pixels_px[0])
                 assert seen.pixels_px[0] == 3 * step

@@ -8,7 +8,7 @@ import pytest
 
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of
 from tvsbayes.cli.main import COMMANDS
-from tvsbayes.instrument.campaign_header import SCANNER, mechanism_of
+from tvsbayes.instrument.campaign_header import SCANNER, mechanism_key
 
 HANDED_ON = {"out", "issue", "moves", "alone"}
 """What a command makes of its options before it hands them on."""
@@ -26,9 +26,9 @@ HANDED_ON = {"out", "issue", "moves", "alone"}
 )
 def test_a_folder_says_whose_it_is(tmp_path, text, mechanism):
     (tmp_path / "campaign.toml").write_text(text)
-    assert mechanism_of(tmp_path) == mechanism
+    assert mechanism_key(tmp_path) == mechanism
     assert instrument_of(tmp_path) is INSTRUMENTS.get(mechanism)
-    assert mechanism_of(tmp_path / "nowhere") == "" and instrument_of(None) is None
+    assert mechanism_key(tmp_path / "nowhere") == "" and instrument_of(None) is None
 
 
 @pytest.mark.parametrize("name", INSTRUMENTS)

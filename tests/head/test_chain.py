@@ -16,7 +16,6 @@ from tvsbayes.instrument.parameters import HEAD_TERMS, Prior, names_of
 from tvsbayes.instrument.places import line_share, seen_places
 from tvsbayes.instrument.plan import PlanBuilder
 from tvsbayes.instrument.rig import Rig, RigTable
-from tvsbayes.instrument.stereo_pair import NO_STEREO
 from tvsbayes.model.gear_processes import Places
 from tvsbayes.model.headlines import SeenLine, line_deg_per_step
 from tvsbayes.model.laser_path import beam_angles, trace
@@ -68,7 +67,7 @@ def truths():
     """Heads with terms of degrees and offsets of centimetres."""
     wide = {term.name: Prior(0.0, 15.0 if term.unit == "mm" else 3.0) for term in HEAD_TERMS.values()}
     table = RigTable(mechanism=SIGHTING_HEAD)
-    rig = Rig(table, NO_STEREO, {**table.priors, **wide}, {}, {}, {}, {})
+    rig = Rig(table, None, {**table.priors, **wide}, {}, {}, {}, {})
     rng = np.random.default_rng(50)
     drawn = [draw_truth(rig, rng) for _ in range(40)]
     # The twin's cotangent is not held at the horizon.
@@ -111,7 +110,7 @@ def test_headlines_count_on_around_the_circle_and_through_the_zenith(azimuth_zer
     )
     true = {**table.priors, **terms, **dict.fromkeys(still, Prior(0.0, 0.0))}
     true |= {"azimuth_zero_deg": Prior(azimuth_zero_deg, 0.1), "tangent_flexure_deg": Prior(0.0, 0.0)}
-    rig = Rig(table, NO_STEREO, true, {}, {}, {"sighting_sd_deg": 0.005}, {"move_s": 1.0, "look_s": 1.0})
+    rig = Rig(table, None, true, {}, {}, {"sighting_sd_deg": 0.005}, {"move_s": 1.0, "look_s": 1.0})
     for seed in range(4):
         run = simulate(rig, tuple(plan.steps), seed)
         p, spots = run.truth.parameters, run.campaign.spots

@@ -19,7 +19,6 @@ from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.parameters import Prior, names_of
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, read_plan
 from tvsbayes.instrument.rig import Rig, RigTable
-from tvsbayes.instrument.stereo_pair import NO_STEREO
 from tvsbayes.pipeline import calibrate
 from tvsbayes.planning.expectation import information_of, prior_knowledge
 from tvsbayes.planning.looks import covariance_of
@@ -41,7 +40,7 @@ def head_rig() -> Rig:
     terms = {name: Prior(value, 0.3) for name, value in nominal.items() if name in SIGHTING_HEAD.documented}
     table = RigTable({**ratios, **terms}, mechanism=SIGHTING_HEAD)
     costs = {"move_s": 1.5, "look_s": 1.0}
-    return Rig(table, NO_STEREO, dict(table.priors), {}, {}, {"sighting_sd_deg": 0.005}, costs)
+    return Rig(table, None, dict(table.priors), {}, {}, {"sighting_sd_deg": 0.005}, costs)
 
 
 def rounds() -> tuple[PlanStep, ...]:
@@ -129,7 +128,7 @@ def test_fresh_looks_say_whether_the_calibration_acts(ask, known_head, tmp_path,
     """Not applied: the motors get the counters of the nominal head for the directions that were meant."""
     folder, truth = known_head
     assert ask("plan", folder, "--verify", "-o", tmp_path / "plan.csv")[0] == 0
-    steps = read_plan(tmp_path / "plan.csv", sheets=False)
+    steps = read_plan(tmp_path / "plan.csv", SIGHTING_HEAD)
     priors = read_campaign(folder).rig.priors
     true, nominal = truth.parameters, {name: prior.value for name, prior in priors.items()}
 
@@ -166,7 +165,7 @@ def test_plan_of_a_watch_needs_no_sheet(ask, known_head, tmp_path):
     folder, _ = known_head
     code, document = ask("plan", folder, "--watch", "--minutes", 3, "-o", tmp_path / "looks.csv")
     assert code == 0 and document["looks"] >= 4
-    steps = read_plan(tmp_path / "looks.csv", sheets=False)
+    steps = read_plan(tmp_path / "looks.csv", SIGHTING_HEAD)
     assert {step.action for step in steps} == {"home", "move", "look"}
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tvsbayes.errors import InputError
-from tvsbayes.estimators.plausibility import check_campaign
+from tvsbayes.estimators.plausibility import check_campaign, misfit_causes
 from tvsbayes.files.documents import parse_toml
 from tvsbayes.instrument.campaign import read_campaign, write_campaign
 from tvsbayes.instrument.mechanisms import MECHANISMS, SIGHTING_HEAD, TWO_MIRROR
@@ -14,7 +14,7 @@ from tvsbayes.instrument.parameters import NAMES
 from tvsbayes.instrument.plan import PlanBuilder
 from tvsbayes.instrument.rig import Rig, RigTable, parse_rig_table, rig_table_toml
 from tvsbayes.instrument.sightings import Sighting, tangent_frames
-from tvsbayes.instrument.stereo_pair import NO_STEREO
+from tvsbayes.report import figures as plots
 from tvsbayes.twin.simulated_campaign import simulate
 from tvsbayes.twin.true_rig import read_truth
 
@@ -24,7 +24,7 @@ PLACES = [(-900, 200), (-400, 900), (100, 500), (600, 1200), (1100, 300), (-1300
 def head_rig() -> Rig:
     """A head with gears of 0.05 deg a step and axes some degrees from where it is believed to point."""
     table = RigTable(mechanism=SIGHTING_HEAD)
-    return Rig(table, NO_STEREO, dict(table.priors), {}, {}, {}, {"move_s": 1.0, "look_s": 1.0})
+    return Rig(table, None, dict(table.priors), {}, {}, {}, {"move_s": 1.0, "look_s": 1.0})
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +54,16 @@ def test_folder_there_and_back(simulated, tmp_path):
     truth = read_truth(tmp_path / "truth.json", found.stereo)
     assert truth.parameters["azimuth_zero_deg"] == simulated.truth.parameters["azimuth_zero_deg"]
     assert not check_campaign(found).findings
+
+
+@pytest.mark.parametrize("of_spots", [plots.points_3d, plots.setup, plots.coverage])
+def test_what_needs_spots_refuses_sightings(simulated, of_spots):
+    with pytest.raises(InputError, match=r"found sightings of a head.*; allowed: spots that a stereo pair sees; give"):
+        of_spots(simulated.campaign)
+
+
+def test_causes_of_a_failed_fit_need_no_spots(simulated):
+    assert misfit_causes(simulated.campaign, 3.0) == ()
 
 
 def test_two_tables_of_looks_are_refused(simulated, tmp_path):
@@ -112,7 +122,7 @@ def test_tables_there_and_back(key):
 )
 def test_wrong_tables_are_named(simulated, mended, code):
     wrong = tuple(map(mended, simulated.campaign.spots))
-    campaign = type(simulated.campaign)(simulated.campaign.moves, wrong, NO_STEREO, simulated.campaign.rig)
+    campaign = type(simulated.campaign)(simulated.campaign.moves, wrong, None, simulated.campaign.rig)
     findings = check_campaign(campaign).findings
     assert next(f.code for f in findings if f.certain) == code
 

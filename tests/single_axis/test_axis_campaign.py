@@ -6,7 +6,7 @@ import pytest
 from support.axes import campaign, runs
 
 from tvsbayes.errors import InputError
-from tvsbayes.instrument.campaign_header import mechanism_of
+from tvsbayes.instrument.campaign_header import mechanism_key
 from tvsbayes.single_axis.axis_campaign import axis_hashes, read_axis, write_axis
 from tvsbayes.single_axis.axis_parameters import AxisPrior
 
@@ -29,7 +29,7 @@ def test_what_is_written_is_read_back(tmp_path):
     found = read_axis(tmp_path / "a")
     assert (found.moves, found.readings, found.stated, found.unit) == (made.moves, made.readings, made.stated, "deg")
     assert axis_hashes(found) == axis_hashes(made)
-    assert mechanism_of(tmp_path / "a") == "axis"
+    assert mechanism_key(tmp_path / "a") == "axis"
 
 
 def test_marks_line_ends_and_empty_cells_are_accepted(tmp_path):

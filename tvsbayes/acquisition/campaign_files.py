@@ -20,6 +20,7 @@ from tvsbayes.files.documents import TOML_BYTES_MAX, parse_toml
 from tvsbayes.instrument.campaign import (
     UNDETECTED,
     Campaign,
+    Look,
     Spot,
     campaign_toml,
     moves_bytes,
@@ -69,11 +70,11 @@ def _files(campaign: Campaign, folder: Path, tables_only: bool = False) -> dict[
     ]
     moves, table = moves_bytes(campaign.moves), spots_bytes(spots)
     if campaign.moves:
-        parse_spots(table, "spots.csv", len(parse_moves(moves)), campaign.stereo)
+        parse_spots(table, "spots.csv", len(parse_moves(moves)), campaign.stereo_pair)
     files = {"moves.csv": moves, "spots.csv": table}
     if tables_only:
         return files
-    return {"stereo.json": stereo_bytes(campaign.stereo), **files, "campaign.toml": campaign_toml(campaign)}
+    return {"stereo.json": stereo_bytes(campaign.stereo_pair), **files, "campaign.toml": campaign_toml(campaign)}
 
 
 def keep_edited(campaign: Campaign, folder: Path) -> dict[str, Path]:
@@ -117,7 +118,7 @@ def _extra_rows(campaign: Campaign, folder: Path) -> dict[str, int]:
     except InputError:
         return {}
 
-    def same(table: Sequence[Spot], journal: Sequence[Spot]) -> bool:
+    def same(table: Sequence[Look], journal: Sequence[Look]) -> bool:
         return len(table) == len(journal) and all(map(_same_look, table, journal))
 
     moves, looks = len(campaign.moves), len(campaign.spots)
@@ -128,7 +129,7 @@ def _extra_rows(campaign: Campaign, folder: Path) -> dict[str, int]:
     return {name: rows for name, rows in extra_rows.items() if rows > 0}
 
 
-def _same_look(row: Spot, journal: Spot) -> bool:
+def _same_look(row: Look, journal: Look) -> bool:
     """Whether a row of spots.csv is the journal's look, regardless of later changes by `detect` or a homing."""
     if journal.status == UNDETECTED and row.spot == journal.spot:
         return True
@@ -143,7 +144,7 @@ def _detected(campaign: Campaign, folder: Path) -> dict[int, Spot]:
     waiting = {spot.spot: spot for spot in campaign.spots if spot.status == UNDETECTED}
     try:
         data = read_bytes(folder / "spots.csv", CSV_BYTES_MAX, folder)
-        present = parse_spots(data, "spots.csv", len(campaign.moves), campaign.stereo)
+        present = parse_spots(data, "spots.csv", len(campaign.moves), campaign.stereo_pair)
     except InputError:
         return {}
     return {

@@ -128,7 +128,7 @@ def contract(
     broken: dict[str, list[str]] = {}
     # There is no look to finish: the first Ctrl-C interrupts, and the driver is closed.
     stop.requested = True
-    size = rig.stereo.image_width, rig.stereo.image_height
+    size = rig.stereo_pair.image_width, rig.stereo_pair.image_height
     try:
         with stop:
             positioner = positioner_of(rig) if open_positioner is None else open_positioner()
@@ -251,7 +251,7 @@ def _camera(
     rig: Rig, open_camera: Callable[[], StereoCamera] | None, positioner: Positioner | None, clock: Clock
 ) -> tuple[StereoCamera | None, list[Check]]:
     """Check opening, settings, time of a new pair, exposure and focus."""
-    size = rig.stereo.image_width, rig.stereo.image_height
+    size = rig.stereo_pair.image_width, rig.stereo_pair.image_height
     try:
         camera = open_camera() if open_camera is not None else cameras_of(rig)
     except TvsError as error:

@@ -273,18 +273,18 @@ class Acquisition:
             remedy = "check the sheet and [sheets] of the rig file, then go on with --resume"
             raise fault("placement", f"the sheet is not where it should be: {misplacement}", remedy)
         frames = tuple(self.journal.store(name, data) for name, data in observation.pictures.items())
-        sighting = observation.sighting
-        comparison = {} if reference is None else self._compared(reference, sighting.pixels_px)
+        spot = observation.spot
+        comparison = {} if reference is None else self._compared(reference, spot.pixels_px)
         event = Looked(
             step=step,
             spot=self._spot,
             target=self._log.recorder.state.target,
             experiment=experiment,
             point=point,
-            status=sighting.status,
-            pixels_px=sighting.pixels_px,
-            sds_px=sighting.sds_px,
-            correlations=sighting.correlations,
+            status=spot.status,
+            pixels_px=spot.pixels_px,
+            sds_px=spot.sds_px,
+            correlations=spot.correlations,
             frames=frames,
             time_s=self._log.now_s(),
             **comparison,
@@ -292,7 +292,7 @@ class Acquisition:
         self._log.write(event)
         pictures = {name: data for name, data in observation.pictures.items() if name.startswith("frames/")}
         sheet = self._log.recorder.state.target
-        self._live.looked(SeenLook(self._spot, sighting.status, sheet, sighting.pixels_px, sighting.sds_px, pictures))
+        self._live.looked(SeenLook(self._spot, spot.status, sheet, spot.pixels_px, spot.sds_px, pictures))
         self._spot += 1
         self._log.derive()
 
@@ -315,7 +315,7 @@ class Acquisition:
                 self._heed_stop()
                 continue
             attempt += 1
-            status = observation.sighting.status
+            status = observation.spot.status
             if status in ("ok", UNDETECTED) or self._stop.requested or attempt == ATTEMPTS_PER_LOOK:
                 return observation
             self._retries += 1
@@ -323,10 +323,10 @@ class Acquisition:
 
     def _misplaced(self, observation: Observation) -> str | None:
         """Why the sheet seems misplaced, judged by the first spot after its placement; None if it does not."""
-        pixels = observation.sighting.pixels_px
-        if not self._check_depth or observation.sighting.status != "ok" or pixels is None:
+        pixels = observation.spot.pixels_px
+        if not self._check_depth or observation.spot.status != "ok" or pixels is None:
             return None
-        depth_mm = float(triangulate(self.rig.stereo, np.array([pixels]))[0, 0])
+        depth_mm = float(triangulate(self.rig.stereo_pair, np.array([pixels]))[0, 0])
         target = self._log.recorder.state.target
         nominal_mm = self.rig.sheets_mm[target]
         distances_mm = [abs(x - nominal_mm) for x in self.rig.sheets_mm.values() if x != nominal_mm]
@@ -422,7 +422,7 @@ class Acquisition:
 
     def _begin_live(self) -> None:
         """Publishes values that do not change during the run."""
-        stereo, created = self.rig.stereo, self.journal.records[0].data
+        stereo, created = self.rig.stereo_pair, self.journal.records[0].data
         self._live.publish(
             name=str(created.get("name", "")),
             simulated=bool(created.get("synthetic")),

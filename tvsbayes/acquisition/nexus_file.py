@@ -30,7 +30,7 @@ from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, TOML_BYTES_MAX
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import CAMERAS, MOVES, PIXEL_SDS, SPOTS, Campaign, Move, Spot, read_campaign
+from tvsbayes.instrument.campaign import CAMERAS, MOVES, PIXEL_SDS, SPOTS, Campaign, Look, Move, read_campaign
 
 NOTHING = -1
 """Value for a look without experiment or point."""
@@ -141,7 +141,7 @@ def _instrument(instrument: Any, campaign: Campaign) -> None:
         _put(group, "name", axis)
         _put(group, "description", f"{axis} axis: absolute motor counter after every move")
         _put(group, "value", [getattr(move, f"{axis}_steps") for move in campaign.moves], "steps")
-    stereo = campaign.stereo
+    stereo = campaign.stereo_pair
     for side, matrix, distortion in (("left", stereo.M1, stereo.D1), ("right", stereo.M2, stereo.D2)):
         group = _group(instrument, f"camera_{side}", "NXdetector")
         _put(group, "description", f"{side} camera of the stereo pair; OpenCV's camera model")
@@ -177,7 +177,7 @@ def _looks(group: Any, campaign: Campaign, records: Sequence[Record]) -> None:
         _column(group, column, spots)
 
 
-def _column(group: Any, column: Column, rows: Sequence[Move] | Sequence[Spot]) -> None:
+def _column(group: Any, column: Column, rows: Sequence[Move] | Sequence[Look]) -> None:
     """A column of a table: its unit becomes an attribute; standard uncertainties are the `_errors` of a value."""
     name, unit = column.name, next((unit for unit in _UNITS if column.name.endswith(f"_{unit}")), "")
     if unit != "steps":

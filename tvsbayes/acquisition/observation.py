@@ -45,7 +45,7 @@ UNSTEADY = "unsteady"
 
 
 @dataclass(frozen=True)
-class Sighting:
+class DetectedSpot:
     """The result of a detector for a pair of pictures.
 
     Attributes:
@@ -63,16 +63,16 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Observation:
-    """A sighting with its pictures, PNG by name relative to the campaign's folder."""
+    """A detected spot with its pictures, PNG by name relative to the campaign's folder."""
 
-    sighting: Sighting
+    spot: DetectedSpot
     pictures: dict[str, bytes] = field(default_factory=dict)
 
 
 class Detector(Protocol):
     """Finds the spot in a pair of pictures."""
 
-    def __call__(self, lit: StereoImage, dark: StereoImage) -> Sighting:
+    def __call__(self, lit: StereoImage, dark: StereoImage) -> DetectedSpot:
         """Find the spot: `lit` has the laser on, `dark` was taken just before; both state their full scale."""
 
 
@@ -83,9 +83,9 @@ class Observer(Protocol):
         """Take look number `spot`; the laser is off before and after."""
 
 
-def wait_for_detection(lit: StereoImage, dark: StereoImage) -> Sighting:
+def wait_for_detection(lit: StereoImage, dark: StereoImage) -> DetectedSpot:
     """The detector for a later detection: every look is `undetected`."""
-    return Sighting(UNDETECTED)
+    return DetectedSpot(UNDETECTED)
 
 
 @dataclass
@@ -134,10 +134,10 @@ class CameraObserver:
                 for camera in CAMERAS
             }
         unsteady = max(rises_dn(lit, dark)) > CHANGE_DN
-        sighting = Sighting(UNSTEADY) if unsteady else self.detector(lit, dark)
-        if sighting.status == "ok" and min(rises_dn(dark, lit)) <= CHANGE_DN:
-            self._require_new(sighting, dark)
-        return Observation(sighting, pictures)
+        found = DetectedSpot(UNSTEADY) if unsteady else self.detector(lit, dark)
+        if found.status == "ok" and min(rises_dn(dark, lit)) <= CHANGE_DN:
+            self._require_new(found, dark)
+        return Observation(found, pictures)
 
     def _grab(self) -> StereoImage:
         """Grab a pair with its full scale, from the driver or else from the brightest pixel so far.
@@ -165,12 +165,12 @@ class CameraObserver:
                 return lit, False
         return lit, positioner.state().laser_on
 
-    def _require_new(self, sighting: Sighting, dark: StereoImage) -> None:
+    def _require_new(self, spot: DetectedSpot, dark: StereoImage) -> None:
         """Refuses a spot that the picture without laser light also shows: a laser that is always on, or a lamp."""
         dark_px = self.detector(dark, dark).pixels_px
-        if dark_px is None or sighting.pixels_px is None:
+        if dark_px is None or spot.pixels_px is None:
             return
-        if max(abs(a - b) for a, b in zip(dark_px, sighting.pixels_px, strict=True)) < SAME_PLACE_PX:
+        if max(abs(a - b) for a, b in zip(dark_px, spot.pixels_px, strict=True)) < SAME_PLACE_PX:
             remedy = "cut the laser's supply at once; if it is off, cover what else shines in the picture"
             raise fault("light", "the spot is there with the laser off, too", remedy)
 
@@ -212,9 +212,9 @@ class TwinObserver:
         finally:
             positioner.laser(False)
         if not np.isfinite(pixels).all():
-            return Observation(Sighting("no-spot"))
+            return Observation(DetectedSpot("no-spot"))
         u_left, v_left, u_right, v_right = map(float, pixels)
-        return Observation(Sighting("ok", (u_left, v_left, u_right, v_right), (self.sd_px,) * 4))
+        return Observation(DetectedSpot("ok", (u_left, v_left, u_right, v_right), (self.sd_px,) * 4))
 
 
 def live_detector(stereo: Stereo) -> Detector:
@@ -226,22 +226,22 @@ def live_detector(stereo: Stereo) -> Detector:
         stereo: the calibration, for the epipolar check.
     """
 
-    def detect(lit: StereoImage, dark: StereoImage) -> Sighting:
+    def detect(lit: StereoImage, dark: StereoImage) -> DetectedSpot:
         white = max(lit.full_scale, dark.full_scale)
         left, right = (find_spot(picture, SpotNoise(), white) for picture in (lit.left, lit.right))
         status = pair_status(left, right)
         if status != "ok":
-            return Sighting(status)
+            return DetectedSpot(status)
         pixels = np.concatenate([left.centre_px, right.centre_px])
         covariance = np.zeros((4, 4))
         covariance[:2, :2], covariance[2:, 2:] = left.covariance_px2, right.covariance_px2
         if epipolar_refused(pixels[None], covariance[None], stereo)[0]:
-            return Sighting("epipolar")
+            return DetectedSpot("epipolar")
         sds = np.sqrt(np.diag(covariance))
         correlations = covariance[0, 1] / (sds[0] * sds[1]), covariance[2, 3] / (sds[2] * sds[3])
         u, v, x, y = pixels.tolist()
         su, sv, sx, sy = sds.tolist()
-        return Sighting("ok", (u, v, x, y), (su, sv, sx, sy), (float(correlations[0]), float(correlations[1])))
+        return DetectedSpot("ok", (u, v, x, y), (su, sv, sx, sy), (float(correlations[0]), float(correlations[1])))
 
     return detect
 
@@ -254,7 +254,7 @@ def twin_renderer(rig: Rig, seed: int) -> Renderer:
         seed: seed of the simulation.
     """
     truth = Instrument(rig, seed).truth
-    cameras = cameras_of(truth.stereo, truth.parameters["focal_scale"])
+    cameras = cameras_of(truth.stereo_pair, truth.parameters["focal_scale"])
     scene, sensor = Scene(), Sensor()
 
     def pictures(light: Light, look: int, frame: int) -> StereoImage:

@@ -45,7 +45,7 @@ def data_entries(rig: Rig, synthetic: bool) -> Entries:
     entries["rig.aperture_convention"] = table.aperture_convention
     for axis, periods in table.harmonic_period_deg.items():
         entries[f"rig.harmonic_period_deg.{axis}"] = ", ".join(map(str, periods))
-    entries["stereo"] = hashlib.sha256(stereo_bytes(rig.stereo)).hexdigest()
+    entries["stereo"] = hashlib.sha256(stereo_bytes(rig.stereo_pair)).hexdigest()
     entries["positioner.driver"] = rig.positioner.get("driver", DEFAULT_DRIVER)
     entries |= {f"positioner.{key}": value for key, value in rig.positioner.items() if _means_counters(key)}
     if synthetic:
@@ -135,7 +135,7 @@ def _check_earlier(created: Mapping[str, object], rig: Rig) -> None:
     later = tuple(f'"{name}" = ' for name in GEAR_ERROR_NAMES)
     lines = rig_table_toml(rig.table).splitlines(keepends=True)
     table = "".join(line for line in lines if not line.startswith(later))
-    content = table.encode() + stereo_bytes(rig.stereo) + tables.encode()
+    content = table.encode() + stereo_bytes(rig.stereo_pair) + tables.encode()
     if created.get("rig_sha256") != hashlib.sha256(content).hexdigest():
         allowed = f"the rig file that this campaign began with (SHA-256 {created.get('rig_sha256')})"
         remedy = "give the unchanged rig file (port and cameras count too), or begin a new campaign in another folder"

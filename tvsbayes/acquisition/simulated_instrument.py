@@ -280,7 +280,7 @@ class Instrument:
 
     def centroid_px(self) -> np.ndarray:
         """(4,) u_left, v_left, u_right, v_right of the spot without noise; NaN where it is not seen."""
-        return project(self.light().points_mm[None], self.truth.stereo, self.truth.parameters["focal_scale"])[0]
+        return project(self.light().points_mm[None], self.truth.stereo_pair, self.truth.parameters["focal_scale"])[0]
 
     def noisy_centroid_px(self, sd_px: float) -> np.ndarray:
         """The centroid of a detector that states `sd_px`: its noise is pixel scale x sd_px."""

@@ -180,7 +180,7 @@ def _classic_predicted(source: _Source) -> dict[str, Estimate | None]:
     if not len(selection.experiments):
         return result
     rows = experiment_rows(fit.campaign, selection)
-    experiment = selection.steps, selection.axis, fit.campaign.stereo
+    experiment = selection.steps, selection.axis, fit.campaign.stereo_pair
     if source.posterior is None:
         slopes = ratio_slopes(np.asarray(fit.linearised.predicted)[rows][..., :4], *experiment)
         push = np.asarray(fit.linearised.predicted_jacobian)[rows][..., :4, :]

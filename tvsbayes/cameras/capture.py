@@ -190,7 +190,7 @@ def opencv_cameras(rig: Rig) -> OpenCVCamera:
         InputError: `[cameras]` names no cameras.
         DeviceFault: they cannot be opened or set.
     """
-    return open_cameras(rig.cameras, rig.stereo.image_width, rig.stereo.image_height)
+    return open_cameras(rig.cameras, rig.stereo_pair.image_width, rig.stereo_pair.image_height)
 
 
 class OpenCVCamera:

@@ -42,7 +42,7 @@ from tvsbayes.files.images import (
     png_bytes,
     white_level,
 )
-from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, Campaign, Spot, frame_name, with_pixels
+from tvsbayes.instrument.campaign import CAMERAS, UNDETECTED, Campaign, Spot, frame_name, stereo_spots, with_pixels
 from tvsbayes.instrument.stereo_pair import Stereo
 from tvsbayes.progress import Job, Show
 
@@ -267,14 +267,14 @@ def detect(
         InputError: a frame cannot be read safely or has another size, or the campaign has no folder.
         NothingToEstimate: no row has both frames.
     """
-    frames = replace(_frames_of(campaign, method), dark=dark)
-    rows = [row for row, spot in enumerate(campaign.spots) if _may_detect(spot.status)]
-    present = [row for row in rows if frames.present(campaign.spots[row])]
+    frames, before = replace(_frames_of(campaign, method), dark=dark), stereo_spots(campaign.spots)
+    rows = [row for row, spot in enumerate(before) if _may_detect(spot.status)]
+    present = [row for row in rows if frames.present(before[row])]
     if not present:
         raise _no_frames(campaign)
     workers = workers or os.cpu_count() or 1
     pilot_looks = min(PILOT_LOOKS_MAX, len(present)) if method == "fit" else 0
-    present_spots = [campaign.spots[row] for row in present]
+    present_spots = [before[row] for row in present]
     try:
         deep_looks = len(present) if frames.deep(present_spots[0]) else 0
         with Job({LEVELLING: deep_looks, LEARNING: pilot_looks, DETECTING: len(present)}, progress) as job:
@@ -297,10 +297,10 @@ def detect(
         raise all_of(errors or [first]) from None
     noise = _final_noise(looks.noise, pairs, speckle_contrast) if method == "fit" else looks.noise
     sides = {side: widened([pair[k].under(noise[side]) for pair in pairs]) for k, side in enumerate(CAMERAS)}
-    sizes = campaign.stereo.image_sizes
+    sizes = campaign.stereo_pair.image_sizes
     right = [centre.scaled(sizes["right"], sizes["left"]) for centre in sides["right"].centres]
     centres = list(zip(sides["left"].centres, right, strict=True))
-    spots = _rows(campaign.spots, present, centres, campaign.stereo)
+    spots = _rows(before, present, centres, campaign.stereo_pair)
     detected = [spots[row] for row in present]
     sds = [
         sd
@@ -345,10 +345,10 @@ def _frames_of(campaign: Campaign, method: str) -> _Frames:
         raise InputError("method", f"no method {method!r}", found=method, allowed=", ".join(METHODS), remedy=remedy)
     if campaign.path is None:
         raise InputError("path", "a campaign that was not read from a folder has no frames")
-    if method != "fit" and campaign.stereo.right_image_size is not None:
+    if method != "fit" and campaign.stereo_pair.right_image_size is not None:
         remedy, allowed = "leave out --method: fit is the default", "cameras of one picture size for contour"
         raise InputError("method", f"cameras of two picture sizes; allowed: {allowed}", allowed=allowed, remedy=remedy)
-    return _Frames(Path(campaign.path), campaign.stereo.image_sizes)
+    return _Frames(Path(campaign.path), campaign.stereo_pair.image_sizes)
 
 
 @dataclass(frozen=True)
@@ -403,8 +403,9 @@ def _prepared_looks(
     noise: dict[str, SpotNoise] = {}
     patches: dict[int, _Patches] = {}
     rectified: dict[str, Rectified] = {}
+    spots = stereo_spots(campaign.spots)
     if method == "fit":
-        patches = _pilots(campaign.spots, present, frames, workers)
+        patches = _pilots(spots, present, frames, workers)
         for number, camera in enumerate(CAMERAS):
             patches_of_camera = [patch for pair in patches.values() if not isinstance(patch := pair[number], str)]
             noise[camera] = _estimated_noise(
@@ -412,10 +413,10 @@ def _prepared_looks(
             )
     else:
         noise["left"] = noise["right"] = SpotNoise(speckle_contrast=_contrast(speckle_contrast))
-        rectified["left"], rectified["right"] = rectified_pair(campaign.stereo)
+        rectified["left"], rectified["right"] = rectified_pair(campaign.stereo_pair)
     if overlay is not None:
         make_folder(overlay)
-    return _Looks(campaign.spots, frames, noise, patches, rectified, overlay)
+    return _Looks(spots, frames, noise, patches, rectified, overlay)
 
 
 def _final_noise(

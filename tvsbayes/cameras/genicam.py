@@ -103,7 +103,7 @@ def genicam_cameras(rig: Rig) -> GenicamCamera:
         # Harvesters would continue without it, and find no cameras.
         allowed, remedy = "the GenTL producer of the cameras' maker", "install it, or correct the path of its .cti file"
         raise _refused("options.producer", f"no file {escaped(stated.producer, 200)}", allowed, remedy)
-    return GenicamCamera(Harvester(), stated, rig.stereo.image_width, rig.stereo.image_height)
+    return GenicamCamera(Harvester(), stated, rig.stereo_pair.image_width, rig.stereo_pair.image_height)
 
 
 class GenicamCamera:

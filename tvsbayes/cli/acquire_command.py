@@ -127,7 +127,8 @@ def acquire(
     placement = None if place_command is None else PlaceCommand.parsed(place_command, place_seconds)
     vision = Vision()
     if not centroids:
-        vision = Vision(live_detector(instrument.stereo), twin_renderer(instrument, seed or 0) if simulate else None)
+        pair = instrument.stereo_pair
+        vision = Vision(live_detector(pair), twin_renderer(instrument, seed or 0) if simulate else None)
     with LiveLine() as line, _live_page(port or 0 if live else None, no_browser) as live_run:
         outcome = run_plan(
             instrument,

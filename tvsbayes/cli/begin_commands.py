@@ -172,9 +172,9 @@ def _blank_moves(count: int) -> bytes:
 
 def _rows_of(out: Path) -> tuple[Spot, ...]:
     """The looks that a campaign lists; none for a missing folder."""
-    from tvsbayes.instrument.campaign import read_campaign
+    from tvsbayes.instrument.campaign import read_campaign, stereo_spots
 
-    return read_campaign(out).spots if has_rows(out) else ()
+    return stereo_spots(read_campaign(out).spots) if has_rows(out) else ()
 
 
 def has_rows(out: Path) -> bool:

@@ -114,7 +114,7 @@ def simulate(
     home_approach = None if unrecorded_sides else HOME_APPROACH
     declared = read_rig(rig)
     result = run_plan(
-        *(declared, read_plan(plan, not declared.table.mechanism.sightings), seed),
+        *(declared, read_plan(plan, declared.table.mechanism), seed),
         aperture=aperture,
         home_approach=home_approach,
         sides_recorded=not unrecorded_sides,
@@ -220,13 +220,14 @@ def check(
 
 def _contents(path: Path, plan_file: Path | None) -> dict[str, Any]:
     """Contents of a plan with its rig, a plan, a rig, a journal or a campaign; warnings under their own key."""
+    from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
     from tvsbayes.instrument.plan import read_plan
     from tvsbayes.instrument.rig import read_rig
 
     if plan_file is not None:
         _check_rig_and_plan(path, plan_file)
         rig = read_rig(path)
-        steps = read_plan(plan_file, not rig.table.mechanism.sightings)
+        steps = read_plan(plan_file, rig.table.mechanism)
         from tvsbayes.planning.plan_check import check_plan
 
         compile_for(report_line)
@@ -238,7 +239,7 @@ def _contents(path: Path, plan_file: Path | None) -> dict[str, Any]:
         raise InputError("usage", f"{found}, checked as a whole", allowed="a campaign folder", remedy=remedy)
     kind = path.suffix.lower()
     if kind == ".csv" and not path.is_dir():
-        steps = read_plan(path, sheets=False)
+        steps = read_plan(path, SIGHTING_HEAD)
         if any(step.action == "place" for step in steps):
             steps = read_plan(path)
         actions = {action: sum(s.action == action for s in steps) for action in ("home", "place", "move", "look")}

@@ -38,11 +38,11 @@ FITTING, MAKING = "fit", "compensation"
 LETTERS, APPLIERS = "XYZABC", ("controller", "host")
 
 
-def _mechanism(folder: Path) -> Mechanism | None:
+def _two_axis_mechanism(folder: Path) -> Mechanism | None:
     """The mechanism of a scanner or a head; None for an axis, and where no header can be read."""
-    from tvsbayes.instrument.campaign_header import mechanism_of
+    from tvsbayes.instrument.campaign_header import mechanism_key
 
-    return MECHANISMS.get(mechanism_of(folder))
+    return MECHANISMS.get(mechanism_key(folder))
 
 
 def compensate(
@@ -84,7 +84,7 @@ def compensate(
     from tvsbayes.single_axis.axis_record import results_for
 
     check_output(out)
-    if (mechanism := _mechanism(campaign)) is not None:
+    if (mechanism := _two_axis_mechanism(campaign)) is not None:
         # Counters of two axes follow from the whole calibration, which is the table.
         default = "urdf" if mechanism.terms else "header"
         if to != default:
@@ -174,9 +174,9 @@ def verify(
     from tvsbayes.report.compensation_text import verification_text
     from tvsbayes.results.compensation_record import CANNOT_TELL, KEPT, VERIFICATION_FORMAT
 
-    mechanism = _mechanism(campaign)
+    mechanism = _two_axis_mechanism(campaign)
     scanner = mechanism is not None
-    if mechanism is not _mechanism(fresh):
+    if mechanism is not _two_axis_mechanism(fresh):
         kind = "an axis" if mechanism is None else "a head" if mechanism.terms else "a scanner"
         message = f"{escaped(str(campaign), 200)} is of {kind}, {escaped(str(fresh), 200)} is not"
         raise InputError("usage", message, remedy="give fresh readings or looks of the same kind of machine")
@@ -234,7 +234,7 @@ def plan_verify(folder: Path | None, *, out: Path | None, seed: int, as_json: bo
     if folder is None:
         remedy = "write tvsbayes plan FOLDER --verify -o plan.csv"
         raise InputError("usage", "--verify needs a folder with a table or a calibration in force", remedy=remedy)
-    if _mechanism(folder) is not None:
+    if _two_axis_mechanism(folder) is not None:
         _plan_looks(folder, out, as_json)
         return
     data = read_axis(folder)
@@ -266,7 +266,7 @@ def _plan_looks(folder: Path, out: Path | None, as_json: bool) -> None:
     document, text = plain(looks), aim_plan_text(looks)
     if out is not None:
         target = Counter(spot.target for spot in data.spots).most_common(1)[0][0]
-        write_plan(looks.steps(target), out, not data.rig.mechanism.sightings)
+        write_plan(looks.steps(target), out, data.rig.mechanism)
         document["plan"] = str(out)
         text += f"\nwritten: {escaped(str(out), 200)}"
     finish(document, text, as_json)

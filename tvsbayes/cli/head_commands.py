@@ -174,14 +174,14 @@ def _sighting_files(rows: ForeignSightings, to: Path, table: str) -> _SightingFi
         InputError: the folder has another instrument, rows, or stated ratios for angles of an encoder.
     """
     from tvsbayes.instrument.campaign import MOVES, head_templates
-    from tvsbayes.instrument.campaign_header import mechanism_of
+    from tvsbayes.instrument.campaign_header import mechanism_key
     from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
     from tvsbayes.instrument.sightings import SIGHTINGS
 
     current = templates = head_templates(True)
     stated: set[str] = set()
     if not (is_new := not (to / "campaign.toml").is_file()):
-        if mechanism_of(to) != SIGHTING_HEAD.key:
+        if mechanism_key(to) != SIGHTING_HEAD.key:
             found, allowed = "a campaign without sightings.csv", "one that `new --mechanism pan-tilt --sightings` made"
             remedy = "name a new folder with --to"
             raise refusal("instrument", file=escaped(str(to), 200), found=found, allowed=allowed, remedy=remedy)

@@ -100,6 +100,7 @@ def import_(
     """
     from tvsbayes.files.foreign_table import read_foreign
     from tvsbayes.instrument.axes import AXES, sides_of
+    from tvsbayes.instrument.campaign import stereo_spots
     from tvsbayes.instrument.column_names import map_columns
     from tvsbayes.instrument.corrections import Correction, corrected, flipped_axis, shift_of
     from tvsbayes.instrument.foreign_looks import SD_PX, Notation, looks_of
@@ -170,7 +171,8 @@ def import_(
     notation = Notation(pixels_from, angles, SD_PX if sd_px is None else sd_px, relative, approach)
     looks = looks_of(table, mapping.columns, notation, listed)
     changed = corrected(looks.moves, looks.spots, correction, None if listed is None else len(listed))
-    looks = replace(looks, moves=changed.moves, spots=changed.spots, assumed=(*looks.assumed, *changed.changes))
+    spots = None if changed.spots is None else stereo_spots(changed.spots)
+    looks = replace(looks, moves=changed.moves, spots=spots, assumed=(*looks.assumed, *changed.changes))
     _check_no_rows(to, looks)
     document = _mapping_document(table, mapping, looks)
     lines = [_mapping_text(table, mapping, notation, looks)]
@@ -241,7 +243,7 @@ def _assumption(text: str, known: Mapping[str, str], example: str) -> tuple[str,
 
 def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bool, as_json: bool) -> None:
     """Write a copy of a campaign with corrected tables; other files of its folder are not copied."""
-    from tvsbayes.instrument.campaign import looks_bytes, looks_file, moves_bytes, read_campaign
+    from tvsbayes.instrument.campaign import looks_bytes, moves_bytes, read_campaign
     from tvsbayes.instrument.corrections import Correction, corrected
 
     if serve("import", folder, to=to, correction=correction, yes=yes, as_json=as_json):
@@ -265,7 +267,7 @@ def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bo
         make_folder(to, empty=True)
         copied = [name for name in ("campaign.toml", "stereo.json", HEAD_URDF) if (folder / name).is_file()]
         contents = {name: read_bytes(folder / name, CSV_BYTES_MAX, folder) for name in copied}
-        contents |= {"moves.csv": moves_bytes(moves), looks_file(campaign): looks_bytes(campaign)}
+        contents |= {"moves.csv": moves_bytes(moves), campaign.looks_table.file: looks_bytes(campaign)}
         for name, data in contents.items():
             write_atomically(to / name, data)
         written = [str(to / name) for name in contents]

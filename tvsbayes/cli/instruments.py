@@ -89,9 +89,9 @@ INSTRUMENTS = {
 
 def instrument_of(path: Path | None) -> Instrument | None:
     """The instrument of a campaign folder; None for a scanner, and where no header can be read."""
-    from tvsbayes.instrument.campaign_header import mechanism_of
+    from tvsbayes.instrument.campaign_header import mechanism_key
 
-    return None if path is None else INSTRUMENTS.get(mechanism_of(path))
+    return None if path is None else INSTRUMENTS.get(mechanism_key(path))
 
 
 def serve(command: str, campaign: Path | None, **options: object) -> bool:

@@ -311,7 +311,7 @@ def plan(
         )
     text, document = plan_text(result), result.as_json()
     if out is not None and result.steps:
-        write_plan(result.steps, out, not instrument.table.mechanism.sightings)
+        write_plan(result.steps, out, instrument.table.mechanism)
         document["plan"] = str(out)
         text += f"\nwritten: {escaped(str(out), 200)}"
     elif out is not None:
@@ -379,7 +379,7 @@ def study(
         refuse_options("for a cluster that is started here", "leave it out, or leave out --scheduler", workers=workers)
     check_order(rig, plan_file)
     instrument = read_rig(rig)
-    steps = read_plan(plan_file, not instrument.table.mechanism.sightings)
+    steps = read_plan(plan_file, instrument.table.mechanism)
     from tvsbayes.planning.target import DEFAULT_TARGET, parse_target
     from tvsbayes.report.command_text import study_text
     from tvsbayes.statistics.chances import ASSURED

@@ -112,7 +112,7 @@ def plan_watch(
 
     text = watch_plan_text(looks)
     if out is not None:
-        write_plan(looks.steps, out, not known.rig.mechanism.sightings)
+        write_plan(looks.steps, out, known.rig.mechanism)
         looks = structs.replace(looks, plan=str(out))
         text += f"\nwritten: {escaped(str(out), 200)}"
     finish(looks.as_json(), text, as_json)

@@ -14,6 +14,7 @@ import numpy as np
 from tvsbayes.comparison.gap import camera_influence
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import TARGETS, unit_of
+from tvsbayes.instrument.stereo_pair import stereo_parameters
 from tvsbayes.results.comparison_record import Change, Comparison
 
 if TYPE_CHECKING:
@@ -45,11 +46,8 @@ def compare(first: JointFit, second: JointFit) -> Comparison:
     from scipy import special
 
     pose = first.reference_pose_rad
-    cameras = first.campaign.stereo, second.campaign.stereo
-    shared = bool(
-        np.array_equal(cameras[0].vector, cameras[1].vector)
-        and np.array_equal(cameras[0].parameter_covariance, cameras[1].parameter_covariance)
-    )
+    cameras = [stereo_parameters(fit.campaign.stereo) for fit in (first, second)]
+    shared = all(np.array_equal(ours, theirs) for ours, theirs in zip(*cameras, strict=True))
     before, after = _draws_at(first, pose), _draws_at(second, pose)
     limit = -float(special.ndtri(0.5 * (1 - 0.95 ** (1 / len(COMPARED)))))
     variance = before[1:].var(axis=0, ddof=1) + after[1:].var(axis=0, ddof=1)

@@ -165,7 +165,7 @@ def _idealised(found: JointFit, selection: Selection, chosen: _Chosen) -> _Ideal
             return looks(replace(fit, space=space), z[values], repeated_rad(fit, repeating_rad[values]))[:, rows]
 
         pixels = by_way(chosen.ways, of_way)
-        ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, found.campaign.stereo))
+        ratios.append(four_point_ratios(pixels, selection.steps, selection.axis, found.campaign.stereo_pair))
     return _Idealised(tuple(ratios), full, ideal)
 
 

@@ -153,7 +153,7 @@ def hold_out(fit_of_all: JointFit, by: str = "steps", seed: int = 0, *, progress
             return undecided(f"{what}; measure a second |N|")
         what = "all experiments start at one counter: no other region is left to predict it from"
         return undecided(f"{what}; measure experiments from a second starting counter")
-    angle = four_point_ratios(selection.pixels, selection.steps, selection.axis, campaign.stereo) * selection.steps
+    angle = four_point_ratios(selection.pixels, selection.steps, selection.axis, campaign.stereo_pair) * selection.steps
     predictions: list[Prediction] = []
     with Job(dict.fromkeys(folds, 1.0), progress) as job:
         for index, (name, out) in enumerate(folds.items()):
@@ -244,7 +244,7 @@ def predict_joint(
     pixels = looks_again(taught, z, physical, errors_rad, generator)
     pixels = pixels[:, experiment_rows(taught.campaign, selection)[out]]
     steps, axis = selection.steps[out], selection.axis[out]
-    draws = four_point_ratios(pixels, steps, axis, taught.campaign.stereo) * steps
+    draws = four_point_ratios(pixels, steps, axis, taught.campaign.stereo_pair) * steps
     angles = {}
     for k, e in enumerate(np.flatnonzero(out).tolist()):
         finite = draws[np.isfinite(draws[:, k]), k]

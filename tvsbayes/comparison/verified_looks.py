@@ -24,7 +24,7 @@ from tvsbayes.estimators.campaign_arrays import in_sight
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES, FULL_TURN_DEG, HOME_SD_DEG, SIDES
-from tvsbayes.instrument.campaign import Campaign, input_hashes, looks_file, ordered_spots
+from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.parameters import INDEX
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 from tvsbayes.instrument.stops import rests_of
@@ -229,8 +229,8 @@ def verify_looks(
     if used.sum() < LOOKS_MIN:
         raise NothingToEstimate(
             "too-few-looks",
-            f"{looks_file(looks)}: {int(used.sum())} fresh looks can be used; verify takes at least {LOOKS_MIN}",
-            file=looks_file(looks),
+            f"{looks.looks_table.file}: {int(used.sum())} fresh looks can be used; verify takes at least {LOOKS_MIN}",
+            file=looks.looks_table.file,
             remedy="aim at more points; `tvsbayes plan CAMPAIGN --verify` names them",
         )
     aimed = AimedLooks.of(calibration, looks, used)

@@ -21,7 +21,7 @@ from tvsbayes.estimators.linear_spots import LinearSpots, linear_spots, stop_inf
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES, HOME_SD_DEG
-from tvsbayes.instrument.campaign import Campaign, input_hashes, looks_file, ordered_spots
+from tvsbayes.instrument.campaign import Campaign, input_hashes, ordered_spots
 from tvsbayes.instrument.homing import homed
 from tvsbayes.instrument.mechanisms import Mechanism
 from tvsbayes.instrument.parameters import COLUMNS as COORDINATES
@@ -438,10 +438,11 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
     """
     usable = int(in_sight(looks).sum()) if ordered_spots(looks) else 0
     if usable < LOOKS_MIN:
+        file = looks.looks_table.file
         raise NothingToEstimate(
             "too-few-looks",
-            f"{looks_file(looks)}: {usable} new looks can be used; a calibration is watched with at least {LOOKS_MIN}",
-            file=looks_file(looks),
+            f"{file}: {usable} new looks can be used; a calibration is watched with at least {LOOKS_MIN}",
+            file=file,
             remedy="look at more places, or detect the refused spots again",
         )
     watched = WatchedLooks(fit, looks)

@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from tvsbayes.instrument.axes import APPROACH_SIGN
-from tvsbayes.instrument.campaign import Campaign, Move, Spot, ordered_spots, pixels_of
+from tvsbayes.instrument.campaign import Campaign, Look, Move, ordered_spots, pixels_of
 from tvsbayes.instrument.conditions import kelvin, powered_on_s, warm_minutes
 from tvsbayes.instrument.places import PLACES_MAX, SeenPlaces, gears_vary, seen_places
 from tvsbayes.instrument.rig import RigTable
@@ -195,7 +195,7 @@ def gear_arrays(given: SeenPlaces, size: int) -> GearArrays:
     return GearArrays(places, *(padded(np.pad(share, wider), size) for share in (given.error_share, given.play_share)))
 
 
-def pixel_covariance(spot: Spot | Sighting) -> np.ndarray:
+def pixel_covariance(spot: Look) -> np.ndarray:
     """Return the stated covariance of (u_left, v_left, u_right, v_right), px^2; of a sighting, rad^2."""
     if isinstance(spot, Sighting):
         covariance = np.eye(4)
@@ -220,7 +220,7 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
     """
     spots = ordered_spots(campaign)
     size = bucket(len(spots))
-    frames = tangent_frames(sighted_deg(sightings_of(spots))) if campaign.rig.mechanism.sightings else None
+    frames = tangent_frames(sighted_deg(sightings_of(spots))) if campaign.stereo is None else None
     pixels = pixels_of(spots) if frames is None else np.zeros((len(spots), 4))
     covariance = np.stack([pixel_covariance(s) for s in spots])
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -230,7 +230,7 @@ def campaign_arrays(campaign: Campaign, table: RigTable | None = None) -> Campai
     places = seen_places(campaign.moves, looks, priors)
     gears = gear_arrays(places if gears_vary(priors) else places.none, size)
     aperture = [np.nan if s.aperture_deg is None else s.aperture_deg for s in spots]
-    points_mm = triangulate(campaign.stereo, pixels) if frames is None else frames[:, 2]
+    points_mm = triangulate(campaign.stereo_pair, pixels) if frames is None else frames[:, 2]
     finite = np.isfinite(points_mm).all(axis=1)
     points_mm[~finite] = NOWHERE_MM
     spot_arrays = SpotArrays(
@@ -261,9 +261,10 @@ def components(rig: RigTable) -> int:
 
 def in_sight(campaign: Campaign) -> np.ndarray:
     """Mark each ordered spot that has a triangulated point; one outside the lens model's range has none."""
-    if campaign.rig.mechanism.sightings:
-        return np.ones(len(ordered_spots(campaign)), dtype=bool)
-    return np.isfinite(triangulate(campaign.stereo, pixels_of(ordered_spots(campaign)))).all(axis=1)
+    spots = ordered_spots(campaign)
+    if campaign.stereo is None:
+        return np.ones(len(spots), dtype=bool)
+    return np.isfinite(triangulate(campaign.stereo, pixels_of(spots))).all(axis=1)
 
 
 def spot_constants(campaign: Campaign) -> np.ndarray:

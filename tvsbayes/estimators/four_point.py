@@ -213,15 +213,17 @@ def select_experiments(campaign: Campaign) -> Selection:
     """
     moves = {move.move: move for move in campaign.moves}
     rows: dict[int, list[int]] = {}
-    for row, spot in enumerate(campaign.spots):
+    # Sightings belong to no experiment.
+    spots = [spot for spot in campaign.spots if isinstance(spot, Spot)]
+    for row, spot in enumerate(spots):
         if spot.experiment is not None:
             rows.setdefault(spot.experiment, []).append(row)
     kept: list[tuple[int, list[int], str, int]] = []
     skipped: list[SkippedExperiment] = []
     for number in sorted(rows):
-        by_point, reason = _by_point(campaign.spots, rows[number])
+        by_point, reason = _by_point(spots, rows[number])
         if reason is None:
-            at = [moves[campaign.spots[row].move] for row in by_point]
+            at = [moves[spots[row].move] for row in by_point]
             axis, steps, reason = _commanded(at)
         if reason is None:
             kept.append((number, by_point, axis, steps))
@@ -231,7 +233,7 @@ def select_experiments(campaign: Campaign) -> Selection:
     return Selection(
         experiments=np.array([k[0] for k in kept], dtype=int),
         spot_rows=spot_rows,
-        pixels=pixels_of(campaign.spots[row] for row in spot_rows.ravel()).reshape(-1, 4, 4),
+        pixels=pixels_of(spots[row] for row in spot_rows.ravel()).reshape(-1, 4, 4),
         steps=np.array([k[3] for k in kept], dtype=int),
         axis=np.array([k[2] for k in kept], dtype="U4"),
         skipped=tuple(skipped),
@@ -328,7 +330,7 @@ def _direction(campaign: Campaign, selection: Selection, rows: np.ndarray, ratio
     n = len(ratios)
     average = float(np.mean(ratios))
     focal_u = campaign.rig.priors["focal_scale"].u
-    type_b = float(np.sqrt(stereo_variance(mean, campaign.stereo, focal_u)))
+    type_b = float(np.sqrt(stereo_variance(mean, campaign.stereo_pair, focal_u)))
     if n == 1:
         return DirectionResult(1, average, None, None, None, None, None, type_b, None)
     sd = float(np.std(ratios, ddof=1))

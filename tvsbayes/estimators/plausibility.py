@@ -31,7 +31,7 @@ from tvsbayes.estimators.spot_pattern import (
     table_findings,
 )
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import PIXEL_SDS, UNDETECTED, Campaign, Spot, ordered_spots, pixels_of
+from tvsbayes.instrument.campaign import PIXEL_SDS, UNDETECTED, Campaign, Spot, ordered_spots, pixels_of, stereo_spots
 from tvsbayes.instrument.conditions import interpolated
 from tvsbayes.instrument.parameters import names_of
 from tvsbayes.instrument.sightings import SIGHTINGS, sighted_deg, sightings_of
@@ -137,17 +137,17 @@ def implausible(campaign: Campaign, points_mm: np.ndarray | None = None) -> tupl
     Returns:
         Findings, certain ones and doubts; `Finding.sentence` is printed.
     """
-    if campaign.rig.mechanism.sightings:
+    if campaign.stereo is None:
         return sighting_findings(campaign)
     points_mm = campaign.usable_points_mm if points_mm is None else points_mm
-    few = partial(listed, most=SPOTS_LISTED)
-    ok = [spot for spot in campaign.spots if spot.status == "ok"]
+    few, spots = partial(listed, most=SPOTS_LISTED), stereo_spots(campaign.spots)
+    ok = [spot for spot in spots if spot.status == "ok"]
     findings = []
     misspelt = [s.spot for s in campaign.spots if s.status != "ok" and s.status.strip().lower() == "ok"]
     if misspelt:
         said = f"spots {few(misspelt)} are left out: their status is not spelt ok, in small letters"
         findings.append(Finding("status", said, file="spots.csv"))
-    stray = [s.spot for s in campaign.spots if s.status == UNDETECTED and s.u_left_px is not None]
+    stray = [s.spot for s in spots if s.status == UNDETECTED and s.u_left_px is not None]
     if stray:
         said = f"spots {few(stray)} are undetected and have pixels, which nothing uses: ok, or refused?"
         findings.append(Finding("status", said, file="spots.csv"))
@@ -184,7 +184,9 @@ def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple
         does not test it. Empty where nothing explains the failure.
     """
     findings = [*implausible(campaign)]
-    ok = [spot for spot in campaign.spots if spot.status == "ok"]
+    if campaign.stereo is None:
+        return tuple(findings)
+    ok = [spot for spot in stereo_spots(campaign.spots) if spot.status == "ok"]
     points_mm = campaign.usable_points_mm
     stands = _can_stand(points_mm[:, 0])
     if stands.sum() < 2 * SPOTS_MIN or stands.mean() <= 1 - ODD_SHARE:
@@ -206,11 +208,11 @@ def misfit_causes(campaign: Campaign, pixel_scale: float | None = None) -> tuple
 
 def _stereo_findings(campaign: Campaign) -> list[Finding]:
     """Find contradictions in the pair of cameras; an impossible baseline is certain."""
-    unit = baseline_doubt(campaign.stereo)
-    others = doubts("stereo", (text for text in pair_doubts(campaign.stereo) if text != unit), "stereo.json")
+    unit = baseline_doubt(campaign.stereo_pair)
+    others = doubts("stereo", (text for text in pair_doubts(campaign.stereo_pair) if text != unit), "stereo.json")
     if unit is None:
         return others
-    given = "m" if float(np.linalg.norm(campaign.stereo.T)) < SHORTEST_BASELINE_MM else "mm"
+    given = "m" if float(np.linalg.norm(campaign.stereo_pair.T)) < SHORTEST_BASELINE_MM else "mm"
     remedy = f"import it again: `tvsbayes stereo --import FILE --import-unit {given} -o stereo.json`"
     return [Finding("units", unit, remedy, certain=True, file="stereo.json"), *others]
 
@@ -218,7 +220,7 @@ def _stereo_findings(campaign: Campaign) -> list[Finding]:
 def _pixel_unit(campaign: Campaign, ok: Sequence[Spot]) -> Finding | None:
     """Find centres that are not in pixels: all of them are near the corner of the picture."""
     largest_px = float(np.abs(pixels_of(ok)).max())
-    if largest_px >= CORNER_SHARE * campaign.stereo.image_height:
+    if largest_px >= CORNER_SHARE * campaign.stereo_pair.image_height:
         return None
     said = f"no pixel is larger than {largest_px:.3g}: are the centres in millimetres? They are in px"
     remedy = "import the table again with centres in px, by --column u_left_px=NAME and so on"
@@ -227,7 +229,7 @@ def _pixel_unit(campaign: Campaign, ok: Sequence[Spot]) -> Finding | None:
 
 def _from_one(campaign: Campaign, ok: Sequence[Spot]) -> list[Finding]:
     """Find centres outside the picture by less than a pixel, as where the first pixel is called 1."""
-    width, height = campaign.stereo.image_width, campaign.stereo.image_height
+    width, height = campaign.stereo_pair.image_width, campaign.stereo_pair.image_height
     last = np.array([width, height, width, height]) - 0.5
     pixels = pixels_of(ok)
     beyond = np.any(pixels > last, axis=1)
@@ -251,12 +253,12 @@ def _impossible_depths(campaign: Campaign, ok: Sequence[Spot], odd: Sequence[Spo
     said = f"spots {listed([spot.spot for spot in odd], SPOTS_LISTED)} triangulate outside {limits}: "
     line = line_of(campaign.spots.index(odd[0]))
     exchanged = pixels_of(ok)[:, [2, 3, 0, 1]]
-    points_mm = triangulate(campaign.stereo, exchanged)
+    points_mm = triangulate(campaign.stereo_pair, exchanged)
     stands = _can_stand(points_mm[:, 0])
     swapped = len(ok) >= SPOTS_MIN and len(odd) > (1 - ODD_SHARE) * len(ok) and stands.mean() > 1 - ODD_SHARE
     if not swapped:
         return Finding("depths", f"{said}are left and right swapped, or mismatched?", file="spots.csv", line=line)
-    off_px = float(np.median(mismatch_px(campaign.stereo, exchanged[stands], points_mm[stands])))
+    off_px = float(np.median(mismatch_px(campaign.stereo_pair, exchanged[stands], points_mm[stands])))
     said += f"are left and right swapped? Exchanged, both pictures of a spot agree to {off_px:.1f} px"
     remedy = f"exchange them: {mending_command(campaign, '--swap')}"
     return Finding("cameras-swapped", said, remedy, off_px < MISMATCH_PX, "spots.csv", line)
@@ -332,13 +334,13 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     ok = [spot for spot in campaign.spots if spot.status == "ok"]
     refused = Counter(spot.status for spot in campaign.spots if spot.status != "ok")
     selection = select_experiments(campaign)
-    sightings = campaign.rig.mechanism.sightings
-    points_mm = np.zeros((0, 3)) if sightings else campaign.usable_points_mm
+    stereo = campaign.stereo
+    points_mm = np.zeros((0, 3)) if stereo is None else campaign.usable_points_mm
     # Causes first, then their consequences.
     findings = implausible(campaign, points_mm)
     warnings = [*(finding.sentence for finding in findings), *_incomplete(selection.skipped)]
     if not ok:
-        warnings.append(f"no {'sighting' if sightings else 'spot'} has status ok: there is nothing to estimate from")
+        warnings.append(f"no {'spot' if stereo else 'sighting'} has status ok: there is nothing to estimate from")
     if count := interpolated(campaign.moves):
         warnings.append(f"{count} of {len(campaign.moves)} moves have no temperature_degC: interpolated in time")
     observed = {spot.move for spot in ok}
@@ -355,9 +357,9 @@ def check_campaign(campaign: Campaign) -> CampaignCheck:
     depths_mm = points_mm[:, 0]
     if len(depths_mm) and np.all(_can_stand(depths_mm)) and depths_mm.max() < SHALLOW * depths_mm.min():
         warnings.append("all spots lie at one depth: a second sheet position lowers u of ratios threefold")
-    if campaign.stereo.assumed:
+    if stereo is not None and stereo.assumed:
         warnings.append("the stereo covariance is assumed, not estimated: uncertainties depend on it")
-    if not sightings and not np.any(campaign.stereo.parameter_covariance):
+    if stereo is not None and not np.any(stereo.parameter_covariance):
         warnings.append(
             "the stereo covariance is zero: its error (0.3 to 0.5 % of a ratio) is missing from every interval"
         )

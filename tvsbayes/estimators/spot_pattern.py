@@ -79,7 +79,7 @@ def pattern_of(campaign: Campaign, spots: Sequence[Spot], points_mm: np.ndarray)
     order = sorted(range(len(spots)), key=lambda k: (spots[k].move, spots[k].spot))
     ordered, points_mm = tuple(spots[k] for k in order), points_mm[order]
     pixels = pixels_of(ordered)
-    return SpotPattern(campaign, ordered, pixels, points_mm, mismatch_px(campaign.stereo, pixels, points_mm))
+    return SpotPattern(campaign, ordered, pixels, points_mm, mismatch_px(campaign.stereo_pair, pixels, points_mm))
 
 
 def picture_findings(pattern: SpotPattern) -> list[Finding]:
@@ -109,7 +109,7 @@ def _picture_doubts(pattern: SpotPattern) -> tuple[str, ...]:
     off_px = float(np.median(pattern.mismatch_px))
     if off_px < MISMATCH_PX:
         return ()
-    stereo = pattern.campaign.stereo
+    stereo = pattern.campaign.stereo_pair
     for factor, word in ((2.0, "half"), (0.5, "twice")):
         pixels = factor * pattern.pixels
         other = mismatch_px(stereo, pixels, triangulate(stereo, pixels))
@@ -133,7 +133,7 @@ def _picture_doubts(pattern: SpotPattern) -> tuple[str, ...]:
 
 def signed_mismatch_px(pattern: SpotPattern) -> np.ndarray:
     """Compute the mismatch with the sign of the left row's, (n,)."""
-    projected = project_pair(pattern.campaign.stereo, pattern.points_mm)
+    projected = project_pair(pattern.campaign.stereo_pair, pattern.points_mm)
     return pattern.mismatch_px * np.sign((projected - pattern.pixels)[:, 1])
 
 
@@ -251,7 +251,7 @@ def _stray_doubts(pattern: SpotPattern) -> tuple[str, ...]:
 
 def _mm_per_pixel(pattern: SpotPattern, rows: np.ndarray) -> np.ndarray:
     """Compute the change of depth per pixel of disparity, (n,): depth squared over focal length times baseline."""
-    stereo = pattern.campaign.stereo
+    stereo = pattern.campaign.stereo_pair
     return pattern.points_mm[rows, 0] ** 2 / (stereo.M1[0, 0] * float(np.linalg.norm(stereo.T)))
 
 

@@ -9,14 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 
 from tvsbayes.files.csv_table import NUMBER
 from tvsbayes.files.foreign_table import ForeignTable
 from tvsbayes.instrument.axes import AXES, Axis
-from tvsbayes.instrument.campaign import MOVES, SPOTS, Move, Spot
+from tvsbayes.instrument.campaign import MOVES, SPOTS, Move
 from tvsbayes.instrument.column_names import COUNTERS, DEGREES, SPREAD, field_by_word, unit_of_name, words_of
 from tvsbayes.instrument.corrections import Correction, corrected
 from tvsbayes.instrument.foreign_cells import FieldCells, left_out, plain_column, status_of
@@ -136,7 +135,7 @@ def sightings_of_table(
             )
         )
     assumed += left_out(cells_of, statuses, "sighting")
-    changed = corrected(listing.moves, cast(list[Spot], sightings), correction)
+    changed = corrected(listing.moves, sightings, correction)
     moves, sightings = changed.moves or (), sightings_of(changed.spots or ())
     encoders = frozenset(axis for axis, field in zip(AXES, COUNTERS, strict=True) if field in units)
     if turned := tuple(axis for axis in AXES if axis in encoders & set(falling) and _falls(moves, sightings, axis)):

@@ -98,14 +98,9 @@ def pointing_model(campaign: Campaign) -> PointingModel:
     """
     mechanism, priors = campaign.rig.mechanism, campaign.rig.priors
     if not mechanism.sightings:
+        allowed = "a campaign of a head with sightings"
         remedy = "`tvsbayes classic` of spots needs four-point experiments"
-        raise refusal(
-            "no-sightings",
-            file="spots.csv",
-            found="spots",
-            allowed="a campaign of a head with sightings",
-            remedy=remedy,
-        )
+        raise refusal("no-sightings", file="spots.csv", found="spots", allowed=allowed, remedy=remedy)
     rows = sightings_of(ordered_spots(campaign))
     terms = [term.name for term in HEAD_TERMS.values()]
     values: dict[str, float | complex] = {name: priors[name].value for name in (*RATIOS, *terms)}

@@ -18,7 +18,7 @@ from tvsbayes.errors import escaped, refusal
 from tvsbayes.files.csv_table import CSV_BYTES_MAX
 from tvsbayes.files.disk import read_bytes
 from tvsbayes.head.foreign_sightings import STEP_DEG
-from tvsbayes.instrument.campaign import Campaign, Move, next_move, sighted_campaign
+from tvsbayes.instrument.campaign import Campaign, Move, next_move
 from tvsbayes.instrument.mechanisms import SIGHTING_HEAD
 from tvsbayes.instrument.parameters import Prior, names_of
 from tvsbayes.instrument.rig import RigTable
@@ -145,4 +145,4 @@ def campaign_of(stars: tuple[Star, ...], name: str, u_arcsec: float = U_ARCSEC) 
         for k, star in enumerate(stars)
     )
     table = RigTable(encoder_priors(), mechanism=SIGHTING_HEAD)
-    return sighted_campaign(moves, sightings, table, {"name": name})
+    return Campaign(tuple(moves), sightings, None, table, {"name": name})

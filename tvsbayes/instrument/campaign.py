@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -39,7 +39,7 @@ from tvsbayes.instrument.campaign_header import parse_header
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
 from tvsbayes.instrument.rig import RigTable, parse_rig_table, rig_table_toml
 from tvsbayes.instrument.sightings import SIGHTINGS, Sighting, parse_sightings
-from tvsbayes.instrument.stereo_pair import NO_STEREO, Stereo, parse_stereo, stereo_bytes, triangulate
+from tvsbayes.instrument.stereo_pair import Stereo, WithStereo, no_stereo_pair, parse_stereo, stereo_bytes, triangulate
 
 CAMERAS: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 """The two cameras, in the order of the columns of spots.csv."""
@@ -226,6 +226,21 @@ MOVES = CsvKind(
     [Move(move=0, segment=0, time_s=0.0, pan_steps=0, tilt_steps=0, pan_approach="unknown", tilt_approach="unknown")],
 )
 SPOTS = CsvKind(Spot, "spots.csv", "a row for every look, in any order")
+Look = Spot | Sighting
+"""A look of any instrument."""
+
+
+def stereo_spots(looks: Iterable[Look]) -> tuple[Spot, ...]:
+    """The looks of a campaign as spots.
+
+    Raises:
+        InputError: they are sightings.
+    """
+    rows = tuple(looks)
+    spots = tuple(look for look in rows if isinstance(look, Spot))
+    if len(spots) != len(rows):
+        raise no_stereo_pair()
+    return spots
 
 
 NAME_ACQUIRED = "acquired campaign"
@@ -244,15 +259,15 @@ def title_of(header: Mapping[str, object], path: Path | None) -> str:
 
 
 @dataclass(frozen=True, repr=False)
-class Campaign(Shown):
+class Campaign(Shown, WithStereo):
     """A campaign folder, checked. `header` holds the keys of `campaign.toml` outside `[rig]`.
 
-    `spots` are sightings, and `stereo` is `NO_STEREO`, where the mechanism has sightings.
+    `spots` are sightings, and `stereo` is None, where the mechanism has sightings.
     """
 
     moves: tuple[Move, ...]
-    spots: tuple[Spot, ...]
-    stereo: Stereo
+    spots: tuple[Look, ...]
+    stereo: Stereo | None
     rig: RigTable = field(default_factory=RigTable)
     header: dict[str, object] = field(default_factory=dict)
     path: Path | None = None
@@ -262,10 +277,13 @@ class Campaign(Shown):
         """Each spot triangulated by the stated cameras, frame S, shape (n, 3); computed once, read-only.
 
         NaN where a look has no spot, and outside the range of the lens model.
+
+        Raises:
+            InputError: the campaign has sightings.
         """
         points = np.full((len(self.spots), 3), np.nan)
         usable = np.array([spot.status == "ok" for spot in self.spots], dtype=bool)
-        points[usable] = triangulate(self.stereo, pixels_of(spot for spot in self.spots if spot.status == "ok"))
+        points[usable] = triangulate(self.stereo_pair, pixels_of(spot for spot in self.spots if spot.status == "ok"))
         points.flags.writeable = False
         return points
 
@@ -275,6 +293,11 @@ class Campaign(Shown):
         return self.points_mm[[spot.status == "ok" for spot in self.spots]]
 
     @property
+    def looks_table(self) -> CsvKind[Any]:
+        """The kind of file that holds its looks."""
+        return SIGHTINGS if self.rig.mechanism.sightings else SPOTS
+
+    @property
     def title(self) -> str:
         """The name in its header, else that of its folder; see `title_of`."""
         return title_of(self.header, self.path)
@@ -282,8 +305,9 @@ class Campaign(Shown):
     def shown(self) -> View:
         """Counts, and the looks with their counters."""
         ok = sum(spot.status == "ok" for spot in self.spots)
-        kind, word = (SIGHTINGS, "sightings") if self.rig.mechanism.sightings else (SPOTS, "spots")
-        title = f"Campaign {self.title!r}: {len(self.moves)} moves, {len(self.spots)} {word} ({ok} ok)"
+        kind = self.looks_table
+        looks = f"{len(self.spots)} {Path(kind.file).stem}"
+        title = f"Campaign {self.title!r}: {len(self.moves)} moves, {looks} ({ok} ok)"
         counters = {move.move: (move.pan_steps, move.tilt_steps) for move in self.moves}
         columns = kind.required[2:]
         rows = [
@@ -409,44 +433,19 @@ def _exchanged(pixels: Sequence[Sequence[float | None]], statuses: Sequence[str]
     return all(value is None or -_IMAGE_MARGIN <= value / extent <= 1 + _IMAGE_MARGIN for value, extent in cells)
 
 
-# campaign.toml is written last: a folder without it is incomplete.
-_FILES = {
-    "stereo.json": JSON_BYTES_MAX,
-    "moves.csv": CSV_BYTES_MAX,
-    "spots.csv": CSV_BYTES_MAX,
-    "campaign.toml": TOML_BYTES_MAX,
-}
-_FILES_OF_SIGHTINGS = {
-    "moves.csv": CSV_BYTES_MAX,
-    SIGHTINGS.file: CSV_BYTES_MAX,
-    "campaign.toml": TOML_BYTES_MAX,
-}
+_BYTES_MAX = {".json": JSON_BYTES_MAX, ".csv": CSV_BYTES_MAX, ".toml": TOML_BYTES_MAX}
 
 
 def _parse_files(files: dict[str, bytes], path: Path | None) -> Campaign:
     keys = parse_toml(files["campaign.toml"], "campaign.toml")
     sightings = SIGHTINGS.file in files
     header, rig = parse_header(keys), parse_rig_table(keys.table("rig"), sightings)
-    if sightings:
-        moves = parse_moves(files["moves.csv"])
-        sightings_rows = parse_sightings(files[SIGHTINGS.file], SIGHTINGS.file, len(moves))
-        return sighted_campaign(moves, sightings_rows, rig, header, path)
-    stereo = parse_stereo(files["stereo.json"], "stereo.json")
+    stereo = None if sightings else parse_stereo(files["stereo.json"], "stereo.json")
     moves = parse_moves(files["moves.csv"])
-    spots = parse_spots(files["spots.csv"], "spots.csv", len(moves), stereo)
-    return Campaign(moves, spots, stereo, rig, header, path)
-
-
-def sighted_campaign(
-    moves: Sequence[Move],
-    sightings: Sequence[Sighting],
-    rig: RigTable,
-    header: dict[str, object] | None = None,
-    path: Path | None = None,
-) -> Campaign:
-    """A campaign of a head with sightings in place of spots: they have the attributes that all looks share."""
-    looks = cast(tuple[Spot, ...], tuple(sightings))
-    return Campaign(tuple(moves), looks, NO_STEREO, rig, header or {}, path)
+    if stereo is None:
+        looks = parse_sightings(files[SIGHTINGS.file], SIGHTINGS.file, len(moves))
+        return Campaign(moves, looks, None, rig, header, path)
+    return Campaign(moves, parse_spots(files["spots.csv"], "spots.csv", len(moves), stereo), stereo, rig, header, path)
 
 
 def read_campaign(folder: Path | str) -> Campaign:
@@ -477,8 +476,9 @@ def read_campaign(folder: Path | str) -> Campaign:
             "make a campaign of each: a stereo pair sees the spots of the one, the head says where the other pointed"
         )
         raise refusal("two-tables", file=SIGHTINGS.file, found=found, allowed=allowed, remedy=remedy)
-    bytes_max = _FILES_OF_SIGHTINGS if sightings else _FILES
-    return _parse_files({name: read_bytes(folder / name, cap, folder) for name, cap in bytes_max.items()}, folder)
+    tables = (MOVES.file, SIGHTINGS.file) if sightings else ("stereo.json", MOVES.file, SPOTS.file)
+    paths = [folder / name for name in (*tables, "campaign.toml")]
+    return _parse_files({path.name: read_bytes(path, _BYTES_MAX[path.suffix], folder) for path in paths}, folder)
 
 
 def _no_campaign(folder: Path) -> InputError:
@@ -517,21 +517,15 @@ def moves_bytes(moves: Iterable[Move]) -> bytes:
     return MOVES.content(moves)
 
 
-def spots_bytes(spots: Iterable[Spot]) -> bytes:
+def spots_bytes(spots: Iterable[Look]) -> bytes:
     """The content of `spots.csv`; the correlations appear only where one is not zero."""
-    return SPOTS.content(spots)
-
-
-def looks_file(campaign: Campaign) -> str:
-    """Name of the file with the campaign's looks."""
-    return SIGHTINGS.file if campaign.rig.mechanism.sightings else SPOTS.file
+    return SPOTS.content(stereo_spots(spots))
 
 
 def looks_bytes(campaign: Campaign, ordered: bool = False) -> bytes:
     """The content of `spots.csv` or `sightings.csv`; `ordered` by id."""
     rows = sorted(campaign.spots, key=lambda row: row.spot) if ordered else campaign.spots
-    kind: CsvKind = SIGHTINGS if campaign.rig.mechanism.sightings else SPOTS
-    return kind.content(rows)
+    return campaign.looks_table.content(rows)
 
 
 def campaign_toml(campaign: Campaign) -> bytes:
@@ -550,11 +544,10 @@ def campaign_bytes(campaign: Campaign) -> dict[str, bytes]:
     Raises:
         InputError: `read_campaign` would refuse the files.
     """
-    tables = moves_bytes(campaign.moves), looks_bytes(campaign)
-    sightings = campaign.rig.mechanism.sightings
-    cameras = () if sightings else (stereo_bytes(campaign.stereo),)
-    names = _FILES_OF_SIGHTINGS if sightings else _FILES
-    files = dict(zip(names, (*cameras, *tables, campaign_toml(campaign)), strict=True))
+    files = {} if campaign.stereo is None else {"stereo.json": stereo_bytes(campaign.stereo)}
+    files |= {MOVES.file: moves_bytes(campaign.moves), campaign.looks_table.file: looks_bytes(campaign)}
+    # Written last: a folder without it is incomplete.
+    files["campaign.toml"] = campaign_toml(campaign)
     _parse_files(files, None)
     return files
 
@@ -580,18 +573,19 @@ def input_hashes(campaign: Campaign) -> dict[str, str]:
     contents = {
         "moves": moves_bytes(campaign.moves),
         "spots": looks_bytes(campaign, ordered=True),
-        "stereo": b"" if campaign.rig.mechanism.sightings else stereo_bytes(campaign.stereo),
+        "stereo": b"" if campaign.stereo is None else stereo_bytes(campaign.stereo),
         "rig": rig_table_toml(campaign.rig).encode(),
     }
     return {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
 
 
-def ordered_spots(campaign: Campaign) -> list[Spot]:
-    """Spots, or sightings, with status ok in the order in which the filter takes them."""
+def ordered_spots(campaign: Campaign) -> list[Look]:
+    """Looks with status ok in the order in which the filter takes them."""
     ok = [s for s in campaign.spots if s.status == "ok"]
     return sorted(ok, key=lambda s: (s.move, s.spot))
 
 
-def pixels_of(spots: Iterable[Spot]) -> np.ndarray:
-    """`PIXELS` of the spots, shape (spots, 4); NaN for missing values."""
-    return np.array([[getattr(spot, name) for name in PIXELS] for spot in spots], dtype=float).reshape(-1, 4)
+def pixels_of(spots: Iterable[Look]) -> np.ndarray:
+    """`PIXELS` of the spots, shape (spots, 4); NaN for missing values. Refuses sightings as `stereo_spots`."""
+    rows = [[getattr(spot, name) for name in PIXELS] for spot in stereo_spots(spots)]
+    return np.array(rows, dtype=float).reshape(-1, 4)

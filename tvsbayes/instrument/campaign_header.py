@@ -67,7 +67,7 @@ def parse_header(keys: Keys) -> dict[str, object]:
     return header
 
 
-def mechanism_of(folder: Path) -> str:
+def mechanism_key(folder: Path) -> str:
     """The instrument of a campaign folder, by `format` and `[rig] mechanism` of its `campaign.toml`.
 
     A file `sightings.csv` means a head with sightings in place of spots. An unreadable folder counts as a scanner's:

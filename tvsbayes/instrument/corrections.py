@@ -14,7 +14,7 @@ from typing import Any
 
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.axes import AXES, Axis
-from tvsbayes.instrument.campaign import CAMERAS, PIXELS, Move, Spot
+from tvsbayes.instrument.campaign import CAMERAS, PIXELS, Look, Move, Spot, stereo_spots
 
 _SHIFT = re.compile(r"([+-]?[0-9]{1,9})(?:@([0-9]{1,9}))?")
 
@@ -51,12 +51,12 @@ class CorrectedTables:
     """Corrected tables.
 
     Attributes:
-        moves, spots: rows of `moves.csv` and `spots.csv`; None where the table is missing.
+        moves, spots: rows of `moves.csv` and of the looks; None where the table is missing.
         changes: the changes, in words.
     """
 
     moves: tuple[Move, ...] | None
-    spots: tuple[Spot, ...] | None
+    spots: tuple[Look, ...] | None
     changes: tuple[str, ...]
 
 
@@ -88,13 +88,13 @@ def shift_of(text: str) -> Shift:
 
 
 def corrected(
-    moves: Sequence[Move] | None, spots: Sequence[Spot] | None, correction: Correction, count: int | None = None
+    moves: Sequence[Move] | None, spots: Sequence[Look] | None, correction: Correction, count: int | None = None
 ) -> CorrectedTables:
     """Apply a correction to tables.
 
     Args:
         moves: rows of `moves.csv`; None where they are not to be written.
-        spots: rows of `spots.csv`, in the order of the file; None where they are not to be written.
+        spots: rows of `spots.csv` or `sightings.csv`, in the order of the file; None where they are not to be written.
         correction: the changes.
         count: number of moves, where `moves` is None.
 
@@ -116,15 +116,15 @@ def corrected(
         name = f"{axis}_steps"
         new_moves = tuple(replace(move, **{name: -getattr(move, name)}) for move in new_moves or ())
         changes.append(f"{name}: written with the other sign; approaches stay, they say how the beam moved")
-    looks = None if spots is None else tuple(spots)
+    looks: tuple[Look, ...] | None = None if spots is None else tuple(spots)
     for shift in correction.shifts if looks is not None else ():
         looks, sentence = _shifted(looks or (), shift, count if new_moves is None else len(new_moves))
         changes.append(sentence)
     if looks is not None and correction.swapped:
-        looks = tuple(map(_swapped, looks))
+        looks = tuple(map(_swapped, stereo_spots(looks)))
         changes.append("left and right: centres exchanged, with their uncertainties")
     if looks is not None and correction.pixels_from:
-        looks = tuple(_from_zero(spot, correction.pixels_from) for spot in looks)
+        looks = tuple(_from_zero(spot, correction.pixels_from) for spot in stereo_spots(looks))
         changes.append(f"pixels: {correction.pixels_from} taken from all centres")
     return CorrectedTables(new_moves, looks, tuple(changes))
 
@@ -142,7 +142,7 @@ def _absolute(moves: tuple[Move, ...]) -> tuple[Move, ...]:
 _COUNTERS = tuple(f"{axis}_steps" for axis in AXES)
 
 
-def _shifted(spots: tuple[Spot, ...], shift: Shift, count: int | None) -> tuple[tuple[Spot, ...], str]:
+def _shifted(spots: tuple[Look, ...], shift: Shift, count: int | None) -> tuple[tuple[Look, ...], str]:
     """Assign looks to other moves; a look whose new move is missing keeps its number and is excluded by its status."""
     first_key = (-1, -1)
     if shift.spot is not None:
@@ -152,7 +152,7 @@ def _shifted(spots: tuple[Spot, ...], shift: Shift, count: int | None) -> tuple[
             raise InputError("usage", f"--shift-moves {shift.moves}@{shift.spot}: no such spot", remedy=remedy)
         first_key = keys[0]
     last = max((spot.move for spot in spots), default=0) if count is None else count - 1
-    shifted, lost = [], 0
+    shifted, lost = list[Look](), 0
     for spot in spots:
         if (spot.move, spot.spot) < first_key:
             shifted.append(spot)

@@ -121,8 +121,3 @@ WORDS: tuple[str, ...] = tuple(dict.fromkeys(mechanism.word for mechanism in MEC
 def mechanism_by_key(key: str) -> Mechanism:
     """The entry of the list."""
     return MECHANISMS[key]
-
-
-def mechanism_of(word: str, sightings: bool) -> Mechanism:
-    """The mechanism by its word in files and the kind of looks; the scanner has no sightings."""
-    return next(m for m in MECHANISMS.values() if (m.word, m.sightings) == (word, sightings))

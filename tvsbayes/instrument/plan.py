@@ -21,6 +21,7 @@ from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.instrument.axes import AXES, HOME_APPROACH, Axis, PanApproach, TiltApproach, direction_of
 from tvsbayes.instrument.campaign import Move, check_experiments, next_move
 from tvsbayes.instrument.counter_limits import COUNTER_MAX
+from tvsbayes.instrument.mechanisms import TWO_MIRROR, Mechanism
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stops import rests_of
 
@@ -63,7 +64,7 @@ _PLAN_ACTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def _check_actions(table: Table, values: Values, sheets: bool = True) -> None:
+def _check_actions(table: Table, values: Values, sheets: bool) -> None:
     """Refuse an action without its columns or with another's, and a look before a placement where sheets are used."""
     check_experiments(table, values["experiment"], values["point"], [True] * len(table))
     targets, sheet = values["target"], ""
@@ -83,32 +84,32 @@ def _check_actions(table: Table, values: Values, sheets: bool = True) -> None:
             raise table.refuse(row, "target", "target", allowed, "place the target first")
 
 
-def parse_plan(data: bytes, file: str = PLANS.file, sheets: bool = True) -> tuple[PlanStep, ...]:
+def parse_plan(data: bytes, file: str = PLANS.file, mechanism: Mechanism = TWO_MIRROR) -> tuple[PlanStep, ...]:
     """The checked rows of `plan.csv`; see `read_plan`."""
-    steps = PLANS.parse(data, file, partial(_check_actions, sheets=sheets))
+    steps = PLANS.parse(data, file, partial(_check_actions, sheets=not mechanism.sightings))
     return tuple(
         replace(step, pan_steps=step.pan_steps or 0, tilt_steps=step.tilt_steps or 0) if step.action == "home" else step
         for step in steps
     )
 
 
-def read_plan(path: Path, sheets: bool = True) -> tuple[PlanStep, ...]:
+def read_plan(path: Path, mechanism: Mechanism = TWO_MIRROR) -> tuple[PlanStep, ...]:
     """Read `plan.csv`: home (counters default to 0), place, move and look steps in order.
 
     Args:
         path: the file.
-        sheets: looks need placed sheets; a head with sightings has no sheets.
+        mechanism: the plan's; a head with sightings looks without placed sheets.
 
     Raises:
         InputError: wrong order, an action without its columns or with another's, a look before a placement.
     """
-    return parse_plan(read_bytes(path, CSV_BYTES_MAX), escaped(Path(path).name), sheets)
+    return parse_plan(read_bytes(path, CSV_BYTES_MAX), escaped(Path(path).name), mechanism)
 
 
-def write_plan(steps: Sequence[PlanStep], path: Path, sheets: bool = True) -> None:
+def write_plan(steps: Sequence[PlanStep], path: Path, mechanism: Mechanism = TWO_MIRROR) -> None:
     """Write `plan.csv` atomically; refuse steps that `read_plan` would refuse."""
     data = PLANS.content(steps)
-    parse_plan(data, escaped(Path(path).name), sheets)
+    parse_plan(data, escaped(Path(path).name), mechanism)
     write_atomically(path, data)
 
 

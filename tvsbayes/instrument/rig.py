@@ -16,7 +16,7 @@ from tvsbayes.files.disk import read_bytes
 from tvsbayes.files.documents import TOML_BYTES_MAX, Keys, parse_toml, toml_line
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, FULL_TURN_DEG
 from tvsbayes.instrument.counter_limits import COUNTER_MAX, HOME_KEYS, LIMIT_KEYS, CounterLimits
-from tvsbayes.instrument.mechanisms import HEAD, MECHANISMS, TWO_MIRROR, WORDS, Mechanism, mechanism_of
+from tvsbayes.instrument.mechanisms import HEAD, MECHANISMS, TWO_MIRROR, WORDS, Mechanism
 from tvsbayes.instrument.parameters import (
     AMPLITUDE_NAMES,
     HARMONIC_NAMES,
@@ -28,7 +28,7 @@ from tvsbayes.instrument.parameters import (
     Prior,
     parameter_of,
 )
-from tvsbayes.instrument.stereo_pair import NO_STEREO, Stereo, read_stereo
+from tvsbayes.instrument.stereo_pair import Stereo, WithStereo, read_stereo
 
 SPOT_SD_PX = 0.08
 """Default standard uncertainty of a spot centre."""
@@ -74,7 +74,7 @@ class RigTable:
 
 
 @dataclass(frozen=True)
-class Rig:
+class Rig(WithStereo):
     """A rig file: the declared rig, its stereo calibration, and the drivers of the hardware.
 
     `truth` is the distribution from which `simulate` and `study` draw true rigs; names absent from `[truth]` take the
@@ -85,7 +85,7 @@ class Rig:
     """
 
     table: RigTable
-    stereo: Stereo
+    stereo: Stereo | None
     truth: dict[str, Prior]
     sheets_mm: dict[str, float]
     positioner: dict[str, Setting]
@@ -274,14 +274,14 @@ _OWN_KEYS = ("aperture_convention", "mechanism", "prior")
 """Keys of `[rig]` without a value and a u."""
 
 
-def _mechanism(table: Keys, sightings: bool) -> Mechanism:
+def _stated_mechanism(table: Keys, sightings: bool) -> Mechanism:
     """The mechanism by its key in `[rig]`."""
     word = table.word("mechanism", WORDS) if "mechanism" in table else TWO_MIRROR.word
     if sightings and word == TWO_MIRROR.word:
         remedy = 'write mechanism = "pan-tilt" into [rig]; a scanner needs stereo.json and spots.csv instead'
         allowed = "a pan-tilt head where there are sightings and no stereo pair"
         raise table.refuse("mechanism", "mechanism", allowed, remedy, f"a {word} instrument")
-    return mechanism_of(word, sightings)
+    return next(kind for kind in MECHANISMS.values() if (kind.word, kind.sightings) == (word, sightings))
 
 
 def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
@@ -295,7 +295,7 @@ def parse_rig_table(table: Keys, sightings: bool = False) -> RigTable:
         InputError: unknown or misplaced names, entries that are not { value, u }, values out of range,
             a half-normal with a value other than 0, harmonics or amplitudes without a period, a period with u > 0.
     """
-    mechanism = _mechanism(table, sightings)
+    mechanism = _stated_mechanism(table, sightings)
     declared_names, prior_names = (_names_at(place, mechanism) for place in ("rig", "rig.prior"))
     extra = {k: v for k, v in table.values.items() if k not in _OWN_KEYS}
     own_keys = Keys(extra, table.file, table.text, table.path)
@@ -411,7 +411,7 @@ def _parse_positioner(table: Keys) -> dict[str, Setting]:
     return {**values, **steps, **_parse_options(table)}
 
 
-def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, Setting]:
+def _parse_cameras(table: Keys, stereo: Stereo | None) -> dict[str, Setting]:
     """`[cameras]`: driver, devices, size (that of the calibration), exposure, spot uncertainty, `options`."""
     numbers = {"exposure": (-100.0, 1e9), "spot_sd_px": (1e-4, 100.0), "sighting_sd_deg": (1e-7, 30.0)}
     table.only(("driver", "source", "left", "right", "width", "height", *numbers, "options"))
@@ -422,16 +422,17 @@ def _parse_cameras(table: Keys, stereo: Stereo) -> dict[str, Setting]:
         if key in table:
             is_name = isinstance(table.values[key], str)
             values[key] = table.text_value(key) if is_name else table.integer(key, 0, 1000)
-    if stereo.right_image_size is not None:
+    if stereo is not None and stereo.right_image_size is not None:
         remedy = "record with the cameras' own program, then `tvsbayes new --pictures FOLDER`"
         found = "a stereo file of two picture sizes"
         raise table.refuse("stereo", "image-size", "cameras of one picture size", remedy, found)
-    for key, calibrated in (("width", stereo.image_width), ("height", stereo.image_height)):
+    calibrated = {} if stereo is None else {"width": stereo.image_width, "height": stereo.image_height}
+    for key in ("width", "height"):
         if key in table:
-            values[key] = table.integer(key, 1, 65_535)
-            if values[key] != calibrated:
+            size = values[key] = table.integer(key, 1, 65_535)
+            if size != calibrated.get(key, size):
                 remedy = "calibrate and observe at one image size"
-                raise table.refuse(key, "image-size", f"{calibrated} px, as in the stereo file", remedy)
+                raise table.refuse(key, "image-size", f"{calibrated[key]} px, as in the stereo file", remedy)
     values |= {key: table.number(key, *limits) for key, limits in numbers.items() if key in table}
     return values
 
@@ -461,7 +462,7 @@ def read_rig(path: Path) -> Rig:
     header = {key: keys.text_value(key, length) for key, length in (("name", 200), ("notes", 2000)) if key in keys}
     sightings = "stereo" not in keys and keys.table("rig").values.get("mechanism") == HEAD.word
     table = parse_rig_table(keys.table("rig"), sightings)
-    stereo = NO_STEREO if sightings else read_stereo(_file_beside(keys, "stereo", path.parent), folder=path.parent)
+    stereo = None if sightings else read_stereo(_file_beside(keys, "stereo", path.parent), folder=path.parent)
     sheets = keys.table("sheets")
     for name in sheets.values:
         if not (name.isprintable() and 0 < len(name) <= 100):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -44,32 +44,19 @@ class Sighting:
         ),
     ] = None
     status: Annotated[str, Column("`ok`, or a reason in words", chars_max=200, filled=True)] = "ok"
+    target: ClassVar[str] = ""
+    """Without a name: a head has no sheets."""
+    aperture_deg: ClassVar[None] = None
+    """A head has no receiver."""
 
     @property
     def spot(self) -> int:
         """Its id, under the name used for all looks."""
         return self.sighting
 
-    @property
-    def target(self) -> str:
-        """A sighting has no sheet."""
-        return ""
-
-    @property
-    def experiment(self) -> None:
-        """The four-point method needs spots."""
-
-    @property
-    def point(self) -> None:
-        """As `experiment`."""
-
     def renumbered(self, number: int, move: int) -> Sighting:
         """The sighting with another id, after another move."""
         return replace(self, sighting=number, move=move)
-
-    @property
-    def aperture_deg(self) -> None:
-        """None: a head has no receiver."""
 
 
 SIGHTINGS = CsvKind(Sighting, "sightings.csv", "a row for every sighting, in any order")

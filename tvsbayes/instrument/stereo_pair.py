@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tvsbayes.errors import InputError, escaped, shown
+from tvsbayes.errors import InputError, escaped, refusal, shown
 from tvsbayes.files.disk import read_bytes, write_atomically
 from tvsbayes.files.documents import JSON_BYTES_MAX, Keys, parse_json
 from tvsbayes.instrument.parameters import STEREO_PARAMETER_NAMES
@@ -151,12 +151,37 @@ class Stereo:
         )
 
 
-NO_STEREO = Stereo(
-    *(1, 1, np.eye(3), np.zeros(5), np.eye(3), np.zeros(5), np.eye(3), np.zeros(3)),
-    parameter_covariance=np.zeros((len(STEREO_PARAMETER_NAMES),) * 2),
-    rms_px=0.0,
-)
-"""Placeholder for the cameras of an instrument that has none: exactly known."""
+class WithStereo:
+    """Base of what has a stereo pair or, of a head with sightings, None."""
+
+    stereo: Stereo | None
+
+    @property
+    def stereo_pair(self) -> Stereo:
+        """Its stereo pair.
+
+        Raises:
+            InputError: it has none.
+        """
+        if self.stereo is None:
+            raise no_stereo_pair()
+        return self.stereo
+
+
+def no_stereo_pair() -> InputError:
+    """The refusal of sightings where spots and cameras are needed."""
+    found, allowed = "sightings of a head, without cameras", "spots that a stereo pair sees"
+    remedy = "give a campaign with stereo.json and spots.csv; `tvsbayes fit`, then `report`, show this one"
+    return refusal("no-stereo", file="sightings.csv", found=found, allowed=allowed, remedy=remedy)
+
+
+def stereo_parameters(stereo: Stereo | None) -> tuple[np.ndarray, np.ndarray]:
+    """The 24 parameters and their covariance (24, 24); of no pair those of an ideal one, exactly known."""
+    if stereo is None:
+        ideal = np.zeros(24)
+        ideal[[0, 1, 9, 10]] = 1.0
+        return ideal, np.zeros((24, 24))
+    return stereo.vector, np.asarray(stereo.parameter_covariance, float)
 
 
 def rotation_matrix(rotation_vector_rad: np.ndarray) -> np.ndarray:

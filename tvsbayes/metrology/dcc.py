@@ -192,7 +192,7 @@ def _statements(campaign: Campaign, fit: FitRecord, when: Performance, parties: 
 
 def _cameras(campaign: Campaign) -> str:
     """Describe the camera pair in words."""
-    declared, stereo = header_table(campaign, "traceability"), campaign.stereo
+    declared, stereo = header_table(campaign, "traceability"), campaign.stereo_pair
     text = f"2 x {stereo.image_width} x {stereo.image_height} px, calibration residual {stereo.rms_px:.3g} px rms"
     if stereo.assumed:
         text += "; covariance of the calibration assumed, not estimated"

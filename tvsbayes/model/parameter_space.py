@@ -35,7 +35,7 @@ from tvsbayes.instrument.parameters import (
     RIG_NAMES,
 )
 from tvsbayes.instrument.rig import RigTable
-from tvsbayes.instrument.stereo_pair import Stereo
+from tvsbayes.instrument.stereo_pair import Stereo, stereo_parameters
 from tvsbayes.model.compiled import placed
 from tvsbayes.model.gear_processes import GearScales
 from tvsbayes.model.geometry import Scalar, StereoCameras, Vector, materialise
@@ -310,10 +310,10 @@ def model_of(
     )
 
 
-def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
+def parameter_space(table: RigTable, stereo: Stereo | None) -> ParameterSpace:
     """Build the arrays of the priors of `[rig]` and of the stereo calibration."""
     priors = [table.priors[name] for name in table.mechanism.rig_names]
-    covariance = np.asarray(stereo.parameter_covariance, dtype=np.float64)
+    cameras, covariance = stereo_parameters(stereo)
     scale = np.sqrt(np.diag(covariance))
     # Standard deviations span 1e-5 (rad) to 1 (px): the root is that of the correlation matrix. Zero rows (fixed
     # parameters) stay zero.
@@ -325,7 +325,7 @@ def parameter_space(table: RigTable, stereo: Stereo) -> ParameterSpace:
         value=placed(np.array([float(p.value) for p in priors])),
         u=placed(np.array([float(p.u) for p in priors])),
         kind=placed(np.array([KINDS.index(p.distribution) for p in priors])),
-        stereo_mean=placed(stereo.vector),
+        stereo_mean=placed(cameras),
         stereo_root=placed(root),
         harmonic_period_deg=placed(np.stack([_periods_deg(table, axis) for axis in AXES])),
         key=table.mechanism.key,

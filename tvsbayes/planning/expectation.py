@@ -306,7 +306,7 @@ def design_arrays(
 
 def largest_px(rig: Rig) -> np.ndarray | None:
     """Return the largest (u, v, u, v) inside the images of a rig, shape (4,); None for a head with sightings."""
-    if rig.table.mechanism.sightings:
+    if rig.stereo is None:
         return None
     return np.tile([rig.stereo.image_width - 1.0, rig.stereo.image_height - 1.0], 2)
 

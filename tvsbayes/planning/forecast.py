@@ -60,7 +60,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
     for physical in instruments.physical[:CLASSIC_DRAWS]:
         parameters = dict(zip(rig.table.mechanism.names, map(float, physical), strict=True))
         noise_free = dict.fromkeys([*names_of("stop_sd_deg", "look_scatter_deg"), "pixel_scale"], 0.0)
-        stereo = rig.stereo.with_vector(physical[len(RIG_NAMES) :])
+        stereo = rig.stereo_pair.with_vector(physical[len(RIG_NAMES) :])
         simulated = simulate(rig, plan, 0, Truth(with_derived({**parameters, **noise_free}), stereo))
         selection = select_experiments(simulated.campaign)
         # The second experiment of each direction starts like all later ones, unlike the first.
@@ -79,7 +79,7 @@ def classic_forecast(knowledge: Knowledge, instruments: Instruments) -> ClassicF
         campaign = simulated.campaign if campaign is None else campaign
     if campaign is None:
         return None
-    slopes = ratio_slopes(np.concatenate(pixels), np.concatenate(steps), np.concatenate(axes), rig.stereo)
+    slopes = ratio_slopes(np.concatenate(pixels), np.concatenate(steps), np.concatenate(axes), rig.stereo_pair)
     ratio = slopes.ratio.reshape(-1, len(DIRECTIONS))
     by_pixel = np.sum(slopes.by_pixel**2, axis=(1, 2)).reshape(ratio.shape)
     stop_variance = np.array(stops) + np.array(stops)[:, [1, 0, 3, 2]] + 2 * factor * np.array(looks)

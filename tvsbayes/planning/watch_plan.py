@@ -31,7 +31,7 @@ from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.estimators.linear_spots import LinearSpots, stop_information
 from tvsbayes.estimators.noise_scales import noise_draws
 from tvsbayes.instrument.axes import AXES
-from tvsbayes.instrument.campaign import Campaign, Spot, ordered_spots, pixels_of
+from tvsbayes.instrument.campaign import Campaign, Look, ordered_spots, pixels_of
 from tvsbayes.instrument.homing import homed
 from tvsbayes.instrument.parameters import INDEX, NAMES
 from tvsbayes.instrument.plan import PlanBuilder, PlanStep, plan_seconds, run_plan
@@ -60,10 +60,10 @@ class Candidate:
     steps: tuple[int, int]
     side: tuple[int, int]
     target: str
-    spot: Spot
+    spot: Look
 
 
-def _candidates(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> list[Candidate]:
+def _candidates(campaign: Campaign, spots: Sequence[Look], used: np.ndarray) -> list[Candidate]:
     """List one look of each kind, at most `CANDIDATES_MAX` on a sheet, outermost counters first."""
     rests = [rests_of(campaign.moves, axis) for axis in AXES]
     by_place: dict[tuple, Candidate] = {}
@@ -98,13 +98,13 @@ class Pattern:
         return sum(map(len, self.looks.values()))
 
 
-def _rig_of(campaign: Campaign, spots: Sequence[Spot], used: np.ndarray) -> Rig:
+def _rig_of(campaign: Campaign, spots: Sequence[Look], used: np.ndarray) -> Rig:
     """Build a rig from a campaign: sheets at the depths of its spots, default costs."""
     sheets: dict[str, float] = {}
     for name in () if campaign.rig.mechanism.sightings else dict.fromkeys(spot.target for spot in spots):
         sheet_spots = [spot for spot, use in zip(spots, used, strict=True) if use and spot.target == name]
         if sheet_spots:
-            sheets[name] = float(np.median(triangulate(campaign.stereo, pixels_of(sheet_spots))[:, 0]))
+            sheets[name] = float(np.median(triangulate(campaign.stereo_pair, pixels_of(sheet_spots))[:, 0]))
     return Rig(campaign.rig, campaign.stereo, campaign.rig.priors, sheets, {}, {}, dict(COSTS_S))
 
 
@@ -247,7 +247,7 @@ class WatchDesigns:
         """Build the plan: each sheet placed once, with the pattern after every homing."""
         return tuple(step for step, _ in self._ordered(pattern, homings))
 
-    def _ordered(self, pattern: Pattern, homings: int) -> list[tuple[PlanStep, Spot | None]]:
+    def _ordered(self, pattern: Pattern, homings: int) -> list[tuple[PlanStep, Look | None]]:
         """Build the steps with the campaign's spot of each look."""
         plan, counts = PlanBuilder(), {}
         for sheet, looks in pattern.looks.items():

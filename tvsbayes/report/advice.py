@@ -106,9 +106,9 @@ def noise_line(summary: FitSummary) -> str | None:
     return f"{stated.format(f'{scale:.2g}')}; the fit allows for it: state {worse} ones if you know them"
 
 
-def assumed_stereo(stereo: Stereo, budgets: Sequence[BudgetTable]) -> str | None:
+def assumed_stereo(stereo: Stereo | None, budgets: Sequence[BudgetTable]) -> str | None:
     """Shares of an assumed stereo covariance in the results' variances, and its remedy; None for an estimated one."""
-    if not stereo.assumed:
+    if stereo is None or not stereo.assumed:
         return None
     cause = REGISTRY[STEREO_PARAMETER_NAMES[0]].cause
     shares = [

@@ -15,6 +15,7 @@ import numpy as np
 from tvsbayes.errors import listed
 from tvsbayes.estimators.four_point import ClassicResult, DirectionResult, select_experiments
 from tvsbayes.instrument.axes import DIRECTIONS, SENSES, Axis
+from tvsbayes.instrument.campaign import Campaign, stereo_spots
 from tvsbayes.report.drawing import (
     BLACK,
     BLUE,
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tvsbayes.coordinates.error_map import ErrorMap
-    from tvsbayes.instrument.campaign import Campaign
     from tvsbayes.metrology.look_budget import Budget
     from tvsbayes.results.comparison_record import ComparisonRecord, Gap
     from tvsbayes.results.estimates import Cause, Curves, Estimate, FitSummary, StopResidual
@@ -187,7 +187,7 @@ def setup(
         baseline_mm: baseline of the TVS, for the caption of the positioner.
     """
     points = campaign.usable_points_mm
-    right = -campaign.stereo.R.T @ campaign.stereo.T
+    right = -campaign.stereo_pair.R.T @ campaign.stereo_pair.T
     right_s = np.array([right[2], -right[0], -right[1]])
     with drawing(5.4) as figure:
         panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
@@ -213,7 +213,7 @@ def coverage(campaign: Campaign) -> Figure:
     """Draw the coverage of the data: counters seen, and spots in both images."""
     from matplotlib.patches import Rectangle
 
-    spots = [spot for spot in campaign.spots if spot.status == "ok"]
+    spots = [spot for spot in stereo_spots(campaign.spots) if spot.status == "ok"]
     moves = {move.move: move for move in campaign.moves}
     counters = np.array([(moves[s.move].pan_steps, moves[s.move].tilt_steps) for s in spots]).reshape(-1, 2)
     with drawing(5.6) as figure:
@@ -224,7 +224,7 @@ def coverage(campaign: Campaign) -> Figure:
         for side, colour, marker in (("left", GREEN, "s"), ("right", RED, "^")):
             u, v = ([getattr(s, f"{c}_{side}_px") for s in spots] for c in "uv")
             panels[1].plot(u, v, marker, color=colour, markersize=2.5, label=f"{side} image", rasterized=True)
-        width, height = campaign.stereo.image_width, campaign.stereo.image_height
+        width, height = campaign.stereo_pair.image_width, campaign.stereo_pair.image_height
         panels[1].add_patch(Rectangle((0, 0), width, height, fill=False, color=GREY))
         panels[1].set(xlabel="u, px", ylabel="v, px", title="spots in the images; frame: the sensor")
         panels[1].set(xlim=(-0.02 * width, 1.02 * width), ylim=(1.02 * height, -0.02 * height))

@@ -65,7 +65,7 @@ class StudyJob:
             version("tvsbayes"),
             rig_table_toml(rig.table),
             json.dumps({name: [p.value, p.u, p.distribution] for name, p in sorted(rig.truth.items())}),
-            "" if rig.table.mechanism.sightings else stereo_bytes(rig.stereo).decode(),
+            "" if rig.stereo is None else stereo_bytes(rig.stereo).decode(),
             json.dumps([sorted(rig.sheets_mm.items()), rig.look_sd, sorted(rig.costs_s.items())]),
             json.dumps([[s.action, s.pan_steps, s.tilt_steps, s.target, s.experiment, s.point] for s in self.steps]),
             json.dumps([self.target.text, self.seed, self.aperture]),

@@ -108,18 +108,18 @@ def write_frames(
 def _board_poses(simulated: SimulatedCampaign, seed: int, views: int | None) -> list[BoardPose]:
     """Draw the poses of the board, view by view."""
     views = BOARD_VIEWS if views is None else views
-    return board_poses(cameras_of(simulated.truth.stereo), Board(), views, seed) if views else []
+    return board_poses(cameras_of(simulated.truth.stereo_pair), Board(), views, seed) if views else []
 
 
 def _render(
     folder: Path, simulated: SimulatedCampaign, seed: int, poses: list[BoardPose], progress: Show | None
 ) -> int:
     """Write the pictures of `write_frames`, for boards at these poses."""
-    visible, board = cameras_of(simulated.truth.stereo), Board()
+    visible, board = cameras_of(simulated.truth.stereo_pair), Board()
     make_folder(folder / "frames")
     if poses:
         make_folder(folder / "boards")
-    infrared = cameras_of(simulated.truth.stereo, simulated.truth.parameters["focal_scale"])
+    infrared = cameras_of(simulated.truth.stereo_pair, simulated.truth.parameters["focal_scale"])
     looks, boards = _Looks(folder, simulated, infrared, seed), _Boards(folder, board, poses, visible, seed)
     jobs = [partial(boards.write, number) for number in range(len(poses))]
     jobs += [partial(looks.write, row) for row in range(len(simulated.campaign.spots))]

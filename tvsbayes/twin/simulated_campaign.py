@@ -17,7 +17,7 @@ import numpy as np
 from tvsbayes.display import Shown, View
 from tvsbayes.files.disk import make_folder, write_atomically
 from tvsbayes.instrument.axes import FULL_TURN_DEG, HOME_APPROACH, HOME_SD_DEG, SIDES, PanApproach, TiltApproach
-from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Move, Spot, campaign_bytes, sighted_campaign, with_pixels
+from tvsbayes.instrument.campaign import UNDETECTED, Campaign, Move, Spot, campaign_bytes, stereo_spots, with_pixels
 from tvsbayes.instrument.conditions import powered_on_s
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.plan import PlanLog, PlannedLook, PlanStep, run_plan
@@ -69,7 +69,7 @@ class SimulatedCampaign(Shown):
 
     def undetected(self) -> SimulatedCampaign:
         """Return the same run before detection in its pictures: no pixels, status "undetected"."""
-        spots = tuple(with_pixels(spot, UNDETECTED) for spot in self.campaign.spots)
+        spots = tuple(with_pixels(spot, UNDETECTED) for spot in stereo_spots(self.campaign.spots))
         return replace(self, campaign=replace(self.campaign, spots=spots))
 
     def files(self) -> dict[str, bytes]:
@@ -156,30 +156,26 @@ def simulate(
         log.moves = [replace(move, temperature_degC=one) for move, one in zip(log.moves, measured, strict=True)]
     driven = _drive(log.moves, truth, rig.table.first_period_deg, streams, powered_on_s(full_header))
     truth = replace(driven.truth, homing_side=home_approach)
-    if rig.table.mechanism.sightings:
-        sightings = _sightings(log, rig, truth, streams)
-        ok = [row.move for row in sightings]
-        pan, tilt = driven.resting_deg[ok].mean(axis=0) if ok else (0.0, 0.0)
-        truth = replace(truth, reference_pose_deg=(float(pan), float(tilt)) if ok else None)
-        moves = log.moves if sides_recorded else [_unrecorded(move) for move in log.moves]
-        none = np.zeros((0, 3))
-        campaign = sighted_campaign(moves, sightings, rig.table, full_header)
-        return SimulatedCampaign(campaign, truth, Light(none, none, none, none))
-    light = _light(log, rig, truth, streams)
-    pixels = project(light.points_mm, truth.stereo, truth.parameters["focal_scale"])
-    noise_px = truth.parameters["pixel_scale"] * sd_px * streams.pixels.standard_normal(pixels.shape)
-    pixels = inside_images(pixels + noise_px, truth.stereo)
-    angles = _aperture_deg(light, truth.parameters, rig, streams.aperture) if aperture else [None] * len(pixels)
-    spots = tuple(
-        _spot(number, look, log.targets[look.placement], pixels[number], sd_px, angles[number])
-        for number, look in enumerate(log.looks)
-    )
-    moves_seen = [look.move for look, spot in zip(log.looks, spots, strict=True) if spot.status == "ok"]
+    looks: tuple[Spot | Sighting, ...]
+    if rig.stereo is None:
+        light = Light(*[np.zeros((0, 3))] * 4)
+        looks = _sightings(log, rig, truth, streams)
+    else:
+        light = _light(log, rig, truth, streams)
+        pixels = project(light.points_mm, truth.stereo_pair, truth.parameters["focal_scale"])
+        noise_px = truth.parameters["pixel_scale"] * sd_px * streams.pixels.standard_normal(pixels.shape)
+        pixels = inside_images(pixels + noise_px, truth.stereo_pair)
+        angles = _aperture_deg(light, truth.parameters, rig, streams.aperture) if aperture else [None] * len(pixels)
+        looks = tuple(
+            _spot(number, look, log.targets[look.placement], pixels[number], sd_px, angles[number])
+            for number, look in enumerate(log.looks)
+        )
+    moves_seen = [look.move for look in looks if look.status == "ok"]
     if moves_seen:
         pan, tilt = driven.resting_deg[moves_seen].mean(axis=0)
         truth = replace(truth, reference_pose_deg=(float(pan), float(tilt)))
     moves = log.moves if sides_recorded else [_unrecorded(move) for move in log.moves]
-    campaign = Campaign(tuple(moves), spots, rig.stereo, rig.table, full_header)
+    campaign = Campaign(tuple(moves), looks, rig.stereo, rig.table, full_header)
     return SimulatedCampaign(campaign, truth, light)
 
 

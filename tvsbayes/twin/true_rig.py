@@ -27,7 +27,7 @@ from tvsbayes.instrument.parameters import (
     Prior,
 )
 from tvsbayes.instrument.rig import Rig
-from tvsbayes.instrument.stereo_pair import Stereo
+from tvsbayes.instrument.stereo_pair import Stereo, WithStereo, stereo_parameters
 from tvsbayes.twin.gear_errors import PERFECT, AxisErrors, GearErrors, Tabulated, draw_gear_errors
 from tvsbayes.twin.physics import local_deg_per_step
 from tvsbayes.twin.true_headlines import AT_POSE, effective_deg_per_step
@@ -64,12 +64,12 @@ class TruthDocument(TypedDict):
 
 
 @dataclass(frozen=True)
-class Truth:
+class Truth(WithStereo):
     """A true rig, which no estimator may read.
 
     Attributes:
         parameters: every physical parameter by its public name, derived ones included.
-        stereo: the true cameras (the campaign carries the stated ones).
+        stereo: the true cameras (the campaign carries the stated ones); None for a head with sightings.
         mirror_angles_deg: (psi, beta) of each move as realised, stop errors included; empty before a run.
         stop_errors_deg: (pan, tilt) stop error after each move.
         home_offsets_deg: (pan, tilt) home offset of each segment.
@@ -82,7 +82,7 @@ class Truth:
     """
 
     parameters: dict[str, float]
-    stereo: Stereo
+    stereo: Stereo | None
     mirror_angles_deg: tuple[Pair, ...] = ()
     stop_errors_deg: tuple[Pair, ...] = ()
     home_offsets_deg: tuple[Pair, ...] = ()
@@ -120,13 +120,13 @@ class Truth:
     def as_json(self, campaign: Campaign) -> TruthDocument:
         """Return the document of truth.json for a campaign of this rig, with effective ratios if it has looks."""
         mechanism = campaign.rig.mechanism
-        constants = mechanism.fixed
-        cameras = dict(zip(STEREO_PARAMETER_NAMES, map(float, self.stereo.vector), strict=True))
+        constants, stereo = mechanism.fixed, self.stereo
+        cameras = {} if stereo is None else dict(zip(STEREO_PARAMETER_NAMES, stereo.vector.tolist(), strict=True))
         document: TruthDocument = {
             "format": TRUTH_FORMAT,
             "note": self.note,
             "parameters": {name: float(v) for name, v in self.parameters.items() if name not in constants},
-            "stereo": {} if mechanism.sightings else cameras,
+            "stereo": cameras,
             "mirror_angles_deg": self.mirror_angles_deg,
             "stop_errors_deg": self.stop_errors_deg,
             "home_offsets_deg": self.home_offsets_deg,
@@ -156,7 +156,7 @@ class Truth:
         }
 
     @classmethod
-    def from_json(cls, document: TruthDocument, stated: Stereo) -> Truth:
+    def from_json(cls, document: TruthDocument, stated: Stereo | None) -> Truth:
         """Rebuild from truth.json; image size and covariance come from the campaign's `stated` stereo."""
         pose, known = document["reference_pose_deg"], document["stereo"]
         # Older files without errors of gears, scatter of looks and shifts of zeros have none of them.
@@ -166,9 +166,7 @@ class Truth:
         side, tables = document.get("homing_side"), document.get("gear_error")
         return cls(
             parameters=parameters,
-            stereo=stated.with_vector(np.array([float(known[name]) for name in STEREO_PARAMETER_NAMES]))
-            if known
-            else stated,
+            stereo=stated and stated.with_vector(np.array([float(known[name]) for name in STEREO_PARAMETER_NAMES])),
             mirror_angles_deg=pan_and_tilt(document["mirror_angles_deg"]),
             stop_errors_deg=pan_and_tilt(document["stop_errors_deg"]),
             home_offsets_deg=pan_and_tilt(document["home_offsets_deg"]),
@@ -198,7 +196,7 @@ def pan_and_tilt(rows: Iterable[Sequence[float]]) -> tuple[Pair, ...]:
     return tuple((float(pan), float(tilt)) for pan, tilt in rows)
 
 
-def read_truth(path: str | Path, stated: Stereo) -> Truth:
+def read_truth(path: str | Path, stated: Stereo | None) -> Truth:
     """Read a truth.json; `stated` is the stereo calibration of its campaign.
 
     Raises:
@@ -237,11 +235,12 @@ def draw_truth(rig: Rig, rng: np.random.Generator) -> Truth:
     late = (*HARMONIC_NAMES, *GEAR_ERROR_NAMES, *LATE_NAMES)
     parameters = drawn((n for n in rig_names if n not in late), rng)
     # By eigenvectors, since fixed parameters give a semi-definite covariance, for which Cholesky fails.
-    variances, vectors = np.linalg.eigh(np.asarray(rig.stereo.parameter_covariance, float))
+    cameras, covariance = stereo_parameters(rig.stereo)
+    variances, vectors = np.linalg.eigh(covariance)
     offset = vectors @ (np.sqrt(np.clip(variances, 0.0, None)) * rng.standard_normal(len(variances)))
     # Last, so that rigs without transmission error do not depend on these draws.
     parameters |= drawn(HARMONIC_NAMES, rng) | drawn(GEAR_ERROR_NAMES, gears)
-    stereo = rig.stereo.with_vector(rig.stereo.vector + offset)
+    stereo = None if rig.stereo is None else rig.stereo.with_vector(cameras + offset)
     errors = draw_gear_errors(parameters, rig.table.harmonic_period_deg, gears)
     # After the gears' errors, which must not depend on these draws.
     parameters |= drawn(LATE_NAMES, gears)

@@ -24,6 +24,7 @@ from tvsbayes.instrument.campaign import (
     ordered_spots,
     pixels_of,
     read_campaign,
+    stereo_spots,
 )
 from tvsbayes.instrument.parameters import NAMES, RIG_NAMES, unit_of
 from tvsbayes.instrument.stops import rests_of
@@ -172,14 +173,14 @@ def scene(campaign: Campaign, fitted: Fitted | None = None, notes: Sequence[str]
     seen_mm = looks.point_mm[np.isfinite(looks.point_mm).all(axis=1)]
     reach_mm = float(np.median(np.linalg.norm(seen_mm, axis=1))) if len(seen_mm) else 0.0
     correlated, correlation = _correlation(fitted)
-    size = campaign.stereo.image_width, campaign.stereo.image_height
+    size = campaign.stereo_pair.image_width, campaign.stereo_pair.image_height
     return Scene(
         name=campaign.title,
         fitted=fitted is not None,
         notes=tuple(notes),
         image_px=size,
         looks=looks,
-        cameras=pyramids(campaign.stereo, PYRAMID_SHARE * reach_mm or PYRAMID_MM),
+        cameras=pyramids(campaign.stereo_pair, PYRAMID_SHARE * reach_mm or PYRAMID_MM),
         sheets=sheets(looks.target, looks.point_mm),
         origin_mm=np.full(3, np.nan) if ways is None else np.asarray(ways.origin_mm)[:, 0],
         gears=() if fitted is None else fitted.gears,
@@ -208,7 +209,7 @@ _WAY_SHAPES = {"mirrors_mm": (0, 3), "normals": (0, 3), "end_mm": (3,), "predict
 
 def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> LookColumns:
     """Compute the columns."""
-    spots, count = campaign.spots, len(campaign.spots)
+    spots, count = stereo_spots(campaign.spots), len(campaign.spots)
     row_of = {spot.spot: row for row, spot in enumerate(spots)}
     used = ordered_spots(campaign)
     rows = np.array([row_of[spot.spot] for spot in used], dtype=int)
@@ -232,7 +233,7 @@ def _looks(campaign: Campaign, ways: Ways | None, fitted: Fitted | None) -> Look
     if used:
         point[rows] = campaign.points_mm[rows]
         noise = scale**2 * np.stack([pixel_covariance(spot) for spot in used])
-        covariance[rows] = point_covariance_mm2(campaign.stereo, point[rows], noise)
+        covariance[rows] = point_covariance_mm2(campaign.stereo_pair, point[rows], noise)
     deviation, u = _deviations(row_of, () if fitted is None else fitted.stops)
     return LookColumns(
         spot=np.array([spot.spot for spot in spots], dtype=int),
