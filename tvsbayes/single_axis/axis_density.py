@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -12,17 +12,12 @@ from tvsbayes.single_axis.axis_mode import AxisMode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES
 
-FUNCTIONALS: dict[str, Callable[[AxisModel], np.ndarray]] = {
-    # The offset is that at command zero.
-    "offset": lambda model: model.head(offset=1.0, slope=-model.middle),
-    "per_command": lambda model: model.head(slope=1.0),
-    "ratio_contrast": lambda model: model.head(contrast=1.0),
-    "backlash": lambda model: model.head(backlash=1.0),
-    "per_command.forward": lambda model: model.head(slope=1.0, contrast=0.5),
-    "per_command.backward": lambda model: model.head(slope=1.0, contrast=-0.5),
-}
-"""Functionals of the columns by quantity of `AXIS_QUANTITIES`; these do not depend on the draw."""
-HEADLINE_DRAWS = (*FUNCTIONALS, "effective_per_command")
+LINES = sorted(
+    (quantity for quantity in AXIS_QUANTITIES.values() if quantity.line),
+    key=lambda quantity: (bool(quantity.parts), quantity.name != "offset"),
+)
+"""Quantities of the line in the order in which they are drawn; their functionals do not depend on the draw."""
+HEADLINE_DRAWS = (*(quantity.name for quantity in LINES), "effective_per_command")
 """Rows of `headline_functionals`."""
 
 
@@ -47,7 +42,7 @@ def blocks_of(w: np.ndarray) -> list[np.ndarray]:
 def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
     """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns), or (n, ...) as in `line_weights`."""
     lines, weights = line_functionals(model), line_weights(model, w)
-    functionals = np.concatenate([lines, model.head(slope=1.0)[None]])
+    functionals = np.concatenate([lines, model.head(per_command=1.0)[None]])
     if weights.ndim == 2:
         functionals = np.repeat(functionals[None], len(weights), axis=0)
     functionals[..., -1, :] += weights
@@ -55,8 +50,13 @@ def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
 
 
 def line_functionals(model: AxisModel) -> np.ndarray:
-    """Functionals of all but the last of `HEADLINE_DRAWS`; independent of the draw."""
-    return np.array([functional(model) for functional in FUNCTIONALS.values()])
+    """Functionals of all but the last of `HEADLINE_DRAWS`; the same for all draws."""
+    return np.array([model.head(**factors) for factors in line_factors(model).values()])
+
+
+def line_factors(model: AxisModel) -> dict[str, Mapping[str, float]]:
+    """Factors of `AxisModel.head` by name of `LINES`."""
+    return {each.name: each.line(model.middle, model.rows.travel) for each in LINES if each.line}
 
 
 class AxisDensity:

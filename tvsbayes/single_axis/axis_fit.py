@@ -31,8 +31,8 @@ from tvsbayes.single_axis.classic_line import fit_line
 from tvsbayes.single_axis.period_search import waves_of
 from tvsbayes.statistics.streams import AxisStream, random_stream
 
-ABSORBED = {"per_command": "slope", "backlash": "backlash"}
-"""Keys of `[axis]` that processes of position can absorb, with their functionals."""
+ABSORBED = ("per_command", "backlash")
+"""Keys of `[axis]` that processes of position can absorb."""
 REMEDY = (
     "check sign and unit of commands (steps or microsteps?) and readings, or state the prior wider or leave it out of "
     "[axis]"
@@ -110,7 +110,7 @@ def _absorbed_conflict(model: AxisModel, name: str, default: AxisPrior) -> Prior
         return None
     rng = np.random.default_rng(0)
     w = rng.multivariate_normal(mode.w, mode.covariance, DRAWS) if len(mode.w) else np.zeros((DRAWS, 0))
-    draws = without_prior.linear(w).drawn(without_prior.head(**{ABSORBED[name]: 1.0})[None], rng)[:, 0]
+    draws = without_prior.linear(w).drawn(without_prior.head(**{name: 1.0})[None], rng)[:, 0]
     value, sd = float(draws.mean()), float(draws.std())
     difference = abs(value - prior.value)
     if difference <= CONFLICT_LIMIT * float(np.hypot(prior.u, sd)):

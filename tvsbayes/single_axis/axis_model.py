@@ -507,7 +507,7 @@ class AxisModel:
         return means, covariances
 
     def head(self, **factors: float) -> np.ndarray:
-        """A functional (columns,) of `offset`, `slope`, `contrast`, `backlash` by their factors."""
+        """A functional (columns,) of `offset`, `per_command`, `ratio_contrast`, `backlash` by their factors."""
         functional = np.zeros(self.columns)
         for name, factor in factors.items():
             functional[_HEAD_COLUMNS[name]] = factor
@@ -552,7 +552,7 @@ def _creeps(rows: AxisRows) -> bool:
     return bool(np.ptp(rows.warm_s) > 0)
 
 
-_HEAD_COLUMNS = {"offset": OFFSET, "slope": SLOPE, "contrast": CONTRAST, "backlash": BACKLASH}
+_HEAD_COLUMNS = {"offset": OFFSET, "per_command": SLOPE, "ratio_contrast": CONTRAST, "backlash": BACKLASH}
 
 
 def _information(block: _Block, flat: int) -> tuple[np.ndarray, np.ndarray]:

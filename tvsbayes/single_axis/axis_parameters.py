@@ -7,8 +7,9 @@ Formulation 8.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Literal
 
 import numpy as np
@@ -28,8 +29,20 @@ class AxisPrior:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AxisKey(Quantity):
-    """A key of `[axis]`; in its unit, {unit} stands for that of the folder.
+class AxisQuantity(Quantity):
+    """A quantity of an axis; in its unit, {unit} stands for that of the folder.
+
+    Attributes:
+        line: function of the middle command and the travel; it returns the factors of `per_command`, `ratio_contrast`,
+            `backlash` and the offset at the middle command whose sum the quantity is. None for all other quantities.
+    """
+
+    line: Callable[[float, float], Mapping[str, float]] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisKey(AxisQuantity):
+    """A key of `[axis]`.
 
     Attributes:
         kind: kind of its prior.
@@ -50,19 +63,32 @@ def _key(
     return AxisKey(name=name, block=name, kind=kind, share=share, u=u, label=label, unit=unit, **fields)
 
 
-_SIDES, _PER_COMMAND = ("forward", "backward"), "{unit} per command"
-AXIS_QUANTITIES: Quantities[Quantity] = Quantities(
-    _key("per_command", "normal", None, 1.0, "unit per command", _PER_COMMAND, target="per_command"),
-    _key("ratio_contrast", "normal", None, 0.0, "forward less backward", _PER_COMMAND),
-    *Quantity.many("per_command", _SIDES, unit=_PER_COMMAND, headline=True),
-    *Quantity.many("effective_per_command", (), unit=_PER_COMMAND, target="effective_per_command"),
-    _key("backlash", "normal", 0.05, 0.0, "play lost in a reversal", headline=True, target="backlash"),
+def _linear_key(name: str, *texts: Any, **fields: Any) -> AxisKey:
+    return _key(name, *texts, line=lambda middle, travel: {name: 1.0}, **fields)
+
+
+def _side(side: str, part: float) -> list[AxisQuantity]:
+    """The ratio in one direction, given its part of the contrast."""
+    factors = {"per_command": 1.0, "ratio_contrast": part}
+    line = lambda middle, travel: factors  # noqa: E731
+    return AxisQuantity.many("per_command", (side,), unit=_PER_COMMAND, headline=True, line=line)
+
+
+_PER_COMMAND = "{unit} per command"
+CONTRAST_PARTS = {"forward": 0.5, "backward": -0.5}
+"""Parts of the contrast that the ratios of both directions have."""
+AXIS_QUANTITIES: Quantities[AxisQuantity] = Quantities(
+    _linear_key("per_command", "normal", None, 1.0, "unit per command", _PER_COMMAND, target="per_command"),
+    _linear_key("ratio_contrast", "normal", None, 0.0, "forward less backward", _PER_COMMAND),
+    *chain.from_iterable(_side(*each) for each in CONTRAST_PARTS.items()),
+    *AxisQuantity.many("effective_per_command", (), unit=_PER_COMMAND, target="effective_per_command"),
+    _linear_key("backlash", "normal", 0.05, 0.0, "play lost in a reversal", headline=True, target="backlash"),
     _key("transmission_error", "half-normal", 0.002, 0.0, "prior scale, error by position"),
     _key("transmission_error_length", "log-normal", 0.2, 0.7, "it changes over a way of"),
     _key("play_variation", "half-normal", 0.001, 0.0, "prior scale, play by position"),
     _key("drift_per_root_hour", "half-normal", 0.0005, 0.0, "zero walks in a root hour"),
     _key("stop_sd", "log-normal", 0.0005, 1.5, "scatter of stops"),
-    *Quantity.many("stop_sd", _SIDES, unit="{unit}", label="scatter of stops, {0}"),
+    *AxisQuantity.many("stop_sd", CONTRAST_PARTS, unit="{unit}", label="scatter of stops, {0}"),
     _key("home_sd", "log-normal", 0.001, 1.5, "scatter of homings"),
     _key("reading_scale", "log-normal", None, 0.5, "scatter of readings / u", "1"),
     _key("creep", "normal", 0.0005, 0.0, "zero creeps while it warms up, in all"),
@@ -70,9 +96,14 @@ AXIS_QUANTITIES: Quantities[Quantity] = Quantities(
     _key("thermal_per_K", "normal", 0.0001, 0.0, "zero shifts per kelvin", "{unit}/K"),
     _key("seeing_scale", "log-normal", None, 1.0, "seeing / u of a reading", "1"),
     _key("seeing_s", "log-normal", None, 1.2, "seeing lasts, s", "s", median=10.0),
-    *Quantity.many("offset", (), unit="{unit}", label="reading at command 0"),
+    *AxisQuantity.many(
+        *("offset", ()),
+        unit="{unit}",
+        label="reading at command 0",
+        line=lambda middle, travel: {"offset": 1.0, "per_command": -middle},
+    ),
 )
-"""Reported quantities of an axis. `axis_density.FUNCTIONALS` has the functionals of the linear ones."""
+"""Reported quantities of an axis."""
 AXIS_KEYS = {name: key for name, key in AXIS_QUANTITIES.items() if isinstance(key, AxisKey)}
 """Shares of the travel: half-normals and stop scatter come from eleven stepper axes measured by others, where left-out
 positions, with the scales integrated out, lie within 1.96 u in 95 % of cases. Backlash: cheap gears lose up to some per

@@ -33,10 +33,10 @@ from tvsbayes.results.records import (
     stored_document,
 )
 from tvsbayes.single_axis.axis_campaign import AxisCampaign, axis_hashes
-from tvsbayes.single_axis.axis_density import FUNCTIONALS, blocks_of, line_weights
+from tvsbayes.single_axis.axis_density import blocks_of, line_factors, line_weights
 from tvsbayes.single_axis.axis_doubts import axis_warnings
 from tvsbayes.single_axis.axis_fit import AxisFit, conflict_text, fit_axis, model_of
-from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, kind_of, prior_sd
+from tvsbayes.single_axis.axis_parameters import AXIS_QUANTITIES, CONTRAST_PARTS, kind_of, prior_sd
 from tvsbayes.single_axis.axis_periods import period_estimate, wave_samples, waves_at_an_end, weak_waves
 from tvsbayes.single_axis.classic_line import ClassicAxis, classic_axis
 from tvsbayes.statistics.intervals import NORMAL_95, interval95
@@ -175,13 +175,11 @@ def _prior_sds(fit: AxisFit) -> dict[str, float]:
     priors = fit.model.priors
     sampled = [name for name in fit.free if not name.startswith("wave_")]
     sds = {name: prior_sd(kind_of(name), priors[name.split(".")[0]]) for name in (*sampled, *fit.model.shifts)}
-    side = float(np.hypot(priors["per_command"].u, 0.5 * priors["ratio_contrast"].u))
     return sds | {
-        "per_command": priors["per_command"].u,
-        "backlash": priors["backlash"].u,
-        "ratio_contrast": priors["ratio_contrast"].u,
-        "per_command.forward": side,
-        "per_command.backward": side,
+        name: float(np.hypot.reduce([factor * priors[key].u for key, factor in factors.items()], initial=0.0))
+        for name, factors in line_factors(fit.model).items()
+        # The offset has no prior of its own.
+        if "offset" not in factors
     }
 
 
@@ -194,9 +192,8 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         return _estimate(draws[name] if values is None else values, sds.get(name), diagnosis)
 
     effective, contrast = draws["effective_per_command"], draws["ratio_contrast"]
-    sides = {"forward": 0.5, "backward": -0.5}
     sampled = [name for name in fit.free if not name.startswith("wave_")]
-    linear = [name for name, quantity in AXIS_QUANTITIES.items() if name in FUNCTIONALS and not quantity.parts]
+    linear = [name for name, quantity in AXIS_QUANTITIES.items() if quantity.line and not quantity.parts]
     names = [*sampled, *fit.model.shifts, *linear]
     samples = wave_samples(fit)
     return AxisSummary(
@@ -207,9 +204,9 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
         monte_carlo_error={} if fit.sample is None else fit.sample.convergence.monte_carlo_error,
         converged=fit.error is None and (fit.sample is None or fit.answer != "laplace"),
         problems=fit.missing,
-        per_command={side: estimate(f"per_command.{side}") for side in sides},
+        per_command={side: estimate(f"per_command.{side}") for side in CONTRAST_PARTS},
         effective_per_command={
-            side: _estimate(effective + half * contrast, None, diagnoses[""]) for side, half in sides.items()
+            side: _estimate(effective + half * contrast, None, diagnoses[""]) for side, half in CONTRAST_PARTS.items()
         },
         range_command=(float(fit.rows.command.min()), float(fit.rows.command.max())),
         parameters={name: estimate(name) for name in dict.fromkeys(names)} | _prior_backlash(fit),
@@ -233,15 +230,20 @@ def summarise_axis(fit: AxisFit) -> AxisSummary:
 
 
 def _prior_backlash(fit: AxisFit) -> dict[str, Estimate]:
-    """The backlash from its prior, where every stop was reached from one side.
+    """The backlash and what follows from it alone, from its prior, where every stop was reached from one side.
 
     Its draws would depend on how a start of unknown side is treated, which contains no information on the play.
     """
     prior = fit.model.priors["backlash"]
     if fit.rows.both_sides or not prior.u:
         return {}
-    half = NORMAL_95 * prior.u
-    return {"backlash": Estimate(prior.value, prior.u, (prior.value - half, prior.value + half), prior.u, 0.0)}
+    estimates = {}
+    for name, factors in line_factors(fit.model).items():
+        if set(factors) == {"backlash"}:
+            value, u = factors["backlash"] * prior.value, factors["backlash"] * prior.u
+            half = NORMAL_95 * u
+            estimates[name] = Estimate(value, u, (value - half, value + half), u, 0.0)
+    return estimates
 
 
 def deviation_functionals(fit: AxisFit, commands: np.ndarray) -> np.ndarray:
