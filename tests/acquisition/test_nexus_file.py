@@ -58,6 +58,7 @@ def test_the_default_plot_is_found_by_the_rules_of_nexus(exported):
         assert data["pan_steps"][()].tolist() == [campaign.moves[s.move].pan_steps for s in campaign.spots]
         assert text(data["target"]) == [spot.target for spot in campaign.spots]
         assert np.diff(data["time"][()]).min() >= 0 and data["time"].attrs["units"] == "s"
+        assert entry["moves/temperature_degC"].attrs["units"] == "degC"
         assert text(entry["start_time"]) == "2026-01-01T00:00:00+00:00" and entry["simulated"][()]
         assert np.allclose(entry["instrument/stereo/translation"][()], np.ravel(campaign.stereo.T), atol=0)
         assert entry["instrument/prior/focal_scale"].attrs["uncertainty"] == 0.002

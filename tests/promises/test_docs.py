@@ -144,11 +144,14 @@ def test_every_option_of_a_command_is_explained(name):
 
 def test_exit_codes_are_those_of_the_errors():
     from tvsbayes.cli.app import INTERRUPTED, TARGET_MISSED
-    from tvsbayes.errors import DeviceFault, InputError, NotConverged, NothingToEstimate
+    from tvsbayes.errors import TvsError
 
     codes = [int(code) for code in re.findall(r"^\| (\d+) \|", section(COMMANDS, "Exit codes"), flags=re.MULTILINE)]
-    errors = (InputError, NothingToEstimate, NotConverged, DeviceFault)
-    assert codes == [0, TARGET_MISSED, *(error.exit_code for error in errors), INTERRUPTED]
+
+    def codes_of(error: type[TvsError]) -> set[int]:
+        return {error.exit_code}.union(*map(codes_of, error.__subclasses__()))
+
+    assert codes == [0, *sorted({TARGET_MISSED, *codes_of(TvsError), INTERRUPTED})]
 
 
 QUICK = {

@@ -41,8 +41,8 @@ _FILES = {
     "spots.csv": CSV_BYTES_MAX,
     LOG: LOG_BYTES_MAX,
 }
-_UNITS = ("s", "steps", "px", "deg")
-"""Units as suffixes of column names."""
+_NAMED_UNITS = ("steps", "degC")
+"""Units that the names of datasets keep."""
 
 
 @dataclass(frozen=True)
@@ -179,8 +179,8 @@ def _looks(group: Any, campaign: Campaign, records: Sequence[Record]) -> None:
 
 def _column(group: Any, column: Column, rows: Sequence[Move] | Sequence[Look]) -> None:
     """A column of a table: its unit becomes an attribute; standard uncertainties are the `_errors` of a value."""
-    name, unit = column.name, next((unit for unit in _UNITS if column.name.endswith(f"_{unit}")), "")
-    if unit != "steps":
+    name, unit = column.name, column.unit
+    if unit not in _NAMED_UNITS:
         name = name.removesuffix(f"_{unit}")
     if column.name in PIXEL_SDS:
         name = f"{name[1:]}_errors"

@@ -1,8 +1,7 @@
 """The command line: reads options, calls the library, prints tables or one JSON document.
 
-Heavy modules are imported inside the commands that need them; `tvsbayes --help` loads none of them. Exit codes:
-0 done, 1 done but a limit or target is not met, 2 bad input, 3 nothing to estimate, 4 not converged, 5 device fault,
-130 interrupted.
+Heavy modules are imported inside the commands that need them; `tvsbayes --help` loads none of them. Exit codes: 0 done,
+1 done but a limit or target is not met, 130 interrupted, others by the classes of `errors`.
 """
 
 from __future__ import annotations

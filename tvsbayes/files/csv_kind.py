@@ -18,6 +18,8 @@ from tvsbayes.files.disk import shipped_data
 
 ID_MAX = 10**9
 """Largest number of a row."""
+UNITS = frozenset(("s", "ms", "min", "steps", "px", "mm", "m", "deg", "rad", "K", "degC", "hPa"))
+"""Units that end the name of a column."""
 COMMENT_CHARS = 120
 """Length of a comment line in a template."""
 Values = Mapping[str, Sequence[Any]]
@@ -52,6 +54,12 @@ class Column:
     kind: type = field(default=str, kw_only=True)
     words: tuple[str, ...] = field(default=(), kw_only=True)
     default: Any = field(default=None, kw_only=True)
+
+    @property
+    def unit(self) -> str:
+        """Unit that ends the name; "" where there is none."""
+        unit = self.name.rpartition("_")[2]
+        return unit if unit in UNITS else ""
 
     @property
     def may_be_empty(self) -> bool:

@@ -35,7 +35,7 @@ def _in_worker(job: StudyJob, index: int) -> StudyRow:
 
 def made_rows(
     job: StudyJob, indices: Sequence[int], engine: str = "serial", workers: int = 2, address: str | None = None
-) -> Generator[StudyRow, None, None]:
+) -> Generator[StudyRow]:
     """Compute rows of a study, in the order in which they are finished.
 
     Close the iterator if it is left early, which ends the workers that it started.
