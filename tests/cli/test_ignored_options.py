@@ -36,6 +36,15 @@ IGNORED = [
     ("acquire r.toml p.csv o --simulate --no-browser", "--no-browser is for --live"),
     ("acquire r.toml p.csv o --simulate --laser-class 3B", "--laser-class is for a laser"),
     ("acquire r.toml p.csv o --target-u 1e-4 --no-estimate", "--target-u needs the fits"),
+    ("import t.csv --to o --run 1 --deviations", "--run and --deviations are for files of an axis"),
+    ("import t.csv --to o --assume u_deg=1", "--assume is for a guide log or sightings"),
+    ("import t.csv --to o --axis --sightings", "--sightings is for a head"),
+    ("import t.csv --to o --axis --tilt-approach up", "--tilt-approach is for a scanner"),
+    ("import t.csv --to o --sightings --swap", "--swap is for spots in pictures"),
+    ("import t.urdf --to o --urdf --assume u_deg=1 --format phd2", "--format and --assume are for other tables"),
+    ("import t.dat --to o --format pointing --pixels-from 1", "--pixels-from is for other tables"),
+    ("import t.dat --to o --format pointing --tilt-joint a", "--tilt-joint is for a URDF"),
+    ("import . --to o --swap --run 1 --urdf", "--run and --urdf are for tables of other programs"),
 ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import math
 import shlex
@@ -12,11 +13,21 @@ from pathlib import Path
 import pytest
 from support.commands import MOUNTED, assert_error
 
+from tvsbayes.cli import axis_import
+from tvsbayes.cli.import_command import AXIS, KINDS_OF, import_
 from tvsbayes.instrument.campaign import moves_bytes, pixels_of, read_campaign, write_campaign
 from tvsbayes.instrument.rig import read_rig
 
 UNIT = Path(__file__).parents[1] / "head" / "unit.urdf"
 TABLE = "Nr;Pan;Tilt;XL;YL;XR;YR;Blatt\n1;0;0;640,5;360,25;500;360;nah\n2;200;0;700,5;360,25;560;360;nah\n"
+
+
+def test_every_option_says_for_which_files_it_is():
+    """One that does not would be ignored in silence where it means nothing."""
+    for_all = {"file", "to", "yes", "as_json"}
+    assert set(KINDS_OF) == set(inspect.signature(import_).parameters) - for_all
+    of_an_axis = {option for option, kinds in KINDS_OF.items() if AXIS in kinds}
+    assert set(axis_import.KINDS_OF) == of_an_axis - {"axis", "kind"}
 
 
 @pytest.fixture

@@ -106,15 +106,6 @@ def is_interactive() -> bool:
     return sys.stdin is not None and sys.stdin.isatty()
 
 
-def confirmed(lines: list[str], to: Path, yes: bool, as_json: bool) -> bool:
-    """Whether an import may be written; an interactive user first sees the `lines`, which are then cleared."""
-    if yes or as_json or not is_interactive():
-        return yes
-    typer.echo("\n".join(lines))
-    lines.clear()
-    return typer.confirm(f"write this into {escaped(str(to), 200)}?", default=False)
-
-
 def report_error(error: TvsError) -> None:
     """Print an error for people, with the remedy where the message does not contain it."""
     report_line(f"error: {error.message}")

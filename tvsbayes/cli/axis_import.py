@@ -7,10 +7,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import confirmed, finish, refuse_options
-from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, import_ending, table_document, table_lines
+from tvsbayes.cli.app import finish, refuse_options
+from tvsbayes.cli.confirmed_import import Import, write_files
+from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
-from tvsbayes.files.disk import make_folder, write_atomically
+from tvsbayes.files.disk import make_folder
 from tvsbayes.files.documents import toml_line
 
 if TYPE_CHECKING:
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
 
 KINDS = ("csv", "phd2", "epics", "klipper")
 """Kinds of files of an axis: tables, guide logs, series logged by camonitor or Klipper."""
+_LOG, _TABLES = ("phd2",), ("csv", "epics", "klipper")
+KINDS_OF = {
+    **{"run": _LOG, "assume": _LOG, "column": _TABLES, "deviations": _TABLES, "counts_per_turn": _TABLES},
+    "sheet": ("csv",),
+}
+"""Kinds for which an option is."""
 NEEDED = ("command", "value")
 UNIT = "deg"
 """Unit of readings in the template, where no column states one."""
@@ -56,8 +63,11 @@ class _ReadFile:
 
 def import_readings(
     file: Path, to: Path, stated: Mapping[str, str], sheet: str | None, wish: FileOptions, *, yes: bool, as_json: bool
-) -> None:
-    """Import a table or log of an axis into a folder that is new or has only the tables of the template."""
+) -> Import | None:
+    """Import a table or log of an axis into a folder that is new or has only the tables of the template.
+
+    Returns None where the runs of a log were listed instead.
+    """
     from tvsbayes.files.csv_table import CSV_BYTES_MAX
     from tvsbayes.files.disk import read_bytes
     from tvsbayes.files.foreign_table import read_foreign, text_of
@@ -76,7 +86,7 @@ def import_readings(
         runs = read_runs(text_of(data, name)[0], name)
         if wish.run is None and len(runs) > 1:
             _list_runs(file, to, runs, yes=yes, as_json=as_json)
-            return
+            return None
         contents = _read_run(runs, file, wish)
     else:
         if kind == "epics":
@@ -88,23 +98,24 @@ def import_readings(
             table = read_foreign(file, sheet)
         contents = _read_table(table, stated, wish, to)
     _refuse_filled(to)
-    _finish_import(contents, to, yes=yes, as_json=as_json)
+    return _import_of(contents, to)
 
 
-def _finish_import(contents: _ReadFile, to: Path, *, yes: bool, as_json: bool) -> None:
-    """Show the contents of a file, write them if confirmed, and print the next command."""
+def _import_of(contents: _ReadFile, to: Path) -> Import:
+    """The import of a file that was read."""
     table, unit = contents.readings, contents.unit
-    unit_line = _unit_line(to, unit)
-    assumed = [*table.assumed, unit_line, *_drive_lines(table)]
+    assumed = [*table.assumed, _unit_line(to, unit), *_drive_lines(table)]
     lines = [*contents.lines, *table.notes, *(f"assumed: {text}" for text in assumed)]
     ok = sum(reading.status == "ok" for reading in table.readings)
     lines.append(f"gives: {len(table.moves)} moves, {len(table.readings)} readings{_minutes(table)}")
-    written = _write(to, table, unit) if confirmed(lines, to, yes, as_json) else []
     document = {**contents.document, "notes": list(table.notes), "assumed": assumed, "moves": len(table.moves)}
-    next_command = f"tvsbayes calibrate {typed(to)}" if written else None
-    document |= {"readings": len(table.readings), "ok": ok, "campaign": str(to), "files": written, "next": next_command}
-    lines.append(import_ending(written, f"`{next_command}`", CORRECT_HINT))
-    finish(document, "\n".join(lines), as_json)
+    document |= {"readings": len(table.readings), "ok": ok, "campaign": str(to)}
+    command = f"tvsbayes calibrate {typed(to)}"
+
+    def outcome(written: list[str]) -> dict[str, Any]:
+        return {"files": written, "next": command if written else None}
+
+    return Import(lines, document, lambda: _write(to, table, unit), f"`{command}`", CORRECT_HINT, outcome)
 
 
 def _minutes(readings: ForeignReadings) -> str:
@@ -115,11 +126,9 @@ def _minutes(readings: ForeignReadings) -> str:
 
 def _check_options(kind: str, opts: FileOptions, stated: Mapping[str, str], sheet: str | None) -> None:
     """Refuse options that a file of this kind would ignore."""
-    log = kind == "phd2"
-    refused: dict[str, object] = {"run": None if log else opts.run, "assume": None if log else opts.assume or None}
-    if log:
-        refused |= {"column": stated or None, "deviations": opts.deviations, "counts_per_turn": opts.counts_per_turn}
-    refused |= {"sheet": None if kind == "csv" else sheet}
+    given: dict[str, object] = {"run": opts.run, "assume": opts.assume or None, "column": stated or None}
+    given |= {"deviations": opts.deviations, "counts_per_turn": opts.counts_per_turn, "sheet": sheet}
+    refused = {name: value for name, value in given.items() if kind not in KINDS_OF[name]}
     refuse_options(f"of another kind of file: this one is read as {kind}", "leave it out, or name --format", **refused)
 
 
@@ -257,9 +266,7 @@ def _write(to: Path, rows: ForeignReadings, unit: str | None) -> list[str]:
         stated = unit or UNIT
         template = template.replace(f'\nunit = "{UNIT}"'.encode(), f'\nunit = "{stated}"'.encode())
         contents["campaign.toml"] = template if rows.drive is None else _with_drive(template, rows.drive)
-    for name, data in contents.items():
-        write_atomically(to / name, data)
-    return [str(to / name) for name in contents]
+    return write_files(to, contents)
 
 
 def _with_drive(template: bytes, drive: LoggedDrive) -> bytes:

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tvsbayes.cli.app import check_output, command_line, confirmed, finish, report_line
+from tvsbayes.cli.app import check_output, command_line, finish, report_line
+from tvsbayes.cli.confirmed_import import Import, write_files
 from tvsbayes.cli.report_page import DRAWING, written_page
-from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, import_ending, table_document, table_lines
+from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
 from tvsbayes.errors import InputError, escaped, refusal, typed
 from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
 from tvsbayes.files.documents import TOML_BYTES_MAX, toml_line
@@ -65,9 +66,7 @@ def refuse_head(calibration: Calibration) -> None:
         raise InputError("usage", message, remedy="steps-for says which counters point along a direction")
 
 
-def import_urdf(
-    file: Path, to: Path, joints: Mapping[str, str | None], steps_per_turn: float | None, *, yes: bool, as_json: bool
-) -> None:
+def import_urdf(file: Path, to: Path, joints: Mapping[str, str | None], steps_per_turn: float | None) -> Import:
     """Import the nominal geometry of two joints into a new campaign of a head, or into one made by `new`."""
     from tvsbayes.head.urdf import URDF_BYTES_MAX, head_joints, ratios_of
     from tvsbayes.instrument.campaign import head_templates
@@ -97,19 +96,22 @@ def import_urdf(
     files[HEAD_URDF] = data
     lines = [f"nominal: {name} = {prior.value:.6g}" for name, prior in priors.items()]
     lines += [f"assumed: {text}" for text in assumed]
-    yes = confirmed(lines, to, yes, as_json)
     next_step = f"log moves and spots there, then `tvsbayes check {typed(to)}`"
     if kind is SIGHTING_HEAD:
         next_step = f"`tvsbayes import LOG --sightings --to {typed(to)}` with moves and sightings"
-    if yes:
-        if kind is SIGHTING_HEAD:
-            make_folder(to, empty=True)
-        for name, text in files.items():
-            write_atomically(to / name, text)
-    lines.append(import_ending([escaped(str(to), 200)] * yes, next_step))
     document = {"campaign": str(to), "joints": dict(head.names), "signs": dict(head.sign), "assumed": assumed}
     document |= {"nominal": {name: prior.value for name, prior in priors.items()}}
-    finish({**document, "written": yes, "files": list(files) if yes else []}, "\n".join(lines), as_json)
+
+    def write() -> list[str]:
+        if kind is SIGHTING_HEAD:
+            make_folder(to, empty=True)
+        write_files(to, files)
+        return [escaped(str(to), 200)]
+
+    def outcome(written: list[str]) -> dict[str, Any]:
+        return {"written": bool(written), "files": list(files) if written else []}
+
+    return Import(lines, document, write, next_step, outcome=outcome)
 
 
 def import_sightings(
@@ -120,10 +122,7 @@ def import_sightings(
     notation: Notation,
     correction: Correction,
     u_deg: float | None,
-    *,
-    yes: bool,
-    as_json: bool,
-) -> None:
+) -> Import:
     """Import a table of moves and sightings into a new campaign of a head, or into one without rows."""
     from tvsbayes.files.foreign_table import read_foreign
     from tvsbayes.head.foreign_sightings import NEEDED, SIGHTING_FIELDS, sighting_field, sightings_of_table
@@ -143,20 +142,18 @@ def import_sightings(
     joints = _joints_of(to)
     reversed_axes = () if joints is None else [axis for axis in AXES if joints.sign[axis] < 0]
     sightings = sightings_of_table(table, mapping.columns, notation, correction, u_deg, reversed_axes)
-    written = _sighting_files(sightings, to, table.file)
+    contents = _sighting_files(sightings, to, table.file)
     ok = sum(sighting.status == "ok" for sighting in sightings.sightings)
-    lines = [*table_lines(table, mapping, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in written.assumed)]
+    lines = [*table_lines(table, mapping, SIGHTING_FIELDS, unit), *(f"assumed: {text}" for text in contents.assumed)]
     lines.append(f"gives: {len(sightings.moves)} moves, {len(sightings.sightings)} sightings, {ok} of use")
-    yes = confirmed(lines, to, yes, as_json)
-    files = [str(to / name) for name in written.files] if yes else []
-    if yes:
+    document = {**table_document(table, mapping), "assumed": contents.assumed, "moves": len(sightings.moves)}
+    document |= {"sightings": len(sightings.sightings), "ok": ok, "campaign": str(to)}
+
+    def write() -> list[str]:
         to.mkdir(parents=True, exist_ok=True)
-        for name, data in written.files.items():
-            write_atomically(to / name, data)
-    lines.append(import_ending(files, f"`tvsbayes check {typed(to)}`", CORRECT_HINT))
-    document = {**table_document(table, mapping), "assumed": written.assumed, "moves": len(sightings.moves)}
-    document |= {"sightings": len(sightings.sightings), "ok": ok, "campaign": str(to), "files": files}
-    finish(document, "\n".join(lines), as_json)
+        return write_files(to, contents.files)
+
+    return Import(lines, document, write, f"`tvsbayes check {typed(to)}`", CORRECT_HINT)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ Reads options, calls the library, prints a table or JSON; heavy imports are insi
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,14 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tvsbayes.cli.app import Json, confirmed, finish, is_interactive, refuse_options, report_line
+from tvsbayes.cli.app import Json, is_interactive, refuse_options, report_line
 from tvsbayes.cli.begin_commands import has_rows, moves_file, write_templates
+from tvsbayes.cli.confirmed_import import Import, write_files
 from tvsbayes.cli.head_commands import HEAD_URDF, import_sightings, import_urdf
 from tvsbayes.cli.instruments import INSTRUMENTS, instrument_of, serve
-from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, import_ending, table_document, table_lines
+from tvsbayes.cli.understood_columns import CORRECT_HINT, column_refusal, table_document, table_lines
 from tvsbayes.errors import InputError, closest, escaped, refusal, typed
 from tvsbayes.files.csv_table import CSV_BYTES_MAX, NUMBER
-from tvsbayes.files.disk import make_folder, read_bytes, write_atomically
+from tvsbayes.files.disk import make_folder, read_bytes
 
 if TYPE_CHECKING:
     from tvsbayes.files.foreign_table import ForeignTable
@@ -28,8 +30,20 @@ if TYPE_CHECKING:
     from tvsbayes.instrument.corrections import Correction
     from tvsbayes.instrument.foreign_looks import ForeignLooks, Notation
 
-POINTING = "pointing"
-"""Format of pointing tables of telescopes."""
+COPY, URDF, POINTING, AXIS, SIGHTINGS, LOOKS = "copy", "urdf", "pointing", "axis", "sightings", "looks"
+"""Kinds of files; --format names that of a telescope's table."""
+KINDS_OF: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("column", "sheet"), (AXIS, SIGHTINGS, LOOKS)),
+    **{"pixels_from": (COPY, LOOKS), "angles": (SIGHTINGS, LOOKS), "sd_px": (LOOKS,)},
+    **{"axis": (AXIS,), "sightings": (SIGHTINGS,), "kind": (POINTING, AXIS)},
+    **dict.fromkeys(("run", "deviations", "counts_per_turn"), (AXIS,)),
+    "assume": (AXIS, SIGHTINGS),
+    **dict.fromkeys(("relative", "flip", "shift_moves"), (COPY, SIGHTINGS, LOOKS)),
+    "swap": (COPY, LOOKS),
+    **dict.fromkeys(("pan_approach", "tilt_approach"), (SIGHTINGS, LOOKS)),
+    **dict.fromkeys(("urdf", "pan_joint", "tilt_joint", "steps_per_turn"), (URDF,)),
+}
+"""Kinds of files for which an option is, by the name of its parameter; --to, --yes and --json are for all."""
 
 
 def import_(
@@ -98,94 +112,129 @@ def import_(
 
     A campaign folder as FILE: a copy, corrected by the options that change its tables.
     """
-    from tvsbayes.files.foreign_table import read_foreign
-    from tvsbayes.instrument.axes import AXES, sides_of
-    from tvsbayes.instrument.campaign import stereo_spots
-    from tvsbayes.instrument.column_names import map_columns
-    from tvsbayes.instrument.corrections import Correction, corrected, flipped_axis, shift_of
-    from tvsbayes.instrument.foreign_looks import SD_PX, Notation, looks_of
+    options = locals()
+    from tvsbayes.instrument.axes import sides_of
+    from tvsbayes.instrument.corrections import Correction, flipped_axis, shift_of
+    from tvsbayes.instrument.foreign_looks import SD_PX, Notation
 
-    if angles not in (None, "deg", "rad"):
-        found, remedy = f"--angles {escaped(angles)}", "write --angles deg or --angles rad"
-        raise InputError("usage", f"{found}; allowed: deg, rad", allowed="deg, rad", remedy=remedy)
     approach = (pan_approach, tilt_approach)
+    notation = Notation(pixels_from, _angle_unit(angles), SD_PX if sd_px is None else sd_px, relative, approach)
     sides_of(approach)
-    stated = dict(_field_and_column(text) for text in column or ())
-    flipped, shifts = tuple(dict.fromkeys(map(flipped_axis, flip or ()))), tuple(map(shift_of, shift_moves or ()))
-    correction = Correction(flipped, shifts, swap)
-    if file.is_dir():
-        sides = {f"{a}_approach": None if side == "unknown" else side for a, side in zip(AXES, approach, strict=True)}
-        refused = {"column": column, "sheet": sheet, "angles": angles, "sd_px": sd_px, "axis": axis, **sides}
-        refuse_options("for tables of other programs, and FILE is a folder", "leave it out", **refused)
-        full_correction = replace(correction, pixels_from=pixels_from, relative=relative)
-        _correct_campaign(file, to, full_correction, yes=yes, as_json=as_json)
-        return
-    urdf_options = {"pan_joint": pan_joint, "tilt_joint": tilt_joint, "steps_per_turn": steps_per_turn}
-    if not urdf:
-        refuse_options("for a URDF", "add --urdf, or leave it out", **urdf_options)
-    if urdf or kind == POINTING:
-        other_options: dict[str, object] = {
-            "column": column,
-            "sheet": sheet,
-            "angles": angles,
-            "axis": axis,
-            "relative": relative,
-            "flip": flip,
-        }
-        other_options |= {"shift_moves": shift_moves, "swap": swap, "sd_px": sd_px, "sightings": sightings}
-        refuse_options("for other tables", "leave it out", **other_options)
-    if urdf:
-        refuse_options("for other tables", "leave it out", format=kind if kind != "auto" else None)
-        import_urdf(file, to, {"pan": pan_joint, "tilt": tilt_joint}, steps_per_turn, yes=yes, as_json=as_json)
-        return
-    if kind == POINTING:
-        _import_pointing(file, to, yes=yes, as_json=as_json)
-        return
-    if axis or instrument_of(to) is INSTRUMENTS["axis"]:
+    stated = dict(map(_field_and_column, column or ()))
+    flipped = tuple(dict.fromkeys(map(flipped_axis, flip or ())))
+    correction = Correction(flipped, tuple(map(shift_of, shift_moves or ())), swap)
+    found: Import | None
+    kind_of_file = _kind_of_file(file, to, options)
+    _refuse_others(kind_of_file, options)
+    if kind_of_file == COPY:
+        found = _corrected_campaign(file, to, replace(correction, pixels_from=pixels_from, relative=relative), options)
+    elif kind_of_file == URDF:
+        found = import_urdf(file, to, {"pan": pan_joint, "tilt": tilt_joint}, steps_per_turn)
+    elif kind_of_file == POINTING:
+        found = _pointing_table(file, to)
+    elif kind_of_file == AXIS:
         from tvsbayes.cli.axis_import import FileOptions, import_readings
         from tvsbayes.single_axis.guide_log import ASSUMPTIONS
 
-        refused = {"pixels_from": pixels_from or None, "angles": angles, "sd_px": sd_px, "relative": relative}
-        refused |= {"flip": flip, "shift_moves": shift_moves, "swap": swap}
-        sides = {f"{a}_approach": None if side == "unknown" else side for a, side in zip(AXES, approach, strict=True)}
-        refuse_options("for a scanner, and this is an axis folder", "leave it out", **refused, **sides)
-        given = dict(_assumption(text, ASSUMPTIONS, "declination_deg=45.9") for text in assume or ())
-        file_options = FileOptions(_axis_kind(kind), run, deviations, counts_per_turn, given)
-        import_readings(file, to, stated, sheet, file_options, yes=yes, as_json=as_json)
-        return
-    axis_options: dict[str, object] = {"run": run, "deviations": deviations, "counts_per_turn": counts_per_turn}
-    axis_options |= {"format": None if kind == "auto" else kind}
-    refuse_options("for files of an axis", "add --axis, or leave it out", **axis_options)
-    if sightings or instrument_of(to) is INSTRUMENTS["pan-tilt-sightings"]:
-        refused = {"pixels_from": pixels_from or None, "sd_px": sd_px, "swap": swap}
-        refuse_options("for spots in pictures, and these are sightings", "leave it out", **refused)
-        given = dict(_assumption(text, {"u_deg": "standard uncertainty"}, "u_deg=0.005") for text in assume or ())
-        notation = Notation(0, angles, SD_PX, relative, approach)
-        import_sightings(file, to, stated, sheet, notation, correction, given.get("u_deg"), yes=yes, as_json=as_json)
-        return
-    refuse_options("for a guide log or sightings", "add --axis or --sightings, or leave it out", assume=assume)
+        assumed = _assumptions(assume, ASSUMPTIONS, "declination_deg=45.9")
+        wish = FileOptions(_axis_kind(kind), run, deviations, counts_per_turn, assumed)
+        found = import_readings(file, to, stated, sheet, wish, yes=yes, as_json=as_json)
+    elif kind_of_file == SIGHTINGS:
+        u_deg = _assumptions(assume, {"u_deg": "standard uncertainty"}, "u_deg=0.005").get("u_deg")
+        found = import_sightings(file, to, stated, sheet, notation, correction, u_deg)
+    else:
+        interactive = not (yes or as_json) and is_interactive()
+        found = _looks(file, to, stated, sheet, notation, correction, interactive)
+    if found is not None:
+        found.carry_out(to, yes, as_json)
+
+
+def _kind_of_file(file: Path, to: Path, options: Mapping[str, Any]) -> str:
+    """What FILE is, by itself, by the options and by the campaign that it goes to."""
+    if file.is_dir():
+        return COPY
+    if options["urdf"]:
+        return URDF
+    if options["kind"] == POINTING:
+        return POINTING
+    if options["axis"] or instrument_of(to) is INSTRUMENTS["axis"]:
+        return AXIS
+    if options["sightings"] or instrument_of(to) is INSTRUMENTS["pan-tilt-sightings"]:
+        return SIGHTINGS
+    return LOOKS
+
+
+def _refuse_others(kind_of_file: str, options: Mapping[str, Any]) -> None:
+    """Refuse given options that this kind of file would ignore.
+
+    Raises:
+        InputError: such an option differs from its default.
+    """
+    parameters = inspect.signature(import_).parameters
+    refused: dict[tuple[str, str], dict[str, object]] = {}
+    for name, kinds in KINDS_OF.items():
+        if kind_of_file not in kinds and options[name] != parameters[name].default:
+            shown = "format" if name == "kind" else name
+            refused.setdefault(_why_refused(kind_of_file, name), {})[shown] = options[name]
+    for (reason, remedy), given in refused.items():
+        refuse_options(reason, remedy, **given)
+
+
+def _why_refused(kind_of_file: str, option: str) -> tuple[str, str]:
+    """Reason and remedy for an option that this kind of file would ignore."""
+    remedy = "leave it out"
+    if kind_of_file == COPY:
+        return "for tables of other programs, and FILE is a folder", remedy
+    if kind_of_file == URDF:
+        return "for other tables", remedy
+    if KINDS_OF[option] == (URDF,):
+        return "for a URDF", "add --urdf, or leave it out"
+    if kind_of_file == POINTING:
+        return "for other tables", remedy
+    if kind_of_file == AXIS:
+        machine = "a head" if option == "sightings" else "a scanner"
+        return f"for {machine}, and this is an axis folder", remedy
+    if option == "assume":
+        return "for a guide log or sightings", "add --axis or --sightings, or leave it out"
+    if AXIS in KINDS_OF[option]:
+        return "for files of an axis", "add --axis, or leave it out"
+    return "for spots in pictures, and these are sightings", remedy
+
+
+def _looks(
+    file: Path,
+    to: Path,
+    stated: Mapping[str, str],
+    sheet: str | None,
+    notation: Notation,
+    correction: Correction,
+    interactive: bool,
+) -> Import:
+    """Import a table of moves and looks; missing columns are asked for where `interactive`."""
+    from tvsbayes.files.foreign_table import read_foreign
+    from tvsbayes.instrument.campaign import stereo_spots
+    from tvsbayes.instrument.column_names import map_columns
+    from tvsbayes.instrument.corrections import corrected
+    from tvsbayes.instrument.foreign_looks import looks_of
+
     listed = _listed_moves(to)
     table = read_foreign(file, sheet)
-    interactive = not (yes or as_json) and is_interactive()
     mapping = _complete_mapping(table, map_columns(table.columns, stated), stated, listed is not None, interactive)
-    notation = Notation(pixels_from, angles, SD_PX if sd_px is None else sd_px, relative, approach)
     looks = looks_of(table, mapping.columns, notation, listed)
     changed = corrected(looks.moves, looks.spots, correction, None if listed is None else len(listed))
     spots = None if changed.spots is None else stereo_spots(changed.spots)
     looks = replace(looks, moves=changed.moves, spots=spots, assumed=(*looks.assumed, *changed.changes))
     _check_no_rows(to, looks)
-    document = _mapping_document(table, mapping, looks)
+    document = _mapping_document(table, mapping, looks) | {"campaign": str(to)}
     lines = [_mapping_text(table, mapping, notation, looks)]
-    written = _write_looks(to, looks) if confirmed(lines, to, yes, as_json) else []
-    document |= {"campaign": str(to), "files": written}
     next_step = f"`tvsbayes check {typed(to)}`"
     if not (to / "stereo.json").is_file():
         cameras = f"tvsbayes stereo --import CALIBRATION -o {typed(to / 'stereo.json')}"
         next_step = f"`{cameras}`, or of pictures of a board, then {next_step}"
-    finish(document, "\n".join([*lines, import_ending(written, next_step, CORRECT_HINT)]), as_json)
+    return Import(lines, document, lambda: _write_looks(to, looks), next_step, CORRECT_HINT)
 
 
-def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
+def _pointing_table(file: Path, to: Path) -> Import:
     """Import a pointing table of a telescope as a campaign of sightings."""
     from tvsbayes.head.foreign_sightings import STEP_DEG
     from tvsbayes.head.pointing_table import U_ARCSEC, campaign_of, read_stars
@@ -203,12 +252,14 @@ def _import_pointing(file: Path, to: Path, *, yes: bool, as_json: bool) -> None:
     if table.left_out:
         assumed.append(f"{table.left_out} blocks without RAA:, TAA: or LST: are no pointings")
     lines = [f"gives: {moves} moves, {sightings} sightings", *(f"assumed: {text}" for text in assumed)]
-    yes = confirmed(lines, to, yes, as_json)
-    if yes:
+    document = {"campaign": str(to), "moves": moves, "sightings": sightings, "assumed": assumed}
+
+    def write() -> list[str]:
         write_campaign(campaign, to)
-    lines.append(import_ending([escaped(str(to), 200)] * yes, f"`tvsbayes check {typed(to)}`"))
-    document = {"campaign": str(to), "moves": moves, "sightings": sightings, "assumed": assumed, "written": yes}
-    finish(document, "\n".join(lines), as_json)
+        return [escaped(str(to), 200)]
+
+    next_step = f"`tvsbayes check {typed(to)}`"
+    return Import(lines, document, write, next_step, outcome=lambda written: {"written": bool(written)})
 
 
 def _field_and_column(text: str) -> tuple[str, str]:
@@ -218,6 +269,14 @@ def _field_and_column(text: str) -> tuple[str, str]:
         remedy = "write --column u_left_px=XL; --column target= where the table has none"
         raise InputError("usage", f"--column {escaped(text)}: no =", allowed="FIELD=NAME", remedy=remedy)
     return field.strip(), name.strip()
+
+
+def _angle_unit(unit: str | None) -> str | None:
+    """The value of --angles."""
+    if unit not in (None, "deg", "rad"):
+        found, remedy = f"--angles {escaped(unit)}", "write --angles deg or --angles rad"
+        raise InputError("usage", f"{found}; allowed: deg, rad", allowed="deg, rad", remedy=remedy)
+    return unit
 
 
 def _axis_kind(kind: str) -> str:
@@ -231,49 +290,47 @@ def _axis_kind(kind: str) -> str:
     return kind
 
 
-def _assumption(text: str, known: Mapping[str, str], example: str) -> tuple[str, float]:
-    """Split --assume NAME=NUMBER; `known` holds the names with their meanings."""
-    name, _, number = text.partition("=")
-    allowed = ", ".join(f"{key}=NUMBER ({meaning})" for key, meaning in known.items())
-    if name.strip() not in known or not NUMBER.fullmatch(number.strip()):
-        remedy = f"write --assume {example}"
-        raise InputError("usage", f"--assume {escaped(text)}; allowed: {allowed}", allowed=allowed, remedy=remedy)
-    return name.strip(), float(number)
+def _assumptions(texts: list[str] | None, known: Mapping[str, str], example: str) -> dict[str, float]:
+    """The values of --assume NAME=NUMBER; `known` holds the names with their meanings."""
+    assumed = {}
+    for text in texts or ():
+        name, _, number = (part.strip() for part in text.partition("="))
+        if name not in known or not NUMBER.fullmatch(number):
+            allowed = ", ".join(f"{key}=NUMBER ({meaning})" for key, meaning in known.items())
+            message, remedy = f"--assume {escaped(text)}; allowed: {allowed}", f"write --assume {example}"
+            raise InputError("usage", message, allowed=allowed, remedy=remedy)
+        assumed[name] = float(number)
+    return assumed
 
 
-def _correct_campaign(folder: Path, to: Path, correction: Correction, *, yes: bool, as_json: bool) -> None:
+def _corrected_campaign(folder: Path, to: Path, correction: Correction, options: Mapping[str, Any]) -> Import:
     """Write a copy of a campaign with corrected tables; other files of its folder are not copied."""
     from tvsbayes.instrument.campaign import looks_bytes, moves_bytes, read_campaign
     from tvsbayes.instrument.corrections import Correction, corrected
 
-    if serve("import", folder, to=to, correction=correction, yes=yes, as_json=as_json):
-        return
+    serve("import", folder)
     if correction == Correction():
         remedy = "say what to correct: --flip, --shift-moves, --swap, --pixels-from 1, --relative"
         raise InputError("usage", f"{escaped(str(folder), 200)} is a campaign already", remedy=remedy)
     campaign = read_campaign(folder)
     if campaign.rig.mechanism.sightings:
-        refused = {"swap": correction.swapped or None, "pixels_from": correction.pixels_from or None}
-        refuse_options("for spots in pictures, and these are sightings", "leave it out", **refused)
+        _refuse_others(SIGHTINGS, options)
     changed = corrected(campaign.moves, campaign.spots, correction)
     moves, spots = changed.moves or (), changed.spots or ()
     campaign = replace(campaign, moves=moves, spots=spots)
     ok = sum(spot.status == "ok" for spot in spots)
     lines = [f"corrected: {text}" for text in changed.changes]
     lines.append(f"gives: {len(moves)} moves, {len(spots)} looks, {ok} of use")
-    yes = confirmed(lines, to, yes, as_json)
-    written = []
-    if yes:
+    document = {"assumed": list(changed.changes), "moves": len(moves), "spots": len(spots), "ok": ok}
+
+    def write() -> list[str]:
         make_folder(to, empty=True)
         copied = [name for name in ("campaign.toml", "stereo.json", HEAD_URDF) if (folder / name).is_file()]
         contents = {name: read_bytes(folder / name, CSV_BYTES_MAX, folder) for name in copied}
         contents |= {"moves.csv": moves_bytes(moves), campaign.looks_table.file: looks_bytes(campaign)}
-        for name, data in contents.items():
-            write_atomically(to / name, data)
-        written = [str(to / name) for name in contents]
-    lines.append(import_ending(written, f"`tvsbayes check {typed(to)}`"))
-    document = {"assumed": list(changed.changes), "moves": len(moves), "spots": len(spots), "ok": ok}
-    finish({**document, "campaign": str(to), "files": written}, "\n".join(lines), as_json)
+        return write_files(to, contents)
+
+    return Import(lines, document | {"campaign": str(to)}, write, f"`tvsbayes check {typed(to)}`")
 
 
 def _listed_moves(to: Path) -> tuple[Move, ...] | None:
@@ -356,9 +413,7 @@ def _write_looks(to: Path, looks: ForeignLooks) -> list[str]:
         write_templates(to)
     contents = {} if looks.moves is None else {"moves.csv": moves_bytes(looks.moves)}
     contents |= {} if looks.spots is None else {"spots.csv": spots_bytes(looks.spots)}
-    for name, data in contents.items():
-        write_atomically(to / name, data)
-    return [str(to / name) for name in contents]
+    return write_files(to, contents)
 
 
 def _mapping_document(table: ForeignTable, mapping: ColumnMapping, looks: ForeignLooks) -> dict[str, Any]:

@@ -78,10 +78,3 @@ def column_refusal(
     names = ", ".join(escaped(name) for name in table.columns)
     line, allowed = table.first_line, f"any of {names}"
     return refusal("missing-column", file=table.file, line=line, found=found, allowed=allowed, remedy=remedy)
-
-
-def import_ending(written: Sequence[str], next_step: str, hint: str = "") -> str:
-    """The last lines of an import: the written files and the next step, or how to write them."""
-    if not written:
-        return f"nothing written: add --yes{hint}"
-    return f"written: {', '.join(written)}\nnext: {next_step}"
