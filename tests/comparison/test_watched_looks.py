@@ -18,8 +18,8 @@ from tvsbayes.comparison.watched_looks import (
     COLUMNS,
     FALSE_ALARM_RATE,
     SIGHTED_CHANGES,
-    Believed,
     Departure,
+    DrawnDepartures,
     WatchedLooks,
     null_distribution,
     powers,
@@ -131,7 +131,7 @@ def test_false_alarms_and_power_are_those_of_the_linear_model():
         for moved in (False, True):
             seen = noise + moved * columns[:, shifted] @ [CHANGES[6].size]
             trial = replace(known, chi2=float(seen @ seen), score=columns.T @ seen)
-            logs = watched_looks.log_chances(Believed(trial, (trial,), np.ones(1)), [])
+            logs = watched_looks.log_chances(DrawnDepartures(trial, (trial,), np.ones(1)), [])
             alarms += (not moved) and bool(logs[1:].min() <= null.limit)
             noticed += moved and bool(logs[1 + 6] <= null.limit)
     low, high = binomial_bounds(trials, FALSE_ALARM_RATE)

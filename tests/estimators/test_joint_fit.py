@@ -283,7 +283,7 @@ def test_coverage_of_forty_rigs(protocol, mounted_rig):
         simulated = simulate(rig, plan, seed, aperture=protocol == "grid")
         result = fit(simulated.campaign)
         assert result.converged
-        true = local_deg_per_step(simulated.truth.parameters, tuple(np.degrees(result.reference_pose_rad)))
+        true = simulated.truth.effective_deg_per_step(simulated.campaign)
         sd = result.draws.effective_deg_per_step.std(axis=0)
         z.append((result.mode.effective_deg_per_step - list(true.values())) / sd)
     squares = np.sum(np.square(z), axis=0)

@@ -30,7 +30,7 @@ PRIOR_PARTS = (TRANSMISSION_ERROR, PLAY_VARIATION, "stereo calibration")
 
 
 @dataclass(frozen=True)
-class _Told:
+class _SplitInformation:
     """Information J^T C^-1 J of a campaign on coordinates and errors at places, split by noise.
 
     With C = 1 + (stop errors), whitened by the noise of looks, it is (C^-1 J)^T (C^-1 J) and a remainder; matrices (p +
@@ -58,7 +58,7 @@ def _noise_of(fit: JointFit, readings: bool) -> str:
     return "pixel and aperture noise" if readings else "pixel noise"
 
 
-def _told(fit: JointFit) -> _Told:
+def _split_information(fit: JointFit) -> _SplitInformation:
     readings = np.any(np.asarray(fit.arrays.spots.has_aperture) * np.asarray(fit.arrays.spots.valid))
     linear = linear_spots(
         fit.linearised, fit.arrays, np.where(fit.held, 0.0, -np.asarray(fit.linearised.residual_jacobian))
@@ -72,7 +72,7 @@ def _told(fit: JointFit) -> _Told:
     error_columns = len(NAMES) + np.arange(places)
     groups = dict(fit.space.mechanism.prior_groups)
     groups |= {TRANSMISSION_ERROR: error_columns.tolist(), PLAY_VARIATION: (error_columns + places).tolist()}
-    return _Told(
+    return _SplitInformation(
         _noise_of(fit, bool(readings)),
         noise - by_looks,
         by_looks,
@@ -108,7 +108,7 @@ def causes_of(fit: JointFit, by_places: np.ndarray | None = None) -> Causes:
         fit: a converged fit.
         by_places: further inputs, as d(input)/d(errors at places, N(0, 1) a priori), shape (inputs, errors).
     """
-    information = _told(fit)
+    information = _split_information(fit)
     parts = {
         information.pixels: information.by_pixels,
         LOOK_SCATTER: information.by_looks,
@@ -151,7 +151,7 @@ def headline_causes(fit: JointFit) -> HeadlineCauses:
     if not columns:
         none = np.zeros((0, 0))
         return HeadlineCauses((), (), none, np.zeros(0), np.zeros(0), (), none)
-    information = _told(fit)
+    information = _split_information(fit)
     spread = whole_gradients(fit, np.stack(list(columns.values()), axis=1)) @ information.posterior
     causes = [*_noise_causes(fit, information, tuple(columns), spread), *_prior_causes(fit, spread)]
     kept = [cause for cause in causes if np.any(cause.contribution != 0)]
@@ -173,7 +173,9 @@ def _headline_draws(fit: JointFit) -> dict[str, np.ndarray]:
     return {name: fit.draws[name] for name in names}
 
 
-def _noise_causes(fit: JointFit, information: _Told, quantities: tuple[str, ...], spread: np.ndarray) -> list[_Cause]:
+def _noise_causes(
+    fit: JointFit, information: _SplitInformation, quantities: tuple[str, ...], spread: np.ndarray
+) -> list[_Cause]:
     """Compute causes other than single priors: noise of the campaign, errors of the gears, the cameras' calibration."""
     moved, every = moved_directions(fit), np.ones(len(quantities))
     physical = np.asarray(fit.draws.physical)

@@ -18,7 +18,15 @@ from tvsbayes.calibration.optics import beam_components, is_head, output_deg
 from tvsbayes.calibration.pointing import INPUT_NAMES, Calibration
 from tvsbayes.comparison.watched_looks import LOOKS_MIN, WatchedLooks
 from tvsbayes.compensation.promise import bound_of, refuse_answer
-from tvsbayes.compensation.verification import SEPARATE, TELLING, Trial, judged, other_axis, size_of, telling_visits
+from tvsbayes.compensation.verification import (
+    IDENTIFIED,
+    SEPARATE,
+    Trial,
+    discriminating_visits,
+    judged,
+    other_axis,
+    size_of,
+)
 from tvsbayes.errors import InputError, NothingToEstimate
 from tvsbayes.estimators.campaign_arrays import in_sight
 from tvsbayes.estimators.joint_fit import JointFit
@@ -305,7 +313,7 @@ def plan_looks(campaign: Campaign, calibration: Calibration) -> AimPlan:
     pan, tilt = ([axis.stops[i % len(axis.stops)] for i in range(count)] for axis in axes)
     stops = tuple((p, t, ps, ts) for (p, ps), (t, ts) in zip(pan, tilt, strict=True))
     reached = max(axis.reached for axis in axes)
-    return AimPlan(stops, (run_up[0], run_up[1]), reached >= TELLING, float(np.sqrt(reached)))
+    return AimPlan(stops, (run_up[0], run_up[1]), reached >= IDENTIFIED, float(np.sqrt(reached)))
 
 
 @dataclass(frozen=True)
@@ -338,7 +346,7 @@ def _axis_stops(campaign: Campaign, calibration: Calibration, k: int, run_up: in
     visible = np.max(np.abs(off[1])) > np.sqrt(SEPARATE * np.max(np.diag(common) + noise))
     worlds = off if visible else off[:1]
     spread = np.isin(np.arange(CANDIDATES), [0, CANDIDATES // 2, CANDIDATES - 1])
-    visits = telling_visits(worlds, common, noise, np.repeat(spread, 2))
+    visits = discriminating_visits(worlds, common, noise, np.repeat(spread, 2))
     chosen = [i for i in range(2 * CANDIDATES) for _ in range(int(visits.visits[i]))]
     return _AxisStops([(int(steps[i, k]), int(sides[i, k])) for i in chosen], visits.reached)
 

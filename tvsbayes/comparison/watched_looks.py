@@ -154,7 +154,7 @@ class Departure:
 
 
 @dataclass(frozen=True)
-class Believed:
+class DrawnDepartures:
     """Departures over the distribution of the noise scales.
 
     Attributes:
@@ -196,7 +196,7 @@ def _test(score: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 @dataclass(frozen=True)
-class _Told:
+class _ScoreInformation:
     """Score and information of columns of linearised spots, with the coordinates eliminated.
 
     Attributes:
@@ -210,7 +210,7 @@ class _Told:
     information: np.ndarray
 
     @classmethod
-    def of(cls, spots: LinearSpots, prior: np.ndarray) -> _Told:
+    def of(cls, spots: LinearSpots, prior: np.ndarray) -> _ScoreInformation:
         """Eliminate the first columns, coordinates with prior N(0, 1) that are at `prior`, shape (p,)."""
         information, count = stop_information(spots), len(prior)
         errors = np.concatenate([group.residual for group in information.groups])
@@ -255,7 +255,7 @@ class WatchedLooks:
         The shifts are those of the changes, or with `angles` the mirror angles (pan, tilt) of every usable look, deg.
         """
         linear, prior = self.linear(z, angles=angles), np.where(self.problem.held, 0.0, z)
-        whole, before = (_Told.of(spots, prior) for spots in (linear, rows_of(linear, slice(self.first))))
+        whole, before = (_ScoreInformation.of(spots, prior) for spots in (linear, rows_of(linear, slice(self.first))))
         return Departure(whole.chi2 - before.chi2, self.dof, whole.score, whole.information, self.changes)
 
     def linear(self, z: np.ndarray, *, angles: bool = False) -> LinearSpots:
@@ -307,11 +307,11 @@ class WatchedLooks:
                 sizes.append(0.01 * value[COORDINATES[name]] if change.unit == "%" else radians)
         return np.array(sizes)
 
-    def believed(self, seed: int) -> Believed:
+    def departures(self, seed: int) -> DrawnDepartures:
         """Compute departures over the first session's marginal of the noise scales."""
         noise = noise_draws(self.fit, NOISE_DRAWS, seed)
         drawn = tuple(self.departure(z) for z in noise.z)
-        return Believed(self.departure(noise.centre), drawn, noise.weights)
+        return DrawnDepartures(self.departure(noise.centre), drawn, noise.weights)
 
 
 def rows_of(spots: LinearSpots, rows: slice) -> LinearSpots:
@@ -319,17 +319,17 @@ def rows_of(spots: LinearSpots, rows: slice) -> LinearSpots:
     return LinearSpots(**{part.name: getattr(spots, part.name)[rows] for part in fields(spots)})
 
 
-def log_chances(believed: Believed, known: list[slice]) -> np.ndarray:
+def log_chances(departures: DrawnDepartures, known: list[slice]) -> np.ndarray:
     """Compute log p of all residuals, then of every change given known ones, averaged over noise scales, (1 + c,)."""
     chances = []
-    for departure in believed.drawn:
+    for departure in departures.drawn:
         left, logs = departure.given(known), [log_chance(departure.chi2, departure.dof)]
         for rows in departure.columns:
             chi2, dof = _test(left.score[rows], left.information[rows, rows])
             logs.append(np.zeros(()) if rows in known or not dof else log_chance(chi2, dof))
         chances.append(np.array(logs))
     with np.errstate(divide="ignore"):
-        weights = np.log(believed.weights)
+        weights = np.log(departures.weights)
     return np.logaddexp.reduce(np.array(chances) + weights[:, None], axis=0)
 
 
@@ -395,12 +395,12 @@ def powers(departure: Departure, limit: float, seed: int, times: float = 1.0) ->
     return shares
 
 
-def _moved(believed: Believed, limit: float) -> tuple[MovedPart, ...]:
+def _moved(departures: DrawnDepartures, limit: float) -> tuple[MovedPart, ...]:
     """Find changes that explain the looks, the best first, each given those before it."""
     known: list[slice] = []
-    places = believed.centre.columns
+    places = departures.centre.columns
     while len(known) < len(places):
-        logs = log_chances(believed, known)[1:]
+        logs = log_chances(departures, known)[1:]
         best = int(np.argmin(logs))
         if logs[best] > limit:
             break
@@ -408,9 +408,9 @@ def _moved(believed: Believed, limit: float) -> tuple[MovedPart, ...]:
     if not known:
         return ()
     rows = np.concatenate([np.arange(part.start, part.stop) for part in known])
-    covariance = _inverse(believed.centre.information[np.ix_(rows, rows)])
-    shift = Shift(covariance @ believed.centre.score[rows], covariance)
-    named = [(part, change.unit) for change in believed.centre.changes for part in change.parts]
+    covariance = _inverse(departures.centre.information[np.ix_(rows, rows)])
+    shift = Shift(covariance @ departures.centre.score[rows], covariance)
+    named = [(part, change.unit) for change in departures.centre.changes for part in change.parts]
     parts: list[MovedPart] = []
     start = 0
     for columns in known:
@@ -446,10 +446,10 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
             remedy="look at more places, or detect the refused spots again",
         )
     watched = WatchedLooks(fit, looks)
-    believed = watched.believed(seed)
-    null = null_distribution(believed.centre, seed)
-    logs = log_chances(believed, [])
-    able = powers(believed.centre, null.limit, seed)
+    departures = watched.departures(seed)
+    null = null_distribution(departures.centre, seed)
+    logs = log_chances(departures, [])
+    able = powers(departures.centre, null.limit, seed)
     changes = tuple(
         SeenChange(change.what, change.size, change.unit, power, float(np.exp(log_p)))
         for change, power, log_p in zip(watched.changes, able, logs[1:], strict=True)
@@ -463,7 +463,7 @@ def watch(fit: JointFit, looks: Campaign, *, seed: int = 0) -> Watch:
         p=null.probability(float(logs[1:].min())),
         false_alarm_rate=FALSE_ALARM_RATE,
         p_all=float(np.exp(logs[0])),
-        moved=_moved(believed, null.limit) if moved else (),
+        moved=_moved(departures, null.limit) if moved else (),
         changes=changes,
         looks=watched.looks,
         same_cameras=hashes[0] == hashes[1],

@@ -59,7 +59,7 @@ SCENARIOS = {
 SEPARATE = 16.0
 """Squared distance, in standard deviations of the readings, from which a fault of the play alone is a separate case; a
 smaller one does not affect the promise."""
-TELLING = 25.0
+IDENTIFIED = 25.0
 """Squared distance of two hypotheses at which readings identify the true one in 95 of 100 cases: half of it less 1.645
 times its root exceeds ln(76), the odds of 0.95 against four others."""
 OTHERS, OTHER_LEAST = 12, 3.0
@@ -212,7 +212,7 @@ def needed_readings(promised: PredictedStops, off: np.ndarray, noise: np.ndarray
     _, covariance = promised.pooled()
     kept = covariance - np.diag(0.999 * np.minimum(noise, np.diag(covariance)))
     for times in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32):
-        if _distance(off, kept + np.diag(noise) / times) >= TELLING:
+        if _distance(off, kept + np.diag(noise) / times) >= IDENTIFIED:
             return times * len(off)
     return None
 
@@ -381,7 +381,7 @@ class VerifyPlan:
         )
 
 
-def _parting(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarray, visits: np.ndarray) -> float:
+def _separation(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarray, visits: np.ndarray) -> float:
     """Compute the squared distance of the nearest hypothesis, for numbers of visits to candidates (m,)."""
     used = np.flatnonzero(visits)
     scatter = covariance[np.ix_(used, used)] + np.diag(noise[used] / visits[used])
@@ -389,16 +389,16 @@ def _parting(off: Sequence[np.ndarray], covariance: np.ndarray, noise: np.ndarra
 
 
 @dataclass(frozen=True)
-class TellingVisits:
+class DiscriminatingVisits:
     """Number of visits to each candidate, shape (m,), and the squared distance of the nearest hypothesis by them."""
 
     visits: np.ndarray
     reached: float
 
 
-def telling_visits(
+def discriminating_visits(
     off: Sequence[np.ndarray], common: np.ndarray, noise: np.ndarray, first: np.ndarray
-) -> TellingVisits:
+) -> DiscriminatingVisits:
     """Choose the fewest visits that discriminate the hypotheses, by greedy choice.
 
     Args:
@@ -408,13 +408,13 @@ def telling_visits(
         first: mask of candidates that are always visited.
     """
     visits = first.astype(float)
-    reached = _parting(off, common, noise, visits)
-    while reached < TELLING and visits.sum() < PLANNED_MAX:
-        each = [_parting(off, common, noise, visits + row) for row in np.eye(len(visits))]
+    reached = _separation(off, common, noise, visits)
+    while reached < IDENTIFIED and visits.sum() < PLANNED_MAX:
+        each = [_separation(off, common, noise, visits + row) for row in np.eye(len(visits))]
         best = int(np.argmax(each))
         visits[best] += 1
         reached = each[best]
-    return TellingVisits(visits, reached)
+    return DiscriminatingVisits(visits, reached)
 
 
 def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> VerifyPlan:
@@ -448,8 +448,8 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         raise NothingToEstimate("no-correction", "the table corrects nothing", remedy="nothing is to be verified")
     # Stops over the whole range first: a fault in a part of the table shows only there.
     spread = np.linspace(0, len(nodes) - 1, SPREAD).round().astype(int)
-    chosen = telling_visits(off, common, noise, np.isin(run.index, spread))
+    chosen = discriminating_visits(off, common, noise, np.isin(run.index, spread))
     visits, reached = chosen.visits, chosen.reached
     order = [k for k in range(len(mean)) for _ in range(int(visits[k]))]
     stops = tuple((float(nodes[run.index[k]]), int(run.side[k])) for k in order)
-    return VerifyPlan(stops, overrun, reached >= TELLING, float(np.sqrt(reached)))
+    return VerifyPlan(stops, overrun, reached >= IDENTIFIED, float(np.sqrt(reached)))

@@ -118,7 +118,7 @@ def _absorbed_conflict(model: AxisModel, name: str, default: AxisPrior) -> Prior
     return PriorConflict(name, value, sd, prior, True, difference / prior.u if prior.u else np.inf)
 
 
-MODE, WEIGHING, WALKING, TELLING = "mode", "weighted draws", "chain", "summarising"
+MODE, WEIGHING, WALKING, SUMMARISING = "mode", "weighted draws", "chain", "summarising"
 EQUAL_DRAWS = 2000
 """Number of equally weighted draws kept of a sample."""
 ROUNDS_MAX = 32
@@ -273,7 +273,7 @@ def fit_axis(
         InputError: too many moves, or angles that wrap.
     """
     model = model_of(campaign, more)
-    stages = {MODE: 1.0, WEIGHING: 2.0 * sampled, WALKING: 8.0 * (sampled and tier != IMPORTANCE), TELLING: 0.5}
+    stages = {MODE: 1.0, WEIGHING: 2.0 * sampled, WALKING: 8.0 * (sampled and tier != IMPORTANCE), SUMMARISING: 0.5}
     with Job(stages, progress) as job:
         job.begin(MODE)
         mode, sample = find_mode(model), None
@@ -286,7 +286,7 @@ def fit_axis(
                 walk = run_of(tier)
                 job.begin(WALKING)
                 sample = better(sample, walk(run, None, None, job.at, start_time).until_converged(60.0 * max_minutes))
-        job.begin(TELLING)
+        job.begin(SUMMARISING)
         rng = random_stream(seed, AxisStream.RESAMPLING)
         if sample is not None and sample.convergence.converged:
             w = sample.equal(EQUAL_DRAWS, rng)
