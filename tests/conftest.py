@@ -145,15 +145,14 @@ def ctrl_c_works():
 class Evaluated:
     """Everything between coordinates and log likelihood, as NumPy arrays: see the library's own records.
 
-    `terms` are the residuals (spots, 4), slopes (spots, 4, 2), log scales and predicted looks (spots, 5). `innovations`
-    are those at the mean errors of the places, `moved` these and then those where each normal number is 1 by itself.
+    `terms` are the residuals (spots, 4), slopes (spots, 4, 2), log scales and predicted looks (spots, 5).
+    `log_likelihood` is that of `likelihood.evaluate`, less the prior's part.
     """
 
     model: Any
     angles: Any
     terms: Any
-    innovations: Any
-    moved: Any
+    log_likelihood: float
 
 
 @pytest.fixture(scope="session")
@@ -162,7 +161,7 @@ def evaluate():
     import jax
     import jax.numpy as jnp
 
-    from tvsbayes.estimators.likelihood import blocks_filled, innovations, standing
+    from tvsbayes.estimators import likelihood
     from tvsbayes.model.laser_path import mirror_angles
 
     # Run a hundred times, compiled once: a third of the time of compilation is optimisation.
@@ -170,21 +169,20 @@ def evaluate():
     def compiled(z, space, arrays):
         model = space.model(z)
         angles = mirror_angles(model.transmission, model.tilt_zero_rad, arrays.moves)
-        found = standing(model, arrays)
+        found = likelihood.standing(model, arrays)
         terms = {
             "residual": jnp.stack(found.terms.residual, axis=1),
             "slope": jnp.stack([jnp.stack(found.terms.by_pan, 1), jnp.stack(found.terms.by_tilt, 1)], axis=2),
             "log_scale": found.terms.log_scale,
             "predicted": jnp.stack(found.looks.predicted, axis=1),
         }
-        size, blocks = 2 * len(arrays.gears.places.steps), blocks_filled(arrays)
-        normals = jnp.concatenate([jnp.zeros((1, size)), jnp.eye(size)])
-        return model, angles, terms, jax.vmap(lambda normal: innovations(model, arrays, normal, blocks))(normals)
+        return model, angles, terms
 
     def run(z, space, arrays) -> Evaluated:
         with jax.enable_x64(True):
-            model, angles, terms, moved = jax.tree.map(np.asarray, compiled(jnp.asarray(z), space, arrays))
-            return Evaluated(model, angles, SimpleNamespace(**terms), jax.tree.map(lambda a: a[0], moved), moved)
+            model, angles, terms = jax.tree.map(np.asarray, compiled(jnp.asarray(z), space, arrays))
+            log_density = likelihood.evaluate(z[None], likelihood.no_draw(1, arrays), space, arrays).log_density[0]
+            return Evaluated(model, angles, SimpleNamespace(**terms), float(log_density + 0.5 * z @ z))
 
     return run
 

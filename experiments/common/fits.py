@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import numpy as np
 
-from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.joint_fit import JointFit, fit, fit_at
-from tvsbayes.estimators.likelihood import BLOCK
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.parameters import RIG_NAMES
 from tvsbayes.model.parameter_space import coordinates_of
 from tvsbayes.statistics.least_squares import newton_mode
 from tvsbayes.twin.true_rig import Truth
-
-
-def without_padding(arrays: CampaignArrays, moves: int) -> CampaignArrays:
-    """A campaign's own moves and whole blocks of spots: derivatives in reverse mode pass through every row."""
-    own = arrays.of_spots(0, -(-int(arrays.count) // BLOCK) * BLOCK)
-    return replace(own, moves=jax.tree.map(lambda of_move: of_move[:moves], own.moves))
 
 
 def physical_of(truth: Truth) -> np.ndarray:

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from arviz_stats.base import array_stats
 
+from experiments.common.jax_density import innovations, without_padding
 from tvsbayes.estimators.joint_fit import JointFit
-from tvsbayes.estimators.likelihood import blocks_filled, innovations
 from tvsbayes.instrument.parameters import NAMES, NOISE_NAMES
 from tvsbayes.posterior import transport
 from tvsbayes.posterior.target import Target
@@ -74,13 +74,7 @@ def pivoted(covariance: np.ndarray) -> np.ndarray:
 @jax.jit
 def whitened(z, space, arrays):
     """Standardised innovations and errors at places of many points, shape (n, residuals)."""
-    still, blocks = jnp.zeros(2 * len(arrays.gears.places.steps)), blocks_filled(arrays)
-
-    def one(z):
-        seen = innovations(space.model(z), arrays, still, blocks)
-        return jnp.concatenate([seen.standardised.ravel(), seen.places])
-
-    return jax.vmap(one)(z)
+    return jax.vmap(lambda z: innovations(z, space, arrays).residual)(z)
 
 
 def build_transport(joint: JointFit) -> Transport:
@@ -88,7 +82,7 @@ def build_transport(joint: JointFit) -> Transport:
     rows = np.flatnonzero(joint.free)
     index = rows[pivoted(joint.covariance[np.ix_(rows, rows)])]
     root = np.linalg.cholesky(joint.covariance[np.ix_(index, index)])
-    size = index.size
+    size, arrays = index.size, without_padding(joint.arrays, len(joint.campaign.moves))
 
     def residuals(y: np.ndarray) -> np.ndarray:
         out = []
@@ -96,7 +90,7 @@ def build_transport(joint: JointFit) -> Transport:
             part = y[first : first + BATCH]
             z = np.repeat(joint.z[None], BATCH, axis=0)
             z[: len(part), index] += part @ root.T
-            out.append(np.asarray(whitened(jnp.asarray(z), joint.space, joint.arrays))[: len(part)])
+            out.append(np.asarray(whitened(jnp.asarray(z), joint.space, arrays))[: len(part)])
         return np.concatenate(out)
 
     geometry = [k for k in range(size) if NAMES[index[k]] not in NOISE_NAMES]

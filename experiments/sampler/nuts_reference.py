@@ -5,7 +5,7 @@
     taskset -c 1 python -m experiments.sampler.nuts_reference paper --speed --chains 1 --warmup 200 --limit 90
 
 The first two write `data/reference/posterior_{paper,grid}.json`: mean, sd and quantiles of every free parameter and
-headline under `tvsbayes.estimators.likelihood.log_density`, each with its Monte Carlo standard error. NumPyro's NUTS
+headline under the density of `tvsbayes.estimators.likelihood`, each with its Monte Carlo standard error. NumPyro's NUTS
 (the extra `bench`; four chains in step, diagonal mass) samples the sheared coordinates of
 `common/reference_samplers.py`: a reference shares no sampling code with `tvsbayes.posterior`, which it judges.
 `--speed` measures effective draws per second without the shear, dense mass.
@@ -26,12 +26,12 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from experiments.common.command_line import parser
-from experiments.common.fits import without_padding
+from experiments.common.jax_density import log_density, without_padding
 from experiments.common.reference_samplers import AXES, Run, Setting, build_transport, nuts
 from experiments.common.rigs import twin_campaign
 from experiments.common.rows import ROOT
 from tvsbayes.estimators.joint_fit import JointFit, fit
-from tvsbayes.estimators.likelihood import evaluate, log_density, no_draw
+from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.instrument.axes import DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign, input_hashes
 from tvsbayes.instrument.model_choice import ModelChoice
@@ -120,7 +120,7 @@ def write_reference(twin: str, campaign: Campaign, setting: Setting, run: Run, r
     """`data/reference/posterior_TWIN.json`, a quantity a line."""
     reference = {
         "twin": f"{twin}_twin",
-        "target": "tvsbayes.estimators.likelihood.log_density, perfect gears",
+        "target": "tvsbayes.estimators.likelihood.evaluate, perfect gears",
         "sampler": "NUTS in sheared coordinates, experiments/sampler/nuts_reference.py",
         "versions": {name: version(name) for name in ("numpyro", "jax", "numpy")},
         "seed": setting.seed,

@@ -14,12 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
-from experiments.common.fits import without_padding
+from experiments.common.jax_density import innovations as exact_innovations
+from experiments.common.jax_density import root_at_places, without_padding
 from tvsbayes.estimators.annealed_stage import Fixed, innovations, stage
 from tvsbayes.estimators.campaign_arrays import CampaignArrays
 from tvsbayes.estimators.kalman_filter import no_belief
-from tvsbayes.estimators.likelihood import innovations as exact_innovations
-from tvsbayes.estimators.likelihood import root_at_places
 from tvsbayes.estimators.linear_spots import linearise
 from tvsbayes.estimators.mode_search import Problem
 from tvsbayes.instrument.campaign import Campaign, ordered_spots
@@ -37,9 +36,7 @@ def exact_values(z, args):
     """Standardised innovations, errors at places and prior residuals."""
     space, arrays, fixed = args
     full = jnp.where(fixed.held, fixed.value, z)
-    found = exact_innovations(space.model(full), arrays, jnp.zeros(2 * len(arrays.gears.places.steps)))
-    prior = jnp.where(fixed.held, z - fixed.value, z)
-    return jnp.concatenate([found.standardised.ravel(), found.places, prior])
+    return jnp.append(exact_innovations(full, space, arrays).residual, jnp.where(fixed.held, z - fixed.value, z))
 
 
 def exact_residuals(z, args) -> LinearResidual:

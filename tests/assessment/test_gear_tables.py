@@ -72,7 +72,7 @@ def fitted(steps: dict[str, list[float]], scales: dict[str, float], ratios: dict
         np.full((2, 3), 2 * np.pi),
     )
     angle = np.radians(counters * np.where(on_tilt, ratios["tilt"], ratios["pan"]))
-    root = np.asarray(place_root(shape, angle, on_tilt, valid, np))
+    root = place_root(shape, angle, on_tilt, valid)
     places = SimpleNamespace(steps=counters, on_tilt=on_tilt, valid=valid)
     fit = SimpleNamespace(
         arrays=SimpleNamespace(gears=SimpleNamespace(places=places)),

@@ -7,13 +7,14 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from support.dense_likelihood import angle_covariances, physical, residual_covariance
 from support.dozen_algebra import NOISE, found_at
 from support.varying_gears import perfect_gears
 
-from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, innovations, stage
+from tvsbayes.estimators.annealed_stage import NO_STEP, Fixed, stage
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
-from tvsbayes.estimators.kalman_filter import no_belief
 from tvsbayes.estimators.linear_spots import linear_spots, stop_information
+from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import LOOK_SCATTER_NAMES, NAMES
 
 pytestmark = [pytest.mark.thorough, pytest.mark.usefixtures("x64")]
@@ -34,14 +35,15 @@ def found(dozen, evaluate):
         return SimpleNamespace(z=beside(dozen), **vars(found_at(evaluate, dozen, beside(dozen))))
 
 
-def test_innovations_are_those_of_the_density(dozen, found):
-    """The same filter as the density's: its standardised errors, at the mean errors of the gears' places."""
-    lin, size, filled = found.reduced.also, len(dozen.campaign.spots), dozen.arrays.gears.errors_filled
-    before = no_belief(1 + len(NAMES) + len(filled))
-    columns = np.asarray(jax.jit(innovations)(lin, dozen.arrays.of_spots(0, size), before).standardised)
-    own = columns[..., 0] + columns[..., 1 + len(NAMES) :] @ lin.place_root @ found.moved.places[0][filled]
-    expected = found.moved.standardised[0][:size]
-    np.testing.assert_allclose(own, expected, atol=ALGEBRA * np.abs(expected).max())
+def test_squares_are_the_quadratic_form_of_the_dense_gaussian(dozen, found):
+    """And the prior's: with stop errors, scatter of looks and errors at places, as in the density."""
+    count = len(ordered_spots(dozen.campaign))
+    residual, slope = found.terms.residual[:count].ravel(), found.terms.slope[:count]
+    covariance = residual_covariance(angle_covariances(dozen.campaign, physical(found)), slope)
+    value, prior = found.reduced.value, np.where(NOISE, 0.0, found.z)
+    squares = residual @ np.linalg.solve(covariance, residual) + prior @ prior
+    # Dense solves of a covariance of condition 1e8.
+    assert value @ value == pytest.approx(squares, rel=1e-7)
 
 
 def test_reduced_residuals_have_length_slope_and_curvature_of_all(dozen, found):

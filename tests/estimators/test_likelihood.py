@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.dense_likelihood import dense_log_density, drawn_at_every_move, physical, play_band_deg, stop_labels
-from support.sloped_density import value_and_gradient
 
+from experiments.common.jax_density import log_density, without_padding
 from tvsbayes.estimators import likelihood as density
 from tvsbayes.estimators.campaign_arrays import bucket, campaign_arrays, spot_constants
 from tvsbayes.estimators.likelihood import no_draw
@@ -28,6 +28,7 @@ pytestmark = pytest.mark.usefixtures("x64")
 LOG_UNIT = 1.0
 """One unit of log density; exact algebra on a dozen spots leaves 1e-8 of it."""
 FINE_UNIT = 1e-8 * LOG_UNIT
+value_and_gradient = jax.jit(jax.value_and_grad(log_density))
 
 
 def random_points(dozen, count: int, scale: float) -> np.ndarray:
@@ -65,7 +66,7 @@ def test_filter_equals_dense_gaussian(dozen, evaluate, offset_sds):
     evaluated = evaluate(z, dozen.space, dozen.arrays)
     dense = dense_log_density(dozen.campaign, evaluated)
     # Rounding of a chi2 of 1e6 at one prior sd is 1e-10 per operation.
-    assert evaluated.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
+    assert evaluated.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
 
 
 @pytest.mark.parametrize("coordinates", [(1.0, -0.5), (3.0, -8.0), (-8.0, 6.0)])
@@ -75,9 +76,9 @@ def test_looks_that_scatter_equal_a_dense_gaussian(dozen, evaluate, coordinates)
     z[[INDEX[name] for name in LOOK_SCATTER_NAMES]] = coordinates
     evaluated = evaluate(z, dozen.space, dozen.arrays)
     dense = dense_log_density(dozen.campaign, evaluated)
-    assert evaluated.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
+    assert evaluated.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
     without = evaluate(np.where(np.isin(NAMES, LOOK_SCATTER_NAMES), -36.0, z), dozen.space, dozen.arrays)
-    assert abs(without.innovations.log_density - dense) > LOG_UNIT, "scatter changes nothing here"
+    assert abs(without.log_likelihood - dense) > LOG_UNIT, "scatter changes nothing here"
 
 
 def test_of_stops_looked_at_once_the_sum_of_both_scatters_is_known(dozen, evaluate):
@@ -95,34 +96,22 @@ def test_of_stops_looked_at_once_the_sum_of_both_scatters_is_known(dozen, evalua
         z[index] = half_normal_coordinate(np.full(2, scatter_deg / 0.01))
         left = np.sqrt(0.03**2 - scatter_deg**2)
         z[stops] = np.log(left / dozen.space.value[jnp.array(stops)]) / dozen.space.u[jnp.array(stops)]
-        found.append(float(evaluate(z, dozen.space, once).innovations.log_density))
+        found.append(evaluate(z, dozen.space, once).log_likelihood)
     assert found[1:] == pytest.approx(found[:1] * 2, abs=FINE_UNIT, rel=1e-12)
-    shared = float(evaluate(z, dozen.space, dozen.arrays).innovations.log_density)
+    shared = evaluate(z, dozen.space, dozen.arrays).log_likelihood
     assert abs(shared - found[0]) > LOG_UNIT, "of stops looked at twice the shares are told"
 
 
 def test_blocks_of_spots_are_one_campaign(dozen, evaluate, monkeypatch):
     """Stop errors, homings and play of the dozen last from one block of four to the next.
 
-    Twenty do not divide the padded number: four do.
+    Twenty do not divide the padded number: four do. Another padded number is compiled anew.
     """
-    whole = evaluate(dozen.z, dozen.space, dozen.arrays).innovations
-    still = jnp.zeros(2 * len(dozen.arrays.gears.places.steps))
+    whole = evaluate(dozen.z, dozen.space, dozen.arrays).log_likelihood
     monkeypatch.setattr(density, "BLOCK", 20)
-    cut = jax.jit(
-        lambda z, space, arrays: density.innovations(space.model(z), arrays, still, density.blocks_filled(arrays)),
-        compiler_options={"xla_backend_optimization_level": 0},
-    )(jnp.asarray(dozen.z), dozen.space, dozen.arrays)
-    assert float(cut.log_density) == pytest.approx(float(whole.log_density), abs=FINE_UNIT, rel=1e-12)
-    np.testing.assert_allclose(cut.standardised, whole.standardised, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_log_density_adds_the_prior(dozen, evaluate):
-    z = random_points(dozen, 1, 0.3)[0]
-    value, _ = value_and_gradient(jnp.asarray(z), dozen.space, dozen.arrays)
-    expected = evaluate(z, dozen.space, dozen.arrays).innovations.log_density - 0.5 * z @ z
-    assert float(value) == pytest.approx(expected, abs=FINE_UNIT, rel=1e-12)
+    arrays = dozen.arrays.of_spots(0, 484)
+    cut = density.evaluate(dozen.z[None], no_draw(1, arrays), dozen.space, arrays).log_density[0]
+    assert cut + 0.5 * dozen.z @ dozen.z == pytest.approx(whole, abs=FINE_UNIT, rel=1e-12)
 
 
 def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
@@ -130,8 +119,8 @@ def test_a_stop_error_per_pose_is_another_density(dozen, evaluate):
     mistaken = drawn_at_every_move(dozen.campaign, dozen.arrays)
     right, wrong = (evaluate(dozen.z, dozen.space, arrays) for arrays in (dozen.arrays, mistaken))
     dense = dense_log_density(dozen.campaign, right, persistent=False)
-    assert wrong.innovations.log_density == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
-    assert abs(wrong.innovations.log_density - right.innovations.log_density) > 0.5 * LOG_UNIT
+    assert wrong.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-12)
+    assert abs(wrong.log_likelihood - right.log_likelihood) > 0.5 * LOG_UNIT
 
 
 @pytest.mark.thorough
@@ -172,35 +161,33 @@ def test_excluded_spot_leaves_no_trace(dozen, evaluate):
     arrays = eqx.tree_at(lambda a: a.spots.valid, dozen.arrays, dozen.arrays.spots.valid.at[row].set(0.0))
     kept = tuple(s for s in dozen.campaign.spots if s.spot != spots[row].spot)
     without = jax.tree.map(jnp.asarray, campaign_arrays(replace(dozen.campaign, spots=kept)))
-    one, two = (evaluate(dozen.z, dozen.space, a).innovations.log_density for a in (arrays, without))
+    one, two = (evaluate(dozen.z, dozen.space, a).log_likelihood for a in (arrays, without))
     assert one == pytest.approx(two, abs=FINE_UNIT)
 
 
 def central_gradient(function, z: np.ndarray, step: float) -> np.ndarray:
-    """Fourth-order central differences, coordinate by coordinate."""
-    gradient = np.empty(z.size)
-    for k in range(z.size):
-        nudge = np.zeros(z.size)
-        nudge[k] = step
-        near, far = (function(z + m * nudge) - function(z - m * nudge) for m in (1, 2))
-        gradient[k] = (8 * near - far) / (12 * step)
-    return gradient
+    """Fourth-order central differences, of a function of many points."""
+    near, far = (function(z + m * step * np.eye(z.size)) - function(z - m * step * np.eye(z.size)) for m in (1, 2))
+    return (8 * near - far) / (12 * step)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("where", ["0.5 sd away", "prior mean", "astray"])
-def test_gradient_against_differences(dozen, where):
+def test_density_with_gradient_against_the_librarys_and_its_differences(dozen, where):
+    """What experiments differentiate is the density that fits and samplers evaluate."""
     z = {
         "0.5 sd away": random_points(dozen, 1, 0.5)[0],
         "prior mean": np.zeros(len(NAMES)),
         "astray": astray(dozen),
     }[where]
+    arrays = without_padding(dozen.arrays, len(dozen.campaign.moves))
+    value, gradient = value_and_gradient(jnp.asarray(z), dozen.space, arrays)
 
-    def value(at):
-        return float(value_and_gradient(jnp.asarray(at), dozen.space, dozen.arrays)[0])
+    def librarys(points):
+        return density.evaluate(points, no_draw(len(points), dozen.arrays), dozen.space, dozen.arrays).log_density
 
-    gradient = np.asarray(value_and_gradient(jnp.asarray(z), dozen.space, dozen.arrays)[1])
-    differences = central_gradient(value, z, 1e-3)
+    assert float(value) == pytest.approx(librarys(z[None])[0], abs=FINE_UNIT, rel=1e-12)
+    differences = central_gradient(librarys, z, 1e-3)
     # Truncation (1e-3 prior sds)^4, rounding 1e-16 x density / 1e-3: 1e-6 of the steepest coordinate.
     assert np.abs(gradient - differences).max() < 1e-6 * np.abs(gradient).max()
 
@@ -211,14 +198,16 @@ def far_out():
     return 3.0 * np.random.default_rng(41).standard_normal((100, len(NAMES)))
 
 
-def test_density_is_finite_everywhere(dozen, evaluate, far_out):
-    assert all(np.isfinite(evaluate(z, dozen.space, dozen.arrays).innovations.log_density) for z in far_out)
+def test_density_is_finite_everywhere(dozen, far_out):
+    found = density.evaluate(far_out, no_draw(len(far_out), dozen.arrays), dozen.space, dozen.arrays)
+    assert np.all(np.isfinite(found.log_density))
 
 
 @pytest.mark.slow
 def test_gradient_is_finite_everywhere(dozen, far_out):
+    arrays = without_padding(dozen.arrays, len(dozen.campaign.moves))
     for z in far_out:
-        value, gradient = value_and_gradient(jnp.asarray(z), dozen.space, dozen.arrays)
+        value, gradient = value_and_gradient(jnp.asarray(z), dozen.space, arrays)
         assert np.isfinite(float(value)) and np.all(np.isfinite(gradient))
 
 
@@ -340,7 +329,7 @@ def test_free_range_takes_up_displacement_along_the_beam(dozen, evaluate):
 def test_angles_are_compared_on_the_circle(dozen, evaluate):
     """A reading of B + 360 deg is the same reading."""
     turned = eqx.tree_at(lambda a: a.spots.aperture_rad, dozen.arrays, dozen.arrays.spots.aperture_rad + 2 * np.pi)
-    one, two = (evaluate(dozen.z, dozen.space, a).innovations.log_density for a in (dozen.arrays, turned))
+    one, two = (evaluate(dozen.z, dozen.space, a).log_likelihood for a in (dozen.arrays, turned))
     # 2 pi adds rounding of 1e-15 rad to a reading with an sd of 3e-4 rad.
     assert one == pytest.approx(two, abs=10 * FINE_UNIT)
 
@@ -354,8 +343,7 @@ def test_receiver_matters_only_with_readings(dozen, evaluate):
         moved = z.copy()
         moved[RIG_NAMES.index(name)] += 0.01
         without, with_readings = (
-            evaluate(moved, dozen.space, a).innovations.log_density
-            - evaluate(z, dozen.space, a).innovations.log_density
+            evaluate(moved, dozen.space, a).log_likelihood - evaluate(z, dozen.space, a).log_likelihood
             for a in (bare, dozen.arrays)
         )
         assert abs(without) < FINE_UNIT and abs(with_readings) > 1e-5 * LOG_UNIT, name

@@ -26,6 +26,7 @@ from support.dense_likelihood import (
 from support.dozen_algebra import NOISE, found_at
 from support.varying_gears import PERIODS_DEG, coordinates_with, perfect_gears, varying_gears
 
+from tvsbayes.estimators import likelihood
 from tvsbayes.estimators.campaign_arrays import campaign_arrays
 from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.instrument.parameters import NAMES
@@ -99,14 +100,7 @@ def found(request, varying, evaluate) -> SimpleNamespace:
 
 def test_log_density_is_that_of_the_dense_gaussian(varying, found):
     dense = dense_log_density(varying.campaign, found)
-    assert found.moved.log_density[0] == pytest.approx(dense, abs=FINE_UNIT, rel=1e-10)
-    # Quadratic form and determinant as the fit and its diagnoses read them.
-    count = len(ordered_spots(varying.campaign))
-    residual, slope = found.terms.residual[:count], found.terms.slope[:count]
-    covariance = residual_covariance(angle_covariances(varying.campaign, found.values), slope)
-    chi2 = residual.ravel() @ np.linalg.solve(covariance, residual.ravel())
-    squares = np.sum(found.moved.standardised[0] ** 2) + np.sum(found.moved.places[0] ** 2)
-    assert squares == pytest.approx(chi2, rel=ALGEBRA)
+    assert found.log_likelihood == pytest.approx(dense, abs=FINE_UNIT, rel=1e-10)
 
 
 def test_every_scale_matters(varying, found):
@@ -152,14 +146,17 @@ def dense_places(varying: Varying, values: dict[str, float]) -> tuple[np.ndarray
 
 def test_draws_of_errors_at_places_have_the_conditional_gaussians_moments(varying, found):
     """Mean, and covariance from what each normal number moves: no draw is left to chance."""
-    count, valid = len(ordered_spots(varying.campaign)), np.asarray(varying.arrays.gears.places.valid)
+    count, places = len(ordered_spots(varying.campaign)), varying.arrays.gears.places
+    filled, valid = varying.arrays.gears.filled, np.asarray(places.valid)
     residual, slope = found.terms.residual[:count], found.terms.slope[:count]
     prior, angles = dense_places(varying, found.values)
     load = np.einsum("iua,aie->iue", slope, angles).reshape(4 * count, -1)
     whole = residual_covariance(angle_covariances(varying.campaign, found.values), slope)
     gain = np.linalg.solve(whole, load @ prior).T
-    own = np.tile(valid, 2)
-    drawn = found.moved.place_errors_rad
+    normals = np.concatenate([np.zeros((1, 2 * filled)), np.eye(2 * filled)])
+    points = np.repeat(found.z[None], len(normals), axis=0)
+    drawn = likelihood.evaluate(points, normals, varying.space, varying.arrays).place_errors_rad
+    own = np.tile(valid[:filled], 2)
     mean, moved = drawn[0][own], (drawn[1:] - drawn[0])[:, own]
     scale = np.sqrt(np.diag(prior)) + 1e-12
     np.testing.assert_allclose(mean / scale, gain @ residual.ravel() / scale, atol=ALGEBRA * 100)
@@ -197,6 +194,6 @@ def test_scales_of_zero_are_perfect_gears(varying, dozen, evaluate):
         none = {n: 0.0 for n in SCALES["rough"] if "length" not in n}
         here = found_at(evaluate, varying, coordinates_with(varying.space, varying.z, none))
         z = coordinates_of(space, physical_at(varying.z, varying.space).value)
-        perfect = evaluate(z, space, arrays).innovations.log_density
+        perfect = evaluate(z, space, arrays).log_likelihood
     # What is left is the floor of 1e-12 rad under every place: with slopes of 1e4 per rad 1e-16 of a variance.
-    assert here.moved.log_density[0] == pytest.approx(perfect, abs=1e-9 * LOG_UNIT, rel=1e-12)
+    assert here.log_likelihood == pytest.approx(perfect, abs=1e-9 * LOG_UNIT, rel=1e-12)

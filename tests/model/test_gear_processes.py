@@ -25,7 +25,7 @@ ANGLE_RAD = np.radians([0.0, 1.0, 40.0, 3.0, 5.5, 0.0])
 RELATIVE = 1e-9
 
 
-def scales(functions) -> GearScales:
+def scales() -> GearScales:
     """Two points at once: leading axis 2."""
     given = {
         "error_rad": [[1e-3, 2e-3], [0.0, 1e-9]],
@@ -35,12 +35,12 @@ def scales(functions) -> GearScales:
         "amplitude_rad": [[[1e-3, 2e-4, 0.0], [0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [0.0, 1e-4, 0.0]]],
         "period_rad": [[[0.5, 0.02, 6.28], [6.28, 6.28, 6.28]], [[0.5, 0.02, 6.28], [6.28, 0.3, 6.28]]],
     }
-    return GearScales(**{name: functions.asarray(value) for name, value in given.items()})
+    return GearScales(**{name: np.asarray(value) for name, value in given.items()})
 
 
 def by_hand(point: int, i: int, j: int) -> tuple[float, float]:
     """Covariance of transmission errors and of plays at two places, rad^2."""
-    given = scales(np)
+    given = scales()
     if i == j and not VALID[i]:
         return 0.0, 0.0
     if ON_TILT[i] != ON_TILT[j] or not VALID[i] or not VALID[j]:
@@ -52,9 +52,8 @@ def by_hand(point: int, i: int, j: int) -> tuple[float, float]:
     return given.error_rad[point, axis] ** 2 * near + waves.sum(), given.play_rad[point, axis] ** 2 * near
 
 
-@pytest.mark.parametrize("functions", [np, jnp])
-def test_the_factor_is_that_of_the_covariance_of_both_processes(functions):
-    root = np.asarray(place_root(scales(functions), ANGLE_RAD, ON_TILT, VALID, functions))
+def test_the_factor_is_that_of_the_covariance_of_both_processes():
+    root = place_root(scales(), ANGLE_RAD, ON_TILT, VALID)
     size = len(ANGLE_RAD)
     assert root.shape == (2, 2 * size, 2 * size) and np.array_equal(root, np.tril(root))
     for point in range(2):
@@ -75,8 +74,8 @@ def test_the_factor_is_that_of_the_covariance_of_both_processes(functions):
 
 def test_blocks_are_those_of_the_factor():
     """Its products too, of two points at once; three places of pan, two of tilt and one of padding."""
-    rng, dense = np.random.default_rng(5), place_root(scales(np), ANGLE_RAD, ON_TILT, VALID, np)
-    root = place_blocks(scales(np), ANGLE_RAD, ON_TILT, VALID)
+    rng, dense = np.random.default_rng(5), place_root(scales(), ANGLE_RAD, ON_TILT, VALID)
+    root = place_blocks(scales(), ANGLE_RAD, ON_TILT, VALID)
     assert [block.shape for block in root.blocks] == [(2, 3, 3), (2, 2, 2), (2, 1, 1)] * 2 and root.size == 12
     x, y = rng.standard_normal((2, 12)), rng.standard_normal((2, 12, 4))
     symmetric = y @ np.swapaxes(y, 1, 2)
@@ -89,7 +88,7 @@ def test_blocks_are_those_of_the_factor():
         ):
             np.testing.assert_allclose(value, expected, rtol=RELATIVE, atol=RELATIVE * np.abs(expected).max())
     with pytest.raises(ValueError, match="then padding"):
-        place_blocks(scales(np), ANGLE_RAD, ON_TILT, VALID[::-1])
+        place_blocks(scales(), ANGLE_RAD, ON_TILT, VALID[::-1])
 
 
 @pytest.fixture(scope="module")

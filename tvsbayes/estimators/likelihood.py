@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -35,9 +34,8 @@ from tvsbayes.estimators.spot_residuals import NoiseScales, SpotResiduals, ToSta
 from tvsbayes.instrument.parameters import INDEX, names_of
 from tvsbayes.model.compiled import compiled, in_batches
 from tvsbayes.model.gear_kriging import scales_at
-from tvsbayes.model.gear_processes import BlockRoot, place_blocks, place_root
-from tvsbayes.model.geometry import Scalar
-from tvsbayes.model.laser_path import MirrorAngles, Stretch, angles_at, mirror_angles, no_moves
+from tvsbayes.model.gear_processes import BlockRoot, place_blocks
+from tvsbayes.model.laser_path import MirrorAngles, Stretch, angles_at, no_moves
 from tvsbayes.model.parameter_space import Model, ParameterSpace
 
 RATIO_COLUMNS = np.array([INDEX[name] for name in names_of("degrees_per_step")])
@@ -111,25 +109,15 @@ def standing(
 
 
 class FilterInput(eqx.Module):
-    """Rows of the filter, and the residuals that depend on no state.
+    """Rows of the filter, and each spot's log density without them.
 
-    `slope` is d(rows' residual)/d(pan, tilt). `free` are the other standardised components, which depend on no state.
-    `log_scale` is each spot's log density without the rows, `free` included.
+    `slope` is d(rows' residual)/d(pan, tilt). `log_scale` includes the other four standardised components, which depend
+    on no state.
     """
 
     rows: FilterRows
     slope: Float[Array, "spots 2 2"]
-    free: Float[Array, "spots 4"]
     log_scale: Float[Array, " spots"]
-
-
-def root_at_places(model: Model, gears: GearArrays) -> Float[Array, "errors errors"]:
-    """Compute the factor of the covariance of transmission errors, then plays, at the places, rad."""
-    places = gears.places
-    if not len(places.steps):
-        return jnp.zeros((0, 0))
-    angle_rad = places.steps * places.by_axis(model.transmission.ratio_rad_per_step)
-    return jnp.asarray(place_root(model.gears, angle_rad, places.on_tilt, places.valid))
 
 
 def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | None = None) -> FilterInput:
@@ -140,7 +128,7 @@ def filter_input(model: Model, arrays: CampaignArrays, angles: MirrorAngles | No
     load, slope = jnp.stack([first, second], axis=1), turned.slope
     rows = filter_rows(load, slope, stood.play_sd_rad, stood.stop_variance, stood.drift_variance, arrays.spots)
     log_scale = terms.log_scale + turned.log_scale - 0.5 * sum(number**2 for number in free)
-    return FilterInput(rows, slope, jnp.stack(free, axis=1), log_scale)
+    return FilterInput(rows, slope, log_scale)
 
 
 class Sums(eqx.Module):
@@ -162,20 +150,16 @@ def pairs_of(groups: Any) -> Any:
     return groups * (groups + 1) // 2
 
 
-class Passed(eqx.Module):
+class FilteredBlocks(eqx.Module):
     """State of the filter after some blocks of a campaign; rows of later spots are zero.
 
     `belief` has the means of the residuals and of the first group's columns, their derivatives by errors at places;
-    `means` are those of the other groups. `block` holds all these columns of the last block, standardised. If a caller
-    uses the sums alone, the compiler drops `standardised`, `columns` and `free`.
+    `means` are those of the other groups. `block` holds all these columns of the last block, standardised.
     """
 
     belief: Belief
     means: Float[Array, "groups 6 columns"]
     block: Float[Array, "groups rows columns"]
-    standardised: Float[Array, "spots 2"]
-    columns: Float[Array, "groups spots 2 columns"]
-    free: Float[Array, "spots 4"]
     sums: Sums
     stretch: Stretch
 
@@ -191,29 +175,22 @@ def blocks_filled(arrays: CampaignArrays) -> Int[Array, ""]:
     return -(-arrays.count // block_size(arrays.spots))
 
 
-def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -> Passed:
-    """Run the filter over the first blocks of spots; the result does not depend on the block size.
+def campaign_sums(model: Model, arrays: CampaignArrays) -> Sums:
+    """Run the filter over all spots; the result does not depend on the block size.
 
-    Moves are computed up to the last spot, and columns of groups with a place only; all of both where the number of
-    blocks is a constant.
+    Moves are computed up to the last spot, and columns of groups with a place only.
     """
-    count, size, together = len(arrays.spots.valid), block_size(arrays.spots), arrays.gears.together
+    size, together = block_size(arrays.spots), arrays.gears.together
     gears, zero = model.transmission, model.tilt_zero_rad
-    every = mirror_angles(gears, zero, arrays.moves) if isinstance(blocks, int) else None
     most, columns = arrays.gears.groups, 2 * together
-    groups = most if isinstance(blocks, int) else -(-jnp.sum(arrays.gears.places.valid) // max(together, 1))
+    groups = -(-jnp.sum(arrays.gears.places.valid) // max(together, 1))
     one, two = (jnp.asarray(each) for each in np.tril_indices(most))
 
     def through(number, so_far):
         start = jnp.asarray(number) * size
         part = arrays.of_spots(start, size)
-        index, stretch = part.spots.move_index, so_far.stretch
-        if every is None:
-            found = angles_at(gears, zero, arrays.moves, index, stretch)
-            angles, stretch = found.angles, found.stretch
-        else:
-            angles = jax.tree.map(lambda of_moves: of_moves[index], every)
-        given = filter_input(model, part, angles)
+        found = angles_at(gears, zero, arrays.moves, part.spots.move_index, so_far.stretch)
+        given = filter_input(model, part, found.angles)
         # The first group is filtered with the residuals: its columns need no loop of their own.
         both = [given.rows.residual[..., None], place_columns(given.slope, part.gears.some(0, together))]
         rows = eqx.tree_at(lambda r: r.residual, given.rows, jnp.concatenate(both, axis=2))
@@ -240,125 +217,68 @@ def passed(model: Model, arrays: CampaignArrays, blocks: Int[Array, ""] | int) -
             gram = jax.lax.fori_loop(0, pairs_of(groups), of_pair, gram)
         squares = jnp.sum(after.log_variance) + jnp.sum(standardised**2)
         log_density = so_far.sums.log_density + jnp.sum(given.log_scale) - 0.5 * squares
-        return Passed(
-            after.belief,
-            means,
-            block,
-            jax.lax.dynamic_update_slice_in_dim(so_far.standardised, standardised, start, 0),
-            jax.lax.dynamic_update_slice_in_dim(so_far.columns, block.reshape(most, size, 2, columns), start, 1),
-            jax.lax.dynamic_update_slice_in_dim(so_far.free, given.free, start, 0),
-            Sums(log_density, along, gram),
-            stretch,
-        )
+        return FilteredBlocks(after.belief, means, block, Sums(log_density, along, gram), found.stretch)
 
     sums = Sums(jnp.zeros(()), jnp.zeros((most, columns)), jnp.zeros((pairs_of(most), columns, columns)))
-    begin = Passed(
+    begin = FilteredBlocks(
         no_belief(1 + columns),
         jnp.zeros((most, STATES, columns)),
         jnp.zeros((most, 2 * size, columns)),
-        jnp.zeros((count, 2)),
-        jnp.zeros((most, count, 2, columns)),
-        jnp.zeros((count, 4)),
         sums,
         no_moves(arrays.moves),
     )
-    return jax.lax.fori_loop(0, blocks, through, begin)
+    return jax.lax.fori_loop(0, blocks_filled(arrays), through, begin).sums
 
 
-class RepeatedErrors(eqx.Module):
+@dataclass(frozen=True)
+class RepeatedErrors:
     """Conditional distribution of errors at places given all looks: divided by `root`, N(mean, (factor factor')^-1).
 
     A priori they are N(0, 1). `explained` is the mean times the transposed factor. Many points with leading axes.
     """
 
     root: BlockRoot
-    factor: Float[Array | np.ndarray, "*batch errors errors"]
-    explained: Float[Array | np.ndarray, "*batch errors"]
+    factor: Float[np.ndarray, "*batch errors errors"]
+    explained: Float[np.ndarray, "*batch errors"]
 
     @classmethod
-    def of(cls, sums: Sums, root: BlockRoot, functions: ModuleType = jnp) -> RepeatedErrors:
+    def of(cls, sums: Sums, root: BlockRoot) -> RepeatedErrors:
         """Solve the normal equations of the errors at places.
 
         Args:
             sums: sums of all groups, or of the first of them.
             root: factor of the prior covariance of their errors, rad.
-            functions: jax.numpy or numpy.
         """
-        xp, groups = functions, sums.along.shape[-2]
+        groups = sums.along.shape[-2]
         one, two = np.indices((groups, groups))
         given = sums.gram[..., pairs_of(np.maximum(one, two)) + np.minimum(one, two), :, :]
-        whole = xp.where((one < two)[:, :, None, None], given.swapaxes(-2, -1), given)
+        whole = np.where((one < two)[:, :, None, None], given.swapaxes(-2, -1), given)
         size, half = root.size, sums.along.shape[-1] // 2
         batch = sums.along.shape[:-2]
-        along = xp.einsum("...gkp->...kgp", sums.along.reshape(*batch, groups, 2, half)).reshape(*batch, size)
-        whole = xp.einsum("...ghkplq->...kgplhq", whole.reshape(*batch, groups, groups, 2, half, 2, half))
-        precision = xp.eye(size) + root.congruent(whole.reshape(*batch, size, size))
+        along = np.einsum("...gkp->...kgp", sums.along.reshape(*batch, groups, 2, half)).reshape(*batch, size)
+        whole = np.einsum("...ghkplq->...kgplhq", whole.reshape(*batch, groups, groups, 2, half, 2, half))
+        precision = np.eye(size) + root.congruent(whole.reshape(*batch, size, size))
         slope = root.transposed_times(along[..., None])[..., 0]
         # The last row of its factor is the slope divided by the factor; its last pivot is not used, but positive.
-        corner = 1 + xp.sum(slope**2, axis=-1)[..., None, None]
-        below = xp.concatenate([slope[..., None, :], corner], axis=-1)
-        bordered = xp.concatenate([xp.concatenate([precision, slope[..., None]], axis=-1), below], axis=-2)
-        factor = xp.linalg.cholesky(bordered)
+        corner = 1 + np.sum(slope**2, axis=-1)[..., None, None]
+        below = np.concatenate([slope[..., None, :], corner], axis=-1)
+        bordered = np.concatenate([np.concatenate([precision, slope[..., None]], axis=-1), below], axis=-2)
+        factor = np.linalg.cholesky(bordered)
         return cls(root, factor[..., :-1, :-1], factor[..., -1, :-1])
 
-    def log_density(self, functions: ModuleType = jnp) -> Any:
+    def log_density(self) -> np.ndarray:
         """Compute the term of the errors in the spots' log density (least squares: r'r - b' P^-1 b)."""
-        logs = functions.log(functions.diagonal(self.factor, axis1=-2, axis2=-1))
-        return 0.5 * functions.sum(self.explained**2, axis=-1) - functions.sum(logs, axis=-1)
+        logs = np.log(np.diagonal(self.factor, axis1=-2, axis2=-1))
+        return 0.5 * np.sum(self.explained**2, axis=-1) - np.sum(logs, axis=-1)
 
-    def drawn(self, normal: Any, functions: ModuleType = jnp) -> Any:
-        """Draw the errors, divided by `root`, from standard normal numbers; zeros give their mean."""
-        return functions.linalg.solve(self.factor.swapaxes(-2, -1), (self.explained + normal)[..., None])[..., 0]
-
-
-class Innovations(eqx.Module):
-    """Standardised one-step prediction errors, N(0, 1) and independent under the model at given errors of places.
-
-    Each spot has two from the filter, then four components that depend on no stop error, with at most two degrees of
-    freedom. They are taken at the means of the errors at places, whose standardised values are in `places`; the squares
-    of both sum to the quadratic form of the campaign. `log_density` is its log likelihood without the terms of
-    `spot_constants`; `place_errors_rad` is a draw of the errors at places, or their means.
-    """
-
-    standardised: Float[Array, "spots 6"]
-    places: Float[Array, " errors"]
-    place_errors_rad: Float[Array, " errors"]
-    log_density: Scalar
-
-
-def innovations(
-    model: Model, arrays: CampaignArrays, normal: Float[Array, " errors"], blocks: Int[Array, ""] | int | None = None
-) -> Innovations:
-    """Run the filter over all spots in time order, and eliminate errors that repeat.
-
-    Args:
-        model: parameters.
-        arrays: the campaign.
-        normal: deviations of the errors at places from their means, in units of their sds: zero, or a draw's numbers.
-        blocks: blocks of spots to filter, by default all of them. A number that is not a constant of the compiled
-            function (`blocks_filled`) saves the cost of padding, but has no derivative in reverse mode.
-
-    Returns:
-        Standardised innovations and log likelihood; cost linear in the number of spots.
-    """
-    every = len(arrays.spots.valid) // block_size(arrays.spots)
-    result = passed(model, arrays, every if blocks is None else blocks)
-    standardised, log_density, none = result.standardised, jnp.asarray(result.sums.log_density), jnp.zeros(0)
-    if not arrays.gears.groups:
-        return Innovations(jnp.concatenate([standardised, result.free], axis=1), none, none, log_density)
-    errors = RepeatedErrors.of(result.sums, BlockRoot((root_at_places(model, arrays.gears),)))
-    mean = jnp.asarray(errors.drawn(jnp.zeros_like(normal)))
-    by_group = (
-        errors.root.times(mean).reshape(2, arrays.gears.groups, -1).swapaxes(0, 1).reshape(arrays.gears.groups, -1)
-    )
-    standardised = standardised - jnp.einsum("gsce,ge->sc", result.columns, by_group)
-    drawn = jnp.asarray(errors.root.times(errors.drawn(normal)))
-    whole = jnp.concatenate([standardised, result.free], axis=1)
-    return Innovations(whole, mean, drawn, jnp.asarray(log_density + errors.log_density()))
+    def drawn_rad(self, normal: np.ndarray) -> np.ndarray:
+        """Draw the errors from standard normal numbers; zeros give their mean."""
+        right = (self.explained + normal)[..., None]
+        return self.root.times(np.linalg.solve(self.factor.swapaxes(-2, -1), right)[..., 0])
 
 
 def roots_at(values: np.ndarray, space: ParameterSpace, gears: GearArrays) -> BlockRoot:
-    """Compute the factors of `root_at_places` for n points.
+    """Compute the factors of the covariance of transmission errors, then plays, at the places, for n points.
 
     Args:
         values: all parameters in the units of their names, shape (n, p).
@@ -390,21 +310,17 @@ def prior_errors_at_places(
     return in_batches(drawn, z, normal)
 
 
-def log_density(z: Float[Array, " parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Scalar:
-    """Compute the log posterior density of the coordinates, up to a constant: likelihood and standard normal priors."""
-    still = jnp.zeros(2 * len(arrays.gears.places.steps))
-    return innovations(space.model(z), arrays, still).log_density - 0.5 * jnp.dot(z, z)
-
-
 @compiled(Sums)
 def _sums(values: Float[Array, "batch parameters"], space: ParameterSpace, arrays: CampaignArrays) -> Sums:
-    blocks = blocks_filled(arrays)
-    return jax.vmap(lambda values: passed(space.model_at(values), arrays, blocks).sums)(values)
+    return jax.vmap(lambda values: campaign_sums(space.model_at(values), arrays))(values)
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Log posterior density (n,) and errors at places (n, e), as in `Innovations`, of many points."""
+    """Log posterior density (n,) and errors at places, rad, drawn or their means (n, e), of many points.
+
+    The density is without the terms of `spot_constants`.
+    """
 
     log_density: np.ndarray
     place_errors_rad: np.ndarray
@@ -416,7 +332,7 @@ def evaluate(
     space: ParameterSpace,
     arrays: CampaignArrays,
 ) -> Evaluation:
-    """Evaluate `log_density` at many points; NaN where the model has no value.
+    """Evaluate the log posterior density (likelihood, standard normal priors) at many points; NaN where there is none.
 
     Args:
         z: coordinates, shape (n, p).
@@ -434,14 +350,13 @@ def evaluate(
 
     def added(values: np.ndarray, sums: Sums, normal: np.ndarray) -> Evaluation:
         try:
-            errors = RepeatedErrors.of(sums, roots_at(values, space, gears), np)
+            errors = RepeatedErrors.of(sums, roots_at(values, space, gears))
         except np.linalg.LinAlgError:
             if len(values) == 1:
                 return Evaluation(np.full(1, np.nan), np.zeros(normal.shape))
             rows = [slice(k, k + 1) for k in range(len(values))]
             return _joined([added(values[k], jax.tree.map(lambda x, k=k: x[k], sums), normal[k]) for k in rows])
-        errors_rad = errors.root.times(errors.drawn(normal, np))
-        return Evaluation(sums.log_density + errors.log_density(np), errors_rad)
+        return Evaluation(np.asarray(sums.log_density) + errors.log_density(), errors.drawn_rad(normal))
 
     def block(z: np.ndarray, normal: np.ndarray) -> Evaluation:
         values = space.values(z)

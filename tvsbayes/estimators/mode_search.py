@@ -91,9 +91,8 @@ class Room:
         root = place_root(
             scales_at(self.space.values(z), np.asarray(self.space.harmonic_period_deg)),
             self.angle_rad,
-            self.places.on_tilt,
-            self.places.valid,
-            np,
+            np.asarray(self.places.on_tilt),
+            np.asarray(self.places.valid),
         )
         back = np.swapaxes(root, 1, 2)
         inner = np.eye(root.shape[1]) + back @ self.products[rest, rest] @ root

@@ -78,7 +78,7 @@ class KnownPlaces:
         if self.scales is None:
             return np.zeros((0, 0))
         angle_rad = steps * self.ratio_rad_per_step[on_tilt.astype(int)]
-        return np.asarray(place_root(self.scales, angle_rad, on_tilt, np.ones(len(steps), dtype=bool), np))
+        return place_root(self.scales, angle_rad, on_tilt, np.ones(len(steps), dtype=bool))
 
     def factors_with(self, steps: np.ndarray, on_tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute factors of errors and of plays at the places, then at other counters, shapes (c + m, c + m), rad."""

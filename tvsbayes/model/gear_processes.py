@@ -7,8 +7,8 @@ Looks determine both at their own counters; rad. Arrays over axes are ordered (p
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
-from types import ModuleType
 from typing import Any
 
 import equinox as eqx
@@ -64,15 +64,11 @@ def errors_at(errors: np.ndarray, places: int) -> np.ndarray:
     return errors_rad.reshape(len(errors), -1)
 
 
-def _by_axis(of_axis: Any, on_tilt: Any, functions: ModuleType) -> Any:
-    """Select numbers (..., 2) of the axes for the places, shape (..., places)."""
-    return functions.where(on_tilt, of_axis[..., 1:], of_axis[..., :1])
+@dataclass(frozen=True)
+class BlockRoot:
+    """A block-diagonal lower triangular factor, for many points."""
 
-
-class BlockRoot(eqx.Module):
-    """A block-diagonal lower triangular factor, for many points; for JAX it has one block."""
-
-    blocks: tuple[Float[Array | np.ndarray, "*batch _ _"], ...]
+    blocks: tuple[Float[np.ndarray, "*batch _ _"], ...]
 
     @property
     def size(self) -> int:
@@ -85,15 +81,15 @@ class BlockRoot(eqx.Module):
         ends = np.cumsum([0, *(block.shape[-1] for block in self.blocks)]).tolist()
         return tuple(slice(*pair) for pair in pairwise(ends))
 
-    def times(self, x: Any) -> Any:
+    def times(self, x: np.ndarray) -> np.ndarray:
         """Compute R x for vectors (..., e)."""
         return _joined([(block @ x[..., span, None])[..., 0] for block, span in self._parts], -1)
 
-    def transposed_times(self, x: Any) -> Any:
+    def transposed_times(self, x: np.ndarray) -> np.ndarray:
         """Compute R'X for matrices (..., e, c)."""
         return _joined([block.swapaxes(-2, -1) @ x[..., span, :] for block, span in self._parts], -2)
 
-    def congruent(self, x: Any) -> Any:
+    def congruent(self, x: np.ndarray) -> np.ndarray:
         """Compute R'X R for symmetric matrices (..., e, e)."""
         if len(self.blocks) == 1:
             return self.blocks[0].swapaxes(-2, -1) @ x @ self.blocks[0]
@@ -106,34 +102,35 @@ class BlockRoot(eqx.Module):
         return result
 
     @property
-    def _parts(self) -> tuple[tuple[Any, slice], ...]:
+    def _parts(self) -> tuple[tuple[np.ndarray, slice], ...]:
         return tuple(zip(self.blocks, self.spans, strict=True))
 
 
-def _joined(parts: list[Any], axis: int) -> Any:
+def _joined(parts: list[np.ndarray], axis: int) -> np.ndarray:
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=axis)
 
 
-def _roots(scales: GearScales, rows: Callable[[Any], Any], angle_rad: Any, together: Any, xp: ModuleType) -> BlockRoot:
+def _roots(
+    scales: GearScales, rows: Callable[[Any], np.ndarray], angle_rad: np.ndarray, together: np.ndarray | bool
+) -> BlockRoot:
     """Compute factors of transmission errors and plays, a block each; `rows` spreads an axis' number over places."""
     size, distance = angle_rad.shape[-1], angle_rad[..., :, None] - angle_rad[..., None, :]
     amplitudes, periods = (
         [rows(x[..., k]) for k in range(PERIODS_MAX)] for x in (scales.amplitude_rad, scales.period_rad)
     )
-    # A traced amplitude may be zero at some points only, so it is always included.
-    waves = [pair for pair in zip(amplitudes, periods, strict=True) if xp is not np or np.any(pair[0])]
-    error, near = rows(scales.error_rad), matern52(distance, rows(scales.length_rad), xp)
-    covariance = with_waves(error**2 * near, distance, waves, xp)
+    waves = [pair for pair in zip(amplitudes, periods, strict=True) if np.any(pair[0])]
+    error, near = rows(scales.error_rad), matern52(distance, rows(scales.length_rad))
+    covariance = with_waves(error**2 * near, distance, waves)
     floor = JITTER * sum((amplitude**2 for amplitude, _ in waves), error**2) + FLOOR_RAD2
-    error_root = xp.linalg.cholesky(xp.where(together, covariance, error**2 * xp.eye(size)) + floor * xp.eye(size))
-    # The play scales the factor, not the covariance: its derivative then exists at zero play too.
-    near = xp.where(together, near, xp.eye(size))
-    play_root = rows(scales.play_rad) * xp.linalg.cholesky(near + JITTER * xp.eye(size))
+    error_root = np.linalg.cholesky(np.where(together, covariance, error**2 * np.eye(size)) + floor * np.eye(size))
+    # The play scales the factor, not the covariance, which may be zero.
+    near = np.where(together, near, np.eye(size))
+    play_root = rows(scales.play_rad) * np.linalg.cholesky(near + JITTER * np.eye(size))
     return BlockRoot((error_root, play_root))
 
 
 def place_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray, valid: np.ndarray) -> BlockRoot:
-    """Compute `place_root` in independent blocks: places of pan, then of tilt, then padding; NumPy.
+    """Compute `place_root` in independent blocks: places of pan, then of tilt, then padding.
 
     Args:
         scales: scales of the processes, fields with any leading axes.
@@ -146,10 +143,10 @@ def place_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray,
         raise ValueError("places are those of pan, then of tilt, then padding")
 
     def roots(kind: int) -> BlockRoot:
-        def rows(of_axis: Any) -> Any:
+        def rows(of_axis: Any) -> np.ndarray:
             return of_axis[..., kind % 2, None, None]
 
-        return _roots(scales, rows, angle_rad[..., kinds == kind], kind < 2, np)
+        return _roots(scales, rows, angle_rad[..., kinds == kind], kind < 2)
 
     by_kind = [roots(kind).blocks for kind in np.unique(kinds).tolist()]
     blocks = tuple(root for of_kinds in zip(*by_kind, strict=True) for root in of_kinds)
@@ -157,29 +154,24 @@ def place_blocks(scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray,
 
 
 def place_root(
-    scales: GearScales, angle_rad: Any, on_tilt: Any, valid: Any, functions: ModuleType = jnp
-) -> Float[Array | np.ndarray, "*batch errors errors"]:
+    scales: GearScales, angle_rad: np.ndarray, on_tilt: np.ndarray, valid: np.ndarray
+) -> Float[np.ndarray, "*batch errors errors"]:
     """Compute the lower triangular factor of the covariance of transmission errors, then plays (formulation 3.1).
 
-    It works with NumPy and JAX.
-
     Args:
-        scales: scales of the processes, fields with any leading axes.
+        scales: scales of the processes, fields of NumPy with any leading axes.
         angle_rad: k n of the places, shape (..., places).
         on_tilt: as in `Places`.
         valid: as in `Places`.
-        functions: jax.numpy or numpy.
 
     Returns:
         Factor at the places, rad; diagonal for padding.
     """
-    xp = functions
     together = (on_tilt[:, None] == on_tilt[None, :]) & valid[:, None] & valid[None, :]
 
-    def rows(of_axis: Any) -> Any:
-        return _by_axis(of_axis, on_tilt, xp)[..., None]
+    def rows(of_axis: Any) -> np.ndarray:
+        return np.where(on_tilt, of_axis[..., 1:], of_axis[..., :1])[..., None]
 
-    error_root, play_root = _roots(scales, rows, angle_rad, together, xp).blocks
-    nothing = xp.zeros_like(error_root)
-    above = xp.concatenate([error_root, nothing], axis=-1)
-    return xp.concatenate([above, xp.concatenate([nothing, play_root], axis=-1)], axis=-2)
+    error_root, play_root = _roots(scales, rows, angle_rad, together).blocks
+    nothing = np.zeros_like(error_root)
+    return np.block([[error_root, nothing], [nothing, play_root]])

@@ -1,13 +1,12 @@
 """Covariances of stationary Gaussian processes of one variable, which describe errors that repeat by position.
 
 Rasmussen and Williams, Gaussian Processes for Machine Learning, MIT Press 2006, 4.2. Distances, lengths and periods of
-a call share one unit. The functions work with NumPy and JAX.
+a call share one unit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,23 +16,14 @@ JITTER = 1e-10
 factor. A hundred readings known to a tenth of the process' sd change by 1e-6 in a log density."""
 
 
-def matern52[Numbers: Any](distance: Numbers, length: Numbers, functions: ModuleType = np) -> Numbers:
+def matern52[Numbers: Any](distance: Numbers, length: Numbers) -> Numbers:
     """Correlate a Matern process of smoothness 5/2 (twice differentiable) at signed distances (4.17)."""
-    scaled = np.sqrt(5.0) * functions.abs(distance) / length
-    return (1 + scaled + scaled**2 / 3) * functions.exp(-scaled)
-
-
-def periodic[Numbers: Any](distance: Numbers, period: Numbers, functions: ModuleType = np) -> Numbers:
-    """Compute the correlation of a cosine of random phase and normal amplitude at signed distances."""
-    return functions.cos(2 * np.pi * distance / period)
+    scaled = np.sqrt(5.0) * np.abs(distance) / length
+    return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
 
 
 def repeated[Numbers: Any](
-    distance: Numbers,
-    sd: Numbers,
-    length: Numbers,
-    waves: Iterable[tuple[Numbers, Numbers | float]],
-    functions: ModuleType = np,
+    distance: Numbers, sd: Numbers, length: Numbers, waves: Iterable[tuple[Numbers, Numbers | float]]
 ) -> Numbers:
     """Compute the covariance of errors that repeat by position: a Matern process and cosines of stated periods.
 
@@ -42,18 +32,14 @@ def repeated[Numbers: Any](
         sd: standard deviation of the process.
         length: its correlation length.
         waves: sd and period of each cosine.
-        functions: numpy or jax.numpy.
     """
-    return with_waves(sd**2 * matern52(distance, length, functions), distance, waves, functions)
+    return with_waves(sd**2 * matern52(distance, length), distance, waves)
 
 
 def with_waves[Numbers: Any](
-    covariance: Numbers,
-    distance: Numbers,
-    waves: Iterable[tuple[Numbers, Numbers | float]],
-    functions: ModuleType = np,
+    covariance: Numbers, distance: Numbers, waves: Iterable[tuple[Numbers, Numbers | float]]
 ) -> Numbers:
-    """Add the covariance of cosines of these sds and periods to a covariance."""
+    """Add the covariance of cosines of random phase and normal amplitude, of these sds and periods."""
     for amplitude, period in waves:
-        covariance = covariance + amplitude**2 * periodic(distance, period, functions)
+        covariance = covariance + amplitude**2 * np.cos(2 * np.pi * distance / period)
     return covariance

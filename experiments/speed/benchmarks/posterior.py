@@ -11,7 +11,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 
 from experiments.common.clock import timed
-from experiments.common.fits import without_padding
+from experiments.common.jax_density import log_density, without_padding
 from experiments.common.reference_samplers import (
     AXES,
     Run,
@@ -25,7 +25,6 @@ from experiments.common.reference_samplers import (
 from experiments.common.rigs import dense_plan, mounted_rig
 from experiments.speed.benchmarks.measure import Bench, Case, Column
 from tvsbayes.estimators.joint_fit import JointFit, fit
-from tvsbayes.estimators.likelihood import log_density
 from tvsbayes.model.compilation_cache import use_compilation_cache
 from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
