@@ -53,8 +53,8 @@ def root_at_places(model: Model, gears: GearArrays) -> jax.Array:
 class Innovations(eqx.Module):
     """Standardised one-step prediction errors, N(0, 1) and independent under the model, and the log likelihood.
 
-    `residual` holds two components of each spot from the filter, at the means of the errors at places; four of each
-    that depend on no state; then these means, divided by their factor. Their squares sum to the quadratic form.
+    `residual` holds of each spot two components from the filter, at the means of the errors at places, then four that
+    depend on no state; behind all spots these means, divided by their factor. The squares sum to the quadratic form.
     `log_density` is without the terms of `spot_constants`.
     """
 
@@ -80,7 +80,8 @@ def innovations(z: jax.Array, space: ParameterSpace, arrays: CampaignArrays) -> 
     mean = solve_triangular(factor, explained, lower=True, trans="T")
     squares = residual @ residual - explained @ explained + jnp.sum(seen.log_variance)
     log_density = jnp.sum(given.log_scale) - 0.5 * squares - jnp.sum(jnp.log(jnp.diagonal(factor)))
-    return Innovations(jnp.concatenate([residual - load @ mean, free.ravel(), mean]), log_density)
+    of_spots = jnp.concatenate([(residual - load @ mean).reshape(-1, 2), free], axis=1)
+    return Innovations(jnp.append(of_spots, mean), log_density)
 
 
 def log_density(z: jax.Array, space: ParameterSpace, arrays: CampaignArrays) -> jax.Array:

@@ -12,7 +12,7 @@ from experiments.common.command_line import print_only
 from experiments.common.rows import ROOT
 from tvsbayes.results.compensation_record import COMPENSATION_FORMAT, Compensation, Verification
 from tvsbayes.results.fit_record import Provenance, fit_schema
-from tvsbayes.results.records import DIALECT, schema_of
+from tvsbayes.results.records import schema_of
 from tvsbayes.results.watch_record import Watch, WatchPlan
 from tvsbayes.single_axis.axis_record import AxisInputs, axis_fit_schema
 
@@ -38,7 +38,7 @@ def schemas() -> dict[str, dict[str, Any]]:
     }
     return {
         name: {
-            "$schema": DIALECT,
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
             "$id": f"urn:tvsbayes:schema:{name}",
             "title": title,
             "description": GROWTH,

@@ -15,12 +15,12 @@ from tvsbayes.cli.main import run
 from tvsbayes.comparison import watched_looks
 from tvsbayes.comparison.watched_looks import (
     CHANGES,
-    COLUMNS,
     FALSE_ALARM_RATE,
     SIGHTED_CHANGES,
     Departure,
     DrawnDepartures,
     WatchedLooks,
+    columns_of,
     null_distribution,
     powers,
     watch,
@@ -119,11 +119,12 @@ def test_nothing_has_moved(mounted_rig, mixed_fit, truth, monkeypatch):
 def test_false_alarms_and_power_are_those_of_the_linear_model():
     """Scores drawn from a model in which nothing, or one change, has moved: counted against what is stated."""
     generator = np.random.default_rng(5)
-    columns = generator.standard_normal((40, COLUMNS[-1].stop)) * 0.6
+    rows = columns_of(CHANGES)
+    columns = generator.standard_normal((40, rows[-1].stop)) * 0.6
     # A size of 1 mm beside one of 0.05 deg: all changes about as visible.
     columns /= np.concatenate([np.full(len(c.names), c.size) for c in CHANGES])
     known = Departure(0.0, 40, np.zeros(columns.shape[1]), columns.T @ columns)
-    null, trials, shifted = null_distribution(known, 1), 400, COLUMNS[6]
+    null, trials, shifted = null_distribution(known, 1), 400, rows[6]
     stated = powers(known, null.limit, 1)[6]
     alarms = noticed = 0
     for _ in range(trials):

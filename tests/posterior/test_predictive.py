@@ -143,9 +143,9 @@ class FitOfOneWay:
 def posterior_of_two_ways() -> Posterior:
     """Two ways of homing, as probable: of the first the coordinate of every draw is 0, of the second 1."""
     campaign, count = small_campaign(), 50
-    valid = SimpleNamespace(valid=np.ones(len(ordered_spots(campaign))))
+    used = np.ones(len(ordered_spots(campaign)), dtype=bool)
     one, other = (
-        FitOfOneWay(campaign, SimpleNamespace(spots=valid, number=float(k)), {"pan": side})
+        FitOfOneWay(campaign, SimpleNamespace(used=used, number=float(k)), {"pan": side})
         for k, side in enumerate(("left", "right"))
     )
     ways = tuple(Alternative(each.sides, 0.5, each) for each in (one, other))

@@ -94,7 +94,6 @@ CAMERA_FIELDS = tuple(FIELDS)[: tuple(FIELDS).index("R")]
 SIDES = {"left": 0, "right": 1, "l": 0, "r": 1, "first": 0, "second": 1}
 """Words for the camera; numbers start at 0 where one of them is 0, else at 1."""
 _MARKS = ("cam", "camera", "cameraparameters", "sensor", "")
-_SIDED = re.compile(r"left|right|first|second|[0-9]|l|r")
 _IGNORED_TABLES = {"roi", "region_of_interest", "header"}
 """Tables whose numbers are not part of the calibration."""
 MODEL_NAMES = ("distortionmodel", "distmodel", "cameratype", "cameramodel", "model", "lensmodel", "distortiontype")

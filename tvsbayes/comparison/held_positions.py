@@ -38,8 +38,8 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
     """
     campaign = fit_of_all.campaign
     spots = ordered_spots(campaign)
-    used = np.asarray(fit_of_all.arrays.spots.valid)[: len(spots)] > 0
-    folds: dict[str, tuple[int, np.ndarray, np.ndarray]] = {}
+    used = fit_of_all.arrays.used
+    folds: dict[str, tuple[int, int, np.ndarray, np.ndarray]] = {}
     warnings = []
     for number, axis in enumerate(AXES):
         rests = [rests_of(campaign.moves, axis)[spot.move] for spot in spots]
@@ -48,7 +48,8 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
         if len(counters) < POSITIONS_MIN:
             warnings.append(f"{axis} is seen at {len(counters)} counters: with one left out no line is determined")
             continue
-        folds |= {f"{axis} {counter}": (number, used & (steps == counter), sign) for counter in counters.tolist()}
+        for counter in counters.tolist():
+            folds[f"{axis} {counter}"] = number, counter, used & (steps == counter), sign
     if not folds:
         raise NothingToEstimate(
             "too-few-positions",
@@ -58,7 +59,7 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
         )
     positions: list[HeldOutCounter] = []
     with Job(dict.fromkeys(folds, 1.0), progress) as job:
-        for name, (number, out, sign) in folds.items():
+        for name, (number, counter, out, sign) in folds.items():
             try:
                 taught = refit(fit_of_all, frozenset(spots[k].spot for k in np.flatnonzero(out)), job.part(name))
             except TvsError as error:
@@ -67,7 +68,7 @@ def hold_out_positions(fit_of_all: JointFit, *, progress: Show | None = None) ->
             if not taught.converged:
                 warnings.append(f"without {name} the fit does not converge: {'; '.join(taught.problems)}")
                 continue
-            positions += predicted_positions(fit_of_all, taught, number, int(name.split()[1]), out, sign)
+            positions += predicted_positions(fit_of_all, taught, number, counter, out, sign)
     rms_z = rms([position.z for position in positions]) if positions else None
     return PositionHoldOut(positions=tuple(positions), rms_z=rms_z, warnings=tuple(warnings))
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
-import equinox as eqx
 import numpy as np
 
 from tvsbayes.errors import NothingToEstimate
@@ -104,9 +103,6 @@ def columns_of(changes: Sequence[StatedChange]) -> tuple[slice, ...]:
     """Return the columns of each change among the shifts of all."""
     ends = np.cumsum([len(change.names) for change in changes])
     return tuple(slice(int(end) - len(change.names), int(end)) for end, change in zip(ends, changes, strict=True))
-
-
-COLUMNS = columns_of(CHANGES)
 
 
 def after_each_other(campaign: Campaign, looks: Campaign) -> Campaign:
@@ -232,16 +228,12 @@ class WatchedLooks:
         campaign = homed(fit.campaign, fit.sides)
         self.fit, self.first = fit, len(ordered_spots(campaign))
         joined = after_each_other(campaign, homed(looks, fit.sides))
-        visible, used = in_sight(joined), np.asarray(fit.arrays.spots.valid)[: self.first] > 0
-        used = np.append(used, visible[self.first :])
+        used = np.append(fit.arrays.used, in_sight(joined)[self.first :])
         table = replace(
             campaign.rig,
             priors=priors_used(campaign.rig.priors, np.asarray(fit.space.value), np.asarray(fit.space.u)),
         )
-        self.problem = Problem(joined, table, used)
-        weight = np.array(self.problem.arrays.spots.weight)
-        weight[: self.first] = np.asarray(fit.arrays.spots.weight)[: self.first]
-        self.problem.arrays = eqx.tree_at(lambda a: a.spots.weight, self.problem.arrays, placed(weight))
+        self.problem = Problem(joined, table, used, np.asarray(fit.arrays.spots.weight)[: self.first])
         later = self.problem.spots[self.first :]
         self.looks = int(used[self.first :].sum())
         readings = sum(s.aperture_deg is not None for s, use in zip(later, used[self.first :], strict=True) if use)
@@ -288,8 +280,7 @@ class WatchedLooks:
     @property
     def usable(self) -> np.ndarray:
         """Return indices of the usable new looks in the linearised campaign, shape (looks,)."""
-        used = np.asarray(self.problem.arrays.spots.valid)[: len(self.problem.spots)] > 0
-        return self.first + np.flatnonzero(used[self.first :])
+        return self.first + np.flatnonzero(self.problem.arrays.used[self.first :])
 
     def _of_angles(self, slope: np.ndarray) -> np.ndarray:
         """Build columns for the mirror angles of every usable new look, pan and tilt in turn, per degree."""

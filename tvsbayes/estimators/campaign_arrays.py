@@ -123,6 +123,11 @@ class CampaignArrays(eqx.Module):
     azimuth_convention: Bool[Array, ""]
     count: Int[Array, ""]
 
+    @property
+    def used(self) -> Bool[np.ndarray, " spots"]:
+        """Mark each spot that the fit uses, without padding; NumPy only."""
+        return np.asarray(self.spots.valid)[: int(self.count)] > 0
+
     def of_spots(self, start: Int[Array, ""] | int, count: int) -> CampaignArrays:
         """Return the same moves with `count` spots from `start` on."""
 

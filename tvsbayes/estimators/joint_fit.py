@@ -11,7 +11,6 @@ from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool
@@ -312,10 +311,8 @@ def _by_homing(first: JointFit, problem: Problem, axes: tuple[str, ...], seed: i
 
 def _problem_under(found: JointFit, problem: Problem, sides: Sides) -> Problem:
     """Build the problem of a fit with these sides of the homings."""
-    used = np.asarray(found.arrays.spots.valid)[: len(problem.spots)] > 0
-    under = Problem(homed(found.campaign, sides), problem.table, used)
-    under.arrays = eqx.tree_at(lambda a: a.spots.weight, under.arrays, problem.arrays.spots.weight)
-    return under
+    weight = np.asarray(problem.arrays.spots.weight)
+    return Problem(homed(found.campaign, sides), problem.table, found.arrays.used, weight)
 
 
 def laplace_evidence(mode: Mode, free: Bool[np.ndarray, " parameters"]) -> float:
@@ -348,29 +345,25 @@ def priors_used(stated: Mapping[str, Prior], value: np.ndarray, u: np.ndarray) -
     }
 
 
-def restored(campaign: Campaign, stored: StoredMode, seed: int = 0) -> JointFit | None:
+def restored(campaign: Campaign, stored: StoredMode) -> JointFit | None:
     """Restore a converged fit from its stored mode, without fitting: its model, weights and Laplace draws.
 
     Args:
         campaign: the campaign that was fitted.
         stored: from `stored_draws.stored_mode`.
-        seed: seed of the Laplace draws, which equal those of `fit` with the same seed.
 
     Returns:
-        The fit; None where another version of tvsbayes used other parameter names.
+        The fit, with the Laplace draws of `fit` at its default seed; None where another version of tvsbayes used other
+        parameter names.
     """
     if stored.names != campaign.rig.mechanism.names or stored.prior.shape[1] != len(RIG_NAMES):
         return None
     table = replace(campaign.rig, priors=priors_used(campaign.rig.priors, *stored.prior))
-    valid = stored.valid > 0
     with jax.enable_x64(True):
         sides: dict[str, str] = {axis: side for axis, side in zip(AXES, stored.sides, strict=True) if side}
-        problem = Problem(homed(campaign, sides), table, valid)
-        weight = np.array(problem.arrays.spots.weight)
-        weight[: len(valid)] = stored.weight
-        problem.arrays = eqx.tree_at(lambda a: a.spots.weight, problem.arrays, placed(weight))
+        problem = Problem(homed(campaign, sides), table, stored.valid > 0, stored.weight)
         mode = Mode(stored.z, stored.covariance, -stored.log_density, ())
-        return replace(fit_at(campaign, problem, mode, seed), sides=sides)
+        return replace(fit_at(campaign, problem, mode, 0), sides=sides)
 
 
 @dataclass(frozen=True)
@@ -407,7 +400,7 @@ def fit_at(campaign: Campaign, problem: Problem, mode: Mode, seed: int, prior_dr
         seed: seed of the Laplace draws.
         prior_draws: those of a fit of the same campaign and seed; by default they are drawn.
     """
-    used = np.asarray(problem.arrays.spots.valid)[: len(problem.spots)] > 0
+    used = problem.arrays.used
     lin = problem.linearised(mode.z)
     information = problem.information(lin)
     chi2_spots = leave_one_out_chi2(information, np.asarray(problem.arrays.spots.weight)[: len(problem.spots)])

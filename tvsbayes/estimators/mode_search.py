@@ -107,16 +107,28 @@ def held_by(free: Bool[np.ndarray, " parameters"]) -> Bool[np.ndarray, " paramet
 
 
 class Problem:
-    """One campaign with its priors, as arguments of the compiled functions."""
+    """One campaign with its priors, as arguments of the compiled functions.
 
-    def __init__(self, campaign: Campaign, table: RigTable, used: np.ndarray | None = None):
+    Args of the constructor: the campaign, its priors, which spots are used, and the weights of the first spots (default
+    of both: 1).
+    """
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        table: RigTable,
+        used: np.ndarray | None = None,
+        weight: np.ndarray | None = None,
+    ):
         self.spots, self.table = ordered_spots(campaign), table
         used = np.ones(len(self.spots), dtype=bool) if used is None else used
         self.space = parameter_space(table, campaign.stereo)
         arrays = campaign_arrays(campaign, table)
-        valid = np.array(arrays.spots.valid)
+        valid, weights = np.array(arrays.spots.valid), np.array(arrays.spots.weight)
         valid[: len(used)] *= used
-        self.arrays = eqx.tree_at(lambda a: a.spots.valid, arrays, placed(valid))
+        if weight is not None:
+            weights[: len(weight)] = weight
+        self.arrays = eqx.tree_at(lambda a: (a.spots.valid, a.spots.weight), arrays, (placed(valid), placed(weights)))
         readings = (spot.aperture_deg is not None for spot, use in zip(self.spots, used, strict=True) if use)
         self.free = free_mask(self.space, any(readings), unseen_shifts(campaign.moves, table.priors))
         self.noise = np.flatnonzero(np.isin(NAMES, NOISE_NAMES) & self.free)

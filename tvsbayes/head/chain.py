@@ -75,9 +75,9 @@ class HeadOptics(NamedTuple):
         aside_mm, over_mm = self.beam_offset_mm
         origin = Vectors(self.elevation_axis_offset_mm, 0.0, 0.0) + axis * aside_mm + over * over_mm
         sight = ahead * cos(self.beam_not_square_rad) + axis * -sin(self.beam_not_square_rad)
-        return Ray(*materialise(tuple(self._leaning(azimuth.forward(v), functions) for v in (origin, sight))))
+        return Ray(*materialise(tuple(self._leaning(azimuth.forward(v)) for v in (origin, sight))))
 
-    def _leaning(self, v: Vectors, functions: ModuleType) -> Vectors:
+    def _leaning(self, v: Vectors) -> Vectors:
         """Vectors turned about the horizontal axis that tilts z to the azimuth axis (Rodrigues)."""
         north, east = self.azimuth_axis_tilt_rad
         square = north * north + east * east

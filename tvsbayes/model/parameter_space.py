@@ -229,8 +229,9 @@ def scale_of(mechanism: Mechanism) -> np.ndarray:
 
 
 STOP_COLUMNS = np.array([[INDEX[f"stop_sd_deg.{side}"] for side in SIDES[axis]] for axis in AXES])
+"""Coordinates of the stop sds by axis and side, (right, left) and (down, up): shape (2, 2)."""
 SCATTER_COLUMNS = np.array([INDEX[name] for name in LOOK_SCATTER_NAMES])
-"""Coordinates of the stop sds by axis and side, (right, left) and (down, up): shape (2, 2); those of looks' scatter."""
+"""Coordinates of the looks' scatter by axis."""
 
 
 def _camera_columns(*parts: str) -> slice | np.ndarray:

@@ -122,7 +122,7 @@ class WatchDesigns:
         self.campaign = homed(fit.campaign, fit.sides)
         self.z = noise_draws(fit, 2, seed).centre
         spots = ordered_spots(self.campaign)
-        used = np.asarray(fit.arrays.spots.valid)[: len(spots)] > 0
+        used = fit.arrays.used
         self.rig = _rig_of(self.campaign, spots, used) if rig is None else rig
         all_candidates = _candidates(self.campaign, spots, used)
         self.candidates = [look for look in all_candidates if self._reachable(look)]

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 DRIFT_COLUMNS = [INDEX[name] for name in names_of("drift_deg_per_root_hour")]
+PREDICTED_DRAWS = 8
+"""Draws of each chain for which looks are predicted again."""
 RANK_TOLERANCE = 1e-12
 """Share of a state's precision below which its conditional precision given other states is rounding."""
 
@@ -183,7 +185,7 @@ def move_log_likelihood(posterior: Posterior) -> xr.DataArray:
 
     fit = posterior.fit
     spots = ordered_spots(fit.campaign)
-    used = np.asarray(fit.arrays.spots.valid)[: len(spots)] > 0
+    used = fit.arrays.used
     z = posterior.z.reshape(-1, posterior.z.shape[-1])
     errors_rad = np.asarray(posterior.joined.place_errors_rad)
 
@@ -233,7 +235,7 @@ def ideal_pixels(posterior: Posterior, draws: int) -> np.ndarray:
     return by_way(ways_of(posterior, posterior.chosen(draws)), of_way)
 
 
-def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.DataArray:
+def predictive_pixels(posterior: Posterior) -> xr.DataArray:
     """Predict the same looks taken again: new stop errors, home offsets, play and noise, ranges as observed.
 
     Returns:
@@ -244,7 +246,7 @@ def predictive_pixels(posterior: Posterior, draws_per_chain: int = 8) -> xr.Data
     fit = posterior.fit
     generator = random_stream(posterior.seed, Stream.PREDICTED_MOVES)
     chains, draws = posterior.z.shape[:2]
-    chosen = np.unique(np.linspace(0, draws - 1, min(draws_per_chain, draws)).astype(int))
+    chosen = np.unique(np.linspace(0, draws - 1, min(PREDICTED_DRAWS, draws)).astype(int))
     z, drawn = posterior.z.reshape(-1, posterior.z.shape[-1]), posterior.joined
 
     places = np.arange(chains * draws).reshape(chains, draws)[:, chosen].ravel()

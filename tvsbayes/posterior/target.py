@@ -16,7 +16,6 @@ from tvsbayes.estimators.likelihood import evaluate, no_draw
 from tvsbayes.inference.density import Points
 from tvsbayes.inference.importance import Sample
 from tvsbayes.inference.proposal import Independence, first_proposal
-from tvsbayes.instrument.campaign import ordered_spots
 from tvsbayes.model.compiled import BATCH
 from tvsbayes.posterior.draws import Draws, Posterior, derived_of, headline_names
 from tvsbayes.posterior.transport import Mapped, Transport
@@ -65,11 +64,11 @@ class Target:
         """Compute the constant of the evidence over the free parameters, `spot_constants` included.
 
         |det root| converts the integral over w to the coordinates z, whose normal priors have no constants in
-        `likelihood.log_density`.
+        `likelihood.evaluate`.
         """
         fit = self.fit
-        used = np.asarray(fit.arrays.spots.valid)[: len(ordered_spots(fit.campaign))] > 0
-        constants = float(spot_constants(fit.campaign)[used].sum()) - 0.5 * self.dimension * np.log(2 * np.pi)
+        constants = float(spot_constants(fit.campaign)[fit.arrays.used].sum())
+        constants -= 0.5 * self.dimension * np.log(2 * np.pi)
         # Fixed parameters have no prior to integrate over.
         held = 0.5 * float(np.sum(fit.z[~fit.free] ** 2))
         volume = float(np.sum(np.log(np.diag(self.path.root))))

@@ -51,7 +51,6 @@ TEXT_CHARS_MAX = 20_000
 """Largest length of one text in a document that tvsbayes wrote."""
 SCHEMA_PROBLEMS = 20
 """Number of problems among which the reported one is chosen: a foreign document has thousands."""
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _ROW = {"type": "array", "minItems": 1, "items": {"type": "number"}}
 type Matrix = Annotated[np.ndarray, Meta(extra_json_schema={"type": "array", "minItems": 1, "items": _ROW})]
 

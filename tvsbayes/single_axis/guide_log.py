@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
+from typing import NamedTuple
 
 from tvsbayes.errors import InputError, escaped, refusal
 from tvsbayes.single_axis.axis_campaign import AxisMove, Reading
@@ -57,6 +58,16 @@ _HEADER = {
 _MOUNT, _PIER = re.compile(r"^Mount = ([^,]*)"), re.compile(r"\bPier side = (\w+)")
 
 
+class GuideFrame(NamedTuple):
+    """A frame with a star: line of the log, time, raw distance, pulse with W positive, whether the guider settles."""
+
+    line: int
+    time_s: float
+    raw_px: float
+    pulse_ms: float
+    settling: bool
+
+
 @dataclass
 class GuideRun:
     """A run of a log.
@@ -68,7 +79,7 @@ class GuideRun:
         mount: driver of the mount as logged.
         pier: side of the pier.
         header: numbers of the header by the names of `_HEADER`.
-        frames: (line, time_s, raw distance px, pulse ms with W positive, settling) of frames with a star.
+        frames: those with a star.
         dropped: (line, time_s) of frames without a star.
         breaks: indices of `frames` with a new zero: after dithers, new lock positions, settling, pauses.
         counts: numbers of events by name.
@@ -81,7 +92,7 @@ class GuideRun:
     mount: str = "unknown"
     pier: str = "unknown"
     header: dict[str, float] = field(default_factory=dict)
-    frames: list[tuple[int, float, float, float, bool]] = field(default_factory=list)
+    frames: list[GuideFrame] = field(default_factory=list)
     dropped: list[tuple[int, float]] = field(default_factory=list)
     breaks: set[int] = field(default_factory=set)
     counts: Counter[str] = field(default_factory=Counter)
@@ -90,12 +101,12 @@ class GuideRun:
     @property
     def minutes(self) -> float:
         """Time from the first frame to the last."""
-        return (self.frames[-1][1] - self.frames[0][1]) / 60.0 if self.frames else 0.0
+        return (self.frames[-1].time_s - self.frames[0].time_s) / 60.0 if self.frames else 0.0
 
     @property
     def settling(self) -> int:
         """Number of frames while the mount settled."""
-        return sum(frame[4] for frame in self.frames)
+        return sum(frame.settling for frame in self.frames)
 
 
 def is_guide_log(text: str) -> bool:
@@ -186,7 +197,7 @@ def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settli
     try:
         cells = dict(zip(columns, next(csv.reader([line])), strict=False))
         time_s, device = float(cells["Time"]), cells.get("mount", "Mount")
-        last = max((run.frames[-1][1] if run.frames else 0.0, run.dropped[-1][1] if run.dropped else 0.0))
+        last = max((run.frames[-1].time_s if run.frames else 0.0, run.dropped[-1][1] if run.dropped else 0.0))
         if time_s < last or not math.isfinite(time_s):
             run.counts["damaged row"] += 1
         elif device == "DROP" or cells["RARawDistance"] == "":
@@ -196,7 +207,7 @@ def _frame(run: GuideRun, number: int, line: str, columns: Sequence[str], settli
         else:
             raw, pulse_ms = float(cells["RARawDistance"]), float(cells["RADuration"] or 0)
             sign = {"W": 1.0, "E": -1.0, "": 0.0}[cells["RADirection"].strip()[:1].upper()]
-            run.frames.append((number, time_s, raw, sign * pulse_ms, settling))
+            run.frames.append(GuideFrame(number, time_s, raw, sign * pulse_ms, settling))
             run.counts["frame with a saturated star"] += cells.get("ErrorCode") == "1"
     except (KeyError, ValueError, csv.Error, StopIteration):
         run.counts["damaged row"] += 1
@@ -260,17 +271,16 @@ def _scale(run: GuideRun, stated: Mapping[str, float], file: str) -> _Scale:
         pulse = stated["pulse_arcsec_per_s"]
         assumed.append(f"pulses turn the axis by {pulse:g} arcsec/s, as stated")
     else:
-        pulse = _logged_pulse(run, known, need("rate_px_per_s", "xRate", "pulse_arcsec_per_s") * pixel, cosine, assumed)
+        pulse = _logged_pulse(known, need("rate_px_per_s", "xRate", "pulse_arcsec_per_s") * pixel, cosine, assumed)
     drive = stated.get("drive_arcsec_per_s", SIDEREAL_ARCSEC_PER_S)
     assumed.append(f"the drive turns at {drive:.6g} arcsec/s; --assume drive_arcsec_per_s=")
     return _Scale(pixel, cosine, pulse, drive, tuple(assumed))
 
 
-def _logged_pulse(run: GuideRun, known: Mapping[str, float], x_rate: float, cosine: float, assumed: list[str]) -> float:
+def _logged_pulse(known: Mapping[str, float], x_rate: float, cosine: float, assumed: list[str]) -> float:
     """Rate of the axis during a pulse, arcsec/s: xRate is that at the run's declination or at the calibration's.
 
     Args:
-        run: the run, for its pulses.
         known: numbers of the header.
         x_rate: xRate times pixel scale, arcsec/s.
         cosine: cosine of the declination.
@@ -359,9 +369,9 @@ def _remarks(run: GuideRun) -> list[str]:
     remarks = [f"pier side {run.pier}"]
     if not run.ended:
         remarks.append("the log does not say that the run ended: it may be cut off")
-    times = [frame[1] for frame in run.frames]
+    times = [frame.time_s for frame in run.frames]
     step = median([b - a for a, b in pairwise(times)] or [0.0])
-    pulses = [abs(frame[3]) for frame in run.frames]
+    pulses = [abs(frame.pulse_ms) for frame in run.frames]
     if long_pulses := sum(p > 1000.0 * step for p in pulses):
         remarks.append(f"{long_pulses} pulses last longer than the {step:.2g} s between frames and act in part later")
     if (limit_ms := run.header.get("pulse_max_ms")) and (at_limit := sum(p >= limit_ms for p in pulses)):
