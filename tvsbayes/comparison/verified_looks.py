@@ -40,7 +40,7 @@ from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.results.compensation_record import Millimetres, Verification
 from tvsbayes.results.fit_record import FIT_FORMATS
 from tvsbayes.results.records import stored_document
-from tvsbayes.single_axis.predicted_stops import PredictedStops
+from tvsbayes.single_axis.predicted_stops import PredictedReadings
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import systematic
 
@@ -208,7 +208,7 @@ def _millimetres(
     def lengths(angles: np.ndarray) -> np.ndarray:
         return np.linalg.norm(np.einsum("mxa,...ma->...mx", slopes, angles.reshape(*angles.shape[:-1], -1, 2)), axis=-1)
 
-    promised = PredictedStops(np.zeros((len(measured.covariance), len(measured.value))), measured.covariance, {})
+    promised = PredictedReadings(np.zeros((len(measured.covariance), len(measured.value))), measured.covariance)
     drawn = lengths(promised.drawn(PROMISED_DRAWS, random_stream(seed, Stream.PROMISED_LENGTHS)))
     return Millimetres(
         distance_mm=distance_mm,
@@ -246,9 +246,9 @@ def verify_looks(
     angles = SeenAngles.of(fit, WatchedLooks(fit, looks), aimed.sides, seed)
 
     @cache
-    def at(common: float, play: float) -> PredictedStops:
+    def at(common: float, play: float) -> PredictedReadings:
         off = aimed.off_deg(nominal, common, play).ravel()
-        return PredictedStops(np.tile(off, (len(angles.covariance), 1)), angles.covariance, {})
+        return PredictedReadings(np.tile(off, (len(angles.covariance), 1)), angles.covariance)
 
     aim = np.zeros(len(angles.value))
     travel = float(np.max(np.ptp(aimed.ratios * aimed.steps, axis=0)))

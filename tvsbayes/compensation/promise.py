@@ -27,7 +27,7 @@ from tvsbayes.single_axis.axis_density import line_weights
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import AxisResults, results_for
 from tvsbayes.single_axis.axis_rows import HOUR_S, AxisRows, legs_of
-from tvsbayes.single_axis.predicted_stops import PredictedStops, predicted_stops
+from tvsbayes.single_axis.predicted_stops import PredictedReadings, PredictedStops, predicted_stops
 from tvsbayes.statistics.intervals import NORMAL_95, absolute_bound95
 from tvsbayes.statistics.streams import Stream, random_stream
 
@@ -230,7 +230,7 @@ def _folded(at: _Expected, fitted: float, period: float, resolution: float) -> _
     return _Shaped(Correction(command, added, added, resolution), {"period_command": period})
 
 
-def bound_of(stops: PredictedStops, aim: np.ndarray, members: np.ndarray, shift: bool = False) -> float:
+def bound_of(stops: PredictedReadings, aim: np.ndarray, members: np.ndarray, shift: bool = False) -> float:
     """Compute the bound of 95 % of the errors of some stops.
 
     Args:

@@ -41,7 +41,7 @@ from tvsbayes.single_axis.axis_campaign import AxisCampaign, AxisMove, axis_hash
 from tvsbayes.single_axis.axis_fit import AxisFit
 from tvsbayes.single_axis.axis_record import results_for
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, rows_of
-from tvsbayes.single_axis.predicted_stops import PredictedStops, log_mean, predicted_stops
+from tvsbayes.single_axis.predicted_stops import PredictedReadings, PredictedStops, log_mean, predicted_stops
 from tvsbayes.statistics.streams import Stream, random_stream
 
 SURE, UNLIKELY, P_MIN = 0.95, 0.01, 0.003
@@ -124,7 +124,7 @@ class Trial:
         noise: variances of the noise drawn at each visit, shape (r,).
     """
 
-    at: Callable[[float, float], PredictedStops]
+    at: Callable[[float, float], PredictedReadings]
     value: np.ndarray
     aim: np.ndarray
     other: np.ndarray
@@ -144,8 +144,8 @@ class Judged:
     p: float
     worlds: dict[str, float]
     needed: int | None
-    promised: PredictedStops
-    without: PredictedStops
+    promised: PredictedReadings
+    without: PredictedReadings
 
 
 def _log_densities(trial: Trial) -> dict[str, float]:
@@ -176,7 +176,7 @@ def judged(trial: Trial, seed: int) -> Judged:
     return Judged(verdict, p, worlds, needed, promised, without)
 
 
-def _p_value(promised: PredictedStops, value: np.ndarray, shift: np.ndarray, seed: int) -> float:
+def _p_value(promised: PredictedReadings, value: np.ndarray, shift: np.ndarray, seed: int) -> float:
     """Compute the p-value of the readings' squared distance, from readings drawn from the prediction."""
     mean, covariance = promised.pooled()
     inverse = np.linalg.inv(covariance + shift)
@@ -201,7 +201,7 @@ def _verdict(worlds: dict[str, float], p: float) -> Verdict:
     return KEPT if worlds[APPLIED] >= SURE else CANNOT_TELL
 
 
-def needed_readings(promised: PredictedStops, off: np.ndarray, noise: np.ndarray) -> int | None:
+def needed_readings(promised: PredictedReadings, off: np.ndarray, noise: np.ndarray) -> int | None:
     """Compute the number of repeated readings that discriminates two hypotheses; None where none does.
 
     Args:

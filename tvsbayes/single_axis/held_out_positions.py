@@ -17,7 +17,7 @@ from tvsbayes.single_axis.axis_mode import find_mode
 from tvsbayes.single_axis.axis_model import AxisModel
 from tvsbayes.single_axis.axis_rows import DIRECTIONS, AxisRows, line_design
 from tvsbayes.single_axis.classic_line import fit_line
-from tvsbayes.single_axis.predicted_stops import PredictedStops, transferred_scales
+from tvsbayes.single_axis.predicted_stops import PredictedReadings, transferred_scales
 from tvsbayes.statistics.intervals import NORMAL_95, rms
 from tvsbayes.statistics.streams import AxisStream, random_stream
 from tvsbayes.statistics.weighted_draws import effective_draws, smoothed_weights
@@ -60,7 +60,7 @@ def _reweighted(model: AxisModel, w: np.ndarray, rows: np.ndarray) -> _Predictio
     None where the weights are unreliable. Leave-one-out by importance sampling (Vehtari, Gelman and Gabry, Stat.
     Comput. 27 (2017) 1413), with whole positions left out.
     """
-    stops = PredictedStops(*model.left_out(w, rows), {})
+    stops = PredictedReadings(*model.left_out(w, rows))
     smoothed = smoothed_weights(-stops.log_densities(model.rows.value[rows]))
     if not smoothed.pareto_k < K_MAX or effective_draws(smoothed.weights) < EFFECTIVE_MIN:
         return None
@@ -73,7 +73,7 @@ def _refitted(model: AxisModel, left_out: np.ndarray, seed: int) -> _Prediction:
     rng = random_stream(seed, AxisStream.HELD_OUT)
     sample = _equal_draws(reduced, DRAWS, seed, rng)
     w = transferred_scales(reduced, sample.w, model, rng)
-    return _Prediction(*PredictedStops(*model.left_out(w, np.flatnonzero(left_out)), {}).pooled(), sample.fault)
+    return _Prediction(*PredictedReadings(*model.left_out(w, np.flatnonzero(left_out))).pooled(), sample.fault)
 
 
 def hold_out_positions(campaign: AxisCampaign, seed: int = 0, progress: Show | None = None) -> AxisHoldOut:

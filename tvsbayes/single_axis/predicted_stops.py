@@ -24,18 +24,16 @@ DRAWS = 160
 
 
 @dataclass(frozen=True)
-class PredictedStops:
-    """Readings of r stops for n draws of the scales, normal given each draw.
+class PredictedReadings:
+    """Readings of r stops for n draws, normal given each draw.
 
     Attributes:
-        mean: shape (n, r).
-        covariance: shape (n, r, r).
-        scales: the draws by name, each (n,).
+        mean: means, shape (n, r).
+        covariance: covariances, shape (n, r, r).
     """
 
     mean: np.ndarray
     covariance: np.ndarray
-    scales: dict[str, np.ndarray]
 
     def pooled(self, weights: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Mean (r,) and covariance (r, r) of the mixture with weights (n,) of sum 1; None: equal weights."""
@@ -62,6 +60,13 @@ class PredictedStops:
     def log_density(self, value: np.ndarray, additional: np.ndarray | None = None) -> float:
         """Log density of readings (r,) under the mixture of equal draws; `additional` as in `log_densities`."""
         return log_mean(self.log_densities(value, additional))
+
+
+@dataclass(frozen=True)
+class PredictedStops(PredictedReadings):
+    """Readings of stops, with the draws of the scales by name, each (n,)."""
+
+    scales: dict[str, np.ndarray]
 
 
 def log_mean(logs: Sequence[float] | np.ndarray) -> float:
