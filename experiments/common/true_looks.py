@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from tvsbayes.coordinates.simple_calibration import simple_belief, simple_calibrations
+from tvsbayes.coordinates.simple_calibration import assumed_geometry, simple_calibrations
 from tvsbayes.estimators.four_point import classic_of
 from tvsbayes.instrument.axes import AXES, SIDES
 from tvsbayes.instrument.campaign import Campaign
@@ -78,7 +78,7 @@ class TrueLooks:
         result = {"classic": np.full_like(self.points_mm, np.nan)}
         azimuth = campaign.rig.aperture_convention == "azimuth"
         for name, simple in simple_calibrations(campaign.rig.priors, classic_of(campaign)).items():
-            found = simple_belief(simple, *self.counters_steps.T).points(np.array(self.readings), azimuth)
+            found = assumed_geometry(simple, *self.counters_steps.T).points(np.array(self.readings), azimuth)
             result[name] = found.T - self.points_mm
         return result
 

@@ -15,7 +15,7 @@ from tvsbayes.calibration.located_point import meets
 from tvsbayes.calibration.pointing import Calibration
 from tvsbayes.coordinates.location import Linear, Settings, locate, locate_linear
 from tvsbayes.coordinates.looks_file import LookRows
-from tvsbayes.coordinates.simple_calibration import SimpleCalibration, simple_belief
+from tvsbayes.coordinates.simple_calibration import SimpleCalibration, assumed_geometry
 from tvsbayes.errors import InputError
 
 CHECKED_MAX = 200
@@ -85,7 +85,7 @@ def cloud(
             covariance_mm2=linear.covariance[meets],
             extrapolated=(pan < pan_low) | (pan > pan_high) | (tilt < tilt_low) | (tilt > tilt_high),
             simple_xyz_mm={
-                name: simple_belief(one, pan, tilt).points(reading, calibration.azimuth).T
+                name: assumed_geometry(one, pan, tilt).points(reading, calibration.azimuth).T
                 for name, one in simple.items()
             },
             refused=refused,

@@ -16,7 +16,7 @@ from tvsbayes.calibration.drawn_looks import Drawn, drawn
 from tvsbayes.calibration.located_point import DIVERGING_SHARE
 from tvsbayes.calibration.optics import Components, aperture_angle_deg
 from tvsbayes.calibration.pointing import Calibration, Sides
-from tvsbayes.coordinates.simple_calibration import Belief, SimpleCalibration, simple_belief
+from tvsbayes.coordinates.simple_calibration import AssumedGeometry, SimpleCalibration, assumed_geometry
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ class _Errors:
     usable: np.ndarray
 
 
-def _errors(belief: Belief, truth: _Truth, azimuth: bool) -> _Errors:
-    error = belief.points(truth.aperture_deg, azimuth) - truth.xyz_mm
+def _errors(assumed: AssumedGeometry, truth: _Truth, azimuth: bool) -> _Errors:
+    error = assumed.points(truth.aperture_deg, azimuth) - truth.xyz_mm
     meets = np.isfinite(error[0])
     kept, count = np.where(meets, error, 0.0), np.maximum(meets.sum(axis=0), 1)
     usable = (~meets).mean(axis=0) <= DIVERGING_SHARE
@@ -111,12 +111,12 @@ def simple_error(
     beam = calibration.beam_at(steps, (1.0, 1.0))
     point = np.array(beam.at(range_mm))
     reading = np.array(calibration.reading(point))
-    belief = simple_belief(simple, np.array(steps[:1]), np.array(steps[1:]))
-    joint = Belief(beam, best["baseline_mm"], best["aperture_zero_deg"])
-    turned = replace(joint, beam=Components(beam.origin, belief.beam.direction))
-    moved = replace(belief, beam=Components(belief.beam.origin, beam.direction))
+    assumed = assumed_geometry(simple, np.array(steps[:1]), np.array(steps[1:]))
+    joint = AssumedGeometry(beam, best["baseline_mm"], best["aperture_zero_deg"])
+    turned = replace(joint, beam=Components(beam.origin, assumed.beam.direction))
+    moved = replace(assumed, beam=Components(assumed.beam.origin, beam.direction))
     parts = [float(np.linalg.norm(np.ravel(b.points(reading, azimuth)) - point)) for b in (turned, moved)]
-    directions = [np.ravel(np.array(each.direction)) for each in (belief.beam, beam)]
+    directions = [np.ravel(np.array(each.direction)) for each in (assumed.beam, beam)]
     pan, tilt = (np.degrees(np.subtract(*angle)) for angle in zip(*map(_angles, directions), strict=True))
     return SimpleError(float(pan), float(tilt), *parts)
 
@@ -158,9 +158,9 @@ def error_map(
     truth = _truth(calibration, pan, tilt, ranges, approach, drawn(calibration, draws, seed))
     best = calibration.estimates
     beam = calibration.beam_at((pan, tilt), approach)
-    beliefs = {"joint": Belief(beam, best["baseline_mm"], best["aperture_zero_deg"])}
-    beliefs |= {name: simple_belief(one, pan, tilt) for name, one in simple.items()}
-    errors = {name: _errors(belief, truth, calibration.azimuth) for name, belief in beliefs.items()}
+    geometries = {"joint": AssumedGeometry(beam, best["baseline_mm"], best["aperture_zero_deg"])}
+    geometries |= {name: assumed_geometry(one, pan, tilt) for name, one in simple.items()}
+    errors = {name: _errors(assumed, truth, calibration.azimuth) for name, assumed in geometries.items()}
     (pan_low, pan_high), (tilt_low, tilt_high) = calibration.range_steps
     inside = (pan >= pan_low) & (pan <= pan_high) & (tilt >= tilt_low) & (tilt <= tilt_high)
     shape = tuple(len(x) for x in axes)

@@ -74,7 +74,7 @@ def simple_rays(simple: SimpleCalibration, steps: np.ndarray) -> Ray:
 
 
 @dataclass(frozen=True)
-class Belief:
+class AssumedGeometry:
     """Geometry assumed by an estimator: beams (points,), twice the aperture's distance from y = 0, its zero."""
 
     beam: Components
@@ -87,10 +87,10 @@ class Belief:
         return self.beam.met(reach)
 
 
-def simple_belief(simple: SimpleCalibration, pan: np.ndarray, tilt: np.ndarray) -> Belief:
+def assumed_geometry(simple: SimpleCalibration, pan: np.ndarray, tilt: np.ndarray) -> AssumedGeometry:
     """Compute the geometry of a simple calibration at counters (points,)."""
     ray = simple_rays(simple, np.stack([pan, tilt], axis=1))
     (x, y, z), (u, v, w) = ray.origin_mm, ray.direction
     # `range_components` puts the aperture at half the given distance; that of a simple user is at origin - baseline.
     aperture_mm = 2 * (simple.baseline_mm - simple.origin_y_mm)
-    return Belief(Components((x, y, z), (u, v, w)), aperture_mm, simple.aperture_zero_deg)
+    return AssumedGeometry(Components((x, y, z), (u, v, w)), aperture_mm, simple.aperture_zero_deg)
