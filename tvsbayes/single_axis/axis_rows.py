@@ -210,6 +210,17 @@ def _check_turns(campaign: AxisCampaign, command: np.ndarray, value: np.ndarray,
         )
 
 
+def _check_motion(slope: float, command: np.ndarray, value: np.ndarray, remedy: str) -> None:
+    """Refuse readings that do not follow the command.
+
+    Raises:
+        NothingToEstimate: the readings do not change with the command.
+    """
+    if not abs(slope) * np.ptp(command) > 1e-9 * max(float(np.max(np.abs(value))), 1e-300):
+        found = "the readings do not move with the command: nothing to estimate"
+        raise NothingToEstimate("no-motion", found, file="readings.csv", remedy=remedy)
+
+
 def rows_of(campaign: AxisCampaign) -> AxisRows:
     """The rows of a campaign.
 
@@ -242,13 +253,8 @@ def rows_of(campaign: AxisCampaign) -> AxisRows:
     _check_turns(campaign, command, value, moves)
     design = np.column_stack([np.ones(len(command)), command - command.mean(), legs.side[moves]])
     line = np.linalg.lstsq(design, value, rcond=None)[0]
-    if not abs(line[1]) * np.ptp(command) > 1e-9 * max(float(np.max(np.abs(value))), 1e-300):
-        raise NothingToEstimate(
-            "no-motion",
-            "the readings do not move with the command: nothing to estimate",
-            file="readings.csv",
-            remedy="check the columns move and value, and that the reading follows this axis",
-        )
+    remedy = "check the columns move and value, and that the reading follows this axis"
+    _check_motion(line[1], command, value, remedy)
     times_s = np.array([m.time_s for m in campaign.moves])
     stated_u = [r.u for r in used if r.u > 0]
     rows = AxisRows(
@@ -315,13 +321,8 @@ def rows_in_motion(campaign: AxisCampaign, rate: float) -> AxisRows:
     command = by_move["command"][move] + rate * (time_s - by_move["time_s"][move])
     _check_turns(campaign, command, value, move)
     slope = float(np.polyfit(command - command.mean(), value, 1)[0])
-    if not abs(slope) * np.ptp(command) > 1e-9 * max(float(np.max(np.abs(value))), 1e-300):
-        raise NothingToEstimate(
-            "no-motion",
-            "the readings do not move with the command: nothing to estimate",
-            file="readings.csv",
-            remedy="give total positions, not what they are off the drive; check the sign of `rate`",
-        )
+    remedy = "give total positions, not what they are off the drive; check the sign of `rate`"
+    _check_motion(slope, command, value, remedy)
     u = np.array([r.u for r in used])
     u = np.where(u > 0, u, _neighbours_sd(value - slope * command, move))
     weight = 1.0 / np.maximum(u, FLOOR_SHARE * abs(slope) * np.ptp(command)) ** 2
