@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments.common.rigs import numbered
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
+from tvsbayes.instrument.protocols import RUN_UP_STEPS
 from tvsbayes.planning.assurance import Family
 from tvsbayes.planning.candidates import Candidates, candidates
 from tvsbayes.planning.expectation import Knowledge, information_of
@@ -38,8 +38,8 @@ def full_turn_plan(looks: int, turn_steps: int = TURN_STEPS) -> tuple[PlanStep, 
         for at in (0, turn_steps)[:: 1 if number == 0 else -1]:
             for look in range(looks):
                 pan, tilt = poses[look % len(poses)]
-                pan_run_up = OVERSHOOT_STEPS * (1 if look % 2 == 0 else -1)
-                tilt_run_up = OVERSHOOT_STEPS * (1 if look // 2 % 2 == 0 else -1)
+                pan_run_up = RUN_UP_STEPS * (1 if look % 2 == 0 else -1)
+                tilt_run_up = RUN_UP_STEPS * (1 if look // 2 % 2 == 0 else -1)
                 orders += [("move", at + pan - pan_run_up, tilt - tilt_run_up), ("move", at + pan, tilt), ("look",)]
     return numbered(orders)
 

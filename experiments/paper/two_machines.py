@@ -19,7 +19,7 @@ from tvsbayes.estimators.four_point import four_point_ratios, select_experiments
 from tvsbayes.instrument.axes import AXES, DIRECTION_SIGNS, DIRECTIONS
 from tvsbayes.instrument.campaign import Campaign
 from tvsbayes.instrument.plan import PlanStep
-from tvsbayes.instrument.protocols import OVERSHOOT_STEPS, grid_protocol
+from tvsbayes.instrument.protocols import RUN_UP_STEPS, grid_protocol
 from tvsbayes.instrument.rig import Rig
 from tvsbayes.instrument.stereo_pair import Stereo, rotation_matrix
 from tvsbayes.planning.expectation import prior_knowledge
@@ -56,7 +56,7 @@ def four_point_plan(
             end, beyond = list(start), list(start)
             end[axis] += sign * steps[repeat % len(steps)]
             # Arriving by a move against the homing's last one.
-            beyond[axis] += home_sign * OVERSHOOT_STEPS
+            beyond[axis] += home_sign * RUN_UP_STEPS
             orders += [("home", *start), ("place", None, None, "d1")]
             if other_side[repeat % len(other_side)]:
                 orders += [("move", *beyond), ("move", *start)]

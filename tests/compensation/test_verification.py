@@ -106,6 +106,6 @@ def test_plan_spreads_its_stops_and_knows_whether_they_tell():
     at = [float(row[1]) for row in rows]
     for k, row in enumerate(rows):
         if row[3] == "1":
-            assert (at[k] > at[k - 1]) == (row[2] == "forward") and abs(at[k] - at[k - 1]) >= found.overrun - 1e-9
+            assert (at[k] > at[k - 1]) == (row[2] == "forward") and abs(at[k] - at[k - 1]) >= found.run_up - 1e-9
     tiny = [structs.replace(r, add_forward=1e-5, add_backward=-1e-5) for r in table().table]
     assert not plan_verification(results().fit, structs.replace(table(), table=tuple(tiny))).enough

@@ -7,7 +7,7 @@ import pytest
 
 from tvsbayes.instrument.axes import DIRECTION_SIGNS
 from tvsbayes.instrument.plan import PlanStep, read_plan, write_plan
-from tvsbayes.instrument.protocols import OVERSHOOT_STEPS, PROTOCOLS, four_point_protocol, grid_protocol
+from tvsbayes.instrument.protocols import PROTOCOLS, RUN_UP_STEPS, four_point_protocol, grid_protocol
 from tvsbayes.twin.simulated_campaign import simulate
 
 
@@ -100,7 +100,7 @@ def test_protocols_are_valid_plans_within_their_range(name, tmp_path):
     write_plan(steps, tmp_path / "plan.csv")
     assert read_plan(tmp_path / "plan.csv") == steps
     # Grid: poses -60 ... 240 and their run-up; the others: 0 ... 200 and theirs.
-    furthest = 240 + OVERSHOOT_STEPS
+    furthest = 240 + RUN_UP_STEPS
     assert all(abs(s.pan_steps) <= furthest and abs(s.tilt_steps) <= furthest for s in steps if s.action == "move")
     assert any(s.action == "look" for s in steps)
 

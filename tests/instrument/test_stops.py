@@ -9,7 +9,7 @@ import pytest
 from support.written_rows import move_row
 
 from tvsbayes.instrument.campaign import Move
-from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
+from tvsbayes.instrument.protocols import RUN_UP_STEPS
 from tvsbayes.instrument.stops import Stop, few_stops, legs_of, observed_stops, redraws, rests_of, separation
 
 
@@ -74,7 +74,7 @@ def test_two_step_counts_separate():
 
 def test_cleared_starts_separate():
     """Both ends of one |N| seen from both sides: run-ups beyond either end."""
-    cycle = [-OVERSHOOT_STEPS, 0, 200, 200 + OVERSHOOT_STEPS, 200, 0]
+    cycle = [-RUN_UP_STEPS, 0, 200, 200 + RUN_UP_STEPS, 200, 0]
     moves = pan_moves(*cycle * 4)
     observed = [m.move for m in moves if m.pan_steps in (0, 200)]
     assert separation(observed_stops(moves, observed, "pan"), "pan") is None

@@ -36,7 +36,7 @@ def test_limits_are_kept(mounted_rig, found):
     tight = {"pan_min_steps": 0, "pan_max_steps": 150, "tilt_min_steps": -70, "tilt_max_steps": 90}
     known = prior_knowledge(replace(mounted_rig, positioner=tight))
     inside = candidates(known)
-    arranged = arrange(inside.looks, known.sheets, inside.overshoot)
+    arranged = arrange(inside.looks, known.sheets, inside.run_up)
     moves = np.array([(s.pan_steps, s.tilt_steps) for s in arranged.steps if s.action == "move"])
     low, high = np.array([0, -70]), np.array([150, 90])
     # The images reach beyond these limits: the outermost looks stand on them, and no run-up goes past.
@@ -66,7 +66,7 @@ def test_a_full_turn_waits_until_the_ratio_is_known(mounted_rig):
         np.tile(turned.looks.side[away], (2, 1)),
         np.tile(turned.looks.sheet[away], 2),
     )
-    steps = arrange(looks, vague.sheets, turned.overshoot).steps
+    steps = arrange(looks, vague.sheets, turned.run_up).steps
     ratio = parse_target("u(left) <= 1e-5 deg/step")
     information = information_of(steps, vague)
     covariance = covariance_of(vague.precision + information.fisher)

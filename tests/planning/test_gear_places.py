@@ -215,7 +215,7 @@ def test_looks_of_real_gears_add_up_to_the_plan_they_make(real):
     known, found = real
     seen = LookArrays(found.looks, known, False).at(known.z, known.space)
     picks = np.random.default_rng(5).integers(0, len(found.looks), 24)
-    arranged = arrange(found.looks[picks], known.sheets, found.overshoot)
+    arranged = arrange(found.looks[picks], known.sheets, found.run_up)
     exact = information_of(arranged.steps, known).fisher
     quick = information_of_looks(seen, picks, arranged.path, known.space, False, arranged.warm_minutes(known.rig))
     assert exact.shape == (known.size, known.size) and known.gears.size > 20

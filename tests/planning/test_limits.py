@@ -100,7 +100,7 @@ def test_a_target_below_the_floor_names_the_term_and_what_would_do(mounted_rig):
 def test_no_calibration_removes_the_stop_at_the_point(knowledge, seen, found):
     target = parse_target("U95(x) at 1000,0,0 mm <= 0.5 mm")
     at = sensitivity(target, knowledge.z, knowledge.space, knowledge.rig.table, np.zeros(2))
-    path = arrange(found.looks, knowledge.sheets, found.overshoot).path
+    path = arrange(found.looks, knowledge.sheets, found.run_up).path
     information = information_of_looks(seen, np.arange(len(found.looks)), path, knowledge.space, False)
     limit = limit_of(knowledge, information, at, target)
     assert not limit.reachable and "at the point itself" in limit.needed

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("small_searches")
 def test_looks_add_up_to_the_plan_they_make(knowledge, found, seen):
     """The fast sum equals the filter's pass over the arranged plan, with and without an unknown home offset."""
     picks = np.random.default_rng(5).integers(0, len(found.looks), 24)
-    arranged = arrange(found.looks[picks], knowledge.sheets, found.overshoot)
+    arranged = arrange(found.looks[picks], knowledge.sheets, found.run_up)
     for after_data in (False, True):
         known = replace(knowledge, after_data=after_data)
         exact = information_of(arranged.steps, known).fisher
@@ -51,14 +51,14 @@ def test_order_of_experiments_does_not_matter(knowledge, found, seen):
     )
     values = []
     for order in (picks, generator.permutation(picks)):
-        path = arrange(found.looks[order], knowledge.sheets, found.overshoot).path
+        path = arrange(found.looks[order], knowledge.sheets, found.run_up).path
         information = information_of_looks(seen, order, path, knowledge.space, False)
         values.append(at.value(covariance_of(knowledge.precision + information)))
     assert values[1] == pytest.approx(values[0], rel=ROUNDING)
 
 
 def test_every_look_is_reached_from_its_side(found, knowledge):
-    arranged = arrange(found.looks, knowledge.sheets, found.overshoot)
+    arranged = arrange(found.looks, knowledge.sheets, found.run_up)
     assert [s.target for s in arranged.steps if s.action == "place"] == list(knowledge.sheets)
     counters, last, row = np.zeros(2, dtype=int), np.zeros(2, dtype=int), 0
     for step in arranged.steps:
@@ -68,7 +68,7 @@ def test_every_look_is_reached_from_its_side(found, knowledge):
         elif step.action == "look":
             look = arranged.order[row]
             assert (counters == found.looks.steps[look]).all()
-            assert (last * found.looks.side[look] >= found.overshoot).all()
+            assert (last * found.looks.side[look] >= found.run_up).all()
             row += 1
     assert row == len(found.looks)
 
@@ -79,7 +79,7 @@ def test_an_arranged_plan_travels_and_costs_what_its_steps_do(knowledge, found, 
     picks = np.random.default_rng(2).integers(0, len(found.looks), 30)
     looks = found.looks[np.concatenate([picks, picks[:1]])]
     looks.steps[5], looks.side[5], looks.sheet[5] = home, (1, 1), 0
-    arranged = arrange(looks, knowledge.sheets, found.overshoot, home)
+    arranged = arrange(looks, knowledge.sheets, found.run_up, home)
     at, far, travelled = np.array(home), np.zeros(2, dtype=int), []
     for step in arranged.steps[1:]:
         if step.action == "move":

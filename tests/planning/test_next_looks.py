@@ -15,7 +15,7 @@ from tvsbayes.instrument.axes import AXES, DIRECTIONS
 from tvsbayes.instrument.plan import PlanStep, run_plan
 from tvsbayes.instrument.protocols import grid_protocol
 from tvsbayes.instrument.stops import rests_of
-from tvsbayes.planning.candidates import UNSTATED_STEPS, counter_range, overshoot_steps
+from tvsbayes.planning.candidates import UNSTATED_STEPS, counter_range, expected_run_up
 from tvsbayes.planning.expectation import Knowledge, information_of, knowledge_of
 from tvsbayes.planning.looks import covariance_of
 from tvsbayes.planning.next_looks import Confirmation, next_looks
@@ -73,17 +73,17 @@ def test_what_is_promised_is_the_information_of_the_whole_run(found, mounted_rig
 
 def test_every_look_is_reached_with_a_run_up_inside_the_limits(found, mounted_rig, begun_fit):
     limits = counter_range(mounted_rig.limits, UNSTATED_STEPS).limits
-    overshoot = overshoot_steps(knowledge_of(begun_fit, mounted_rig))
+    least = expected_run_up(knowledge_of(begun_fit, mounted_rig))
     assert found.steps[0].action == "place" and sum(step.action == "look" for step in found.steps) == 12
     log = run_plan(whole_plan(mounted_rig, found), mounted_rig)
-    for axis, (low, high), needed in zip(AXES, limits, overshoot, strict=True):
+    for axis, (low, high), needed in zip(AXES, limits, least, strict=True):
         rests = rests_of(log.moves, axis)
         for look in log.looks[12:]:
             assert low <= rests[look.move].steps <= high and rests[look.move].leg >= needed
     first_move = next(step for step in found.steps if step.action == "move")
     after = found.steps[found.steps.index(first_move) + 1]
     run_up = np.abs(np.array([after.pan_steps, after.tilt_steps]) - [first_move.pan_steps, first_move.tilt_steps])
-    assert np.all(run_up >= overshoot), "wherever the axes stood"
+    assert np.all(run_up >= least), "wherever the axes stood"
 
 
 def test_a_sheet_that_stands_there_costs_nothing(found, mounted_rig):

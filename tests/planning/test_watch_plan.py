@@ -91,7 +91,7 @@ def test_candidates_keep_to_the_limits(designs, watched_fit, monkeypatch):
         moved = [getattr(step, f"{axis}_steps") for step in steps if step.action in ("home", "move")]
         assert min(own) <= min(moved) and max(moved) <= max(own)
     # A run-up longer than the travel leads beyond it, whatever the look.
-    monkeypatch.setitem(designs.__dict__, "_overshoot", np.array([1000, 1000]))
+    monkeypatch.setitem(designs.__dict__, "_run_up", np.array([1000, 1000]))
     assert not any(map(designs._reachable, designs.candidates))
 
 

@@ -72,13 +72,13 @@ class Cycles:
     side: np.ndarray
 
 
-def cycles(commands: np.ndarray, overrun: float, hours: float, count: int) -> Cycles:
-    """Build `count` runs up and down through ascending commands, beyond both ends by `overrun`.
+def cycles(commands: np.ndarray, run_up: float, hours: float, count: int) -> Cycles:
+    """Build `count` runs up and down through ascending commands, beyond both ends by `run_up`.
 
     Command k is read in run k modulo count.
     """
     m = len(commands)
-    run = [commands[0] - overrun, *commands, commands[-1] + overrun, *commands[::-1]]
+    run = [commands[0] - run_up, *commands, commands[-1] + run_up, *commands[::-1]]
     path = [*run * count]
     sides = np.tile(np.r_[0, np.ones(m, int), 0, -np.ones(m, int)], count)
     index = np.tile(np.r_[0, np.arange(m), 0, np.arange(m)[::-1]], count)

@@ -55,9 +55,9 @@ class _Expected:
     both_sides: bool
 
 
-def _expected(fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, seed: int) -> _Expected:
+def _expected(fit: AxisFit, commands: np.ndarray, run_up: float, since: Since, seed: int) -> _Expected:
     """Predict readings at the table's commands, without the noise of a reading."""
-    stops, run = _run(fit, commands, overrun, since, None, 0.0, seed)
+    stops, run = _run(fit, commands, run_up, since, None, 0.0, seed)
     mean, covariance = stops.pooled()
     order = [np.flatnonzero(run.side == side)[np.argsort(run.index[run.side == side])] for _, side in SIDES]
     u = np.sqrt(np.diag(covariance))
@@ -80,17 +80,17 @@ class Since:
         hours = max(float(np.ptp(time_s[members])) for members in each) / HOUR_S
         return cls(hours, max(float(np.abs(legs.step[members]).sum()) for members in each))
 
-    def cycles(self, commands: np.ndarray, overrun: float) -> Cycles:
+    def cycles(self, commands: np.ndarray, run_up: float) -> Cycles:
         """Build as many runs through commands as make up the travel."""
-        once = 2.0 * (float(np.ptp(commands)) + 2.0 * overrun)
-        return cycles(commands, overrun, self.hours, max(1, min(round(self.travel / once), RUNS_MAX)))
+        once = 2.0 * (float(np.ptp(commands)) + 2.0 * run_up)
+        return cycles(commands, run_up, self.hours, max(1, min(round(self.travel / once), RUNS_MAX)))
 
 
 def _run(
-    fit: AxisFit, commands: np.ndarray, overrun: float, since: Since, applied: Correction | None, u: float, seed: int
+    fit: AxisFit, commands: np.ndarray, run_up: float, since: Since, applied: Correction | None, u: float, seed: int
 ) -> tuple[PredictedStops, Cycles]:
     """Predict runs up and down, under a correction."""
-    run = since.cycles(commands, overrun)
+    run = since.cycles(commands, run_up)
     moves = run.moves if applied is None else applied.moved(run.moves)
     return predicted_stops(fit, moves, run.read.tolist(), np.full(len(run.read), u), seed), run
 
@@ -322,15 +322,15 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         far = 0.05 * (high - low) + 2.0 * abs(float(fit.draws["backlash"].mean()) / fitted)
         at = _expected(fit, table_commands(rows), far, since, seed)
         gap = np.abs(at.mean[0] - at.mean[1]) + NORMAL_95 * np.hypot(*at.u)
-        overrun = float(np.max(gap)) / abs(fitted)
+        run_up = float(np.max(gap)) / abs(fitted)
         shaped = _shaped(form, at, nominal, fitted, wish, _line_draws(fit))
         job.begin("promise")
         u = reading_u(campaign)
         # Commands between the lines of the table are tested too.
         tried = low + (high - low) * (np.arange(TRIED) + 0.5) / TRIED
-        after, run = _run(fit, tried, max(far, overrun), since, shaped.correction, u, seed)
+        after, run = _run(fit, tried, max(far, run_up), since, shaped.correction, u, seed)
         job.at(0.5)
-        before, _ = _run(fit, tried, max(far, overrun), since, None, u, seed)
+        before, _ = _run(fit, tried, max(far, run_up), since, None, u, seed)
         tried_aim = nominal * tried[run.index]
         offset = _offset(at, nominal) if form.holds == "table" else float((after.pooled()[0] - tried_aim).mean())
         promise = _promise(after, before, run, offset + tried_aim, u, form.zero_free)
@@ -345,7 +345,7 @@ def compensation_of(results: AxisResults, wish: Wish, *, seed: int = 0, progress
         zero_free=form.zero_free,
         range_command=(low, high),
         resolution=wish.resolution,
-        reversal_command=overrun,
+        reversal_command=run_up,
         hours=since.hours,
         travel_command=since.travel,
         homings=len(np.unique(rows.segment)),

@@ -362,13 +362,13 @@ class VerifyPlan:
 
     Attributes:
         stops: command and side, 1 or -1, of each stop.
-        overrun: distance by which the axis moves beyond a command before it returns to it.
+        run_up: distance by which the axis moves beyond a command before it returns to it.
         enough: whether they discriminate the hypotheses in 95 of 100 cases.
         distance: distance of the nearest two hypotheses, standard deviations.
     """
 
     stops: tuple[tuple[float, int], ...]
-    overrun: float
+    run_up: float
     enough: bool
     distance: float
 
@@ -376,7 +376,7 @@ class VerifyPlan:
         """Return `plan.csv`: step, command, direction, read (1 or 0)."""
         before = [side * math.inf for _, side in self.stops[:1]] + [command for command, _ in self.stops]
         return stops_csv(
-            (command - side * self.overrun if side * (command - at) < self.overrun else None, command, DIRECTIONS[side])
+            (command - side * self.run_up if side * (command - at) < self.run_up else None, command, DIRECTIONS[side])
             for at, (command, side) in zip(before, self.stops, strict=False)
         )
 
@@ -424,13 +424,13 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
         NothingToEstimate: the table corrects nothing.
     """
     applied = Correction.of(made)
-    overrun, (low, high) = made.reversal_command, made.range_command
+    run_up, (low, high) = made.reversal_command, made.range_command
     nodes = np.array([row.command for row in made.table])
     # Commands whose both sides can be reached within the range, if there are enough.
-    inside = nodes[(nodes - overrun >= low) & (nodes + overrun <= high)]
+    inside = nodes[(nodes - run_up >= low) & (nodes + run_up <= high)]
     nodes = inside if len(inside) >= SPREAD else nodes
     nodes = nodes[np.linspace(0, len(nodes) - 1, min(len(nodes), CANDIDATES)).round().astype(int)]
-    run = Since(made.hours, 0.0).cycles(nodes, overrun)
+    run = Since(made.hours, 0.0).cycles(nodes, run_up)
     u = np.full(len(run.read), reading_u(fit.campaign))
 
     def at(common: float, play: float) -> PredictedStops:
@@ -452,4 +452,4 @@ def plan_verification(fit: AxisFit, made: Compensation, *, seed: int = 0) -> Ver
     visits, reached = chosen.visits, chosen.reached
     order = [k for k in range(len(mean)) for _ in range(int(visits[k]))]
     stops = tuple((float(nodes[run.index[k]]), int(run.side[k])) for k in order)
-    return VerifyPlan(stops, overrun, reached >= IDENTIFIED, float(np.sqrt(reached)))
+    return VerifyPlan(stops, run_up, reached >= IDENTIFIED, float(np.sqrt(reached)))

@@ -140,10 +140,10 @@ class PlanBuilder:
         """Observe, as a point of an experiment or not."""
         self.steps.append(PlanStep(len(self.steps), "look", experiment=experiment, point=point))
 
-    def reach(self, axis: Axis, counter: int, sign: int, overshoot: int) -> None:
-        """Arrive at a counter by a move of the given sign, with an overshoot first where needed."""
+    def reach(self, axis: Axis, counter: int, sign: int, run_up: int) -> None:
+        """Arrive at a counter by a move of the given sign, with a run-up first where needed."""
         if (counter - self.at[AXES.index(axis)]) * sign <= 0:
-            self.move(**{axis: counter - sign * overshoot})
+            self.move(**{axis: counter - sign * run_up})
         self.move(**{axis: counter})
 
 

@@ -14,7 +14,7 @@ from tvsbayes.instrument.plan import PlanBuilder, PlanStep
 
 PAN_RANGE_STEPS = (0, 200)
 TILT_RANGE_STEPS = (-100, 100)
-OVERSHOOT_STEPS = 40
+RUN_UP_STEPS = 40
 """Distance beyond a start at which an approach begins: 2.4 deg at 0.06 deg/step, more than any play to be measured."""
 GRID_PAN_STEPS = (-60, 0, 60, 120, 180, 240)
 GRID_TILT_STEPS = (-90, -30, 30, 90)
@@ -56,7 +56,7 @@ def four_point_protocol(
             if approach == "direct":
                 plan.move(**{axis: start})
             else:
-                plan.reach(axis, start, sign if approach == "cleared" else -sign, OVERSHOOT_STEPS)
+                plan.reach(axis, start, sign if approach == "cleared" else -sign, RUN_UP_STEPS)
             plan.look(experiment, 1)
             plan.place(targets[1])
             plan.look(experiment, 2)
@@ -111,9 +111,9 @@ def grid_protocol(
                 rank = row if tilt_sign > 0 else len(tilt_steps) - 1 - row
                 pan_sign = tilt_sign * (1 if rank % 2 == 0 else -1)
                 ordered = sorted(pan_steps, reverse=pan_sign < 0)
-                run_up = ordered[0] - pan_sign * OVERSHOOT_STEPS
+                run_up = ordered[0] - pan_sign * RUN_UP_STEPS
                 if (tilt - plan.at[1]) * tilt_sign <= 0:
-                    plan.move(pan=run_up, tilt=tilt - tilt_sign * OVERSHOOT_STEPS)
+                    plan.move(pan=run_up, tilt=tilt - tilt_sign * RUN_UP_STEPS)
                 plan.move(pan=run_up, tilt=tilt)
                 for pan in ordered:
                     plan.move(pan=pan)
@@ -129,7 +129,7 @@ PROTOCOLS = {
 }
 """Plans that `experiments/inputs/make_twins.py` ships, by file name."""
 UNSTATED_STEPS = {
-    "pan": (min(GRID_PAN_STEPS) - OVERSHOOT_STEPS, max(GRID_PAN_STEPS) + OVERSHOOT_STEPS),
-    "tilt": (min(GRID_TILT_STEPS) - OVERSHOOT_STEPS, max(GRID_TILT_STEPS) + OVERSHOOT_STEPS),
+    "pan": (min(GRID_PAN_STEPS) - RUN_UP_STEPS, max(GRID_PAN_STEPS) + RUN_UP_STEPS),
+    "tilt": (min(GRID_TILT_STEPS) - RUN_UP_STEPS, max(GRID_TILT_STEPS) + RUN_UP_STEPS),
 }
 """Counters used where `[positioner]` states no limits: the ranges of the grid protocol."""

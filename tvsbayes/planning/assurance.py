@@ -122,7 +122,7 @@ class Family:
 
     def arranged(self, experiments: int) -> LookPlan:
         """Arrange these looks as a plan."""
-        return arrange(self.looks(experiments), self.knowledge.sheets, self.candidates.overshoot)
+        return arrange(self.looks(experiments), self.knowledge.sheets, self.candidates.run_up)
 
     @property
     def largest(self) -> int:

@@ -35,14 +35,14 @@ class Candidates:
 
     Attributes:
         looks: the candidates.
-        overshoot: run-up (pan, tilt), steps.
+        run_up: run-up (pan, tilt), steps.
         limits: lowest and highest counter of (pan, tilt), shape (2, 2).
         turned: whether a look lies a full turn of pan away, shape (m,).
         notes: sentences on excluded looks and the reasons.
     """
 
     looks: Looks
-    overshoot: np.ndarray
+    run_up: np.ndarray
     limits: np.ndarray
     turned: np.ndarray
     notes: tuple[str, ...]
@@ -70,7 +70,7 @@ def run_up_steps(physical: np.ndarray, play_axes_deg: np.ndarray) -> np.ndarray:
     return np.array(result)
 
 
-def overshoot_steps(knowledge: Knowledge) -> np.ndarray:
+def expected_run_up(knowledge: Knowledge) -> np.ndarray:
     """Compute the run-up (pan, tilt) that takes up the play in 99 % of expected instruments."""
     draws = draws_of(knowledge, 200, np.random.default_rng(17))
     physical = np.stack([physical_at(z, knowledge.space).value for z in draws])
@@ -106,11 +106,11 @@ class Positions:
         return arrays.in_images(points).mean(axis=0)
 
 
-def from_all_sides(positions: Positions, limits: np.ndarray, overshoot: np.ndarray) -> Looks:
+def from_all_sides(positions: Positions, limits: np.ndarray, run_up: np.ndarray) -> Looks:
     """Build looks at positions from all four sides whose run-up is inside the limits (2, 2)."""
     parts = []
     for side in itertools.product((1, -1), repeat=2):
-        start = positions.steps - np.array(side) * overshoot
+        start = positions.steps - np.array(side) * run_up
         end_points = np.stack([positions.steps, start])
         inside = np.all((end_points >= limits[:, 0]) & (end_points <= limits[:, 1]), axis=(0, 2))
         sides = np.tile(np.array(side), (int(inside.sum()), 1))
@@ -211,20 +211,20 @@ def candidates(knowledge: Knowledge) -> Candidates:
         widest = {axis: (-steps, steps) for axis, steps in reach.items()}
     stated_range = counter_range(rig.limits, widest)
     limits = stated_range.limits
-    overshoot = overshoot_steps(knowledge)
+    run_up = expected_run_up(knowledge)
     box = _box_in_view(knowledge, limits, ratio)
     turn = round(FULL_TURN_DEG / abs(float(ratio[0])))
     turns = [n for n in (turn, -turn) if limits[0, 0] <= box[0, 1] + n and box[0, 0] + n <= limits[0, 1]]
     view = _visible_positions(knowledge, box, turns, 0.5 * turn)
-    looks = from_all_sides(view.positions, limits, overshoot)
+    looks = from_all_sides(view.positions, limits, run_up)
     if not len(looks):
         raise InputError(
             "limits",
-            f"no look has room for a run-up of {overshoot[0]} pan and {overshoot[1]} tilt steps, which takes up the "
+            f"no look has room for a run-up of {run_up[0]} pan and {run_up[1]} tilt steps, which takes up the "
             f"play, within pan {limits[0, 0]} to {limits[0, 1]} and tilt {limits[1, 0]} to {limits[1, 1]}",
             file="rig.toml",
             column="positioner",
             remedy="widen the limits in [positioner], or state backlash and ratio more closely in [rig.prior]",
         )
     turned = np.abs(looks.steps[:, 0] - box[0].mean()) >= 0.5 * turn
-    return Candidates(looks, overshoot, limits, turned, (*stated_range.notes, *view.notes))
+    return Candidates(looks, run_up, limits, turned, (*stated_range.notes, *view.notes))

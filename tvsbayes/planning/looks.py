@@ -128,19 +128,24 @@ class LookPlan:
         return tuple(plan.steps)
 
 
-def arrange(looks: Looks, sheets: Sequence[str], overshoot: np.ndarray, home: tuple[int, int] = (0, 0)) -> LookPlan:
+def run_up_start(goal: np.ndarray, side: np.ndarray, at: np.ndarray, run_up: np.ndarray) -> np.ndarray:
+    """Find where the last move to `goal` begins: `at` where that is a run-up before it, else a run-up before it."""
+    return np.where((goal - at) * side < run_up, goal - side * run_up, at)
+
+
+def arrange(looks: Looks, sheets: Sequence[str], run_up: np.ndarray, home: tuple[int, int] = (0, 0)) -> LookPlan:
     """Order looks into a plan.
 
     Args:
         looks: looks to arrange.
         sheets: names of the sheets, in the order of `Looks.sheet`.
-        overshoot: run-up (pan, tilt) in steps that takes up all play, shape (2,).
+        run_up: run-up (pan, tilt) in steps that takes up all play, shape (2,).
         home: counters of the homing.
     """
     order = np.lexsort((looks.steps[:, 0] * looks.side[:, 0], looks.side[:, 0], looks.side[:, 1], looks.sheet))
     goal, side = looks.steps[order], looks.side[order]
     previous = np.concatenate([np.array([home]), goal])[:-1]
-    via = np.where((goal - previous) * side < overshoot, goal - side * overshoot, previous)
+    via = run_up_start(goal, side, previous, run_up)
     return LookPlan(order, tuple(sheets[number] for number in looks.sheet[order]), via, goal, home)
 
 

@@ -166,12 +166,10 @@ def judge(steps: Sequence[PlanStep], knowledge: Knowledge, *, aperture: bool = F
     return Judgement(information, covariance, gradient, prior)
 
 
-def appended(
-    steps: Sequence[PlanStep], looks: Looks, knowledge: Knowledge, overshoot: np.ndarray
-) -> tuple[PlanStep, ...]:
+def appended(steps: Sequence[PlanStep], looks: Looks, knowledge: Knowledge, run_up: np.ndarray) -> tuple[PlanStep, ...]:
     """Write looks as steps after a plan: without homing, with a placement only where another sheet is needed."""
     end = run_plan(steps, knowledge.rig)
-    addition = [s for s in arrange(looks, knowledge.sheets, overshoot, end.at).steps if s.action != "home"]
+    addition = [s for s in arrange(looks, knowledge.sheets, run_up, end.at).steps if s.action != "home"]
     if addition and addition[0].action == "place" and addition[0].target == end.sheet:
         addition = addition[1:]
     return tuple(replace(s, step=len(steps) + k) for k, s in enumerate(addition))
@@ -197,7 +195,7 @@ def _cure(
     allowed = possible.looks.sheet == (knowledge.sheets.index(sheet) if sheet in knowledge.sheets else 0)
     picks = np.array(search.among(allowed).greedy(CURE_LOOKS), dtype=int)
     for count in range(1, len(picks) + 1):
-        addition = appended(steps, possible.looks[picks[:count]], knowledge, possible.overshoot)
+        addition = appended(steps, possible.looks[picks[:count]], knowledge, possible.run_up)
         after = judge((*steps, *addition), knowledge)
         if after.fault(axis) is None:
             return _Cure(addition, after)

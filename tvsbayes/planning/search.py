@@ -298,11 +298,11 @@ class DesignProblem:
         """
         picks = np.array(search.among(allowed).greedy(count))
         looks = self.candidates.looks[picks]
-        design = arrange(looks, self.knowledge.sheets, self.candidates.overshoot, start or (0, 0))
+        design = arrange(looks, self.knowledge.sheets, self.candidates.run_up, start or (0, 0))
         if start is not None:
             # The first look gets a run-up, since the counters at the start of the looks are unknown.
             via = design.via.copy()
-            via[0] = design.goal[0] - looks.side[design.order[0]] * self.candidates.overshoot
+            via[0] = design.goal[0] - looks.side[design.order[0]] * self.candidates.run_up
             design = replace(design, via=via)
         return Choice(picks, design, self.value(picks, design))
 

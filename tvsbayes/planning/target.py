@@ -17,7 +17,7 @@ from tvsbayes.calibration.pointing import NOISE_NAMES as CALIBRATION_NOISE
 from tvsbayes.errors import InputError, escaped
 from tvsbayes.instrument.axes import APPROACH_SIGN, DIRECTIONS
 from tvsbayes.instrument.parameters import INDEX, NAMES, TARGET_ROWS, TARGETS
-from tvsbayes.instrument.protocols import OVERSHOOT_STEPS
+from tvsbayes.instrument.protocols import RUN_UP_STEPS
 from tvsbayes.instrument.rig import RigTable
 from tvsbayes.model.parameter_space import ParameterSpace, physical_at
 from tvsbayes.planning.gear_places import NO_PLACES, GearPlaces
@@ -196,7 +196,7 @@ def sensitivity(
         mean=physical[inputs],
         covariance=slope[inputs] @ slope[inputs].T,
         noise_variance=dict(zip(CALIBRATION_NOISE, stop_sd**2, strict=True)),
-        overshoot_steps={"pan": OVERSHOOT_STEPS, "tilt": OVERSHOOT_STEPS},
+        overshoot_steps={"pan": RUN_UP_STEPS, "tilt": RUN_UP_STEPS},
         azimuth=azimuth,
         period_deg=table.first_period_deg,
     )

@@ -41,6 +41,7 @@ from tvsbayes.instrument.stops import rests_of
 from tvsbayes.model.parameter_space import physical_at
 from tvsbayes.planning.candidates import BACKLASH_COLUMNS, run_up_steps
 from tvsbayes.planning.expectation import HOME_VARIANCE_RAD2
+from tvsbayes.planning.looks import run_up_start
 from tvsbayes.results.watch_record import LOOKS_MAX, PlannedChange, WatchPlan
 from tvsbayes.statistics.streams import Stream, random_stream
 
@@ -143,7 +144,7 @@ class WatchDesigns:
         self._prepare(watched.linear(self.z), watched.first, [rows[look.spot.spot] for look in self.candidates])
 
     @cached_property
-    def _overshoot(self) -> np.ndarray:
+    def _run_up(self) -> np.ndarray:
         """Compute the run-up (pan, tilt) that takes up the play by the fit, steps."""
         physical = physical_at(self.z, self.fit.space).value
         return run_up_steps(physical, physical[BACKLASH_COLUMNS])
@@ -158,7 +159,7 @@ class WatchDesigns:
     def _reachable(self, candidate: Candidate) -> bool:
         if candidate.target not in self.rig.depths_mm:
             return False
-        start = np.array(candidate.steps) - np.array(candidate.side) * self._overshoot
+        start = np.array(candidate.steps) - np.array(candidate.side) * self._run_up
         end_points = np.stack([np.array(candidate.steps), start])
         return bool(np.all((end_points >= self._limits[:, 0]) & (end_points <= self._limits[:, 1])))
 
@@ -256,11 +257,8 @@ class WatchDesigns:
                 if not homing:
                     plan.place(sheet)
                 for look in (self.candidates[k] for k in looks):
-                    start = [
-                        goal - side * run_up if (goal - at) * side < run_up else at
-                        for goal, side, run_up, at in zip(look.steps, look.side, self._overshoot, plan.at, strict=True)
-                    ]
-                    plan.move(*map(int, start))
+                    goal, side, at = map(np.array, (look.steps, look.side, plan.at))
+                    plan.move(*map(int, run_up_start(goal, side, at, self._run_up)))
                     plan.move(*look.steps)
                     counts[len(plan.steps)] = look.spot
                     plan.look()

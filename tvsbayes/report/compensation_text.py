@@ -198,7 +198,7 @@ def verify_plan_text(plan: VerifyPlan) -> str:
     words = {1: "forward", -1: "backward"}
     rows = [[f"{command:.10g}", words[side]] for command, side in plan.stops]
     table = TableView(f"{len(rows)} readings with the table in force, in this order", ["command", "arriving"], rows)
-    return terminal(table, f"to arrive on a side, come from at least {plan.overrun:.4g} commands away", _power(plan))
+    return terminal(table, f"to arrive on a side, come from at least {plan.run_up:.4g} commands away", _power(plan))
 
 
 def aim_plan_text(plan: AimPlan) -> str:

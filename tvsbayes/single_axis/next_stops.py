@@ -29,8 +29,8 @@ CANDIDATES, STOPS_DEFAULT, DRAWS = 17, 8, 24
 """Candidate positions along the range, default number of stops, draws of the scales."""
 MOVE_S = 60.0
 """Time of a move where the campaign has no times."""
-OVERRUN = 0.05
-"""Overrun beyond a position before the move back to it, as a share of the range."""
+RUN_UP_SHARE = 0.05
+"""Run-up before the move back to a position, as a share of the range."""
 
 
 def unit_of(target: str, unit: str) -> str:
@@ -113,7 +113,7 @@ def _with_stop(
     sign = 1 if direction == "forward" else -1
     via = None
     if sign * (command - last.command) <= 0:
-        via = command - sign * OVERRUN * (max(commands) - min(commands))
+        via = command - sign * RUN_UP_SHARE * (max(commands) - min(commands))
         via = float(np.round(via)) if np.all(np.array(commands) == np.round(commands)) else via
         moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, via))
     moves.append(AxisMove(len(moves), last.segment, moves[-1].time_s + seconds, command))
