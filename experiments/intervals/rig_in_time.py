@@ -1,27 +1,25 @@
 """Do the intervals hold the truth of scanners that creep, follow the temperature and make waves?
 
-    python -m experiments.intervals.rig_in_time run --n 300 --cores 0 1    # of each protocol, 10 to 25 CPU s a rig
+    python -m experiments.intervals.rig_in_time run --n 300 --cores 0 1    # of each protocol, 10 CPU s a rig
     python -m experiments.intervals.rig_in_time table > experiments/intervals/rig_in_time.md
 
-Rig i of a shipped protocol is drawn with seed i, every prior quantity anew: the mounted rig, whose zeros creep from the
-first move on and shift with a recorded temperature. Rigs of odd seed state a period of both axes: pan has a wave drawn
-from the prior of its amplitude, tilt has none. Each is simulated by the twin, fitted and sampled by importance. The
-paper's protocol measures one direction after the other, which a creep resembles. Rows are kept beside the page: all
-rigs take longer than one sitting.
+Rig i of a shipped protocol is drawn with seed i, every quantity from its prior: the mounted rig, whose zeros creep from
+the first move on and shift with a recorded temperature. Rigs of odd seed state a period of both axes: pan has a wave
+drawn from the prior of its amplitude, tilt has none. Each is simulated by the twin, fitted and sampled by importance.
+The paper's protocol measures one direction after the other, which a creep resembles.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from experiments.common.command_line import act, study_parser
 from experiments.common.drawn_instruments import USABLE, scored, tables
 from experiments.common.rigs import drawn_rig, shipped_plan
-from experiments.common.rows import read_rows, run_rows
+from experiments.common.rows import output, read_rows, run_rows
 from tvsbayes.assessment.gear_waves import gear_periods
 from tvsbayes.instrument.axes import AXES
 from tvsbayes.instrument.parameters import CREEP_NAMES, RIG_PRIORS, names_of
@@ -30,7 +28,7 @@ from tvsbayes.posterior.draws import Posterior
 from tvsbayes.statistics.chances import binomial_bounds
 from tvsbayes.twin.simulated_campaign import SimulatedCampaign, simulate
 
-ROWS = Path(__file__).with_name("rig_in_time.jsonl")
+ROWS = output(__file__, "rig_in_time.jsonl")
 PROTOCOLS = {"paper": "The paper's, one direction after the other", "mixed": "Mixed directions", "grid": "Grid"}
 NAMES = names_of("backlash_deg", "creep_deg", "thermal_deg_per_K")
 PERIOD_DEG = 12.0
@@ -39,7 +37,7 @@ SURE = 0.95
 
 
 def moving_rig(periodic: bool) -> Rig:
-    """What is believed of a rig, and drawn from: the mounted one, whose zeros move in time, with periods or without."""
+    """Priors and truths of a rig: the mounted one, whose zeros move in time, with periods or without."""
     rig = drawn_rig()
     truth = {name: p for name, p in rig.truth.items() if name not in CREEP_NAMES}
     if not periodic:
