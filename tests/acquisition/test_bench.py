@@ -180,6 +180,7 @@ def test_hardware_path_from_rig_file_to_campaign(small_rig, tmp_path):
     assert start.data["device"]["fw"] == "1.1.0" and "cameras" in start.data
 
 
+@pytest.mark.thorough
 @needs_pseudo_terminals
 def test_a_run_goes_on_at_another_port_with_another_camera(small_rig, tmp_path):
     """As after a reboot: the board comes back as ttyACM1, the camera at another address, and both are logged."""

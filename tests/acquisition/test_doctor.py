@@ -188,6 +188,7 @@ def test_rig_without_hardware_says_what_is_missing(tmp_path):
     assert checks["disk flush"].status in ("ok", "warning") and list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.thorough
 def test_missing_hardware_is_told_once_and_by_us_alone(tmp_path):
     """In a process of its own: OpenCV and FFmpeg write past Python, FFmpeg as loud as its first caller says."""
     folder = shipped_data() / "rigs" / "mounted"

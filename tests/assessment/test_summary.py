@@ -239,6 +239,7 @@ def test_dof_counts_spots_less_what_they_determine(summary, paper):
     assert abs(summary.noise.chi2 / summary.noise.dof - 1) < 4 * np.sqrt(2 / summary.noise.dof)
 
 
+@pytest.mark.thorough
 def test_an_axis_that_never_moved_is_null_and_named(short):
     tilted = {m.move for m in short.moves if m.tilt_steps != 0}
     pan_only = replace(
@@ -297,6 +298,7 @@ def test_harmonics_are_listed_where_they_are_free_or_known(short):
     assert listed["harmonic_deg.pan.1.sin"].prior_sd == pytest.approx(0.05)
 
 
+@pytest.mark.thorough
 def test_a_prior_that_the_data_contradict_is_named(short, summary):
     assert summary.prior_conflicts == ()
     wrong = Prior(summary.parameters["degrees_per_step.pan"].value + 0.01, 1e-4)

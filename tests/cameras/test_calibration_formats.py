@@ -318,6 +318,7 @@ def test_rational_distortion_is_refused_unless_it_is_none(mounted, tmp_path):
                 read_calibration(paths)
 
 
+@pytest.mark.thorough
 def test_random_damage_ends_in_a_refusal_or_a_calibration(mounted, tmp_path):
     """Six hundred seeded mutations of a good file: nothing but InputError comes out."""
     rng = np.random.default_rng(0)

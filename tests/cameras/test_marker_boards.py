@@ -57,6 +57,7 @@ def test_corners_of_parts_are_found_where_they_are(found):
     assert min(counts) < NAMED.corners and min(counts) >= CORNERS_MIN
 
 
+@pytest.mark.thorough
 def test_a_pair_is_calibrated_from_parts(found):
     """Within four of its own sds, the largest of 24; the sds are those of tenths of a pixel."""
     result = calibrate_stereo(found.views, NAMED, SIZE, fix_k3=True, pictures=found)
@@ -67,6 +68,7 @@ def test_a_pair_is_calibrated_from_parts(found):
     assert abs(result.triangulated_pitch_mm[0] / 40.0 - 1) < 5e-3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "squares, dictionary, word",
     (
@@ -81,6 +83,7 @@ def test_another_board_is_named(few, squares, dictionary, word):
     assert ("--dictionary 5X5_1000?" if dictionary == "4X4_50" else "--charuco 9xROWS") in caught.value.remedy
 
 
+@pytest.mark.thorough
 def test_markers_where_a_plain_board_is_named(few):
     with pytest.raises(NothingToEstimate, match="markers of 5X5 are seen") as caught:
         find_views(few, Board(9, 8, 40.0))

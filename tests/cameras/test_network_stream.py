@@ -91,6 +91,7 @@ def test_a_stream_that_does_not_come_back_delivers_no_frame(again):
     stream.release()
 
 
+@pytest.mark.thorough
 def test_a_server_that_drops_idle_viewers_keeps_us(monkeypatch):
     """As during a homing: nobody grabs until the server has sent more than all buffers between hold."""
     monkeypatch.setattr(streamed_camera, "VIEWER_TIMEOUT_S", 0.3)

@@ -52,6 +52,7 @@ def test_fit_and_what_goes_on_from_it(ask, say, folder, tmp_path):
     assert "Calibration of an axis" in page and "data:image/svg+xml" in page
 
 
+@pytest.mark.thorough
 def test_positions_left_out(ask, folder):
     code, document = ask("compare", folder, "--by", "positions")
     held = document["hold_out"]
@@ -105,6 +106,7 @@ def test_two_positions_leave_nothing_to_predict(ask, tmp_path):
     assert code == 3 and assert_error(document, "too-few-positions")
 
 
+@pytest.mark.thorough
 def test_a_sampler_without_an_answer_leaves_laplaces_and_says_so(ask, folder, monkeypatch):
     """As of a scanner: exit 0 with a warning, no mode is exit 4; of a chain without time weighted draws answer."""
     code, document = ask("fit", folder, "--max-minutes", "0.01")

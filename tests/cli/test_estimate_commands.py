@@ -227,6 +227,7 @@ def test_robust_fit_names_the_spot_it_leaves_out(ask, grid_campaign, tmp_path):
     assert document["excluded_spots"] == [spots[9].spot]
 
 
+@pytest.mark.thorough
 def test_a_direction_never_moved_is_null_and_one_side_is_weak(ask, say, mounted_rig, tmp_path):
     plan = two_sheets((80, 0), (80, 40), (160, 40), (160, 80))
     write_campaign(simulate(mounted_rig, plan, seed=5).campaign, tmp_path / "one way")
@@ -248,6 +249,7 @@ def test_too_few_spots_are_nothing_to_estimate(ask, grid_campaign, tmp_path):
     assert not (tmp_path / "few" / "results").exists()
 
 
+@pytest.mark.thorough
 def test_spots_at_one_stop_inform_no_headline(ask, mounted_rig, tmp_path):
     """Both axes move, but only after the last look."""
     looks = [("place", "d1"), *[("look",)] * 5, ("place", "d2"), *[("look",)] * 5]
@@ -307,6 +309,7 @@ def test_a_spot_beyond_the_lens_and_one_twice_cost_themselves_only(ask, mounted_
     assert saved["gap"]["up"] is None and saved["gap"]["down"] is not None
 
 
+@pytest.mark.thorough
 def test_looks_at_one_stop_have_nothing_to_tell(ask, grid_campaign, tmp_path):
     seen = grid_campaign.moves[grid_campaign.spots[0].move]
     only = replace(grid_campaign.moves[0], pan_steps=seen.pan_steps, tilt_steps=seen.tilt_steps)

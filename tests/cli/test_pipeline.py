@@ -24,6 +24,7 @@ from tvsbayes.pipeline import FITTING, SUMMARISING, StoredOrFitted, calibrate, c
 pytestmark = pytest.mark.usefixtures("own_compilation_cache", "each_fitted_once")
 
 
+@pytest.mark.thorough
 def test_what_a_fit_left_is_taken_up_again(grid_folder, monkeypatch):
     """`compare` and `plan --given` start from results/: the same model, mode and draws, no second fit."""
     from tvsbayes.estimators.joint_fit import restored
@@ -128,6 +129,7 @@ def test_results_from_python_are_those_of_the_command(ask, grid_folder, tmp_path
     assert tvsbayes.calibrate(campaign, sampled=False, seed=4).files == {}
 
 
+@pytest.mark.thorough
 def test_no_sample_of_another_fit_stays_beside_a_record(grid_folder):
     """A report that fits first replaces fit.json: the sample of the fit before it would not be that of fit.json."""
     results, told = grid_folder / "results", []

@@ -26,6 +26,7 @@ def test_a_plan_does_not_replace_the_rig_file_that_it_is_made_for(ask, tmp_path,
     assert code == 2 and "would replace" in document["error"]["message"] and rig.read_bytes() == before
 
 
+@pytest.mark.thorough
 def test_plan_writes_a_plan_and_says_by_its_exit_code_whether_the_users_target_is_met(ask, say, tmp_path, monkeypatch):
     whole, made = planner.plan, []
     small = ("--draws", 20, "--minutes", 3, "-o", tmp_path / "plan.csv")

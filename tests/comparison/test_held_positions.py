@@ -53,6 +53,7 @@ def unfitted(monkeypatch):
     monkeypatch.setattr("tvsbayes.comparison.held_positions.refit", lambda fit_of_all, *_: fit_of_all)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("unfitted")
 def test_counters_are_predicted_within_their_u_where_the_model_knows_that_gears_err(worn, whole):
     """Four counters, two sides of which say the same: rms of z below the 99.9 % quantile of four; else beyond it."""

@@ -38,6 +38,7 @@ def results() -> AxisResults:
     return results_for(AxisCampaign("arcsec", moves, readings, {}, {"rate": RATE}, asked))
 
 
+@pytest.mark.thorough
 def test_the_table_takes_off_the_wave_within_the_promise():
     made = compensation_of(results(), Wish("pec"))
     assert made.settings["period_command"] == pytest.approx(PERIOD)

@@ -45,6 +45,7 @@ def test_within_one_homing_errors_lie_within_the_promise_but_for_a_shift():
     assert all(left.shift_free95 < left.error95 for left in made.promise.values())
 
 
+@pytest.mark.thorough
 def test_a_format_that_holds_less_leaves_more():
     left = {name: max(p.error95 for p in table(name, **w).promise.values()) for name, w in CASES.items()}
     assert left["csv"] < left["grblhal"] < left["grbl"]

@@ -84,6 +84,7 @@ def test_other_units_and_missing_tables_are_refused(tmp_path):
         stored_compensation(replace(results().fit.campaign, path=tmp_path))
 
 
+@pytest.mark.thorough
 def test_grblhal_may_begin_in_either_half_of_the_play():
     """One shift of all readings by half the play is no fault of a format that leaves the zero open."""
     made = table("grblhal", in_force=250.0)

@@ -106,6 +106,7 @@ def test_a_second_campaign_of_another_size_compiles_nothing(simulated, fitted, m
     assert again.converged and again.arrays.gears.filled > fitted.arrays.gears.filled and made == []
 
 
+@pytest.mark.thorough
 def test_the_order_of_rows_does_not_matter(simulated, fitted):
     shuffled = np.random.default_rng(3).permutation(len(simulated.campaign.spots))
     campaign = replace(simulated.campaign, spots=tuple(simulated.campaign.spots[i] for i in shuffled))
@@ -131,6 +132,7 @@ def test_an_outlier_is_blamed_on_the_right_spot_of_its_stop(simulated, fitted):
     assert np.all(np.abs(difference) < 0.5 * SD * sd)
 
 
+@pytest.mark.thorough
 def test_the_plain_fit_names_the_outlier_as_suspect(simulated):
     campaign = simulated.campaign
     victim = ordered_spots(campaign)[30]
@@ -169,6 +171,7 @@ def wobbling(mounted_rig) -> SimulatedCampaign:
     return simulate(rig, plan, seed=5)
 
 
+@pytest.mark.thorough
 def test_a_pinions_error_is_found_and_without_it_the_stops_scatter(wobbling):
     plain = fit(wobbling.campaign, model=ModelChoice(perfect_gears=True))
     freed = fit(wobbling.campaign, model=ModelChoice(perfect_gears=True, harmonics=True))
@@ -210,6 +213,7 @@ def test_gears_without_play_put_it_into_the_stops(simulated, fitted):
     assert np.max(result.mode.physical[sds] / fitted.mode.physical[sds]) > 2
 
 
+@pytest.mark.thorough
 def test_a_fixed_parameter_stays_and_the_rest_follows(simulated, fitted):
     campaign = with_priors(simulated.campaign, mirror_offset_mm=Prior(35.0, 0.0))
     result = fit(campaign)

@@ -54,6 +54,7 @@ def test_parts_make_the_whole(both, dozen):
     assert moving.sum() == len(NAMES) - len(NOISE_NAMES) - 8 - 2
 
 
+@pytest.mark.thorough
 def test_slopes_are_the_derivatives_by_angles_and_range(both, dozen):
     """Of the ideal look along pan, tilt and range, by central differences: truncation and rounding 1e-6 of them."""
     looks = both[2]

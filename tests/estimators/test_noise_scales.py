@@ -62,6 +62,7 @@ def test_what_geometry_took_is_given_back(mixed_fit):
     assert np.all(found.z[:, still] == mixed_fit.z[still])
 
 
+@pytest.mark.thorough
 def test_the_mean_is_that_of_many_more_draws(mixed_fit):
     """A proposal narrower or askew is made good by the weights: within four standard errors of the few."""
     few, many = noise_draws(mixed_fit, 32, seed=1), noise_draws(mixed_fit, 64, seed=2)

@@ -94,6 +94,7 @@ def test_twin_and_model_are_the_same_optics(truths):
             assert np.abs(np.stack(np.broadcast_arrays(*own), axis=1) - wanted).max() < 100 * ROUNDING
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("azimuth_zero_deg", [0.0, 180.0])
 def test_headlines_count_on_around_the_circle_and_through_the_zenith(azimuth_zero_deg):

@@ -202,6 +202,7 @@ def test_campaigns_of_unknown_rigs(tmp_path, name, moves, spots):
     assert_same(campaign, read_campaign(tmp_path / name))
 
 
+@pytest.mark.thorough
 def test_forty_thousand_spots_and_more_are_read():
     campaign = small_campaign()
     base = campaign.spots[4]

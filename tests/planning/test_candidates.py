@@ -47,6 +47,7 @@ def test_limits_are_kept(mounted_rig, found):
     assert np.abs(found.looks.steps).max() <= 280
 
 
+@pytest.mark.thorough
 def test_a_full_turn_waits_until_the_ratio_is_known(mounted_rig):
     """Two stops over 360 deg hold k to a stop error over 6000 steps, whatever the cameras; once the spot is found."""
     limits = {"pan_min_steps": -100, "pan_max_steps": 6100, "tilt_min_steps": -130, "tilt_max_steps": 130}

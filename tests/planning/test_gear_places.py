@@ -115,6 +115,7 @@ def test_a_line_through_looks_is_the_least_squares_line_of_what_places_carry():
     assert not still.any(), "one counter has no line"
 
 
+@pytest.mark.thorough
 def test_a_ratio_is_the_sum_of_what_each_place_has_in_it(real):
     """The slope and its derivatives along any line, at one instrument: by the formula of fits itself, by differences.
 
@@ -147,6 +148,7 @@ def test_a_ratio_is_the_sum_of_what_each_place_has_in_it(real):
         np.testing.assert_allclose(np.asarray(found.gradient)[:4] @ step, wanted, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_what_is_reported_of_real_gears_is_along_the_looks_by_the_instruments_own_scales(real):
     """Assurance of designs equals the plan judged move by move, on gears whose errors are as large as drawn.
 

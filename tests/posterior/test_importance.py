@@ -167,6 +167,7 @@ def test_a_campaign_is_sampled_in_few_rounds_and_accepted(sampled):
     np.testing.assert_allclose(posterior.log_density[0, :64], again, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_draws_of_its_own_say_the_same_of_a_way_of_homing(sampled, monkeypatch):
     """The most probable way once more, as if its draws had not served: by the proposal that they taught."""
     fitted, run, posterior = sampled
@@ -227,6 +228,7 @@ def too_narrow(sampled, monkeypatch):
     return fitted
 
 
+@pytest.mark.thorough
 def test_a_proposal_that_is_too_narrow_is_fitted_anew(too_narrow, sampled, monkeypatch):
     """Its draws teach the next one; they take no part in the answer, which is that of the right proposal."""
     begun = []
@@ -250,6 +252,7 @@ def test_a_proposal_that_is_too_narrow_is_fitted_anew(too_narrow, sampled, monke
     assert abs(one.mean - two.mean) < SIGMAS * np.hypot(one.mcse_mean, two.mcse_mean)
 
 
+@pytest.mark.thorough
 def test_a_budget_that_is_used_up_leaves_a_worse_answer(too_narrow):
     """Rounds of the narrow proposal: none is left for another."""
     run = importance_run(too_narrow, SEED, rounds_max=importance.ROUNDS_LEAST)
@@ -265,6 +268,7 @@ def test_a_budget_that_is_used_up_leaves_a_worse_answer(too_narrow):
     assert summary.problems == tuple(f"LAPLACE: {sentence}" for sentence in posterior.convergence.missing)
 
 
+@pytest.mark.thorough
 def test_few_draws_of_a_good_proposal_are_a_rough_answer(sampled, monkeypatch):
     """Weights are sound and the mean is known to a tenth of an sd or two; the posterior's numbers are given."""
     fitted, run, _ = sampled

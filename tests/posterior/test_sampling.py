@@ -115,6 +115,7 @@ def test_a_seed_gives_one_chain_also_when_interrupted(fitted, long, tmp_path, mo
         np.testing.assert_array_equal(whole[key], longer[key][:SHORT])
 
 
+@pytest.mark.thorough
 def test_ctrl_c_in_the_middle_of_a_step_is_quiet_and_loses_no_step(fitted, tmp_path, monkeypatch, capfd):
     limits(monkeypatch, SHORT)
     unbroken = sample(fitted, seed=SEED)
@@ -169,6 +170,7 @@ def test_only_a_converged_fit_is_sampled(fitted):
         sample(replace(fitted, converged=False, problems=("no maximum",)))
 
 
+@pytest.mark.thorough
 def test_what_is_missing_when_the_time_is_over_is_said(fitted, monkeypatch):
     monkeypatch.setattr("tvsbayes.inference.ensemble.BLOCK", BLOCK)
     quickly(monkeypatch)

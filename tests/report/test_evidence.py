@@ -83,6 +83,7 @@ def test_the_headline_and_the_table_say_a_probability_alike():
     assert verdict_of(small_summary(), (far,)).text.endswith("(probability below 0.001)")
 
 
+@pytest.mark.thorough
 def test_a_verification_of_this_calibration_is_reported_with_millimetres(reported, evidence):
     """Kept by `verify` of the very calibration; of another one it is not."""
     size = {"rms": 0.0123, "worst": 0.045}

@@ -200,6 +200,7 @@ def test_causes_and_parameters_are_called_by_words():
     )
 
 
+@pytest.mark.thorough
 def test_no_two_reports_have_one_number(evidence, page, no_pictures):
     """Another laboratory, customer, day, limit or operator is another report; the same one has the same number."""
     day = datetime.date(2026, 1, 15)
@@ -302,6 +303,7 @@ def test_axes_are_judged_with_the_fitted_contrast(reported, evidence):
         assert abs(table.predicted["accuracy_deg"].median - untold["accuracy_deg"].median) > 1e-6
 
 
+@pytest.mark.thorough
 def test_a_campaign_without_experiments_says_so(evidence, no_pictures):
     spots = tuple(replace(s, experiment=None, point=None) for s in evidence.campaign.spots)
     plain = replace(evidence, classic=None, campaign=replace(evidence.campaign, spots=spots))
@@ -430,6 +432,7 @@ def test_chromium_shows_the_page_without_overflow_or_complaint(reported, tmp_pat
     assert "CONSOLE" not in done.stderr
 
 
+@pytest.mark.thorough
 def test_the_printed_twin_has_eight_pages_at_most_and_none_is_empty(reported, tmp_path):
     """Folded sections are open in print: a page of nothing but folded headings would be one or two."""
     if not any(map(shutil.which, BROWSERS)):
@@ -443,6 +446,7 @@ def test_the_printed_twin_has_eight_pages_at_most_and_none_is_empty(reported, tm
     assert sum(length > 2000 for length in streams) >= pages
 
 
+@pytest.mark.thorough
 def test_no_heading_stands_at_the_foot_of_a_printed_page(tmp_path):
     """A heading with a single line below it is as lost as one alone; sections of many lengths meet every foot."""
     reader = shutil.which("pdftotext")

@@ -55,6 +55,7 @@ def test_draws_of_the_line_have_the_moments_that_it_has_given_the_scales():
     assert np.all(far.log_target == -np.inf) and np.isfinite(far.parts["linear"]).all()
 
 
+@pytest.mark.thorough
 def test_both_answers_of_a_short_time_are_given_and_said():
     """A chain without time is no answer, and the weighted draws before it are; of a single round they are rough."""
     made = drawn(1).campaign

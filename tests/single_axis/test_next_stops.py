@@ -46,6 +46,7 @@ def test_a_plan_begins_at_the_u_of_the_fit(fitted, target):
     assert found.u_now > 1.001 * given and found.next[0].u < found.u_now
 
 
+@pytest.mark.thorough
 def test_stops_lower_a_play_that_is_sampled_and_none_that_is_held():
     """Where moves may be shorter than the play it is no linear quantity."""
     made = drawn(4, runs(1)).campaign

@@ -137,6 +137,7 @@ def test_a_drive_is_the_dense_gaussian():
         assert found[k] == pytest.approx(wanted, rel=1e-6, abs=1e-3)
 
 
+@pytest.mark.thorough
 def test_readings_in_motion_are_averaged_without_losing_the_wave():
     """4000 readings become few rows, and say of period and amplitude what they should."""
     made = drive(4, AMPLITUDE, WavePeriods((), ((100.0, 800.0),), True), 4000, 4000.0)

@@ -163,6 +163,7 @@ def test_document_carries_every_column(shown):
     assert looks["status"] == list(shown.looks.status)
 
 
+@pytest.mark.thorough
 def test_two_campaigns_with_what_has_changed(viewed):
     looked = look_at(viewed.folder, viewed.folder)
     assert len(looked.scenes) == 2 and looked.changes.verdict == "no significant change"
