@@ -300,8 +300,8 @@ def test_every_limit_is_said():
         ({"pareto": np.nan}, "Pareto k nan"),
         ({"draws": 1000}, "Pareto k 0.69, wanted below 0.67"),
         ({"heaviest": 0.061}, "one draw holds 6.1 % of the weight, wanted at most 5 %"),
-        ({"errors": errors(mean=0.13)}, "the mean of backlash_deg.tilt to 0.13 sd and its interval's ends to 0.10 sd"),
-        ({"errors": errors(low=0.25)}, "its interval's ends to 0.25 sd, wanted at most 0.1 and 0.2"),
+        ({"errors": errors(mean=0.13)}, "backlash_deg.tilt: 0.13 sd of its mean, 0.10 sd of its interval's ends"),
+        ({"errors": errors(low=0.25)}, "0.25 sd of its interval's ends, wanted at most 0.1 and 0.2"),
         ({"errors": errors(high=np.nan)}, "backlash_deg.tilt"),
     ):
         (sentence,) = lacking(**{**inside, **changed})

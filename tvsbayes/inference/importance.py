@@ -313,7 +313,7 @@ def uncertain(errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
     name = max(bad, key=lambda each: bad[each].rounds_factor)
     mean, ends = bad[name].mean, max(bad[name].interval95)
     wanted = f"wanted at most {MEAN_ERROR_MAX:g} and {END_ERROR_MAX:g}"
-    return (f"sampling knows the mean of {name} to {mean:.2f} sd and its interval's ends to {ends:.2f} sd, {wanted}",)
+    return (f"Monte Carlo error of {name}: {mean:.2f} sd of its mean, {ends:.2f} sd of its interval's ends, {wanted}",)
 
 
 @dataclass(frozen=True)
