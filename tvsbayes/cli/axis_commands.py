@@ -151,11 +151,11 @@ def _parts(folder: Path, issue: Issue, quick: bool, no_sample: bool, seed: int, 
 
     data = read_axis(folder)
     check = contents(folder)
-    yield "check", check, check_text(check), None
-    yield "classic", *_classic(data), None
+    yield Part("check", check, check_text(check))
+    yield Part("classic", *_classic(data))
     stored = _kept_fit(data, output_place(folder, "results"), quick, no_sample, MAX_MINUTES, seed)
     text = axis_fit_text(stored.summary, written=list(stored.files.values()))
-    yield "fit", stored.as_json(seed), text, stored.error
+    yield Part("fit", stored.as_json(seed), text, stored.error)
     page = _page(data, folder, issue, pdf)
     page.report_removed()
     yield page.part()

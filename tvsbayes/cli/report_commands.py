@@ -260,10 +260,10 @@ def _parts(content: PageContent, quick: bool, no_sample: bool, seed: int, pdf: b
 
     campaign, data = content.campaign, content.data
     check = campaign_contents(campaign, data)
-    yield "check", check, check_text(check), None
+    yield Part("check", check, check_text(check))
     if not anyway:
         stop_at(implausible(data), OVERRIDE_HINT)
-    yield "classic", *_classic(data), None
+    yield Part("classic", *_classic(data))
     compile_for(report_line)
     with chain_progress(f"go on with `{command_line('fit', campaign)} --resume`") as progress:
         results = calibrate_campaign(
@@ -277,7 +277,7 @@ def _parts(content: PageContent, quick: bool, no_sample: bool, seed: int, pdf: b
         )
     summary = results.record.summary
     text = fit_text(summary, written=list(results.files.values()), causes=results.causes)
-    yield "fit", {**summary.as_json(), "seed": seed, "files": results.files}, text, results.error
+    yield Part("fit", {**summary.as_json(), "seed": seed, "files": results.files}, text, results.error)
     page = content.written(pdf)
     page.report_removed(certificates=True)
     yield page.part(content.lines(page), content.evidence.criteria)

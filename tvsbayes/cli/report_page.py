@@ -18,8 +18,16 @@ if TYPE_CHECKING:
     from tvsbayes.report.evidence import Criterion
 
 DRAWING, PRINTING = "drawing the page", "printing to PDF"
-Part = tuple[str, Mapping[str, Any] | None, str, TvsError | None]
-"""Part of `calibrate`: its key, document and text, and the error that ends the sequence, else None."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of `calibrate`: key, document and text, and the error that ends the sequence, else None."""
+
+    key: str
+    document: Mapping[str, Any] | None
+    text: str
+    error: TvsError | None = None
 
 
 @dataclass(frozen=True)
@@ -56,7 +64,7 @@ class WrittenPage:
     def part(self, lines: Sequence[str] = (), criteria: Sequence[Criterion] = ()) -> Part:
         """The last part of `calibrate`, with the verdicts on the limits, as lines and as criteria."""
         text = "\n".join([*lines, f"next: open {', '.join(self.files.values())} in a browser"])
-        return "report", self.as_json(criteria), text, None
+        return Part("report", self.as_json(criteria), text)
 
 
 def written_page(
@@ -93,11 +101,11 @@ def written_page(
 def print_parts(parts: Iterable[Part], as_json: bool) -> None:
     """Print the parts of `calibrate`, each as soon as it is made; an error ends them, and there is no report."""
     documents: dict[str, Any] = {}
-    for name, document, text, error in parts:
-        documents[name] = document
-        if error is not None:
-            finish({**documents, "report": None}, text, as_json, error)
-        elif name == "report":
-            finish(documents, text, as_json)
+    for part in parts:
+        documents[part.key] = part.document
+        if part.error is not None:
+            finish({**documents, "report": None}, part.text, as_json, part.error)
+        elif part.key == "report":
+            finish(documents, part.text, as_json)
         else:
-            print_part(text, as_json)
+            print_part(part.text, as_json)
