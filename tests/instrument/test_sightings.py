@@ -56,7 +56,9 @@ def test_folder_there_and_back(simulated, tmp_path):
     assert not check_campaign(found).findings
 
 
-@pytest.mark.parametrize("of_spots", [plots.points_3d, plots.setup, plots.coverage])
+@pytest.mark.parametrize(
+    "of_spots", [plots.points_3d, plots.setup, plots.coverage, lambda campaign: campaign.stereo_pair]
+)
 def test_what_needs_spots_refuses_sightings(simulated, of_spots):
     with pytest.raises(InputError, match=r"found sightings of a head.*; allowed: spots that a stereo pair sees; give"):
         of_spots(simulated.campaign)
