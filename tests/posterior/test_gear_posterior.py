@@ -10,10 +10,11 @@ from support.small_posterior import SIGMAS
 from support.varying_gears import varying_gears
 
 from tvsbayes.estimators.joint_fit import fit
+from tvsbayes.inference.importance import K_MAX
 from tvsbayes.instrument.parameters import Prior
 from tvsbayes.instrument.protocols import four_point_protocol
 from tvsbayes.posterior.draws import headline_names
-from tvsbayes.posterior.importance import K_MAX, importance_run
+from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.twin.simulated_campaign import simulate
 

@@ -6,7 +6,6 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
-import jax
 import numpy as np
 import pytest
 from scipy import stats
@@ -29,7 +28,7 @@ from tvsbayes.instrument.campaign import read_campaign
 from tvsbayes.instrument.parameters import BLOCKS, Prior
 from tvsbayes.pipeline import unusable
 from tvsbayes.posterior.draws import headline_names
-from tvsbayes.posterior.importance import importance_run, run_beside
+from tvsbayes.posterior.importance import importance_run
 from tvsbayes.posterior.sampling import sample
 from tvsbayes.posterior.target import Target
 from tvsbayes.results.convergence import MonteCarloError
@@ -165,20 +164,6 @@ def test_a_campaign_is_sampled_in_few_rounds_and_accepted(sampled):
     w = path.to_w(z)
     again = Target(fitted, path)(w) + fitted.log_density - path.mapped(w).log_jacobian
     np.testing.assert_allclose(posterior.log_density[0, :64], again, atol=1e-6)
-
-
-@pytest.mark.thorough
-def test_draws_of_its_own_say_the_same_of_a_way_of_homing(sampled, monkeypatch):
-    """The most probable way once more, as if its draws had not served: by the proposal that they taught."""
-    fitted, run, posterior = sampled
-    monkeypatch.setattr("tvsbayes.posterior.importance.BESIDE_ROUNDS_MAX", 2)
-    monkeypatch.setattr("tvsbayes.posterior.importance.K_MAX", -1.0)
-    with jax.enable_x64(True):
-        beside = run_beside(fitted, run, SEED + 1)
-    one, other = posterior.convergence.importance, beside.convergence.importance
-    assert other.draws == 2 * importance.ROUND and other.effective_share > 0.3
-    error = np.hypot(one.log_evidence_mcse, other.log_evidence_mcse)
-    assert error < 0.05 and other.log_evidence == pytest.approx(one.log_evidence, abs=SIGMAS * error)
 
 
 def test_the_same_seed_gives_the_same_draws(sampled, monkeypatch):

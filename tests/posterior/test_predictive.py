@@ -17,7 +17,7 @@ from tvsbayes.instrument.campaign import Campaign, ordered_spots
 from tvsbayes.instrument.parameters import INDEX, NAMES, names_of
 from tvsbayes.posterior import predictive
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.importance import mixed
+from tvsbayes.posterior.homing_mixture import mixed
 from tvsbayes.posterior.predictive import ideal_pixels, looks_again, move_log_likelihood, predictive_pixels
 from tvsbayes.results.convergence import Importance, NamedValue, Reweighted
 
@@ -157,7 +157,7 @@ def posterior_of_two_ways() -> Posterior:
         draws = drawn_quantities(1, count)
         weights = np.full((1, count), 1 / count)
         parts.append(Posterior(fit, z, z[..., 0], draws, weights, found, 0, 0.0))
-    return mixed(parts)
+    return mixed(parts, np.array([0.5, 0.5]))
 
 
 def test_every_draw_speaks_of_looks_by_its_own_way_of_homing(monkeypatch):

@@ -30,7 +30,7 @@ from tvsbayes.results.convergence import (
     Reweighted,
     extreme,
 )
-from tvsbayes.results.records import Tier
+from tvsbayes.results.records import AnswerKind, Tier
 from tvsbayes.results.tiers import IMPORTANCE
 from tvsbayes.statistics.streams import Stream, random_stream
 from tvsbayes.statistics.weighted_draws import (
@@ -240,11 +240,6 @@ class Weighing:
         deviations = {n: self.columns[n] - mean for n, mean in zip(self.headlines, summary.mean, strict=True)}
         pareto, heaviest = self.smoothed.pareto_k, float(np.max(self.smoothed.weights))
         missing = lacking(pareto, heaviest, count, self.monte_carlo_error)
-        rough = (
-            pareto < ROUGH_K_MAX
-            and heaviest <= ROUGH_HEAVIEST_MAX
-            and all(e.roughly_known for e in self.monte_carlo_error.values())
-        )
         return Importance(
             accepted=not missing,
             missing=missing,
@@ -258,7 +253,7 @@ class Weighing:
             log_evidence=self.log_evidence,
             log_evidence_mcse=float(np.sqrt(max(1 / kish - 1 / count, 0.0))),
             invalid_evaluations=self.pool.invalid,
-            answer="accepted" if not missing else "rough" if rough else "laplace",
+            answer="accepted" if not missing else best_answer(pareto, heaviest, self.monte_carlo_error),
         )
 
     @property
@@ -305,6 +300,12 @@ def lacking(pareto: float, heaviest: float, draws: int, errors: Mapping[str, Mon
     return (*missing, *uncertain(errors))
 
 
+def best_answer(pareto: float, heaviest: float, errors: Mapping[str, MonteCarloError]) -> AnswerKind:
+    """Choose the answer of draws that are not accepted, by the arguments of `lacking`."""
+    known = all(error.roughly_known for error in errors.values())
+    return "rough" if pareto < ROUGH_K_MAX and heaviest <= ROUGH_HEAVIEST_MAX and known else "laplace"
+
+
 def uncertain(errors: Mapping[str, MonteCarloError]) -> tuple[str, ...]:
     """Name in a sentence the headline of the largest Monte Carlo error; none where all errors are within limits."""
     bad = {name: e for name, e in errors.items() if not e.within(MEAN_ERROR_MAX, END_ERROR_MAX)}
@@ -324,15 +325,6 @@ class ImportanceRun[D: Density]:
     pool: Pool
     sample: Sample
     seed: int
-
-    def extended(self, rounds: int) -> ImportanceRun[D]:
-        """Extend to so many rounds in all, the further ones from the same proposal."""
-        began, pool = time.monotonic(), self.pool
-        generator = np.random.RandomState([self.seed, len(pool.drawn)])
-        for _ in range(rounds - len(pool.drawn) // ROUND):
-            pool = pool.extended(self.density, generator, fitted=False)
-        sample = Weighing(self.density, pool).sample(self.sample.seconds + time.monotonic() - began)
-        return replace(self, pool=pool, sample=sample)
 
     @cached_property
     def proposal(self) -> Proposal:
@@ -375,7 +367,7 @@ def weighted_run[D: Density](
     try:
         pool = piloted(density, generator, pilots_max)
         wanted = ROUNDS_LEAST if rounds_least is None else rounds_least
-        total, rounds, patience = 0, 0, PATIENCE * wanted
+        begun, total, rounds, patience = wanted, 0, 0, PATIENCE * wanted
         while True:
             while rounds < wanted:
                 rounds, total = rounds + 1, total + 1
@@ -385,11 +377,14 @@ def weighted_run[D: Density](
             left = (ROUNDS_MAX if rounds_max is None else rounds_max) - total
             if weighed.importance.accepted or left <= 0:
                 return ImportanceRun(density, pool, weighed.sample(time.monotonic() - began), seed)
-            needed = weighed.rounds_wanted
-            if needed > patience and left >= 2 * rounds:
+            needed, heavy = weighed.rounds_wanted, not weighed.importance.pareto_k < K_MAX
+            if (needed > patience or (heavy and rounds >= 2 * begun)) and left >= 2 * rounds:
                 # The next proposal is fitted to these draws and may use twice as many.
                 pool = Pool.empty(pool.refitted, pool.invalid)
-                rounds, wanted, patience = 0, rounds, 2 * patience
+                begun, rounds, wanted, patience = rounds, 0, rounds, 2 * patience
+            elif heavy and rounds < 2 * begun <= rounds + left:
+                # More draws hardly change the tail index, but a proposal fitted to them may.
+                wanted = 2 * begun
             else:
                 # Few draws predict the rounds needed poorly: draw about half of them, then judge again.
                 more = max(rounds + 1, rounds * 9 // 8, int(min(np.ceil(0.5 * (rounds + 1.1 * needed)), 2 * rounds)))

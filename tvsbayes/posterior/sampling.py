@@ -8,24 +8,19 @@ from functools import partial
 from pathlib import Path
 
 import jax
-import numpy as np
 
 from tvsbayes.errors import NotConverged, require_kind
 from tvsbayes.estimators.joint_fit import JointFit
 from tvsbayes.inference.chain import better, run_of
-from tvsbayes.inference.importance import ImportanceRun
 from tvsbayes.posterior.chain import stored_chain, write_chain
 from tvsbayes.posterior.draws import Posterior
-from tvsbayes.posterior.importance import importance_run, mixed, run_beside
-from tvsbayes.posterior.target import Target
+from tvsbayes.posterior.homing_mixture import homing_mixture
+from tvsbayes.posterior.importance import importance_run
 from tvsbayes.progress import Job, Show
 from tvsbayes.results.convergence import Convergence
 from tvsbayes.results.records import Tier
 from tvsbayes.results.tiers import CHAIN, IMPORTANCE, TIERS
 
-MIXTURE_ROUNDS, MIXTURE_MARGIN = 16, 1.5
-"""Largest number of rounds of the most probable way of homing where the mixture of all would be rough; factor on the
-rounds that the errors of the mixture require."""
 DRAWING = "drawing weighted samples"
 DRAWN_SECONDS, WALKED_SECONDS = 3.0, 8.0
 """Seconds of the stages, for the progress display."""
@@ -95,11 +90,7 @@ def sample(
         else:
             job.begin(DRAWING)
             start, chain = importance_run(fit, seed, job.at), None
-        early = _mixture(start, seed)
-        if early.convergence.answer == "rough" and start.sample.convergence.answer == "accepted" and chain is None:
-            # A mixture with less probable ways of homing needs more draws than the most probable one alone.
-            start = start.extended(_rounds_of_mixture(start, early))
-            early = _mixture(start, seed)
+        early = homing_mixture(start)
         if tier == IMPORTANCE:
             return early
         if first is not None:
@@ -113,17 +104,3 @@ def sample(
         agrees = convergence.agreement is None or convergence.agreement.agrees
         # A chain has one way of homing only; where others have weight, the weighted draws of all are the result.
         return early if len(early.fit.mixture) > 1 and walked.converged and agrees else better(early, walked)
-
-
-def _rounds_of_mixture(start: ImportanceRun[Target], mixture: Posterior) -> int:
-    """Compute the rounds of the most probable way of homing that the errors of the mixture require."""
-    factor = max(error.rounds_factor for error in mixture.convergence.monte_carlo_error.values())
-    rounds = start.sample.convergence.importance.rounds
-    return int(np.clip(np.ceil(MIXTURE_MARGIN * factor * rounds), rounds + 1, MIXTURE_ROUNDS))
-
-
-def _mixture(start: ImportanceRun[Target], seed: int) -> Posterior:
-    """Build the posterior over all ways of homing, from the draws of the most probable one."""
-    first = start.density.posterior(start.sample, seed)
-    others = [run_beside(way.fit, start, seed) for way in first.fit.mixture[1:] if way.fit]
-    return mixed([first, *others]) if others else first

@@ -1,0 +1,148 @@
+"""Mixture over ways of homing: draws shared or of a way's own, and rounds where the error comes from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from support.small_posterior import SIGMAS, small_fit
+
+from tvsbayes.estimators.joint_fit import Alternative
+from tvsbayes.inference.importance import ROUND, Pool
+from tvsbayes.posterior import homing_mixture
+from tvsbayes.posterior.homing_mixture import Mixture, WayDraws
+from tvsbayes.posterior.importance import importance_run
+from tvsbayes.posterior.target import Target
+
+SEED = 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def double():
+    """As commands compute."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def run():
+    """Importance sampling of the shared fit, whose homings are recorded."""
+    fitted, path = small_fit()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tvsbayes.posterior.importance.transport", lambda fit: path)
+        return importance_run(fitted, SEED)
+
+
+@pytest.fixture(scope="module")
+def first(run):
+    """The draws of the most probable way."""
+    return WayDraws(run.density, run.pool, SEED)
+
+
+def shared(first: WayDraws, rounds: int = 1) -> WayDraws:
+    """Draws of another way weighed anew; here the other way has the same density."""
+    target = Target(first.target.fit, first.target.path)
+    way = WayDraws(target, Pool.empty(first.pool.next_proposal), SEED, shared=True)
+    return way.extended(rounds, first.pool)
+
+
+@pytest.fixture(scope="module")
+def own(run, first):
+    """Two rounds of a way's own draws, by the proposal fitted for the most probable one."""
+    target = Target(run.density.fit, run.density.path)
+    return WayDraws(target, Pool.empty(run.pool.proposals[-1]), SEED + 1).extended(2, run.pool)
+
+
+def test_the_same_density_weighed_anew_has_the_same_weights(first):
+    """Only the errors at places are drawn anew; the density of w has them integrated out."""
+    again = shared(first, first.rounds)
+    np.testing.assert_allclose(again.weighed.log_weights, first.weighed.log_weights, atol=1e-9)
+    assert again.log_evidence == pytest.approx(first.log_evidence, abs=1e-9)
+
+
+def test_draws_of_its_own_give_the_same_evidence(first, own):
+    assert own.rounds == 2 and not own.shared and own.reliable
+    error = np.hypot(*(way.weighed.importance.log_evidence_mcse for way in (first, own)))
+    assert error < 0.05 and own.log_evidence == pytest.approx(first.log_evidence, abs=SIGMAS * error)
+
+
+def test_a_way_that_shares_all_draws_adds_no_knowledge(first):
+    """Two ways of one density are equally probable, and their mixture has the errors of one."""
+    mixture = Mixture((first, shared(first, first.rounds)), 0)
+    np.testing.assert_allclose(mixture.probabilities, 0.5)
+    one = Mixture((first,), 0)
+    for name, error in one.errors.items():
+        assert mixture.errors[name].mean == pytest.approx(error.mean, rel=1e-9)
+    assert mixture.missing == one.missing == () and mixture.improved() is None
+
+
+def test_independent_draws_add_their_squared_errors(first, own):
+    """Shares of the error are those of the variance of a sum of independent means."""
+    mixture = Mixture((first, own), 0)
+    shares = mixture.shares_of_error
+    assert shares.sum() == pytest.approx(1) and shares[1] > shares[0], "two rounds are less than three or more"
+    column = mixture.names.index("backlash_deg.pan")
+    each = [Mixture((way,), 0).summary.mcse_mean[column] for way in (first, own)]
+    together = np.hypot(*(p * error for p, error in zip(mixture.probabilities, each, strict=True)))
+    assert mixture.summary.mcse_mean[column] == pytest.approx(together, rel=0.05)
+
+
+def few(way: WayDraws) -> WayDraws:
+    """The first 128 draws alone."""
+    points = way.pool.drawn.taken(slice(0, 128))
+    return replace(way, pool=replace(way.pool, points=points, counts=(128,)))
+
+
+def test_rounds_go_to_the_way_that_the_error_comes_from(first, own, monkeypatch):
+    """Of an equally probable way there are a few draws only: it is extended, as far as rounds are left."""
+    mixture = Mixture((first, few(own)), 5)
+    assert mixture.missing and mixture.shares_of_error[1] > 0.9
+    monkeypatch.setattr(WayDraws, "reliable", True)
+    better = mixture.improved()
+    assert better is not None and better.ways[0] is first and better.left == 4
+    assert len(better.ways[1].pool.drawn) >= ROUND
+    worst, least = (max(e.rounds_factor for e in each.errors.values()) for each in (mixture, better))
+    assert least < worst / 2
+    assert replace(mixture, left=0).improved() is None, "no rounds are left"
+
+
+def test_weights_that_cannot_be_trusted_are_replaced(first, monkeypatch):
+    """First by all shared draws, then by draws of the way's own, then by a proposal fitted to those."""
+    monkeypatch.setattr(WayDraws, "reliable", False)
+    monkeypatch.setattr(homing_mixture, "ALONE_ROUNDS", 1)
+    mixture = Mixture((first, shared(first)), 2)
+    every = mixture.improved()
+    assert every.ways[1].shared and every.ways[1].rounds == first.rounds and every.left == 2
+    alone = every.improved()
+    assert not alone.ways[1].shared and alone.ways[1].rounds == 1 and alone.left == 1
+    refitted = alone.improved()
+    assert refitted.ways[1].pool.proposals[0] is not alone.ways[1].pool.proposals[0] and refitted.left == 0
+    assert refitted.ways[1].pool.counts == (ROUND,), "draws that a proposal was fitted to are in the answer"
+    assert refitted.improved() is None
+
+
+def test_an_improbable_way_need_not_be_reliable(first, own, monkeypatch):
+    """Its tail index is not that of the mixture."""
+    heavy = replace(own)
+    heavy.weighed.__dict__["smoothed"] = replace(own.weighed.smoothed, pareto_k=0.9)
+    for chance, k in ((0.05, first.weighed.smoothed.pareto_k), (0.2, 0.9)):
+        mixture = Mixture((first, heavy), 0)
+        mixture.__dict__["probabilities"] = np.array([1 - chance, chance])
+        assert mixture.pareto_k == k
+        assert bool(mixture.missing) == (k == 0.9)
+
+
+def test_the_posterior_says_how_probable_each_way_is(first, own):
+    """All draws, by the weight of their way; the diagnosis is that of the mixture."""
+    fit = first.target.fit
+    ways = tuple(Alternative({}, 0.5, fit) for _ in range(2))
+    with_ways = replace(first, target=Target(replace(fit, alternatives=ways), first.target.path))
+    mixture = Mixture((with_ways, own), 0)
+    posterior = mixture.posterior(1.0)
+    assert posterior.weights.sum() == pytest.approx(1) and posterior.seconds == 1.0
+    by_way = [posterior.weights[posterior.way == k].sum() for k in range(2)]
+    np.testing.assert_allclose(by_way, mixture.probabilities)
+    np.testing.assert_allclose([way.probability for way in posterior.fit.mixture], mixture.probabilities)
+    assert posterior.convergence.monte_carlo_error == mixture.errors and posterior.convergence.answer == "accepted"
