@@ -284,6 +284,20 @@ def classes(rows: Sequence[Row]) -> None:
     print()
 
 
+def cost_of_unrecorded_homings(rows: Sequence[Row]) -> None:
+    """CPU time without recorded homings over that with them, at equal numbers of looks."""
+    timed = [row for row in rows if "cpu_s" in row]
+    unrecorded = np.array([not row["homing_recorded"] for row in timed], float)
+    looks = np.log(_of(timed, "looks"))
+    design = np.stack([np.ones(len(timed)), looks - looks.mean(), unrecorded], axis=1)
+    y = np.log(_of(timed, "cpu_s"))
+    solution, (square,), *_ = np.linalg.lstsq(design, y)
+    sd = np.sqrt(np.linalg.inv(design.T @ design)[2, 2] * square / (len(timed) - 3))
+    low, middle, high = np.exp(solution[2] + np.array([-2, 0, 2]) * sd)
+    print("Benches without recorded homings have other numbers of looks. Least squares of ln CPU on ln looks and on")
+    print(f"whether homings were recorded: without, {middle:.2f} times the CPU time ({low:.2f} to {high:.2f}, 2 sd).\n")
+
+
 def listed(rows: Sequence[Row]) -> None:
     """Benches one by one: answer, draws, cost, and the headline furthest from its truth."""
     columns = ("bench", "looks", "answer", "Pareto k", "effective of draws", "heaviest, %", "CPU s")
@@ -322,6 +336,7 @@ def page(arguments: argparse.Namespace) -> None:
     if drawn:
         print(f"## {len(drawn)} drawn benches\n")
         classes(drawn)
+        cost_of_unrecorded_homings(drawn)
         answered = [row for row in drawn if row["answer"] in ANSWERED]
         print(f"### Headlines of the {len(answered)} that were answered\n")
         coverage(answered)

@@ -275,10 +275,15 @@ def test_too_few_spots_are_refused_by_number(simulated):
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["paper", "mixed", "grid"])
 def test_coverage_of_forty_rigs(protocol, mounted_rig):
-    """A short form of `experiments/intervals/laplace_coverage.py`; bounds of the full study stand there."""
-    from scipy import stats
+    """A short form of `experiments/intervals/laplace_coverage.py`; bounds of the full study stand there.
+
+    Shares inside, not squares: few reversals make the posterior of the play skew, and the tails of Laplace's z heavier
+    than a normal's.
+    """
+    from scipy.special import ndtri
 
     from tvsbayes.instrument.plan import read_plan
+    from tvsbayes.statistics.chances import binomial_bounds
 
     plan = read_plan(shipped_data() / "rigs" / "mounted" / f"{protocol}.csv")
     rig = read_rig(shipped_data() / "rigs" / "mounted" / "rig.toml")
@@ -290,6 +295,7 @@ def test_coverage_of_forty_rigs(protocol, mounted_rig):
         true = simulated.truth.effective_deg_per_step(simulated.campaign)
         sd = result.draws.effective_deg_per_step.std(axis=0)
         z.append((result.mode.effective_deg_per_step - list(true.values())) / sd)
-    squares = np.sum(np.square(z), axis=0)
-    low, high = stats.chi2.ppf([5e-5, 1 - 5e-5], len(z))
-    assert np.all((squares > low) & (squares < high))
+    for share in (0.5, 0.8, 0.95):
+        inside = np.mean(np.abs(z) < ndtri((1 + share) / 2), axis=0)
+        low, high = binomial_bounds(len(z), share)
+        assert np.all((inside >= low) & (inside <= high)), (share, inside)
