@@ -173,8 +173,8 @@ def _shaped(form: Format, at: _Expected, nominal: float, fitted: float, wish: Wi
 def _line_draws(fit: AxisFit) -> np.ndarray:
     """Draw zero at command 0 and slope of the line through the readings, (draws, 2)."""
     model = fit.model
-    slope = model.head(per_command=1.0) + line_weights(model, fit.w)
-    level = model.head(offset=1.0) + model.functional(fit.rows.command, fit.w).mean(axis=-2)
+    slope = model.line_terms(per_command=1.0) + line_weights(model, fit.w)
+    level = model.line_terms(offset=1.0) + model.functional(fit.rows.command, fit.w).mean(axis=-2)
     both = np.stack([level - model.middle * slope, slope], axis=-2)
     return fit.linear.drawn(both, random_stream(fit.seed, Stream.PROMISE))
 

@@ -42,7 +42,7 @@ def blocks_of(w: np.ndarray) -> list[np.ndarray]:
 def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
     """Functionals of the columns, shape (`HEADLINE_DRAWS`, columns), or (n, ...) as in `line_weights`."""
     lines, weights = line_functionals(model), line_weights(model, w)
-    functionals = np.concatenate([lines, model.head(per_command=1.0)[None]])
+    functionals = np.concatenate([lines, model.line_terms(per_command=1.0)[None]])
     if weights.ndim == 2:
         functionals = np.repeat(functionals[None], len(weights), axis=0)
     functionals[..., -1, :] += weights
@@ -51,7 +51,7 @@ def headline_functionals(model: AxisModel, w: np.ndarray) -> np.ndarray:
 
 def line_functionals(model: AxisModel) -> np.ndarray:
     """Functionals of all but the last of `HEADLINE_DRAWS`; the same for all draws."""
-    return np.array([model.head(**factors) for factors in line_factors(model).values()])
+    return np.array([model.line_terms(**factors) for factors in line_factors(model).values()])
 
 
 def line_factors(model: AxisModel) -> dict[str, Mapping[str, float]]:

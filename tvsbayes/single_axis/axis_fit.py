@@ -110,7 +110,7 @@ def _absorbed_conflict(model: AxisModel, name: str, default: AxisPrior) -> Prior
         return None
     rng = np.random.default_rng(0)
     w = rng.multivariate_normal(mode.w, mode.covariance, DRAWS) if len(mode.w) else np.zeros((DRAWS, 0))
-    draws = without_prior.linear(w).drawn(without_prior.head(**{name: 1.0})[None], rng)[:, 0]
+    draws = without_prior.linear(w).drawn(without_prior.line_terms(**{name: 1.0})[None], rng)[:, 0]
     value, sd = float(draws.mean()), float(draws.std())
     difference = abs(value - prior.value)
     if difference <= CONFLICT_LIMIT * float(np.hypot(prior.u, sd)):

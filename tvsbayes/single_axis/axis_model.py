@@ -31,8 +31,9 @@ FARTHEST = 12.0
 BLOCK_NUMBERS_MAX = 8_000_000
 """Largest number of values in a block of draws."""
 OFFSET, SLOPE, CONTRAST, BACKLASH = 0, 1, 2, 3
-"""Indices of the first columns."""
-HEAD = 4
+"""Indices of the first columns, the terms of the line and the backlash."""
+LINE_TERMS = 4
+"""Their number."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,7 @@ class AxisModel:
     @property
     def waves_begin(self) -> int:
         """First column of the waves: `COLUMNS` of each."""
-        return HEAD + len(self.homed) + len(self.unknown_segments) + len(self.shifts)
+        return LINE_TERMS + len(self.homed) + len(self.unknown_segments) + len(self.shifts)
 
     @property
     def processes(self) -> int:
@@ -266,10 +267,10 @@ class AxisModel:
         filled[:, :, 1 + OFFSET], filled[:, :, 1 + SLOPE], filled[:, :, 1 + CONTRAST] = 1.0, anchor, 0.5 * play.path
         filled[:, :, 1 + BACKLASH] = 0.5 * play.side
         for k, segment in enumerate(self.homed):
-            filled[:, :, 1 + HEAD + k] = rows.segment == segment
+            filled[:, :, 1 + LINE_TERMS + k] = rows.segment == segment
         for k, segment in enumerate(self.unknown_segments):
-            filled[:, :, 1 + HEAD + len(self.homed) + k] = spread * (rows.segment == segment)
-        first_shift = 1 + HEAD + len(self.homed) + len(self.unknown_segments)
+            filled[:, :, 1 + LINE_TERMS + len(self.homed) + k] = spread * (rows.segment == segment)
+        first_shift = 1 + LINE_TERMS + len(self.homed) + len(self.unknown_segments)
         for k, (name, column) in enumerate(shifts.items(), start=first_shift):
             filled[:, :, 0] -= self.priors[name].value * column
             filled[:, :, k] = column
@@ -340,12 +341,12 @@ class AxisModel:
         factor[:, SLOPE, SLOPE] = self.priors["per_command"].u
         factor[:, CONTRAST, CONTRAST] = self.priors["ratio_contrast"].u
         factor[:, BACKLASH, BACKLASH] = 0.0 if self.play_is_sampled else self.priors["backlash"].u
-        homes = HEAD + np.arange(len(self.homed))
+        homes = LINE_TERMS + np.arange(len(self.homed))
         factor[:, homes, homes] = values["home_sd"][:, None]
-        unknown = HEAD + len(self.homed) + np.arange(len(self.unknown_segments))
+        unknown = LINE_TERMS + len(self.homed) + np.arange(len(self.unknown_segments))
         # The sd of a uniform distribution from -1 to 1.
         factor[:, unknown, unknown] = np.sqrt(1 / 3)
-        for k, name in enumerate(self.shifts, start=HEAD + len(self.homed) + len(self.unknown_segments)):
+        for k, name in enumerate(self.shifts, start=LINE_TERMS + len(self.homed) + len(self.unknown_segments)):
             factor[:, k, k] = self.priors[name].u
         for k, scale in enumerate(scales):
             of_wave = self.waves_begin + COLUMNS * k + np.arange(COLUMNS)
@@ -426,7 +427,7 @@ class AxisModel:
         means[:, SLOPE] = self.priors["per_command"].value
         means[:, CONTRAST] = self.priors["ratio_contrast"].value
         means[:, BACKLASH] = self.coordinates.values(w)["backlash"]
-        for k, name in enumerate(self.shifts, start=HEAD + len(self.homed) + len(self.unknown_segments)):
+        for k, name in enumerate(self.shifts, start=LINE_TERMS + len(self.homed) + len(self.unknown_segments)):
             means[:, k] = self.priors[name].value
         return means
 
@@ -506,17 +507,17 @@ class AxisModel:
             covariances[part] = inverse[:, self.columns :, self.columns :]
         return means, covariances
 
-    def head(self, **factors: float) -> np.ndarray:
+    def line_terms(self, **factors: float) -> np.ndarray:
         """A functional (columns,) of `offset`, `per_command`, `ratio_contrast`, `backlash` by their factors."""
         functional = np.zeros(self.columns)
         for name, factor in factors.items():
-            functional[_HEAD_COLUMNS[name]] = factor
+            functional[_LINE_COLUMNS[name]] = factor
         return functional
 
     def shift(self, name: str) -> np.ndarray:
         """A functional (columns,) of one of `shifts`."""
         functional = np.zeros(self.columns)
-        functional[HEAD + len(self.homed) + len(self.unknown_segments) + self.shifts.index(name)] = 1.0
+        functional[LINE_TERMS + len(self.homed) + len(self.unknown_segments) + self.shifts.index(name)] = 1.0
         return functional
 
     @property
@@ -552,7 +553,7 @@ def _creeps(rows: AxisRows) -> bool:
     return bool(np.ptp(rows.warm_s) > 0)
 
 
-_HEAD_COLUMNS = {"offset": OFFSET, "per_command": SLOPE, "ratio_contrast": CONTRAST, "backlash": BACKLASH}
+_LINE_COLUMNS = {"offset": OFFSET, "per_command": SLOPE, "ratio_contrast": CONTRAST, "backlash": BACKLASH}
 
 
 def _information(block: _Block, flat: int) -> tuple[np.ndarray, np.ndarray]:

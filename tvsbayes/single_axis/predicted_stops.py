@@ -88,7 +88,7 @@ def transferred_scales(source: AxisModel, draws: np.ndarray, target: AxisModel, 
         if name in source.coordinates.names:
             w[:, column] = draws[:, source.coordinates.names.index(name)]
         elif name == "backlash":
-            values, sd = source.linear(draws).of(source.head(backlash=1.0)[None])
+            values, sd = source.linear(draws).of(source.line_terms(backlash=1.0)[None])
             prior = target.priors[name]
             w[:, column] = (values[:, 0] + sd[:, 0] * rng.standard_normal(len(draws)) - prior.value) / prior.u
     return w
