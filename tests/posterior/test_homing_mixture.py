@@ -89,6 +89,27 @@ def test_independent_draws_add_their_squared_errors(first, own):
     assert mixture.summary.mcse_mean[column] == pytest.approx(together, rel=0.05)
 
 
+def test_shares_of_the_error_of_a_mean_do_not_depend_on_its_origin(run, first, own, monkeypatch):
+    monkeypatch.setattr(homing_mixture, "END_ERROR_MAX", 1e9)
+    shares = Mixture((first, own), 0).shares_of_error
+    moved = tuple(replace(way) for way in (first, own))
+    for way, each in zip(moved, (first, own), strict=True):
+        way.weighed.__dict__["columns"] = {name: 1.0 + x for name, x in each.weighed.columns.items()}
+    # Rounding of numbers of 1e-4 beside 1.
+    np.testing.assert_allclose(Mixture(moved, 0).shares_of_error, shares, rtol=1e-9)
+    monkeypatch.undo()
+    assert not np.allclose(Mixture((first, own), 0).shares_of_error, shares, rtol=1e-3), "ends weigh draws otherwise"
+
+
+def test_a_way_is_as_probable_as_firmware_homes_that_way(first):
+    """Of equal evidence: always from one side 0.45, from anywhere 0.1 (formulation 3.1)."""
+    ways = (
+        replace(first, target=Target(replace(first.target.fit, sides={"pan": side}), first.target.path))
+        for side in ("left", "anywhere")
+    )
+    np.testing.assert_allclose(Mixture(tuple(ways), 0).probabilities, [0.45 / 0.55, 0.1 / 0.55])
+
+
 def few(way: WayDraws) -> WayDraws:
     """The first 128 draws alone."""
     points = way.pool.drawn.taken(slice(0, 128))

@@ -237,6 +237,24 @@ def test_a_proposal_that_is_too_narrow_is_fitted_anew(too_narrow, sampled, monke
     assert abs(one.mean - two.mean) < SIGMAS * np.hypot(one.mcse_mean, two.mcse_mean)
 
 
+def test_a_heavy_tail_is_answered_by_another_proposal(sampled, monkeypatch):
+    """More draws hardly change its index. With a limit that no weights meet: 3 rounds and 3 more, then 6 and 6."""
+    fitted, run, _ = sampled
+    monkeypatch.setattr("tvsbayes.posterior.importance.transport", lambda fit: run.density.path)
+    monkeypatch.setattr(importance, "K_MAX", -1.0)
+    monkeypatch.setattr(importance, "ROUND", 512)
+    begun = []
+
+    def empty(proposal, invalid=0):
+        begun.append(proposal)
+        return Pool(None, (), (), proposal, invalid)
+
+    monkeypatch.setattr(Pool, "empty", empty)
+    again = importance_run(fitted, SEED, rounds_max=6 + 12)
+    assert again.pool.proposals == (begun[-1],) and again.pool.counts == (12 * 512,)
+    assert again.sample.convergence.answer != "accepted"
+
+
 @pytest.mark.thorough
 def test_a_budget_that_is_used_up_leaves_a_worse_answer(too_narrow):
     """Rounds of the narrow proposal: none is left for another."""
