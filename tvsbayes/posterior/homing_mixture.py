@@ -34,6 +34,8 @@ WORTH_RELIABLE_WEIGHTS = 0.1
 """
 SHARED_COST = 0.4
 """Cost of weighing a shared draw anew, over that of drawing."""
+WORTH_DRAWING = 0.01
+"""Least share in the squared error of a way that is given more draws."""
 MARGIN = 1.1
 """Factor on the predicted number of rounds, which a few draws predict poorly."""
 
@@ -206,6 +208,8 @@ class Mixture:
         factor, shares = max(error.rounds_factor for error in self.errors.values()), self.shares_of_error
         cost = np.array([SHARED_COST if way.shared and way.rounds < first.rounds else 1.0 for way in self.ways])
         for place in np.argsort(-shares / cost).tolist():
+            if shares[place] < WORTH_DRAWING:
+                continue
             way = self.ways[place]
             # Of the squared error, 1 - 1 / factor must go, which this way's share may not hold.
             kept = max(1 - (1 - 1 / factor) / shares[place], 0.5) if factor > 1 else 0.5
