@@ -166,6 +166,11 @@ def test_demo_keeps_campaign_and_results_where_it_is_told(ask, demonstrated, tmp
         kept.append((len(campaign.spots), place, tier))
         return SimpleNamespace(record=demonstrated)
 
+    # A checkout whose twin somebody has fitted.
+    shipped = tmp_path / "data"
+    shutil.copytree(PAPER_TWIN, shipped / "twins" / "paper_twin")
+    (shipped / "twins" / "paper_twin" / "results").mkdir(exist_ok=True)
+    monkeypatch.setattr(campaign_commands, "shipped_data", lambda: shipped)
     monkeypatch.setattr(campaign_commands, "calibrate", calibrate)
     assert ask("demo", out) == (0, demonstrated.document)
     assert kept == [(384, out / "results", "importance")]

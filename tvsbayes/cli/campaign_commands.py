@@ -47,7 +47,8 @@ def demo(
     with tempfile.TemporaryDirectory(prefix="tvsbayes-demo-") as scratch:
         folder = Path(scratch) / "paper_twin" if out is None else out
         make_folder(folder, empty=True)
-        for part in sorted(source.iterdir()):
+        # A checkout's own twin may have been fitted: results are not part of the campaign.
+        for part in sorted(path for path in source.iterdir() if path.is_file()):
             write_atomically(folder / part.name, part.read_bytes())
         report_line("paper twin: 96 four-point experiments of a simulated rig with known truth; fitting ...")
         from tvsbayes.estimators.four_point import classic as estimate_classic
