@@ -61,8 +61,8 @@ class MonteCarloError:
 class Importance:
     """Diagnosis of importance sampling: its draws and their weights.
 
-    Where homings are not recorded, the limits are those of the mixture of all ways of homing, with the largest tail index
-    of the ways that count; the numbers of draws and the evidence are those of the way that is most probable by Laplace.
+    Where homings are not recorded, the limits are those of the mixture of all ways of homing, with the largest tail
+    index of the ways that count; numbers of draws and evidence are those of the way that is most probable by Laplace.
 
     Attributes:
         accepted: whether its intervals may be used.
